@@ -103,12 +103,6 @@ def zstd_frame_of_8_gb(good: Good) -> bytes:
 
 
 @file
-def zstd_frame_and_chunk_of_8_gb(good: Good) -> bytes:
-    frame = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", CLAIM) + b"\x03\x00\x00" + b"x" * 99
-    return with_first_chunk(good, chunk(b"", data=frame, size=CLAIM))
-
-
-@file
 def zstd_frame_of_unknown_size(good: Good) -> bytes:
     compressor = zstandard.ZstdCompressor(write_content_size=False).compressobj()
     frame = compressor.compress(bytes(2**27)) + compressor.flush()
@@ -144,11 +138,6 @@ def half_a_million_messages(good: Good) -> bytes:
 
 
 @file
-def unknown_compression(good: Good) -> bytes:
-    return with_first_chunk(good, chunk(b"x", "brotli", data=b"x"))
-
-
-@file
 def record_of_8_exabytes(good: Good) -> bytes:
     return join(good[:6]) + pack(Opcode.CHUNK, b"x" * 99, 2**63) + join(good[6:])
 
@@ -162,11 +151,6 @@ def chunk_whose_data_are_longer_than_it(good: Good) -> bytes:
 @file
 def messages_longer_than_their_chunk(good: Good) -> bytes:
     return with_first_chunk(good, chunk(pack(Opcode.MESSAGE, b"x" * 99, 2**62)))
-
-
-@file
-def messages_shorter_than_their_head(good: Good) -> bytes:
-    return with_first_chunk(good, chunk(pack(Opcode.MESSAGE, b"x" * 9) * 99))
 
 
 @file
@@ -227,18 +211,8 @@ def yaml_with_tags(good: Good) -> bytes:
 
 
 @file
-def yaml_that_is_a_list(good: Good) -> bytes:
-    return with_config(good, b"[1, 2]")
-
-
-@file
 def yaml_of_bytes(good: Good) -> bytes:
     return with_config(good, bytes(range(256)))
-
-
-@file
-def half_of_a_character(good: Good) -> bytes:
-    return with_config(good, b'name: "\\ud800"')
 
 
 @file
@@ -275,16 +249,6 @@ def frame_with_damaged_pixels(good: Good) -> bytes:
 
 
 @file
-def frame_that_is_no_png(good: Good) -> bytes:
-    return picture(good, "/9j/4AAQSkZJRgABAQAAAQABAAD/2wBDAAgGBgcGBQgHBwcJ")
-
-
-@file
-def frame_that_is_not_base64(good: Good) -> bytes:
-    return picture(good, "???")
-
-
-@file
 def frame_without_a_head(good: Good) -> bytes:
     return with_messages(good, CAMERA, [{"t": ODD}])
 
@@ -298,12 +262,6 @@ def numbers_that_no_fish_has(good: Good) -> bytes:
     return with_messages(
         good, TICK, [tick_of(good, seq=61 + i, **c) for i, c in enumerate(changes)]
     )
-
-
-@file
-def counts_that_no_fishd_has(good: Good) -> bytes:
-    changes = [{"seq": 2**63 - 1}, {"missed": -(2**62)}, {"seq": -1}, {"missed": 2**62}]
-    return with_messages(good, TICK, [tick_of(good, **change) for change in changes])
 
 
 @file
@@ -334,20 +292,10 @@ def texts_that_are_commands(good: Good) -> bytes:
 
 
 @file
-def texts_in_bytes(good: Good) -> bytes:
-    return with_messages(good, EVENT, [b'{"t":1,"level":"\xff","kind":"mark","message":""}'])
-
-
-@file
 def deep_json(good: Good) -> bytes:
     deep = b"[" * 100_000 + b"]" * 100_000
     event = b'{"t":1,"level":"info","kind":"mark","message":"","data":{"a":' + deep + b"}}"
     return with_messages(good, EVENT, [event])
-
-
-@file
-def deep_summary(good: Good) -> bytes:
-    return join([*good[:-30], metadata("fishd.end", {"ticks": "[" * 100_000}), *good[-30:]])
 
 
 @file

@@ -25,7 +25,6 @@ GROUPS = (
 SAID = {
     ("export --csv", "zstd-chunk-of-8-gb"): "20 ticks lost (a chunk claims 8192 MB, 64 MB at most)",
     ("export --csv", "zstd-frame-of-8-gb"): "20 ticks lost (a zstd frame claims 8589934592 bytes,",
-    ("export --csv", "lz4-chunk-of-8-gb"): "20 ticks lost (a chunk claims 8192 MB, 64 MB at most)",
     ("export --csv", "lz4-frame-of-8-gb"): "20 ticks lost",
     ("export --csv", "chunks-of-zeros"): "more than 100 times the length of the file",
     ("export --csv", "frame-without-data"): "the picture of frame 9 is empty",

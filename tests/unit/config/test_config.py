@@ -1,7 +1,6 @@
 """The configuration: what is accepted, and what is said about what is not."""
 
 import json
-import os
 import time
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rigs.documents import ROOT
-from rigs.processes import fishctl
 
 from fishd.config import SERVICE_FILE, Config, load, mistakes, to_yaml
 from fishd.core.errors import ConfigError
@@ -80,25 +78,6 @@ def test_a_good_file_has_no_mistakes() -> None:
             assert mistakes.find(file) == []
 
 
-def test_config_check_prints_each_mistake_in_a_line_of_its_own(tmp_path: Path) -> None:
-    file = tmp_path / "fish.yaml"
-    file.write_text("tik: 1\ntick: 3\n")
-    done = fishctl("config", "check", str(file))
-    assert (done.returncode, done.stdout) == (os.EX_CONFIG, "")
-    assert [line.split(": ")[2] for line in done.stderr.splitlines()] == ["tik", "tick"]
-
-
-def test_an_empty_file_means_the_defaults(tmp_path: Path) -> None:
-    file = tmp_path / "fish.yaml"
-    file.write_text("")
-    assert load(file) == Config() == load()
-
-
-def test_a_length_in_millimetres_is_refused_with_the_question_whether_it_is_one() -> None:
-    with pytest.raises(ConfigError, match=r"m is needed \(mm\? that is 0\.1 m\)$"):
-        load(None, ["swimmer.body.length=100"])
-
-
 def test_only_values_that_were_given_are_doubted(caplog: pytest.LogCaptureFixture) -> None:
     load(None, ["start.rest=3000", "simulation.noise=0.001"])
     (record,) = caplog.records
@@ -106,11 +85,6 @@ def test_only_values_that_were_given_are_doubted(caplog: pytest.LogCaptureFixtur
         "careful: --set start.rest=3000: start.rest: 3000 s is more than makes sense: up to 600 s "
         "does (ms? that is 3 s)"
     )
-
-
-def test_the_shipped_configuration_is_good() -> None:
-    config = load(ROOT / "config" / "simulated.yaml")
-    assert config.start.controller == "swing"
 
 
 def test_a_file_may_be_named_by_a_text(tmp_path: Path) -> None:
@@ -125,6 +99,8 @@ def test_a_section_with_nothing_below_it_takes_its_defaults(tmp_path: Path) -> N
     file = tmp_path / "fish.yaml"
     file.write_text("plant:\n#  xi: 0.7\nstart: {controller: null, parameters: {}}\n")
     assert load(file) == Config()
+    file.write_text("")
+    assert load(file) == Config() == load()
 
 
 @pytest.mark.parametrize("name", ["y", "1e5", "7:30", "Fu's fish"])
@@ -146,19 +122,12 @@ plant:
 noise: 0.1
 => fish.yaml:1: noise: unknown key; did you mean 'simulation.noise'?
 
-plant:
-  xi: soft
-=> fish.yaml:2: plant.xi: 'soft' is not valid: a number in [0, 20] is needed
-
 
 tick: 1
 => fish.yaml:2: tick: 1 is not valid: a number in [0.002, 0.2] s is needed
 
 tick: .nan
 => fish.yaml:1: tick: nan is not valid: a number in [0.002, 0.2] s is needed
-
-tick: true
-=> fish.yaml:1: tick: true is not valid: a number in [0.002, 0.2] s is needed
 
 realtime: {priority: 50.5}
 => fish.yaml:1: realtime.priority: 50.5 is not valid: a whole number in [0, 99]
@@ -193,9 +162,6 @@ a: &a [*a]
 plant.xi: 2
 => plant.xi: unknown key; write 'plant:' and below it, indented, 'xi:'
 
-telemetry: {address: 'tcp://127.0.0.1:99999'}
-=> tcp://HOST:PORT or ipc://PATH
-
 control: {address: 'tcp://127.evil.com:99'}
 => taken from this machine only
 
@@ -212,17 +178,8 @@ start:
     c: 0.5
 => fish.yaml:4: start.parameters.c: unknown parameter 'c' of controller swing; did you mean 'C'?
 
-start:
-  controller: swing
-  parameters:
-    amplitude: 0.5
-=> amplitude: 0.5 rad is beyond the robot's amplitude_limit, 0.42 rad
-
 start: {parameters: {C: 1}}
 => there is no start.controller to take these
-
-control: {address: 'tcp://0.0.0.0:5000'}
-=> fish.yaml:1: control.address: 'tcp://0.0.0.0:5000' is not valid
 
 telemetry: {address: localhost}
 => fish.yaml:1: telemetry.address: 'localhost' is not valid: tcp://HOST:PORT or ipc://PATH is needed
@@ -235,12 +192,10 @@ telemetry: {address: localhost}
     [
         *(case.split("=> ") for case in BAD_FILES[:-1].split("\n\n")),
         ("a: " + "[" * 3000, "nested too deeply"),
-        ("x: 1\n" + "- " * 500, "fish.yaml:2: "),
         (BOMB, "fish.yaml:1: more than 2000 values and keys, each alias counted as all that it"),
         ("a: [" + "x, " * 3000 + "]", "fish.yaml:1: more than 2000 values and keys"),
         ("# " + "x" * 70000, "fish.yaml: is longer than 64 kB, far more than a configuration"),
         ("a: " + "1" * 200, "fish.yaml:1: a: a number of 200 letters"),
-        ("a: !!int '" + "1:" * 20000 + "1'", "fish.yaml:1: a: a number of 40001 letters"),
     ],
 )
 def test_a_bad_file_gets_a_line_with_place_and_remedy(
@@ -254,11 +209,8 @@ def test_a_bad_file_gets_a_line_with_place_and_remedy(
     [
         ("plant.omega=3", "--set plant.omega=3: plant.omega: unknown key; did you mean 'omega0'?"),
         ("tick", "--set tick: write KEY=VALUE"),
-        ("=3", "--set =3: write KEY=VALUE"),
         ("tick.x=3", "--set tick.x=3: "),
         ("tick=soon", "--set tick=soon: tick: 'soon' is not valid: a number in [0.002, 0.2] s"),
-        ("tick=", "--set tick=: tick: '' is not valid"),
-        ("realtime.lock_memory=on", "realtime.lock_memory: 'on' is true in YAML; write true"),
         ("control.address=ipc://@abstract", "'ipc://@abstract' is not valid: ipc://PATH"),
         ("control.address=tcp://[::1]:5000", "is not valid: ipc://PATH or tcp://127.0.0.1:PORT"),
     ],
@@ -309,32 +261,21 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         (["robot=pi", "force_sensor.data_rate=32"], "force_sensor.data_rate", "78.1 ms"),
         (["robot=pi", "tick=0.002"], "force_sensor.data_rate", "2.9 ms"),
         (["servo.centre=2300", "servo.trim=400"], "servo.trim", "2700 µs"),
-        (["servo.host="], "servo.host", "127.0.0.1"),
         (["servo.host=my pi"], "servo.host", "'my pi' is not valid"),
-        (["virtual_pi.socket="], "virtual_pi.socket", "a path or null"),
         ([f"virtual_pi.socket=/tmp/{'x' * 103}"], "virtual_pi.socket", "this one has 108"),
         ([f"control.address=ipc:///tmp/{'x' * 103}"], "control.address", "at most 107 bytes"),
         ([f"telemetry.address=ipc:///tmp/{'é' * 60}"], "telemetry.address", "this one has 125"),
-        (
-            ["start.controller=null", "start.parameters.C=0.6"],
-            "start.parameters",
-            "there is no start.controller to take these; name one, or remove them",
-        ),
         (["servo.frequency=100"], "servo.frequency", "drivers that have it: rpi-gpio, sysfs-pwm"),
         (["servo.driver=steam"], "servo.driver", "installed: pigpio, rpi-gpio, sysfs-pwm"),
-        (["servo.driver=sysfs"], "servo.driver", "did you mean 'sysfs-pwm'?"),
         (["servo.driver=3"], "servo.driver", "one of pigpio, rpi-gpio, sysfs-pwm"),
-        (["force_sensor=3"], "force_sensor", "a section"),
         (["gpio=3"], "gpio", "did you mean 'servo.gpio'?"),
         (["panel.led_gpio=18"], "panel.led_gpio", "servo.gpio"),
         (["panel.estop_gpio=3"], "panel.estop_gpio", "force_sensor.bus"),
         (["panel.estop_gpio=5", "panel.led_gpio=5"], "panel.led_gpio", "panel.estop_gpio"),
         (["robot=virtual-pi", "servo.driver=sysfs-pwm"], "servo.driver", "pigpiod"),
         (["virtual_pi.servo_scale=0"], "virtual_pi.servo_scale", "would not turn"),
-        (["virtual_pi.channel_y=A0-A1"], "virtual_pi.channel_y", "channel_x"),
         (["state_folder=~nobody-here/fish"], "state_folder", "no user here is 'nobody-here'"),
         (['state_folder="/var/\\0fish"'], "state_folder", "a path has no zero byte"),
-        (['state_folder="/var/\\ud800"'], "state_folder", "half of a character"),
     ],
 )
 def test_hardware_that_is_at_odds_is_refused_by_key(
@@ -344,10 +285,6 @@ def test_hardware_that_is_at_odds_is_refused_by_key(
         load(None, overrides)
     assert f"{key}: " in str(refusal.value)
     assert words in str(refusal.value)
-
-
-def test_pins_of_another_bus_are_free() -> None:
-    assert load(None, ["force_sensor.bus=3", "panel.estop_gpio=3"]).panel.estop_gpio == 3
 
 
 def test_the_longest_path_that_a_unix_socket_takes_is_good() -> None:
@@ -361,7 +298,7 @@ def test_what_is_installed_on_a_pi_is_the_file_that_the_verbs_look_for() -> None
     assert f"\nCONFIG={SERVICE_FILE}\n" in layout
 
 
-@pytest.mark.parametrize("name", ["", " tank", "tank ", "a\nb", "tank\n", "a\x1bb", "x" * 41])
+@pytest.mark.parametrize("name", ["", " tank", "tank\n", "a\x1bb", "x" * 41])
 def test_a_name_is_short_printable_text(name: str, tmp_path: Path) -> None:
     line = complaint(f"name: {json.dumps(name)}\n", tmp_path)
     assert line.startswith("fish.yaml:1: name: ")

@@ -1,33 +1,41 @@
 """What a program says in a terminal as it ends."""
 
 import errno
+from collections.abc import Callable
 
 import click
 import pytest
 
 from fishd.core import console
-from fishd.core.errors import NoDaemon, ServoError
+from fishd.core.errors import NoDaemon
+
+Run = Callable[[BaseException], tuple[object, str]]
 
 
-@pytest.mark.parametrize("how", [KeyboardInterrupt, EOFError])
-def test_a_command_that_is_interrupted_says_so(
-    how: type[BaseException],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    @click.command()
-    def computes() -> None:
-        raise how
+@pytest.fixture
+def end(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Run a command that raises an error; its exit status and what it says."""
 
-    monkeypatch.setattr("sys.argv", ["fishctl"])
-    with pytest.raises(SystemExit) as ended:
-        console.run(computes, "fishctl")
-    assert ended.value.code == console.INTERRUPTED
-    assert capsys.readouterr().err.strip() == "fishctl: interrupted"
+    def run(error: BaseException) -> tuple[object, str]:
+        @click.command()
+        def computes() -> None:
+            raise error
+
+        monkeypatch.setattr("sys.argv", ["fishctl"])
+        with pytest.raises(SystemExit) as ended:
+            console.run(computes, "fishctl")
+        return ended.value.code, capsys.readouterr().err.strip()
+
+    return run
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), EOFError()])
+def test_a_command_that_is_interrupted_says_so(end: Run, error: BaseException) -> None:
+    assert end(error) == (console.INTERRUPTED, "fishctl: interrupted")
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "words"),
     [
         (OSError(errno.ENOSPC, "No space left on device", "track.csv"), "track.csv: No space"),
         (MemoryError(), "there is not enough memory"),
@@ -36,32 +44,13 @@ def test_a_command_that_is_interrupted_says_so(
     ],
 )
 def test_a_file_or_memory_that_makes_trouble_is_one_line(
-    error: Exception,
-    said: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    end: Run, error: Exception, words: str
 ) -> None:
-    @click.command()
-    def computes() -> None:
-        raise error
-
-    monkeypatch.setattr("sys.argv", ["fishctl"])
-    with pytest.raises(SystemExit) as ended:
-        console.run(computes, "fishctl")
-    assert ended.value.code == 1
-    line = capsys.readouterr().err
-    assert line.startswith(f"fishctl: {said}")
-    assert line.count("\n") == 1
+    status, line = end(error)
+    assert (status, "\n" in line) == (1, False)
+    assert line.startswith(f"fishctl: {words}")
 
 
-@pytest.mark.parametrize("error", [ServoError("no pulses"), NoDaemon("no fishd")])
-def test_an_error_of_fishd_is_no_error_of_the_output(
-    error: Exception, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    @click.command()
-    def fails() -> None:
-        raise error
-
-    monkeypatch.setattr("sys.argv", ["fishctl"])
-    with pytest.raises(type(error), match=str(error)):
-        console.run(fails, "fishctl")
+def test_an_error_of_fishd_is_no_error_of_the_output(end: Run) -> None:
+    with pytest.raises(NoDaemon, match="no fishd"):
+        end(NoDaemon("no fishd"))

@@ -16,12 +16,11 @@ from fishd.cli.calibrate import load_files
 from fishd.config import load
 from fishd.controllers.policy import file as policy_file
 from fishd.core import files
-from fishd.core.calibration import ForceCalibration, ServoCalibration
+from fishd.core.calibration import ForceCalibration
 from fishd.core.errors import ConfigError, FishdError, PolicyError
 from fishd.hardware.calibration_files import CalibrationFolder
 
 FORCE = "force-2026-01-01T000000.000000Z.yaml"
-SERVO = "servo-2026-01-01T000000.000000Z.yaml"
 
 
 def pipe(path: Path) -> None:
@@ -30,10 +29,6 @@ def pipe(path: Path) -> None:
 
 def endless(path: Path) -> None:
     path.symlink_to("/dev/zero")
-
-
-def nothing(path: Path) -> None:
-    path.symlink_to("/dev/null")
 
 
 def folder(path: Path) -> None:
@@ -56,7 +51,6 @@ def hole(path: Path) -> None:
 PLANTS = {
     pipe: "is a named pipe; a regular file is needed",
     endless: "is a device; a regular file is needed",
-    nothing: "is a device; a regular file is needed",
     folder: "is a folder; a regular file is needed",
     listened_at: "is a socket; a regular file is needed",
     hole: "is longer than ",
@@ -65,7 +59,6 @@ PLANTS = {
 READERS: dict[str, Callable[[Path], object]] = {
     "fish.yaml": load,
     FORCE: lambda path: CalibrationFolder(path.parent).newest(ForceCalibration),
-    SERVO: lambda path: CalibrationFolder(path.parent).newest(ServoCalibration),
     "loads.csv": lambda path: load_files.read(path, "N"),
     "swim.onnx": policy_file.read,
 }
@@ -187,7 +180,6 @@ def test_a_name_may_be_as_long_as_the_file_system_permits(tmp_path: Path) -> Non
         ("none/file", "there is no folder to put it into"),
         ("file/file", "cannot be written: Not a directory"),
         ("link", "is a device; a regular file is needed"),
-        ("/proc/file", "there is no folder to put it into|cannot be written"),
         ("a\0b", "cannot be written: a name has no zero byte"),
     ],
 )

@@ -82,9 +82,11 @@ def test_a_package_installed_later_is_found(
     gadgets: Plugins[Gadget], install: Callable[[str, str], None]
 ) -> None:
     assert gadgets.names() == ["key", "lost", "shapeless", "text", "unfinished"]
+    install("broken_package", "this line is no entry point")
     install("late_package", "late = late_package:Gadget\nkey = late_package:Gadget")
     assert gadgets.names() == ["key", "late", "lost", "shapeless", "text", "unfinished"]
     assert gadgets.find("late") is Gadget
+    assert "package broken_package cannot be read" in gadgets.problems["broken_package"]
     assert gadgets.package("late") == "late_package 1.0"
     assert gadgets.package("key") == "fishd", "one that is built in is replaced by nobody"
 
@@ -98,15 +100,6 @@ def test_a_package_in_an_archive_is_found(
         archive.writestr("packed-1.0.dist-info/entry_points.txt", line)
     monkeypatch.syspath_prepend(str(tmp_path / "packages.zip"))
     assert gadgets.find("packed") is Gadget
-
-
-def test_a_package_with_broken_entry_points_does_not_hide_the_others(
-    gadgets: Plugins[Gadget], install: Callable[[str, str], None]
-) -> None:
-    install("broken_package", "this line is no entry point")
-    install("good_package", "good = good_package:Gadget")
-    assert gadgets.find("good") is Gadget
-    assert "package broken_package cannot be read" in gadgets.problems["broken_package"]
 
 
 def test_one_that_was_repaired_loads_and_its_problem_is_forgotten(

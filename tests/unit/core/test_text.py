@@ -31,7 +31,6 @@ def test_a_block_keeps_its_line_breaks_and_nothing_else_that_is_odd(odd: str) ->
         ("as  it is – µs", "as  it is – µs"),
         ("two\r\n   lines\n", "two lines"),
         ("\x1b[2Jgone", "?[2Jgone"),
-        ("C1: \x9b31m", "C1: ?31m"),
         ("half: \udcff", "half: ?"),
         ("\u202etxet", "?txet"),
     ],
@@ -72,9 +71,7 @@ def test_an_exception_is_named_whatever_it_is(error: BaseException, line: str) -
     ("ci95", "said"),
     [
         (0.12e-3, "25.74 ± 0.12 mN"),
-        (4e-6, "25.74 ± 0.004 mN"),
         (1.7e-18, "25.74 mN (exact)"),
-        (0.0, "25.74 mN (exact)"),
         (None, "25.74 mN"),
     ],
 )

@@ -41,8 +41,7 @@ def test_a_recording_gives_back_every_bit_of_a_run(tmp_path: Path) -> None:
     assert [run.about[key] for key in about] == ["Ada", "fish 3", "stiff fin", "fishd"]
     assert run.finished
     assert (run.gaps, run.summary.swimming) == ([], {"swing": 60})
-    table = read(path)
-    assert list(table.fx) == [tick.fx for tick in rig.recorder.ticks]
+    assert list(read(path).fx) == [tick.fx for tick in rig.recorder.ticks]
 
 
 def test_its_thrust_is_the_mean_over_all_its_swimming() -> None:
@@ -82,24 +81,11 @@ def test_ticks_that_are_missing_are_counted(tmp_path: Path) -> None:
     assert open_run(path).gaps == [Gap(ticks[9].t, 11, 3), Gap(ticks[-1].t, 1, 2)]
 
 
-@pytest.mark.parametrize("seq", [3, 30], ids=["lower", "higher"])
-def test_another_fishd_of_which_a_status_is_heard_first_is_one(seq: int) -> None:
-    ticks, tally = swum().recorder.ticks, Tally()
-    tally.status(status(ticks[0], pid=1))
-    for tick in ticks[:20]:
-        tally.tick(tick)
-    tally.status(status(ticks[seq - 1], pid=2))
-    for tick in ticks[seq:]:
-        tally.tick(tick)
-        tally.status(status(tick, pid=2))
-    assert tally.restarts == 1
-
-
 def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> None:
     whole = recorded(swum(), tmp_path / "whole", flush_every=10)
     content, ticks = whole.read_bytes(), open_run(whole).ticks
     kept = []
-    for share in (0.3, 0.5, 0.7, 0.9, 0.999):
+    for share in (0.3, 0.7, 0.999):
         part = tmp_path / f"cut{share}.mcap.part"
         part.write_bytes(content[: int(share * len(content))])
         (cut,) = (each for each in glances(tmp_path) if each.path == part)
@@ -177,7 +163,7 @@ def test_a_damaged_byte_costs_its_chunk_at_most_and_is_told(tmp_path: Path) -> N
     path = recorded(rig, tmp_path / "run", flush_every=10)
     whole, ticks = path.read_bytes(), rig.recorder.ticks
     worst = 0
-    for offset in range(30, len(whole) - 40, 397):
+    for offset in range(30, len(whole) - 40, 797):
         content = bytearray(whole)
         content[offset] ^= 0x55
         path.write_bytes(content)
@@ -220,9 +206,8 @@ def test_what_is_recovered_of_a_damaged_recording_is_whole(tmp_path: Path) -> No
         recover(run.path)
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
 def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     writer, ticks, room = RunWriter(tmp_path / "run"), swum().recorder.ticks, 20000
     written = os.write
@@ -230,7 +215,7 @@ def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
     def full(fd: int, data: bytes) -> int:
         nonlocal room
         if room <= 0:
-            raise OSError(number, os.strerror(number))
+            raise OSError(errno.ENOSPC, "No space left on device")
         room -= len(data := bytes(data)[:room])  # the last write is cut short
         return written(fd, data)
 
@@ -241,7 +226,7 @@ def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
             writer.tick(tick)
             writer.flush()
 
-    with pytest.raises(RecordingError, match=f"{os.strerror(number)}; what was written is reada"):
+    with pytest.raises(RecordingError, match="No space left on device; what was written is reada"):
         record()
     with pytest.raises(RecordingError, match="has ended"):
         writer.tick(ticks[0])
@@ -252,34 +237,24 @@ def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
     assert run.ticks == (ticks * 10)[: len(run.ticks)]
 
 
-@pytest.mark.parametrize("t", [1e300, -1.0, 1.1e10])
-def test_a_message_from_no_time_is_left_out_and_the_recording_goes_on(
-    tmp_path: Path, t: float
+def test_messages_from_no_time_are_left_out_and_counted_and_the_recording_goes_on(
+    tmp_path: Path,
 ) -> None:
-    ticks = swum(0.4).recorder.ticks
-    with RunWriter(tmp_path / "run") as writer:
-        writer.message("tick", msgspec.json.encode(ticks[0]))
-        with pytest.raises(msgspec.DecodeError, match="is no time"):
-            writer.message("tick", msgspec.json.encode(replace(ticks[1], t=t)))
-        writer.message("tick", msgspec.json.encode(ticks[2]))
-    run = open_run(writer.path)
-    assert run.ticks == [ticks[0], ticks[2]]
-    assert run.summary == glance(writer.path).summary
-
-
-def test_a_flood_of_what_is_none_of_fishds_is_counted_and_told_twice(tmp_path: Path) -> None:
     said: list[str] = []
-    tick = swum(0.2).recorder.ticks[0]
+    ticks = swum(0.4).recorder.ticks
     recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=said.append)
     recorder._writer = recorder._open_writer()
-    for t in (tick.t, 1e300, 1e301, -1.0):
-        recorder._take("tick", msgspec.json.encode(replace(tick, t=t)))
+    wrong = [replace(ticks[1], t=t) for t in (1e300, -1.0, 1.1e10)]
+    for tick in (ticks[0], *wrong, ticks[1]):
+        recorder._take("tick", msgspec.json.encode(tick))
     recorder.__exit__(None, None, None)
     assert said == [
         "a message of topic tick is none of fishd's: left out",
         "messages that are none of fishd's, left out: 3",
     ]
-    assert len(open_run(tmp_path / "run.mcap").ticks) == 1
+    run = open_run(tmp_path / "run.mcap")
+    assert run.ticks == ticks[:2]
+    assert run.summary == glance(run.path).summary
 
 
 @pytest.mark.parametrize("seq", [3, 30], ids=["lower", "higher"])
@@ -351,20 +326,9 @@ def test_what_fishd_could_not_be_told_of_the_camera_it_is_told_later(
     assert marks == ["it is gone", "and again", "and well"]
 
 
-def test_a_run_that_never_began_leaves_no_file(tmp_path: Path) -> None:
-    config = Rig().config
-    with (
-        pytest.raises(ValueError, match="nothing is left to judge"),
-        RunWriter(tmp_path / "run") as writer,
-    ):
-        simulate(config, "swing", {}, 1.0, publisher=writer)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
-        (lambda path: path.touch(), "is no MCAP file"),
         (lambda path: path.write_text("t,fx\n0,1\n" * 100), "is no MCAP file"),
         (lambda path: path.mkdir(), "cannot be read: Is a directory"),
         (lambda path: None, "cannot be read: No such file"),

@@ -43,7 +43,7 @@ def test_it_has_every_imperfection_that_there_is(section: str, defaults: msgspec
 def test_the_same_seed_swims_the_same_to_the_last_bit_and_another_one_does_not() -> None:
     def ticks(*overrides: str) -> list[tuple[float, ...]]:
         publisher = KeepingPublisher()
-        simulate(load(FILE, overrides), "swing", {"C": 0.6}, 6.0, 2.0, publisher)
+        simulate(load(FILE, overrides), "swing", {"C": 0.6}, 3.0, 1.0, publisher)
         return [(t.fx, t.fy, t.phi_c, t.alpha, t.alpha_rate) for t in publisher.ticks]
 
     first = ticks()
@@ -55,7 +55,7 @@ def test_the_same_seed_swims_the_same_to_the_last_bit_and_another_one_does_not()
 @pytest.mark.parametrize("robot", ["simulated", "virtual-pi"])
 def test_a_square_wave_swims_on_it_as_well_as_its_frequency_permits(robot: str) -> None:
     config = load(FILE, [f"robot={robot}"])
-    best = simulate(config, "square", {"frequency": 1.6}, 7.0, 3.0)
+    best = simulate(config, "square", {"frequency": 1.6}, 5.0, 3.0)
     assert best.mode == "running"
     assert 0.9 < best.relative_thrust < 1.03
     assert best.best_square_thrust < 0.5 * 0.0258  # of a fish without any of it

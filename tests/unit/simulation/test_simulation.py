@@ -73,12 +73,6 @@ def test_on_the_grid_the_best_square_wave_comes_close_to_the_optimum() -> None:
     assert report.best_square_thrust == pytest.approx(25.78384e-3, rel=1e-4)
 
 
-def test_the_comparison_is_with_the_amplitude_that_the_controller_uses() -> None:
-    report = simulate(load(), "square", {"frequency": 1.7856, "amplitude": 0.2})
-    assert report.best_square_thrust == pytest.approx(6.819563e-3, rel=1e-4)
-    assert report.relative_thrust > 0.95
-
-
 def test_a_fish_that_does_not_beat_has_no_frequency_and_no_thrust() -> None:
     report = simulate(load(), "hold", {"angle": 0.3}, 30)
     assert (report.frequency, report.mean_thrust) == (0.0, pytest.approx(0.0, abs=1e-9))
@@ -91,9 +85,7 @@ def test_a_fish_that_does_not_beat_has_no_frequency_and_no_thrust() -> None:
     ("seconds", "settle", "why"),
     [
         (math.nan, 1, r"a number from 0 to 1e\+08 s is needed"),
-        (math.inf, 1, r"a number from 0 to 1e\+08 s is needed"),
         (9, -1, r"a number from 0 to 1e\+08 s is needed"),
-        (1e300, 1, r"a number from 0 to 1e\+08 s is needed"),
         (5, 10, "nothing is left to judge: a run of 5 s"),
     ],
 )
@@ -109,22 +101,19 @@ def test_slack_that_swallows_the_whole_amplitude_leaves_nothing_to_compare_with(
     assert (report.mean_thrust, report.relative_thrust) == (0.0, 0.0)
 
 
-@pytest.mark.parametrize("tick", [0.002, 0.01, 0.2])
+@pytest.mark.parametrize("tick", [0.002, 0.2])
 def test_the_loop_runs_at_any_tick(tick: float) -> None:
-    report = simulate(load(None, [f"tick={tick}"]), "square", {"frequency": 1.25}, 20, settle=5)
+    report = simulate(load(None, [f"tick={tick}"]), "square", {"frequency": 1.25}, 12, settle=5)
     assert report.mean_thrust == pytest.approx(
         square_wave(load().plant, 0.42, 1.25).thrust, rel=1e-3
     )
 
 
-def test_cable_slack_costs_thrust() -> None:
-    with_slack = simulate(load(None, ["plant.cable_slack=0.1"]), "swing", {}, 30)
-    assert with_slack.mean_thrust < 0.8 * simulate(load(), "swing", {}, 30).mean_thrust
-
-
 def test_only_whole_beats_are_counted() -> None:
     beats = Beats()
-    for angle, thrust in [(1.0, 9.0)] * 3 + [(-1.0, 1.0), (1.0, 2.0)] * 4 + [(-1.0, 9.0)]:
+    beats.add(1.0, TrueWindow(0.5, 9.0, 0.9))
+    assert math.isnan(beats.means().thrust_deviation)  # there are no two beats
+    for angle, thrust in [(1.0, 9.0)] * 2 + [(-1.0, 1.0), (1.0, 2.0)] * 4 + [(-1.0, 9.0)]:
         beats.add(angle, TrueWindow(0.5, thrust, 0.1 * thrust))
     found = beats.means()
     assert found[:3] == pytest.approx((1.5, 1.0, 0.15))
@@ -133,12 +122,6 @@ def test_only_whole_beats_are_counted() -> None:
         beats.add(1.0, TrueWindow(0.5, thrust, 0.1))
         beats.add(-1.0, TrueWindow(0.5, 1.0, 0.1))
     assert beats.means().thrust_deviation > 0.0
-
-
-def test_a_run_without_two_beats_has_no_spread() -> None:
-    beats = Beats()
-    beats.add(0.1, TrueWindow(0.5, 1.0, 0.1))
-    assert math.isnan(beats.means().thrust_deviation)
 
 
 @pytest.mark.slow
@@ -180,11 +163,9 @@ def test_the_command_prints_json_with_the_documented_keys() -> None:
     ("arguments", "message", "status"),
     [
         (["swim"], "fishctl: no controller is named 'swim'; did you mean 'swing'?\n", 1),
-        (["swing", "--C", "2"], "fishctl: swing: C: 2.0 is not valid: a number in [0, 1]", 1),
         (["swing", "--C", "inf"], "'inf' is not valid: a number in [0, 1] (or auto) is needed", 2),
         (["swing", "--set", "tick=3"], "fishctl: --set tick=3: tick: 3 is not valid", 78),
         (["swing", "--seconds", "1"], "fishctl: nothing is left to judge", 1),
-        (["swing", "--seconds", "0"], "a run of 0 s must be longer than the 10 s that it may", 1),
         (["swing", "--seconds", "12", "--settle", "11.5"], "no whole tail beat in the 0.5 s", 1),
         (["swing", "--config", "no.yaml"], "fishctl: no.yaml: no such file", 78),
         (["swing", "--speed", "3"], "fishctl: No such option", 2),
@@ -201,7 +182,6 @@ def test_a_wrong_command_gets_one_line(arguments: list[str], message: str, statu
     ("arguments", "warning"),
     [
         (["thrust", "--target", "5"], "5 N is 194 times the best thrust known: .* 25.8 mN .*mN?"),
-        (["thrust", "--target", "0.03"], "0.03 N is 1.16 times the best thrust known"),
         (["swing", "--longest-half-period", "8"], "8 s is more than makes sense: .* (ms? that"),
         (["thrust", "--target", "0.02"], ""),
     ],
@@ -215,13 +195,6 @@ def test_a_value_beyond_what_makes_sense_is_warned_of(arguments: list[str], warn
     else:
         assert "target=0.02 N C=0.6 amplitude=default longest_half_period=1 s" in done.stdout
         assert not done.stderr
-
-
-def test_the_half_beats_that_were_swum_are_said() -> None:
-    assert "1.667 Hz, in half beats of 6 ticks\n" in run("square", "--frequency", "1.6667").stdout
-    between = run("square", "--frequency", "1.709").stdout
-    assert "1.709 Hz, in half beats of 5 to 6 ticks (2.000 to 1.667 Hz)\n" in between
-    assert "frequency       –, as nothing was reversed\n" in run("hold").stdout
 
 
 def test_the_heading_says_that_another_controller_swam(tmp_path: Path) -> None:
