@@ -19,7 +19,6 @@ from rigs.recordings import recorded, status, swum, write
 from fishd.config import Config
 from fishd.core.errors import NoDaemon, RecordingError, Refused
 from fishd.core.signals import Tick
-from fishd.lab.simulation import simulate
 from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording import recorder as recorder_module
 from fishd.recording.camera_tap import Taken
