@@ -4,6 +4,8 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any
 
+from msgspec import structs
+
 from fishd.assembly import build_loop, simulated_fish
 from fishd.config import Config, load
 from fishd.controllers import registry
@@ -11,6 +13,7 @@ from fishd.controllers.base import Controller, Limits
 from fishd.core.clock import Slot, VirtualClock
 from fishd.core.signals import Event, Measurement, Observation, Tick
 from fishd.hardware.base import Robot
+from fishd.virtual.plant.tethered import TetheredFish
 
 
 class Recorder:
@@ -54,6 +57,12 @@ class Rig:
     def open_robot(self, stack: ExitStack) -> Robot:
         self.fish = simulated_fish(self.config)
         return self.fish.robot()
+
+    def change_fin(self, thrust_coefficient: float) -> None:
+        """Give the fish another fin while it swims."""
+        fish = self.fish.fish
+        plant = structs.replace(fish.parameters, thrust_coefficient=thrust_coefficient)
+        self.fish.fish = TetheredFish(plant, fish.state, self.config.simulation.motor)
 
     @property
     def now(self) -> float:

@@ -1,14 +1,12 @@
 """What the true client meets when the emulated pigpiod is gone, frozen or restarted."""
 
 import socket
-import time
 from collections.abc import Iterator
 
 import pigpio
 import pytest
-from rigs.pigpiod_client import GPIO, Bench, dispose, eventually, pigpiod_bench
+from rigs.pigpiod_client import GPIO, Bench, dispose, pigpiod_bench
 
-from fishd.core.clock import SystemClock
 from fishd.hardware.servo.pigpio_pulses import COUNTDOWN
 
 
@@ -57,16 +55,3 @@ def test_frozen_its_pulses_go_on_and_its_scripts_stand_still(bench: Bench) -> No
     assert bench.width == 1600
     bench.sleep(0.04)
     assert bench.width == 1500
-
-
-def test_it_takes_no_processor_time_while_nothing_happens() -> None:
-    with pigpiod_bench(SystemClock()) as bench:
-        bench.pi.run_script(bench.stored("tag 0 mils 10 jmp 0"))
-        bench.pi.set_servo_pulsewidth(GPIO, 1500)
-        identity = bench.daemon._thread.ident
-        assert identity is not None
-        clock = time.pthread_getcpuclockid(identity)
-        assert eventually(lambda: bench.width == 1500)
-        before = time.clock_gettime(clock)
-        time.sleep(0.2)
-        assert time.clock_gettime(clock) - before < 0.002

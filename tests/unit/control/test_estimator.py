@@ -79,13 +79,9 @@ def test_it_tells_for_how_long_the_angle_has_been_on_its_side() -> None:
         for tick, angle in enumerate(angles)
     ]
     assert times == pytest.approx([0.0, DT, 2 * DT, -DT, -2 * DT, 0.0, -DT])
-
-
-def test_a_tail_that_is_held_at_one_side_is_there_for_two_seconds_at_most() -> None:
-    beat = TailBeat()
     for _ in range(100):
-        beat.update(-0.4, 0.0, DT)
-    assert beat.side_time == -2.0
+        time = estimator.update(Measurement(9.0, 0.0, 0.0, 10), -0.4, 9.0, DT).side_time
+    assert time == -2.0
 
 
 def test_nothing_but_the_measurement_and_the_own_command_goes_in() -> None:

@@ -144,15 +144,6 @@ def test_a_servo_behind_a_dead_pigpiod_is_lost_and_may_have_pulses_until_it_is_r
     assert rig.pulse == 0.0
 
 
-def test_a_servo_that_was_released_before_it_was_lost_has_no_pulses() -> None:
-    rig, robot = fragile_rig()
-    rig.run(2)
-    rig.loop.estop("test")
-    robot.release_error = ServoError("pigpiod is gone")
-    rig.run(2)
-    assert (rig.loop.servo.on, rig.loop.servo.lost) == (False, True)
-
-
 @pytest.mark.parametrize("fault", ["read_error", "suspect"])
 def test_a_force_is_lost_with_the_third_bad_read_and_back_with_the_next_good_one(
     fault: str,

@@ -102,7 +102,7 @@ def test_it_searches_anew_when_the_fish_changes() -> None:
     rig = Rig()
     rig.start("swing", C="auto")
     assert any(tick.quantities["searching"] == 0.0 for tick in rig.run(900))
-    rig.fish.fish.parameters = load(None, ["plant.thrust_coefficient=0.03"]).plant
+    rig.change_fin(0.03)
     assert any(tick.quantities["searching"] == 1.0 for tick in rig.run(200))
 
 
@@ -122,3 +122,5 @@ def test_it_is_refused_where_the_force_does_not_tell_the_thrust() -> None:
         registry.create("swing", {"C": "auto"}, replace(LIMITS, tethered=False))
     with pytest.raises(ParameterError, match=r"needs ticks of 0\.15 s at most, not 0\.2 s"):
         registry.create("swing", {"C": "auto"}, replace(LIMITS, tick=0.2))
+    with pytest.raises(ParameterError, match=r"lead: 0.1 s is not valid with C auto"):
+        registry.create("swing", {"C": "auto", "lead": 0.1}, LIMITS)

@@ -8,7 +8,6 @@ from rigs.harness import LIMITS, Rig, commands, observe
 
 from fishd.config import load
 from fishd.controllers import registry
-from fishd.core.errors import ParameterError
 from fishd.lab.simulation import simulate
 
 IMPERFECT = ["simulation.noise=1e-3", "simulation.offset_y=0.02", "simulation.drift=0.02"]
@@ -44,11 +43,6 @@ def test_with_a_lead_it_reverses_before_the_fin_slows_down_once_two_beats_are_ov
     late = reversals(feed(speeds, C=0.6))
     assert early[:4] == late[:4]
     assert early[4] < late[4]
-
-
-def test_c_auto_finds_its_own_lead() -> None:
-    with pytest.raises(ParameterError, match=r"lead: 0.1 s is not valid with C auto"):
-        registry.create("swing", {"C": "auto", "lead": 0.1}, LIMITS)
 
 
 def test_without_any_sign_of_slowing_down_it_reverses_after_the_longest_half_period() -> None:

@@ -86,6 +86,10 @@ def test_more_than_the_amplitude_limit_gives_is_held_there_and_told() -> None:
     assert abs(ticks[-1].phi_c) == rig.config.amplitude_limit
     rig.retune(target=0.010)
     assert shown(rig.run_for(10))["saturated"] == 0.0
+    rig.retune(target=0.020, amplitude=0.2)
+    ticks = rig.run_for(8)
+    assert max(abs(tick.phi_c) for tick in ticks) == 0.2
+    assert shown(ticks)["saturated"] == 1.0
 
 
 def test_less_than_the_smallest_amplitude_gives_is_held_there_and_told() -> None:
@@ -97,23 +101,12 @@ def test_less_than_the_smallest_amplitude_gives_is_held_there_and_told() -> None
     assert ticks[-1].frequency > 0.5
 
 
-def test_a_smaller_largest_amplitude_is_kept_to_at_once() -> None:
-    rig = rested()
-    rig.start("thrust", target=0.020)
-    rig.run_for(8)
-    rig.retune(amplitude=0.2)
-    ticks = rig.run_for(8)
-    assert max(abs(tick.phi_c) for tick in ticks) == 0.2
-    assert shown(ticks)["saturated"] == 1.0
-
-
 def test_it_finds_the_target_again_with_another_fin() -> None:
     rig = rested(factor=None)
     rig.start("thrust", target=0.010)
     rig.run_for(10)
     coefficient = 0.03
-    plant = replace(rig.config.plant, thrust_coefficient=coefficient)
-    rig.fish.fish.parameters = plant
+    rig.change_fin(coefficient)
     assert true_thrust(rig.run_for(3), coefficient) < 0.008
     rig.run_for(25)
     assert true_thrust(rig.run_for(10), coefficient) == pytest.approx(0.010, rel=0.15)

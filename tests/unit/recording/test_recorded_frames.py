@@ -137,19 +137,6 @@ def test_a_recording_that_was_cut_off_is_finished_with_its_frames(
     assert run.summary.frames == len(found)
 
 
-def test_damaged_bytes_cost_the_frames_of_their_chunk_alone(
-    path: Path, frames: list[Frame]
-) -> None:
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    path.write_bytes(content)
-    run = open_run(path)
-    found = list(run.frames())
-    assert run.is_damaged
-    assert len(frames) - 30 < len(found) < len(frames)
-    assert run.summary.frames_lost == len(frames) - len(found)
-
-
 def test_frames_are_exported_as_one_array_with_a_table_of_their_times(
     path: Path, frames: list[Frame], tmp_path: Path
 ) -> None:

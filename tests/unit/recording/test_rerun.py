@@ -90,18 +90,6 @@ def test_the_model_based_estimator_is_rerun_too_and_sees_another_fish_where_aske
     assert other.stretches[0].equal < 200
 
 
-def test_a_change_of_the_code_would_be_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rig = Rig()
-    rig.start("swing")
-    rig.run_for(5)
-    monkeypatch.setattr("fishd.controllers.reversal.REFRACTORY", 0.4)
-    (stretch,) = rerun_of(rig, tmp_path / "run").stretches
-    assert stretch.equal < stretch.ticks
-    assert stretch.largest == pytest.approx(0.84)
-
-
 def test_who_swam_before_the_recording_began_is_said_to_have_an_unknown_past(
     tmp_path: Path,
 ) -> None:

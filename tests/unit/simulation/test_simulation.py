@@ -134,7 +134,7 @@ def test_fullness_and_squareness_tell_the_waveforms_apart(
 ) -> None:
     amplitude = 0.3
     report = simulate(
-        load(None, ["tick=0.005"]), waveform, {"frequency": 1.0, "amplitude": amplitude}, 30
+        load(None, ["tick=0.005"]), waveform, {"frequency": 1.0, "amplitude": amplitude}, 14
     )
     assert report.fullness == pytest.approx(fullness, abs=1e-3)
     assert report.squareness == pytest.approx(squareness, abs=1e-3)

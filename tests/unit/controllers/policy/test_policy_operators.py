@@ -106,11 +106,6 @@ def test_more_operators_than_a_policy_needs_are_refused() -> None:
             r"its network computes 1e\+10 values for one answer; 4.2e\+06 are the most",
         ),
         (
-            [make("Expand", ["observation", "s"], ["c"]), make("ReduceMean", ["c"], ["action"])],
-            [integers("s", 2**20, 2**20)],
-            r"its network computes 1.1e\+12 values",
-        ),
-        (
             [make("MatMul", ["a", "b"], ["c"]), make("ReduceMean", ["c"], ["action"])],
             [floats("a", 1000, 1000), floats("b", 1000, 1000)],
             r"its network computes 1e\+09 multiplications for one answer; 1e\+08 are the most",
@@ -132,11 +127,6 @@ def test_more_operators_than_a_policy_needs_are_refused() -> None:
             ],
             [],
             "its network contradicts itself|how much its Expand computes cannot be told",
-        ),
-        (
-            [make("Cast", ["observation"], ["c"], to=TensorProto.STRING)],
-            [],
-            "its c is text; a network computes numbers|its network contradicts itself",
         ),
         (
             [make("Tanh", ["observation"], ["w"]), make("Tanh", ["w"], ["action"])],

@@ -94,13 +94,6 @@ def test_an_output_that_is_not_finite_in_the_tick_is_a_fault_at_neutral(tmp_path
     assert (last.controller, last.phi_c) == ("hold", 0.0)
 
 
-def test_an_infinite_output_is_a_fault_and_not_the_full_amplitude(tmp_path: Path) -> None:
-    grow = helper.make_node("Exp", ["observation"], ["action"])
-    content = of_nodes([grow], (), card(("instruction_angle", 1e-6)))
-    with pytest.raises(ParameterError, match="its output is not finite for the input"):
-        made(write(tmp_path, content))  # a probe of 1000 is enough for this one
-
-
 def test_a_policy_whose_output_is_not_finite_for_some_input_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, root_of_what_is_left(0.5, card()))
     message = refusal(path)
