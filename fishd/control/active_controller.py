@@ -32,8 +32,6 @@ class ActiveController:
         self.parameter_units = _parameter_units(self.controller)
         self.wave = _wave(self.name, self.controller, self.parameters)
         """Which kind of wave it makes, as another object after each change."""
-        self.quantities: dict[str, float] = {}
-        """Its own, as of its latest update; empty where it has none to show."""
         self.quantity_units: dict[str, str] = {}
         """The units of all that it has."""
         self.fallback: Reason | None = None
@@ -47,8 +45,13 @@ class ActiveController:
         self.parameter_units = _parameter_units(controller)
         self.name, self.controller, self.fallback, self._fresh = name, controller, None, True
         self.wave = _wave(name, controller, self.parameters)
-        self.quantities, self.quantity_units = {}, units
+        self.quantity_units = units
         self.dispose(former, f"the controller before {name}")
+
+    @property
+    def quantities(self) -> dict[str, float]:
+        """Its own, since its latest update; empty where it has none to show."""
+        return {} if self._fresh else values_of(self.controller, self.quantity_units)
 
     def dispose(self, controller: Controller[Any], what: str) -> None:
         """Close a controller that will not be active any more."""
@@ -76,10 +79,7 @@ class ActiveController:
         if self._fresh:
             controller.activate(observation)
             self._fresh = False
-        command = controller.update(observation)
-        if self.quantity_units:
-            self.quantities = values_of(controller, self.quantity_units)
-        return command
+        return controller.update(observation)
 
     def retune(self, parameters: Struct) -> None:
         """Give it new, already checked parameters; raises what it raises."""

@@ -322,7 +322,8 @@ class ControlLoop:
             if self.fy_corrected is not self.lateral_sign.corrected:
                 self._estimator.reverse_fy()
                 self.fy_corrected = self._estimator.fy_corrected
-            seen = self._estimator.update(measurement, self.applied, slot.deadline, dt)
+            known = self.thrust.factor
+            seen = self._estimator.update(measurement, self.applied, slot.deadline, dt, known)
             if not math.isfinite(seen.fy_rate + seen.fin_velocity + seen.thrust):
                 raise ArithmeticError(f"it gave a fin velocity of {seen.fin_velocity}")
             return seen
@@ -349,9 +350,10 @@ class ControlLoop:
             self.reporter.problem("the thrust cannot be told, and is found anew", error)
             self.thrust.forget()
             known = None
-        if known is None:
+        factor, ci95 = known or (None, None)
+        if factor == observation.thrust_factor and ci95 == observation.thrust_factor_error:
             return observation
-        return replace(observation, thrust_factor=known[0], thrust_factor_error=known[1])
+        return replace(observation, thrust_factor=factor, thrust_factor_error=ci95)
 
     def _watch_sign(self, observation: Observation, fy: float, suspect: bool) -> None:
         """Notice, when the tail sets off, that F_y is reversed.

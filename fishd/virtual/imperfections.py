@@ -135,6 +135,7 @@ class Imperfections:
         self._walk_x = self._walk_y = 0.0
         self._duration = self._deviation = 0.0
         """Length of the latest window [s], and the standard deviation of its noise [N]."""
+        self._drifts = bool(settings.drift or settings.drift_rate or settings.drift_walk)
         disturbed = settings.hum or settings.spike_rate or settings.quantum
         self._electronics = [Electronics(settings, axis) for axis in "xy"] if disturbed else None
 
@@ -152,6 +153,24 @@ class Imperfections:
         if duration != self._duration:
             self._duration = duration
             self._deviation = settings.noise * math.sqrt(self._tick / duration)
+        shown_x = self._cos * fx - self._sin * fy + settings.offset_x
+        shown_y = self._sin * fx + self._cos * fy + settings.offset_y
+        if self._drifts:
+            drift_x, drift_y = self._drift(time, duration)
+            shown_x += drift_x
+            shown_y += drift_y
+        x, y = self._normal_pair() if settings.noise_freedom is None else self._student_pair()
+        shown_x += self._deviation * x
+        shown_y += self._deviation * y
+        if self._electronics:
+            along, across = self._electronics
+            shown_x = along.read(shown_x, time, duration, samples)
+            shown_y = across.read(shown_y, time, duration, samples)
+        return shown_x, shown_y
+
+    def _drift(self, time: float, duration: float) -> tuple[float, float]:
+        """Return the drift of either force [N]; the rest is as for `apply`."""
+        settings = self._settings
         if settings.drift_walk:
             step = settings.drift_walk * math.sqrt(duration)
             x, y = self._normal_pair()
@@ -162,18 +181,7 @@ class Imperfections:
             angle = math.tau * time / settings.drift_period
             drift_x += settings.drift * math.sin(angle + self._phase_x)
             drift_y += settings.drift * math.sin(angle + self._phase_y)
-        drift_x += self._walk_x
-        drift_y += self._walk_y
-        shown_x = self._cos * fx - self._sin * fy + settings.offset_x + drift_x
-        shown_y = self._sin * fx + self._cos * fy + settings.offset_y + drift_y
-        x, y = self._normal_pair() if settings.noise_freedom is None else self._student_pair()
-        shown_x += self._deviation * x
-        shown_y += self._deviation * y
-        if self._electronics:
-            along, across = self._electronics
-            shown_x = along.read(shown_x, time, duration, samples)
-            shown_y = across.read(shown_y, time, duration, samples)
-        return shown_x, shown_y
+        return drift_x + self._walk_x, drift_y + self._walk_y
 
     def _normal_pair(self) -> tuple[float, float]:
         """Return two normal deviates of variance 1, by the method of Box and Muller."""

@@ -115,14 +115,21 @@ class Estimator(ABC):
             self._fy = -self._fy
 
     def update(
-        self, measurement: Measurement, instruction_angle: float, time: float, dt: float
+        self,
+        measurement: Measurement,
+        instruction_angle: float,
+        time: float,
+        dt: float,
+        thrust_factor: tuple[float, float] | None = None,
     ) -> Observation:
         """The observation for the tick at `time`.
 
         instruction_angle: applied since the previous tick [rad]
         time: start of the tick [s, monotonic]
         dt: time since the previous tick [s]
+        thrust_factor: the one that is known so far, and its `error` [N]
         """
+        factor, ci95 = thrust_factor or (None, None)
         if self.fy_corrected:
             measurement = replace(measurement, fy=-measurement.fy)
         fy = measurement.fy
@@ -143,6 +150,8 @@ class Estimator(ABC):
             previous_angle=before,
             thrust=self._beat.thrust,
             frequency=self._beat.frequency,
+            thrust_factor=factor,
+            thrust_factor_error=ci95,
             side_time=self._beat.side_time,
         )
 
