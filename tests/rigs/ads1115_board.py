@@ -38,7 +38,6 @@ class Board:
         self.measured: list[tuple[int, float, float]] = []
         self.chip = Ads1115Chip(self.clock, self.input, self.faults, noise, seed)
         self.bus.attach(0x48, self.chip)
-        self.transfers = 0
         self.device = LinuxI2c(self.transfer, {1, ABSENT_BUS}, self.set_timeout)
 
     def __enter__(self) -> Self:
@@ -53,7 +52,6 @@ class Board:
         return self.volts[mux]
 
     def transfer(self, address: int, messages: Sequence[Message]) -> list[bytes]:
-        self.transfers += 1
         return self.bus.transfer(address, messages)
 
     def driver(self, **options: float) -> ADS1115:
@@ -79,6 +77,6 @@ def codes(volts: float, full_scale: float = 4.096) -> int:
     return round(volts / full_scale * 0x8000)
 
 
-def config(mux: int, *, start: bool = True, rate: int = 7, low_byte: int = 3) -> int:
+def config(mux: int, *, rate: int = 7) -> int:
     """A single-shot config at ±4.096 V."""
-    return (0x8000 if start else 0) | mux << 12 | 1 << 9 | 0x100 | rate << 5 | low_byte
+    return 0x8000 | mux << 12 | 1 << 9 | 0x100 | rate << 5 | 3

@@ -25,7 +25,6 @@ class ScriptedAgent:
         self.address = f"ipc://{folder}/agent"
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)
-        self._connected = self._socket.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED)
         self._socket.bind(self.address)
         self._peer = b""
         self.seen: list[dict[str, Any]] = []
@@ -44,11 +43,6 @@ class ScriptedAgent:
 
     def has_message(self) -> bool:
         return bool(self._socket.poll(0))
-
-    def wait_for_fishd(self) -> None:
-        """Until one has connected."""
-        assert self._connected.poll(int(PATIENCE * 1e3)), "nobody has connected"
-        self._connected.recv_multipart()
 
     def drain(self) -> list[dict[str, Any]]:
         """Everything that has come by now."""

@@ -44,8 +44,6 @@ class Faults(msgspec.Struct, frozen=True):
     """Its JPEGs are cut off."""
     garbage: bool = False
     """It sends anything."""
-    extraneous: bool = False
-    """Bytes between the end of the image and its end marker, as many cameras send."""
     realtime_stamps: bool = False
     """Time stamps are of another clock than the monotonic one."""
     late: int = 0
@@ -300,8 +298,6 @@ class V4l2Camera:
             return data
         if self.faults.broken:
             return data[: len(data) // 2]
-        if self.faults.extraneous:
-            return data[:-2] + bytes(40) + data[-2:]
         return data
 
 

@@ -11,7 +11,7 @@ from rigs.documents import ROOT
 from rigs.processes import call, one_line
 
 from fishd.camera import main
-from fishd.camera.settings import CameraSettings, SimulatedSettings, load, public, to_yaml
+from fishd.camera.settings import CameraSettings, SimulatedSettings, load, public
 from fishd.camera.simulated.settings import WEB
 from fishd.core.errors import ConfigError
 
@@ -28,12 +28,6 @@ def test_the_good_simulated_camera_is_the_default_and_the_bad_one_the_rig_web() 
     assert set(good) == set(SimulatedSettings.__struct_fields__)
     web = load(ROOT / "config/camera-web.yaml").simulated
     assert msgspec.structs.asdict(web) == msgspec.structs.asdict(WEB) | {"fishd": None}
-
-
-def test_all_settings_are_read_back(tmp_path: Path) -> None:
-    file = tmp_path / "camera.yaml"
-    file.write_text(to_yaml(CameraSettings()))
-    assert load(file) == CameraSettings()
 
 
 @pytest.mark.parametrize(

@@ -52,11 +52,6 @@ def test_nothing_is_shown_where_a_frame_is_missing_for_too_long(missing: int) ->
     assert shown(history_of(*times), 0.95) is None
 
 
-def test_a_frame_that_is_not_newer_than_the_others_is_dropped() -> None:
-    history = history_of(0.0, 0.1, 0.05, 0.1, 0.2)
-    assert shown(history, 0.2) == [4, 1, 1, 0]
-
-
 @pytest.mark.parametrize("rate", [20, 100, 1000])
 def test_a_stack_is_found_however_many_frames_there_are_a_second(rate: int) -> None:
     history = history_of(*(k / rate for k in range(10 * rate)), delay=0.1, oldest=0.06)

@@ -38,12 +38,6 @@ def test_the_tip_is_where_the_fin_angle_puts_it() -> None:
     assert tip(CLEAR, 0.2)[0] - 41.5 == pytest.approx(0.74 * 84 * np.tan(0.2), rel=0.05)
 
 
-def test_its_picture_is_mirrored_with_the_angle() -> None:
-    painter = TailPainter(CLEAR, 84)
-    one, other = painter.paint(0.15, 1.0, 0.0), painter.paint(-0.15, -1.0, 0.0)
-    assert np.array_equal(one, other[::-1])
-
-
 def test_a_fast_tail_is_smeared_by_a_long_exposure() -> None:
     still, fast = tip(CLEAR, 0.0)[1], tip(CLEAR, 0.0, 6.0)[1]
     assert fast > 1.2 * still

@@ -54,13 +54,6 @@ def test_cutting_shortens_the_pulse_under_way(train: PulseTrain) -> None:
     assert train.width(0.06) == 0.0
 
 
-def test_cutting_cancels_a_change_that_was_to_come(train: PulseTrain) -> None:
-    train.set(0.0, 1500.0)
-    train.set(0.041, 1600.0)
-    train.cut(0.0411)
-    assert train.width(0.06) == 0.0
-
-
 def test_shorter_frames_begin_where_the_longer_one_ends(train: PulseTrain) -> None:
     train.set(0.0, 1500.0)
     train.set(0.101, 1600.0, frame=0.003)

@@ -7,7 +7,7 @@ import pytest
 from rigs.example_packages import forget_drivers
 from rigs.processes import install
 
-from fishd.config import json_schema, load, to_yaml
+from fishd.config import json_schema, load
 from fishd.core.errors import ConfigError, FishLost, StartupError
 from fishd.lab.simulation.virtual_run import KeepingPublisher, VirtualRun
 from fishd.virtual.plant.registry import open_plant
@@ -92,14 +92,6 @@ def test_a_plant_of_another_package_is_what_the_sensor_feels_and_keeps_its_keys(
         windows = [run.tick() for _ in range(3)]
     assert [(tick.fx, tick.fy, tick.alpha) for tick in publisher.ticks] == [(0.01, 0.02, 0.25)] * 3
     assert windows[0].thrust == 0.01
-
-
-def test_what_is_shown_of_it_can_be_read_back(tmp_path: Path) -> None:
-    config = load(None, ["plant.model=good", "plant.size=0.25", "plant.xi=0.7"])
-    file = tmp_path / "fish.yaml"
-    file.write_text(to_yaml(config))
-    assert load(file) == config
-    assert load(file).plant.xi == 0.7
 
 
 def test_the_schema_knows_its_keys_and_takes_the_others_that_add_none() -> None:

@@ -76,13 +76,6 @@ def test_a_fish_whose_halves_agree_is_steady(speed: Array) -> None:
     assert gait(track(20.0, speed), SETTINGS).speed_trend is None
 
 
-def test_chance_is_seldom_taken_for_a_trend() -> None:
-    rng = np.random.default_rng(4)
-    tracks = (track(20.0, 0.1 + 0.05 * rng.normal(size=2000)) for _ in range(200))
-    told = sum(gait(each, SETTINGS).speed_trend is not None for each in tracks)
-    assert told <= 20
-
-
 def test_the_interval_covers_the_mean_although_beats_are_alike() -> None:
     rng = np.random.default_rng(3)
     held = 0
