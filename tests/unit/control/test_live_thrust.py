@@ -95,16 +95,6 @@ def test_a_new_zero_of_the_sensor_is_found_again_and_the_factor_stays() -> None:
         assert fish.swim("swing", {}, 8.0)[-1].thrust_error is UNSET
 
 
-def test_a_load_that_is_hung_on_at_rest_is_no_drift() -> None:
-    with rig() as fish:
-        fish.rest(4.0)
-        sensor = fish._run.loop.robot.tared
-        assert sensor
-        sensor.recalibrate(replace(sensor.calibration, x0=0.05))
-        thrust, error = known(fish.rest(4.0))
-        assert abs(thrust) < error < 2e-3
-
-
 @pytest.mark.parametrize("leak", [0.1, 0.3, 1.0])
 def test_a_wave_for_which_the_factor_is_another_is_known_soon(leak: float) -> None:
     config = replace(CONFIG, estimator=replace(CONFIG.estimator, leak=leak))

@@ -29,13 +29,8 @@ def fastest(function: Callable[[], object]) -> float:
 
 @pytest.mark.parametrize(
     ("word", "words", "limit"),
-    [
-        ("x" * 65536, ["status", "controllers"], 2),
-        ("status" * 10_000, ["status", "controllers"], 2),
-        ("servo.gpoi" * 10, KEYS, 6),
-        ("policy-0123-swum", POLICIES, 15),
-    ],
-    ids=["64 kB", "64 kB of letters", "100 letters", "500 names"],
+    [("status" * 10_000, ["status", "controllers"], 2), ("policy-0123-swum", POLICIES, 15)],
+    ids=["64 kB", "500 names"],
 )
 def test_a_suggestion_is_quick(word: str, words: list[str], limit: int) -> None:
     assert cost(lambda: nearest(word, words)) < limit
@@ -54,7 +49,7 @@ def test_a_word_that_is_too_long_to_be_meant_gets_no_suggestion() -> None:
     assert nearest(known + "y", [known]).startswith("valid: ")
 
 
-@pytest.mark.parametrize("value", ["x" * 60_000, [[1] * 20_000], {"a": ["b"] * 20_000}, 10**4000])
+@pytest.mark.parametrize("value", ["x" * 60_000, {"a": ["b"] * 20_000}, 10**4000])
 def test_a_long_value_is_quoted_briefly_and_quickly(value: object) -> None:
     def refuse() -> str:
         with pytest.raises(Problem) as problem:

@@ -7,7 +7,6 @@ import pytest
 from rigs.harness import LIMITS
 from rigs.policy_files import card, linear, write
 
-import fishd
 from fishd.controllers import registry
 from fishd.controllers.policy import library
 from fishd.controllers.policy.network import to_onnx
@@ -116,9 +115,3 @@ def test_a_folder_that_cannot_be_read_hides_no_other(tmp_path: Path) -> None:
     (tmp_path / "system").write_text("a file where a folder should be")
     write(tmp_path / "shipped", name="swim")
     assert library.names() == ["swim"]
-
-
-def test_what_ships_is_found_in_the_checkout(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.undo()
-    checkout = Path(fishd.__file__).parents[1]
-    assert library.folders()[-1] == checkout / "config" / "policies"
