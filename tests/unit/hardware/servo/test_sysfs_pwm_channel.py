@@ -19,7 +19,9 @@ def bench() -> Bench:
     [
         ({FAN: 4, PI5: 4}, {"gpio": 18}, PI5, 2),
         ({PI5: 4, FAN: 4}, {"gpio": 19}, PI5, 3),
+        ({PI5: 4}, {"gpio": 13}, PI5, 1),
         ({PI4: 2}, {"gpio": 18}, PI4, 0),
+        ({PI4: 2}, {"gpio": 13}, PI4, 1),
         ({"3f20c000.pwm": 2}, {"gpio": 12}, "3f20c000.pwm", 0),
         ({PI5: 4, "soc:pwm": 1}, {"gpio": 4, "chip": "soc:pwm", "channel": 0}, "soc:pwm", 0),
     ],
