@@ -81,19 +81,12 @@ def test_short_bursts_go_unseen_in_no_part_of_a_tick(rig: MeterRig) -> None:
     assert sum(powers) / len(powers) == pytest.approx(10.0 * 2 / 47, rel=0.03)
 
 
-def test_a_meter_that_is_not_there_says_where_it_was_looked_for(rig: MeterRig) -> None:
-    rig.faults.inject("meter-unplugged")
-    meter = rig.meter()
-    with pytest.raises(SensorError, match=f"nothing answers at 0x40.* of the {rig.kind.upper()}"):
-        rig.tick(meter)
-
-
 def test_a_meter_that_was_unplugged_is_set_up_anew(rig: MeterRig) -> None:
     meter = rig.meter()
     rig.tick(meter)
     rig.faults.inject("meter-unplugged", 1.0)
     for _ in range(10):
-        with pytest.raises(SensorError, match="nothing answers"):
+        with pytest.raises(SensorError, match=r"nothing answers at 0x40 .* of the INA2"):
             rig.tick(meter)
     for _ in range(40):
         try:
