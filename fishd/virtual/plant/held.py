@@ -83,14 +83,13 @@ class HeldWindows:
         """Number of windows that were taken."""
         self.jump = 0.0
         """Energy of the jump of the wheel's speed at the start [J]."""
-        self._energies: list[float] = []
+        self.energies: list[float] = []
+        """Energy of the motor in each window [J]; empty until `add_energies` is called."""
 
-    def energy(self, motor: Motor, window: int) -> float:
-        """Return the energy of the motor in a window [J]."""
-        if not self._energies:
-            self._energies = motor.energy(self.stretch).tolist()
-            self._energies[0] += self.jump
-        return self._energies[window]
+    def add_energies(self, motor: Motor) -> None:
+        """Work out the energies."""
+        self.energies = motor.energy(self.stretch).tolist()
+        self.energies[0] += self.jump
 
 
 class HeldWindow(Struct, frozen=True, eq=False):
@@ -121,6 +120,9 @@ class HeldWindow(Struct, frozen=True, eq=False):
     @property
     def power(self) -> float:
         """Mean electrical power of the servo [W]; NaN where the fish has no motor."""
-        if self.motor is None:
+        motor, held = self.motor, self.held
+        if motor is None:
             return math.nan
-        return self.motor.idle + self.held.energy(self.motor, self.number) / self.duration
+        if not held.energies:
+            held.add_energies(motor)
+        return motor.idle + held.energies[self.number] / self.duration

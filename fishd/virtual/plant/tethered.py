@@ -67,7 +67,8 @@ class FinWindow(Struct, frozen=True, eq=False):
         energy = 0.0
         for before, after, course in self.drives:
             energy += motor.jump(before, after)
-            energy += sum(float(motor.energy(stretch)) for stretch in course)
+            for stretch in course:
+                energy += float(motor.energy(stretch))
         return motor.idle + energy / self.duration
 
 
@@ -116,8 +117,8 @@ class TetheredFish(Plant[PlantParameters]):
             self._line or self._brakes or parameters.servo_dead_zone or parameters.servo_reaction
         )
         self._request: tuple[float | None, float, int] = (None, 0.0, 0)
-        self._lasted = self._lasted_before = 0
-        """Number of windows of this request so far, and of the one before."""
+        self._lasted, self._usual = 0, 0.0
+        """Number of windows of this request so far, and what it was of late on average."""
         self._held: HeldWindows | None = None
         """Windows of this request that were worked out at once."""
         self._expected: PlantState | None = None
@@ -137,7 +138,14 @@ class TetheredFish(Plant[PlantParameters]):
         if not (duration > 0.0 and samples > 0):
             raise ValueError(f"a window needs time and samples, not {duration} s and {samples}")
         if self._is_plain and instruction_angle is not None:
-            held = self._hold(instruction_angle, duration, samples)
+            held = self._held
+            if (
+                held is None
+                or held.taken == COUNT
+                or self.state is not self._expected
+                or self._request != (instruction_angle, duration, samples)
+            ):
+                held = self._hold(instruction_angle, duration, samples)
             if held:
                 return self._take(held, instruction_angle, duration)
         if self._line is None:
@@ -160,22 +168,20 @@ class TetheredFish(Plant[PlantParameters]):
         )
 
     def _hold(self, angle: float, duration: float, samples: int) -> HeldWindows | None:
-        """Return windows to take the next one of; None where the instruction may soon change.
+        """Return windows to come; None where the instruction may soon change.
 
-        It is expected to last as long as the one before, or as long again as it has lasted.
+        It is expected to last as long as others of late, or as long again as it has lasted.
         """
         request = (angle, duration, samples)
         if request != self._request:
             self._request, self._held = request, None
-            self._lasted_before, self._lasted = self._lasted, 0
+            self._usual = 0.5 * (self._usual + min(COUNT, self._lasted))
+            self._lasted = 0
         self._lasted += 1
-        held, state = self._held, self.state
-        if held and held.taken < COUNT and state is self._expected:
-            return held
         self._held = None
-        p = self.parameters
+        p, state = self.parameters, self.state
         lag = (angle - state.phi) / p.servo_lag
-        if max(self._lasted, self._lasted_before) < _HELD or abs(lag) > _LINEAR_LAG:
+        if max(self._lasted, self._usual) < _HELD or abs(lag) > _LINEAR_LAG:
             return None
         segments = self._equal_segments(duration, samples, (0.0, duration))
         if len(segments) > 1 or duration > self._graded_from:
@@ -189,6 +195,8 @@ class TetheredFish(Plant[PlantParameters]):
         """Swim the next one of the windows of an instruction that is held."""
         p, k = self.parameters, held.taken
         held.taken += 1
+        if k:  # the first one is counted
+            self._lasted += 1
         alpha, rate, side_force, sampled_side_force = held.ends[k]
         thrust, sampled_thrust = held.thrusts[k]
         lag = math.sinh((angle - self.state.phi) / p.servo_lag)
