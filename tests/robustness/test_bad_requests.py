@@ -56,7 +56,7 @@ def test_many_requests_sent_at_once_are_all_answered(daemon: Daemon) -> None:
         ({"op": "set-parameter", "args": {"parameters": {}}}, "not-running", "idle"),
     ],
 )
-def test_a_bad_request_gets_an_error_that_says_what_is_wrong(
+def test_a_bad_request_gets_an_error(
     daemon: Daemon, request_: dict[str, Any], code: str, message: str
 ) -> None:
     with daemon.socket() as socket:
@@ -97,9 +97,7 @@ def shoot(daemon: Daemon, seconds: float) -> None:
     context.destroy(linger=0)
 
 
-def test_a_fishd_that_goes_on_after_a_hang_begins_nothing_that_was_asked_for_before(
-    own_daemon: Daemon,
-) -> None:
+def test_a_fishd_that_goes_on_after_a_hang_begins_nothing_of_before(own_daemon: Daemon) -> None:
     own_daemon.process.send_signal(signal.SIGSTOP)
     with own_daemon.socket() as socket:
         swing = {"v": 1, "id": 1, "op": "set-controller", "args": {"name": "swing"}}

@@ -127,7 +127,7 @@ def test_many_that_are_given_up_just_when_they_are_done_are_either_taken_or_thro
         assert len(late) <= (0 if done else 1)
 
 
-def test_one_that_is_given_up_before_its_thread_has_begun_ends_without_a_call(
+def test_one_given_up_before_its_thread_began_calls_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     begin, calls, uncaught = threading.Event(), [], []

@@ -156,9 +156,7 @@ def test_no_answer_and_no_refusal_says_anything_to_the_terminal(
 @pytest.mark.parametrize(
     "rubbish", [b"no JSON", b'{"v":1,"id":"\xff"}', b'{"a":' + 60_000 * b"["], ids=len
 )
-def test_rubbish_is_one_line_that_says_where_it_comes_from(
-    hostile: Hostile, rubbish: bytes
-) -> None:
+def test_rubbish_is_one_line_that_says_its_origin(hostile: Hostile, rubbish: bytes) -> None:
     with Fish(hostile.endpoint, timeout=PATIENCE) as fish:
         telemetry = fish.status().telemetry
     hostile.rubbish = rubbish

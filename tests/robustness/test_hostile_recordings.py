@@ -70,7 +70,7 @@ def results(folder: Path) -> dict[tuple[str, str], Outcome]:
     return {(each.verb, each.file.removesuffix(".mcap")): each for each in outcomes}
 
 
-def test_every_verb_ends_with_a_line_and_little_memory_whatever_the_file_claims(
+def test_every_verb_ends_with_a_line_and_little_memory(
     results: dict[tuple[str, str], Outcome],
 ) -> None:
     wrong = {
@@ -98,7 +98,7 @@ def test_one_bad_file_does_not_hide_the_others(
         assert outcome.out.replace("\n", "").isprintable()
 
 
-def test_no_text_of_a_file_is_a_command_for_terminal_page_or_spreadsheet(
+def test_no_text_of_a_file_is_a_command(
     folder: Path, results: dict[tuple[str, str], Outcome]
 ) -> None:
     name = "texts-that-are-commands"

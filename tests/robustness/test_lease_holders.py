@@ -63,14 +63,6 @@ def test_a_program_that_was_stopped_ends_in_one_line_and_does_not_drive_on(daemo
     assert daemon.status().mode == "idle"
 
 
-def test_a_program_whose_fish_is_stopped_by_hand_says_so(daemon: Daemon) -> None:
-    with swimming(daemon) as program:
-        stopped = daemon.fishctl("stop")
-        _, _, err = program.finish()
-    assert stopped.stderr.startswith("fishctl: took the fish from my experiment (pid ")
-    assert err == "lost: this program no longer holds the fish: the fish was stopped by hand\n"
-
-
 @pytest.mark.realtime
 def test_a_fish_that_swims_keeps_its_program_while_that_computes(daemon: Daemon) -> None:
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:

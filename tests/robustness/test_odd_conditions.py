@@ -41,9 +41,7 @@ def test_an_emergency_stop_passes_and_its_status_says_so(condition: str, rig: Ri
         ("record", "full disk"),
     ],
 )
-def test_a_command_does_its_work_or_says_in_one_line_why_not(
-    group: str, condition: str, rig: Rig
-) -> None:
+def test_a_command_works_or_says_in_one_line_why_not(group: str, condition: str, rig: Rig) -> None:
     cells = list(odd_conditions.try_group(group, condition, *rig))
     if not all(cell.tried for cell in cells):
         pytest.skip("no file system may be mounted here")
@@ -57,9 +55,7 @@ def test_a_version_that_cannot_be_written_is_one_line(stream: str) -> None:
     assert done.stderr.startswith("fishd: the output cannot be written: ")
 
 
-def test_bytes_that_are_no_text_do_not_keep_an_emergency_stop_from_passing(
-    tmp_path: Path,
-) -> None:
+def test_bytes_that_are_no_text_do_not_keep_an_emergency_stop_from_passing(tmp_path: Path) -> None:
     with Daemon(tmp_path).wait_until_up() as daemon, Fish(daemon.endpoint) as fish:
         assert fish.estop(os.fsdecode(b"fin \xff")).mode == "estop"
         reason = fish.status().reason

@@ -78,9 +78,7 @@ def answers(endpoint: str) -> bool:
         return False
 
 
-def test_as_a_module_fishd_executes_none_but_those_that_python_itself_loads_before(
-    trap: Trap,
-) -> None:
+def test_as_a_module_fishd_executes_none_but_those_that_python_loads_first(trap: Trap) -> None:
     loaded = call(sys.executable, "-I", "-c", "import runpy, sys; print(*sys.modules)").stdout
     for name in {"fishd", *loaded.split()}:
         (trap.folder / f"{name}.py").unlink(missing_ok=True)

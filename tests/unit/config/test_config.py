@@ -87,20 +87,15 @@ def test_only_values_that_were_given_are_doubted(caplog: pytest.LogCaptureFixtur
     )
 
 
-def test_a_file_may_be_named_by_a_text(tmp_path: Path) -> None:
-    file = tmp_path / "fish.yaml"
-    file.write_text("tick: 0.1\n")
-    assert load(str(file)).tick == 0.1
-    with pytest.raises(ConfigError, match=r"^nowhere\.yaml: no such file"):
-        load("nowhere.yaml")
-
-
 def test_a_section_with_nothing_below_it_takes_its_defaults(tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("plant:\n#  xi: 0.7\nstart: {controller: null, parameters: {}}\n")
     assert load(file) == Config()
     file.write_text("")
-    assert load(file) == Config() == load()
+    assert load(str(file)) == Config() == load()
+    assert load(None, ["slew_limit=null", "simulation.noise=1e-3"]).simulation.noise == 1e-3
+    with pytest.raises(ConfigError, match=r"^nowhere\.yaml: no such file"):
+        load("nowhere.yaml")
 
 
 @pytest.mark.parametrize("name", ["y", "1e5", "7:30", "Fu's fish"])
@@ -125,9 +120,6 @@ noise: 0.1
 
 tick: 1
 => fish.yaml:2: tick: 1 is not valid: a number in [0.002, 0.2] s is needed
-
-tick: .nan
-=> fish.yaml:1: tick: nan is not valid: a number in [0.002, 0.2] s is needed
 
 realtime: {priority: 50.5}
 => fish.yaml:1: realtime.priority: 50.5 is not valid: a whole number in [0, 99]
@@ -198,9 +190,7 @@ telemetry: {address: localhost}
         ("a: " + "1" * 200, "fish.yaml:1: a: a number of 200 letters"),
     ],
 )
-def test_a_bad_file_gets_a_line_with_place_and_remedy(
-    text: str, message: str, tmp_path: Path
-) -> None:
+def test_a_bad_file_gets_a_line_with_a_remedy(text: str, message: str, tmp_path: Path) -> None:
     assert message in complaint(text, tmp_path)
 
 
@@ -219,12 +209,6 @@ def test_a_bad_override_is_named_as_it_was_written(override: str, message: str) 
     with pytest.raises(ConfigError) as caught:
         load(None, [override])
     assert message in str(caught.value)
-
-
-def test_overrides_take_numbers_as_people_write_them() -> None:
-    config = load(None, ["simulation.noise=1e-3", "slew_limit=null", "tick=0.1", "tick=0.02"])
-    assert config.simulation.noise == 1e-3
-    assert config.tick == 0.02
 
 
 def test_a_bomb_of_aliases_costs_milliseconds() -> None:
@@ -278,9 +262,7 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         (['state_folder="/var/\\0fish"'], "state_folder", "a path has no zero byte"),
     ],
 )
-def test_hardware_that_is_at_odds_is_refused_by_key(
-    overrides: list[str], key: str, words: str
-) -> None:
+def test_hardware_at_odds_is_refused_by_key(overrides: list[str], key: str, words: str) -> None:
     with pytest.raises(ConfigError) as refusal:
         load(None, overrides)
     assert f"{key}: " in str(refusal.value)

@@ -100,7 +100,7 @@ def test_whoever_latches_a_fault_the_servo_gets_what_its_row_says(code: str) -> 
 
 @pytest.mark.parametrize("data_rate", [860], ids=["default-rate"])
 @pytest.mark.parametrize("name", SENSOR_FAULTS)
-def test_a_force_that_is_lost_or_not_to_be_believed_ends_in_neutral_and_recovers_after_a_clear(
+def test_a_bad_force_ends_in_neutral_and_recovers_after_a_clear(
     rig: LockstepRig, name: str
 ) -> None:
     code, earliest, latest = SENSOR_FAULTS[name]

@@ -43,9 +43,7 @@ def test_a_fade_reaches_neutral_and_stays_there(
 
 
 @given(amplitudes, ticks)
-def test_the_default_slew_limit_leaves_a_square_wave_as_it_is(
-    amplitude: float, tick: float
-) -> None:
+def test_the_default_slew_limit_leaves_a_square_wave_alone(amplitude: float, tick: float) -> None:
     guard = Guard(amplitude, tick, None, fade_time=0.4)
     assert guard.apply(-amplitude, amplitude) == -amplitude
     assert guard.apply(amplitude, -amplitude) == amplitude

@@ -187,9 +187,7 @@ def test_one_in_a_beat_spoils_no_thrust(fx: float) -> None:
 
 @pytest.mark.parametrize("tick", [43, 57, 59])
 @pytest.mark.parametrize("fx", [0.2, -5.0])
-def test_a_spike_that_nobody_doubts_makes_the_zero_uncertain_and_not_wrong(
-    fx: float, tick: int
-) -> None:
+def test_a_spike_without_doubt_makes_the_zero_uncertain_not_wrong(fx: float, tick: int) -> None:
     rig, robot = fragile_rig()
     rig.run(tick)
     robot.fx = fx

@@ -29,9 +29,7 @@ def stand_still(rig: LockstepRig, seconds: float) -> None:
 
 
 @pytest.mark.parametrize("seconds", [0.25, 0.5, 2.0])
-def test_after_a_hang_longer_than_the_countdown_the_servo_is_released_until_a_clear(
-    rig: LockstepRig, seconds: float
-) -> None:
+def test_after_a_hang_the_servo_is_released_until_a_clear(rig: LockstepRig, seconds: float) -> None:
     since = rig.now
     stand_still(rig, seconds)
     rig.run_for(1.0)
@@ -132,7 +130,7 @@ def test_a_servo_that_waits_for_ever_goes_on_after_a_hang() -> None:
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen"])
-def test_a_servo_behind_a_dead_pigpiod_is_lost_and_may_have_pulses_until_it_is_released(
+def test_a_servo_behind_a_dead_pigpiod_may_have_pulses_until_released(
     rig: LockstepRig, fault: str
 ) -> None:
     rig.pi.faults.inject(fault)
@@ -145,9 +143,7 @@ def test_a_servo_behind_a_dead_pigpiod_is_lost_and_may_have_pulses_until_it_is_r
 
 
 @pytest.mark.parametrize("fault", ["read_error", "suspect"])
-def test_a_force_is_lost_with_the_third_bad_read_and_back_with_the_next_good_one(
-    fault: str,
-) -> None:
+def test_a_force_is_lost_with_the_third_bad_read_and_back_with_a_good_one(fault: str) -> None:
     rig, robot = fragile_rig()
     rig.run(3)
     good = getattr(robot, fault)

@@ -51,9 +51,7 @@ def test_the_dwell_is_a_time_in_whole_ticks_rounded_up(tick: float, ticks: int) 
     ],
     ids=["slow", "one side", "no dwell"],
 )
-def test_a_wave_without_quick_reversals_or_without_a_dwell_passes_untouched(
-    wanted: list[float], dwell: float
-) -> None:
+def test_a_slow_wave_or_no_dwell_changes_nothing(wanted: list[float], dwell: float) -> None:
     assert limited(wanted, dwell) == wanted
 
 

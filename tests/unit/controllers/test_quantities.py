@@ -94,9 +94,7 @@ def test_what_is_no_finite_number_is_left_out_and_the_fish_swims_on(shown: Any) 
         (["two words"], "'two words' cannot name a quantity"),
     ],
 )
-def test_too_much_to_show_is_refused_where_the_class_is_made(
-    names: list[str], complaint: str
-) -> None:
+def test_too_much_to_show_is_refused_with_the_class(names: list[str], complaint: str) -> None:
     declared = {name: quantity("1", "One of many.") for name in names}
     with pytest.raises(TypeError, match=complaint):
         type("Many", (Controller,), declared)

@@ -43,9 +43,7 @@ def test_a_command_that_is_interrupted_says_so(end: Run, error: BaseException) -
         (OSError(errno.EMFILE, "Too many open files"), "Too many open files"),
     ],
 )
-def test_a_file_or_memory_that_makes_trouble_is_one_line(
-    end: Run, error: Exception, words: str
-) -> None:
+def test_trouble_with_a_file_or_memory_is_one_line(end: Run, error: Exception, words: str) -> None:
     status, line = end(error)
     assert (status, "\n" in line) == (1, False)
     assert line.startswith(f"fishctl: {words}")

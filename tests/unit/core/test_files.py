@@ -84,7 +84,7 @@ def said(read: Callable[[Path], object], path: Path) -> str:
 
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
 @pytest.mark.parametrize("name", READERS)
-def test_what_is_no_file_or_has_no_end_is_one_line_at_once(
+def test_what_is_no_file_is_one_line(
     tmp_path: Path, name: str, plant: Callable[[Path], None]
 ) -> None:
     plant(tmp_path / name)
@@ -183,7 +183,7 @@ def test_a_name_may_be_as_long_as_the_file_system_permits(tmp_path: Path) -> Non
         ("a\0b", "cannot be written: a name has no zero byte"),
     ],
 )
-def test_whether_a_file_can_be_written_is_found_out_beforehand(
+def test_a_file_that_cannot_be_written_is_refused(
     tmp_path: Path, name: str, complaint: str
 ) -> None:
     (tmp_path / "file").touch()

@@ -49,9 +49,7 @@ def test_any_json_becomes_a_request_or_a_refusal(value: object) -> None:
     st.integers(-(2**63), 2**63 - 1) | st.text(max_size=256),
     st.dictionaries(st.text(), json_values, max_size=3),
 )
-def test_a_good_request_arrives_as_sent(
-    op: str, identity: int | str, args: dict[str, object]
-) -> None:
+def test_a_request_arrives_as_sent(op: str, identity: int | str, args: dict[str, object]) -> None:
     wire = {"v": 1, "op": op, "id": identity, "args": args}
     request = protocol.decode_request(msgspec.json.encode(wire))
     assert (request.op, request.id, request.args) == (op, identity, args)

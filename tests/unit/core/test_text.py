@@ -75,7 +75,5 @@ def test_an_exception_is_named_whatever_it_is(error: BaseException, line: str) -
         (None, "25.74 mN"),
     ],
 )
-def test_an_interval_of_zero_is_called_exact_and_never_shown_as_zero(
-    ci95: float | None, said: str
-) -> None:
+def test_an_interval_of_zero_is_called_exact_and_not_zero(ci95: float | None, said: str) -> None:
     assert text.format_measured(25.74e-3, ci95, "N") == said

@@ -49,7 +49,7 @@ def test_without_ticks_the_watchdog_gets_nothing(systemd: socket.socket) -> None
     notifier.close()
 
 
-def test_a_watchdog_for_another_process_is_not_fed(
+def test_a_watchdog_of_others_is_not_fed(
     systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WATCHDOG_PID", "1")
@@ -60,7 +60,7 @@ def test_a_watchdog_for_another_process_is_not_fed(
     notifier.close()
 
 
-def test_a_systemd_that_does_not_listen_stops_nothing(
+def test_a_deaf_systemd_stops_nothing(
     systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     notifier = SystemdNotifier()

@@ -57,9 +57,7 @@ def test_a_file_that_a_power_cut_left_is_finished_at_the_next_start(tmp_path: Pa
     assert not any(copy.exists() for copy in copies)
 
 
-def test_an_almost_full_disk_costs_the_oldest_file_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_costs_the_oldest_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     box = BlackBox(tmp_path, KEEP, RunWriter)
     fill(box, tmp_path, 3)
     oldest, *others = paths(tmp_path)

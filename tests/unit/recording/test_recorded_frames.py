@@ -67,7 +67,7 @@ def path(tmp_path: Path, ticks: list[Tick], frames: list[Frame]) -> Path:
     return write(tmp_path / "run.mcap", ticks, frames)
 
 
-def test_every_pixel_and_every_time_is_given_back(
+def test_pixels_and_times_are_given_back(
     path: Path, ticks: list[Tick], frames: list[Frame]
 ) -> None:
     run = open_run(path)
@@ -116,7 +116,7 @@ def test_an_hour_of_frames_has_the_size_that_the_docs_say(path: Path, tmp_path: 
     assert 4.0e3 < each < 6.0e3
 
 
-def test_frames_that_are_missing_are_counted_and_a_camera_that_begins_anew_is_a_gap(
+def test_missing_frames_and_a_new_camera_are_counted_as_gaps(
     tmp_path: Path, frames: list[Frame]
 ) -> None:
     with RunWriter(tmp_path / "run") as writer:
@@ -159,9 +159,7 @@ def test_frames_are_exported_as_one_array_with_a_table_of_their_times(
         export(open_run(path), tmp_path, "csv")
 
 
-def test_frames_that_are_recorded_meanwhile_are_no_part_of_an_export(
-    tmp_path: Path, frames: list[Frame]
-) -> None:
+def test_frames_recorded_meanwhile_are_not_exported(tmp_path: Path, frames: list[Frame]) -> None:
     with RunWriter(tmp_path / "run") as writer:
         writer.describe(Rig().config)
         writer.frame(head(frames[0], 1), frames[0].pixels)

@@ -112,9 +112,7 @@ def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("damaged", [False, True], ids=["cut off", "damaged"])
-def test_whenever_a_recovery_is_killed_the_next_one_finishes_it(
-    tmp_path: Path, damaged: bool
-) -> None:
+def test_a_recovery_that_is_killed_is_finished_by_the_next(tmp_path: Path, damaged: bool) -> None:
     whole = recorded(swum(), tmp_path / "whole", flush_every=10)
     content = bytearray(whole.read_bytes())
     for call in count():
@@ -138,9 +136,7 @@ def test_whenever_a_recovery_is_killed_the_next_one_finishes_it(
     assert call > 5
 
 
-def test_a_recording_that_was_killed_while_it_got_its_name_gets_it_from_a_recovery(
-    tmp_path: Path,
-) -> None:
+def test_a_recording_killed_while_it_got_its_name_gets_it_from_a_recovery(tmp_path: Path) -> None:
     whole = recorded(swum(), tmp_path / "run")
     content, part = whole.read_bytes(), whole.with_name("run.mcap.part")
     part.hardlink_to(whole)
@@ -236,9 +232,7 @@ def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
     assert run.ticks == (ticks * 10)[: len(run.ticks)]
 
 
-def test_messages_from_no_time_are_left_out_and_counted_and_the_recording_goes_on(
-    tmp_path: Path,
-) -> None:
+def test_messages_from_no_time_are_left_out_and_counted(tmp_path: Path) -> None:
     said: list[str] = []
     ticks = swum(0.4).recorder.ticks
     recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=said.append)
@@ -333,7 +327,7 @@ def test_what_fishd_could_not_be_told_of_the_camera_it_is_told_later(
         (lambda path: None, "cannot be read: No such file"),
     ],
 )
-def test_what_is_no_recording_is_said_in_one_line(
+def test_what_is_no_recording_is_one_line(
     tmp_path: Path, make: Callable[[Path], None], complaint: str
 ) -> None:
     make(tmp_path / "run.mcap")

@@ -55,9 +55,7 @@ def test_every_command_and_every_estimate_comes_out_to_the_last_bit(
 
 
 @pytest.mark.parametrize("kind", ["lateral_force", "observer"])
-def test_a_reversed_force_that_was_corrected_in_flight_is_corrected_again(
-    tmp_path: Path, kind: str
-) -> None:
+def test_a_reversed_force_that_was_corrected_is_corrected_again(tmp_path: Path, kind: str) -> None:
     rig = Rig(f"estimator.kind={kind}", wrap=reversed_robot)
     rig.run_for(3)
     rig.start("swing")
@@ -77,9 +75,7 @@ def test_a_thrust_that_was_held_by_a_measured_factor_is_held_by_it_again(tmp_pat
     assert (stretch.equal, stretch.ticks) == (200, 200)
 
 
-def test_the_model_based_estimator_is_rerun_too_and_sees_another_fish_where_asked(
-    tmp_path: Path,
-) -> None:
+def test_the_observer_is_rerun_and_sees_another_fish_where_asked(tmp_path: Path) -> None:
     rig = Rig("estimator.kind=observer", "simulation.noise=0.002")
     rig.start("swing")
     rig.run_for(10)
@@ -90,9 +86,7 @@ def test_the_model_based_estimator_is_rerun_too_and_sees_another_fish_where_aske
     assert other.stretches[0].equal < 200
 
 
-def test_who_swam_before_the_recording_began_is_said_to_have_an_unknown_past(
-    tmp_path: Path,
-) -> None:
+def test_a_swim_before_the_recording_began_has_an_unknown_past(tmp_path: Path) -> None:
     rig = Rig()
     rig.start("swing", C=0.4)
     rig.run_for(20)
@@ -108,9 +102,7 @@ def test_who_swam_before_the_recording_began_is_said_to_have_an_unknown_past(
     assert stretch.equal >= 295  # from its first reversal on, swing remembers nothing of before
 
 
-def test_another_fishd_whose_first_ticks_were_lost_is_judged_with_its_own_configuration(
-    tmp_path: Path,
-) -> None:
+def test_another_fishd_is_judged_with_its_own_configuration(tmp_path: Path) -> None:
     first, second = Rig(), Rig("slew_limit=4")
     first.run(10)
     second.start("swing")

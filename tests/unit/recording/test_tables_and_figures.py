@@ -41,9 +41,7 @@ def test_a_table_has_every_bit_of_every_tick(path: Path, tmp_path: Path, form: s
 
 
 @pytest.mark.slow  # to load matplotlib and plotly takes seconds
-def test_a_recording_is_drawn_as_a_picture_and_as_a_page_that_loads_nothing(
-    path: Path, tmp_path: Path
-) -> None:
+def test_a_recording_is_drawn_as_picture_and_as_page(path: Path, tmp_path: Path) -> None:
     done = fishctl("plot", str(path), "--to", str(tmp_path), "--from", "0.5")
     picture, page = map(Path, done.stdout.split())
     assert picture.read_bytes().startswith(b"\x89PNG")
@@ -72,9 +70,7 @@ def test_an_interval_is_in_the_legend_where_there_is_one(tmp_path: Path) -> None
     assert "95 %" in (tmp_path / "known.svg").read_text()
 
 
-def test_where_ticks_are_missing_a_curve_has_a_break_and_events_and_units_are_said(
-    path: Path, tmp_path: Path
-) -> None:
+def test_a_curve_has_breaks_and_events_and_units_are_said(path: Path, tmp_path: Path) -> None:
     ticks = swum().recorder.ticks
     drawn = traces(open_run(write(tmp_path / "run", ticks[:20] + ticks[30:])))
     assert len(drawn.time) == 51

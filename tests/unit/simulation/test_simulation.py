@@ -6,7 +6,6 @@ import re
 from functools import partial
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from rigs.documents import ROOT
@@ -14,22 +13,14 @@ from rigs.processes import fishctl, one_line
 
 from fishd.assembly import simulated_fish
 from fishd.config import load
-from fishd.controllers import registry
 from fishd.core.errors import ConfigError, ParameterError
 from fishd.lab import simulation
-from fishd.lab.simulation import Beats, EncodingPublisher, Report, judge, simulate
+from fishd.lab.simulation import Beats, simulate
 from fishd.virtual.imperfections import Imperfections
 from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.optimum import square_wave
 
 REALISTIC = ["simulation.offset_y=0.02", "simulation.drift=0.02", "simulation.rotation=0.1"]
-
-
-def physics(report: Report) -> dict[str, object]:
-    """A report without what depends on the machine."""
-    fields = msgspec.structs.asdict(report)
-    del fields["real_time_factor"], fields["microseconds_per_tick"]
-    return fields
 
 
 @pytest.mark.parametrize("start", [0.0, 12_345.67])
@@ -74,9 +65,7 @@ def test_a_fish_that_does_not_beat_has_no_frequency_and_no_thrust() -> None:
         (5, 10, "nothing is left to judge: a run of 5 s"),
     ],
 )
-def test_a_length_that_leaves_nothing_to_judge_is_refused(
-    seconds: float, settle: float, why: str
-) -> None:
+def test_a_length_that_leaves_nothing_is_refused(seconds: float, settle: float, why: str) -> None:
     with pytest.raises(ParameterError, match=why):
         simulate(load(), "swing", {}, seconds, settle)
 
@@ -114,7 +103,7 @@ def test_only_whole_beats_are_counted() -> None:
     ("waveform", "fullness", "squareness"),
     [("square", 1.0, 1.0), ("sine", 2.0 / math.pi, 0.9003), ("triangle", 0.5, 0.8660)],
 )
-def test_fullness_and_squareness_tell_the_waveforms_apart(
+def test_fullness_and_squareness_of_waveforms(
     waveform: str, fullness: float, squareness: float
 ) -> None:
     amplitude = 0.3
@@ -123,13 +112,6 @@ def test_fullness_and_squareness_tell_the_waveforms_apart(
     )
     assert report.fullness == pytest.approx(fullness, abs=1e-3)
     assert report.squareness == pytest.approx(squareness, abs=1e-3)
-
-
-def test_a_ready_made_controller_gets_the_same_report_as_one_by_name() -> None:
-    config = load(None, REALISTIC)
-    controller = registry.create("swing", {"C": 0.5}, config.limits)
-    ready_made = judge(config, "swing", controller, 30, 10, EncodingPublisher())
-    assert physics(ready_made) == physics(simulate(config, "swing", {"C": 0.5}, 30))
 
 
 run = partial(fishctl, "simulate")

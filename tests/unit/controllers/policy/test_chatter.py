@@ -43,7 +43,7 @@ def longest_chatter(ticks: list[Tick]) -> float:
     return longest * 0.05
 
 
-def test_a_policy_that_insists_loses_command_to_swing_within_two_seconds(
+def test_chatter_gives_swing_command_in_two_seconds(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = flipping(tmp_path)
@@ -96,9 +96,7 @@ def test_a_policy_that_is_set_again_starts_anew(tmp_path: Path) -> None:
     assert rig.loop.active.fallback is None
 
 
-def test_a_take_over_in_a_tick_builds_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_take_over_builds_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rig = flipping(tmp_path)
 
     def never(*args: Any) -> None:
@@ -109,9 +107,7 @@ def test_a_take_over_in_a_tick_builds_nothing(
     assert (rig.mode, rig.loop.active.name) == ("running", "swing")
 
 
-def test_a_policy_reverses_no_sooner_than_the_dwell_and_warm_ups_are_no_reversals(
-    tmp_path: Path,
-) -> None:
+def test_a_policy_keeps_to_the_dwell_and_warm_ups_are_no_reversals(tmp_path: Path) -> None:
     rig = flipping(tmp_path)
     for _ in range(100):
         rig.loop.warm_up()

@@ -168,9 +168,7 @@ def test_wrong_ends_are_refused_with_what_is_right(change: Change, found: str, w
 
 
 @pytest.mark.parametrize(("bad", "layer"), [(np.nan, 0), (-np.inf, 2)])
-def test_weights_that_are_not_finite_are_refused_though_tanh_hides_them(
-    bad: float, layer: int
-) -> None:
+def test_weights_that_are_not_finite_are_refused_behind_a_tanh(bad: float, layer: int) -> None:
     content = to_onnx(random_layers(1, 8, 8, 1), "tanh", card())
 
     def spoil(model: Any) -> None:

@@ -179,9 +179,7 @@ def test_what_runs_the_network_leaves_nothing_in_the_users_folder(tmp_path: Path
     assert list(home.iterdir()) == []
 
 
-def test_a_policy_is_refused_that_never_saw_a_fin_velocity_in_rad_per_second(
-    tmp_path: Path,
-) -> None:
+def test_a_policy_that_never_saw_a_velocity_in_rad_per_second_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, to_onnx(linear(1.0), "tanh", card(("fin_velocity", 0.002))))
     assert "trained to see fin_velocity as estimator.kind: lateral_force gives it" in refusal(
         path, replace(LIMITS, scaled=True)
