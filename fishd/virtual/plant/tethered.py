@@ -28,7 +28,7 @@ _GRADED_FROM = 16.0  # windows longer than this many Δ/Ω need fewer segments g
 _FIN_REACH = 3.0  # segment length, in units of the fin's shortest time, that N nodes resolve
 _LINEAR_LAG = 300.0  # in Δ; sinh is safe below, and above the wheel runs at Ω all segment long
 _ROUNDING = 1e-9  # a window of exactly one servo time constant stays one segment
-_HELD = 3  # an instruction that lasts so many windows makes it worth while to look ahead
+_HELD = 4  # an instruction that lasts so many windows makes it worth while to look ahead
 _DRAG_STEP = 0.05  # longest segment with quadratic drag, s
 REACTION_TIME = 0.01
 """Of the mount that passes the servo's reaction on to the sensor [s]."""
@@ -172,19 +172,20 @@ class TetheredFish(Plant[PlantParameters]):
 
         It is expected to last as long as others of late, or as long again as it has lasted.
         """
-        request = (angle, duration, samples)
-        if request != self._request:
-            self._request, self._held = request, None
-            self._usual = 0.5 * (self._usual + min(COUNT, self._lasted))
-            self._lasted = 0
-        self._lasted += 1
         self._held = None
+        request = (angle, duration, samples)
+        if request == self._request:
+            self._lasted += 1
+        else:
+            lasted = self._lasted
+            self._usual = 0.5 * (self._usual + (lasted if lasted < COUNT else COUNT))
+            self._request, self._lasted = request, 1
+        if self._lasted < _HELD and self._usual < _HELD:
+            return None
         p, state = self.parameters, self.state
         lag = (angle - state.phi) / p.servo_lag
-        if max(self._lasted, self._usual) < _HELD or abs(lag) > _LINEAR_LAG:
-            return None
         segments = self._equal_segments(duration, samples, (0.0, duration))
-        if len(segments) > 1 or duration > self._graded_from:
+        if len(segments) > 1 or duration > self._graded_from or abs(lag) > _LINEAR_LAG:
             return None
         self._held = held = self._ahead(segments[0], samples).swim(state, p.coupling * angle, lag)
         if self._motor:
