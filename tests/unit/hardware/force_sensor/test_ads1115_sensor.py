@@ -79,17 +79,6 @@ def test_while_the_chip_is_away_reads_raise_and_soon_after_it_is_well(
     assert counters["i2c_reconnects"] == 1
 
 
-def test_a_brown_out_costs_a_sample_and_nothing_else(rig: ForceRig) -> None:
-    sensor = rig.sensor()
-    ticks = Ticks(sensor)
-    for _ in range(40):
-        measured = ticks.next()
-        assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
-        assert measured.suspect == ""
-        rig.faults.inject("brown-out")
-    assert sensor.counters()["i2c_reconnects"] == 0
-
-
 def test_a_slow_data_rate_repeats_the_last_measurement_with_its_own_time(rig: ForceRig) -> None:
     ticks = Ticks(rig.sensor(data_rate=16))
     found = measurements(ticks.run(3.0)[4:])

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import VirtualClock
-from fishd.core.errors import Escaped, ServoError
+from fishd.core.errors import ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pulses import LONGEST, SHORTEST, pulse_width, reach
 from fishd.hardware.settings import ServoSettings
@@ -41,11 +41,6 @@ def raising(error: BaseException) -> Any:
     made = servo()
     made.driver.write = made.driver.off = made.driver.close = fail
     return made
-
-
-def test_a_driver_that_wants_to_end_the_process_is_an_error_like_any_other() -> None:
-    with pytest.raises(Escaped, match="SystemExit: 3"):
-        raising(SystemExit(3)).write(0.1)
 
 
 @pytest.mark.parametrize(

@@ -111,16 +111,6 @@ def test_a_living_fishd_notices_the_last_resort(bench: Bench) -> None:
         servo.write(0.5)
 
 
-def test_close_goes_on_when_a_step_fails(bench: Bench) -> None:
-    servo = bench.servo()
-    bench.write(servo, 0.5)
-    bench.kernel.unload(PI5)
-    bench.kernel.load(PI5, 1)
-    with pytest.raises(ServoError):
-        servo.close()
-    assert bench.exported() == []
-
-
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
     """A folder of plain files with a channel that is exported already."""

@@ -83,18 +83,6 @@ def test_a_reloaded_driver_is_found_under_its_new_number(bench: Bench) -> None:
     assert bench.exported(7) == []
 
 
-def test_a_servo_that_is_not_there_at_start_is_found_later(bench: Bench) -> None:
-    bench.kernel.unload(PI5)
-    servo = bench.servo()
-    with pytest.raises(ServoError, match=r"no PWM chip 1f00098000.pwm or .* has 1f0009c000.pwm"):
-        servo.write(0.0)
-    bench.kernel.load(PI5, 1)
-    with pytest.raises(ServoError):
-        servo.write(0.0)
-    bench.clock.sleep(0.05)
-    assert bench.write(servo, 0.0) == 1500.0
-
-
 @pytest.mark.parametrize(
     ("chips", "settings", "message"),
     [
