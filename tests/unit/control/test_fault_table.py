@@ -98,8 +98,10 @@ def test_whoever_latches_a_fault_the_servo_gets_what_its_row_says(code: str) -> 
     assert rig.recorder.kinds() == ["controller", "mode", "mode" if released else "fault"]
 
 
-@pytest.mark.parametrize("data_rate", [860], ids=["default-rate"])
-@pytest.mark.parametrize("name", SENSOR_FAULTS)
+@pytest.mark.parametrize(
+    ("name", "data_rate"),
+    [(name, 250 if name in TRANSFER_ERRORS else 860) for name in SENSOR_FAULTS],
+)
 def test_a_bad_force_ends_in_neutral_and_recovers_after_a_clear(
     rig: LockstepRig, name: str
 ) -> None:

@@ -14,7 +14,7 @@ from fishd.control.guard import Guard
 angles = st.floats(-10, 10)
 amplitudes = st.floats(1e-3, 1.5)
 ticks = st.floats(0.002, 0.2)
-slews = st.none() | st.floats(0.01, 100)
+slews = st.none() | st.floats(0.5, 100)
 
 
 @given(amplitudes, ticks, slews, st.lists(st.floats(allow_nan=False, allow_infinity=False)))

@@ -30,12 +30,12 @@ def thrust(ticks: list[Tick], rig: Rig) -> float:
 
 
 def swum(controller: str, parameters: dict[str, object], *overrides: str, wrap: Wrap) -> float:
-    """Return the mean thrust from 5 to 35 s after a start from rest [N]."""
+    """Return the mean thrust from 5 to 20 s after a start from rest [N]."""
     rig = Rig(*overrides, wrap=wrap)
     rig.run_for(REST)
     rig.start(controller, **parameters)
     rig.run_for(5.0)
-    return thrust(rig.run_for(30.0), rig)
+    return thrust(rig.run_for(15.0), rig)
 
 
 def started(rig: Rig, controller: str = "swing", **parameters: object) -> bool | None:
