@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Any
+from typing import Any, Self
 
 from msgspec import structs
 
@@ -78,13 +78,15 @@ class Rig:
         reason = self.loop.supervisor.reason
         return reason.code if reason else None
 
-    def start(self, controller: str | Controller[Any], **parameters: Any) -> None:
+    def start(self, controller: str | Controller[Any], **parameters: Any) -> Self:
+        """Give a controller command, which takes over with the next tick."""
         if isinstance(controller, str):
             name = controller
             controller = registry.create(controller, parameters, self.config.limits)
         else:
             name = type(controller).__name__.lower()
         self.loop.set_controller(name, controller)
+        return self
 
     def retune(self, **parameters: Any) -> None:
         loop = self.loop

@@ -11,8 +11,7 @@ from rigs.harness import Rig
 
 def swum(seconds: float = 3.0, *overrides: str) -> Rig:
     """A virtual fish that has swum, and was retuned in the middle of it."""
-    rig = Rig(*overrides)
-    rig.start("swing")
+    rig = Rig(*overrides).start("swing")
     rig.run_for(seconds / 2)
     rig.retune(C=0.3)
     rig.run_for(seconds / 2)

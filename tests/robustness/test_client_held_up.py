@@ -5,9 +5,9 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
-import pytest
 import zmq
 from rigs.processes import PATIENCE, wait_until
 
@@ -15,7 +15,8 @@ from fishd.camera.settings import CameraSettings, SimulatedSettings
 from fishd.core import protocol
 from fishd.core.protocol import State
 
-TIMEOUT = 1.0
+TIMEOUT = 3.0
+"""What a client waits for an answer: longer than a busy machine takes to stop it [s]."""
 SYNCHRONOUS = """
 import sys
 from fishd.client import Fish
@@ -54,32 +55,37 @@ def state_of(pid: int) -> str:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
-@pytest.mark.parametrize(
-    ("program", "answer", "said"),
-    [
-        (SYNCHRONOUS, IDLE, "idle"),
-        (ASYNCHRONOUS, IDLE, "idle"),
-        (CAMERA, CAMERA_SETTINGS, CAMERA_SETTINGS.source),
-    ],
-    ids=["Fish", "AsyncFish", "CameraRequests"],
+CLIENTS = (
+    (SYNCHRONOUS, IDLE, "idle"),
+    (ASYNCHRONOUS, IDLE, "idle"),
+    (CAMERA, CAMERA_SETTINGS, CAMERA_SETTINGS.source),
 )
-def test_an_answer_that_nobody_has_read_yet_is_no_silence(
-    tmp_path: Path, program: str, answer: object, said: str
-) -> None:
-    endpoint = f"ipc://{tmp_path}/control"
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as server:
-        server.bind(endpoint)
-        command = [sys.executable, "-c", program, endpoint, str(TIMEOUT)]
-        with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        ) as client:
-            assert server.poll(PATIENCE * 1e3)
+"""Programs, what each is answered, and what it prints then."""
+
+
+def test_an_answer_that_nobody_has_read_yet_is_no_silence(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        context, poller = stack.enter_context(zmq.Context()), zmq.Poller()
+        clients = {}
+        for number, (program, answer, words) in enumerate(CLIENTS):
+            endpoint = f"ipc://{tmp_path}/{number}"
+            server = stack.enter_context(context.socket(zmq.ROUTER))
+            server.bind(endpoint)
+            poller.register(server, zmq.POLLIN)
+            command = [sys.executable, "-c", program, endpoint, str(TIMEOUT)]
+            client = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            )
+            clients[server] = stack.enter_context(client), answer, words
+        for _ in clients:  # in the order in which they ask
+            ((server, _), *_) = poller.poll(PATIENCE * 1e3)
+            client, answer, _ = clients[server]
             *envelope, payload = server.recv_multipart()
             os.kill(client.pid, signal.SIGSTOP)
-            wait_until(lambda: state_of(client.pid) == "T")
+            wait_until(lambda pid=client.pid: state_of(pid) == "T")
             request = protocol.decode_request(payload)
             server.send_multipart([*envelope, protocol.success(request.id, answer)])
-            time.sleep(TIMEOUT + 0.2)  # longer than the client means to wait
+        time.sleep(TIMEOUT + 0.2)  # longer than a client means to wait
+        for client, _, words in clients.values():
             os.kill(client.pid, signal.SIGCONT)
-            out, err = client.communicate(timeout=PATIENCE)
-    assert (out, err) == (f"{said}\n", "")
+            assert client.communicate(timeout=PATIENCE) == (f"{words}\n", "")

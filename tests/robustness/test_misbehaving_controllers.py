@@ -13,9 +13,7 @@ pytestmark = pytest.mark.usefixtures("sigint_ignored")
 
 
 def started(method: str, deed: str) -> Rig:
-    rig = Rig()
-    rig.start(Zoo(ZooParameters(method=method, deed=deed), LIMITS))
-    return rig
+    return Rig().start(Zoo(ZooParameters(method=method, deed=deed), LIMITS))
 
 
 def check_latched(rig: Rig) -> None:
@@ -86,8 +84,7 @@ class Forgetful(Zoo):
 
 @pytest.mark.parametrize("lost", [None, {"a": 1}, 3, ZooParameters(deed="\udcff")])
 def test_a_controller_that_lost_its_parameters_does_not_take_over(lost: Any) -> None:
-    rig = Rig()
-    rig.start("square")
+    rig = Rig().start("square")
     rig.run(3)
     with pytest.raises(Exception) as caught:  # noqa: PT011  (that it is one is what matters)
         rig.start(Forgetful(lost))

@@ -25,15 +25,13 @@ def correlation(rig: Rig, seconds: float) -> float:
 
 @pytest.mark.parametrize("frequency", [1.0, 1.7, 2.5])
 def test_the_fin_velocity_follows_the_true_one(frequency: float) -> None:
-    rig = Rig()
-    rig.start("square", frequency=frequency)
+    rig = Rig().start("square", frequency=frequency)
     rig.run_for(10)
     assert correlation(rig, 20) > 0.97
 
 
 def test_an_offset_of_the_sensor_is_found_and_taken_off() -> None:
-    rig = Rig("simulation.offset_y=0.05", "simulation.drift=0.02")
-    rig.start("square", frequency=1.7)
+    rig = Rig("simulation.offset_y=0.05", "simulation.drift=0.02").start("square", frequency=1.7)
     rig.run_for(10)
     ticks = rig.run_for(20)
     mean = sum(tick.fin_velocity for tick in ticks) / len(ticks)

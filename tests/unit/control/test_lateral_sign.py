@@ -99,8 +99,7 @@ def test_a_push_with_a_force_that_is_not_to_be_believed_shows_nothing(tick: int)
 
 
 def test_a_push_without_a_rest_or_small_or_short_or_drowned_in_noise_shows_nothing() -> None:
-    restless = Rig()
-    restless.start("swing")
+    restless = Rig().start("swing")
     restless.run_for(5.0)
     assert restless.loop.lateral_sign.reversed is None
     for overrides, parameters in (

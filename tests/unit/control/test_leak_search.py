@@ -14,8 +14,7 @@ RIGHT = PlantParameters().thrust_coefficient / DRAG
 
 def found(*overrides: str, seconds: float = 60.0, **parameters: object) -> float:
     """The leak that is in use after a minute of swing [s]."""
-    rig = Rig("estimator.leak=auto", *overrides)
-    rig.start("swing", **parameters)
+    rig = Rig("estimator.leak=auto", *overrides).start("swing", **parameters)
     leak = rig.run_for(seconds)[-1].leak
     assert leak is not UNSET
     return float(leak)
@@ -48,8 +47,7 @@ def test_a_servo_that_shakes_the_sensor_leaves_it_as_it_was(reaction: float) -> 
 
 
 def test_a_fish_that_rests_keeps_what_was_found() -> None:
-    rig = Rig("estimator.leak=auto", f"plant.lateral_drag={3.0 * DRAG}")
-    rig.start("swing")
+    rig = Rig("estimator.leak=auto", f"plant.lateral_drag={3.0 * DRAG}").start("swing")
     swum = rig.run_for(60.0)[-1].leak
     rig.loop.stop()
     assert rig.run_for(120.0)[-1].leak == swum

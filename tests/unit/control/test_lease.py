@@ -106,8 +106,7 @@ def test_a_second_experiment_is_told_who_has_the_fish_and_since_when() -> None:
 
 
 def test_what_swam_by_hand_swims_on_when_a_lease_ends_that_changed_nothing() -> None:
-    rig = Rig()
-    rig.start("sine")
+    rig = Rig().start("sine")
     rig.loop.lease.take("measure", "lab", 42, SECONDS)
     assert rig.run_for(2.0 * SECONDS)[-1].controller == "sine"
     assert len(expirations(rig)) == 1

@@ -30,8 +30,7 @@ def test_missed_slots_are_counted_and_the_next_observation_covers_them() -> None
         seen.append(round(observation.dt, 9))
         return 0.0
 
-    rig = Rig()
-    rig.start(Scripted(note))
+    rig = Rig().start(Scripted(note))
     rig.run(2)
     tick = rig.run(missed=3)[0]
     assert seen == [0.05, 0.05, 0.2]
@@ -41,8 +40,7 @@ def test_missed_slots_are_counted_and_the_next_observation_covers_them() -> None
 
 
 def test_stopping_fades_to_neutral_within_the_fade_time() -> None:
-    rig = Rig()
-    rig.start("hold", angle=0.42)
+    rig = Rig().start("hold", angle=0.42)
     rig.run(2)
     rig.loop.stop()
     angles = [tick.phi_c for tick in rig.run(8)]
@@ -93,8 +91,7 @@ def test_an_emergency_stop_ends_the_pulses_before_the_next_tick() -> None:
 
 
 def test_after_an_emergency_stop_the_way_back_is_clear_and_gentle() -> None:
-    rig = Rig()
-    rig.start("hold", angle=0.42)
+    rig = Rig().start("hold", angle=0.42)
     rig.run(2)
     rig.loop.estop("test")
     rig.run(2)

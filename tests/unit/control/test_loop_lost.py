@@ -123,8 +123,7 @@ def test_a_hang_in_the_very_write_that_fails_is_told_as_the_hang() -> None:
 
 
 def test_a_servo_that_waits_for_ever_goes_on_after_a_hang() -> None:
-    rig = Rig()
-    rig.start("square")
+    rig = Rig().start("square")
     rig.run(10)
     assert rig.run(1, missed=40)[-1].mode == "running"
 

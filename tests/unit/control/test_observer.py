@@ -21,15 +21,13 @@ def error(rig: Rig, seconds: float, delay: int = 0) -> float:
 
 @pytest.mark.parametrize("plant", [(), ("plant.backlash=0.02", "plant.cable_slack=0.02")])
 def test_it_gives_the_fin_velocity_in_rad_per_second(plant: tuple[str, ...]) -> None:
-    rig = Rig(OBSERVER, *REAL, *plant)
-    rig.start("square", frequency=1.7)
+    rig = Rig(OBSERVER, *REAL, *plant).start("square", frequency=1.7)
     rig.run_for(10)
     assert error(rig, 20) < 0.02
 
 
 def test_it_looks_ahead_by_the_delay_of_the_servo() -> None:
-    rig = Rig(OBSERVER, *REAL, "plant.servo_delay=0.1")
-    rig.start("square", frequency=1.25)
+    rig = Rig(OBSERVER, *REAL, "plant.servo_delay=0.1").start("square", frequency=1.25)
     rig.run_for(10)
     assert error(rig, 20, delay=2) < 0.25  # the commands of these two ticks are not known yet
 
@@ -48,8 +46,7 @@ def test_skipped_slots_and_a_sensor_that_fails_once_cost_little() -> None:
 
 @pytest.mark.parametrize("seconds", [1.2, 600.0])
 def test_after_a_fishd_that_stood_still_it_finds_the_fin_anew(seconds: float) -> None:
-    rig = Rig(OBSERVER, *REAL)
-    rig.start("square", frequency=1.7)
+    rig = Rig(OBSERVER, *REAL).start("square", frequency=1.7)
     rig.run_for(10)
     rig.run(1, missed=round(seconds / rig.config.tick))
     rig.run_for(1)

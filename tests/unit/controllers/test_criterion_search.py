@@ -87,8 +87,7 @@ def test_neither_drift_nor_a_turned_sensor_misleads_it() -> None:
 
 
 def test_it_shows_what_it_does_in_telemetry() -> None:
-    rig = Rig()
-    rig.start("swing", C="auto")
+    rig = Rig().start("swing", C="auto")
     ticks = rig.run(600)
     tried = {tick.quantities["criterion"] for tick in ticks if tick.quantities}
     assert {LADDER[BEGIN].C, LADDER[BEGIN + 1].C, LADDER[BEGIN - 1].C} <= tried
@@ -97,8 +96,7 @@ def test_it_shows_what_it_does_in_telemetry() -> None:
 
 
 def test_it_searches_anew_when_the_fish_changes() -> None:
-    rig = Rig()
-    rig.start("swing", C="auto")
+    rig = Rig().start("swing", C="auto")
     assert any(tick.quantities["searching"] == 0.0 for tick in rig.run(900))
     rig.change_fin(0.03)
     assert any(tick.quantities["searching"] == 1.0 for tick in rig.run(200))

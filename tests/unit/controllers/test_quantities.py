@@ -29,8 +29,7 @@ class Showing(Scripted):
 
 
 def test_every_tick_shows_the_speeds_that_swing_reverses_by() -> None:
-    rig = Rig()
-    rig.start("swing", C=0.5)
+    rig = Rig().start("swing", C=0.5)
     ticks = rig.run(100)
     assert all(set(tick.quantities) == {"top_speed", "reversal_speed", "since_reversal"}
                for tick in ticks)  # fmt: skip
@@ -43,16 +42,14 @@ def test_every_tick_shows_the_speeds_that_swing_reverses_by() -> None:
 
 
 def test_a_square_wave_reverses_where_its_phase_says_so() -> None:
-    rig = Rig()
-    rig.start("square", frequency=1.3)
+    rig = Rig().start("square", frequency=1.3)
     for tick in rig.run(60):
         assert isinstance(tick.quantities, dict)
         assert (tick.quantities["phase"] < 0.5) == (tick.phi_c > 0.0)
 
 
 def test_nothing_is_shown_once_the_controller_is_out_of_command() -> None:
-    rig = Rig()
-    rig.start("swing")
+    rig = Rig().start("swing")
     rig.run(5)
     rig.loop.stop()
     assert "quantities" not in msgspec.to_builtins(rig.run(1)[-1])
@@ -64,8 +61,7 @@ def test_nothing_is_shown_once_the_controller_is_out_of_command() -> None:
 
 @pytest.mark.parametrize("number", [2, np.float32(0.5), np.array([0.25])])
 def test_any_real_number_can_be_shown(number: Any) -> None:
-    rig = Rig()
-    rig.start(Showing(number))
+    rig = Rig().start(Showing(number))
     assert rig.run(2)[-1].quantities == {"shown": float(np.asarray(number).item())}
 
 
@@ -79,8 +75,7 @@ class Poisoned:
 
 @pytest.mark.parametrize("shown", [*BAD.values(), Poisoned()], ids=[*BAD, "poisoned"])
 def test_what_is_no_finite_number_is_left_out_and_the_fish_swims_on(shown: Any) -> None:
-    rig = Rig()
-    rig.start(Showing(shown))
+    rig = Rig().start(Showing(shown))
     tick = rig.run(3)[-1]
     assert (tick.mode, tick.phi_c) == ("running", 0.1)
     assert b"quantities" not in msgspec.json.encode(tick)
@@ -108,8 +103,7 @@ def test_to_count_on_from_nothing_is_told_with_what_would_be_right() -> None:
             self.beats += 1
             return 0.0
 
-    rig = Rig()
-    rig.start(Counting(lambda _: 0.0))
+    rig = Rig().start(Counting(lambda _: 0.0))
     rig.run(1)
     assert rig.reason == "controller-error"
     message = rig.loop.supervisor.reason.message  # type: ignore[union-attr]

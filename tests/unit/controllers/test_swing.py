@@ -54,8 +54,7 @@ def test_without_any_sign_of_slowing_down_it_reverses_after_the_longest_half_per
 def test_a_longer_longest_half_period_changes_nothing_where_the_fin_tells_when(tick: float) -> None:
     swum = []
     for longest in (1.0, 10.0):
-        rig = Rig(f"tick={tick}")
-        rig.start("swing", longest_half_period=longest)
+        rig = Rig(f"tick={tick}").start("swing", longest_half_period=longest)
         swum.append([tick.phi_c for tick in rig.run_for(15)])
     assert swum[0] == swum[1]
 
@@ -67,8 +66,7 @@ def test_it_takes_over_towards_the_side_that_is_in_force() -> None:
 
 @pytest.mark.parametrize(("amplitude", "tick"), [(0.02, 0.05), (1.4, 0.01)])
 def test_it_starts_from_rest_and_beats_within_seconds(amplitude: float, tick: float) -> None:
-    rig = Rig(f"amplitude_limit={amplitude}", f"tick={tick}", *IMPERFECT)
-    rig.start("swing")
+    rig = Rig(f"amplitude_limit={amplitude}", f"tick={tick}", *IMPERFECT).start("swing")
     rig.run_for(5)
     assert 0.6 < rig.run(1)[-1].frequency < 3.0
 
@@ -85,8 +83,7 @@ def test_it_never_stalls_whatever_the_offset(C: float) -> None:
 
 
 def test_it_swims_on_when_the_offset_jumps() -> None:
-    rig = Rig()
-    rig.start("swing")
+    rig = Rig().start("swing")
     rig.run_for(10)
     rig.fish._imperfections._settings = load(None, ["simulation.offset_y=0.5"]).simulation
     rig.run_for(20)

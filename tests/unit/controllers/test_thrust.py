@@ -51,8 +51,7 @@ def test_with_a_measured_factor_it_holds_the_target_within_five_seconds(target: 
 
 
 def test_with_nothing_known_it_goes_by_the_ripple_and_says_how_badly_it_knows() -> None:
-    rig = Rig(*RIG)
-    rig.start("thrust", target=0.010)
+    rig = Rig(*RIG).start("thrust", target=0.010)
     rig.run_for(10)
     ticks = rig.run_for(20)
     assert true_thrust(ticks) == pytest.approx(0.010, rel=0.08)

@@ -76,8 +76,7 @@ def test_a_thrust_that_was_held_by_a_measured_factor_is_held_by_it_again(tmp_pat
 
 
 def test_the_observer_is_rerun_and_sees_another_fish_where_asked(tmp_path: Path) -> None:
-    rig = Rig("estimator.kind=observer", "simulation.noise=0.002")
-    rig.start("swing")
+    rig = Rig("estimator.kind=observer", "simulation.noise=0.002").start("swing")
     rig.run_for(10)
     run = open_run(recorded(rig, tmp_path / "run"))
     result = rerun(run)
@@ -87,8 +86,7 @@ def test_the_observer_is_rerun_and_sees_another_fish_where_asked(tmp_path: Path)
 
 
 def test_a_swim_before_the_recording_began_has_an_unknown_past(tmp_path: Path) -> None:
-    rig = Rig()
-    rig.start("swing", C=0.4)
+    rig = Rig().start("swing", C=0.4)
     rig.run_for(20)
     with RunWriter(tmp_path / "run") as writer:
         writer.describe(rig.config)
@@ -124,8 +122,7 @@ def test_another_fishd_is_judged_with_its_own_configuration(tmp_path: Path) -> N
 
 
 def test_another_controller_sees_what_the_recorded_one_saw(tmp_path: Path) -> None:
-    rig = Rig()
-    rig.start("square", frequency=1.667)
+    rig = Rig().start("square", frequency=1.667)
     rig.run_for(10)
     run = open_run(recorded(rig, tmp_path / "run"))
     (stretch,) = rerun(run, "swing", {"C": 0.6}).stretches
@@ -177,8 +174,7 @@ def test_a_new_zero_of_the_force_sensor_is_one_for_the_rerun_too(tmp_path: Path)
 def test_time_stands_still_for_a_controller_only_where_it_did(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, source: str, virtual: bool
 ) -> None:
-    rig = Rig()
-    rig.start("swing")
+    rig = Rig().start("swing")
     rig.run_for(1)
     path = recorded(rig, tmp_path / "run", source=source)
     seen = []

@@ -29,9 +29,7 @@ NOISY = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")
 
 def flipping(tmp_path: Path, *overrides: str) -> Rig:
     """A loop in which a policy is active that wants to reverse in every tick."""
-    rig = Rig(*overrides)
-    rig.start("ppo", policy=str(write(tmp_path)))
-    return rig
+    return Rig(*overrides).start("ppo", policy=str(write(tmp_path)))
 
 
 def longest_chatter(ticks: list[Tick]) -> float:
@@ -115,8 +113,7 @@ def test_a_policy_keeps_to_the_dwell_and_warm_ups_are_no_reversals(tmp_path: Pat
 
 
 def test_a_policy_takes_over_as_if_the_tail_had_reversed_just_then(tmp_path: Path) -> None:
-    rig = Rig()
-    rig.start("hold", angle=0.3)
+    rig = Rig().start("hold", angle=0.3)
     rig.run(10)
     rig.start("ppo", policy=str(write(tmp_path)))
     assert [tick.phi_c for tick in rig.run(4)] == [0.3] * 3 + [-0.42]
@@ -127,8 +124,7 @@ def test_controllers_that_know_when_to_reverse_are_not_limited(name: str) -> Non
     parameters = {"square": {"frequency": 4.0}, "swing": {"C": 1.0}}[name]
     found = []
     for dwell in (0.0, 2.0):
-        rig = Rig(*NOISY, f"chatter.dwell={dwell}")
-        rig.start(name, **parameters)
+        rig = Rig(*NOISY, f"chatter.dwell={dwell}").start(name, **parameters)
         found.append([tick.phi_c for tick in rig.run_for(10.0)])
     assert found[0] == found[1]
 

@@ -35,8 +35,7 @@ def refusal(path: Path | str, limits: Limits = LIMITS) -> str:
 def test_a_policy_in_the_loop_gives_exactly_the_angles_of_its_network(tmp_path: Path) -> None:
     # -0.5·φ_c/Φ + 0.25: from neutral φ_c/Φ goes 1/4, 1/8, 3/16, ..., all of them exact.
     path = write(tmp_path, to_onnx(linear(-0.5, bias=0.25), "tanh", card()))
-    rig = Rig("slew_limit=null")
-    rig.start("ppo", policy=str(path))
+    rig = Rig("slew_limit=null").start("ppo", policy=str(path))
     angles = [tick.phi_c for tick in rig.run(5)]
     # The input is float32, so that φ_c/Φ comes back rounded to that.
     assert angles == pytest.approx([0.42 * x for x in (1 / 4, 1 / 8, 3 / 16, 5 / 32, 11 / 64)])
@@ -58,8 +57,7 @@ def test_what_the_network_sees_is_each_feature_over_its_scale(tmp_path: Path) ->
 
 def test_a_policy_for_a_smaller_amplitude_stays_within_it(tmp_path: Path) -> None:
     path = write(tmp_path, to_onnx(linear(-9.0, bias=9.0), "tanh", card(amplitude=0.2)))
-    rig = Rig()
-    rig.start("ppo", policy=str(path))
+    rig = Rig().start("ppo", policy=str(path))
     assert max(tick.phi_c for tick in rig.run(10)) == 0.2
 
 
@@ -84,8 +82,7 @@ def root_of_what_is_left(largest: float, about: Card) -> bytes:
 def test_an_output_that_is_not_finite_in_the_tick_is_a_fault_at_neutral(tmp_path: Path) -> None:
     # No probe is that large, but with this scale an angle of 0.42 rad is.
     content = root_of_what_is_left(1e6, card(("instruction_angle", 1e-8)))
-    rig = Rig()
-    rig.start("ppo", policy=str(write(tmp_path, content)))
+    rig = Rig().start("ppo", policy=str(write(tmp_path, content)))
     first, *_, last = rig.run(20)
     assert first.phi_c == 0.42  # √1e6, cut to 1
     assert (rig.mode, rig.reason) == ("fault", "controller-error")
@@ -134,8 +131,7 @@ def test_a_policy_must_be_given() -> None:
 
 
 def test_the_policy_does_not_change_in_flight(tmp_path: Path) -> None:
-    rig = Rig()
-    rig.start("ppo", policy=str(write(tmp_path)))
+    rig = Rig().start("ppo", policy=str(write(tmp_path)))
     rig.run()
     with pytest.raises(ParameterError, match="it cannot change in flight"):
         rig.retune(policy=str(write(tmp_path, name="other")))
