@@ -24,8 +24,8 @@ def swinging(settings: SimulatedCameraSettings, *, amplitude: float = 0.2) -> Pi
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("rig", [DEFAULT, WEB, BAD])
-@pytest.mark.parametrize(("off", "tilt"), [(0.0, 0.0), (3.0, 0.02), (-3.0, -0.02), (6.5, 0.1)])
+@pytest.mark.parametrize("rig", [DEFAULT, BAD])
+@pytest.mark.parametrize(("off", "tilt"), [(0.0, 0.0), (-3.0, -0.02), (6.5, 0.1)])
 def test_the_axis_is_found_within_a_quarter_of_a_pixel(
     rig: SimulatedCameraSettings, off: float, tilt: float, seed: int
 ) -> None:

@@ -55,7 +55,7 @@ def test_a_long_conversion_has_the_mean_of_all_of_the_hum() -> None:
 
 
 def test_spikes_are_as_frequent_as_said_and_shared_by_the_samples_of_a_window() -> None:
-    seconds = 2000
+    seconds = 1000
     found = at_rest(round(seconds / TICK), spike_rate=0.5, spike_size=0.2)
     for values in ([f.fx for f in found], [f.fy for f in found]):
         spikes = [round(value / (0.2 / SAMPLES), 6) for value in values if value]
@@ -65,7 +65,7 @@ def test_spikes_are_as_frequent_as_said_and_shared_by_the_samples_of_a_window() 
         upwards = sum(size for size in spikes if size > 0)
         assert upwards == pytest.approx(0.5 * count, abs=2.0 * math.sqrt(count))
     together = sum(1 for f in found if f.fx and f.fy)
-    assert together < 60  # 0.025² of the windows by chance: 25
+    assert together < 30  # 0.025² of the windows by chance: 12
 
 
 def test_forces_are_told_in_whole_steps() -> None:

@@ -23,13 +23,6 @@ def test_a_servo_without_pulses_draws_its_idle_current_only() -> None:
     assert mean_power(fish, [None] * 10) == pytest.approx(6.0 * 0.01, rel=1e-12)
 
 
-def test_a_wheel_at_full_speed_without_a_tail_draws_what_the_data_sheet_says() -> None:
-    # So far away that it turns at Ω all the time; and the rotor has been brought to speed before.
-    fish = TetheredFish(PLANT, motor=replace(MOTOR, tail_inertia=0.0, idle_current=0.0))
-    fish.advance(1e3, 0.05, 1)
-    assert fish.advance(1e3, 0.05, 1).power == pytest.approx(6.0 * 0.2, rel=1e-9)
-
-
 def test_the_tail_costs_what_the_water_takes_from_it() -> None:
     # A motor without losses, whose voltage is its torque: k_e = k_t. What is left is τ φ̇, and on a
     # slow ramp, where nothing comes back, that is what damping takes and what the spring keeps.

@@ -266,25 +266,6 @@ def test_the_fin_peak_is_the_largest_angle_at_any_time_in_the_window(
     assert peak >= (1.0 - 1e-6) * max(seen) - 1e-12  # far below, the equations are not resolved
 
 
-@settings(max_examples=30)
-@given(
-    st.floats(0.1, 100.0),
-    st.floats(-10.0, 10.0),
-    st.floats(-1000.0, 1000.0),
-    st.sampled_from([0.1, 12.5, 1000.0]),
-)
-def test_quadratic_drag_stops_any_fin(
-    drag: float, angle: float, rate: float, omega0: float
-) -> None:
-    fish = TetheredFish(Fish(quadratic_drag=drag, omega0=omega0), PlantState(0.0, angle, rate))
-    energy = rate**2 + (omega0 * angle) ** 2
-    for _ in range(5):
-        fish.advance(0.0, min(0.1, 2.0 / omega0), samples=3)
-        _, angle, rate = fish.state
-        assert rate**2 + (omega0 * angle) ** 2 <= energy * (1.0 + 1e-9)
-        energy = rate**2 + (omega0 * angle) ** 2
-
-
 @pytest.mark.parametrize(("duration", "samples"), [(0.0, 10), (-0.1, 10), (0.05, 0)])
 def test_a_window_without_time_or_samples_is_refused(duration: float, samples: int) -> None:
     with pytest.raises(ValueError, match="needs time and samples"):

@@ -24,20 +24,6 @@ def mass(body: Beam) -> Array:
     return moves.T @ (body.excess.ravel()[:, None] * moves)
 
 
-def bent(body: Beam, force: Array) -> Array:
-    """Unknowns at rest under forces on the slices, shape (slices, 3), by small steps."""
-    q = np.zeros(body.size)
-    for share in np.linspace(0.1, 1.0, 10):
-        for _ in range(20):
-            moves = body.motion(body.shape(q)[1]).reshape(-1, body.size)
-            rest = share * (moves.T @ force.ravel()) - body.K @ q
-            change = np.zeros(body.size)
-            free = body.free
-            change[free] = np.linalg.solve(body.K[np.ix_(free, free)], rest[free])
-            q += 0.5 * change
-    return q
-
-
 def test_a_free_beam_rings_at_the_frequencies_of_euler_and_bernoulli() -> None:
     body = beam()
     squares = np.sort(np.linalg.eigvals(np.linalg.solve(mass(body), body.K)).real)
@@ -45,14 +31,6 @@ def test_a_free_beam_rings_at_the_frequencies_of_euler_and_bernoulli() -> None:
     line = DENSITY * 2.0 * HALF
     asked = np.array([22.3733, 61.6728, 120.903]) * np.sqrt(EI / line) / LENGTH**2
     assert np.sqrt(squares[3:6]) == pytest.approx(asked, rel=0.01)
-
-
-def test_its_own_weight_bends_a_clamped_beam_as_it_should() -> None:
-    body = beam(clamped=True)
-    weight = np.zeros((body.slices, 3))
-    weight[:, 1] = 0.01 * body.spacing
-    tip = body.shape(bent(body, weight))[0][-1, 1]
-    assert tip == pytest.approx(0.01 * LENGTH**4 / (8.0 * EI), rel=0.01)
 
 
 def test_muscles_that_ask_for_an_even_curvature_bend_it_to_an_arc() -> None:
