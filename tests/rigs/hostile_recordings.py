@@ -88,14 +88,6 @@ def tick_of(good: Good, **changes: Any) -> dict[str, Any]:
     return {**msgspec.json.decode(next(payloads), type=dict[str, Any]), **changes}
 
 
-# Sizes
-
-
-@file
-def zstd_chunk_of_8_gb(good: Good) -> bytes:
-    return with_first_chunk(good, chunk(b"x" * 1000, size=CLAIM))
-
-
 @file
 def zstd_frame_of_8_gb(good: Good) -> bytes:
     frame = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", CLAIM) + b"\x03\x00\x00" + b"x" * 99
@@ -117,40 +109,15 @@ def lz4_frame_of_8_gb(good: Good) -> bytes:
 
 
 @file
-def lz4_chunk_of_8_gb(good: Good) -> bytes:
-    return with_first_chunk(good, chunk(b"", "lz4", data=lz4.frame.compress(b"x"), size=CLAIM))
-
-
-@file
 def lz4_frame_of_128_mb_in_a_chunk_of_1_kb(good: Good) -> bytes:
     frame = lz4.frame.compress(bytes(2**27), store_size=False)
     return with_first_chunk(good, chunk(b"", "lz4", data=frame, size=1000))
 
 
 @file
-def chunks_of_zeros(good: Good) -> bytes:
-    return with_more(good, *[chunk(bytes(2**25))] * 40)
-
-
-@file
-def half_a_million_messages(good: Good) -> bytes:
-    return with_more(good, chunk(message(TICK, b"") * (2**22 // 31)))
-
-
-@file
-def record_of_8_exabytes(good: Good) -> bytes:
-    return join(good[:6]) + pack(Opcode.CHUNK, b"x" * 99, 2**63) + join(good[6:])
-
-
-@file
 def chunk_whose_data_are_longer_than_it(good: Good) -> bytes:
     opcode, body = chunk(b"x" * 99)
     return with_first_chunk(good, (opcode, body[:36] + struct.pack("<Q", 2**62) + body[44:]))
-
-
-@file
-def messages_longer_than_their_chunk(good: Good) -> bytes:
-    return with_first_chunk(good, chunk(pack(Opcode.MESSAGE, b"x" * 99, 2**62)))
 
 
 @file
@@ -180,9 +147,6 @@ def thousands_of_beginnings_of_chunks(good: Good) -> bytes:
     return join(good[:6]) + (b"\xff" + beginning) * 5_000
 
 
-# Configurations
-
-
 @file
 def aliases(good: Good) -> bytes:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
@@ -190,48 +154,10 @@ def aliases(good: Good) -> bytes:
     return with_config(good, "\n".join(lines).encode())
 
 
-@file
-def yaml_that_contains_itself(good: Good) -> bytes:
-    return with_config(good, b"&a {plant: *a, robot: *a}")
-
-
-@file
-def deep_yaml(good: Good) -> bytes:
-    return with_config(good, b"[" * 2_000_000)
-
-
-@file
-def deep_but_short_yaml(good: Good) -> bytes:
-    return with_config(good, b"a: " + b"[" * 30_000)
-
-
-@file
-def yaml_with_tags(good: Good) -> bytes:
-    return with_config(good, b"tick: !!bool maybe\nname: !!python/object/apply:os.system [exit 1]")
-
-
-@file
-def yaml_of_bytes(good: Good) -> bytes:
-    return with_config(good, bytes(range(256)))
-
-
-@file
-def another_robot(good: Good) -> bytes:
-    return with_config(good, b"robot: pi\ntick: 1.0e-300\nestimator: {kind: observer}")
-
-
-# Frames
-
-
 def picture(good: Good, data: str, **more: Any) -> bytes:
     head = {"t": 1.0, "time": 1.0, "available": 1.0, "seq": 9, "session": ODD}
     stamp = {"timestamp": {"sec": 1, "nsec": 0}, "data": data}
     return with_messages(good, CAMERA, [{**head, **stamp, **more}])
-
-
-@file
-def frame_without_data(good: Good) -> bytes:
-    return picture(good, "")
 
 
 @file
@@ -249,24 +175,11 @@ def frame_with_damaged_pixels(good: Good) -> bytes:
 
 
 @file
-def frame_without_a_head(good: Good) -> bytes:
-    return with_messages(good, CAMERA, [{"t": ODD}])
-
-
-# Numbers and texts
-
-
-@file
 def numbers_that_no_fish_has(good: Good) -> bytes:
     changes = [{name: 1e308 * sign} for name in ("fx", "phi_c", "age_ms", "t") for sign in (1, -1)]
     return with_messages(
         good, TICK, [tick_of(good, seq=61 + i, **c) for i, c in enumerate(changes)]
     )
-
-
-@file
-def a_number_of_400_digits(good: Good) -> bytes:
-    return with_messages(good, TICK, [tick_of(good, seq=10**400)])
 
 
 @file
@@ -326,41 +239,51 @@ def thousands_of_events(good: Good) -> bytes:
 
 
 @file
-def daemons_without_a_number(good: Good) -> bytes:
-    return with_more(
+def cut_off(good: Good) -> bytes:
+    whole = join(good)
+    return whole[: len(whole) // 2]
+
+
+FILES |= {
+    "zstd-chunk-of-8-gb": lambda good: with_first_chunk(good, chunk(b"x" * 1000, size=CLAIM)),
+    "lz4-chunk-of-8-gb": lambda good: with_first_chunk(
+        good, chunk(b"", "lz4", data=lz4.frame.compress(b"x"), size=CLAIM)
+    ),
+    "chunks-of-zeros": lambda good: with_more(good, *[chunk(bytes(2**25))] * 40),
+    "half-a-million-messages": lambda good: with_more(
+        good, chunk(message(TICK, b"") * (2**22 // 31))
+    ),
+    "record-of-8-exabytes": lambda good: (
+        join(good[:6]) + pack(Opcode.CHUNK, b"x" * 99, 2**63) + join(good[6:])
+    ),
+    "messages-longer-than-their-chunk": lambda good: with_first_chunk(
+        good, chunk(pack(Opcode.MESSAGE, b"x" * 99, 2**62))
+    ),
+    "yaml-that-contains-itself": lambda good: with_config(good, b"&a {plant: *a, robot: *a}"),
+    "deep-yaml": lambda good: with_config(good, b"[" * 2_000_000),
+    "deep-but-short-yaml": lambda good: with_config(good, b"a: " + b"[" * 30_000),
+    "yaml-with-tags": lambda good: with_config(
+        good, b"tick: !!bool maybe\nname: !!python/object/apply:os.system [exit 1]"
+    ),
+    "yaml-of-bytes": lambda good: with_config(good, bytes(range(256))),
+    "another-robot": lambda good: with_config(
+        good, b"robot: pi\ntick: 1.0e-300\nestimator: {kind: observer}"
+    ),
+    "frame-without-data": lambda good: picture(good, ""),
+    "frame-without-a-head": lambda good: with_messages(good, CAMERA, [{"t": ODD}]),
+    "a-number-of-400-digits": lambda good: with_messages(good, TICK, [tick_of(good, seq=10**400)]),
+    "daemons-without-a-number": lambda good: with_more(
         good,
         metadata("fishd.daemon", {}),
         attachment("config.yaml", b"tick: 0.05"),
         metadata("fishd.daemon", {"number": "9" * 5000, "lowest": "nan", "highest": ODD}),
         attachment("config.yaml", b"tick: 0.05"),
         attachment("calibrations.json", b"[" * 100_000),
-    )
-
-
-@file
-def limits_that_are_no_numbers(good: Good) -> bytes:
-    return with_more(good, metadata("fishd.daemon", {"number": "0", "lowest": ODD}))
-
-
-# Files
-
-
-@file
-def empty(good: Good) -> bytes:
-    return b""
-
-
-@file
-def nothing_but_magic(good: Good) -> bytes:
-    return MAGIC
-
-
-@file
-def nothing_but_records_of_nothing(good: Good) -> bytes:
-    return join([(Opcode.DATA_END, b"")] * 10_000)
-
-
-@file
-def cut_off(good: Good) -> bytes:
-    whole = join(good)
-    return whole[: len(whole) // 2]
+    ),
+    "limits-that-are-no-numbers": lambda good: with_more(
+        good, metadata("fishd.daemon", {"number": "0", "lowest": ODD})
+    ),
+    "empty": lambda good: b"",
+    "nothing-but-magic": lambda good: MAGIC,
+    "nothing-but-records-of-nothing": lambda good: join([(Opcode.DATA_END, b"")] * 10_000),
+}
