@@ -74,6 +74,7 @@ def test_a_new_frequency_keeps_phase(name: str, before: float, after: float, tic
     commands(changed, ticks)
     commands(steady, ticks)
     changed.retune(type(changed.parameters)(frequency=after))
+    assert changed.parameters.frequency == after
     steady_next, changed_next = steady.update(observe(dt=1e-9)), changed.update(observe(dt=1e-9))
     assert changed_next == pytest.approx(steady_next, abs=1e-6)
 
