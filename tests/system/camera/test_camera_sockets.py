@@ -5,8 +5,8 @@ import os
 import resource
 import socket
 import time
-from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 
 import numpy as np
@@ -45,16 +45,21 @@ def camera(both: Both) -> CameraProcess:
     return both[1]
 
 
-def ask(camera: CameraProcess, *parts: bytes) -> list[bytes] | None:
-    """The answer to a message from a bare client."""
+Make = Callable[[int], "zmq.Socket[bytes]"]
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    """Return what makes bare sockets, which end with the test."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    try:
-        dealer = context.socket(zmq.DEALER)
-        dealer.connect(camera.endpoint)
-        dealer.send_multipart(parts)
-        return dealer.recv_multipart() if dealer.poll(PATIENCE * 1e3) else None
-    finally:
-        context.destroy(linger=0)
+    sockets = []
+
+    def made(kind: int) -> "zmq.Socket[bytes]":
+        sockets.append(context.socket(kind))
+        return sockets[-1]
+
+    yield made
+    context.destroy(linger=0)
 
 
 @pytest.mark.parametrize(
@@ -67,56 +72,38 @@ def ask(camera: CameraProcess, *parts: bytes) -> list[bytes] | None:
     ],
 )
 def test_a_request_that_is_none_gets_an_error(
-    camera: CameraProcess, request_: bytes, code: str
+    camera: CameraProcess, make: Make, request_: bytes, code: str
 ) -> None:
-    reply = ask(camera, request_)
-    assert reply
-    assert json.loads(reply[-1])["error"]["code"] == code
+    dealer = make(zmq.DEALER)
+    dealer.connect(camera.endpoint)
+    dealer.send(request_)
+    assert dealer.poll(PATIENCE * 1e3)
+    assert json.loads(dealer.recv_multipart()[-1])["error"]["code"] == code
     assert camera.status().state == "streaming"
 
 
-def test_a_flood_of_garbage_is_survived_while_frames_go_on(camera: CameraProcess) -> None:
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    strangers = []
+def test_a_flood_of_garbage_is_survived_while_frames_go_on(
+    camera: CameraProcess, make: Make
+) -> None:
     with camera.client() as client:
-        try:
-            for address in (camera.endpoint, camera.frames):
-                for kind in (zmq.DEALER, zmq.SUB, zmq.PUSH):
-                    stranger = context.socket(kind)
-                    strangers.append(stranger)
-                    if kind == zmq.SUB:
-                        for number in range(200):
-                            stranger.subscribe(os.urandom(number))
-                    stranger.connect(address)
-                    for _ in range(50 if kind == zmq.DEALER else 0):
-                        garbage = [os.urandom(100), b"", os.urandom(1000)]
-                        with suppress(zmq.Again):  # the camera has closed the connection
-                            stranger.send_multipart(garbage, zmq.DONTWAIT)
-                raw = socket.socket(socket.AF_UNIX)
+        for address in (camera.endpoint, camera.frames):
+            for kind in (zmq.DEALER, zmq.SUB, zmq.PUSH):
+                stranger = make(kind)
+                if kind == zmq.SUB:
+                    for number in range(200):
+                        stranger.subscribe(os.urandom(number))
+                stranger.connect(address)
+                for _ in range(50 if kind == zmq.DEALER else 0):
+                    garbage = [os.urandom(100), b"", os.urandom(1000)]
+                    with suppress(zmq.Again):  # the camera has closed the connection
+                        stranger.send_multipart(garbage, zmq.DONTWAIT)
+            with socket.socket(socket.AF_UNIX) as raw:
                 raw.connect(address.removeprefix("ipc://"))
                 raw.send(os.urandom(2000))
-                raw.close()
-            before = client.status().seq
-            found = 0
-            while found < 30:
-                new = client.poll_with_headers(5.0)
-                found += sum(header.seq > before for header, _ in new)
-        finally:
-            context.destroy(linger=0)
-    assert camera.status().seq > before
-
-
-@contextmanager
-def bare_subscriber(camera: CameraProcess) -> Iterator["zmq.Socket[bytes]"]:
-    """A client that sends any bytes in the place of subscriptions."""
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    socket = context.socket(zmq.XSUB)
-    socket.set(zmq.SNDHWM, 0)
-    try:
-        socket.connect(camera.frames)
-        yield socket
-    finally:
-        context.destroy(linger=0)
+        before, found = client.status().seq, 0
+        while found < 30:
+            new = client.poll_with_headers(5.0)
+            found += sum(header.seq > before for header, _ in new)
 
 
 def wait_for_view(client: CameraClient, after: float) -> None:
@@ -130,18 +117,20 @@ def wait_for_view(client: CameraClient, after: float) -> None:
 
 
 def test_subscriptions_to_unknown_topics_take_no_memory_and_viewers_come_back(
-    camera: CameraProcess,
+    camera: CameraProcess, make: Make
 ) -> None:
     with camera.client(views=True) as client:
         wait_for_view(client, 0.0)
         before = resident(camera)
-        with bare_subscriber(camera) as stranger:
-            for _ in range(50_000):
-                stranger.send(b"\x01" + os.urandom(40))
-            end, most = time.monotonic() + 3.0, 0.0
-            while time.monotonic() < end:
-                most = max(most, resident(camera))
-                time.sleep(0.05)
+        stranger = make(zmq.XSUB)  # it sends any bytes in the place of subscriptions
+        stranger.set(zmq.SNDHWM, 0)
+        stranger.connect(camera.frames)
+        for _ in range(50_000):
+            stranger.send(b"\x01" + os.urandom(40))
+        end, most = time.monotonic() + 3.0, 0.0
+        while time.monotonic() < end:
+            most = max(most, resident(camera))
+            time.sleep(0.05)
         assert client.view
         wait_for_view(client, client.view.header.time + 3.0)
     assert most < before + 60.0
