@@ -43,6 +43,7 @@ lint: $(VENV)/installed-dev  ## Check style, types and the direction of imports
 docs: $(VENV)/installed-docs  ## Write the generated parts of docs/, and build build/docs/html and build/docs/man
 	$(BIN)/python tools/config_reference.py --write
 	$(BIN)/python tools/protocol_reference.py --write
+	$(BIN)/python tools/verb_reference.py --write
 	$(BIN)/python tools/rooms.py --write
 	$(SPHINX) -b html docs build/docs/html
 	$(SPHINX) -b man docs build/docs/man

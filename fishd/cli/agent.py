@@ -11,8 +11,8 @@ import click
 import msgspec
 
 from fishd.cli.completion import complete_policy
-from fishd.cli.options import endpoint_option, for_option, take_option, verb_lease
-from fishd.cli.output import echo
+from fishd.cli.options import endpoint_option, for_option, json_option, take_option, verb_lease
+from fishd.cli.output import echo, print_json_line
 from fishd.client import Fish
 from fishd.config import adopt
 from fishd.core.errors import ControllerFault, PolicyError
@@ -50,12 +50,14 @@ REPORT = 1.0
 @for_option("End by itself after this time [s]; by default Ctrl-C ends it.")
 @endpoint_option
 @take_option
+@json_option
 def agent(
     policy: str,
     camera: str | None,
     address: str | None,
     seconds: float | None,
     endpoint: str | None,
+    as_json: bool,
 ) -> int:
     """Let a policy swim the fish of a running fishd, tick by tick, until Ctrl-C.
 
@@ -86,8 +88,8 @@ def agent(
         elif camera:
             raise click.UsageError("--camera cannot be given here: this policy sees no pictures")
         link = stack.enter_context(closing(FishdLink(endpoint, *verb_lease(), address=address)))
-        swim = _Swim(link, pilot, sight, unit)
-        echo(f"{policy} swims; it sees {pilot.card.sees}; Ctrl-C ends it")
+        swim = _Swim(link, pilot, sight, unit, as_json)
+        echo(f"{policy} swims; it sees {pilot.card.sees}; Ctrl-C ends it", err=as_json)
         try:
             with _named(policy):
                 swim.run(stopping, seconds)
@@ -99,7 +101,7 @@ def agent(
             link.close()  # neutral first, then whatever takes time
         if sight and pilot.blind > GIVE_UP:
             raise sight.lost()
-    echo(f"the fish rests, after {swim.swum:.0f} s")
+    echo(f"the fish rests, after {swim.swum:.0f} s", err=as_json)
     return 0
 
 
@@ -125,9 +127,15 @@ class _Swim:
     """One swim, from the take-over of the fish until something ends it."""
 
     def __init__(
-        self, link: "FishdLink", pilot: "Pilot", sight: "LiveSight | None", unit: str
+        self,
+        link: "FishdLink",
+        pilot: "Pilot",
+        sight: "LiveSight | None",
+        unit: str,
+        as_json: bool,
     ) -> None:
         """unit: of the forces"""
+        self._as_json = as_json
         self._link, self._pilot, self._sight, self._unit = link, pilot, sight, unit
         self.swum = 0.0
         """How long, by the clock of fishd [s]."""
@@ -164,6 +172,20 @@ class _Swim:
 
     def _report(self, seen: Observation) -> None:
         full = sum(self._angles) / len(self._angles) / self._pilot.card.amplitude
+        if self._as_json:
+            print_json_line(
+                {
+                    "seconds": self.swum,
+                    "frequency": seen.frequency,
+                    "thrust": seen.thrust,
+                    "fullness": full,
+                    "unseen": self._unseen,
+                    "lost": self._lost,
+                    "ticks": len(self._angles),
+                }
+            )
+            self._begin_report()
+            return
         line = (
             f"{self.swum:6.1f} s  {seen.frequency:5.2f} Hz  thrust {seen.thrust * 1e3:6.2f} "
             f"m{self._unit}  |φ_c| {full:4.0%} of Φ"
@@ -173,4 +195,7 @@ class _Swim:
         if self._lost:
             line += f"  late: {self._lost} ticks"
         echo(line)
+        self._begin_report()
+
+    def _begin_report(self) -> None:
         self._reported, self._angles, self._lost, self._unseen = time.monotonic(), [], 0, 0

@@ -87,12 +87,17 @@ def config() -> None:
 @config.command()
 @click.argument("file", type=click.Path(path_type=Path, readable=False))
 @set_option
-def check(file: Path, overrides: tuple[str, ...]) -> None:
+@json_option
+def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     """Check a configuration file, and list all its mistakes.
 
     Exit status 78 when fishd would refuse it.
     """
-    if wrong := mistakes.find(file, overrides):
+    wrong = mistakes.find(file, overrides)
+    if as_json:
+        print_json({"file": file, "mistakes": wrong})
+        sys.exit(os.EX_CONFIG if wrong else 0)
+    if wrong:
         for mistake in wrong:
             echo(f"fishctl: {line(' '.join(mistake.split()), MAX_COMPLAINT)}", err=True)
         sys.exit(os.EX_CONFIG)

@@ -2,8 +2,9 @@
 
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -51,6 +52,15 @@ def echo_rows(rows: Sequence[tuple[str, str]]) -> None:
 def print_json(value: Any) -> None:
     """Print any struct, or list of them, as one indented JSON document."""
     click.echo(_escaped(msgspec.json.format(msgspec.json.encode(value), indent=2)))
+
+
+def print_paths(paths: Iterable[Path], as_json: bool) -> None:
+    """Print the files that a verb has written, a line each or as a list."""
+    if as_json:
+        print_json([str(path) for path in paths])
+    else:
+        for path in paths:
+            echo(path)
 
 
 def print_json_line(value: Any) -> None:

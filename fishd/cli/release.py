@@ -9,7 +9,8 @@ import click
 from msgspec.structs import replace
 
 from fishd.cli.config import load_service, service_option, set_option
-from fishd.cli.output import echo, output_may_fail
+from fishd.cli.options import json_option
+from fishd.cli.output import echo, output_may_fail, print_json
 from fishd.client import Fish
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file
 from fishd.core import text
@@ -27,7 +28,8 @@ _ANSWER_S = 0.3
 @click.command()
 @service_option
 @set_option
-def release(file: Path | None, overrides: tuple[str, ...]) -> int:
+@json_option
+def release(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Send the servo to neutral and stop its pulses, without the daemon.
 
     A fishd that still drives the servo is asked first for an emergency stop; one that does not
@@ -45,7 +47,7 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
     if config.has_hardware:
         done = why + _release(config)
         with output_may_fail(done):
-            echo(done)
+            _print(done, as_json)
         return 0
     if source is None:
         raise click.ClickException(
@@ -53,8 +55,15 @@ def release(file: Path | None, overrides: tuple[str, ...]) -> int:
             f"{SERVICE_FILE}) the robot is simulated; name the one that fishd runs with: "
             "fishctl release --config FILE"
         )
-    click.echo(f"{why}a simulated fish, by {source}, has nothing to release")
+    _print(f"{why}a simulated fish, by {source}, has nothing to release", as_json)
     return 0
+
+
+def _print(done: str, as_json: bool) -> None:
+    if as_json:
+        print_json({"done": done})
+    else:
+        echo(done)
 
 
 def release_by_config(silence: NoDaemon, file: Path | None) -> str:

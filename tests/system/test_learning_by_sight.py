@@ -88,7 +88,7 @@ def test_a_camera_that_dies_ends_the_training_with_the_fish_at_rest(
         )
         assert done.returncode == 1
         assert f"camera at {rig.camera.endpoint}" in done.stderr
-        assert "; to go on: fishctl learn ppo --resume" in done.stderr
+        assert "; resume with: fishctl learn ppo --resume" in done.stderr
         assert rig.daemon.status().mode == "idle"
 
 

@@ -10,7 +10,7 @@ import click
 from fishd.cli.calibrate import load_files
 from fishd.cli.calibrate.force_dialogue import Dialogue
 from fishd.cli.calibrate.load_files import NEWTONS
-from fishd.cli.options import FiniteRange, endpoint_option
+from fishd.cli.options import FiniteRange, endpoint_option, for_option
 from fishd.cli.output import echo
 from fishd.cli.prompts import choose, input_interrupted
 from fishd.client import Fish
@@ -43,13 +43,7 @@ _POOR_FIT = 0.02
     show_default=True,
     help="Unit of the loads: newtons, or grams hung over a pulley.",
 )
-@click.option(
-    "--seconds",
-    type=FiniteRange(0.1, 60.0),
-    default=5.0,
-    show_default=True,
-    help="How long to measure each load.",
-)
+@for_option("How long to measure each load [s].", default=5.0, kind=FiniteRange(0.1, 60.0))
 @click.option(
     "--load-error",
     type=FiniteRange(0.0, 0.5),

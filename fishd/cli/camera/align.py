@@ -19,7 +19,7 @@ from fishd.cli.camera.options import (
     rig_of,
     yaml_of,
 )
-from fishd.cli.options import FiniteRange, endpoint_option, json_option, take_option
+from fishd.cli.options import FiniteRange, endpoint_option, for_option, json_option, take_option
 from fishd.cli.output import echo, echo_rows, print_json
 from fishd.cli.progress import showing
 from fishd.core.console import INTERRUPTED
@@ -39,14 +39,7 @@ LET_IT_SWIM = "let it swim, with 'fishctl set-controller swing', or add --swim"
 @endpoint_option
 @take_option
 @png_option
-@click.option(
-    "--for",
-    "seconds",
-    type=FiniteRange(min=2.0, max=600.0),
-    default=10.0,
-    show_default=True,
-    help="How long to look [s].",
-)
+@for_option("How long to look [s].", default=10.0, kind=FiniteRange(min=2.0, max=600.0))
 @click.option("--swim", is_flag=True, help="Let the fish swim meanwhile; it rests afterwards.")
 @json_option
 def align(

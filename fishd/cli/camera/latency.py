@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.camera.options import Watcher, camera_option, refuse_lockstep, rig_of, yaml_of
-from fishd.cli.options import FiniteRange, endpoint_option, json_option, take_option
+from fishd.cli.options import FiniteRange, endpoint_option, for_option, json_option, take_option
 from fishd.cli.output import echo, echo_rows, print_json
 from fishd.cli.progress import showing
 from fishd.client import Fish
@@ -28,14 +28,7 @@ _GAP = 1.5
 @camera_option
 @endpoint_option
 @take_option
-@click.option(
-    "--for",
-    "seconds",
-    type=FiniteRange(min=15.0, max=600.0),
-    default=40.0,
-    show_default=True,
-    help="How long the fish swims [s].",
-)
+@for_option("How long the fish swims [s].", default=40.0, kind=FiniteRange(min=15.0, max=600.0))
 @json_option
 def latency(address: str | None, endpoint: str | None, seconds: float, as_json: bool) -> int:
     """Measure the delay of the whole camera path, from light to frame, against the lateral force.

@@ -28,7 +28,8 @@ camera_option = click.option(
     help="Where the camera takes requests; default: $FISHD_CAMERA, else the one of this machine.",
 )
 png_option = click.option(
-    "--png",
+    "--plot",
+    "png",
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write the picture into this file.",
 )
@@ -38,7 +39,7 @@ def check_png(path: Path | None) -> None:
     """Refuse a picture that cannot be written, before anything moves or is looked at."""
     if path is None:
         return
-    refused, folder = f"'{path}' is not valid for --png: ", path.parent
+    refused, folder = f"'{path}' is not valid for --plot: ", path.parent
     if path.suffix.lower() != ".png":
         raise click.UsageError(f"{refused}a name ending in .png is needed")
     if not folder.is_dir():

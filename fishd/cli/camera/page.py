@@ -7,7 +7,8 @@ from contextlib import suppress
 import click
 
 from fishd.cli.camera.options import camera_option
-from fishd.cli.output import echo
+from fishd.cli.options import json_option
+from fishd.cli.output import echo, print_json_line
 from fishd.core.errors import StartupError
 from fishd.core.process.interruption import on_signal
 
@@ -33,16 +34,17 @@ LEAVING = 1.0
     help="Address to serve it at. Whoever reaches another one than that of this machine sees what "
     "the camera sees.",
 )
-def page(address: str | None, port: int, host: str) -> None:
+@json_option
+def page(address: str | None, port: int, host: str, as_json: bool) -> None:
     """Show what the camera sees on a web page, live, with the axis of motion, until Ctrl-C.
 
     It needs nothing from the internet, and takes no request that changes anything.
     """
     with suppress(KeyboardInterrupt):
-        asyncio.run(_serve(address, host, port))
+        asyncio.run(_serve(address, host, port, as_json))
 
 
-async def _serve(address: str | None, host: str, port: int) -> None:
+async def _serve(address: str | None, host: str, port: int, as_json: bool) -> None:
     from fishd.camera.page.feed import Feed, News
     from fishd.camera.page.server import PageServer
 
@@ -69,7 +71,10 @@ async def _serve(address: str | None, host: str, port: int) -> None:
         async with server:
             with on_signal(lambda: loop.call_soon_threadsafe(ended.set)):
                 thread.start()
-                echo(f"the camera is at {server.url}; Ctrl-C ends it")
+                if as_json:
+                    print_json_line({"url": server.url})
+                else:
+                    echo(f"the camera is at {server.url}; Ctrl-C ends it")
                 await ended.wait()
             feed.stop()
             await asyncio.to_thread(thread.join, LEAVING)

@@ -21,6 +21,7 @@ def record(
     subject: str,
     note: str,
     seconds: float | None,
+    as_json: bool,
     address: str | None,
 ) -> None:
     """Record a running fish and the frames of the camera above it in one file.
@@ -32,4 +33,4 @@ def record(
 
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     with CameraTap(address, endpoint) as camera:
-        record_one(run, endpoint, folder, begin, seconds, camera)
+        record_one(run, endpoint, folder, begin, seconds, as_json, camera)

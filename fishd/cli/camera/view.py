@@ -44,7 +44,7 @@ def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole:
 
     check_png(png)
     if png and follow:
-        raise click.UsageError("--png writes one picture, --follow shows all: one of the two")
+        raise click.UsageError("--plot writes one picture, --follow shows all: one of the two")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # it too must restore the terminal
     with CameraClient(address, views=whole) as client:
         watch = AxisWatch()

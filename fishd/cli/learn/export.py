@@ -5,6 +5,8 @@ from pathlib import Path
 
 import click
 
+from fishd.cli.options import json_option
+from fishd.cli.output import print_json
 from fishd.core.errors import PolicyError
 
 
@@ -20,7 +22,10 @@ from fishd.core.errors import PolicyError
 @click.option("--newest", is_flag=True, help="The newest checkpoint rather than the best.")
 @click.option("--force", is_flag=True, help="Overwrite FILE; and export a policy that stalls, too.")
 @click.option("--note", default="", help="A remark for people, kept in the file.")
-def export(run: Path, target: Path | None, newest: bool, force: bool, note: str) -> None:
+@json_option
+def export(
+    run: Path, target: Path | None, newest: bool, force: bool, note: str, as_json: bool
+) -> None:
     """Write the policy of RUN, a run folder or one of its checkpoints, to one .onnx file."""
     from fishd.controllers.policy.library import SUFFIX
     from fishd.learning.export import export as write
@@ -36,6 +41,10 @@ def export(run: Path, target: Path | None, newest: bool, force: bool, note: str)
         raise PolicyError(f"{target}: exists already; --force overwrites it, --to names another")
     found = write(checkpoint, target, force=force, note=note)
     past = found.card.provenance
+    if as_json:
+        where = {"path": found.path, "checkpoint": found.checkpoint, "bytes": found.size}
+        print_json({**where, "evaluation": found.evaluation})
+        return
     click.echo(
         f"{found.path}: {found.size / 1024:.0f} kB from {found.checkpoint}, {past.steps} steps "
         f"in {past.on}"

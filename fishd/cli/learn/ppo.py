@@ -2,6 +2,7 @@
 
 import statistics
 import threading
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -11,7 +12,9 @@ from msgspec.structs import replace
 
 from fishd.cli.config import config_option, set_option
 from fishd.cli.experiment_options import On, default_on, on_option
-from fishd.cli.options import endpoint_option, seed_option, take_option, verb_lease
+from fishd.cli.options import endpoint_option, json_option, seed_option, take_option, verb_lease
+from fishd.cli.output import echo, print_json
+from fishd.cli.progress import showing
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError
@@ -91,6 +94,7 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
 @click.option(
     "--cluster", metavar="ADDRESS", help="With --seeds: Dask scheduler that runs them instead."
 )
+@json_option
 def ppo(
     on: On | None,
     file: Path | None,
@@ -108,6 +112,7 @@ def ppo(
     seeds: int | None,
     jobs: int | None,
     cluster: str | None,
+    as_json: bool,
 ) -> int:
     """Train a policy with PPO: checkpoints, tables and TensorBoard logs in a run folder.
 
@@ -135,8 +140,8 @@ def ppo(
     changed = {name: value for name, value in given.items() if value is not None}
     job = _with_camera(replace(job, agent=agent, settings=replace(job.settings, **changed)), camera)
     if seeds is not None:
-        return _train_seeds(job, seeds, jobs, cluster)
-    return _train(job)
+        return _train_seeds(job, seeds, jobs, cluster, as_json)
+    return _train(job, as_json)
 
 
 def _refuse(why: str, options: dict[str, Any]) -> None:
@@ -178,7 +183,7 @@ def _job(
         config = adopt(running, overrides) if adopts else load(file, overrides)
     # The inputs are scaled by the plant, and fishd's is most likely meant.
     if running and (other := other_plant(config, plant)):
-        click.echo(
+        echo(
             "fishctl: careful: scales and relative thrust are made for another plant than "
             f"that of the fishd that runs: {other}",
             err=True,
@@ -212,17 +217,19 @@ def _with_camera(job: "Job", camera: str | None) -> "Job":
     return replace(job, camera=cameras.simulated(camera))
 
 
-def _train(job: "Job") -> int:
-    from fishd.learning.train.progress import on_terminal
+def _train(job: "Job", as_json: bool) -> int:
+    from fishd.learning.train.progress import ShownDisplay
     from fishd.learning.train.training import train
 
     asked = threading.Event()
-    with on_signal(asked.set), on_terminal() as display:
-        outcome = train(job, display, asked.is_set)
-    return report(outcome, job)
+    with on_signal(asked.set), showing(job.last_step(), "steps", err=as_json) as show:
+        outcome = train(job, ShownDisplay(show), asked.is_set)
+    if as_json:
+        print_json(outcome)
+    return report(outcome, job, as_json)
 
 
-def report(outcome: "Outcome", job: "Job") -> int:
+def report(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
     """Say how it ended; the exit status."""
     from fishd.learning.train.progress import NOT_COUNTED, described, minutes
 
@@ -236,32 +243,35 @@ def report(outcome: "Outcome", job: "Job") -> int:
             again += f" {option} {address}"
     if outcome.ended == "diverged":  # and would again
         best = f"; the best so far: fishctl learn export {outcome.folder}" if outcome.best else ""
-        click.echo(f"fishctl: {outcome.message}{best}", err=True)
+        echo(f"fishctl: {outcome.message}{best}", err=True)
         return 1
     if outcome.ended == "lost":
-        click.echo(f"fishctl: {outcome.message}; to go on: {again}", err=True)
+        echo(f"fishctl: {outcome.message}; resume with: {again}", err=True)
         return 1
     if outcome.ended == "interrupted":
         lost = f", {outcome.dropped} of an unfinished rollout dropped" if outcome.dropped else ""
-        click.echo(
-            f"fishctl: stopped after {outcome.steps} steps{lost}; to go on: {again}", err=True
-        )
+        echo(f"fishctl: stopped after {outcome.steps} steps{lost}; resume with: {again}", err=True)
         return INTERRUPTED
     rest = NOT_COUNTED if job.on == "simulation" else ""
     why = f"; {outcome.message}" if outcome.message else ""
-    click.echo(f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time{rest}{why}")
+    echo(
+        f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time{rest}{why}",
+        err=as_json,
+    )
     if found := outcome.best_evaluation:
-        click.echo(f"best: {described(found).strip()}")
+        echo(f"best: {described(found).strip()}", err=as_json)
         off = found.error / found.thrust if found.error else 0.0
         if found.relative_thrust * (1.0 - off) > IMPLAUSIBLE:
-            click.echo(
+            echo(
                 "careful: that is more than the best square wave of the configured plant; the fish "
-                "is another one, or F_x is not calibrated, or it drifts"
+                "is another one, or F_x is not calibrated, or it drifts",
+                err=as_json,
             )
     elif outcome.latest_evaluation:
-        click.echo("it stalled in every evaluation; train it for longer, or with another --seed")
+        stalled = "it stalled in every evaluation; train it for longer, or with another --seed"
+        echo(stalled, err=as_json)
         return 0
-    click.echo(f"to write it to a policy file: fishctl learn export {outcome.folder}")
+    echo(f"to write it to a policy file: fishctl learn export {outcome.folder}", err=as_json)
     return 0
 
 
@@ -275,32 +285,38 @@ def _run_of(path: Path) -> Path:
     return path if (path / SETTINGS).exists() else path.parent
 
 
-def _train_seeds(job: "Job", seeds: int, jobs: int | None, cluster: str | None) -> int:
+def _train_seeds(
+    job: "Job", seeds: int, jobs: int | None, cluster: str | None, as_json: bool
+) -> int:
     """Train them all, a line as each ends, and a summary; the exit status."""
     from fishd.learning.train import seeds as training
 
     if not cluster and find_spec("torch") is None:  # only the processes that train will load it
         raise ModuleNotFoundError("torch is missing", name="torch")
-    click.echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps")
-    outcomes = training.train_seeds(job, seeds, jobs, cluster, _print_seed)
+    echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps", err=as_json)
+    ended = partial(_print_seed, err=as_json)
+    outcomes = training.train_seeds(job, seeds, jobs, cluster, ended)
+    if as_json:
+        print_json(outcomes)
     for name, evaluations in (
         ("latest", [outcome.latest_evaluation for outcome in outcomes]),
         ("best", [outcome.best_evaluation for outcome in outcomes]),
     ):
         shares = [evaluation.relative_thrust for evaluation in evaluations if evaluation]
         if shares:
-            click.echo(
+            echo(
                 f"{name} policies of {len(shares)} seeds: median {statistics.median(shares):.1%} "
-                f"[{min(shares):.1%} – {max(shares):.1%}]"
+                f"[{min(shares):.1%} – {max(shares):.1%}]",
+                err=as_json,
             )
-    click.echo(f"curves: {job.folder / 'seeds.csv'}")
+    echo(f"curves: {job.folder / 'seeds.csv'}", err=as_json)
     ends = {outcome.ended for outcome in outcomes}
     if ends - {"finished", "interrupted"}:
         return 1
     return INTERRUPTED if "interrupted" in ends else 0
 
 
-def _print_seed(seed: int, outcome: "Outcome") -> None:
+def _print_seed(seed: int, outcome: "Outcome", err: bool) -> None:
     from fishd.learning.train.progress import described
 
     latest = outcome.latest_evaluation
@@ -308,4 +324,4 @@ def _print_seed(seed: int, outcome: "Outcome") -> None:
     is_finished = outcome.ended == "finished"
     ended = "" if is_finished else f" {outcome.ended}"
     why = f" ({outcome.message})" if outcome.message else ""
-    click.echo(f"seed {seed}{ended}{why}{swims}", err=not is_finished)
+    echo(f"seed {seed}{ended}{why}{swims}", err=err or not is_finished)

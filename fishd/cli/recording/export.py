@@ -4,7 +4,8 @@ from pathlib import Path
 
 import click
 
-from fishd.cli.output import echo
+from fishd.cli.options import json_option
+from fishd.cli.output import print_paths
 from fishd.cli.recording.choice import folder_option, opened
 from fishd.recording.export import Format
 from fishd.recording.export import export as write
@@ -23,12 +24,19 @@ from fishd.recording.export import export as write
 )
 @click.option("--force", is_flag=True, help="Replace files that are there already.")
 @folder_option
-def export(run: str, form: Format | None, target: Path, force: bool, folder: Path | None) -> None:
+@json_option
+def export(
+    run: str,
+    form: Format | None,
+    target: Path,
+    force: bool,
+    folder: Path | None,
+    as_json: bool,
+) -> None:
     """Write a recording as tables: one row a tick, and a second file with its events.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. No digit of a number is lost.
     """
     if form is None:
         raise click.UsageError("--csv or --parquet is needed")
-    for path in write(opened(run, folder), target, form, replace=force):
-        echo(path)
+    print_paths(write(opened(run, folder), target, form, replace=force), as_json)

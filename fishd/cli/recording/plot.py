@@ -5,8 +5,8 @@ from pathlib import Path
 
 import click
 
-from fishd.cli.options import FiniteRange
-from fishd.cli.output import echo
+from fishd.cli.options import FiniteRange, json_option
+from fishd.cli.output import print_paths
 from fishd.cli.recording.choice import folder_option, opened
 from fishd.lab.run_figure import picture
 from fishd.lab.run_traces import traces
@@ -28,6 +28,7 @@ from fishd.recording.folder import check_new
 @click.option("--html", "only", flag_value="html", help="The interactive page alone.")
 @click.option("--force", is_flag=True, help="Replace files that are there already.")
 @folder_option
+@json_option
 def plot(
     run: str,
     begin: float,
@@ -36,6 +37,7 @@ def plot(
     only: str | None,
     force: bool,
     folder: Path | None,
+    as_json: bool,
 ) -> None:
     """Draw forces, command, thrust, the controller's own quantities, and a phase portrait.
 
@@ -49,9 +51,8 @@ def plot(
     check_new(paths.values(), replace=force)
     if "png" in paths:
         picture(drawn, paths["png"])
-        echo(paths["png"])
     if "html" in paths:
         from fishd.lab.run_page import page
 
         page(drawn, paths["html"])
-        echo(paths["html"])
+    print_paths(paths.values(), as_json)

@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from msgspec.structs import asdict
 
-from fishd.cli.options import Words, endpoint_option, for_option
-from fishd.cli.output import counted, echo
+from fishd.cli.options import Words, endpoint_option, for_option, json_option
+from fishd.cli.output import counted, echo, print_json
 from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
 from fishd.core import text
@@ -58,6 +59,7 @@ class Size(click.ParamType[int]):
 def recording_options(function: F) -> F:
     """RUN, and the options of every verb that records."""
     for decorate in (
+        json_option,
         for_option("End by itself after this time [s]; by default Ctrl-C ends it."),
         click.option("--note", type=Words(), default="", help="What for."),
         click.option("--subject", type=Words(), default="", help="Which fish, such as its number."),
@@ -115,6 +117,7 @@ def record(
     camera: str | None,
     black_box: bool,
     keep: int,
+    as_json: bool,
 ) -> None:
     """Record a running fish: every tick, event and status, until Ctrl-C or SIGTERM.
 
@@ -129,15 +132,15 @@ def record(
     if black_box:
         box = BlackBox(made(folder or runs_folder()), keep, begin)
         open_recorder = partial(Recorder, endpoint, box.open, tell=_tell, due=box.due)
-        _record_for_ever(open_recorder, _Signals(), seconds)
+        _record_for_ever(open_recorder, _Signals(), seconds, as_json)
         return
     if camera is None:
-        record_one(run, endpoint, folder, begin, seconds)
+        record_one(run, endpoint, folder, begin, seconds, as_json)
         return
     from fishd.recording.camera_tap import CameraTap
 
     with CameraTap(camera or None, endpoint) as tap:
-        record_one(run, endpoint, folder, begin, seconds, tap)
+        record_one(run, endpoint, folder, begin, seconds, as_json, tap)
 
 
 def record_one(
@@ -146,6 +149,7 @@ def record_one(
     folder: Path | None,
     begin: Callable[[Path], RunWriter],
     seconds: float | None,
+    as_json: bool,
     camera: "CameraTap | None" = None,
 ) -> None:
     """Record until a signal, or for so long [s].
@@ -154,14 +158,14 @@ def record_one(
     """
     stopping = _Signals()
     place = made(folder or runs_folder())
-    progress = _draw if sys.stdout.isatty() else lambda writer: None
+    progress = _draw if sys.stdout.isatty() and not as_json else lambda writer: None
     path = named(run, place) if run else new_path(place)
     recorder = Recorder(
         endpoint, partial(begin, path), tell=_tell, progress=progress, camera=camera
     )
     try:
         with recorder:
-            echo(f"recording to {recorder.writer.path}; Ctrl-C ends it")
+            echo(f"recording to {recorder.writer.path}; Ctrl-C ends it", err=as_json)
             if (mode := recorder.status.mode) != "running":
                 first = "fishctl clear-fault, then " if mode in ("fault", "estop") else ""
                 _tell(
@@ -176,18 +180,21 @@ def record_one(
     finally:
         if recorder.began:
             _end_line()
-            echo(f"{recorder.writer.path.name}: {_amount(recorder.writer)}")
+            _print(recorder.writer, as_json)
 
 
 def _record_for_ever(
-    open_recorder: Callable[[], Recorder], stopping: "_Signals", seconds: float | None
+    open_recorder: Callable[[], Recorder],
+    stopping: "_Signals",
+    seconds: float | None,
+    as_json: bool,
 ) -> None:
     """Wait for a fishd, record it, and go on after any restart of it."""
     waiting = False
     while not stopping():
         try:
             with open_recorder() as recorder:
-                echo(f"recording to {recorder.writer.path}")
+                echo(f"recording to {recorder.writer.path}", err=as_json)
                 recorder.run(stopping, seconds)
                 return
         except NoDaemon as error:
@@ -230,6 +237,14 @@ def _draw(writer: RunWriter) -> None:
 def _end_line() -> None:
     if sys.stdout.isatty():
         click.echo("\r\x1b[K", nl=False)
+
+
+def _print(writer: RunWriter, as_json: bool) -> None:
+    """Print what a recording holds that has ended."""
+    if as_json:
+        print_json({"path": writer.path, "bytes": writer.size, **asdict(writer.summary)})
+    else:
+        echo(f"{writer.path.name}: {_amount(writer)}")
 
 
 def _amount(writer: RunWriter) -> str:

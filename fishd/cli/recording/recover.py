@@ -3,8 +3,10 @@
 from pathlib import Path
 
 import click
+from msgspec.structs import asdict
 
-from fishd.cli.output import counted, echo
+from fishd.cli.options import json_option
+from fishd.cli.output import counted, echo, print_json
 from fishd.cli.recording.choice import damage, folder_option
 from fishd.recording import open_run
 from fishd.recording.folder import find
@@ -14,7 +16,8 @@ from fishd.recording.recover import recover as finish
 @click.command()
 @click.argument("file")
 @folder_option
-def recover(file: str, folder: Path | None) -> None:
+@json_option
+def recover(file: str, folder: Path | None, as_json: bool) -> None:
     """Finish a recording that was cut off, by a kill, a full disk or a power cut, or is damaged.
 
     FILE is a path, a name in the folder of recordings, or 'latest'. NAME.mcap.part becomes
@@ -24,6 +27,10 @@ def recover(file: str, folder: Path | None) -> None:
     damaged = open_run(path)
     run = finish(path)
     summary = run.summary
+    if as_json:
+        lost = damaged.damaged if damaged.is_damaged else None
+        print_json({"path": run.path, "damaged": lost, **asdict(summary)})
+        return
     frames = f", {counted(summary.frames, 'frame')}" if summary.frames else ""
     what = f"; {damage(damaged.damaged, damaged.damage_reason)}" if damaged.is_damaged else ""
     echo(

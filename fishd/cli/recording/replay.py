@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from fishd.cli.options import FiniteRange
-from fishd.cli.output import counted, echo
+from fishd.cli.options import FiniteRange, json_option
+from fishd.cli.output import counted, echo, print_json_line
 from fishd.cli.recording.choice import folder_option, opened
 from fishd.core.addresses import control_address, find_control
 from fishd.core.process.interruption import interrupted_once
@@ -38,7 +38,15 @@ TELEMETRY = "tcp://127.0.0.1:9872"
     help="Where 'fishctl watch' asks for the status; default: where fishd would be.",
 )
 @folder_option
-def replay(run: str, speed: float, address: str, control: str | None, folder: Path | None) -> None:
+@json_option
+def replay(
+    run: str,
+    speed: float,
+    address: str,
+    control: str | None,
+    folder: Path | None,
+    as_json: bool,
+) -> None:
     """Publish a recording as fishd would, so that `fishctl watch` and PlotJuggler show it.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. It ends with the recording, or
@@ -51,6 +59,11 @@ def replay(run: str, speed: float, address: str, control: str | None, folder: Pa
         Replay(recorded, address, control or control_address()) as player,
     ):
         seconds = recorded.summary.duration / speed
+        if as_json:
+            where = {"telemetry": player.telemetry, "control": player.control}
+            print_json_line({"name": recorded.name, "seconds": seconds, **where})
+            player.play(speed)
+            return
         echo(f"{recorded.name}: {seconds:.0f} s at {player.telemetry}; Ctrl-C ends it")
         if recorded.frame_heads:
             echo(f"its {counted(len(recorded.frame_heads), 'frame')} of a camera are left out")

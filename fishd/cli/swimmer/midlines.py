@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from fishd.cli.options import FiniteRange
-from fishd.cli.output import counted, echo
+from fishd.cli.options import FiniteRange, json_option
+from fishd.cli.output import counted, echo, print_json
 from fishd.cli.swimmer.options import picture_options
 from fishd.core import text
 from fishd.lab.swimmer import midline_figure
@@ -24,7 +24,10 @@ from fishd.recording.folder import check_new
     help="Beats before are left out [s].",
 )
 @picture_options
-def midlines(file: Path, settle: float, target: Path, form: str, force: bool) -> None:
+@json_option
+def midlines(
+    file: Path, settle: float, target: Path, form: str, force: bool, as_json: bool
+) -> None:
     """Draw the midlines of a tail beat relative to the mean, and the amplitude along the body.
 
     SWIM is what 'fishctl simulate ... --save FILE.npz' has written. The picture is named after it:
@@ -37,6 +40,10 @@ def midlines(file: Path, settle: float, target: Path, form: str, force: bool) ->
     frequency = beats / float(found.periods.sum())
     title = f"{text.line(file.stem)}: midlines of the last of {counted(beats, 'beat')}, "
     midline_figure.picture(found, f"{title}{frequency:.2f} Hz".replace("$", r"\$"), path)
+    tail = float(found.amplitudes[:, -1].mean())
+    if as_json:
+        gait = {"beats": beats, "frequency": frequency, "tail": tail}
+        print_json({"path": path, **gait})
+        return
     echo(path)
-    tail = found.amplitudes[:, -1].mean()
     echo(f"{counted(beats, 'beat')} of {frequency:.3f} Hz, tail ±{tail:.3f} lengths")

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from fishd.cli.options import FiniteRange
-from fishd.cli.output import echo
+from fishd.cli.options import FiniteRange, json_option
+from fishd.cli.output import print_paths
 from fishd.cli.swimmer.options import picture_options
 from fishd.lab.swimmer import view, wake_figure
 from fishd.lab.swimmer.files import fish_of
@@ -32,6 +32,7 @@ from fishd.virtual.swimmer import checkpoint
     "such a fish]",
 )
 @picture_options
+@json_option
 def wake(
     file: Path,
     fields: tuple[view.Quantity, ...],
@@ -40,6 +41,7 @@ def wake(
     target: Path,
     form: str,
     force: bool,
+    as_json: bool,
 ) -> None:
     """Draw vorticity and speed of the water, and the body in it.
 
@@ -56,4 +58,4 @@ def wake(
     for field, path in paths.items():
         shown = view.view(fish, field, window, wake_figure.COLUMNS)
         wake_figure.picture(shown, limit or view.scale(fish.settings, field), path)
-        echo(path)
+    print_paths(paths.values(), as_json)

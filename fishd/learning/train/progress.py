@@ -1,15 +1,10 @@
-"""What a person sees of a training: a live bar on a terminal, else a line for each evaluation."""
+"""What a person sees of a training: its lines, and how it stands."""
 
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-import click
+from fishd.lab.experiment import Progress
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
-
     from fishd.learning.env.evaluation import Evaluation
 
 
@@ -36,97 +31,48 @@ class Display:
         """An evaluation is done."""
 
 
-class LineDisplay(Display):
-    """A line for each evaluation, for logs and pipes."""
+class ShownDisplay(Display):
+    """A line for each evaluation, and a bar with thrust, frequency and tank time."""
 
-    _best = 0.0
-    """The highest merit so far, as shown."""
+    def __init__(self, show: Progress) -> None:
+        self._show = show
+        self._steps = 0
+        self._figures = ""
+        self._was_evaluated = False
+        self._best = 0.0
+        """The highest merit so far, as shown."""
 
     def begin(self, steps: int, target: int, text: str) -> None:
         """Print where the run is."""
-        click.echo(text)
+        self._steps = steps
+        self._show.done(text, steps)
 
     def imitated(self, number: int, rounds: int, right: float) -> None:
         """Print one line."""
-        click.echo(imitation(number, rounds, right))
+        self._show.done(imitation(number, rounds, right), self._steps)
+
+    def step(self, tank_time: float) -> None:
+        """Advance by one."""
+        self._steps += 1
+        self._show.at(self._steps, f"{self._figures}  tank {minutes(tank_time)}")
+
+    def explored(self, thrust: float, relative_thrust: float, frequency: float) -> None:
+        """Show how the fish swam with exploration, until the first evaluation."""
+        if not self._was_evaluated:
+            self._figures = figures(thrust, relative_thrust, frequency)
 
     def evaluated(self, evaluation: "Evaluation") -> None:
         """Print one line.
 
         In simulation it is called the best only where the figure shown is higher, too.
         """
+        self._was_evaluated = True
+        self._figures = summary(evaluation)
         merit = round(evaluation.merit, 3)
         better = evaluation.best and (evaluation.error is not None or merit > self._best)
         self._best = merit if better else self._best
-        click.echo(described(evaluation) + (", the best so far" if better else ""))
-
-
-class BarDisplay(Display):
-    """A progress bar with thrust, relative thrust, frequency, tank time and time left."""
-
-    def __init__(self) -> None:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
-
-        self._progress = Progress(
-            MofNCompleteColumn(),
-            TextColumn("steps"),
-            BarColumn(bar_width=20),
-            TextColumn("{task.fields[figures]}"),
-            TextColumn("tank {task.fields[tank]}"),
-            TimeRemainingColumn(compact=True),
-            TextColumn("left"),
-        )
-        self._task: TaskID
-        self._was_evaluated = False
-
-    def begin(self, steps: int, target: int, text: str) -> None:
-        """Show the bar below a line."""
-        self._progress.console.print(text, markup=False, highlight=False, soft_wrap=True)
-        self._task = self._progress.add_task(
-            "", completed=steps, total=target, figures="", tank="0:00"
-        )
-        self._progress.start()
-
-    def imitated(self, number: int, rounds: int, right: float) -> None:
-        """Show it in place of how it swims."""
-        self._progress.update(self._task, figures=imitation(number, rounds, right))
-
-    def step(self, tank_time: float) -> None:
-        """Advance by one."""
-        self._progress.update(self._task, advance=1, tank=minutes(tank_time))
-
-    def explored(self, thrust: float, relative_thrust: float, frequency: float) -> None:
-        """Show how the fish swam with exploration, until the first evaluation."""
-        if not self._was_evaluated:
-            self._progress.update(self._task, figures=figures(thrust, relative_thrust, frequency))
-
-    def evaluated(self, evaluation: "Evaluation") -> None:
-        """Show how it swims without exploration."""
-        self._was_evaluated = True
-        self._progress.update(self._task, figures=summary(evaluation))
-
-    def stop(self) -> None:
-        """Leave the terminal as it is."""
-        self._progress.stop()
-
-
-@contextmanager
-def on_terminal() -> Iterator[Display]:
-    """A bar where standard output is a terminal, else lines."""
-    if not sys.stdout.isatty():
-        yield LineDisplay()
-        return
-    bar = BarDisplay()
-    try:
-        yield bar
-    finally:
-        bar.stop()
+        line = described(evaluation) + (", the best so far" if better else "")
+        self._show.done(line, self._steps)
 
 
 def imitation(number: int, rounds: int, right: float) -> str:

@@ -180,12 +180,12 @@ def test_ctrl_c_at_the_moment_when_a_view_takes_the_screen_gives_it_back(
 def test_a_view_is_written_with_the_axis_once_that_is_looked_for(
     swimming: Daemon, tmp_path: Path
 ) -> None:
-    line = said("view", "--axis", "--png", tmp_path / "a.png")
+    line = said("view", "--axis", "--plot", tmp_path / "a.png")
     offset = re.search(r"axis ([+-][\d.]+) px", line)
     assert offset
     assert float(offset[1]) == pytest.approx(OFF, abs=1.0)
     assert width_of(tmp_path / "a.png") == 84 * 7
-    said("view", "--whole", "--png", tmp_path / "whole.png")
+    said("view", "--whole", "--plot", tmp_path / "whole.png")
     assert width_of(tmp_path / "whole.png") >= 84
 
 
@@ -199,7 +199,7 @@ def test_no_axis_is_found_while_the_fish_rests(daemon: Daemon) -> None:
 
 def test_a_picture_of_another_kind_is_refused_at_once(tmp_path: Path) -> None:
     for verb in ("view", "align"):
-        done = fishctl("camera", verb, "--png", str(tmp_path / "a.jpg"))
+        done = fishctl("camera", verb, "--plot", str(tmp_path / "a.jpg"))
         assert done.returncode == 2
         assert "a name ending in .png is needed" in one_line(done)
 
@@ -208,12 +208,12 @@ def test_a_picture_that_cannot_be_written_is_refused_before_the_fish_swims(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     with Subscriber(daemon.telemetry, b"tick") as ticks:
-        done = fishctl("camera", "align", "--swim", "--png", f"{tmp_path}/nowhere/a.png")
+        done = fishctl("camera", "align", "--swim", "--plot", f"{tmp_path}/nowhere/a.png")
         seen = [ticks.message() for _ in range(3)]
     assert done.returncode == 2
     assert f"there is no folder {tmp_path}/nowhere" in one_line(done)
     assert {tick["mode"] for tick in seen} == {"idle"}
-    looked = fishctl("camera", "view", "--axis", "--png", f"{tmp_path}/nowhere/a.png")
+    looked = fishctl("camera", "view", "--axis", "--plot", f"{tmp_path}/nowhere/a.png")
     assert f"there is no folder {tmp_path}/nowhere" in one_line(looked)
 
 
@@ -233,7 +233,7 @@ def test_a_fish_that_swims_without_moving_has_no_axis(daemon: Daemon) -> None:
 
 
 def test_alignment_finds_the_axis_within_a_pixel(swimming: Daemon, tmp_path: Path) -> None:
-    found = as_json("align", "--for", "8", "--png", str(tmp_path / "motion.png"))
+    found = as_json("align", "--for", "8", "--plot", str(tmp_path / "motion.png"))
     assert found["offset"] == pytest.approx(OFF, abs=1.0)
     assert found["tilt"] == pytest.approx(TILT, abs=0.02)
     assert not found["good"]

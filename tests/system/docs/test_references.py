@@ -51,8 +51,9 @@ def test_the_complaints_in_the_configuration_reference_are_those_of_fishd(
     assert f"fishd: {line}\n" in REFERENCE
 
 
-def test_the_committed_tables_are_what_the_code_says() -> None:
-    program = [sys.executable, str(ROOT / "tools" / "protocol_reference.py"), "--check"]
+@pytest.mark.parametrize("tool", ["protocol_reference.py", "verb_reference.py"])
+def test_the_committed_tables_are_what_the_code_says(tool: str) -> None:
+    program = [sys.executable, str(ROOT / "tools" / tool), "--check"]
     done = subprocess.run(program, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 

@@ -11,6 +11,7 @@ import pytest
 from msgspec.structs import replace
 from rigs.swimming import brief_job, rows
 
+from fishd.cli.progress import Lines
 from fishd.config import load
 from fishd.controllers.policy.file import read
 from fishd.core.errors import ConfigError
@@ -26,7 +27,7 @@ from fishd.learning.settings import (
     check,
 )
 from fishd.learning.train.jobs import Outcome
-from fishd.learning.train.progress import LineDisplay
+from fishd.learning.train.progress import ShownDisplay
 from fishd.learning.train.training import train
 from fishd.virtual.plant.optimum import best_square_wave
 
@@ -47,7 +48,7 @@ def imitated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Outcome, str]:
     """A run that only imitates, which must not be changed, and what was said meanwhile."""
     with redirect_stdout(StringIO()) as said:
         job = brief_job(tmp_path_factory.mktemp("imitated") / "run", **CHANGES)
-        return train(job, LineDisplay()), said.getvalue()
+        return train(job, ShownDisplay(Lines(err=False))), said.getvalue()
 
 
 def test_half_beats_are_compared_by_their_thrust() -> None:
@@ -116,7 +117,7 @@ def test_who_begins_with_another_run_does_not_imitate_again(
 ) -> None:
     parent = imitated[0].best
     found: list[Evaluation] = []
-    display = LineDisplay()
+    display = ShownDisplay(Lines(err=False))
     display.evaluated = found.append  # type: ignore[method-assign]
     outcome = train(
         brief_job(tmp_path / "second", **{**CHANGES, "steps": 64}, parent=parent), display

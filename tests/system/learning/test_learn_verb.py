@@ -159,7 +159,7 @@ def test_a_signal_leaves_a_checkpoint_to_go_on_from(
     assert found.returncode == 130, found.stderr
     done = checkpoints.read_state(checkpoints.newest(folder)).steps
     dropped = r"(, \d+ of an unfinished rollout dropped)?"
-    go_on = re.escape(f"to go on: fishctl learn ppo --resume {folder}\n")
+    go_on = re.escape(f"resume with: fishctl learn ppo --resume {folder}\n")
     assert re.fullmatch(f"fishctl: stopped after {done} steps{dropped}; {go_on}", found.stderr)
     assert int(rows(folder / "progress.csv")[-1]["steps"]) == done
     found = learn("ppo", "--resume", str(folder), "--steps", str(done + 64))
@@ -278,7 +278,7 @@ def test_an_estop_ends_it_with_the_reason_and_a_checkpoint_and_no_other_begins(
         "fishctl: fishd is in mode estop: the tail hit the glass; when that is mended, leave it "
         "with 'fishctl clear-fault'"
     )
-    go_on = f"; to go on: fishctl learn ppo --resume {folder} --endpoint {daemon.endpoint}\n"
+    go_on = f"; resume with: fishctl learn ppo --resume {folder} --endpoint {daemon.endpoint}\n"
     assert (found.returncode, found.stderr) == (1, why + go_on)
     assert checkpoints.read_state(checkpoints.newest(folder)).steps >= 16
     found = learn(*on, "--folder", str(tmp_path / "other"))

@@ -56,7 +56,7 @@ def test_what_sees_no_pictures_or_does_not_swim_or_is_blind_is_refused(tmp_path:
 
 def test_the_verb_says_it_in_a_line_and_draws_it(tmp_path: Path) -> None:
     policy, picture = write(tmp_path, velocity_follower(), "eye"), tmp_path / "look.png"
-    words = ["learn", "look", str(policy), "--png", str(picture), "--seconds", "10"]
+    words = ["learn", "look", str(policy), "--plot", str(picture), "--seconds", "10"]
     done = CliRunner().invoke(fishctl, words)
     assert done.exit_code == 0, done.output
     said, drawn = done.output.splitlines()
@@ -68,5 +68,5 @@ def test_the_verb_says_it_in_a_line_and_draws_it(tmp_path: Path) -> None:
 
 def test_a_figure_that_cannot_be_made_is_refused_before_it_swims(tmp_path: Path) -> None:
     policy = str(write(tmp_path, velocity_follower(), "eye"))
-    done = CliRunner().invoke(fishctl, ["learn", "look", policy, "--png", "a.gif"])
+    done = CliRunner().invoke(fishctl, ["learn", "look", policy, "--plot", "a.gif"])
     assert "a figure has no format .gif" in str(done.exception)

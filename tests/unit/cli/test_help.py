@@ -1,12 +1,17 @@
 """What `fishctl --help` and its groups show, and what a misspelled verb gets."""
 
+import json
+import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import click
 import pytest
 from click.testing import CliRunner
 
+from fishd.cli import experiment_options
 from fishd.cli.main import fishctl
+from verb_reference import commands, options
 
 
 def groups(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -82,3 +87,75 @@ def test_a_time_that_is_no_number_is_a_wrong_use(verb: str) -> None:
     done = CliRunner().invoke(fishctl, [*verb.split(), "--seconds", "nan"])
     assert done.exit_code == 2
     assert "'nan' is not valid: a finite number is needed" in done.stderr
+
+
+WITHOUT_JSON = {
+    *("calibrate force", "calibrate servo", "camera view", "completion", "config schema"),
+    *("virtual-pi clear", "virtual-pi inject", "virtual-pi press", "virtual-pi run"),
+    "virtual-pi unpress",
+}
+"""Verbs that print no result: dialogues, pictures in the terminal, scripts, nothing at all."""
+EXPERIMENTS = ("measure", "compare", "sweep", "optimise", "identify", "adapt", "learn ppo")
+
+
+def test_all_verbs_have_one_vocabulary() -> None:
+    known = dict(commands(fishctl))
+    assert {verb for verb, command in known.items() if "--json" not in options(command)} == (
+        WITHOUT_JSON
+    )
+    for verb, command in known.items():
+        own = options(command)
+        assert ("--for" in own) == ("--seconds" in own), verb
+        assert not own & {"--tank-time", "--out", "--output", "--figure"}, verb
+        for parameter in command.params:
+            if "--seed" in parameter.opts:
+                assert isinstance(parameter, click.Option)
+                assert (parameter.help or "").startswith("Seed of the random number generator of")
+            if "--on" in parameter.opts:
+                assert isinstance(parameter.type, click.Choice)
+                assert list(parameter.type.choices) == ["live", "simulation"]
+    for verb in EXPERIMENTS:
+        assert {"--on", "--config", "--endpoint", "--take", "--folder"} <= options(known[verb]), (
+            verb
+        )
+
+
+@pytest.mark.parametrize("word", ["help", "list", "start", "run", "swim"])
+def test_a_word_of_other_programs_gets_verbs_that_there_are(word: str) -> None:
+    done = CliRunner().invoke(fishctl, [word])
+    assert done.exit_code == 2
+    for verb in re.findall(r"'([a-z-]+)'", done.stderr.partition(": did you mean")[2]):
+        assert verb in fishctl.list_commands(click.Context(fishctl)) or verb == "fishd"
+
+
+def test_ten_verbs_are_marked_and_a_verb_of_controllers_shows_its_options() -> None:
+    lines = CliRunner().invoke(fishctl, ["--help"]).stdout.splitlines()
+    assert sum(" * " in line for line in lines) == 10
+    shown = CliRunner().invoke(fishctl, ["measure", "--help"]).stdout
+    assert all(option in shown for option in ("--for, --seconds", "--on", "--plot", "--json"))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("simulate", "square:frequency=1.7,amplitude=0.3"),
+        ("simulate", "square", "--frequency", "1.7", "--amplitude", "0.3"),
+        ("simulate", "square", "frequency=1.7", "amplitude=0.3"),
+    ],
+)
+def test_parameters_stand_behind_a_controller_or_are_options(words: tuple[str, ...]) -> None:
+    done = CliRunner().invoke(fishctl, [*words, "--for", "14", "--json"])
+    assert json.loads(done.stdout)["parameters"] == {"frequency": 1.7, "amplitude": 0.3}
+
+
+def test_the_fish_is_live_where_a_fishd_runs_and_nothing_describes_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    choose = experiment_options.default_on
+    monkeypatch.setattr(experiment_options, "is_fishd_running", lambda: True)
+    assert choose(None, (), None) == "live"
+    assert choose(Path("fish.yaml"), (), None) == "simulation"
+    assert choose(None, ("plant.xi=1",), "ipc:///run/a") == "simulation"
+    monkeypatch.setattr(experiment_options, "is_fishd_running", lambda: False)
+    assert choose(None, (), None) == "simulation"
+    assert choose(None, (), "ipc:///run/a") == "live"

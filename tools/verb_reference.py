@@ -1,0 +1,85 @@
+"""Writes the table of verbs and the options they share into docs/, from the commands themselves.
+
+python tools/verb_reference.py --write
+python tools/verb_reference.py --check     exits with 1 when it is out of date
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+
+import click
+
+from common.report import DOCS, between, put, table
+from fishd.cli.main import fishctl
+from fishd.cli.options import ControllerGroup
+
+DOCUMENT, MARKER = DOCS / "reference" / "verbs.md", "options"
+SHARED = (
+    *("--on", "--for", "--budget", "--folder", "--resume", "--to", "--plot", "--json", "--seed"),
+    *("--config", "--endpoint", "--take"),
+)
+"""Options with one meaning wherever they are, in the order of the columns."""
+
+
+def commands(
+    command: click.Command, path: tuple[str, ...] = ()
+) -> Iterator[tuple[str, click.Command]]:
+    """Yield each verb with its command; of a verb that takes a controller, with `square`."""
+    context = click.Context(command)
+    if isinstance(command, ControllerGroup):
+        found = command.get_command(context, "square")
+        assert found
+        yield " ".join(path), found
+    elif isinstance(command, click.Group):
+        if command.invoke_without_command:
+            yield " ".join(path), command
+        for name in command.list_commands(context):
+            verb = command.get_command(context, name)
+            assert verb
+            yield from commands(verb, (*path, name))
+    else:
+        yield " ".join(path), command
+
+
+def options(command: click.Command) -> set[str]:
+    """Return the names of the options of a command."""
+    return {
+        name
+        for parameter in command.params
+        if isinstance(parameter, click.Option)
+        for name in parameter.opts
+    }
+
+
+def reference() -> str:
+    """Return the table: a row for each verb, a column for each shared option."""
+    rows = []
+    for verb, command in commands(fishctl):
+        named = options(command)
+        rows.append([f"`{verb}`", *("✓" if option in named else "" for option in SHARED)])
+    head = " | ".join(("verb", *(f"`{option}`" for option in SHARED)))
+    return table(head, rows)
+
+
+def main() -> int:
+    """Print, write or check; the exit status."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--write", action="store_true", help="put it into docs/")
+    parser.add_argument("--check", action="store_true", help="exit with 1 when out of date there")
+    chosen = parser.parse_args()
+    text = reference()
+    if chosen.write:
+        put(DOCUMENT, MARKER, text)
+    elif not chosen.check:
+        print(text)
+    elif between(DOCUMENT, MARKER) != text:
+        print(
+            f"{DOCUMENT}: out of date: run python tools/verb_reference.py --write", file=sys.stderr
+        )
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
