@@ -205,9 +205,9 @@ def test_on_a_terminal_it_shows_a_bar(
     command = ["learn", "ppo", "--settings", settings, "--folder", str(tmp_path / "run")]
     with ThreadPoolExecutor(1) as reader:
         text = reader.submit(shown)
-        with os.fdopen(theirs, "w") as terminal, contextlib.redirect_stdout(terminal):
+        with os.fdopen(theirs, "w") as terminal, contextlib.redirect_stderr(terminal):
             assert commands.main(command, standalone_mode=False) == 0
-    assert "128/128" in text.result()
+    assert "128 of 128 steps" in text.result()
     assert "tank 0:0" in text.result()
     assert "left" in text.result()
 
