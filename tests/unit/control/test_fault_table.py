@@ -195,7 +195,7 @@ def test_an_estimate_that_is_no_number_is_a_fault_and_nothing_keeps_it(
     rig.loop.stop()
     rig.run_for(3.0)  # the zero of the force is found
     rig.start("swing")
-    rig.run_for(5.0)
+    rig.run_for(2.5)
     broke = rig.now
     with monkeypatch.context() as broken:
         broken.setattr(LateralForceEstimator, "fin_velocity", lambda *_: value)
