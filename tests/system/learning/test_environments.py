@@ -125,26 +125,22 @@ def test_where_no_time_has_passed_a_pause_ends_no_dwell() -> None:
     assert sides == "+++-"
 
 
-@pytest.mark.parametrize("action", [[np.nan], [np.inf], np.array([-np.inf], np.float32)])
-def test_an_action_that_is_no_number_is_refused_and_the_episode_goes_on(action: Any) -> None:
-    env = gymnasium.make("fishd/Swim-v0").unwrapped
-    before, _ = env.reset(seed=1)
-    with pytest.raises(ValueError, match=r"^an action of -?(nan|inf) is not valid: a number in "):
-        env.step(action)
-    assert env.step(np.zeros(1, np.float32))[0].shape == before.shape
-
-
-@pytest.mark.parametrize("action", [0.5, np.zeros(2), np.zeros((1, 1)), [], None])
-def test_an_action_of_another_shape_is_refused(action: Any) -> None:
+def test_an_action_that_is_not_one_number_is_refused_and_one_beyond_its_space_clipped() -> None:
     env = gymnasium.make("fishd/Swim-v0").unwrapped
     env.reset(seed=1)
-    with pytest.raises(ValueError, match=r"^an action of shape \(.*\) is not valid: \(1,\) is "):
-        env.step(action)
-
-
-def test_an_action_beyond_its_space_is_clipped() -> None:
-    env = gymnasium.make("fishd/Swim-v0").unwrapped
-    env.reset(seed=1)
+    invalid: list[Any] = [
+        [np.nan],
+        np.array([-np.inf], np.float32),
+        0.5,
+        np.zeros((1, 1)),
+        [],
+        None,
+    ]
+    for action in invalid:
+        with pytest.raises(
+            ValueError, match=r"^an action of .* is not valid: (a number in|\(1,\) is) "
+        ):
+            env.step(action)
     env.step([7])
     assert env.latest.instruction_angle == 0.42  # type: ignore[attr-defined]
 
@@ -237,13 +233,6 @@ def test_the_environment_on_a_running_fishd_listens_where_it_is_told_to(tmp_path
                 assert fish.status().parameters["agent"] == address
         finally:
             env.close()
-
-
-def test_scales_for_another_amplitude_than_that_of_the_fishd_are_refused(daemon: Daemon) -> None:
-    with pytest.raises(ConfigError, match=r"amplitude_limit: 0\.3 rad .* 0\.42 rad in the fishd"):
-        gymnasium.make(
-            "fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, overrides=("amplitude_limit=0.3",)
-        )
 
 
 def test_without_a_fishd_it_says_where_it_looked(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from rigs.processes import running, sets
 from rigs.swimming import NOISY, Failing, Resting, brief_job, rows
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from fishd.client import Fish
 from fishd.config import load
 from fishd.core.signals import Observation
 from fishd.learning import export as exporting
@@ -391,6 +392,8 @@ def test_in_lockstep_a_fishd_gives_the_evaluations_of_a_fish_in_process(tmp_path
     with running(tmp_path, *sets("lockstep=true", "start.controller=remote", agent, *NOISY)) as one:
         there = on_robot(tmp_path / "there", **changes)
         train(replace(there, endpoint=one.endpoint))
+        with Fish(one.endpoint) as fish:
+            assert fish.status().mode == "idle"
     assert any(row["error"] for row in rows(here.folder / "evaluations.csv"))
     for name in ("progress.csv", "evaluations.csv"):
         assert (here.folder / name).read_text() == (there.folder / name).read_text()

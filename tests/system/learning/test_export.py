@@ -17,7 +17,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.controllers.policy.card import Layout
 from fishd.controllers.policy.file import read
-from fishd.core.errors import ParameterError, PolicyError
+from fishd.core.errors import PolicyError
 from fishd.learning.export import export, export_model
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder import checkpoints
@@ -94,15 +94,6 @@ def test_a_file_that_would_say_something_else_is_never_put_in_place(
     with pytest.raises(PolicyError, match="outputs of the file differ from those of the"):
         export(by_force.best, tmp_path / "policy.onnx")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_another_tick_than_that_of_the_training_is_refused(
-    tmp_path: Path, by_force: Outcome
-) -> None:
-    assert by_force.best
-    found = export(by_force.best, tmp_path / "policy.onnx")
-    with pytest.raises(ParameterError, match="tick"):
-        registry.create("ppo", {"policy": str(found.path)}, Limits(amplitude=0.42, tick=0.02))
 
 
 def test_a_broken_checkpoint_is_one_line(tmp_path: Path, by_force: Outcome) -> None:

@@ -1,10 +1,8 @@
 """Learning from the best square waves of many fish, before PPO or in its place."""
 
-import re
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +21,6 @@ from fishd.learning.settings import (
     EnvironmentSettings,
     ImitationSettings,
     Randomisation,
-    TrainingSettings,
-    check,
 )
 from fishd.learning.train.jobs import Outcome
 from fishd.learning.train.progress import ShownDisplay
@@ -136,19 +132,3 @@ def test_the_best_beat_of_a_robot_is_not_known(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="steps: 0 is not valid on a robot"):
         train(nothing)
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"steps": 0}, "steps: 0 is not valid without imitation.rounds"),
-        (
-            {"see": "both", "imitation": SHORT},
-            "imitation.rounds: 2 is not valid with see: both; imitation is for policies that see "
-            "forces only",
-        ),
-    ],
-)
-def test_what_cannot_be_is_one_line(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(ConfigError, match=re.escape(message)):
-        check(TrainingSettings(**changes))

@@ -4,6 +4,7 @@ import shutil
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Literal
 
 import gymnasium
 import msgspec
@@ -16,13 +17,11 @@ from fishd.camera.axis import NoMotion
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import StackSettings
-from fishd.core.errors import ConfigError
 from fishd.learning.env import environment
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.eyes.base import Eye
 from fishd.learning.eyes.making import make
-from fishd.learning.ppo import make_policy
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import (
@@ -31,7 +30,6 @@ from fishd.learning.settings import (
     TrainingSettings,
     VisionSettings,
     check,
-    load,
 )
 from fishd.learning.train.jobs import Job, Outcome
 from fishd.learning.train.training import train
@@ -67,25 +65,19 @@ def test_a_thousand_steps_teach_it_to_swim_by_sight(
     assert outcome.best_evaluation.relative_thrust > 0.9
 
 
-SMALLEST = [("cnn", 68), ("nature", 36)]
-
-
-@pytest.mark.parametrize(("eye", "size"), SMALLEST)
-def test_a_network_can_be_made_for_the_smallest_frames(eye: str, size: int) -> None:
-    stack = StackSettings(size=size)
-    settings = TrainingSettings(see="camera", camera=VisionSettings(eye=eye, stack=stack))
-    check(settings)
-    assert make_policy(settings.ppo, 2, make(settings))
-
-
-@pytest.mark.parametrize(("eye", "size"), SMALLEST)
-def test_a_network_that_sees_learns_from_whole_rollouts(
-    tmp_path: Path, eye: str, size: int
+@pytest.mark.parametrize(
+    ("eye", "size", "see"),
+    [("cnn", 68, "camera"), ("nature", 36, "camera"), ("modes", 16, "both")],
+)
+def test_with_the_smallest_frames_each_eye_learns_from_whole_rollouts(
+    tmp_path: Path, eye: str, size: int, see: Literal["camera", "both"]
 ) -> None:
     job = job_of(tmp_path / "run", eye)
     few = replace(job.settings.ppo, n_epochs=2)
     small = replace(job.settings.camera, stack=StackSettings(size=size))
-    outcome = train(replace(job, settings=replace(job.settings, ppo=few, camera=small)))
+    settings = replace(job.settings, see=see, ppo=few, camera=small)
+    check(settings)
+    outcome = train(replace(job, settings=settings))
     assert (outcome.ended, outcome.steps) == ("finished", 384)
     assert outcome.latest_evaluation
 
@@ -240,26 +232,3 @@ def test_gymnasium_makes_an_environment_that_sees(tmp_path: Path) -> None:
     assert seen.shape == (16 + 5,)
     assert np.count_nonzero(seen[:16]) == 16
     env.close()
-
-
-def test_with_both_forces_and_pictures_it_learns_too(tmp_path: Path) -> None:
-    job = job_of(tmp_path / "run")
-    outcome = train(replace(job, settings=replace(job.settings, see="both")))
-    assert outcome.steps == 384
-
-
-def test_what_cannot_be_is_said(tmp_path: Path) -> None:
-    file = tmp_path / "settings.yaml"
-    for text, complaint in (
-        ("environment: {observation: []}", "the agent would see nothing"),
-        ("see: camera\ncamera: {babble: 64, memory: 16}", "less than a quarter of babble"),
-        ("see: camera\ncamera: {eye: fish}", "camera.eye"),
-        ("see: camera\ncamera: {eye: cnn, stack: {size: 67}}", "68 px or more are needed"),
-        ("see: camera\ncamera: {eye: nature, stack: {size: 35}}", "36 px or more are needed"),
-        ("see: camera\nsteps: 256", "more than the babble, 256 steps, is needed"),
-    ):
-        file.write_text(text, encoding="utf-8")
-        with pytest.raises(ConfigError, match=complaint):
-            load(file)
-    with pytest.raises(ConfigError, match="the agent would see nothing"):
-        check(TrainingSettings(environment=EnvironmentSettings(observation=())))

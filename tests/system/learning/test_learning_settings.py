@@ -77,6 +77,20 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
             "learning.yaml:2: evaluation.on_robot: 5.0 is not valid: a number in [8, 3600] s is "
             "needed",
         ),
+        ("environment: {observation: []}", "the agent would see nothing"),
+        ("see: camera\ncamera: {babble: 64, memory: 16}", "less than a quarter of babble"),
+        ("see: camera\ncamera: {eye: fish}", "camera.eye"),
+        ("see: camera\ncamera: {eye: cnn, stack: {size: 67}}", "68 px or more are needed"),
+        ("see: camera\ncamera: {eye: nature, stack: {size: 35}}", "36 px or more are needed"),
+        ("see: camera\nsteps: 256", "more than the babble, 256 steps, is needed"),
+        ("steps: 0", "steps: 0 is not valid without imitation.rounds"),
+        (
+            "see: both\nimitation: {rounds: 2}",
+            "imitation.rounds: 2 is not valid with see: both; imitation is for policies that see "
+            "forces only",
+        ),
+        ("evaluation: {patience: 0}", "evaluation.patience: 0 is not valid"),
+        ("environment: {observation: [fx, fy]}", "ppo.symmetric: true is not valid where"),
         (
             "evaluation:\n  seconds: 4.0\n",
             "evaluation.settle: 5 s is not valid: less than seconds, 4 s, is needed",
@@ -92,12 +106,3 @@ def test_a_wrong_value_is_one_line_that_names_file_line_key_and_what_is_needed(
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
         load(tmp_path / "none.yaml")
-
-
-def test_thrust_which_has_no_sign_to_change_must_not_be_seen(tmp_path: Path) -> None:
-    file = tmp_path / "learning.yaml"
-    file.write_text("environment:\n  observation: [fx, fy]\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"ppo\.symmetric: true is not valid where"):
-        load(file)
-    file.write_text(file.read_text() + "ppo:\n  symmetric: false\n", encoding="utf-8")
-    assert not load(file).ppo.symmetric

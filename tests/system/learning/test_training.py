@@ -12,7 +12,6 @@ from rigs.processes import Subscriber, running, sets
 from rigs.swimming import BRIEF, NOISY, Failing, Losing, Resting, brief_job, rows
 from stable_baselines3.common.save_util import load_from_zip_file
 
-from fishd.client import Fish
 from fishd.controllers.policy.card import Layout
 from fishd.core.errors import ConfigError
 from fishd.learning.env.environment import features, thrust_scale
@@ -334,6 +333,10 @@ def test_a_rollout_holds_what_stable_baselines_would_have_computed_step_by_step(
     training = Training(job, SimulatedLink(job.config), Display(), lambda: False)
     buffer, model, rewards = training._model.rollout_buffer, training._model, list[float]()
     buffer.signal = None  # type: ignore[attr-defined]
+    with torch.no_grad():  # without biases, all even functions of odd layers are 0
+        for name, parameter in model.policy.named_parameters():
+            if "value_net" in name and name.endswith("bias"):
+                parameter.normal_(0.0, 0.7)
     step, reset = training._env.step, training._env.reset
     ends: list[np.ndarray] = []
 
@@ -351,6 +354,7 @@ def test_a_rollout_holds_what_stable_baselines_would_have_computed_step_by_step(
     with torch.no_grad():
         values, log_probabilities, _ = model.policy.evaluate_actions(seen, actions)
         of_ends = model.policy.predict_values(torch.from_numpy(np.array(ends)))[:, 0].numpy()
+    assert np.ptp(buffer.values) > 0.05
     assert buffer.values == pytest.approx(values.numpy(), abs=1e-6)
     assert buffer.log_probs[:, 0] == pytest.approx(log_probabilities.numpy(), abs=1e-6)
     assert np.flatnonzero(buffer.episode_starts).tolist() == [0, 25, 50]
@@ -406,34 +410,6 @@ def test_another_run_can_begin_with_its_networks(
     assert outcome.checkpoint
     note = checkpoints.read_card(outcome.checkpoint).provenance.note
     assert note == "began with first/step-000128, 128 steps in simulation"
-
-
-def test_networks_with_other_scales_or_sizes_are_refused(
-    tmp_path: Path, brief: tuple[Job, Outcome]
-) -> None:
-    job = brief_job(tmp_path / "second", parent=brief[1].checkpoint)
-    with pytest.raises(CheckpointError, match="its observation, or a scale of it, differs"):
-        train(replace(job, config=replace(job.config, amplitude_limit=0.3)))
-    narrow = replace(job.settings, ppo=replace(job.settings.ppo, hidden=(8,)))
-    with pytest.raises(
-        CheckpointError, match=r"its ppo\.hidden is \[64, 64\], that of this training is \[8\]"
-    ):
-        train(replace(job, settings=narrow))
-    assert not job.folder.exists()
-
-
-def test_in_lockstep_it_gives_the_numbers_of_a_training_in_process(tmp_path: Path) -> None:
-    here = train(brief_job(tmp_path / "here", steps=256, evaluation=never()))
-    agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
-    settings = sets("lockstep=true", "start.controller=remote", agent, *NOISY)
-    with running(tmp_path, *settings) as fishd:
-        job = brief_job(tmp_path / "there", steps=256, evaluation=never())
-        there = train(replace(job, on="live", endpoint=fishd.endpoint))
-        with Fish(fishd.endpoint) as fish:
-            assert fish.status().mode == "idle"
-    assert (there.steps, there.tank_time) == (256, here.tank_time)
-    tables = [(outcome.folder / "progress.csv").read_text() for outcome in (here, there)]
-    assert tables[0] == tables[1]
 
 
 def test_fishd_is_told_where_to_reach_the_agent(tmp_path: Path) -> None:
