@@ -7,15 +7,11 @@ import os
 import stat
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 SETTINGS = 64 * 2**10
 """Longest file that people write by hand [bytes]."""
 TABLE = 16 * 2**20
 """Longest table of numbers [bytes]."""
-
-FORMER_NAMES = {"efficiency": "relative_thrust", "true_efficiency": "true_relative_thrust"}
-"""Keys and columns in files of older versions of fishd, and their present names."""
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -67,15 +63,6 @@ def read_text(path: Path, longest: int, reader: str, encoding: str = "utf-8") ->
     except UnicodeDecodeError as error:
         raise FileProblem(f"not a text file in UTF-8 ({error.reason})") from None
     return text.replace("\r\n", "\n").replace("\r", "\n")
-
-
-def with_current_names(data: Any) -> Any:
-    """Return plain data, such as decoded JSON, with the keys of older versions replaced."""
-    if isinstance(data, dict):
-        return {FORMER_NAMES.get(k, k): with_current_names(value) for k, value in data.items()}
-    if isinstance(data, list):
-        return [with_current_names(value) for value in data]
-    return data
 
 
 def _check_kind(found: os.stat_result) -> None:

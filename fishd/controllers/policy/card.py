@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
-from fishd.core.files import SETTINGS, with_current_names
+from fishd.core.files import SETTINGS
 from fishd.core.schema import Problem, convert, nested_too_deeply, spelled
 from fishd.core.signals import Observation
 
@@ -237,8 +237,9 @@ def decode(text: str) -> Card:
         raise PolicyError(
             f"its card has format {spelled(found)[:60]}; this fishd reads format {FORMAT}{advice}"
         )
-    if "provenance" in data:
-        data["provenance"] = with_current_names(data["provenance"])
+    past = data.get("provenance")
+    if isinstance(past, dict) and "efficiency" in past:  # as sealed files of before call it
+        past["relative_thrust"] = past.pop("efficiency")
     try:
         card = convert(data, Card)
     except Problem as problem:

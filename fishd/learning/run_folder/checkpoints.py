@@ -192,8 +192,7 @@ def read_card(checkpoint: Path) -> Card:
 def read_state(checkpoint: Path) -> State:
     """Raises `CheckpointError`."""
     try:
-        data = msgspec.json.decode(_text(checkpoint / STATE))
-        return msgspec.convert(files.with_current_names(data), State)
+        return msgspec.json.decode(_text(checkpoint / STATE), type=State)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{checkpoint / STATE}: {_brief(error)}; {_ADVICE}") from None
 

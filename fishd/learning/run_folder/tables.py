@@ -9,10 +9,8 @@ import msgspec
 
 from fishd.core.errors import ConfigError
 from fishd.core.files import (
-    FORMER_NAMES,
     FileProblem,
     NoFile,
-    with_current_names,
     write_atomically,
 )
 from fishd.lab import tables
@@ -61,21 +59,20 @@ class Table(tables.Table):
     def keep_until(self, steps: int) -> None:
         """Drop the rows of later steps, which a resumed run is going to do again.
 
-        Columns that an older fishd did not write are empty.
         Raises `CheckpointError` where the file is not such a table.
         """
         try:
             head, *rows = tables.read(self.path)
-            head = [FORMER_NAMES.get(name, name) for name in head]
             at = head.index("steps")
+            if tuple(head) != self.columns:
+                raise ValueError(head)
             complete = [row for row in rows if len(row) == len(head)]
-            kept = [dict(zip(head, row, strict=True)) for row in complete if int(row[at]) <= steps]
+            kept = [row for row in complete if int(row[at]) <= steps]
         except (ValueError, FileProblem):
             raise CheckpointError(
                 f"{self.path}: not a table of a training; move it away, and a new one is begun"
             ) from None
-        rewritten = [[row.get(column, "") for column in self.columns] for row in kept]
-        write_atomically(self.path, tables.lines([self.columns, *rewritten]))
+        write_atomically(self.path, tables.lines([self.columns, *kept]))
 
 
 def read_evaluations(folder: Path) -> list[Evaluation]:
@@ -86,10 +83,7 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     path = folder / EVALUATIONS
     try:
         head, *rows = tables.read(path)
-        given = [
-            with_current_names({key: text for key, text in zip(head, row, strict=True) if text})
-            for row in rows
-        ]
+        given = [{key: text for key, text in zip(head, row, strict=True) if text} for row in rows]
         return msgspec.convert(given, list[Evaluation], strict=False)
     except NoFile:
         return []

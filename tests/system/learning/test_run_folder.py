@@ -202,25 +202,6 @@ def test_a_row_that_a_kill_cut_off_is_none_even_where_only_a_digit_is_missing(ru
     assert [one.steps for one in read_evaluations(run)] == [64]
 
 
-def test_a_run_of_an_older_fishd_goes_on_with_the_columns_of_this_one(run: Path) -> None:
-    table = run / "evaluations.csv"
-    new = ("policy", "swam")
-    older = [{k: v for k, v in row.items() if k not in new} for row in rows(table)]
-    lines = [",".join(older[0]), *(",".join(row.values()) for row in older)]
-    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    for file in (table, run / "progress.csv", run / STEP / "state.json", run / STEP / "card.json"):
-        text = file.read_text(encoding="utf-8")
-        assert "relative_thrust" in text
-        file.write_text(text.replace("relative_thrust", "efficiency"), encoding="utf-8")
-    before = read_evaluations(run)[0].relative_thrust
-    assert checkpoints.read_card(run / STEP).provenance.relative_thrust == before
-    resumed(run)
-    assert [(row["steps"], row["policy"]) for row in rows(table)] == [("64", ""), ("128", "128")]
-    assert all(row["relative_thrust"] for row in rows(run / "progress.csv"))
-    assert read_evaluations(run)[0].relative_thrust == before
-    assert [one.steps for one in read_evaluations(run)] == [64, 128]
-
-
 def test_a_run_in_progress_is_not_resumed_by_another(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", steps=256)
     said = []
