@@ -10,7 +10,7 @@ import msgspec
 from fishd.config import Config
 from fishd.core.errors import LeaseLost, ParameterError, Refused
 from fishd.core.protocol import State
-from fishd.core.signals import Tick
+from fishd.core.signals import Event, Tick
 from fishd.lab.simulation import KeepingPublisher, VirtualRun
 
 
@@ -84,6 +84,9 @@ class VirtualDaemon:
     def stop(self) -> State:
         self.run.loop.stop()
         return self._state()
+
+    def ticks_and_events(self) -> Iterator[Tick | Event]:
+        return iter(self.ticks())
 
     def ticks(self) -> Iterator[Tick]:
         while True:
