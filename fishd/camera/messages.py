@@ -31,7 +31,7 @@ _POSSIBLE = {"ge": -1e9, "le": 1e9}
 _Version = Annotated[int, note("Version of these messages: 1.")]
 _Session = Annotated[
     str,
-    note("Names one run of the camera on one clock; in another one, times and numbers begin anew."),
+    note("Names one run of the camera on one clock; in another one, times and numbers restart."),
 ]
 _Width = Annotated[int, unit("px", "Columns of the picture.", ge=1, le=8192)]
 _Height = Annotated[int, unit("px", "Its rows.", ge=1, le=8192)]
@@ -65,7 +65,7 @@ class FrameHeader(Struct, frozen=True, kw_only=True, gc=False):
     ]
     exposure: Annotated[float | None, unit("s", "Its length; null where it is not known.")] = None
     dropped: Annotated[
-        int, note("Frames that the camera took but nobody got, since its process began.", ge=0)
+        int, note("Frames that the camera took but did not deliver, since its process began.", ge=0)
     ] = 0
     virtual: Annotated[bool, note("True where the clock is the virtual one of a lockstep.")] = False
     width: Annotated[int, unit("px", "Columns of the picture.", ge=1, le=LARGEST)]
@@ -141,7 +141,9 @@ class CameraState(Struct, frozen=True, kw_only=True):
     ] = None
     exposure: Annotated[float | None, unit("s", "Length of the exposure; null: not known.")] = None
     seq: Annotated[int, note("Number of the latest frame; 0 for none.")] = 0
-    dropped: Annotated[int, note("Frames that the camera took but nobody got, since start.")] = 0
+    dropped: Annotated[
+        int, note("Frames that the camera took but did not deliver, since start.")
+    ] = 0
     broken: Annotated[int, note("Frames that could not be decoded, since start.")] = 0
     width: Annotated[int, unit("px", "Width of frames.")]
     height: Annotated[int, unit("px", "Height of frames.")]

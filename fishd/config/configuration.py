@@ -106,7 +106,7 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "s",
-            "An experiment that does not renew its lease for so long is over, and the fish fades "
+            "An experiment that does not renew its lease for this time is over, and the fish fades "
             "to neutral; longer for slow links.",
             ge=SHORTEST_LEASE,
             le=LONGEST_LEASE,

@@ -53,12 +53,12 @@ FAULTS = {
         "calibrate the force sensor or the servo, as the message says",
     ),
     "estimate-error": Fault(
-        "the estimator raised an exception, or gave what is no finite number",
+        "the estimator raised an exception, or returned a value that is not finite",
         "report it, with the log: it is an error in fishd",
     ),
     "controller-error": Fault(
         "the controller raised an exception of any kind, SystemExit too, or returned something "
-        "that is no finite real number",
+        "that is not a finite real number",
         "correct the controller (the log shows where it failed), or set another one",
     ),
     "controller-slow": Fault(
@@ -76,7 +76,7 @@ FAULTS = {
         "start the agent again, or give it a longer deadline",
     ),
     "remote-error": Fault(
-        "the agent of `remote` sent something that is no answer",
+        "the agent of `remote` sent something that is not an answer",
         "correct the agent",
     ),
     "servo-link": Fault(
@@ -89,7 +89,7 @@ FAULTS = {
         "check that nothing else uses the pin of the button",
     ),
     "publish-error": Fault(
-        "telemetry cannot be encoded or sent; a slow subscriber is no reason",
+        "telemetry cannot be encoded or sent; not because of a slow subscriber",
         "report it, with the log: it is an error in fishd",
     ),
     "overrun": Fault(

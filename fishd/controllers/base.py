@@ -31,7 +31,7 @@ class ChatterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "s",
-            "Who insists on such reversals for so long loses command.",
+            "Time after which a policy that keeps reversing too fast loses command.",
             ge=0.2,
             le=600,
             usual=60,

@@ -271,7 +271,7 @@ OPERATIONS = {
     "mark": Operation(Mark, _STATE, "publishes an event `mark`"),
     "calibrations": Operation(NoArguments, _CALIBRATIONS, "nothing"),
     "sample-force": Operation(
-        SampleForce, "[force sample](#calibrations)", "measures for so many seconds"
+        SampleForce, "[force sample](#calibrations)", "measures for this time"
     ),
     "tare": Operation(
         Tare,

@@ -207,7 +207,7 @@ class Tick(Struct, frozen=True, gc=False):
         bool | UnsetType,
         note(
             "True where estimator and controller were shown `fy` and `fy_rate` with the other "
-            "sign; absent where as they are. See `estimator.reversed_fy`."
+            "sign; absent where unchanged. See `estimator.reversed_fy`."
         ),
     ] = UNSET
     suspect: Annotated[
@@ -236,7 +236,7 @@ EventKind = Literal[
     "mark",
 ]
 EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
-    ("mode", "info; error for estop", "another mode, but for `fault`", "`before`, `mode`"),
+    ("mode", "info; error for estop", "another mode except `fault`", "`before`, `mode`"),
     ("controller", "info", "a controller takes over", "`controller`, `parameters`"),
     (
         "parameters",
@@ -367,7 +367,7 @@ class Percentiles(Struct, frozen=True):
     p50: Annotated[float, unit("µs", "Median, at most 12 % too high.")]
     p99: Annotated[float, unit("µs", "99th percentile, at most 12 % too high.")]
     worst: Annotated[float, unit("µs", "The longest, exact.")]
-    worst_seq: Annotated[int, note("Number of the tick that took so long.")]
+    worst_seq: Annotated[int, note("Number of the tick of `worst`.")]
 
 
 class Timing(Struct, frozen=True):
@@ -466,7 +466,7 @@ class Status(Struct, frozen=True):
     fy_reversed: Annotated[
         bool | None,
         note(
-            "Is F_y, as it is measured, reversed against the tail? Seen when the tail set off from "
+            "Is the measured F_y reversed against the tail? Seen when the tail set off from "
             "rest; null while it was not seen."
         ),
     ] = None

@@ -39,7 +39,7 @@ class ForceSensorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         Annotated[float, Meta(ge=0.1, le=600)] | None,
         unit(
             "s",
-            "A channel whose code has not changed for so long is not believed; null where the "
+            "A channel whose code has not changed for this time is not trusted; null where the "
             "signal is quieter than one step of the ADC.",
             usual=60,
         ),

@@ -61,7 +61,7 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     ] = 0.1
     quantum: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1)] | None,
-        unit("N", "Step in which the mean force of a window is told; null for none."),
+        unit("N", "Resolution of the mean force of a window; null for none."),
     ] = None
     offset_x: Annotated[float, unit("N", "Constant offset on F_x.", ge=-10, le=10, usual=1)] = 0.0
     offset_y: Annotated[float, unit("N", "Constant offset on F_y.", ge=-10, le=10, usual=1)] = 0.0

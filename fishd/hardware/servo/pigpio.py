@@ -42,7 +42,7 @@ class PigpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw_
         float,
         unit(
             "s",
-            "Without a tick for so long, three ticks at least, pigpiod takes the servo to rest, "
+            "Without a tick for this time, three ticks at least, pigpiod takes the servo to rest, "
             "and fishd is in fault if it goes on. Longer forgives a busy machine.",
             ge=0.1,
             le=2.0,

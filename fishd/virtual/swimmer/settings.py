@@ -113,7 +113,7 @@ class SwimmerSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "1",
-            "How firmly a torque, without any net force, keeps the fish on the middle of the "
+            "How firmly a torque, without a net force, keeps the fish on the middle of the "
             "tank; 0: it goes where it goes, and the run ends where cells are coarse.",
             ge=0.0,
             le=10.0,
