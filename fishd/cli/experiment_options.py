@@ -189,10 +189,12 @@ def folder_options(function: F) -> F:
     def placed(*args: Any, folder: Path | None, resume: Path | None, **values: Any) -> Any:
         if folder and resume:
             raise click.UsageError("--folder is for a new experiment, --resume for one: give one")
+        from fishd.lab.experiment import default_folder
+
         context = click.get_current_context()
         place = Place(
             kind=verb(context),
-            path=resume or folder or _default_folder(verb(context)),
+            path=resume or folder or default_folder(verb(context)),
             resume=resume is not None,
             command=tuple(context.meta.get(_WORDS, ())),
         )
@@ -252,12 +254,6 @@ def verb(context: click.Context) -> str:
     """Return the words of a verb without a controller: `sweep`, `learn ppo`."""
     words = context.command_path.split()[1:]
     return " ".join(words[: 2 if words[0] in ("learn",) else 1])
-
-
-def _default_folder(kind: str) -> Path:
-    from fishd.lab.experiment import default_folder
-
-    return default_folder(kind)
 
 
 def _header(folder: Path) -> "Header":

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -160,74 +161,70 @@ def _check_ends(
             grid.check_remote([Point(name, given)], Limits(session.amplitude, session.tick))
 
 
+@dataclass
 class _Optimisation:
     """One search, as the command line wants it."""
 
-    def __init__(
-        self,
-        controller: str,
-        fixed: dict[str, Any],
-        search: "Search | LeastPower",
-        budget: float,
-        until: float,
-        aim: "Aim",
-        session: "Session",
-        experiment: "Experiment",
-        fish: ChosenFish,
-        as_json: bool,
-    ) -> None:
-        """fixed: parameters that are not searched"""
+    controller: str
+    fixed: dict[str, Any]
+    """Parameters that are not searched."""
+    search: "Search | LeastPower"
+    budget: float
+    until: float
+    aim: "Aim"
+    session: "Session"
+    experiment: "Experiment"
+    fish: ChosenFish
+    as_json: bool
+
+    def __post_init__(self) -> None:
         from fishd.lab.optimise.trials import read_trials
 
-        self._controller, self._fixed = controller, fixed
-        self._search, self._budget, self._until, self._aim = search, budget, until, aim
-        self._session, self._experiment, self._fish = session, experiment, fish
-        self._as_json = as_json
-        self._units = units_of(_fields().values())
-        self._trials = read_trials(experiment, (each.name for each in search.ranges))
-        for trial in self._trials:
-            aim.observe(search, trial)
+        self.units = units_of(_fields().values())
+        self.trials = read_trials(self.experiment, (each.name for each in self.search.ranges))
+        for trial in self.trials:
+            self.aim.observe(self.search, trial)
 
     def run(self, picture: Path | None) -> int:
         """Search, print and draw; return the exit status."""
         from fishd.lab.optimise.figure import draw
 
-        ending = Ending(self._experiment)
+        ending = Ending(self.experiment)
         waited = self._measure(ending)
-        if not self._trials:
+        if not self.trials:
             if ending.is_interrupted:
                 return ending.interrupted("no candidate is measured yet")
             raise ParameterError(
-                f"a budget of {self._budget:g} s is too short for the first candidate"
+                f"a budget of {self.budget:g} s is too short for the first candidate"
             )
-        proposal = self._search.proposal()
+        proposal = self.search.proposal()
         with ending.measuring():
             optimum = self._judge(proposal, waited)
-            folder, unit = self._experiment.path, self._session.unit
-            if self._as_json:
+            folder, unit = self.experiment.path, self.session.unit
+            if self.as_json:
                 print_json(optimum)
             else:
-                _print(optimum, unit, self._units)
+                _print(optimum, unit, self.units)
                 echo(f"table: {folder / 'rows.csv'}")
             shown = self._drawn_search()
             paths = [picture] if picture else [folder / "thrust.png", folder / "thrust.svg"]
-            draw(paths, shown, proposal, self._units, _label(self._aim, unit))
-            if not self._as_json:
+            draw(paths, shown, proposal, self.units, _label(self.aim, unit))
+            if not self.as_json:
                 echo(f"picture: {', '.join(map(str, paths))}")
         if ending.is_interrupted:
-            return ending.interrupted(f"{counted(len(self._trials), 'candidate')} are kept")
+            return ending.interrupted(f"{counted(len(self.trials), 'candidate')} are kept")
         if not self._is_done(proposal):
             echo(
-                f"fishctl: the budget of {self._budget:g} s is used: another candidate is expected "
-                f"to give {proposal.improvement:.1%} more, not {self._until:.1%} as requested; a "
-                f"larger one: {self._experiment.resume_command} --budget SECONDS",
+                f"fishctl: the budget of {self.budget:g} s is used: another candidate is expected "
+                f"to give {proposal.improvement:.1%} more, not {self.until:.1%} as requested; a "
+                f"larger one: {self.experiment.resume_command} --budget SECONDS",
                 err=True,
             )
             return 1
         return 0
 
     def _is_done(self, proposal: "Proposal") -> bool:
-        return self._search.is_warm and proposal.improvement <= self._until
+        return self.search.is_warm and proposal.improvement <= self.until
 
     def _measure(self, ending: Ending) -> float:
         """Measure candidates until it is done, after those that are there.
@@ -236,35 +233,35 @@ class _Optimisation:
         """
         from fishd.lab.optimise.trials import keep_trial, trials
 
-        search, session, experiment = self._search, self._session, self._experiment
-        last = self._trials[-1] if self._trials else None
+        search, session, experiment = self.search, self.session, self.experiment
+        last = self.trials[-1] if self.trials else None
         before = session.used = last.passed if last else 0.0
         if last:
-            there = counted(len(self._trials), "candidate")
-            echo(f"{experiment.path}: {there} there already", err=self._as_json)
+            there = counted(len(self.trials), "candidate")
+            echo(f"{experiment.path}: {there} there already", err=self.as_json)
             if self._is_done(search.proposal()):
                 return 0.0
         begin = time.monotonic()
-        observe = partial(self._aim.observe, search)
+        observe = partial(self.aim.observe, search)
         with (
             ending.measuring(),
             session,
             session.recorded(experiment.recording("search"), "a search"),
-            showing(self._budget, "s", err=self._as_json) as show,
+            showing(self.budget, "s", err=self.as_json) as show,
         ):
             session.progress = show.at
             for trial in trials(
-                session, self._controller, self._fixed, search, self._budget, last, observe
+                session, self.controller, self.fixed, search, self.budget, last, observe
             ):
                 keep_trial(experiment, trial)
-                self._trials.append(trial)
+                self.trials.append(trial)
                 proposal = search.proposal()
                 best = proposal if search.is_warm else None
-                line = _line(search.trials, trial, best, session.unit, self._units)
+                line = _line(search.trials, trial, best, session.unit, self.units)
                 show.done(line, trial.passed)
                 if self._is_done(proposal):
                     break
-        passed = (self._trials[-1].passed if self._trials else 0.0) - before
+        passed = (self.trials[-1].passed if self.trials else 0.0) - before
         return max(0.0, time.monotonic() - begin - passed)
 
     def _judge(self, proposal: "Proposal", waited: float) -> "Optimum":
@@ -272,13 +269,13 @@ class _Optimisation:
         from fishd.lab.simulation import simulate
 
         optimum = _optimum_of(
-            self._controller, self._trials, self._search, proposal, self._aim,
-            self._session.calibration,
+            self.controller, self.trials, self.search, proposal, self.aim,
+            self.session.calibration,
         )  # fmt: skip
-        if self._fish.on == "live":
+        if self.fish.on == "live":
             return replace(optimum, thinking=waited)
-        parameters = {**self._fixed, **proposal.parameters}
-        truth = simulate(self._fish.load(), self._controller, parameters)
+        parameters = {**self.fixed, **proposal.parameters}
+        truth = simulate(self.fish.load(), self.controller, parameters)
         warn_of_fin(truth.fin_amplitude)
         return replace(
             optimum,
@@ -291,9 +288,9 @@ class _Optimisation:
         """Return the search of the quantity that is drawn."""
         from fishd.lab.optimise.least_power import LeastPower
 
-        if not isinstance(self._search, LeastPower):
-            return self._search
-        return self._search.alike((t.parameters, t.power, t.power_error) for t in self._trials)
+        if not isinstance(self.search, LeastPower):
+            return self.search
+        return self.search.alike((t.parameters, t.power, t.power_error) for t in self.trials)
 
 
 def _label(aim: "Aim", unit: str) -> str:

@@ -1,5 +1,6 @@
 """The verb that measures thrust, or speed, over a grid of parameters, and proposes the best."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,26 +123,18 @@ def _varied(text: str) -> tuple[str, list[Any]]:
     return key.strip(), list(dict.fromkeys(map(typed, spread(values))))
 
 
+@dataclass
 class _Sweep:
     """One sweep, as the command line wants it."""
 
-    def __init__(
-        self,
-        points: "list[Point]",
-        units: dict[str, str],
-        place: Place,
-        fish: ChosenFish,
-        picture: Path | None,
-        as_json: bool,
-    ) -> None:
-        """units: of the parameters"""
-        self._points = points
-        self._units = units
-        self._place = place
-        self._fish = fish
-        self._picture = picture
-        self._as_json = as_json
-        self._finished = 0
+    points: "list[Point]"
+    units: dict[str, str]
+    """Units of the parameters."""
+    place: Place
+    fish: ChosenFish
+    picture: Path | None
+    as_json: bool
+    finished: int = 0
 
     def swim(self, given: dict[str, Any], crew: dict[str, Any]) -> int:
         """Swim simulated fish; given: lengths, crew: who computes."""
@@ -149,20 +142,20 @@ class _Sweep:
         from fishd.lab.sweep.measuring import swim_all
 
         pairs = self._fish_of_points()
-        config = self._fish.load()
+        config = self.fish.load()
         lengths = Lengths.of(config, **given)
         settings = {"lengths": msgspec.to_builtins(lengths)}
-        with self._place.open(self._fish, msgspec.to_builtins(config), settings) as experiment:
+        with self.place.open(self.fish, msgspec.to_builtins(config), settings) as experiment:
             folder = self._folder(experiment)
             ending = Ending(experiment)
-            with showing(len(pairs), "points", err=self._as_json) as show:
-                show.at(self._finished)
+            with showing(len(pairs), "points", err=self.as_json) as show:
+                show.at(self.finished)
 
                 def done(point: "Point", result: "Found") -> None:
-                    show.done(self._line(folder, point, result), self._finished)
+                    show.done(self._line(folder, point, result), self.finished)
 
                 ending.is_interrupted = not swim_all(folder, pairs, lengths, done, **crew)
-            folder.sort(self._points)
+            folder.sort(self.points)
             return self._conclude(folder, ending, "the mean over beats")
 
     def measure(self, seconds: float) -> int:
@@ -171,27 +164,27 @@ class _Sweep:
         from fishd.lab.sweep import grid
         from fishd.lab.sweep.measuring import measure_all
 
-        for point in self._points:
+        for point in self.points:
             plan(seconds, point.parameters)  # which says that it is too short, before it moves
         settings = {"lengths": {"seconds": seconds}}
-        with self._fish.session() as session:
-            grid.check_remote(self._points, Limits(session.amplitude, session.tick))
-            with self._place.open(self._fish, session.config, settings, session.unit) as experiment:
+        with self.fish.session() as session:
+            grid.check_remote(self.points, Limits(session.amplitude, session.tick))
+            with self.place.open(self.fish, session.config, settings, session.unit) as experiment:
                 folder = self._folder(experiment)
                 ending = Ending(experiment)
-                session.used = self._finished * seconds
+                session.used = self.finished * seconds
                 with (
                     ending.measuring(),
                     session,
-                    showing(len(self._points) * seconds, "s", err=self._as_json) as show,
+                    showing(len(self.points) * seconds, "s", err=self.as_json) as show,
                 ):
                     session.progress = show.at
 
                     def done(point: "Point", result: "Found") -> None:
                         show.done(self._line(folder, point, result), session.used)
 
-                    measure_all(folder, self._points, session, seconds, done)
-                folder.sort(self._points)
+                    measure_all(folder, self.points, session, seconds, done)
+                folder.sort(self.points)
                 return self._conclude(folder, ending, "the measurement")
 
     def _fish_of_points(self) -> "list[tuple[Point, Config]]":
@@ -199,17 +192,17 @@ class _Sweep:
         from fishd.lab.sweep import grid
 
         fish: dict[tuple[tuple[str, Any], ...], Config] = {}
-        for point in self._points:
+        for point in self.points:
             changed = tuple(point.keys.items())
             if changed not in fish:
                 fish[changed] = self._fish_of(point)
             grid.check(point, replace(fish[changed].limits, virtual=True))
-        return [(point, fish[tuple(point.keys.items())]) for point in self._points]
+        return [(point, fish[tuple(point.keys.items())]) for point in self.points]
 
     def _fish_of(self, point: "Point") -> Config:
         pairs = [f"{key}={value}" for key, value in point.keys.items()]
         try:
-            return self._fish.load(pairs)
+            return self.fish.load(pairs)
         except ConfigError as error:
             message = str(error)
             for pair in pairs:
@@ -220,35 +213,35 @@ class _Sweep:
         """Open the table, and print what is there already."""
         from fishd.lab.sweep.folder import SweepFolder
 
-        columns = dict.fromkeys(name for point in self._points for name in point.columns())
+        columns = dict.fromkeys(name for point in self.points for name in point.columns())
         folder = SweepFolder(experiment, list(columns))
-        self._finished = sum(folder.key(point) in folder.results for point in self._points)
-        there = f", {self._finished} of them there already" if self._finished else ""
-        self._fish.announce(self._as_json)
-        echo(f"{folder.path}: {counted(len(self._points), 'point')}{there}", err=self._as_json)
+        self.finished = sum(folder.key(point) in folder.results for point in self.points)
+        there = f", {self.finished} of them there already" if self.finished else ""
+        self.fish.announce(self.as_json)
+        echo(f"{folder.path}: {counted(len(self.points), 'point')}{there}", err=self.as_json)
         return folder
 
     def _line(self, folder: "SweepFolder", point: "Point", result: "Found") -> str:
         """Return a line on a point that is done."""
-        self._finished += 1
+        self.finished += 1
         return f"{point.label()}: {_figures(result, folder.quantity)}"
 
     def _conclude(self, folder: "SweepFolder", ending: Ending, error_of: str) -> int:
         """Print what is best, and draw what there is; return the exit status."""
         from fishd.lab.sweep import curves, figure
 
-        points, quantity = self._points, folder.quantity
+        points, quantity = self.points, folder.quantity
         drawn = curves.curves(folder, points)
         bests = [
             (curve, replace(best, whole_ticks=curves.whole_ticks(folder, curve)))
             for curve in drawn
             if (best := curves.best(curve))
         ]
-        if self._as_json:
+        if self.as_json:
             print_json([curves.plain(best, quantity) for _, best in bests])
         else:
             for curve, best in bests:
-                unit = self._units.get(best.over, "")
+                unit = self.units.get(best.over, "")
                 echo(f"{curve.label}: {_proposal(best, unit, quantity.unit)}")
                 if best.whole_ticks:
                     whole = _measured(best.whole_ticks, quantity.unit)
@@ -256,9 +249,9 @@ class _Sweep:
             echo(f"table: {folder.path / 'rows.csv'}")
         if any(curve.peak for curve in drawn):
             stem = folder.path / quantity.name
-            paths = [self._picture] if self._picture else [Path(f"{stem}.png"), Path(f"{stem}.svg")]
-            figure.draw(paths, drawn, self._units, error_of=error_of, quantity=quantity)
-            if not self._as_json:
+            paths = [self.picture] if self.picture else [Path(f"{stem}.png"), Path(f"{stem}.svg")]
+            figure.draw(paths, drawn, self.units, error_of=error_of, quantity=quantity)
+            if not self.as_json:
                 echo(f"picture: {', '.join(map(str, paths))}")
         fins = [
             (getattr(result, "fin_amplitude", None) or 0.0, point.label())

@@ -1,5 +1,6 @@
 """The folder of an experiment: begun once, resumed with the same, used by one process."""
 
+import json
 import os
 import signal
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ from fishd.core.errors import ConfigError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.session import VirtualSession
+from fishd.recording import open_run
 
 HEADER = Header(kind="sweep", on="live", settings={"seed": 1}, config={"plant": {"xi": 1.2}})
 
@@ -133,3 +135,19 @@ def test_an_experiment_is_resumed_by_its_own_verb_with_its_own_options(tmp_path:
     done = fishctl("optimise", "--resume", str(folder))
     assert f"{folder}: 1 candidate there already" in done.stdout
     assert done.stdout.startswith("fish: the default simulated fish, changed by --set\n")
+
+
+def test_a_measurement_keeps_header_recording_and_result_and_is_listed(tmp_path: Path) -> None:
+    folder = tmp_path / "first"
+    words = ("measure", "swing:C=0.5", "--on", "simulation", "--for", "21", "--json")
+    done = fishctl(*words, "--folder", str(folder))
+    assert done.stderr == "fish: the default simulated fish\n"
+    result = json.loads((folder / "result.json").read_bytes())
+    assert result == json.loads(done.stdout)
+    assert len(open_run(folder / "measure.mcap").ticks) == round(result["seconds"] / 0.05)
+    (listed,) = json.loads(fishctl("runs", "--folder", str(tmp_path), "--json").stdout)
+    assert (listed["name"], listed["kind"], listed["on"]) == ("first", "measure", "simulation")
+    (folder / "experiment.json").write_text("{}")
+    done = fishctl("runs", "--folder", str(tmp_path))
+    assert done.returncode == 1
+    assert f"fishctl: {folder}/experiment.json: not as this fishd" in done.stderr
