@@ -98,7 +98,7 @@ class PictureSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     """What frames show: the fish's axis along the rows, its head to the left."""
 
     rotate: Annotated[
-        Literal[0, 90, 180, 270], note("Turn the camera's picture clockwise by so many degrees.")
+        Literal[0, 90, 180, 270], note("Turn the camera's picture clockwise by this angle.")
     ] = 0
     crop: Annotated[Square, note("The part of the turned picture that frames show.")] = Square()
     size: Annotated[
