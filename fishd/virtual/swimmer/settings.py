@@ -127,8 +127,8 @@ class SwimmerSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "1",
-            "Live, a second of the fish takes this number of seconds, or as many more as this machine "
-            "needs. Runs in virtual time are as fast as they can be.",
+            "Live, a second of the fish takes this number of seconds, or as many more as this "
+            "machine needs. Runs in virtual time are as fast as they can be.",
             ge=1.0,
             le=1000.0,
         ),
