@@ -8,6 +8,8 @@ import pigpio
 import pytest
 from rigs.pigpiod_client import GPIO, Bench, dispose, eventually, pigpiod_bench
 
+from fishd.virtual.pi.pigpiod.daemon import Pigpiod
+
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
@@ -130,3 +132,10 @@ def test_closing_ends_every_connection_and_the_thread(bench: Bench) -> None:
     assert eventually(lambda: not bench.daemon._thread.is_alive())
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", bench.daemon.port))
+
+
+def test_a_port_that_is_taken_is_an_error_at_once(bench: Bench) -> None:
+    another = Pigpiod(bench.clock, bench.faults, bench.daemon.port)
+    with pytest.raises(OSError, match="in use"):
+        another.start()
+    another.close()
