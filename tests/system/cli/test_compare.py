@@ -21,7 +21,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_command_draws_a_picture_and_prints_a_table(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason="install the extra 'lab'")
     picture = tmp_path / "contest.png"
     done = run("swing:C=0.5", "hold", "--seconds", "15", "--settle", "5", "--plot", str(picture))
     assert (done.returncode, done.stderr) == (0, "")

@@ -263,7 +263,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     assert outcome.best == job.folder / "best-000064"
     assert same(outcome.best, training.networks[64])
     past = checkpoints.read_card(outcome.best).provenance
-    assert (past.steps, past.relative_thrust, past.on) == (64, best.relative_thrust, "robot")
+    assert (past.steps, past.relative_thrust, past.on) == (64, best.relative_thrust, "live")
     assert outcome.checkpoint
     assert same(outcome.checkpoint, training.networks[192])  # what learned on is the newest
     table = rows(job.folder / "evaluations.csv")

@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-pytest.importorskip("stable_baselines3")
+pytest.importorskip("stable_baselines3", reason="install the extra 'learn'")
 
 from fishd.camera.axis import NoMotion
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings

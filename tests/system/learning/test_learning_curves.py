@@ -7,7 +7,7 @@ from rigs.pictures import letters_of
 
 
 def test_learning_curves_name_their_goal_and_where_the_axis_begins(tmp_path: Path) -> None:
-    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib = pytest.importorskip("matplotlib", reason="install the extra 'lab'")
     from bench.learning_curves import learning_curves
 
     curve = [([200, 400], [0.5, 0.98]), ([200, 400], [0.6, 0.99])]

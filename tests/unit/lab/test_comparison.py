@@ -15,6 +15,7 @@ from fishd.lab.compare.comparison import Standing, Trace, compare, judge_standin
 from fishd.lab.compare.contestants import default_contestants, parse
 
 CONFIG = load(None, ["simulation.offset_y=0.005"])
+FIGURES = "install the extra 'lab'"
 
 
 def swum(*texts: str, runs: int = 1) -> list[comparison.Standing]:
@@ -139,7 +140,7 @@ def test_a_trace_is_the_end_of_the_run() -> None:
 
 
 def test_the_picture_begins_with_an_upward_reversal() -> None:
-    figures = pytest.importorskip("fishd.lab.compare.figures")
+    figures = pytest.importorskip("fishd.lab.compare.figures", reason=FIGURES)
     times = [0.05 * k - 5.0 for k in range(101)]
     command = [0.4 if k % 20 >= 10 else -0.4 for k in range(101)]
     shown = figures._from_upward_reversal(Trace(times, command, times, times))
@@ -149,7 +150,7 @@ def test_the_picture_begins_with_an_upward_reversal() -> None:
 
 @pytest.mark.slow
 def test_the_picture_names_each_line_bar_and_whisker_and_the_amplitude(tmp_path: Path) -> None:
-    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib = pytest.importorskip("matplotlib", reason=FIGURES)
     from fishd.lab.compare.figures import draw
 
     contestants = [parse("swing"), parse("sine:frequency=1.8")]
@@ -166,7 +167,7 @@ def test_the_picture_names_each_line_bar_and_whisker_and_the_amplitude(tmp_path:
 
 
 def test_the_command_is_not_drawn_beyond_the_time_that_is_shown() -> None:
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason=FIGURES)
     from matplotlib.figure import Figure
 
     from fishd.lab.compare.figures import _draw_angles
@@ -179,7 +180,7 @@ def test_the_command_is_not_drawn_beyond_the_time_that_is_shown() -> None:
 
 
 def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
+    pytest.importorskip("matplotlib", reason=FIGURES)
     from fishd.lab.compare.figures import draw
 
     standings, traces = compare(CONFIG, [parse("hold")], 6.0, 1.0)
