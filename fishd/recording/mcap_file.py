@@ -135,6 +135,10 @@ class _Expander:
             raise _Implausible(
                 f"a chunk claims {_megabytes(size)}, {_megabytes(MAX_RECORD)} at most"
             )
+        if chunk.compression == "zstd":
+            claimed = zstandard.frame_content_size(chunk.data)
+            if claimed not in (-1, size):  # it would be allocated; -1 where none is claimed
+                raise _Implausible(f"a zstd frame claims {claimed} bytes, its chunk {size}")
         self._left -= size
         if self._left < 0:
             raise RecordingError(
@@ -151,9 +155,6 @@ class _Expander:
         if not chunk.compression:
             content = chunk.data
         elif chunk.compression == "zstd":
-            claimed = zstandard.frame_content_size(chunk.data)
-            if claimed not in (-1, size):  # it would be allocated; -1 where none is claimed
-                raise _Implausible(f"a zstd frame claims {claimed} bytes, its chunk {size}")
             # A size of 0 would stand for any.
             content = self._decompress(chunk.data, max_output_size=size) if size else b""
         elif chunk.compression == "lz4":
