@@ -70,12 +70,12 @@ class Job(Struct, frozen=True, kw_only=True):
 
     @property
     def cleans_rewards(self) -> bool:
-        """True if the sensor's drift and turn are removed; they cannot be if the fish changes."""
+        """True if the sensor's drift and turn are removed; this takes over an episode of one fish."""
         one_fish = self.on == "live" or self.settings.randomisation == Randomisation()
         return self.settings.ppo.clean_rewards and one_fish
 
     def last_step(self, done: int = 0) -> int:
-        """Return the last step: PPO learns from whole rollouts; done: steps before PPO."""
+        """Return the last step: PPO learns from whole rollouts; done: steps done already."""
         rollout = self.settings.ppo.n_steps
         return done + math.ceil((self.settings.steps - done) / rollout) * rollout
 

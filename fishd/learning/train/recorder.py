@@ -46,7 +46,7 @@ class ProgressWriter(KVWriter):
 
 
 class RunRecorder:
-    """A recorder that creates or opens the run folder, loads initial networks, and logs progress."""
+    """Recorder of a run: creates or opens its folder, loads initial networks, logs progress."""
 
     def __init__(self, job: Job, env: SwimEnv, model: PPO) -> None:
         """
@@ -62,11 +62,11 @@ class RunRecorder:
         self.latest: Evaluation | None = None
         self.best: Evaluation | None = None
         self.unimproved = 0
-        """Number of evaluations since the merit of the best policy rose by `IMPROVEMENT`."""
+        """Number of evaluations in simulation since the best merit rose by `IMPROVEMENT`."""
         self._plateau = 0.0
         """Merit of the best policy after its latest rise by `IMPROVEMENT`."""
         self.imitated = False
-        """Whether imitation is finished, or is not needed because of a parent."""
+        """Whether imitation is finished, in this run or in the one that it began with."""
         self.checkpoint: Path | None = None
         """Newest `step` checkpoint, or the one that the run was resumed from."""
         self.winner: Candidate | None = None
@@ -111,14 +111,14 @@ class RunRecorder:
 
     @property
     def has_converged(self) -> bool:
-        """True if the newest policy is good, and the best has not improved for `patience` evaluations."""
+        """True if the newest policy is good, and `patience` evaluations showed no better one."""
         patience, latest, best = self._job.settings.evaluation.patience, self.latest, self.best
         if patience is None or latest is None or best is None or self.unimproved < patience:
             return False
         return best.merit >= GOOD_ENOUGH and latest.merit > best.merit - IMPROVEMENT
 
     def add_measured(self, evaluation: Evaluation) -> Evaluation:
-        """Write one row of evaluations.csv; `evaluation.best` is set already. Return the evaluation."""
+        """Write one row of evaluations.csv, with `best` as given; return the evaluation."""
         self._evaluations.add(msgspec.structs.asdict(evaluation))
         if evaluation.policy == self.steps:
             self.latest = evaluation
@@ -129,7 +129,8 @@ class RunRecorder:
     def save(self, *, due: bool = True, anew: bool = False) -> None:
         """Write a `best` checkpoint if another policy is now the best, and a `step` one if due.
 
-        due: write a `step` checkpoint unless the newest one is of this step
+        due: write a `step` checkpoint unless the newest one is of this step, and also a `best`
+            one if only the figures of the best policy have changed
         anew: write it even then, because the policy has changed without a step
 
         Call it after the rows of the tables are written: a resume drops rows that are newer than
