@@ -48,7 +48,7 @@ _ADVICE = "move this checkpoint away to resume from the previous one"
 
 
 class CheckpointError(FishdError, RuntimeError):
-    """A needed checkpoint is missing, or a run folder cannot be read or written."""
+    """Error of a missing checkpoint, or of a run folder that cannot be read or written."""
 
 
 class State(Struct, frozen=True):

@@ -70,7 +70,7 @@ class Job(Struct, frozen=True, kw_only=True):
 
     @property
     def cleans_rewards(self) -> bool:
-        """True if the sensor's drift and turn are removed; this takes over an episode of one fish."""
+        """True if the sensor's drift and turn are removed; one episode of a fish is too short."""
         one_fish = self.on == "live" or self.settings.randomisation == Randomisation()
         return self.settings.ppo.clean_rewards and one_fish
 
