@@ -1,4 +1,4 @@
-"""Export of a checkpoint, or of a model of stable-baselines3, to a file for the controller `ppo`."""
+"""Export of a checkpoint, or a model of stable-baselines3, to a file for the controller `ppo`."""
 
 from pathlib import Path
 
@@ -57,8 +57,8 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
     force: write the file even where the policy stalls
     note: for people, kept in the file
 
-    Raises `CheckpointError`, and `PolicyError` where the policy stalls or the file would give other
-    outputs than the policy.
+    Raises `CheckpointError`, and `PolicyError` where the policy stalls or the outputs of the
+    file would differ from those of the policy.
     """
     torch.set_num_threads(1)  # for single pictures, more threads are slower
     card = checkpoints.read_card(checkpoint)
@@ -82,7 +82,8 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
         averages are not stored in a policy file
     note: for people, kept in the file
 
-    Raises `PolicyError` for any other model, and where the file would give other outputs than the policy.
+    Raises `PolicyError` for any other model, and where the outputs of the file would differ from
+    those of the policy.
     """
     path = Path(target)
     vec_env, policy = model.get_env(), model.policy
@@ -237,7 +238,7 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
 
 
 def _stacks(card: Card) -> list[Stack]:
-    """Return stacks of noise, and of a simulated fish that moves at random, if pictures are seen."""
+    """Return stacks of noise, and of a simulated fish that moves at random, if any are seen."""
     if card.pictures is None:
         return []
     random = np.random.default_rng(1)

@@ -31,7 +31,7 @@ from fishd.virtual.plant.parameters import PlantParameters
 LONGEST_HALF = 1.2
 """Longest half beat that is compared [s]."""
 AT_RANDOM = 3
-"""Ticks of a fish per tick of its initial random waves, at least."""
+"""Smallest ratio of all ticks of a fish to its initial ticks, which are swum by random waves."""
 NEARER = 0.3
 """Share of the fish that are from a part of the randomisation; the others are from all of it."""
 RIG_RANGES = ("servo_delay", "servo_dead_zone", "backlash", "servo_reaction")

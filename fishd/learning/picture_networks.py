@@ -41,7 +41,9 @@ def small_network(shape: Shape) -> nn.Sequential:
 
 
 def nature_network(shape: Shape) -> nn.Sequential:
-    """Return the network of Mnih et al., "Human-level control through deep RL" (2015)."""
+    """Return the network of Mnih et al.: "Human-level control through deep reinforcement learning",
+    2015.
+    """
     space: Any = gymnasium.spaces.Box(0.0, 1.0, shape, np.float32)
     whole = NatureCNN(space, LARGE, normalized_image=True)
     return nn.Sequential(*whole.cnn, *whole.linear)

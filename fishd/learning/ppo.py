@@ -40,8 +40,8 @@ class SymmetricPolicy(ActorCriticPolicy):
 
     All inputs (F_y, its rate, the fin velocity, φ_c) change sign when left and right are swapped,
     and so does the action; the value of a state does not. The networks have this symmetry by
-    construction, so it need not be learned, and no policy can favour one side. F_x, whose sign does not
-    change, must not be among the inputs. The bias of the policy's last layer stays zero.
+    construction, so it need not be learned, and no policy can favour one side. F_x, whose sign does
+    not change, must not be among the inputs. The bias of the policy's last layer stays zero.
     """
 
     def _build_mlp_extractor(self) -> None:

@@ -296,7 +296,7 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def seen(self) -> EnvironmentSettings:
-        """Settings of the environment's observation beside pictures; `see: camera` has no forces."""
+        """Settings of the environment; with `see: camera`, the observation has no forces."""
         names = self.environment.observation
         if self.see == "camera":
             names = tuple(name for name in names if name in COMMANDS)

@@ -71,7 +71,7 @@ class State(Struct, frozen=True):
     """Number of measured swims of the best policy in a tank."""
 
     def is_finished(self, steps: int) -> bool:
-        """Return True if a training of `steps` is complete."""
+        """Return True if a training of `steps` control steps is complete."""
         return self.steps >= steps and (self.steps > 0 or self.imitated)
 
 
@@ -229,7 +229,7 @@ def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
 
 
 def load_eye(eye: Eye, checkpoint: Path) -> None:
-    """Load the constants of a checkpoint into an eye, if there are; raises `CheckpointError`."""
+    """Load the constants of a checkpoint into an eye, if any; raises `CheckpointError`."""
     path = checkpoint / EYE
     if not path.exists():
         return

@@ -31,7 +31,7 @@ class Rollouts:
         self._observation: Vector
         self._starts = True
         self._lost = self._blind = 0
-        """Numbers of lost and of blind ticks of the environment until the previous rollout ended."""
+        """Numbers of lost and of blind ticks of the environment until the last rollout ended."""
         self.dropped = 0
         """Number of steps of a rollout that was stopped midway, not used for learning."""
 
