@@ -55,7 +55,7 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
     """Evaluate the policy of a checkpoint, and write it to `target`.
 
     force: write the file even where the policy stalls
-    note: for people, kept in the file
+    note: text for the user, stored in the file
 
     Raises `CheckpointError`, and `PolicyError` where the policy stalls or the outputs of the
     file would differ from those of the policy.
@@ -80,7 +80,7 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
 
     model: PPO or A2C with an `MlpPolicy` of tanh or relu, and without `VecNormalize`, whose
         averages are not stored in a policy file
-    note: for people, kept in the file
+    note: text for the user, stored in the file
 
     Raises `PolicyError` for any other model, and where the outputs of the file would differ from
     those of the policy.

@@ -15,7 +15,7 @@ from fishd.core.schema import Problem, convert, note, unit, without_empty_sectio
 from fishd.virtual.plant.parameters import PlantParameters
 
 SMALLEST = {"modes": 16, "cnn": 68, "nature": 36}
-"""Smallest size of a frame that all convolutions of an eye's network can process [px]."""
+"""Smallest size of a frame that all convolutions of the network can process, by eye [px]."""
 Share = Annotated[float, Meta(ge=0, le=9)]
 
 

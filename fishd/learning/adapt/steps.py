@@ -112,7 +112,7 @@ def search_square_waves(
     """
     last = None
     for one in before:
-        nobody = math.nan, math.nan  # knows its electrical power
+        nobody = math.nan, math.nan  # the electrical power is unknown
         last = Trial(
             {"frequency": one.frequency}, one.thrust, one.error, *nobody, one.swum, one.passed
         )

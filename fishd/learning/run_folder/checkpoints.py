@@ -137,7 +137,7 @@ def newest(folder: Path) -> Path:
 def best(folder: Path) -> Path | None:
     """Return the checkpoint that swam best; None where no policy of the run has swum."""
     found = [path for path in all_in(folder) if path.name.startswith("best")]
-    return max(found, key=_written, default=None)  # a kill may have left the one before
+    return max(found, key=_written, default=None)  # after a kill, the previous best may remain
 
 
 def find(path: Path, *, latest: bool = False) -> Path:
@@ -269,7 +269,7 @@ def _tensors(path: Path) -> dict[str, Any]:
                 raise ValueError("it unpacks to far more than a checkpoint needs")
         found = load_from_zip_file(io.BytesIO(content), load_data=False, device="cpu")
         return cast(dict[str, Any], found[1])
-    except Exception as error:  # a damaged archive contradicts itself in many ways
+    except Exception as error:  # a damaged archive raises many kinds of exceptions
         raise ValueError(_brief(error.__cause__ or error)) from None
 
 

@@ -94,7 +94,7 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
 
 
 def best_so_far(evaluations: Iterable[Evaluation]) -> list[float]:
-    """Return the relative thrust of the best policy until each evaluation; 0 before the first."""
+    """Return the relative thrust of the best policy until each evaluation, stalled excluded."""
     best = 0.0
     return [best := one.relative_thrust if one.best else best for one in evaluations]
 
