@@ -63,7 +63,7 @@ class Tried(Struct, frozen=True):
 
 
 class Trained(Struct, frozen=True, kw_only=True):
-    """The result of the policy on the identified fish, or why there is no result."""
+    """The result of the policy on the identified fish, or the reason why it is missing."""
 
     steps: int
     """Number of steps of all trainings."""
