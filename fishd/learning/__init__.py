@@ -1,6 +1,6 @@
 """Learning to swim: environments, PPO training and export (extra: learn).
 
-To import it registers `fishd/Swim-v0` and `fishd/SwimOnDaemon-v0` with Gymnasium.
+Importing it registers `fishd/Swim-v0` and `fishd/SwimOnDaemon-v0` with Gymnasium.
 """
 
 from fishd.learning.env.registration import register

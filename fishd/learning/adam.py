@@ -1,6 +1,6 @@
 """Adam as torch computes it, without `torch.optim.Optimizer`.
 
-That class imports torch's compiler, which nothing here uses, and which takes a second.
+That class imports torch's compiler, which is not used here and takes a second.
 """
 
 from collections.abc import Iterable
@@ -11,18 +11,18 @@ from torch.optim.adam import adam
 
 BETAS = 0.9, 0.999
 EPSILON = 1e-5
-"""Smallest denominator; that of stable-baselines3."""
+"""Smallest denominator, as in stable-baselines3."""
 
 
 class Adam:
-    """What stable-baselines3 uses of an optimiser; its state is that of `torch.optim.Adam`."""
+    """An optimiser with the methods stable-baselines3 uses, and the state of `torch.optim.Adam`."""
 
     def __init__(self, parameters: Iterable[torch.Tensor], lr: float) -> None:
         self.param_groups: list[dict[str, Any]] = [{"params": list(parameters), "lr": lr}]
         self._state: dict[int, dict[str, torch.Tensor]] = {}
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Delete the gradients."""
         for parameter in self._parameters:
             parameter.grad = None
 
@@ -56,15 +56,15 @@ class Adam:
         )
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what a checkpoint holds."""
+        """Return the state that a checkpoint stores."""
         (group,) = self.param_groups
         numbers = list(range(len(group["params"])))
         return {"state": self._state, "param_groups": [{**group, "params": numbers}]}
 
     def load_state_dict(self, state: dict[str, Any], strict: bool = True) -> None:
-        """Take over what a checkpoint holds.
+        """Load the state from a checkpoint.
 
-        strict: ignored; stable-baselines3 gives it
+        strict: ignored; stable-baselines3 passes it
 
         Raises ValueError where the shapes are those of other parameters.
         """

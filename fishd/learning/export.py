@@ -1,4 +1,4 @@
-"""Writes a checkpoint, or any model of stable-baselines3, to one file for the controller `ppo`."""
+"""Export of a checkpoint, or a model of stable-baselines3, to a file for the controller `ppo`."""
 
 from pathlib import Path
 
@@ -34,33 +34,33 @@ from fishd.learning.settings import EvaluationSettings, TrainingSettings
 
 TOLERANCE = 1e-4
 """Largest difference between the outputs of the file and of the trained policy, as a share of Φ:
-pixels and large weights are summed, which each library does in an order of its own."""
+pixels and large weights are summed, in an order that differs between libraries."""
 _PROBES = 1000
 _STACKS = 100
-"""Of noise, and of a tail."""
+"""Number of stacks of noise, and of stacks of a moving tail."""
 
 
 class Exported(Struct, frozen=True):
-    """What was written."""
+    """The result of an export."""
 
     path: Path
     checkpoint: Path
     card: Card
     evaluation: Evaluation
     size: int
-    """[bytes]"""
+    """Size of the file [bytes]."""
 
 
 def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "") -> Exported:
     """Evaluate the policy of a checkpoint, and write it to `target`.
 
-    force: also where it stalls
-    note: for people, kept in the file
+    force: write the file even where the policy stalls
+    note: text for the user, stored in the file
 
-    Raises `CheckpointError`, and `PolicyError` where the policy stalls or the file would give other
-    outputs than the policy.
+    Raises `CheckpointError`, and `PolicyError` where the policy stalls or the outputs of the
+    file would differ from those of the policy.
     """
-    torch.set_num_threads(1)  # for single pictures, more only get in each other's way
+    torch.set_num_threads(1)  # for single pictures, more threads are slower
     card = checkpoints.read_card(checkpoint)
     policy, perception = checkpoints.load_policy(checkpoint)
     found = _evaluated(checkpoint, card, policy, perception)
@@ -79,10 +79,11 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     """Write the policy of a model of stable-baselines3 that was trained on a `SwimEnv`.
 
     model: PPO or A2C with an `MlpPolicy` of tanh or relu, and without `VecNormalize`, whose
-        averages are no part of a policy file
-    note: for people, kept in the file
+        averages are not stored in a policy file
+    note: text for the user, stored in the file
 
-    Raises `PolicyError` for any other, and where the file would give other outputs than the policy.
+    Raises `PolicyError` for any other model, and where the outputs of the file would differ from
+    those of the policy.
     """
     path = Path(target)
     vec_env, policy = model.get_env(), model.policy
@@ -118,7 +119,7 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
 
 
 def _write(target: Path, card: Card, policy: ActorCriticPolicy, perception: Perception) -> int:
-    """Write the file atomically; its size [bytes]. Raises `PolicyError`."""
+    """Write the file atomically; return its size [bytes]. Raises `PolicyError`."""
     sight = _sight(policy, perception)
     content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
     _verify(PolicyFile(target, content, card), policy, perception)
@@ -133,7 +134,7 @@ def _write(target: Path, card: Card, policy: ActorCriticPolicy, perception: Perc
 
 
 def _sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | None:
-    """How frames become what the first layer is given; None where no frames are seen."""
+    """Return the graph from frames to the inputs of the first layer; None without frames."""
     from onnx import TensorProto, helper
 
     eye = perception.eye
@@ -171,7 +172,7 @@ def _sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | None:
 def _evaluated(
     checkpoint: Path, card: Card, policy: ActorCriticPolicy, perception: Perception
 ) -> Evaluation:
-    """That of this policy on the robot, else one on the simulated fish of its training."""
+    """Return the evaluation of the policy on the robot, else on its simulated fish."""
     state = checkpoints.read_state(checkpoint)
     if state.on == "live":
         for found in (state.best, state.latest):
@@ -190,7 +191,7 @@ def _evaluated(
 
 
 def _camera(run: Path, card: Card) -> Camera | None:
-    """That of a run, where it has one, else a good one; None for a policy that sees no pictures."""
+    """Return the camera of a run, else the default; None for a policy that sees no pictures."""
     if card.pictures is None:
         return None
     try:
@@ -201,7 +202,7 @@ def _camera(run: Path, card: Card) -> Camera | None:
 
 
 def _completed(card: Card, evaluation: Evaluation, note: str = "") -> Card:
-    """The card with the figures of an evaluation, and the note."""
+    """Return the card with the figures of an evaluation, and the note."""
     past = replace(
         card.provenance,
         relative_thrust=evaluation.relative_thrust,
@@ -237,7 +238,7 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
 
 
 def _stacks(card: Card) -> list[Stack]:
-    """Stacks of noise, and of a simulated fish that moves at random; none without pictures."""
+    """Return stacks of noise, and of a simulated fish that moves at random, if any are seen."""
     if card.pictures is None:
         return []
     random = np.random.default_rng(1)

@@ -1,11 +1,11 @@
 """Learning from the best square wave of each fish, before PPO begins or in its place.
 
-Of a simulated fish it is known how many ticks its best half beat has. So the learner swims many
+The number of ticks of the best half beat of a simulated fish is known. So the learner swims many
 fish, each tick is labelled with the side that would be right there, and the network is fitted to
-the labels of all rounds so far (DAgger: Ross, Gordon and Bagnell 2011). It is not told which fish
-swims: what it can see of that is in its history. Many fish look nearly alike and want different
-beats, so it matters which are common: some are drawn from a random share of the randomisation, and
-so fish like the configured one are.
+the labels of all previous rounds (DAgger: Ross, Gordon and Bagnell 2011). The identity of the fish
+is not an input: the network can only infer it from its history. Many fish look nearly alike and
+need different beats, so their distribution matters: some are drawn from a random share of the
+randomisation, so that fish like the configured one are common.
 """
 
 import math
@@ -29,33 +29,33 @@ from fishd.virtual.plant.optimum import square_wave
 from fishd.virtual.plant.parameters import PlantParameters
 
 LONGEST_HALF = 1.2
-"""Half beats up to this long are compared [s]."""
+"""Longest half beat that is compared [s]."""
 AT_RANDOM = 3
-"""At most one in so many ticks of a fish is swum by a wave of any frequency, at its beginning."""
+"""Smallest ratio of all ticks of a fish to its initial ticks, which are swum by random waves."""
 NEARER = 0.3
-"""So many of the fish are from a part of the randomisation, the others from anywhere in it."""
+"""Share of the fish that are from a part of the randomisation; the others are from all of it."""
 RIG_RANGES = ("servo_delay", "servo_dead_zone", "backlash", "servo_reaction")
-"""Ranges of a randomisation that a clean rig has little of."""
+"""Names of the ranges of a randomisation that are smaller for a clean rig."""
 LEAST_WEIGHT = 0.02
-"""What a tick counts in which both sides are as good, in shares of the best thrust."""
+"""Weight of a tick in which both sides are equally good, as a share of the best thrust."""
 
 
 class Labelled(NamedTuple):
-    """Ticks, and what is right in each."""
+    """Ticks, labelled with the right side of each."""
 
     seen: NDArray[np.float32]
-    """What the network is given, shape (ticks, inputs)."""
+    """Inputs of the network, shape (ticks, inputs)."""
     sides: NDArray[np.float32]
-    """1 or -1, shape (ticks,)."""
+    """Right side, 1 or -1, shape (ticks,)."""
     weights: NDArray[np.float32]
-    """What it would cost to choose the other side, shape (ticks,)."""
+    """Cost of the choice of the other side, shape (ticks,)."""
 
 
 def narrowed(spread: Randomisation, share: float, rig_share: float = 1.0) -> Randomisation:
     """Return a randomisation with narrower ranges.
 
     share: factor on each range, from 0 to 1
-    rig_share: a further factor on the ranges of what the rig does to the command and to the force
+    rig_share: further factor on the ranges in `RIG_RANGES`, the effects of the rig
     """
     names = [name for name in Randomisation.__struct_fields__ if name != "fish"]
     ranges = {name: share * getattr(spread, name) for name in names}
@@ -63,7 +63,7 @@ def narrowed(spread: Randomisation, share: float, rig_share: float = 1.0) -> Ran
 
 
 def half_beats(config: Config) -> NDArray[np.float64]:
-    """Thrust of square waves by the ticks of half a beat, over the best of them; of 0 ticks, 0."""
+    """Return the relative thrust of square waves by ticks of half a beat; that of 0 ticks is 0."""
     return _half_beats(config.plant, config.amplitude_limit, config.tick)
 
 
@@ -75,12 +75,12 @@ def _half_beats(plant: PlantParameters, amplitude: float, tick: float) -> NDArra
 
 
 class Imitation:
-    """Fits a policy to what is best for many simulated fish."""
+    """Imitation learning of a policy from the best waves of many simulated fish."""
 
     def __init__(
         self, config: Config, settings: TrainingSettings, policy: ActorCriticPolicy
     ) -> None:
-        """policy: learns in place
+        """policy: trained in place
 
         Raises `ConfigError` as `SwimEnv` does.
         """
@@ -93,11 +93,11 @@ class Imitation:
         self._rounds: list[Labelled] = []
 
     def round(self, stop: Callable[[], bool] = lambda: False) -> float | None:
-        """Swim with other fish, and learn from them and from all before.
+        """Swim with new fish, and learn from them and from all previous fish.
 
         stop: called after each fish; True ends it
 
-        The share of right sides, weighted by what they matter; None where it was stopped.
+        Returns the share of right sides, weighted by cost; None where it was stopped.
         """
         fish = []
         for _ in range(self._settings.fish):
@@ -108,7 +108,7 @@ class Imitation:
         return self._fit(_joined(self._rounds))
 
     def _swum(self) -> Labelled:
-        """One fish: at first with random half beats, then as the learner wants, if it has begun."""
+        """Swim one fish: first random half beats, then, after the first round, the learner."""
         config, draw, ticks = self._config, self._draw, self._settings.ticks
         share = min(1.0, float(draw.uniform()) / NEARER)
         is_clean = self._settings.clean_rigs > 0.0 and draw.uniform() < self._settings.clean_rigs
@@ -157,9 +157,9 @@ class Imitation:
 
 
 def advice(relative_thrust: NDArray[np.float64], elapsed: int) -> tuple[float, float]:
-    """1 to stay or -1 to reverse, and what it would cost to do the other.
+    """Return 1 to stay or -1 to reverse, and the cost of the other choice.
 
-    relative_thrust: as of `half_beats`
+    relative_thrust: as returned by `half_beats`
     elapsed: ticks since the last reversal
     """
     now = min(elapsed, len(relative_thrust) - 2)

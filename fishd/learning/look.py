@@ -1,8 +1,8 @@
-"""What a policy that sees looks at, by occlusion: how much its action changes with what is hidden.
+"""Sensitivity of a policy to parts of its pictures: the change of its action when they are hidden.
 
 A patch of the mean picture is slid over the frames of a swim, as in Zeiler and Fergus, "Visualizing
 and understanding convolutional networks" (2014). The gradient of the action by the pixels misleads:
-it is large at the edges of whatever is bright.
+it is large at the edges of all bright objects.
 """
 
 import os
@@ -28,30 +28,30 @@ from fishd.learning.env.evaluation import judge
 from fishd.learning.env.simulated_link import Camera
 
 SECONDS, SETTLE = 15.0, 5.0
-"""Length of the swim, and what of its beginning is left out [s]."""
+"""Length of the swim, and of its beginning that is left out [s]."""
 STACKS = 40
-"""Ticks of it in which parts are hidden, evenly spread."""
+"""Number of evenly spread ticks of the swim in which parts are hidden."""
 PATCH = 7
-"""A frame is so many patches wide and high."""
+"""Width and height of a frame, in patches."""
 
 Floats = NDArray[np.float64]
 Seen = tuple[Observation, Stack]
 
 
 class Looked(NamedTuple):
-    """What a policy looks at."""
+    """The sensitivity of a policy to the parts of its pictures."""
 
     mean: Floats
-    """The mean picture, grey levels, shape (size, size)."""
+    """Mean picture in grey levels, shape (size, size)."""
     sensitivity: Floats
-    """Root mean square of how much the action changes where a patch is hidden, before it is cut to
-    ±1, in units of Φ, shape (size, size)."""
+    """Root mean square of the change of the action where a patch is hidden, before the cut to ±1,
+    in units of Φ, shape (size, size)."""
     moves: NDArray[np.bool_]
-    """Where the tail moves, shape (size, size)."""
+    """Mask of the pixels where the tail moves, shape (size, size)."""
 
     @property
     def share(self) -> float:
-        """Of the sensitivity that lies where the tail moves."""
+        """Share of the sensitivity that lies where the tail moves."""
         return float(self.sensitivity[self.moves].sum() / self.sensitivity.sum())
 
     @property
@@ -66,13 +66,13 @@ def look(
     camera: SimulatedCameraSettings,
     seconds: float = SECONDS,
 ) -> Looked:
-    """Let a policy swim a simulated fish, and find what it looks at.
+    """Let a policy swim a simulated fish, and compute its sensitivity to parts of the pictures.
 
     policy: name or path
     seconds: length of the swim, of which the first `SETTLE` are left out
 
-    Raises `PolicyError` for a policy that sees no pictures, does not fit, or is moved by nothing
-    in them, `NoMotion` where it does not swim, and `ParameterError` for too short a swim.
+    Raises `PolicyError` for a policy that sees no pictures, does not fit, or does not react to
+    them, `NoMotion` where it does not swim, and `ParameterError` for too short a swim.
     """
     file = opening.read(policy, config.limits)
     if file.card.pictures is None:
@@ -88,7 +88,7 @@ def look(
 
 
 def _swum(policy: str, config: Config, camera: Camera, seconds: float) -> list[Seen]:
-    """What the policy was shown in a swim, tick by tick."""
+    """Return the observations and stacks of a swim, tick by tick."""
     pilot = Pilot(policy, config.limits)
     seen: list[Seen] = []
     first: list[float] = []
@@ -104,7 +104,7 @@ def _swum(policy: str, config: Config, camera: Camera, seconds: float) -> list[S
 
 
 def _uncut(file: PolicyFile) -> Network:
-    """Its network without the cut to ±1, beyond which nothing would seem to matter."""
+    """Return the network without the cut to ±1, which would hide changes of the action."""
     import onnx
     from onnx import helper
 
@@ -116,7 +116,7 @@ def _uncut(file: PolicyFile) -> Network:
 
 
 def _sensitivity(network: Network, seen: list[Seen], mean: Floats, card: Card) -> Floats:
-    """See `Looked.sensitivity`: each pixel has the mean of the patches that hide it."""
+    """Return `Looked.sensitivity`: each pixel has the mean of the patches that hide it."""
     size = len(mean)
     patch = max(2, size // PATCH)
     begins = np.unique(np.linspace(0, size - patch, 2 * PATCH - 1).round().astype(int))
@@ -145,7 +145,7 @@ def _sensitivity(network: Network, seen: list[Seen], mean: Floats, card: Card) -
 
 
 def draw(path: str | os.PathLike[str], found: Looked, title: str) -> None:
-    """A heat map of the sensitivity over the mean picture; a line bounds where the tail moves.
+    """Draw a heat map of the sensitivity over the mean picture; a line bounds the moving tail.
 
     Raises as `fishd.lab.drawing.check` does.
     """

@@ -1,4 +1,4 @@
-"""Networks that look at pictures, and hidden layers with left-right symmetry."""
+"""Networks for pictures, and hidden layers with left-right symmetry."""
 
 import math
 from typing import Any, Literal
@@ -16,16 +16,16 @@ PictureKind = Literal["cnn", "nature"]
 Shape = tuple[int, int, int]
 
 SMALL = 64
-"""What the small network compresses a picture to."""
+"""Number of features of a picture in the small network."""
 LARGE = 512
-"""What that of the paper does."""
+"""Number of features of a picture in the network of Mnih et al."""
 
 HALF = math.sqrt(0.5)
-"""Gives an untrained network's output the same spread as without symmetry."""
+"""Factor that gives an untrained network's output the same spread as without symmetry."""
 
 
 def small_network(shape: Shape) -> nn.Sequential:
-    """Three convolutions of stride 2, and one layer; shape: channels, height, width."""
+    """Return three convolutions of stride 2, and one layer; shape: channels, height, width."""
     layers = [
         nn.Conv2d(shape[0], 16, 5, 2),
         nn.ReLU(),
@@ -41,17 +41,19 @@ def small_network(shape: Shape) -> nn.Sequential:
 
 
 def nature_network(shape: Shape) -> nn.Sequential:
-    """That of Mnih et al., "Human-level control through deep reinforcement learning" (2015)."""
+    """Return the network of Mnih et al.: "Human-level control through deep reinforcement learning",
+    2015.
+    """
     space: Any = gymnasium.spaces.Box(0.0, 1.0, shape, np.float32)
     whole = NatureCNN(space, LARGE, normalized_image=True)
     return nn.Sequential(*whole.cnn, *whole.linear)
 
 
 def network_nodes(network: nn.Sequential, picture: str, out: str) -> Nodes:
-    """A network of convolutions and layers as operators of ONNX.
+    """Return a network of convolutions and layers as operators of ONNX.
 
-    picture: name of what it looks at, shape (batch, channels, height, width)
-    out: name of what it gives, shape (batch, width)
+    picture: name of the input, shape (batch, channels, height, width)
+    out: name of the output, shape (batch, width)
     """
     from onnx import helper
 
@@ -80,7 +82,7 @@ def network_nodes(network: nn.Sequential, picture: str, out: str) -> Nodes:
 
 
 class PictureExtractor(BaseFeaturesExtractor):
-    """A picture, compressed, and the numbers beside it.
+    """An extractor that compresses a picture and passes on the numbers beside it.
 
     The input is flat: the picture's levels, then the other numbers.
     """
@@ -90,19 +92,19 @@ class PictureExtractor(BaseFeaturesExtractor):
     ) -> None:
         """
         shape: channels, height and width of the picture
-        mirrored: give the same for the mirrored fish too, behind the first
+        mirrored: append the features of the mirrored fish
         """
         self._levels = math.prod(shape)
         others = observation_space.shape[0] - self._levels
         compressed = SMALL if kind == "cnn" else LARGE
         self.single = compressed + others
-        """How many numbers it gives for one picture."""
+        """Number of outputs for one picture."""
         super().__init__(observation_space, self.single * (2 if mirrored else 1))
         self._shape, self.mirrored = shape, mirrored
         self.network = small_network(shape) if kind == "cnn" else nature_network(shape)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Shape (batch, features_dim)."""
+        """Return the features, shape (batch, features_dim)."""
         picture = observations[:, : self._levels].reshape(-1, *self._shape)
         others = observations[:, self._levels :]
         if not self.mirrored:

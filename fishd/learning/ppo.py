@@ -1,4 +1,4 @@
-"""PPO of stable-baselines3 as fishd trains it, and its policy as plain layers."""
+"""PPO of stable-baselines3 as configured by fishd, and its policy as plain layers."""
 
 from collections.abc import Generator
 from typing import Any, Literal, cast
@@ -39,9 +39,9 @@ class SymmetricPolicy(ActorCriticPolicy):
     """PPO's networks with left-right symmetry: a mirrored fish gets the mirrored action.
 
     All inputs (F_y, its rate, the fin velocity, φ_c) change sign when left and right are swapped,
-    and so does the action; the value of a state does not. The networks are built that way, so the
-    symmetry need not be learned, and no policy can favour one side. F_x, whose sign does not
-    change, must not be among the inputs. The bias of the policy's last layer stays zero.
+    and so does the action; the value of a state does not. The networks have this symmetry by
+    construction, so it need not be learned, and no policy can favour one side. F_x, whose sign does
+    not change, must not be among the inputs. The bias of the policy's last layer stays zero.
     """
 
     def _build_mlp_extractor(self) -> None:
@@ -58,7 +58,7 @@ class SymmetricPolicy(ActorCriticPolicy):
 
 
 class SymmetricPicturePolicy(SymmetricPolicy):
-    """The same for pictures: their mirror image is flipped, the other numbers change sign."""
+    """A `SymmetricPolicy` for pictures: they are flipped, the other numbers change sign."""
 
     def _build_mlp_extractor(self) -> None:
         self.mlp_extractor = PairExtractor(
@@ -70,9 +70,9 @@ class SymmetricPicturePolicy(SymmetricPolicy):
 
 
 def plain_layers(layers: Layers) -> Layers:
-    """The layers of a `SymmetricPolicy` as those of an ordinary network of twice the width.
+    """Return the layers of a `SymmetricPolicy` as those of an ordinary network of twice the width.
 
-    Its upper half gets the input, its lower half the mirrored input.
+    Its upper half receives the input, its lower half the mirrored input.
     """
     (first, bias), *inner, (last, last_bias) = layers
     doubled = [(np.vstack((first, -first)), np.tile(bias, 2))]
@@ -91,14 +91,14 @@ _ACTIVATIONS: dict[Literal["tanh", "relu"], type[torch.nn.Module]] = {
 class Rollout(RolloutBuffer):
     """The steps of one update, without the void ones.
 
-    A step is void where another angle than the agent's action was applied: its outcome must not be
+    A step is void if an angle other than the agent's action was applied: its outcome must not be
     credited to the action, nor, through the advantages, to those before it.
     """
 
     signal: ThrustSignal | None = None
-    """What finds the thrust in the measured forces; None: F_x is taken as it is."""
+    """Estimator of the thrust from the measured forces; None: F_x is used unchanged."""
     reward_per_newton = 0.0
-    """By which F_x is in the rewards [1/N]."""
+    """Factor of F_x in the rewards [1/N]."""
 
     def reset(self) -> None:
         """Forget all steps."""
@@ -106,12 +106,12 @@ class Rollout(RolloutBuffer):
         self.void = np.zeros(self.buffer_size, dtype=bool)
         """True for each void step."""
         self.forces = np.zeros((self.buffer_size, 2))
-        """F_x and F_y, in the tick that each reward is of [N]."""
+        """F_x and F_y in the tick of each reward [N]."""
 
     def compute_returns_and_advantage(
         self, last_values: torch.Tensor, dones: NDArray[np.bool_]
     ) -> None:
-        """As in PPO; the outcome of a void step equals its value, and it ends its episode."""
+        """Compute them as in PPO; a void step has its value as outcome, and ends its episode."""
         if self.signal:
             fx, fy = self.forces[~self.void].T
             cleaned = self.signal.of(fx, fy) - fx
@@ -120,7 +120,7 @@ class Rollout(RolloutBuffer):
         super().compute_returns_and_advantage(last_values, dones)
 
     def get(self, batch_size: int | None = None) -> Generator[RolloutBufferSamples, None, None]:
-        """Minibatches in random order, of all steps but the void ones."""
+        """Yield minibatches in random order, of all steps except the void ones."""
         for batch in super().get(batch_size):
             if len(batch.advantages) > 1:  # PPO divides by their standard deviation
                 yield batch
@@ -130,7 +130,7 @@ class Rollout(RolloutBuffer):
 
 
 def make_learner(settings: TrainingSettings, env: VecEnv, eye: Eye | None = None) -> PPO:
-    """A new PPO with an untrained policy; seeds torch, numpy and the environment."""
+    """Return a new PPO with an untrained policy; seed torch, numpy and the environment."""
     ppo = settings.ppo
     return PPO(
         _kind(ppo, eye),
@@ -154,9 +154,9 @@ def make_learner(settings: TrainingSettings, env: VecEnv, eye: Eye | None = None
 
 
 def make_policy(ppo: PpoSettings, numbers: int, eye: Eye | None = None) -> ActorCriticPolicy:
-    """The networks alone, as `make_learner` makes them.
+    """Return the networks alone, as in `make_learner`.
 
-    numbers: of inputs beside what the eye gives
+    numbers: number of inputs beside the outputs of the eye
     """
     observation, action = spaces(numbers + (eye.outputs if eye else 0))
     return _kind(ppo, eye)(observation, action, lambda _: ppo.learning_rate, **_shape(ppo, eye))
@@ -186,16 +186,17 @@ def _shape(ppo: PpoSettings, eye: Eye | None) -> dict[str, Any]:
 
 
 def learning_rate(ppo: PpoSettings, steps: int) -> float:
-    """The rate of the update that comes `steps` control steps after the start of the training."""
+    """Return the learning rate of the update that is `steps` control steps after the start."""
     share = min(1.0, steps / ppo.decay_steps)
     return ppo.learning_rate + share * (ppo.final_learning_rate - ppo.learning_rate)
 
 
 def layers_of(policy: ActorCriticPolicy) -> Layers:
-    """The deterministic policy, from its inputs to the mean of the action.
+    """Return the layers of the deterministic policy, from its inputs to the mean of the action.
 
-    From a picture's features, where it looks at one; of a `SymmetricPicturePolicy` the last layer
-    is given what the layers before make of the fish, and behind it what of its mirror image.
+    If the policy sees a picture, its features are the inputs. The last layer of a
+    `SymmetricPicturePolicy` receives the hidden outputs for the fish, then those for its mirror
+    image.
     """
     hidden = [part for part in policy.mlp_extractor.policy_net if isinstance(part, Linear)]
     last = cast(Linear, policy.action_net)
@@ -213,7 +214,7 @@ def layers_of(policy: ActorCriticPolicy) -> Layers:
 
 
 def activation_of(policy: ActorCriticPolicy) -> Literal["tanh", "relu"]:
-    """Its activation function; raises `PolicyError` for any other than these two."""
+    """Return the activation function; raises `PolicyError` for any other than these two."""
     for name, kind in _ACTIVATIONS.items():
         if policy.activation_fn is kind:
             return name
@@ -223,7 +224,7 @@ def activation_of(policy: ActorCriticPolicy) -> Literal["tanh", "relu"]:
 
 
 def is_finite(model: PPO) -> bool:
-    """False once the training has diverged."""
+    """Return False if the training has diverged."""
     return all(bool(torch.isfinite(p).all()) for p in model.policy.parameters())
 
 
@@ -231,7 +232,7 @@ class MeanAction:
     """The mean of a policy's action, for one input at a time.
 
     Plain layers are copied and computed in NumPy, which for a single input is several times as fast
-    as torch; a network for pictures runs as it is.
+    as torch; a network for pictures runs in torch.
     """
 
     def __init__(self, policy: ActorCriticPolicy) -> None:
@@ -254,7 +255,7 @@ class MeanAction:
 
 
 class DeterministicPolicy:
-    """A policy without exploration: what is observed in, instruction angle out [rad]."""
+    """A policy without exploration, from an observation to an instruction angle [rad]."""
 
     def __init__(self, policy: ActorCriticPolicy, perception: Perception, amplitude: float) -> None:
         """amplitude: Φ [rad]"""
@@ -264,9 +265,9 @@ class DeterministicPolicy:
         self._mean = MeanAction(policy)
 
     def __call__(self, observation: Observation, stack: Stack | None = None) -> float:
-        """The angle that answers an observation [rad].
+        """Return the angle for an observation [rad].
 
-        Without the frames that it needs, it holds the last one for `HOLD`, then neutral.
+        If frames are needed and missing, hold the last angle for `HOLD`, then return neutral.
         """
         if stack is None and self._perception.eye:
             self._perception.note(observation)

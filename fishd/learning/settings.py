@@ -15,12 +15,12 @@ from fishd.core.schema import Problem, convert, note, unit, without_empty_sectio
 from fishd.virtual.plant.parameters import PlantParameters
 
 SMALLEST = {"modes": 16, "cnn": 68, "nature": 36}
-"""Size of a frame that leaves something after all convolutions of an eye's network [px]."""
+"""Smallest size of a frame that all convolutions of the network can process, by eye [px]."""
 Share = Annotated[float, Meta(ge=0, le=9)]
 
 
 class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the agent sees, and what it is rewarded for."""
+    """The observation and the reward of the agent."""
 
     observation: Annotated[
         tuple[FeatureName, ...],
@@ -84,7 +84,7 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How pictures become numbers, where the agent sees any."""
+    """The conversion of pictures to numbers, where the agent sees pictures."""
 
     eye: Annotated[
         Literal["modes", "cnn", "nature"],
@@ -114,7 +114,7 @@ class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """By how much fish and rig differ from episode to episode, to be ready for the real one.
+    """The differences of fish and rig between episodes, which prepare a policy for the real fish.
 
     A share s multiplies a parameter by (1 + s)^u with u uniform in [-1, 1].
     """
@@ -155,7 +155,7 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
 
 class ImitationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What a policy learns of square waves before PPO begins, in simulation."""
+    """The imitation of square waves before PPO begins, in simulation."""
 
     rounds: Annotated[
         int,
@@ -188,7 +188,7 @@ class ImitationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Hyper-parameters of PPO, named as stable-baselines3 names them."""
+    """Hyper-parameters of PPO, with their names in stable-baselines3."""
 
     n_steps: Annotated[int, note("Steps between two updates.", ge=2, le=1_000_000)] = 64
     batch_size: Annotated[int, note("Size of a minibatch.", ge=2, le=1_000_000)] = 64
@@ -296,7 +296,7 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def seen(self) -> EnvironmentSettings:
-        """What the environment shows beside pictures: with `see: camera`, no forces."""
+        """Settings of the environment; with `see: camera`, the observation has no forces."""
         names = self.environment.observation
         if self.see == "camera":
             names = tuple(name for name in names if name in COMMANDS)
@@ -304,7 +304,7 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
-    """The settings in a file, or the defaults; raises `ConfigError` that names file and key."""
+    """Read the settings of a file, or the defaults; `ConfigError` names file and key."""
     if path is None:
         return TrainingSettings()
     data, sources = strict_yaml.read(path, "a training", "steps: 8000")
@@ -317,7 +317,7 @@ def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
 
 
 def check(settings: TrainingSettings) -> None:
-    """Refuse settings that were changed since they were loaded; raises `ConfigError`."""
+    """Raise `ConfigError` for settings that became invalid by changes after loading."""
     try:
         _check(settings)
     except Problem as problem:
@@ -325,12 +325,12 @@ def check(settings: TrainingSettings) -> None:
 
 
 def to_yaml(settings: TrainingSettings) -> str:
-    """All settings, defaults included, as YAML that `load` reads back."""
+    """Return all settings, defaults included, as YAML that `load` can read."""
     return strict_yaml.dump(msgspec.to_builtins(settings))
 
 
 def _check(settings: TrainingSettings) -> None:
-    """Refuse values that are valid one by one but not together."""
+    """Raise an error for values that are valid one by one but not together."""
     ppo, evaluation = settings.ppo, settings.evaluation
     if not settings.steps and not settings.imitation.rounds:
         raise Problem(

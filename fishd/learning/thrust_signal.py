@@ -1,9 +1,8 @@
-"""What a force sensor adds to the thrust, taken off before a policy learns from it.
+"""Removal of the errors of a force sensor from the thrust, before a policy learns from it.
 
 F_x of a real rig has an offset that drifts, spikes, and, where the sensor is turned, a share of F_y
-that is larger than the thrust. None of it is anything that a policy did. What remains differs from
-tick to tick as the true thrust does; only how large it is on the whole is lost, by which advantages
-do not differ.
+that is larger than the thrust. A policy does not cause any of these. The remaining signal differs
+from tick to tick as the true thrust does; only its mean is lost, which does not affect advantages.
 """
 
 from collections import deque
@@ -12,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 MEMORY = 4096
-"""Ticks by which the share of F_y is found."""
+"""Number of latest ticks from which the share of F_y is estimated."""
 ORDINARY = 3.0
-"""The thrust of a tick is within so many times the best mean thrust of the median; square waves of
-simulated fish get to two."""
+"""Largest ordinary distance of a tick's thrust from the median, in best mean thrusts; square waves
+of simulated fish reach two."""
 OUTLIER = 4.5
-"""And so is what differs by less than so many medians of the difference."""
+"""Distance from the median below which a thrust is ordinary, too, in medians of the distance."""
 _PASSES = 4
 _HUBER = 1.5
 
@@ -26,7 +25,7 @@ Forces = NDArray[np.float64]
 
 
 class ThrustSignal:
-    """Remembers the latest forces, by which it knows how the sensor is turned."""
+    """An estimator of thrust that keeps the latest forces, to find how the sensor is turned."""
 
     def __init__(self, best: float) -> None:
         """best: mean thrust of the best square wave [N]"""
@@ -34,12 +33,12 @@ class ThrustSignal:
         self._past: deque[tuple[float, float]] = deque(maxlen=MEMORY)
 
     def of(self, fx: Forces, fy: Forces) -> Forces:
-        """The thrust of each tick of a rollout, up to a constant [N], shape (ticks,).
+        """Return the thrust of each tick of a rollout, up to a constant [N], shape (ticks,).
 
-        fx, fy: mean measured forces of each [N], shape (ticks,)
+        fx, fy: mean measured forces of each tick [N], shape (ticks,)
 
-        Left and right are alike, so over many beats the true F_x goes with F_y in no way: where the
-        measured one does, that is the share of F_y in it.
+        Left and right are symmetric, so over many beats the true F_x does not correlate with F_y:
+        a correlation of the measured F_x is the share of F_y in it.
         """
         if not len(fx):
             return fx
@@ -52,7 +51,7 @@ class ThrustSignal:
 
 
 def slope(fx: Forces, fy: Forces) -> float:
-    """Of the straight line through the points (fy, fx), which outliers hardly move (Huber)."""
+    """Return the slope of the line through the points (fy, fx), robust to outliers (Huber)."""
     x, y = fy - np.median(fy), fx - np.median(fx)
     weights, found = np.ones_like(x), 0.0
     for _ in range(_PASSES):

@@ -1,1 +1,1 @@
-"""From a fish that nobody has seen to its best gait: excite, fit, search, train, compare."""
+"""Adaptation to an unknown fish, up to its best gait: excite, fit, search, train, compare."""

@@ -1,4 +1,4 @@
-"""All steps of an adaptation in their order; each is done once, and kept as it is done."""
+"""All steps of an adaptation in order; each is done once, and its result is stored."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -30,7 +30,7 @@ from fishd.learning.adapt.verdict import SQUARE, judge
 
 
 class Gait(NamedTuple):
-    """Who takes part in the comparison."""
+    """A gait that takes part in the comparison."""
 
     name: str
     controller: str
@@ -38,7 +38,7 @@ class Gait(NamedTuple):
 
 
 class Adaptation:
-    """One fish, from its first swim to the verdict."""
+    """The adaptation to one fish, from its first swim to the verdict."""
 
     def __init__(
         self,
@@ -50,9 +50,10 @@ class Adaptation:
         show: Progress,
     ) -> None:
         """
-        session: entered by the caller; nothing of the plant and rig in its configuration is used
-        tank_time: for all that needs the fish, rests included [s]; `steps.LEAST` at least
-        steps: of the training
+        session: entered by the caller; the plant and the rig of its configuration are not used
+        tank_time: time for all steps that need the fish, rests included [s]; at least
+            `steps.LEAST`
+        steps: number of steps of the training
         """
         self._session = session
         self._config = replace(session.read_config(), start=Start())
@@ -66,10 +67,10 @@ class Adaptation:
         session.progress = lambda used: show.at(used, self._doing)
 
     def run(self) -> State:
-        """Do what is not done yet.
+        """Do the steps that are not done yet.
 
         Raises `Unidentifiable`, `FishdError` where the tank time is used up, `Disturbed`,
-        `NoDaemon` and `ConfigError`; what was measured before is kept.
+        `NoDaemon` and `ConfigError`; earlier measurements are kept.
         """
         state = self._run.state
         self._show.at(self._session.used)
@@ -140,7 +141,7 @@ class Adaptation:
         self._done(f"search: {tried}; best at {state.square:.4g} Hz, {by}")
 
     def _model(self, state: State) -> Model:
-        """How far the identified fish is used."""
+        """Return the model of the fit, marked as rejected where the square waves disagree."""
         assert state.fitted
         return replace(state.fitted.model, is_rejected=state.disagrees)
 
@@ -169,7 +170,7 @@ class Adaptation:
         self._done(f"training on {cloud}: {found.relative_thrust:.1%} in simulation{worst}")
 
     def gaits(self, state: State) -> list[Gait]:
-        """Who takes part."""
+        """Return the gaits that take part in the comparison."""
         assert state.swing
         assert state.square
         swing = {"C": state.swing.C} | ({"lead": state.swing.lead} if state.swing.lead else {})
@@ -237,7 +238,7 @@ class Adaptation:
             self._show.warn(f"fishctl: {gait.name}: {found.remark}")
 
     def _expected(self, state: State, gait: Gait) -> list[float]:
-        """Thrusts of a gait on the first fish of the cloud [N]; empty where these are not used."""
+        """Return the thrusts of a gait on the first fish of the cloud [N]; empty if unused."""
         assert state.fitted
         if state.fitted.model.error is None:
             return []
@@ -249,7 +250,7 @@ class Adaptation:
 
     @contextmanager
     def _in_tank(self, step: str, doing: str) -> Iterator[None]:
-        """Whatever ends a step, the time that the fish has swum for it is written down."""
+        """Add the time in the tank of a step to the state, also if the step fails."""
         state, begun = self._run.state, self._session.used
         self._doing = doing
         try:
@@ -270,11 +271,11 @@ class Adaptation:
 
 _NOTE = "fishctl adapt"
 _CLOUD = 8
-"""Fish of the cloud on which a gait is simulated."""
+"""Number of fish of the cloud on which a gait is simulated."""
 
 
 def _truth(config: Config, session: Session, gait: Gait) -> dict[str, float]:
-    """What is known of a simulated fish alone."""
+    """Return the true thrusts of a gait, known only of a simulated fish; else nothing."""
     if session.source != "simulation":
         return {}
     swum = simulate(config, gait.controller, gait.parameters)

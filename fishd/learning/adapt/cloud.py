@@ -10,15 +10,16 @@ from fishd.lab.identification.result import OF_THE_RIG
 from fishd.virtual.plant.parameters import PlantParameters
 
 FISH = 32
-"""How many are drawn."""
+"""Number of fish in the cloud."""
 
 
 def cloud(found: Identification, seed: int = 0, count: int = FISH) -> tuple[PlantParameters, ...]:
-    """Return fish that the data leave possible; the first is the identified one itself.
+    """Return fish that agree with the data; the first is the identified one itself.
 
-    They are drawn from the joint normal distribution of the errors, of logarithms for what is
-    fitted as such, within the bounds of the fit. What a misfit adds is part of it. K_y/K is that of
-    the identified fish: no force depends on it as long as what it scales goes along.
+    They are drawn from the joint normal distribution of the errors, of logarithms for parameters
+    that are fitted as such, within the bounds of the fit. The errors include those of a misfit.
+    K_y/K is that of the identified fish: no force depends on it as long as the parameters that it
+    scales change with it.
     """
     centre = [_centre(found, name) for name in found.names]
     draws = np.random.default_rng(seed).multivariate_normal(
@@ -29,12 +30,12 @@ def cloud(found: Identification, seed: int = 0, count: int = FISH) -> tuple[Plan
 
 
 def identified(found: Identification) -> PlantParameters:
-    """The identified fish."""
+    """Return the identified fish."""
     return msgspec.convert(found.plant, PlantParameters)
 
 
 def _centre(found: Identification, name: str) -> float:
-    """Return the mean of what is fitted: a logarithm of some."""
+    """Return the mean of a fitted parameter, or of its logarithm if that is fitted."""
     value = found[name].value
     return float(np.log(value)) if name in LOGARITHMIC else value
 

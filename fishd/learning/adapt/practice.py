@@ -1,4 +1,4 @@
-"""Trains a policy on the cloud of fish that a fit leaves possible, in simulation."""
+"""Training of a policy in simulation, on the cloud of fish that agree with a fit."""
 
 import shutil
 from collections.abc import Callable
@@ -24,20 +24,22 @@ from fishd.learning.train.training import train
 from fishd.virtual.plant.optimum import best_square_wave
 
 EPISODE = 128
-"""Steps with one fish of the cloud; then the next one is drawn."""
+"""Steps per episode; each episode swims one fish of the cloud."""
 NOISE = 0.3
-"""More noise of a tick than this share of the best thrust would drown the reward."""
+"""Largest noise of a tick in the training, as a share of the best thrust; more would hide the
+reward."""
 GOOD, TRIES = 0.97, 3
-"""A policy is good enough that reaches this share of the best square wave on its worst fish."""
+"""Merit with which a policy is good enough, as a share of the best square wave on its worst fish;
+and the largest number of trainings."""
 IMITATION_ROUNDS, IMITATION_FISH = 2, 64
-"""Before PPO it imitates the best square waves of so many draws from the cloud in each round; PPO
-alone may stay at a wave of one tick too few or too many."""
+"""Rounds of imitation before PPO, and draws from the cloud in each round. PPO alone may stay at a
+wave that is one tick too short or too long."""
 EVERY, OTHERS = 5, 3
-"""Evaluations after so many updates, on the identified fish and so many others of the cloud."""
+"""Updates per evaluation, and number of fish of the cloud evaluated beside the identified one."""
 
 
 def settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
-    """How the policy is trained."""
+    """Return the settings of the training."""
     return TrainingSettings(
         steps=steps,
         seed=seed,
@@ -51,7 +53,7 @@ def settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
 
 
 def simulated(config: Config, fitted: Fitted) -> Config:
-    """The identified fish on its rig, with the loop of the real one."""
+    """Return the configuration of the identified fish on its rig, with the real fish's loop."""
     best = best_square_wave(fitted.plant, config.amplitude_limit).thrust
     rig = replace(fitted.rig, noise=min(fitted.rig.noise, NOISE * best))
     return replace(config, robot="simulated", plant=fitted.plant, simulation=rig, start=Start())
@@ -67,12 +69,12 @@ def practise(
 ) -> Trained:
     """Train, and write the policy that did best on its worst fish into the folder.
 
-    Where that reaches less than `GOOD`, it is trained anew with the next seed, `TRIES` times at
-    most, and the best of all is taken.
+    Where its merit is less than `GOOD`, the training is repeated with the next seed. There are at
+    most `TRIES` trainings, and the best of all policies is taken.
 
-    config: the loop of the fish: its tick, Φ and limits; of its plant and rig nothing is used
-    folder: of the adaptation; a training in it that was broken off is done anew
-    progress: called with the steps that are done
+    config: tick, Φ and limits of the fish; its plant and rig are not used
+    folder: folder of the adaptation; an interrupted training in it is restarted
+    progress: called with the number of finished steps
     """
     best: Outcome | None = None
     display = _Steps(progress)
@@ -108,13 +110,13 @@ def _merit(outcome: Outcome) -> float:
 
 
 class _Steps(Display):
-    """Counts the steps of all trainings."""
+    """A display that counts the steps of all trainings."""
 
     def __init__(self, progress: Callable[[int], None]) -> None:
         self._progress = progress
         self.steps = 0
 
     def step(self, tank_time: float) -> None:
-        """One more."""
+        """Count one step."""
         self.steps += 1
         self._progress(self.steps)

@@ -1,10 +1,10 @@
-"""What the identified fish says of thrusts, with a weight that follows how well it explains.
+"""Thrusts predicted by the identified fish, weighted by how well it explains the forces.
 
-A thrust is taken to be that of the identified fish, times a factor which all gaits have in common,
-times a deviation of each gait. The factor is unknown. The deviations are as large as the fish of
-the cloud differ, and as the share of the forces that the fit does not explain. So a fish that
-explains all of them says how gaits compare, and one that explains little says nothing beside a
-measurement.
+A thrust is modelled as that of the identified fish, times a factor common to all gaits, times a
+deviation of each gait. The factor is unknown. The deviations are as large as the differences
+between the fish of the cloud, and as the share of the forces that the fit does not explain. So a
+fish that explains all forces determines how gaits compare, and one that explains little has no
+influence beside a measurement.
 """
 
 import math
@@ -22,22 +22,22 @@ Array = NDArray[np.float64]
 
 MIN_EXPLAINED = 0.7
 """Smallest share of the variance of each force, out of sample, that a fit must explain to be used,
-if it lacks something."""
+if it fails an assumption."""
 MODEL_ERROR = 0.01
-"""Standard error of a thrust of an identified fish that lacks nothing, as a fraction."""
+"""Standard error of a thrust of an identified fish that fails no assumption, as a fraction."""
 REJECTED = 0.01
 """Probability, under the identified fish, of a misfit at least as large; below it, the measured
 thrusts reject it."""
 _UNKNOWN_FACTOR = 10.0
 """Standard deviation of the common factor."""
 _CORRELATED = 0.3
-"""Distance at which deviations of square waves are still alike, as a logarithm of frequency."""
+"""Correlation length of the deviations of square waves, as a logarithm of frequency."""
 
 
 def model_of(identification: Identification) -> Model:
-    """Return how far the identified fish can be used to choose among gaits.
+    """Return the quality of the identified fish as a model for the choice among gaits.
 
-    Where it lacks something, the standard error of a thrust is as large as the rms of the force
+    Where it fails an assumption, the standard error of a thrust is as large as the rms of the force
     that it does not predict, as a fraction of that of the force.
     """
     explained = min(channel.explained_out_of_sample for channel in identification.channels)
@@ -54,7 +54,7 @@ def deviations(curves: Array, error: float, correlation: Array | None = None) ->
 
     curves: thrusts of the gaits on each fish of the cloud, the identified one first, (fish, gaits)
     error: as `Model.error`
-    correlation: of what the fit does not explain, between gaits; by default there is none
+    correlation: correlation between gaits of the unexplained deviations; by default none
     """
     gaits = curves.shape[1]
     ratios = curves[1:] / curves[0]
@@ -67,7 +67,7 @@ def deviations(curves: Array, error: float, correlation: Array | None = None) ->
 
 
 def correlation_of_waves(frequencies: Sequence[float]) -> Array:
-    """Return how alike the deviations of square waves of these frequencies are [Hz]."""
+    """Return the correlation of the deviations of square waves; frequencies: [Hz]."""
     logs = np.log(frequencies)
     apart = (logs[:, None] - logs[None, :]) / _CORRELATED
     correlation: Array = np.exp(-0.5 * apart**2)
@@ -81,7 +81,7 @@ def combine(
 
     expected: thrusts of the gaits on the identified fish, all above zero [N]
     covariance: as `deviations` returns
-    places: which gait each measurement is of
+    places: index of the gait of each measurement
     measured, ci95: thrusts, and half-widths of their 95 % confidence intervals [N]
     """
     at = list(places)

@@ -28,9 +28,9 @@ img { max-width: 100%; } .claim { font-size: 1.3em; } code { background: #f3f3f3
 
 
 def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
-    """Draw the picture and write the page; the paths of both.
+    """Draw the picture and write the page; return the paths of both.
 
-    amplitude: Φ [rad]; again: the command line that lets the chosen gait swim
+    amplitude: Φ [rad]; again: command line that runs the chosen gait
     Raises `FishdError` where one cannot be written.
     """
     picture = run.path / PICTURE
@@ -43,7 +43,7 @@ def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
 def draw(state: State, folder: Path, amplitude: float, path: Path) -> None:
     """Draw fit, search, training and comparison, a panel each.
 
-    folder: that of the training
+    folder: folder of the training
     """
     assert state.fitted
     with drawn(path, (10.0, 7.0)) as figure:
@@ -55,9 +55,10 @@ def draw(state: State, folder: Path, amplitude: float, path: Path) -> None:
 
 
 def _draw_fit(axis: Any, fitted: Fitted) -> None:
-    """How well those are known whose errors are shares; the others may be as good as zero.
+    """Draw the widths of the intervals of the parameters that are fitted as logarithms.
 
-    Intervals are those for a known K_y/K; one that is withheld has no bar.
+    Others may be near zero, so they have no relative error. Intervals are those for a known K_y/K;
+    one that is withheld has no bar.
     """
     shown = []
     for name, each in fitted.found["estimates"].items():
@@ -74,7 +75,7 @@ def _draw_fit(axis: Any, fitted: Fitted) -> None:
 
 
 def _draw_search(axis: Any, state: State, amplitude: float) -> None:
-    """Square waves as tried, and those of the identified fish."""
+    """Draw the tried square waves, and those of the identified fish."""
     assert state.fitted
     tried = [trial.frequency for trial in state.trials]
     frequencies = np.geomspace(0.9 * min(tried), 1.1 * max(tried), 60)
@@ -97,7 +98,7 @@ def _draw_search(axis: Any, state: State, amplitude: float) -> None:
 
 
 def _draw_training(axis: Any, folder: Path) -> None:
-    """The policy on the identified fish, and on the worst of its cloud."""
+    """Draw the thrust of the policy on the identified fish, and on the worst of its cloud."""
     axis.set_title("training in simulation")
     axis.set_xlabel("steps")
     axis.set_ylabel("% of the best square wave")
@@ -117,7 +118,7 @@ def _draw_training(axis: Any, folder: Path) -> None:
 
 
 def _draw_contest(axis: Any, state: State) -> None:
-    """What was measured on the fish."""
+    """Draw the thrusts measured on the fish."""
     for place, one in enumerate(state.contenders):
         axis.errorbar(
             1e3 * one.thrust, -place, xerr=1e3 * one.error, fmt="o", capsize=3,
@@ -135,7 +136,7 @@ def _draw_contest(axis: Any, state: State) -> None:
 
 
 def page(state: State, picture: bytes, again: str) -> str:
-    """The page, with the picture in it."""
+    """Return the page, which contains the picture."""
     assert state.fitted
     assert state.verdict
     image = base64.b64encode(picture).decode()
@@ -178,7 +179,7 @@ def _item(words: str) -> str:
 
 
 def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Head and rows of the table of who was measured."""
+    """Return the head and the rows of the table of measured gaits."""
     assert state.verdict
     known = any(one.true_thrust is not None for one in state.contenders)
     head = ("gait", "thrust", "Hz", "relative thrust", *(("true thrust",) if known else ()))
@@ -202,7 +203,7 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
 
 
 def _role(name: str, verdict: Verdict) -> str:
-    """Return what the verdict says of a gait, to stand behind its name."""
+    """Return the role of a gait in the verdict, as a suffix to its name."""
     if name not in verdict.undecided:
         return ""
     if verdict.decided:
@@ -211,11 +212,11 @@ def _role(name: str, verdict: Verdict) -> str:
 
 
 def _estimates(fitted: Fitted) -> list[tuple[str, ...]]:
-    """Rows of the fitted numbers, as `fishctl identify` prints them."""
+    """Return the rows of the fitted parameters, as `fishctl identify` prints them."""
     rows = []
     for name, each in fitted.found["estimates"].items():
         if each.get("fitted", True):
-            # JSON has no infinity: null stands for an end that the data do not tell.
+            # JSON has no infinity: null stands for an end that the data do not determine.
             low = -math.inf if each["low"] is None else each["low"]
             high = math.inf if each["high"] is None else each["high"]
             narrow = each.get("if_ratio_holds")

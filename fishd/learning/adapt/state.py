@@ -1,4 +1,4 @@
-"""What an adaptation has found so far, and the folder that keeps it from step to step."""
+"""The results of an adaptation, and the folder that keeps them from step to step."""
 
 from typing import Any
 
@@ -14,23 +14,23 @@ PICTURE, PAGE = "adapt.png", "adapt.html"
 
 
 class Model(Struct, frozen=True, kw_only=True):
-    """How far the identified fish can be used to choose among gaits."""
+    """The quality of the identified fish as a model for the choice among gaits."""
 
     explained: float
-    """Share of the variance of a force that it explains; the smaller one of both forces."""
+    """Share of the variance of a force that the model explains; the smaller of both forces."""
     error: float | None
-    """Standard error of a thrust of it, as a fraction; None where it explains too little."""
+    """Standard error of a thrust of the model, as a fraction; None if it explains too little."""
     is_rejected: bool = False
-    """Whether the square waves tried disagree with it."""
+    """Whether the square waves tried disagree with the model."""
 
 
 class Fitted(Struct, frozen=True, kw_only=True):
-    """The fish that explains the forces best, and those that do nearly as well."""
+    """The fish that explains the forces best, and fish that explain them nearly as well."""
 
     plant: PlantParameters
     rig: SimulationSettings
     offset: float
-    """Half of the range in which the offset of F_y may be while the fish swims [N]."""
+    """Half-width of the range of the offset of F_y while the fish swims [N]."""
     cloud: tuple[PlantParameters, ...]
     model: Model
     found: dict[str, Any]
@@ -38,43 +38,43 @@ class Fitted(Struct, frozen=True, kw_only=True):
 
 
 class Rung(Struct, frozen=True):
-    """What `swing --C auto` has ended with."""
+    """The final parameters of `swing --C auto`."""
 
     C: float
     lead: float
-    """[s]"""
+    """Lead time [s]."""
     settled: bool
-    """Was the search over?"""
+    """Whether the search was over."""
 
 
 class Tried(Struct, frozen=True):
-    """A square wave of the search, as it was measured."""
+    """The measurement of one square wave of the search."""
 
     frequency: float
     """[Hz]"""
     thrust: float
     """[N]"""
     error: float
-    """Half of its 95 % interval [N]."""
+    """Half-width of the 95 % confidence interval of `thrust` [N]."""
     swum: int
-    """Ticks of swimming so far, in the search."""
+    """Ticks of swimming since the beginning of the search."""
     passed: float
-    """Time since its beginning, rest included [s]."""
+    """Time since the beginning of the search, rests included [s]."""
 
 
 class Trained(Struct, frozen=True, kw_only=True):
-    """How the policy did on the fish of the fit, or why there is none."""
+    """The result of the policy on the identified fish, or the reason why it is missing."""
 
     steps: int
-    """Of all trainings."""
+    """Number of steps of all trainings."""
     folder: str = ""
-    """Of the one that it is from."""
+    """Folder of the training that the policy is from."""
     relative_thrust: float | None = None
-    """Over the best square wave of the identified fish."""
+    """Thrust relative to the best square wave of the identified fish."""
     worst: float | None = None
-    """The same, of the worst fish of the cloud that were tried."""
+    """Relative thrust on the worst of the tried fish of the cloud."""
     refused: str = ""
-    """Why there is no policy, if so."""
+    """Reason why a policy is missing; empty if there is one."""
 
 
 class Contender(Struct, frozen=True, kw_only=True):
@@ -87,77 +87,78 @@ class Contender(Struct, frozen=True, kw_only=True):
     thrust: float
     """[N]"""
     error: float
-    """Half of its 95 % interval [N]."""
+    """Half-width of the 95 % confidence interval of `thrust` [N]."""
     calibration_ci95: float | None = None
-    """Half-width of the 95 % interval that the calibration leaves to the thrust [N].
+    """Half-width of the 95 % interval of `thrust` due to the calibration of the sensor [N].
 
-    The same fraction of all thrusts, so no part of a relative thrust; None where it is unknown.
+    It is the same fraction of all thrusts, so it does not affect a relative thrust. None if it is
+    unknown.
     """
     total_ci95: float | None = None
-    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
+    """Half-width of the 95 % interval from `error` and `calibration_ci95` together [N]."""
     frequency: float
     """[Hz]"""
     seconds: float
-    """How long it was measured, rests included [s]."""
+    """Length of the measurement, rests included [s]."""
     remark: str = ""
     expected: list[float] = []
-    """Thrust on fish of the cloud, the identified one first, in simulation [N]; empty where that
-    is not used."""
+    """Simulated thrusts on fish of the cloud, the identified fish first [N]; empty where the
+    cloud is not used."""
     true_thrust: float | None = None
-    """Of a simulated fish [N]."""
+    """True thrust, known only of a simulated fish [N]."""
     true_relative_thrust: float | None = None
-    """That over the thrust of the best of all square waves."""
+    """`true_thrust` relative to the thrust of the best of all square waves."""
 
 
 class Verdict(Struct, frozen=True, kw_only=True):
-    """Which gait is chosen, and why; relative thrusts are over the best square wave found."""
+    """The chosen gait and the reason; thrusts are relative to the best square wave found."""
 
     chosen: str
-    """The winner, or the one chosen from those between which it is undecided."""
+    """Name of the winner, or of the gait chosen from `undecided`."""
     decided: bool
-    """Whether the measurement alone says that it is the best one."""
+    """Whether the measurement alone shows that `chosen` is the best gait."""
     undecided: list[str]
-    """Those that may be the best one, as far as the measurement tells, simplest first."""
+    """Names of the gaits that may be the best according to the measurement, simplest first."""
     relative_thrust: float
-    """Of the chosen one."""
+    """Relative thrust of the chosen gait."""
     low: float
-    """Lower end of its 95 % interval, which holds whichever gait is chosen."""
+    """Lower end of the 95 % interval of `relative_thrust`, valid whichever gait is chosen."""
     high: float
     others: dict[str, tuple[float, float, float]]
-    """Of each one but the square wave: relative thrust, and its interval."""
+    """Relative thrust, and its interval, of each gait except the square wave."""
     claim: str
-    """The same in a sentence."""
+    """The verdict in a sentence."""
 
 
 class State(Struct, kw_only=True):
-    """What was found so far; what is None is still to be done."""
+    """The results of the finished steps; a field that is None belongs to a step still to do."""
 
     tank_time: float = 0.0
-    """Time in the tank so far, rests included, and what was measured in vain, too [s]."""
+    """Time spent in the tank, rests and failed measurements included [s]."""
     spent: dict[str, float] = {}
-    """Of that, what each step took [s]."""
+    """Time in the tank by step [s]."""
     excitation: str | None = None
-    """The recording that the fish is fitted to."""
+    """Name of the recording that the fish is fitted to."""
     fitted: Fitted | None = None
     swing: Rung | None = None
     trials: list[Tried] = []
-    """Square waves, as they were tried."""
+    """Square waves in the order in which they were tried."""
     square: float | None = None
-    """The frequency of the best of them [Hz]."""
+    """Frequency of the best square wave [Hz]."""
     disagrees: bool = False
     """Whether the square waves tried disagree with the identified fish."""
     trained: Trained | None = None
     contenders: list[Contender] = []
     left_out: dict[str, str] = {}
-    """Who could not be measured, and why."""
+    """Reason by name of each gait that could not be measured."""
     verdict: Verdict | None = None
 
 
 class AdaptFolder:
-    """The folder of an adaptation, in which each step is kept as it is done, in `state`."""
+    """The folder of an adaptation, which stores the result of each finished step in `state`."""
 
     def __init__(self, experiment: Experiment) -> None:
-        """Raises `ConfigError` where the state cannot be read."""
+        """Read the state; raises `ConfigError` where that fails."""
         self.path = experiment.path
         self.experiment = experiment
         self.state = experiment.read_struct(STATE, State) or State()

@@ -29,24 +29,24 @@ from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import best_square_wave, square_wave
 
 FITTED = (*DEFAULT, "lateral_quadratic_drag", "servo_dead_zone", "servo_reaction")
-"""What is fitted: all of a fish that a fit can find, but slack, which backlash stands for."""
+"""Fitted parameters: all that a fit can find except slack, which backlash represents."""
 LEAST_EXPLAINED = 0.1
-"""Where the fit explains a smaller share of a force, that is mostly noise, and no fish is known."""
+"""Smallest explained share of a force; below it the force is mostly noise: the fit is rejected."""
 AROUND = 2.0
-"""Square waves are searched from so many times below to above the best of the identified fish."""
+"""Factor of the search range of square waves, below and above the best of the identified fish."""
 SLOWEST, FASTEST = 0.3, 8.0
-"""They are searched between these, whatever the fit says [Hz]."""
+"""Bounds of the search of square waves, whatever the fit [Hz]."""
 BUDGET = {"excitation": 0.2, "swing": 0.14, "search": 0.2}
-"""Shares of the tank time; the comparison has the rest."""
+"""Shares of the tank time; the comparison uses the remainder."""
 LEAST = 150.0
-"""The shortest tank time [s]: the excitation is 30 s then, the shortest that a fit takes."""
+"""Shortest tank time [s]: its excitation takes 30 s, the shortest that a fit accepts."""
 
 
 def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, Fitted]:
-    """The fish of a recorded excitation, of which nothing is known before, and its cloud.
+    """Fit a fish to a recorded excitation, without prior knowledge; return it and its cloud.
 
     amplitude: Φ [rad]
-    Raises `Unidentifiable`, also where the best fit explains next to nothing of a force.
+    Raises `Unidentifiable`, also where the fit explains less than `LEAST_EXPLAINED` of a force.
     """
     found = identify([recording], fit=FITTED)
     for channel, symbol in zip(found.channels, ("F_x", "F_y"), strict=True):
@@ -73,13 +73,13 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
 
 
 def settle_swing(session: Session, seconds: float) -> Rung:
-    """Let `swing --C auto` search for so long; the C and the lead that it ends with."""
+    """Let `swing --C auto` search for `seconds`; return its final C and lead."""
     ticks = session.swim("swing", {"C": "auto"}, seconds)
     session.rest(REST)
     end = ticks[len(ticks) // 2 :]
     shown = [tick.quantities for tick in end if tick.quantities]
     watching = [each for each in shown if not each["searching"]]
-    # Of a search that goes on, the rung between the trials is the one that lasts longest.
+    # If the search is not over, the rung between the trials is the most frequent one.
     rungs = Counter((each["criterion"], each["lead"]) for each in watching or shown)
     (criterion, lead), _ = rungs.most_common(1)[0]
     return Rung(criterion, lead, bool(watching))
@@ -88,7 +88,7 @@ def settle_swing(session: Session, seconds: float) -> Rung:
 def square_waves(fitted: Fitted, session: Session, seed: int) -> Search:
     """Return a search over square waves of whole ticks around the best of the identified fish.
 
-    Where that explains too little, all frequencies are searched.
+    Where the fish explains too little, all frequencies are searched.
     """
     low, high = SLOWEST, FASTEST
     if fitted.model.error is not None:
@@ -108,11 +108,11 @@ def search_square_waves(
 ) -> None:
     """Try square waves until the budget is used [s].
 
-    before: those that were tried already; keep: called with each new one
+    before: square waves tried already; keep: called with each new one
     """
     last = None
     for one in before:
-        nobody = math.nan, math.nan  # knows its electrical power
+        nobody = math.nan, math.nan  # the electrical power is unknown
         last = Trial(
             {"frequency": one.frequency}, one.thrust, one.error, *nobody, one.swum, one.passed
         )
@@ -127,9 +127,9 @@ def best_of(
 ) -> tuple[float, bool]:
     """Return the frequency of the best square wave [Hz], and whether the identified fish is used.
 
-    Its curve stands on a whole excitation, and a few trials with noise tell less. It counts by how
-    well it explains the forces. Where it explains too little, or what was tried disagrees with it,
-    the search alone tells.
+    The curve of the identified fish is based on a whole excitation, so it is more exact than a few
+    noisy trials. Its weight depends on how well it explains the forces. Where it explains too
+    little, or the trials disagree with it, only the search is used.
     """
     frequencies = search.ranges[0].values
     if fitted.model.error is not None:
@@ -150,12 +150,12 @@ def best_of(
 
 
 def least_search(session: Session, search: Search) -> float:
-    """How long a search takes that tries the slowest wave once [s]."""
+    """Return the time of a search that tries the slowest wave once [s]."""
     return 2.0 * REST + lengths({"frequency": search.ranges[0].values[0]})[1] + session.tick
 
 
 def least_measurement(parameters: Mapping[str, Any]) -> float:
-    """The shortest time in which a gait can be measured, rests included [s]."""
+    """Return the shortest time in which a gait can be measured, rests included [s]."""
     frequency = float(parameters.get("frequency", 0.0))
     swim = max(SWIM, 1.5 + 3.0 / frequency) if frequency else SWIM
     seconds = 2.0 * swim + 3.0 * REST

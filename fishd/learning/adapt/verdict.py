@@ -1,4 +1,4 @@
-"""Which gait is the best one, as far as the measurement tells, and its relative thrust."""
+"""The best gait according to the measurement, and its relative thrust."""
 
 from collections.abc import Sequence
 
@@ -30,17 +30,17 @@ NAMES = {
 
 
 def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
-    """Return which gait is the best one, or between which the measurement leaves it undecided.
+    """Return which gait is the best one, or between which gaits the measurement is undecided.
 
-    The one that thrusts more than all others by more than the intervals of the differences wins
+    A gait wins if it thrusts more than all others by more than the intervals of the differences
     (`fishd.lab.ranking`). Where several are left, those are dropped that the measurement and the
     identified fish together exclude, and the simplest of the rest is chosen.
 
-    Relative thrusts are shares of that of the square wave. Their intervals hold together in 95 %
-    of cases (Bonferroni). The square wave itself has 1, without an error.
+    Thrusts are relative to that of the square wave. Their intervals hold together in 95 % of cases
+    (Bonferroni). The relative thrust of the square wave itself is 1, without an error.
 
-    contenders: the one named `square` among them
-    Raises `FishdError` where that hardly thrusts, so that it is no measure.
+    contenders: measured gaits; one is named `square`
+    Raises `FishdError` where the thrust of the square wave is too small to compare with.
     """
     square = next(one for one in contenders if one.name == SQUARE)
     others = [one for one in contenders if one is not square]
@@ -91,7 +91,7 @@ def _relative_thrust(
 
 
 def _not_excluded_by(contenders: Sequence[Contender], names: list[str], model: Model) -> list[str]:
-    """Return the undecided gaits that the identified fish leaves possible, too, in their order."""
+    """Return the undecided gaits that the identified fish does not exclude, in their order."""
     expected = np.array([one.expected for one in contenders]).T
     if model.error is None or model.is_rejected or not expected.size or expected[0].min() <= 0.0:
         return names
@@ -115,7 +115,7 @@ def _not_excluded_by(contenders: Sequence[Contender], names: list[str], model: M
 def _explain_choice(simplest: str, is_simplest: bool, left: int, model: Model) -> str:
     """Return why a gait is chosen among those that the measurement leaves undecided.
 
-    simplest: the reason for the simplest one; left: how many the identified fish leaves
+    simplest: reason for the simplest one; left: number of gaits that the identified fish leaves
     """
     if is_simplest:
         return simplest
@@ -126,7 +126,7 @@ def _explain_choice(simplest: str, is_simplest: bool, left: int, model: Model) -
 
 
 def _explain_disuse(model: Model) -> str:
-    """Return why the identified fish has no part in a choice; empty where it has."""
+    """Return why the identified fish is not used for a choice; empty where it is used."""
     if model.error is None:
         return (
             f"the identified fish explains {max(0.0, model.explained):.0%} of its forces only, so "

@@ -1,1 +1,1 @@
-"""What a training leaves on disk: settings, checkpoints, tables, provenance."""
+"""Files of a training on disk: settings, checkpoints, tables, provenance."""

@@ -1,9 +1,9 @@
 """Checkpoints: folders from which a training is resumed, or a policy is exported.
 
-`step-005120` was due, or is the last of a run; `best-004096` swam best in an evaluation. In each:
-`model.zip` (stable-baselines3: policy, value, optimiser), `card.json` (what a policy file carries)
-and `state.json` (counts and evaluations). Each is written under a temporary name and then renamed:
-whatever kills the writer, half a checkpoint is never used.
+`step-005120` was due, or is the last of a run; `best-004096` swam best in an evaluation. Files:
+`model.zip` (stable-baselines3: policy, value, optimiser), `card.json` (the card of a policy file)
+and `state.json` (counts and evaluations). A checkpoint is written under a temporary name and then
+renamed: half a checkpoint is never used, whatever kills the writer.
 """
 
 import io
@@ -29,7 +29,7 @@ from fishd.learning.eyes import making as eyes
 from fishd.learning.eyes.base import Eye
 from fishd.learning.settings import TrainingSettings
 
-# What brings torch is imported where it is used: most of this is asked for without any networks.
+# Modules that import torch are imported where they are used: most functions need no networks.
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
     from stable_baselines3.common.policies import ActorCriticPolicy
@@ -37,41 +37,41 @@ if TYPE_CHECKING:
 MODEL, CARD, STATE, EYE = "model.zip", "card.json", "state.json", "eye.msgpack"
 
 LARGEST_MODEL = 256 * 2**20
-"""Of networks and optimiser [bytes]."""
+"""Largest size of the file of networks and optimiser [bytes]."""
 LARGEST_EYE = 16 * 2**20
-"""Of what an eye has learned to see [bytes]."""
+"""Largest size of the file of an eye's constants [bytes]."""
 LARGEST_TEXT = 2**20
-"""Of a card, or of a state [bytes]."""
+"""Largest size of the file of a card, or of a state [bytes]."""
 
 _NAME = re.compile(r"(step|best)-(\d+)", re.ASCII)
 _ADVICE = "move this checkpoint away to resume from the previous one"
 
 
 class CheckpointError(FishdError, RuntimeError):
-    """There is no checkpoint where one is needed, or a run folder cannot be read or written."""
+    """Error of a missing checkpoint, or of a run folder that cannot be read or written."""
 
 
 class State(Struct, frozen=True):
-    """What is needed to resume a training, besides the networks and their optimiser."""
+    """The state that resumes a training, besides the networks and their optimiser."""
 
     on: On
     steps: Annotated[int, Meta(ge=0)]
-    """Control steps that were learned from."""
+    """Number of control steps learned from."""
     updates: int
-    """Passes over rollouts so far, as stable-baselines3 counts them."""
+    """Number of passes over rollouts, as stable-baselines3 counts them."""
     tank_time: float
-    """[s]"""
+    """Time in the tank [s]."""
     rollouts: int
-    """Updates so far."""
+    """Number of updates."""
     latest: Evaluation | None
     best: Evaluation | None
     imitated: bool = False
-    """Has it learned by imitation what it was to, itself or in the run that it began with?"""
+    """Whether imitation is finished, in this run or in the one that it began with."""
     swims: int = 0
-    """How often the best was measured in a tank."""
+    """Number of measured swims of the best policy in a tank."""
 
     def is_finished(self, steps: int) -> bool:
-        """Has a training of so many steps nothing left to do?"""
+        """Return True if a training of `steps` control steps is complete."""
         return self.steps >= steps and (self.steps > 0 or self.imitated)
 
 
@@ -80,7 +80,7 @@ class Constant(Struct, frozen=True):
 
     shape: tuple[Annotated[int, Meta(ge=0)], ...]
     values: bytes
-    """As float32, row by row."""
+    """Elements as float32, row by row."""
 
 
 def save(
@@ -117,14 +117,14 @@ def save(
 
 
 def all_in(folder: Path) -> list[Path]:
-    """The checkpoints of a run, by their steps; a `best` comes before a `step` of the same."""
+    """Return the checkpoints of a run by steps; a `best` is before a `step` of the same steps."""
     named = [(_NAME.fullmatch(path.name), path) for path in folder.glob("*-*")]
     found = [(int(name[2]), name[1] == "step", path) for name, path in named if name]
     return [path for _, _, path in sorted(found)]
 
 
 def newest(folder: Path) -> Path:
-    """The checkpoint with most steps in a run folder; raises `CheckpointError`."""
+    """Return the checkpoint with most steps of a run folder; raises `CheckpointError`."""
     found = all_in(folder)
     if not found:
         raise CheckpointError(
@@ -135,15 +135,15 @@ def newest(folder: Path) -> Path:
 
 
 def best(folder: Path) -> Path | None:
-    """The checkpoint that swam best; None where no policy of the run has swum."""
+    """Return the checkpoint that swam best; None where no policy of the run has swum."""
     found = [path for path in all_in(folder) if path.name.startswith("best")]
-    return max(found, key=_written, default=None)  # a kill may have left the one before
+    return max(found, key=_written, default=None)  # after a kill, the previous best may remain
 
 
 def find(path: Path, *, latest: bool = False) -> Path:
-    """The checkpoint at `path`, or in the run folder there: its best, else its newest.
+    """Return the checkpoint at `path`, or of the run folder there: its best, else its newest.
 
-    latest: the newest of a run rather than its best
+    latest: return the newest of a run instead of its best
 
     Raises `CheckpointError`.
     """
@@ -157,7 +157,7 @@ def find(path: Path, *, latest: bool = False) -> Path:
 
 
 def refuse_several(folder: Path) -> None:
-    """Raises `CheckpointError` where each seed has a run folder of its own in this one."""
+    """Raise `CheckpointError` for a folder that contains the run folders of several seeds."""
     seeds = sorted(folder.glob("seed-*"), key=lambda one: (len(one.name), one.name))
     if seeds:
         raise CheckpointError(
@@ -167,7 +167,7 @@ def refuse_several(folder: Path) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what a killed writer left half-written, or half-removed; nothing whole is lost."""
+    """Remove half-written and half-removed files of a killed writer; nothing complete is lost."""
     for replaced in folder.glob(".*.replaced"):
         final = folder / replaced.name.removeprefix(".").removesuffix(".replaced")
         if final.exists():
@@ -182,7 +182,7 @@ def sweep(folder: Path) -> None:
 
 
 def read_card(checkpoint: Path) -> Card:
-    """Raises `CheckpointError`."""
+    """Read the card of a checkpoint; raises `CheckpointError`."""
     try:
         return decode(_text(checkpoint / CARD))
     except PolicyError as error:
@@ -190,7 +190,7 @@ def read_card(checkpoint: Path) -> Card:
 
 
 def read_state(checkpoint: Path) -> State:
-    """Raises `CheckpointError`."""
+    """Read the state of a checkpoint; raises `CheckpointError`."""
     try:
         return msgspec.json.decode(_text(checkpoint / STATE), type=State)
     except (ValueError, RecursionError) as error:
@@ -207,13 +207,13 @@ def load_parameters(model: "PPO", checkpoint: Path, *, optimiser: bool = True) -
 
 
 def read_parameters(checkpoint: Path) -> dict[str, Any]:
-    """Those of networks and optimiser; raises `CheckpointError`."""
+    """Read the parameters of networks and optimiser; raises `CheckpointError`."""
     with _readable(checkpoint / MODEL) as parameters:
         return parameters
 
 
 def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
-    """The networks of a checkpoint, and what they are given; raises `CheckpointError`."""
+    """Return the networks of a checkpoint, and their perception; raises `CheckpointError`."""
     from fishd.learning.ppo import make_policy
 
     card = read_card(checkpoint)
@@ -229,7 +229,7 @@ def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
 
 
 def load_eye(eye: Eye, checkpoint: Path) -> None:
-    """Give an eye the constants of a checkpoint, if it had any; raises `CheckpointError`."""
+    """Load the constants of a checkpoint into an eye, if any; raises `CheckpointError`."""
     path = checkpoint / EYE
     if not path.exists():
         return
@@ -250,7 +250,7 @@ def load_eye(eye: Eye, checkpoint: Path) -> None:
 
 @contextmanager
 def _readable(path: Path) -> Iterator[dict[str, Any]]:
-    """The tensors in a model's file; those who use them may find that their shapes are wrong."""
+    """Yield the tensors of a model's file; raises `CheckpointError`, also if their use fails."""
     try:
         yield _tensors(path)
     except files.FileProblem as problem:
@@ -269,7 +269,7 @@ def _tensors(path: Path) -> dict[str, Any]:
                 raise ValueError("it unpacks to far more than a checkpoint needs")
         found = load_from_zip_file(io.BytesIO(content), load_data=False, device="cpu")
         return cast(dict[str, Any], found[1])
-    except Exception as error:  # a damaged archive contradicts itself in many ways
+    except Exception as error:  # a damaged archive raises many kinds of exceptions
         raise ValueError(_brief(error.__cause__ or error)) from None
 
 
@@ -280,7 +280,7 @@ def _brief(error: BaseException) -> str:
 
 
 def _discard(checkpoint: Path) -> None:
-    """Remove a checkpoint; killed in between, it leaves none that looks complete."""
+    """Remove a checkpoint; if killed midway, it leaves nothing that looks complete."""
     old = checkpoint.with_name(f".{checkpoint.name.removeprefix('.')}.old")
     shutil.rmtree(old, ignore_errors=True)
     checkpoint.rename(old)

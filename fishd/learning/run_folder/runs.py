@@ -34,7 +34,7 @@ def create(
 ) -> None:
     """Make a run folder; raises `ConfigError` where it exists already.
 
-    camera: what a simulated fish is seen with
+    camera: camera that sees a simulated fish
     """
     try:
         mark_folder(folder, "learn ppo", on)
@@ -48,12 +48,12 @@ def create(
 
 
 def write_settings(folder: Path, settings: TrainingSettings) -> None:
-    """Write the settings of a run; a resumed one may go on for longer."""
+    """Write the settings of a run; a resumed run may have more steps."""
     write_atomically(folder / SETTINGS, training.to_yaml(settings))
 
 
 def read(folder: Path) -> tuple[Config, TrainingSettings]:
-    """Configuration and settings of a run; raises `ConfigError`."""
+    """Read the configuration and settings of a run; raises `ConfigError`."""
     if not (folder / SETTINGS).is_file():
         why = f"it has no {SETTINGS}" if folder.exists() else "it does not exist"
         raise ConfigError(f"{folder}: not the folder of a training: {why}")
@@ -63,7 +63,7 @@ def read(folder: Path) -> tuple[Config, TrainingSettings]:
 
 
 def read_camera(folder: Path) -> SimulatedCameraSettings:
-    """What the simulated fish of a run is seen with; raises `ConfigError`."""
+    """Read the settings of the simulated camera of a run; raises `ConfigError`."""
     return cameras.load(folder / CAMERA).simulated
 
 
@@ -92,10 +92,11 @@ def make_card(
     evaluation: Evaluation | None,
     note: str,
 ) -> Card:
-    """
-    on: simulation, robot or another word for what swam
-    steps: control steps that it has learned from
-    evaluation: the latest
+    """Return the card of a policy.
+
+    on: simulation, robot or another word for the fish that swam
+    steps: number of control steps that it has learned from
+    evaluation: latest evaluation
     """
     libraries = {name: version(name) for name in _LIBRARIES}
     imitation = ["imitation"] if settings.imitation.rounds else []

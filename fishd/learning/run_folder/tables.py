@@ -1,4 +1,4 @@
-"""The CSV files of a run, which go on after a resume, and the summary of several seeds."""
+"""The CSV files of a run, which continue after a resume, and the summary of several seeds."""
 
 import statistics
 from collections.abc import Iterable, Sequence
@@ -50,14 +50,14 @@ SUMMARY = (
     "best_lowest",
     "best_highest",
 )
-"""Columns of seeds.csv: relative thrust of the current policies, and of each seed's best so far."""
+"""Columns of seeds.csv: relative thrust of the current policies, and of each seed's best yet."""
 
 
 class Table(tables.Table):
-    """A table whose rows say after how many steps they were made."""
+    """A table whose rows contain the number of steps before them."""
 
     def keep_until(self, steps: int) -> None:
-        """Drop the rows of later steps, which a resumed run is going to do again.
+        """Drop the rows of later steps, which a resumed run repeats.
 
         Raises `CheckpointError` where the file is not such a table.
         """
@@ -76,9 +76,9 @@ class Table(tables.Table):
 
 
 def read_evaluations(folder: Path) -> list[Evaluation]:
-    """The evaluations of a run; empty where it has no table of them.
+    """Read the evaluations of a run; empty where it has no such table.
 
-    Raises `ConfigError` where it is another table.
+    Raises `ConfigError` where the file is another table.
     """
     path = folder / EVALUATIONS
     try:
@@ -94,7 +94,7 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
 
 
 def best_so_far(evaluations: Iterable[Evaluation]) -> list[float]:
-    """Relative thrust of the best policy until each evaluation; one that stalls does not count."""
+    """Return the relative thrust of the best policy until each evaluation, stalled excluded."""
     best = 0.0
     return [best := one.relative_thrust if one.best else best for one in evaluations]
 
@@ -102,7 +102,7 @@ def best_so_far(evaluations: Iterable[Evaluation]) -> list[float]:
 def write_summary(path: Path, folders: Sequence[Path]) -> None:
     """Write seeds.csv from the run folders of all seeds: a row for each evaluation.
 
-    The policies of a training that has ended stay as they are.
+    A training that has ended keeps its last figures.
     """
     runs = []
     for folder in folders:

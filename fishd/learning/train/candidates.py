@@ -1,9 +1,10 @@
-"""Which of several policies swims best, with as few short swims as possible: a bandit.
+"""Selection of the policy that swims best, with as few short swims as possible: a bandit.
 
-Each swim gives one thrust, which is off by an error of unknown size. The next swim is chosen as in
-LUCB (Kalyanakrishnan et al., "PAC subset selection in stochastic multi-armed bandits", ICML 2012):
-of the policy with the highest mean, and of the one that may be better by most, the one that has
-swum less often. It is enough when no other may be better by more than `NEAR`.
+Each swim gives one thrust, with an error of unknown size. The policy of the next swim is chosen as
+in LUCB (Kalyanakrishnan et al., "PAC subset selection in stochastic multi-armed bandits", ICML
+2012): of the policy with the highest mean, and of the one with the highest upper bound among the
+others, the one that has swum less often. The search ends when no other policy may be better by more
+than `NEAR`.
 """
 
 import math
@@ -15,55 +16,56 @@ from fishd.core.calibration import Z95
 from fishd.learning.env.swims import Swim
 
 NEAR = 0.01
-"""Policies whose thrusts differ by less are equally good: a share of the best square wave's."""
+"""Difference of thrust below which policies are equally good, as a share of the best square
+wave's."""
 MOST = 8
-"""So many candidates are kept at most."""
+"""Largest number of candidates."""
 FIRST_ERROR, FIRST_DEGREES = 0.03, 3
-"""Before swims of the same policies can be compared, each is taken to have this standard deviation,
-a share of the best square wave's thrust; it counts like so many comparisons."""
+"""Prior standard deviation of a swim, as a share of the best square wave's thrust, and its weight
+as a number of comparisons of swims of the same policy."""
 
 
 class Candidate(Struct, eq=False, kw_only=True):
-    """A policy that may be the best, and how it has swum."""
+    """A policy that may be the best, and the figures of its swims."""
 
     steps: int
-    """Control steps that it has learned from."""
+    """Number of control steps that it has learned from."""
     updates: int
-    """Passes over rollouts until then, as stable-baselines3 counts them."""
+    """Number of passes over rollouts until then, as stable-baselines3 counts them."""
     rollouts: int
-    """Updates until then."""
+    """Number of updates until then."""
     parameters: dict[str, Any]
-    """Of networks and optimiser."""
+    """Parameters of networks and optimiser."""
     swims: int = 0
-    """Swims that were measured."""
+    """Number of measured swims."""
     thrust: float = 0.0
-    """Their mean [N]."""
+    """Mean thrust of the measured swims [N]."""
     swam: float = 0.0
-    """How long it has swum in all [s]."""
+    """Total time of all swims [s]."""
     frequency: float = 0.0
     """Tail beats per second in its latest swim [Hz]."""
     fullness: float = 0.0
-    """Mean |φ_c|/Φ in it."""
+    """Mean |φ_c|/Φ in the latest swim."""
     stalled: bool = False
-    """It does not swim."""
+    """Whether the policy stalls instead of swimming."""
 
 
 class Candidates:
     """The policies that may be the best."""
 
     def __init__(self, best_thrust: float) -> None:
-        """best_thrust: that of the best square wave [N]"""
+        """best_thrust: thrust of the best square wave [N]"""
         self.those: list[Candidate] = []
         self._near = NEAR * best_thrust
         self._squares = FIRST_DEGREES * (FIRST_ERROR * best_thrust) ** 2
         self._degrees = FIRST_DEGREES
 
     def add(self, one: Candidate) -> None:
-        """One more, which may have swum before."""
+        """Add a candidate, which may have swum before."""
         self.those.append(one)
 
     def count(self, one: Candidate, swim: Swim) -> None:
-        """It has swum; one that stalls is out."""
+        """Add a swim to the figures of a candidate; remove the candidate if it stalls."""
         one.frequency, one.fullness, one.stalled = swim.frequency, swim.fullness, swim.stalled
         one.swam += swim.seconds
         if one.stalled:
@@ -76,10 +78,10 @@ class Candidates:
             one.thrust += (swim.thrust - one.thrust) / one.swims
 
     def error(self, one: Candidate) -> float:
-        """Half of the 95 % interval of its thrust, infinite before its first swim [N].
+        """Return the half-width of the 95 % interval of its thrust, infinite before a swim [N].
 
-        All swims are taken to have errors of one size, which is estimated from all policies that
-        have swum more than once.
+        The errors of all swims are assumed to have the same standard deviation, which is estimated
+        from all policies that have swum more than once.
         """
         if not one.swims:
             return math.inf
@@ -88,11 +90,11 @@ class Candidates:
 
     @property
     def best(self) -> Candidate | None:
-        """The one of which most can be promised: that with the highest lower bound."""
+        """Candidate with the highest lower bound of its thrust; None before the first swim."""
         return max(self._measured, key=self._lower, default=None)
 
     def next(self) -> Candidate | None:
-        """Which one is to swim; None where it is known well enough which is the best."""
+        """Return the candidate of the next swim; None where the best is known well enough."""
         for one in reversed(self.those):
             if not one.swims:
                 return one
@@ -106,7 +108,7 @@ class Candidates:
         return min(first, rival, key=lambda one: one.swims)
 
     def weed(self) -> None:
-        """Forget those that can no longer be the best, and the least likely of too many."""
+        """Remove candidates that can no longer be the best, and the least likely beyond `MOST`."""
         least = max(map(self._lower, self._measured), default=-math.inf)
         likely = sorted(self.those, key=self._upper, reverse=True)
         kept = [one for one in likely if self._upper(one) >= least][:MOST]

@@ -1,4 +1,4 @@
-"""What a training is asked to do, and how it ended."""
+"""The job of a training, and its outcome."""
 
 import math
 from pathlib import Path
@@ -18,40 +18,40 @@ Ended = Literal["finished", "interrupted", "lost", "diverged", "failed"]
 
 
 class Job(Struct, frozen=True, kw_only=True):
-    """What to train, on what, and where to keep it."""
+    """The job of a training: settings, fish and run folder."""
 
     config: Config
-    """The fish; on a robot, the one that the scales are made for."""
+    """Configuration of the fish; on a robot, of the fish that the scales are made for."""
     settings: TrainingSettings
     folder: Path
     """The run folder: a new one, or that of the run to resume."""
     on: On = "simulation"
-    """A fish in this process on the virtual clock, or that of a running fishd."""
+    """Fish to train on: a simulated one in this process on the virtual clock, or that of fishd."""
     endpoint: str | None = None
-    """Control socket of that fishd; None looks for the one on this machine."""
+    """Control socket of fishd; None looks for the fishd on this machine."""
     take: bool = False
-    """Take that fish from an experiment that holds it."""
+    """Whether to take the fish from an experiment that holds it."""
     agent: str | None = None
-    """Where that fishd reaches this program; None: any free port, for a fishd on this machine."""
+    """Address at which fishd reaches this program; None: any free port, for a local fishd."""
     resume: bool = False
-    """Go on from the newest checkpoint in `folder`."""
+    """Whether to continue from the newest checkpoint in `folder`."""
     parent: Path | None = None
     """Checkpoint whose networks a new run begins with."""
 
     camera: SimulatedCameraSettings = SimulatedCameraSettings()
-    """What a simulated fish is seen with, where it is to be seen."""
+    """Camera that sees a simulated fish, if `settings.see` needs one."""
     camera_endpoint: str | None = None
-    """Where the camera of a robot takes requests; None: $FISHD_CAMERA, or that of this machine."""
+    """Request address of a robot's camera; None: $FISHD_CAMERA, or the camera of this machine."""
 
     @property
     def simulated_camera(self) -> Camera | None:
-        """That camera, and what is shown of it; None where only forces are seen."""
+        """Simulated camera and its stack of frames; None where only forces are seen."""
         if self.settings.see == "force":
             return None
         return Camera(self.camera, self.settings.camera.stack)
 
     def check(self) -> None:
-        """Refuse what a robot has nothing to learn from; raises `ConfigError`."""
+        """Raise `ConfigError` for a job from which a robot cannot learn."""
         if self.on == "live" and self.is_begun and not self.settings.steps:
             raise ConfigError(
                 "steps: 0 is not valid on a robot, which does not imitate: it would learn nothing; "
@@ -65,38 +65,38 @@ class Job(Struct, frozen=True, kw_only=True):
 
     @property
     def is_begun(self) -> bool:
-        """Does it begin with networks that have learned something?"""
+        """True if the training begins with the networks of an earlier one."""
         return self.resume or self.parent is not None
 
     @property
     def cleans_rewards(self) -> bool:
-        """Is a sensor's drift and turn to be found? That takes more than an episode of one fish."""
+        """True if the sensor's drift and turn are removed; one episode of a fish is too short."""
         one_fish = self.on == "live" or self.settings.randomisation == Randomisation()
         return self.settings.ppo.clean_rewards and one_fish
 
     def last_step(self, done: int = 0) -> int:
-        """The step with which it ends: PPO learns from whole rollouts; done: steps before."""
+        """Return the last step: PPO learns from whole rollouts; done: steps done already."""
         rollout = self.settings.ppo.n_steps
         return done + math.ceil((self.settings.steps - done) / rollout) * rollout
 
 
 class Outcome(Struct, frozen=True, kw_only=True):
-    """How a training ended."""
+    """The outcome of a training."""
 
     folder: Path
     steps: int = 0
-    """Control steps that were learned from."""
+    """Number of control steps learned from."""
     dropped: int = 0
-    """Steps of a rollout that was stopped midway: nothing was learned from them."""
+    """Number of steps of a rollout that was stopped midway, not used for learning."""
     tank_time: float = 0.0
-    """[s]"""
+    """Time in the tank [s]."""
     ended: Ended
-    """failed: one of several seeds raised an exception."""
+    """Reason of the end; failed: one of several seeds raised an exception."""
     message: str = ""
-    """Why, where it has neither done all steps nor was interrupted by the user."""
+    """Explanation, where the training neither did all steps nor was interrupted by the user."""
     checkpoint: Path | None = None
-    """The newest."""
+    """Newest checkpoint."""
     best: Path | None = None
-    """The checkpoint of `best_evaluation`."""
+    """Checkpoint of `best_evaluation`."""
     latest_evaluation: Evaluation | None = None
     best_evaluation: Evaluation | None = None

@@ -1,4 +1,4 @@
-"""What a person sees of a training: its lines, and how it stands."""
+"""The output of a training for the user: its lines, and a progress bar."""
 
 from typing import TYPE_CHECKING
 
@@ -9,30 +9,30 @@ if TYPE_CHECKING:
 
 
 NOT_COUNTED = " without evaluations"
-"""Addition to the tank time of a simulated training, whose evaluations swim a fish of their own."""
+"""Note on the tank time of a simulated training, whose evaluations swim a separate fish."""
 
 
 class Display:
-    """Is told how a training goes on; this one shows nothing."""
+    """A receiver of the progress of a training; this base class shows nothing."""
 
     def begin(self, steps: int, target: int, text: str) -> None:
-        """It begins, or goes on, after so many steps; text: what and where, one line."""
+        """Handle the start, or the resumption after `steps`; text: one line about the training."""
 
     def imitated(self, number: int, rounds: int, right: float) -> None:
-        """A round of imitation is done; right: share of right sides, weighted."""
+        """Handle the end of a round of imitation; right: weighted share of right sides."""
 
     def step(self, tank_time: float) -> None:
-        """One more control step is done; tank_time: [s]."""
+        """Handle the end of a control step; tank_time: [s]."""
 
     def explored(self, thrust: float, relative_thrust: float, frequency: float) -> None:
-        """A rollout is done, with these means [N], [Hz]."""
+        """Handle the end of a rollout; thrust: mean [N], frequency: mean [Hz]."""
 
     def evaluated(self, evaluation: "Evaluation") -> None:
-        """An evaluation is done."""
+        """Handle the end of an evaluation."""
 
 
 class ShownDisplay(Display):
-    """A line for each evaluation, and a bar with thrust, frequency and tank time."""
+    """A display with a line per evaluation, and a bar with thrust, frequency and tank time."""
 
     def __init__(self, show: Progress) -> None:
         self._show = show
@@ -40,10 +40,10 @@ class ShownDisplay(Display):
         self._figures = ""
         self._was_evaluated = False
         self._best = 0.0
-        """The highest merit so far, as shown."""
+        """Highest merit shown until now."""
 
     def begin(self, steps: int, target: int, text: str) -> None:
-        """Print where the run is."""
+        """Print `text`."""
         self._steps = steps
         self._show.done(text, steps)
 
@@ -52,7 +52,7 @@ class ShownDisplay(Display):
         self._show.done(imitation(number, rounds, right), self._steps)
 
     def step(self, tank_time: float) -> None:
-        """Advance by one."""
+        """Advance the bar by one step."""
         self._steps += 1
         self._show.at(self._steps, f"{self._figures}  tank {minutes(tank_time)}")
 
@@ -64,7 +64,7 @@ class ShownDisplay(Display):
     def evaluated(self, evaluation: "Evaluation") -> None:
         """Print one line.
 
-        In simulation it is called the best only where the figure shown is higher, too.
+        In simulation the policy is called the best only if the figure shown is higher, too.
         """
         self._was_evaluated = True
         self._figures = summary(evaluation)
@@ -76,12 +76,12 @@ class ShownDisplay(Display):
 
 
 def imitation(number: int, rounds: int, right: float) -> str:
-    """`imitation 3 of 8: 92.1% right`."""
+    """Format a round of imitation: `imitation 3 of 8: 92.1% right`."""
     return f"imitation {number} of {rounds}: {right:.1%} right"
 
 
 def described(evaluation: "Evaluation") -> str:
-    """An evaluation in one line."""
+    """Format an evaluation in one line."""
     when = f"{evaluation.steps:7d} steps, {minutes(evaluation.tank_time):>8} in the tank"
     if evaluation.swam is None:
         when += NOT_COUNTED
@@ -92,7 +92,7 @@ def described(evaluation: "Evaluation") -> str:
 
 
 def summary(evaluation: "Evaluation") -> str:
-    """Its figures, or that the policy does not swim."""
+    """Format the figures of an evaluation, or state that the policy does not swim."""
     if evaluation.stalled:
         return "stalled: it does not swim"
     error = evaluation.error
@@ -102,13 +102,13 @@ def summary(evaluation: "Evaluation") -> str:
 def figures(
     thrust: float, relative_thrust: float, frequency: float, error: float | None = None
 ) -> str:
-    """`25.1 mN  97.8%  1.67 Hz`, or `25.1 ± 0.3 mN  97.8%  1.67 Hz`."""
+    """Format figures: `25.1 mN  97.8%  1.67 Hz`, or `25.1 ± 0.3 mN  97.8%  1.67 Hz`."""
     known = "" if error is None else f" ± {error * 1e3:.1f}"
     return f"{thrust * 1e3:.1f}{known} mN  {relative_thrust:.1%}  {frequency:.2f} Hz"
 
 
 def minutes(seconds: float) -> str:
-    """`6:40`, or `1:06:40`."""
+    """Format a time: `6:40`, or `1:06:40`."""
     whole = round(seconds)
     hours, rest = divmod(whole, 3600)
     text = f"{rest // 60:02d}:{rest % 60:02d}" if hours else f"{rest // 60}:{rest % 60:02d}"

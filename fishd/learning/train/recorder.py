@@ -1,4 +1,4 @@
-"""What a training leaves in its run folder: tables, TensorBoard logs, checkpoints."""
+"""Output of a training in its run folder: tables, TensorBoard logs, checkpoints."""
 
 import copy
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ IMPROVEMENT = 0.001
 
 
 class ProgressWriter(KVWriter):
-    """Writes what stable-baselines3 logs in an update as a row of progress.csv."""
+    """A log writer that adds the values of an update as a row to progress.csv."""
 
     def __init__(self, table: Table) -> None:
         self._table = table
@@ -38,41 +38,41 @@ class ProgressWriter(KVWriter):
     def write(
         self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
     ) -> None:
-        """One row."""
+        """Write one row."""
         self._table.add({column: key_values.get(key) for column, key in PROGRESS.items()})
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: no file is held open."""
 
 
 class RunRecorder:
-    """Opens or makes the run folder, loads what the run begins with, and records its progress."""
+    """Recorder of a run: creates or opens its folder, loads initial networks, logs progress."""
 
     def __init__(self, job: Job, env: SwimEnv, model: PPO) -> None:
         """
-        model: gets the networks of the checkpoint that the job begins with
+        model: receives the networks of the initial checkpoint of the job
 
         Raises `ConfigError` and `CheckpointError`.
         """
         self._job, self._env, self._model = job, env, model
         self.steps = 0
-        """Control steps that were learned from."""
+        """Number of control steps learned from."""
         self.rollouts = 0
-        """Updates."""
+        """Number of updates."""
         self.latest: Evaluation | None = None
         self.best: Evaluation | None = None
         self.unimproved = 0
-        """Evaluations in simulation since the merit of the best policy rose by `IMPROVEMENT`."""
+        """Number of evaluations in simulation since the best merit rose by `IMPROVEMENT`."""
         self._plateau = 0.0
-        """Merit of the best policy after the latest rise of this size."""
+        """Merit of the best policy after its latest rise by `IMPROVEMENT`."""
         self.imitated = False
-        """Has it learned by imitation what it was to?"""
+        """Whether imitation is finished, in this run or in the one that it began with."""
         self.checkpoint: Path | None = None
-        """The newest `step` checkpoint, or that which the run was resumed from."""
+        """Newest `step` checkpoint, or the one that the run was resumed from."""
         self.winner: Candidate | None = None
-        """The policy of `best`, where it was found in a tank: it may be older than the model."""
+        """Policy of `best`, where it was evaluated in a tank; it may be older than the model."""
         self._kept: Evaluation | None = None
-        """That of the best policy, as its checkpoint tells it."""
+        """Evaluation of the best policy, as stored in its checkpoint."""
         self._note = ""
         with ExitStack() as lock:
             if job.resume:
@@ -88,11 +88,11 @@ class RunRecorder:
             self._evaluations = self._open_table(EVALUATIONS, Evaluation.__struct_fields__)
             board = TensorBoardOutputFormat(str(job.folder / "tensorboard"))
             model.set_logger(Logger(None, [board, ProgressWriter(progress)]))
-            self.save()  # whatever happens from now on, there is something to resume
+            self.save()  # from now on, there is always a checkpoint to resume from
             self._lock = lock.pop_all()
 
     def log(self) -> None:
-        """Write one row of progress.csv, and what TensorBoard shows, about the latest update."""
+        """Write the figures of the latest update to progress.csv and to the TensorBoard log."""
         logger = self._model.logger
         logger.record("tank/steps", self.steps)
         logger.record("tank/time", self._env.tank_time)
@@ -102,7 +102,7 @@ class RunRecorder:
         logger.dump(self.steps)
 
     def add(self, evaluation: Evaluation) -> Evaluation:
-        """Write one row of evaluations.csv; returns the evaluation with `best` set."""
+        """Write one row of evaluations.csv; return the evaluation with `best` set."""
         is_best = self.best is None or evaluation.merit >= self.best.merit
         self.unimproved += 1
         if evaluation.merit >= self._plateau + IMPROVEMENT:
@@ -111,14 +111,14 @@ class RunRecorder:
 
     @property
     def has_converged(self) -> bool:
-        """Has it a good policy, the newest one, and has it found no better one for long enough?"""
+        """True if the newest policy is good, and `patience` evaluations showed no better one."""
         patience, latest, best = self._job.settings.evaluation.patience, self.latest, self.best
         if patience is None or latest is None or best is None or self.unimproved < patience:
             return False
         return best.merit >= GOOD_ENOUGH and latest.merit > best.merit - IMPROVEMENT
 
     def add_measured(self, evaluation: Evaluation) -> Evaluation:
-        """The same where it is known already whether the policy is the best so far."""
+        """Write one row of evaluations.csv, with `best` as given; return the evaluation."""
         self._evaluations.add(msgspec.structs.asdict(evaluation))
         if evaluation.policy == self.steps:
             self.latest = evaluation
@@ -127,13 +127,14 @@ class RunRecorder:
         return evaluation
 
     def save(self, *, due: bool = True, anew: bool = False) -> None:
-        """Write a checkpoint where another policy is better than the best so far.
+        """Write a `best` checkpoint if another policy is now the best, and a `step` one if due.
 
-        due: write one in any case, if the newest is not of this step
-        anew: or even if it is, since the policy has changed without a step
+        due: write a `step` checkpoint unless the newest one is of this step, and also a `best`
+            one if only the figures of the best policy have changed
+        anew: write it even then, because the policy has changed without a step
 
-        To be called after the rows of the tables are written: a resume drops rows that are newer
-        than the checkpoint, but could not add missing ones.
+        Call it after the rows of the tables are written: a resume drops rows that are newer than
+        the checkpoint, but cannot add missing ones.
         """
         name, best, kept = f"{self.steps:06d}", self.best, self._kept
         is_better = kept is None or (
@@ -152,7 +153,7 @@ class RunRecorder:
         self._lock.close()
 
     def _lock_folder(self, lock: ExitStack) -> None:
-        """Keep other trainings out; raises `ConfigError` where there is one."""
+        """Lock the run folder; raises `ConfigError` where another training has locked it."""
         folder = self._job.folder
         try:
             lock.enter_context(locked(folder / "training", remove=True))
@@ -180,7 +181,7 @@ class RunRecorder:
         return make_card(job.config, job.settings, seen, job.on, steps, evaluation, self._note)
 
     def _begin_with(self, parent: Path) -> None:
-        """Take over the networks of another run; raises `CheckpointError`."""
+        """Load the networks of another run; raises `CheckpointError`."""
         past = self._checked_card(parent).provenance
         checkpoints.load_parameters(self._model, parent, optimiser=False)
         name = f"{parent.resolve().parent.name}/{parent.name}"
@@ -188,9 +189,10 @@ class RunRecorder:
         self.imitated = True
 
     def _checked_card(self, checkpoint: Path) -> Card:
-        """The card of a checkpoint, whose inputs, actions and networks are those of this training.
+        """Return the card of a checkpoint.
 
-        Raises `CheckpointError`.
+        Raises `CheckpointError` where its inputs, actions or networks differ from those of this
+        training.
         """
         card, own = checkpoints.read_card(checkpoint), self._card()
         theirs = _architecture(card.provenance.settings)
@@ -220,7 +222,7 @@ class RunRecorder:
             checkpoints.load_eye(self._env.eye, checkpoint)
 
     def _resume(self) -> None:
-        """Go on from the newest checkpoint; raises `ConfigError` and `CheckpointError`."""
+        """Continue from the newest checkpoint; raises `ConfigError` and `CheckpointError`."""
         job, model = self._job, self._model
         checkpoints.sweep(job.folder)
         self.checkpoint = checkpoints.newest(job.folder)
@@ -247,9 +249,9 @@ class RunRecorder:
         runs.write_settings(job.folder, job.settings)
 
     def _take_best(self, state: State) -> None:
-        """The best so far; that of a tank goes on swimming, with the swims that it had.
+        """Restore the best policy; one from a tank stays a candidate, with its previous swims.
 
-        Where the run was killed, its checkpoint is newer than the one that is resumed.
+        After a kill, the checkpoint of the best may be newer than the one that is resumed.
         """
         path = checkpoints.best(self._job.folder) if state.on == "live" else None
         past = checkpoints.read_state(path) if path else state
@@ -267,7 +269,7 @@ class RunRecorder:
                 frequency=best.frequency,
                 fullness=best.fullness,
             )
-        elif state.on == "live":  # it was moved away
+        elif state.on == "live":  # its checkpoint was moved away
             self._kept = self.best = None
 
     def _open_table(self, name: str, columns: tuple[str, ...]) -> Table:
@@ -279,7 +281,7 @@ class RunRecorder:
 
 @contextmanager
 def _wearing(model: PPO, parameters: dict[str, Any]) -> Iterator[None]:
-    """While this lasts, a model has other networks, and another state of its optimiser."""
+    """Give a model other networks and another optimiser state; restore its own at the end."""
     own: Any = copy.deepcopy(model.get_parameters())
     model.set_parameters(parameters, device="cpu")
     try:
@@ -289,7 +291,7 @@ def _wearing(model: PPO, parameters: dict[str, Any]) -> Iterator[None]:
 
 
 def _architecture(settings: dict[str, Any]) -> dict[str, Any]:
-    """What makes two networks alike, of a training's settings, by key."""
+    """Return the settings that determine the architecture of the networks, by key."""
     settings = msgspec.json.decode(msgspec.json.encode(settings))  # lists, as in a file
     see, ppo = settings.get("see", "force"), settings.get("ppo", {})
     camera = {} if see == "force" else settings.get("camera", {})

@@ -1,7 +1,7 @@
 """The rollouts that PPO learns from: exploration, void steps, figures for the log, pause and stop.
 
-They are those of stable-baselines3 for a single environment, but the networks are computed once for
-all steps of a rollout: torch takes far longer for a single input than the fish for a tick.
+They equal those of stable-baselines3 for a single environment, but the networks are computed once
+for all steps of a rollout: torch takes far longer for a single input than the fish for a tick.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from fishd.learning.train.progress import Display
 
 
 class Rollouts:
-    """Fills the buffer of a PPO, one rollout at a time, and logs how the fish swam."""
+    """A collector that fills the buffer of a PPO, one rollout at a time, and logs the swimming."""
 
     def __init__(
         self, model: PPO, env: SwimEnv, display: Display, stop: Callable[[], bool]
@@ -31,12 +31,12 @@ class Rollouts:
         self._observation: Vector
         self._starts = True
         self._lost = self._blind = 0
-        """Ticks that the environment had lost, and not seen, until the previous rollout ended."""
+        """Numbers of lost and of blind ticks of the environment until the last rollout ended."""
         self.dropped = 0
-        """Steps of a rollout that was stopped midway: nothing was learned from them."""
+        """Number of steps of a rollout that was stopped midway, not used for learning."""
 
     def begin(self, observation: Vector) -> None:
-        """Begin an episode with the observation that the next step answers."""
+        """Begin an episode with the observation for the next step."""
         self._observation, self._starts = observation, True
 
     def collect(self) -> bool:
@@ -77,9 +77,9 @@ class Rollouts:
         return True
 
     def _complete(self, ends: dict[int, Vector]) -> None:
-        """Add to the buffer what the networks make of its steps.
+        """Add the values and log probabilities of its steps to the buffer.
 
-        ends: last observations of the episodes that were truncated, by their steps
+        ends: last observation of each truncated episode, by its step
         """
         buffer, policy = self._buffer, self._model.policy
         policy.set_training_mode(False)
@@ -98,7 +98,7 @@ class Rollouts:
     def _log(self, paused: float) -> None:
         """Log how the fish swam; raise `LinkLost` where most steps were void.
 
-        paused: how long it has waited at neutral before and between the steps [s]
+        paused: waiting time at neutral before and between the steps [s]
         """
         buffer, env = self._buffer, self._env
         lost, blind = env.lost - self._lost, env.blind - self._blind

@@ -1,4 +1,4 @@
-"""The same training with several seeds at once: on the cores of this machine, or on a Dask cluster.
+"""Training with several seeds at once: on the cores of this machine, or on a Dask cluster.
 
 Each seed trains in a folder seed-0, seed-1, ... of the run folder. A seed that fails is reported
 and does not affect the others; one whose process was killed is resumed in another.
@@ -19,15 +19,15 @@ from fishd.core.process.interruption import on_signal
 from fishd.lab.parallel import Killed, Stop, workers
 from fishd.learning.train.jobs import Job, Outcome
 
-# What brings torch is imported where it is used: a process that is told to stop before it has
-# begun ends without it, seconds sooner.
+# Modules that import torch are imported where they are used: a process that is stopped before it
+# has begun ends without torch, seconds sooner.
 
 STOP = "stop"
-"""A file of this name in the run folder ends the trainings in it."""
+"""Name of the file in the run folder that ends the trainings in it."""
 
 
 class _Task(NamedTuple):
-    """What is sent to a worker."""
+    """A task that is sent to a worker."""
 
     job: Job
     stop: Stop
@@ -40,15 +40,15 @@ def train_seeds(
     cluster: str | None = None,
     ended: Callable[[int, Outcome], None] = lambda seed, outcome: None,
 ) -> list[Outcome]:
-    """Train with several seeds, which count up from that of the job, as that of its noise does.
+    """Train with several seeds; both the seed of the job and that of its noise count up.
 
-    jobs: processes at a time; None is one per core
+    jobs: number of processes at a time; None is one per core
     cluster: address of a Dask scheduler, whose workers train instead; they need fishd and its
         extra `learn`, but no folder in common with this machine
-    ended: called with each seed and its outcome as soon as it is known
+    ended: called with each seed and its outcome as soon as the outcome is known
 
     SIGINT, SIGTERM and SIGHUP end all of them, each with a checkpoint. Raises `ConfigError` where
-    the folder is in use, and `FishdError` where there is no scheduler.
+    the folder is in use, and `FishdError` where no scheduler answers.
     """
     from fishd.lab.experiment import check_free, mark_folder
     from fishd.learning.run_folder.tables import write_summary
@@ -89,12 +89,12 @@ def _job_of(job: Job, folder: Path, index: int) -> Job:
 
 
 def _train_here(task: _Task) -> tuple[Outcome, bytes]:
-    """In a process of its own on this machine."""
+    """Train in a worker process on this machine."""
     return _train(task.job, task.stop.asked()), b""
 
 
 def _train_remotely(task: _Task) -> tuple[Outcome, bytes]:
-    """On a Dask worker, in a temporary folder whose files are sent back."""
+    """Train on a Dask worker, in a temporary folder whose files are sent back."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / task.job.folder.name
         outcome = _train(replace(task.job, folder=folder), task.stop.asked())
@@ -109,7 +109,7 @@ def _train_remotely(task: _Task) -> tuple[Outcome, bytes]:
 
 
 def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
-    """Train, or resume what a killed process has begun; an exception is an outcome, too."""
+    """Train, or resume the training of a killed process; an exception becomes an outcome."""
     if stop():
         return Outcome(folder=job.folder, ended="interrupted", message="it had not begun")
     from fishd.learning.run_folder import checkpoints
@@ -130,7 +130,7 @@ def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
 
 
 def _finished(job: Job) -> Outcome | None:
-    """Of a seed that was finished, but whose outcome was lost with a process that was killed."""
+    """Return the outcome of a finished seed whose process was killed; None if not finished."""
     from fishd.learning.run_folder import checkpoints
 
     checkpoints.sweep(job.folder)
@@ -155,7 +155,7 @@ def _failed(job: Job, message: str) -> Outcome:
 
 
 def pack(folder: Path) -> bytes:
-    """All files of a folder as one zip archive."""
+    """Return all files of a folder as one zip archive."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for path in sorted(folder.rglob("*")):
@@ -164,6 +164,6 @@ def pack(folder: Path) -> bytes:
 
 
 def unpack(files: bytes, folder: Path) -> None:
-    """Write the files of such an archive into a folder."""
+    """Write the files of an archive made by `pack` into a folder."""
     with zipfile.ZipFile(io.BytesIO(files)) as archive:
         archive.extractall(folder)

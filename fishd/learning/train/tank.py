@@ -1,4 +1,4 @@
-"""Evaluations in the tank: short swims of the newest policy and of those that may still be best."""
+"""Evaluations in the tank: short swims of the newest policy and of other candidates."""
 
 import copy
 from collections.abc import Callable
@@ -13,13 +13,13 @@ from fishd.learning.train.candidates import Candidate, Candidates
 
 
 class TankEvaluations:
-    """Finds out which policy of a training swims best, a few swims at a time."""
+    """Evaluations that determine which policy of a training swims best, a few swims at a time."""
 
     def __init__(
         self, model: PPO, env: SwimEnv, former: Candidate | None, stop: Callable[[], bool]
     ) -> None:
         """
-        former: the best of a training that is resumed
+        former: best policy of a training that is resumed
         stop: called before each tick; True ends an evaluation there
         """
         self._model, self._env, self._stop = model, env, stop
@@ -27,11 +27,14 @@ class TankEvaluations:
         if former:
             self._candidates.add(former)
         self.best = former
-        """Of the policies that swim, as was known after the latest evaluation."""
+        """Best policy that swims, according to the latest evaluation."""
         self._swum: list[Candidate] = []
 
     def add(self, steps: int, rollouts: int) -> None:
-        """The model as it is now may be the best; steps, rollouts: that it has learned from"""
+        """Add the current policy of the model as a candidate.
+
+        steps, rollouts: numbers of those that it has learned from
+        """
         self._candidates.add(
             Candidate(
                 steps=steps,
@@ -46,8 +49,7 @@ class TankEvaluations:
 
         seconds: how long this may take; one swim is made in any case
 
-        The fish is in a pause before and afterwards. Raises `LinkLost`; what was measured until
-        then is kept.
+        The fish is paused before and afterwards. Raises `LinkLost`; earlier measurements are kept.
         """
         policy, self._swum = self._model.policy, []
         own = copy.deepcopy(policy.state_dict())
@@ -66,10 +68,10 @@ class TankEvaluations:
         self._env.pause()
 
     def results(self, steps: int) -> list[Evaluation]:
-        """What is known now of each policy that swam in the latest evaluation.
+        """Return an evaluation of each policy that swam in the latest evaluation.
 
-        Of the best, too, where that is another than before.
-        steps: that the training has learned from
+        The best policy is included, too, where it has changed.
+        steps: number of steps that the training has learned from
         """
         best = self._candidates.best
         told = {one.steps: one for one in self._swum if one.stalled or one.swims}

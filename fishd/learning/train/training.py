@@ -1,10 +1,10 @@
 """The training loop, in simulation or on a robot.
 
-imitate    where the settings say so, from simulated fish whose best beat is known; then, in turn:
+imitate    if the settings enable it, simulated fish whose best beat is known; then, in turn:
 rollout    n_steps of exploration; the fish then waits at neutral
 update     PPO learns from them
-evaluate   without exploration: on a simulated fish of its own, or in the tank
-record     a row in the tables, a checkpoint where one is due, another where it is the best so far
+evaluate   without exploration: on a separate simulated fish, or in the tank
+record     a row in the tables, a checkpoint if one is due, another if the policy is the best yet
 """
 
 import shlex
@@ -49,7 +49,7 @@ _WHERE = {"live": "on the fish of fishd", "simulation": "in simulation"}
 def train(
     job: Job, display: Display | None = None, stop: Callable[[], bool] = lambda: False
 ) -> Outcome:
-    """Train; whatever ends it, the fish is at neutral afterwards.
+    """Train; the fish is at neutral afterwards, whatever ends the training.
 
     stop: called at first and after each step; True ends the training there, and drops the
         current rollout
@@ -92,10 +92,10 @@ def train(
 
 
 class Training:
-    """One training on one link, which it leaves at neutral."""
+    """A training on one link, with the fish at neutral at its end."""
 
     def __init__(self, job: Job, link: Link, display: Display, stop: Callable[[], bool]) -> None:
-        """Makes or opens the run folder; nothing moves yet. Raises as `train` does."""
+        """Create or open the run folder; nothing moves yet. Raises as `train` does."""
         self._job, self._display, self._stop = job, display, stop
         self._eye = eyes.make(job.settings)
         self._env = SwimEnv(link, job.config, job.settings.seen, self._eye)
@@ -111,7 +111,7 @@ class Training:
         self._paused = False
 
     def run(self) -> Outcome:
-        """Learn until all steps are done, or something ends it."""
+        """Learn until all steps are done, or the training is stopped or fails."""
         with closing(self._recorder):
             return self._run()
 
@@ -173,14 +173,14 @@ class Training:
         self._display.begin(recorder.steps, last, text)
 
     def _reset(self) -> None:
-        """Begin the first episode; that of a resumed run with other random numbers."""
+        """Begin the first episode; a resumed run uses other random numbers."""
         if self._recorder.steps:
             mixed = np.random.SeedSequence([self._job.settings.seed, self._recorder.steps])
             self._model.set_random_seed(int(mixed.generate_state(1)[0]))
         self._rollouts.begin(cast(NDArray[np.float32], self._vec_env.reset())[0])
 
     def _babble(self) -> tuple[Ended, str]:
-        """Move at random first, so that the eye knows what it sees; these steps count, too."""
+        """Move at random first, to fit the eye to its pictures; these steps count, too."""
         env, ticks = self._env, self._job.settings.camera.babble
 
         def stop() -> bool:
@@ -194,7 +194,7 @@ class Training:
         return "finished", ""
 
     def _imitate(self) -> Ended:
-        """Learn from the best waves of other fish first; what is stopped is done anew."""
+        """Learn from the best waves of other fish first; an interrupted imitation is repeated."""
         rounds = self._job.settings.imitation.rounds
         imitation = Imitation(self._job.config, self._job.settings, self._model.policy)
         for number in range(1, rounds + 1):
@@ -209,7 +209,7 @@ class Training:
         return "finished"
 
     def _update(self) -> tuple[Ended, str]:
-        """One rollout, its update and evaluation; how it ended, and why."""
+        """Do one rollout, its update and evaluation; return how it ended, and why."""
         model, settings, recorder = self._model, self._job.settings, self._recorder
         if self._paused:
             self._rollouts.begin(self._env.resume())
@@ -220,7 +220,7 @@ class Training:
         self._paused = True
         model.num_timesteps += settings.ppo.n_steps
         rate = learning_rate(settings.ppo, model.num_timesteps)
-        model.lr_schedule = lambda _: rate  # whatever share of the training is done
+        model.lr_schedule = lambda _: rate  # independent of the progress that PPO computes
         model.train()
         if not is_finite(model):
             return "diverged", (
@@ -245,7 +245,7 @@ class Training:
         return ("interrupted" if self._stop() and not last else "finished"), ""
 
     def _evaluate(self) -> None:
-        """Evaluate the policy without exploration, in a tank others as well."""
+        """Evaluate the policy without exploration; in a tank, evaluate other candidates, too."""
         if self._job.on == "simulation":
             self._display.evaluated(self._recorder.add(self._in_simulation()))
             return
@@ -270,13 +270,13 @@ class Training:
 
 
 def _clean(rollout: Rollout, env: SwimEnv) -> None:
-    """Let it take off of the measured forces what is not the fish's."""
+    """Let the rollout remove the errors of the sensor from the measured forces."""
     rollout.signal = ThrustSignal(env.best_thrust)
     rollout.reward_per_newton = env.reward_per_newton
 
 
 def _advice(job: Job) -> str:
-    """What to do after the run folder could not be written."""
+    """Return advice for the user after the run folder could not be written."""
     folder = shlex.quote(str(job.folder))
     if checkpoints.all_in(job.folder):
         return f"go on from the newest checkpoint with --resume {folder}"
