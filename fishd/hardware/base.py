@@ -18,38 +18,38 @@ class ForceSensor(Protocol):
     """The dual force sensor."""
 
     def read(self, now: float) -> Measurement:
-        """What was measured since the previous read; never blocks.
+        """Return the measurement since the previous read; never blocks.
 
-        `now` is the start of the tick [s, monotonic]. Raises `SensorError` where there is
-        nothing to trust.
+        `now` is the start of the tick [s, monotonic]. Raises `SensorError` if no measurement can
+        be trusted.
         """
 
     def close(self) -> None:
-        """Let go of the sensor; may be called twice."""
+        """Close the sensor; may be called twice."""
 
 
 class TaredSensor(Protocol):
     """A force sensor whose zero can be set."""
 
     calibration: ForceCalibration
-    """What turns what it senses into forces."""
+    """Calibration that turns the sensor's values into forces."""
 
     @property
     def unit(self) -> str:
-        """Of the forces: `N`, or that of the driver until the sensor is calibrated."""
+        """Unit of the forces: `N`, or that of the driver until the sensor is calibrated."""
 
     def recalibrate(self, calibration: ForceCalibration) -> None:
         """Use another calibration from the next read on."""
 
     def watch(self) -> "VoltageWatch":
-        """Begin to add up what it senses from now on."""
+        """Begin to add up the sensor's values from now on."""
 
 
 class Servo(Protocol):
     """The tail servo."""
 
     def write(self, angle: float) -> None:
-        """Send an instruction angle [rad], and with it pulses if there were none.
+        """Send an instruction angle [rad]; start the pulses if there are none.
 
         Raises `ServoError` when the servo cannot be reached.
         """
@@ -61,7 +61,7 @@ class Servo(Protocol):
         """
 
     def close(self) -> None:
-        """Release the servo and let go of it; may be called twice."""
+        """Release and close the servo; may be called twice."""
 
 
 @dataclass(frozen=True)
@@ -72,34 +72,34 @@ class Robot:
     sensor: ForceSensor
     servo: Servo
     truth: Callable[[], Truth] | None = None
-    """The true state at the latest read, where the fish is simulated."""
+    """Function that returns the true state at the latest read, if the fish is simulated."""
     panel: "RpiGpioPanel | None" = None
     tared: TaredSensor | None = None
-    """The force sensor, where it can be tared."""
+    """The force sensor, if it can be tared."""
     calibrated: "CalibratedParts | None" = None
-    """What can be calibrated; None for a simulated fish, whose forces can only be tared."""
+    """Parts that can be calibrated; None for a simulated fish, whose forces can only be tared."""
     degraded: Callable[[], tuple[str, ...]] = tuple
-    """What keeps this robot from being as good as it could be now, a line each."""
+    """Reasons why this robot is not as good as it could be now, a line each."""
     counters: Callable[[], dict[str, int]] = dict
-    """Errors that were survived, such as failed I2C transfers, since start."""
+    """Numbers of recovered errors since start, such as failed I2C transfers."""
     power: Callable[[float], float] | None = None
-    """Mean electrical power of the servo since it was asked last [W]; None without a power meter.
+    """Mean electrical power of the servo since the previous call [W]; None without a power meter.
 
-    Asked after each read of the sensor with the start of the tick [s, monotonic]; never blocks.
-    Raises `SensorError` where it is not known.
+    Called after each read of the sensor with the start of the tick [s, monotonic]; never blocks.
+    Raises `SensorError` if the power is not known.
     """
     countdown: float = math.inf
-    """As `ServoDriver.countdown` [s]."""
+    """Time that the servo goes on without a write [s]; see `ServoDriver.countdown`."""
 
     @property
     def force_unit(self) -> str:
-        """`N`; that of the sensor's driver where it was never calibrated."""
+        """Unit of the forces: `N`, or that of the driver if the sensor was never calibrated."""
         return self.tared.unit if self.tared else "N"
 
 
 @dataclass(frozen=True)
 class CalibratedParts:
-    """A robot's sensor and servo as what can be calibrated."""
+    """The sensor and the servo of a robot that can be calibrated."""
 
     sensor: TaredSensor
     servo: "CalibratedServo"

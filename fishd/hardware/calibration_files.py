@@ -72,9 +72,9 @@ class CalibrationFolder:
         return dated, path
 
     def ignored(self) -> list[str]:
-        """A line about each file whose name looks like a calibration's but has no date.
+        """Return a line about each file named like a calibration but without a date.
 
-        Raises `ConfigError` where the folder cannot be read.
+        Raises `ConfigError` if the folder cannot be read.
         """
         return [
             f"{self.folder / name} is no dated calibration file and is ignored"
@@ -83,7 +83,7 @@ class CalibrationFolder:
         ]
 
     def _names(self, kind: type[C]) -> list[str]:
-        """The files of a kind, oldest first."""
+        """Return the names of the files of a kind, oldest first."""
         start = f"{_NAMES[kind]}-"
         names = [name for name in self._all() if name.startswith(start) and _is_dated(name)]
         return sorted(names, key=lambda name: Path(name).stem)

@@ -1,4 +1,4 @@
-"""What a check of `fishctl doctor` is given, and what it returns."""
+"""Argument and result of a check of `fishctl doctor`: a machine and a verdict."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -24,7 +24,7 @@ class Machine(ABC):
     """The computer that the robot is wired to."""
 
     root: Path = Path("/")
-    """Where /sys, /proc, /dev and so on are looked for."""
+    """Folder that contains /sys, /proc, /dev and so on."""
 
     @property
     @abstractmethod
@@ -33,15 +33,15 @@ class Machine(ABC):
 
     @property
     def model(self) -> str:
-        """What this machine calls itself, such as Raspberry Pi 5 Model B; empty if unknown."""
+        """Model name of this machine, such as Raspberry Pi 5 Model B; empty if unknown."""
         return self.text("/proc/device-tree/model")
 
     def path(self, absolute: str) -> Path:
-        """A path of this machine, below `root`."""
+        """Return a path of this machine, below `root`."""
         return self.root / absolute.lstrip("/")
 
     def text(self, absolute: str) -> str:
-        """A small file's text without the zero or newline at its end; empty if unreadable."""
+        """Return the text of a small file without a final zero or newline; empty if unreadable."""
         try:
             return self.path(absolute).read_text(encoding="utf-8", errors="replace").rstrip("\0\n ")
         except OSError:
@@ -82,17 +82,17 @@ def warning(message: str, mend: str) -> Result:
 
 
 def fail(message: str, mend: str) -> Result:
-    """It cannot work."""
+    """Return the result of a check that failed: the robot cannot work."""
     return Result("FAIL", message, mend)
 
 
 def skipped(message: str) -> Result:
-    """It cannot be told, or was not tried."""
+    """Return the result of a check that is undecided or was not tried."""
     return Result("skipped", message)
 
 
 def name_of(uid: int) -> str:
-    """The name of a user, or its number where it has none."""
+    """Return the name of a user, or `#` and the number of a user without a name."""
     import pwd
 
     try:

@@ -10,13 +10,13 @@ from fishd.core.errors import StartupError
 log = logging.getLogger(__name__)
 
 PACKAGE = "RPi.GPIO"
-"""What a driver that calls `load` has among its `packages`."""
+"""Package that a driver that calls `load` lists in its `packages`."""
 _PROVIDERS = ("RPi.GPIO", "rpi-lgpio")
 _EXTRAS = "fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio] (Pi 4 and older)"
 
 
 def installed() -> list[str]:
-    """Which of the two packages are installed; one would be right."""
+    """Return which of the two packages are installed; exactly one should be."""
     from importlib import metadata  # which takes long to load, and only a Pi needs
 
     found = []
@@ -44,7 +44,7 @@ def load() -> Any:
             f"the pins of the header need the package RPi.GPIO: install {_EXTRAS}"
         ) from None
     except OSError as error:
-        # lgpio makes a pipe, .lgd-nfyN, in the working folder as soon as it is imported.
+        # When imported, lgpio makes a pipe, .lgd-nfyN, in the working folder.
         raise StartupError(
             f"rpi-lgpio cannot make its pipe in the working folder: {error.strerror}; "
             "start fishd in a folder that it may write to"
@@ -75,5 +75,5 @@ def claim(gpio_module: Any, gpio: int, direction: int, **options: int) -> None:
 
 
 def one_line(error: Exception) -> str:
-    """What an error says; lgpio puts its text in quotes."""
+    """Return the text of an error in one line; lgpio puts it in quotes."""
     return " ".join(str(error).strip("'").split()).rstrip(".!") or type(error).__name__

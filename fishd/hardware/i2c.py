@@ -1,6 +1,6 @@
-"""An I2C bus for a driver: how it is opened, what its errors mean, what `fishctl doctor` looks at.
+"""An I2C bus for a driver: opening it, explaining its errors, and the checks of `fishctl doctor`.
 
-Each device has an open file of its own; the kernel keeps transfers of several apart.
+Each device has its own open file; the kernel keeps the transfers of several files apart.
 """
 
 import errno
@@ -27,7 +27,7 @@ _HEADER_BUS, _HEADER_PINS = 1, (2, 3)
 _I2C_TIMEOUT = 0x0702
 _TIMEOUT = 2  # [10 ms]; the kernel's own is 1 s
 _ADAPTERS = ("/sys/bus/i2c/devices", "/sys/class/i2c-adapter")
-"""Where the kernel lists its buses; the latter before 6.12 only."""
+"""Folders in which the kernel lists its buses; the second only before Linux 6.12."""
 _CORE_CLOCK = re.compile(r"Raspberry Pi (3|4|Compute Module [34])")
 """Pis whose bus slows down with the core clock."""
 
@@ -77,7 +77,7 @@ def close_bus(bus: Any) -> None:
         driver.close()
     except OSError as error:  # Linux has closed it all the same
         log.warning("closing an I2C bus failed: %s", error)
-        driver._device = None  # else it would be closed once more
+        driver._device = None  # else it would be closed again
     bus.deinit()
 
 
@@ -121,7 +121,7 @@ def explain(error: Exception, bus: int, address: int, chip: str, section: str) -
 
 
 def checks(bus: int, section: str) -> tuple[Check, ...]:
-    """Of a bus that `section`.bus names."""
+    """Return the checks of the bus that `section`.bus names."""
     return (
         Check("i2c bus", lambda machine: _bus(machine, bus, section), ("pi",)),
         Check("i2c speed", lambda machine: _speed(machine, bus), ("pi",)),
@@ -129,7 +129,7 @@ def checks(bus: int, section: str) -> tuple[Check, ...]:
 
 
 def _bus(machine: Machine, number: int, section: str) -> Result:
-    """The device file, and whether this user may use it."""
+    """Check the device file, and whether this user may use it."""
     device = machine.path(f"/dev/i2c-{number}")
     if not device.exists():
         others = sorted(path.name for path in machine.path("/dev").glob("i2c-*"))
@@ -154,7 +154,7 @@ def _bus(machine: Machine, number: int, section: str) -> Result:
 
 
 def _speed(machine: Machine, number: int) -> Result:
-    """As the device tree says; big-endian."""
+    """Check the speed of the bus that the device tree states."""
     found = _set_speed(machine, number)
     if found is None:
         return skipped("the kernel does not tell the speed of this bus")

@@ -28,14 +28,14 @@ TRIES, PAUSE = 50, 0.02
 
 
 class Part(NamedTuple):
-    """What at most one fishd may drive."""
+    """A part of the robot that at most one fishd may drive."""
 
     path: Path
-    """What is claimed; its lock file is beside it."""
+    """Path that is claimed; its lock file is beside it."""
     what: str
-    """In words."""
+    """Name in messages."""
     key: str
-    """The configuration key that names another one."""
+    """Configuration key with which the user chooses another one."""
 
 
 def lock_folder() -> Path:

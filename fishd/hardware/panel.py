@@ -31,7 +31,7 @@ class RpiGpioPanel:
         self._settings = settings
         self._pressed = False
         self._released_polls = 0
-        self._lock = threading.Lock()  # the library calls from a thread of its own
+        self._lock = threading.Lock()  # the library calls back from its own thread
         self._lit = False
         self._changed = 0.0
         self._dark = settings.led_gpio is None
@@ -65,9 +65,9 @@ class RpiGpioPanel:
             return self._pressed
 
     def close(self) -> None:
-        """Switch the light off and let go of the pins; may be called twice.
+        """Switch the light off and release the pins; may be called twice.
 
-        A step that fails is logged, and the next one is done all the same.
+        A step that fails is logged, and the next one is still done.
         """
         if self._closed:
             return
@@ -157,4 +157,4 @@ class RpiGpioPanel:
 
 
 def _nothing() -> None:
-    """What a press does until somebody says otherwise."""
+    """Do nothing: the default of `on_press`."""

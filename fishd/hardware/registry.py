@@ -56,10 +56,10 @@ PACKAGES = {
 
 @contextmanager
 def driver_packages(driver: str = "") -> Iterator[None]:
-    """Import and open a driver inside of this.
+    """Translate the errors of importing and opening a driver.
 
-    Raises `MissingPackage` where a library is not installed, and `StartupError` for whatever else
-    a driver, if it is named, raises that is no error of fishd's.
+    Raises `MissingPackage` if a library is not installed. If the driver is named, raises
+    `StartupError` for every other exception that is not a `FishdError`.
     """
     try:
         yield

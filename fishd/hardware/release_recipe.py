@@ -1,8 +1,8 @@
-"""What another process needs to release the servo without the configuration: a small file.
+"""A small file with which another process releases the servo without the configuration.
 
 fishd writes it when it opens a servo and at each calibration, for its configuration file and for
-its control socket: `fishd-release` asks by the first, `fishctl estop` by the second. Needs nothing
-but the standard library, and of that not pathlib, which takes longer to load than all of this.
+its control socket: `fishd-release` finds it by the first, `fishctl estop` by the second. Needs only
+the standard library, and not pathlib, which takes longer to load than everything else here.
 """
 
 import json
@@ -16,17 +16,17 @@ from fishd.core.errors import ServoError, StartupError
 from fishd.core.process.runtime_folder import runtime_folder
 
 NOT_RELEASED = "the servo was not released and may still have pulses: cut its power"
-"""What to say where a release has failed."""
+"""Message of a failed release."""
 
 _LARGEST = 65_536
 _SHORTEST, _LONGEST = 500, 2500
 
 
 def carry_out(function: str, neutral: float, arguments: dict[str, Any]) -> bool:
-    """End the pulses as a driver's `LastResort` says; True where there were any.
+    """End the pulses as a driver's `LastResort` says; return True if there were any.
 
-    neutral: its pulse [µs]
-    Raises `ServoError`, in one line also for what else the function raises, but ImportError.
+    neutral: pulse of neutral [µs]
+    Raises `ServoError` with one line, also for other exceptions of the function but ImportError.
     """
     module, _, name = function.partition(":")
     try:
@@ -81,8 +81,8 @@ def remove(config: str) -> None:
 def read(config: str) -> dict[str, Any] | None:
     """Return the recipe of the latest fishd with a configuration file, or a socket, if it left one.
 
-    Its key `fresh` says whether the file has not changed since. One that somebody else may have
-    written, or that is not whole, is none.
+    Its key `fresh` says whether the file has not changed since. A recipe that another user may
+    have written, or that is not complete, is ignored.
     """
     try:
         file = os.open(_path(config), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
@@ -117,5 +117,5 @@ def _signature(config: str) -> list[int]:
 
 
 def _ours(found: os.stat_result, kind: Any) -> bool:
-    """Of the right kind, and nobody but this user or root can have put it there."""
+    """Return whether a file has the right kind and can only come from this user or root."""
     return kind(found.st_mode) and found.st_uid in (os.geteuid(), 0) and not found.st_mode & 0o022

@@ -1,4 +1,4 @@
-"""Samples a driver, and opens it anew where it fails."""
+"""Sampling of a driver, which is opened again after failures."""
 
 import math
 from collections import deque
@@ -13,31 +13,31 @@ from fishd.hardware.driver import Pair, PowerSample, SampledDriver
 X = TypeVar("X", Pair, PowerSample)
 
 REMEMBERED = 4096
-"""Samples that are kept until somebody takes them; the oldest are dropped."""
+"""Largest number of samples kept until they are read; the oldest are dropped."""
 FEW = 3
-"""After so many failures in a row the hardware is opened anew."""
+"""Number of failures in a row after which the hardware is opened again."""
 LONGEST_PAUSE = 0.5
-"""Between two attempts [s]."""
+"""Longest time between two attempts [s]."""
 _SHORTEST_PAUSE = 1e-3
 
 
 class Sampler(Generic[X]):
-    """Owns a driver; only one thread may call it, save for what says otherwise."""
+    """Owner of a driver; only one thread may use it, except for the parts marked below."""
 
     def __init__(self, driver: SampledDriver[Any], clock: Clock) -> None:
-        """Opens nothing yet."""
+        """Open nothing yet."""
         self._driver = driver
         self._clock = clock
         self.samples: deque[X] = deque(maxlen=REMEMBERED)
-        """What came in, for another thread to take with `popleft`."""
+        """Samples received, for another thread to take with `popleft`."""
         self.trouble = ""
-        """Why the latest attempt failed, one line; empty if it did not. For any thread."""
+        """Reason why the latest attempt failed, one line; empty if it did not. For any thread."""
         self.errors = 0
-        """Attempts that failed, since start. For any thread."""
+        """Number of failed attempts since start. For any thread."""
         self.reconnects = 0
-        """How often the hardware was opened anew and samples came again. For any thread."""
+        """Number of times that samples came again after a new opening. For any thread."""
         self.ready_at = -math.inf
-        """No attempt begins earlier [s, monotonic]."""
+        """Earliest time of the next attempt [s, monotonic]."""
         self._failures = 0
         self._open = False
 
@@ -61,7 +61,7 @@ class Sampler(Generic[X]):
                 self.trouble = ""
 
     def close(self) -> None:
-        """Let go of the hardware; never raises, may be called twice."""
+        """Release the hardware; never raises, may be called twice."""
         self._open = False
         with suppress(Exception):
             contained(self._driver.close)

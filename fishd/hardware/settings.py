@@ -1,6 +1,6 @@
-"""What every force sensor, servo and power meter is configured by, and the operator's panel.
+"""Settings of every force sensor, servo and power meter, and of the operator's panel.
 
-A driver adds keys of its own in a subclass beside its code.
+A driver adds its own keys in a subclass beside its code.
 """
 
 from typing import Annotated, Any, Literal, Self
@@ -61,11 +61,11 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     @property
     def calibration(self) -> ServoCalibration:
-        """The calibration that the settings themselves amount to."""
+        """Calibration that the settings themselves contain."""
         return ServoCalibration(**_found(self))
 
     def calibrated(self, calibration: ServoCalibration) -> Self:
-        """The settings with what a calibration says instead."""
+        """Return the settings with the values of a calibration."""
         return msgspec.structs.replace(self, **_found(calibration))
 
 
