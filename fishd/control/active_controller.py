@@ -1,4 +1,4 @@
-"""The active controller. It may be anybody's code, so whatever it raises becomes an Exception."""
+"""The active controller; whatever its code raises, third-party code too, becomes an Exception."""
 
 from functools import lru_cache
 from typing import Any
@@ -20,41 +20,41 @@ Successor = tuple[str, Controller[Any]]
 
 
 class ActiveController:
-    """Calls the controller that chooses the angle, replaces it, and tells of either."""
+    """The controller that chooses the angle: calls it, replaces it, and reports its changes."""
 
     def __init__(self, limits: Limits, reporter: Reporter) -> None:
         self._limits = limits
         self._reporter = reporter
         self.name = "hold"
         self.controller: Controller[Any] = Hold(HoldParameters(), limits)
-        self.parameters = _plain(self.controller)
-        """Its parameters, as JSON has them."""
+        self.parameters = _encode_parameters(self.controller)
+        """Parameters of the controller, as JSON values."""
         self.parameter_units = _parameter_units(self.controller)
-        self.wave = _wave(self.name, self.controller, self.parameters)
-        """Which kind of wave it makes, as another object after each change."""
+        self.wave = _wave_kind(self.name, self.controller, self.parameters)
+        """Kind of wave that the controller makes; a new object after each change."""
         self.quantity_units: dict[str, str] = {}
-        """The units of all that it has."""
+        """Unit of each quantity of the controller, by name."""
         self.fallback: Reason | None = None
-        """Why it took over from the controller that was set, if it did."""
-        self._fresh = False
+        """Reason why this controller took over from the one that was set; None if it did not."""
+        self._is_new = False
 
     def replace(self, name: str, controller: Controller[Any]) -> None:
-        """Make a ready-made controller the active one; raises what its parameters raise."""
-        units = _units(type(controller))
-        former, self.parameters = self.controller, _plain(controller)
+        """Make a controller the active one; raises what its parameters raise."""
+        units = _quantity_units(type(controller))
+        former, self.parameters = self.controller, _encode_parameters(controller)
         self.parameter_units = _parameter_units(controller)
-        self.name, self.controller, self.fallback, self._fresh = name, controller, None, True
-        self.wave = _wave(name, controller, self.parameters)
+        self.name, self.controller, self.fallback, self._is_new = name, controller, None, True
+        self.wave = _wave_kind(name, controller, self.parameters)
         self.quantity_units = units
         self.dispose(former, f"the controller before {name}")
 
     @property
     def quantities(self) -> dict[str, float]:
-        """Its own, since its latest update; empty where it has none to show."""
-        return {} if self._fresh else values_of(self.controller, self.quantity_units)
+        """Quantities of the controller at its latest update; empty before its first one."""
+        return {} if self._is_new else values_of(self.controller, self.quantity_units)
 
     def dispose(self, controller: Controller[Any], what: str) -> None:
-        """Close a controller that will not be active any more."""
+        """Close a controller that will not be active again; what: its description for the log."""
         try:
             contained(controller.close)
         except Exception as error:
@@ -64,8 +64,8 @@ class ActiveController:
         """Make `hold` the active one, at neutral."""
         self.replace("hold", Hold(HoldParameters(), self._limits))
 
-    def succeed(self, error: ControllerFault, code: str, successor: Successor) -> None:
-        """The active controller gave up and named another one, which becomes active."""
+    def hand_over(self, error: ControllerFault, code: str, successor: Successor) -> None:
+        """Activate the successor that a controller named when it gave up, and report that."""
         before = self.name
         self.replace(*successor)
         self.fallback = Reason(code, text.line(f"{before} gave up: {text.said(error)}"))
@@ -74,41 +74,44 @@ class ActiveController:
         )
 
     def update(self, observation: Observation) -> Any:
-        """Return what it commands, unchecked; raises what it raises, so call this `contained`."""
+        """Return the command of the controller, unchecked.
+
+        Raises what the controller raises, so call this through `contained`.
+        """
         controller = self.controller
-        if self._fresh:
+        if self._is_new:
             controller.activate(observation)
-            self._fresh = False
+            self._is_new = False
         return controller.update(observation)
 
     def retune(self, parameters: Struct) -> None:
-        """Give it new, already checked parameters; raises what it raises."""
+        """Give the controller new, already checked parameters; raises what its `retune` raises."""
         contained(self.controller.retune, parameters)
-        self.parameters = _plain(self.controller)
-        self.wave = _wave(self.name, self.controller, self.parameters)
+        self.parameters = _encode_parameters(self.controller)
+        self.wave = _wave_kind(self.name, self.controller, self.parameters)
         self._reporter.controller("parameters", self.name, self.parameters, self.parameter_units)
 
     def warm_up(self) -> None:
-        """Let it warm up for the next update, which is imminent; raises what it raises."""
+        """Warm the controller up for the imminent update; raises what the controller raises."""
         contained(self.controller.warm_up)
 
 
 @lru_cache(maxsize=64)
-def _units(controller: type[Controller[Any]]) -> dict[str, str]:
-    """The units of its quantities, by name; of a class, which does not change."""
-    return {each.name: each.unit for each in quantities_of(controller)}
+def _quantity_units(controller: type[Controller[Any]]) -> dict[str, str]:
+    """Return the unit of each quantity of a controller class, by name."""
+    return {quantity.name: quantity.unit for quantity in quantities_of(controller)}
 
 
 def _parameter_units(controller: Controller[Any]) -> dict[str, str]:
-    """Return the units of its parameters, by name."""
+    """Return the unit of each parameter of a controller, by name."""
     kind: type[Struct] = type(controller.parameters)
     return units_of(fields_of(kind))
 
 
-def told(error: ControllerFault) -> tuple[str, Successor | None]:
-    """Code and successor of a fault, whatever a subclass has made of them."""
+def fault_and_successor(error: ControllerFault) -> tuple[str, Successor | None]:
+    """Return code and successor of a fault, with defaults where a subclass made them invalid."""
 
-    def look() -> tuple[str, Successor | None]:
+    def read() -> tuple[str, Successor | None]:
         code, successor = error.code, error.successor
         if type(code) is not str:
             code = "controller-error"
@@ -119,26 +122,31 @@ def told(error: ControllerFault) -> tuple[str, Successor | None]:
         return code, None
 
     try:
-        return contained(look)
+        return contained(read)
     except Exception:
         return "controller-error", None
 
 
-def _wave(
+def _wave_kind(
     name: str, controller: Controller[Any], parameters: dict[str, Any]
 ) -> tuple[str, dict[str, Any]]:
-    """Waves that are equal are of one kind, though not always of one size."""
-    like = type(controller).swims_like
-    if not isinstance(like, Likeness):
+    """Return a value that is equal for waves of one kind, whatever their size."""
+    likeness = type(controller).swims_like
+    if not isinstance(likeness, Likeness):
         return name, parameters
-    return like.name, {key: each for key, each in parameters.items() if key not in like.but_for}
+    return likeness.name, {
+        key: value for key, value in parameters.items() if key not in likeness.but_for
+    }
 
 
-def _plain(controller: Controller[Any]) -> dict[str, Any]:
-    """The parameters of a controller as JSON has them; raises what it raises, or an Exception."""
+def _encode_parameters(controller: Controller[Any]) -> dict[str, Any]:
+    """Return the parameters of a controller as JSON values.
 
-    def plain() -> dict[str, Any]:
+    Raises what the controller raises, or an Exception.
+    """
+
+    def encode() -> dict[str, Any]:
         encoded = msgspec.json.encode(msgspec.structs.asdict(controller.parameters))
         return msgspec.json.decode(encoded, type=dict[str, Any])
 
-    return contained(plain)
+    return contained(encode)

@@ -9,7 +9,7 @@ from msgspec import Struct
 
 
 class Effect(StrEnum):
-    """What the servo gets."""
+    """Effect of a fault on the pulses of the servo."""
 
     FADE = "mode `fault`: the servo fades to neutral, then it gets no pulses"
     RELEASE = "mode `estop`: no pulses at once, wherever the tail is"
@@ -19,11 +19,11 @@ class Fault(Struct, frozen=True):
     """A row of the table."""
 
     text: str
-    """What triggers it."""
+    """Condition that triggers the fault."""
     remedy: str
-    """What the operator does, before `fishctl clear-fault`."""
+    """Action of the operator before `fishctl clear-fault`."""
     in_a_row: int = 1
-    """How many failed checks in a row it takes."""
+    """Number of failed checks in a row that trigger the fault."""
     effect: Effect = Effect.FADE
 
 
@@ -104,6 +104,6 @@ FAULTS = {
     ),
 }
 UNLISTED = Fault(
-    "a controller of another package gave up, with a code of its own",
+    "a controller of another package gave up with a fault code that is not in this table",
     "see the documentation of that controller",
 )

@@ -1,4 +1,4 @@
-"""The last word on what reaches the servo: finite, within its limits, no faster than permitted."""
+"""Limits on what reaches the servo: finite angles within the range, no faster than permitted."""
 
 import math
 from typing import Any
@@ -7,17 +7,17 @@ from fishd.core.foreign_code import contained, real_number
 
 
 class Guard:
-    """Limits the instruction angle. It remembers no command, so nothing can wind up."""
+    """A limiter of the instruction angle without a memory of commands, so nothing can wind up."""
 
     def __init__(
         self, amplitude: float, tick: float, slew_limit: float | None, fade_time: float
     ) -> None:
-        """Permits every angle within ±Φ until `restrict` is called.
+        """Permit every angle within ±Φ until `restrict` is called.
 
         amplitude: Φ [rad]
         tick: period of the loop [s]
         slew_limit: fastest permitted change [rad/s]; None permits one full reversal a tick
-        fade_time: how long a fade from Φ to neutral takes [s]
+        fade_time: time of a fade from Φ to neutral [s]
         """
         self._amplitude = amplitude
         self.restrict(-amplitude, amplitude)
@@ -28,35 +28,35 @@ class Guard:
         """Largest change per tick while fading to neutral [rad]."""
 
     def restrict(self, lowest: float, highest: float) -> None:
-        """Permit angles from `lowest` to `highest` [rad] only, as far as they are within ±Φ."""
+        """Permit only angles from `lowest` to `highest` [rad], and never any beyond ±Φ."""
         self.lowest = max(-self._amplitude, lowest)
-        """The lowest angle that is permitted [rad]."""
+        """Lowest permitted angle [rad]."""
         self.highest = min(self._amplitude, highest)
-        """The highest angle that is permitted [rad]."""
+        """Highest permitted angle [rad]."""
 
     def apply(self, command: Any, previous: float) -> float:
-        """The instruction angle to send [rad].
+        """Return the instruction angle to send [rad].
 
-        command: what the controller wants [rad]: one real number of any kind, numpy's too
-        previous: the angle that is applied now [rad]
-        Raises ValueError when the command is no number, or not finite.
+        command: angle that the controller commands [rad]: a real number of any type, numpy's too
+        previous: angle that is applied now [rad]
+        Raises ValueError when the command is not a number, or not finite.
         """
-        known = type(command) is float
-        angle = command if known else contained(real_number, command, "the command")
+        is_float = type(command) is float
+        angle = command if is_float else contained(real_number, command, "the command")
         if not math.isfinite(angle):
             raise ValueError(f"the command is {angle}, not an angle")
         if angle > self.highest:
             angle = self.highest
         elif angle < self.lowest:
             angle = self.lowest
-        return _towards(angle, previous, self.step)
+        return _step_towards(angle, previous, self.step)
 
     def fade(self, previous: float) -> float:
-        """The next instruction angle on the way to neutral [rad]."""
-        return _towards(0.0, previous, self.fade_step)
+        """Return the next instruction angle on the way to neutral [rad]."""
+        return _step_towards(0.0, previous, self.fade_step)
 
 
-def _towards(wanted: float, previous: float, step: float) -> float:
+def _step_towards(wanted: float, previous: float, step: float) -> float:
     reach = step * (1.0 + 1e-9)  # rounding must not cost another tick
     if wanted > previous + reach:
         return previous + step

@@ -1,6 +1,6 @@
-"""The lease of the experiment that drives the fish; it ends unless it is renewed.
+"""The lease of the experiment that drives the fish; it expires unless it is renewed.
 
-The loop asks once a tick whether it has run out; requests take it, renew it and end it.
+The loop checks once a tick whether it has expired; requests take it, renew it and end it.
 """
 
 import os
@@ -9,41 +9,41 @@ from collections.abc import Callable
 from fishd.core.errors import Refused
 from fishd.core.signals import LeaseHolder, Reason
 
-MAX_STEP = 0.25
-"""Longest time between two looks at the clock that counts [s].
+MAX_STEP_S = 0.25
+"""Longest time between two checks that counts against a lease [s].
 
-A fishd that stood still, by SIGSTOP say, could hear no renewal meanwhile.
+A fishd that was suspended, by SIGSTOP for example, could receive no renewal meanwhile.
 """
-KEPT = 16
-"""Number of leases that are remembered after their end, to tell their holders why they ended."""
-RETURNED = "it was given back"
+MAX_REMEMBERED_LEASES = 16
+"""Number of ended leases whose reason is kept, so that a late renewal is answered with it."""
+RETURN_REASON = "it was given back"
 
 
 class Lease:
-    """At most one experiment holds it; requests by hand need none, and end it."""
+    """The lease, held by at most one experiment; a manual request needs no lease, and ends it."""
 
     def __init__(self, now: Callable[[], float]) -> None:
-        """now: the clock by which holders live and die [s]"""
+        """now: the clock that measures the lease [s, monotonic]"""
         self.active = False
-        """True while an experiment holds the fish."""
+        """Whether an experiment holds the fish."""
         self.drives = False
-        """Whether what is active was set by its holder: that ends with the lease."""
+        """Whether the holder set the active controller, which then stops with the lease."""
         self.expired: Reason | None = None
-        """Why the fish rests, where the latest lease ran out and nothing has come since."""
+        """Reason why the fish rests, if the latest lease expired and no request came since."""
         self._now = now
         self._token = ""
         self._name = self._host = ""
         self._pid = 0
-        self._seconds = self._left = 0.0
-        self._taken = self._seen = 0.0
+        self._seconds = self._time_left = 0.0
+        self._taken = self._checked = 0.0
         self._dormant = False
-        """Whether it ran out while the fish was at rest: then its holder may go on with it."""
-        self._ends: dict[str, str] = {}
-        """Why each of the latest leases ended, by its token."""
+        """Whether the lease expired while the fish was at rest; its holder may still renew it."""
+        self._end_reasons: dict[str, str] = {}
+        """Reason by token of each of the latest leases that ended."""
 
     @property
     def holder(self) -> LeaseHolder | None:
-        """The experiment that holds the fish."""
+        """The experiment that holds the fish; None without a lease."""
         if not self.active:
             return None
         return LeaseHolder(self._name, self._host, self._pid, self._now() - self._taken)
@@ -55,26 +55,26 @@ class Lease:
             raise Refused("leased", holder.refusal())
 
     def take(self, name: str, host: str, pid: int, seconds: float) -> str:
-        """Begin a lease, and return its token. seconds: that it lasts without a renewal"""
+        """Begin a lease, and return its token; seconds: time without renewal until it expires."""
         self.active, self._dormant, self.expired = True, False, None
         self.drives = False
-        self._token = os.urandom(8).hex()  # another one than that of a daemon before this one
+        self._token = os.urandom(8).hex()  # differs from tokens of an earlier daemon
         self._name, self._host, self._pid, self._seconds = name, host, pid, seconds
         self._taken = self._now()
-        self._fill()
+        self._restart_time()
         return self._token
 
     def renew(self, token: str) -> None:
-        """Let the lease last for its full time again; raise `Refused` where it has ended.
+        """Restart the time of the lease; raise `Refused` where the lease has ended.
 
-        One that ran out while the fish was at rest goes on, if no other client has had the fish
-        since.
+        A lease that expired while the fish was at rest is renewed too, if no other client has
+        controlled the fish since.
         """
         if token != self._token or not (self.active or self._dormant):
-            why = self._ends.get(token, "fishd was restarted, or it is long ago")
+            why = self._end_reasons.get(token, "fishd was restarted, or it is long ago")
             raise Refused("no-lease", f"this program no longer holds the fish: {why}")
         self.active, self._dormant, self.expired = True, False, None
-        self._fill()
+        self._restart_time()
 
     def end(self, why: str) -> LeaseHolder | None:
         """End the lease, if there is one, and return its holder."""
@@ -85,25 +85,25 @@ class Lease:
         return former
 
     def why_ended(self, token: str) -> str | None:
-        """Return why a lease has ended; None while it lasts."""
+        """Return why a lease has ended; None while it is active."""
         if self.active and token == self._token:
             return None
-        return self._ends.get(token, "it ran out")
+        return self._end_reasons.get(token, "it ran out")
 
     def forget(self, token: str) -> None:
-        """Let the holder of a lease that ran out not go on with it."""
+        """Prevent the holder of an expired lease from renewing it."""
         if token == self._token:
             self._dormant = False
 
     def run_out(self, moving: bool) -> LeaseHolder | None:
-        """End the lease, which is active, where its time is up, and return its holder then.
+        """End the active lease if its time is up, and return its holder; else return None.
 
         moving: whether a controller is active
         """
         now = self._now()
-        self._left -= min(now - self._seen, MAX_STEP)
-        self._seen = now
-        if self._left > 0.0:
+        self._time_left -= min(now - self._checked, MAX_STEP_S)
+        self._checked = now
+        if self._time_left > 0.0:
             return None
         former = self.holder
         self.expired = Reason(
@@ -115,10 +115,10 @@ class Lease:
         self.active, self._dormant = False, not moving
         return former
 
-    def _fill(self) -> None:
-        self._left, self._seen = self._seconds, self._now()
+    def _restart_time(self) -> None:
+        self._time_left, self._checked = self._seconds, self._now()
 
     def _remember(self, why: str) -> None:
-        self._ends[self._token] = why
-        if len(self._ends) > KEPT:
-            del self._ends[next(iter(self._ends))]
+        self._end_reasons[self._token] = why
+        if len(self._end_reasons) > MAX_REMEMBERED_LEASES:
+            del self._end_reasons[next(iter(self._end_reasons))]

@@ -1,8 +1,8 @@
-"""The control loop: one synchronous function, `ControlLoop.tick`, that everything calls.
+"""The control loop: one synchronous function, `ControlLoop.tick`, for daemon and simulation alike.
 
 The daemon calls it from asyncio every period, simulation and tests from a plain `for` on a virtual
 clock. It never raises: whatever goes wrong, the supervisor decides and the servo goes neutral.
-Everything else here is called between two ticks, by the thread that ticks.
+All other methods are called between two ticks, by the thread that calls `tick`.
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.control.active_controller import ActiveController, Successor, told
+from fishd.control.active_controller import ActiveController, Successor, fault_and_successor
 from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.control.estimators.live_thrust import LiveThrust
@@ -36,26 +36,27 @@ if TYPE_CHECKING:
     from fishd.hardware.panel import RpiGpioPanel
 
 UPDATE_BUDGET = 0.5
-"""Share of the period that a controller's update may take."""
-SETTLING = 0.1
-"""How long a servo stays at neutral before its pulses end [s]."""
-STALE = 2.0
-"""A newest sample older than this many periods counts as a failed read."""
+"""Largest fraction of the period that an update of the controller may take."""
+SETTLE_TIME_S = 0.1
+"""Time that a servo stays at neutral before its pulses end [s]."""
+MAX_SAMPLE_AGE_PERIODS = 2.0
+"""Largest age of the newest sample, in periods; a read with an older one counts as failed."""
 
 
 class Turn(Struct, frozen=True, gc=False):
-    """The first half of a tick: what was read, and times at the start and after each phase [s]."""
+    """The result of the first half of a tick."""
 
     slot: Slot
     measurement: Measurement
     observation: Observation
     marks: tuple[float, float, float]
+    """Times at the start of the tick, after the read and after the estimate [s, monotonic]."""
     power: float | None
-    """Mean electrical power of the servo since the previous tick, where it is known [W]."""
+    """Mean electrical power of the servo since the previous tick [W]; None where it is unknown."""
 
 
 class ControlLoop:
-    """Reads the sensor, lets one controller choose the instruction angle, drives the servo."""
+    """The loop that reads the sensor, lets a controller choose the angle and drives the servo."""
 
     def __init__(
         self,
@@ -70,7 +71,7 @@ class ControlLoop:
         lateral_sign: LateralSign | None = None,
     ) -> None:
         """
-        publisher: gets the record of every tick, and every event; with None, no record is made
+        publisher: receives the record of every tick, and every event; None: ticks are not recorded
         notify: called at the end of every tick with the time of its start [s, monotonic]
         """
         self.robot = robot
@@ -84,56 +85,59 @@ class ControlLoop:
         self.servo = ServoOutput(robot, clock.monotonic)
         self.power = ServoPower(robot, self.reporter, limits.tick)
         self.seq = 0
-        """Number of the latest tick."""
+        """Sequence number of the latest tick."""
         self.applied = 0.0
-        """The instruction angle that was sent last, after the guard [rad]."""
+        """Instruction angle that was sent last, after the guard [rad]."""
         self.neutral_for = 0.0
-        """How long the instruction angle has been zero [s]."""
+        """Time since the instruction angle became zero [s]."""
         self.thrust = thrust
         self.lateral_sign = lateral_sign or LateralSign()
         self.fy_corrected = False
-        """Whether the latest observation has F_y with the other sign than it is measured with."""
+        """Whether the latest observation has F_y with the opposite sign of the measured F_y."""
         self.observation: Observation | None = None
-        """What the latest tick observed."""
+        """Observation of the latest tick; None before the first one."""
         self._estimator = estimator
         self.found_leak = estimator.found_leak
-        """As of the estimator, at the latest tick [s]."""
+        """Leak time of the estimator at the latest tick [s]; None unless the estimator finds it."""
         self._now = clock.monotonic
         self._notify = notify
         self._budget = UPDATE_BUDGET * limits.tick
-        self._believed = Measurement(clock.monotonic(), 0.0, 0.0, 0)
-        """The latest measurement that was to be believed."""
+        self._trusted = Measurement(clock.monotonic(), 0.0, 0.0, 0)
+        """Latest measurement that was not suspect."""
         self._index = -1
-        self._awaited: tuple[int, str, Controller[Any], ServoCalibration | None] | None = None
+        self._pending: tuple[int, str, Controller[Any], ServoCalibration | None] | None = None
 
     @property
     def known_thrust(self) -> tuple[float, float | None]:
-        """Thrust and half of its 95 % interval [N]; while its zero is not known, as measured."""
+        """Thrust and the half-width of its 95 % confidence interval [N].
+
+        While the zero of the force is not known, it is the measured thrust, without a half-width.
+        """
         if self.thrust.thrust is not None:
             return self.thrust.thrust, self.thrust.error
         return (self.observation.thrust if self.observation else 0.0), None
 
     @property
-    def settled(self) -> bool:
-        """Has the servo been at neutral for so long that its pulses may end?"""
-        return self.neutral_for >= SETTLING - 1e-9
+    def has_settled(self) -> bool:
+        """Whether the servo has been at neutral for `SETTLE_TIME_S`, so that its pulses may end."""
+        return self.neutral_for >= SETTLE_TIME_S - 1e-9
 
     def tick(self, slot: Slot) -> None:
-        """One turn of the loop."""
+        """Run one tick of the loop."""
         self.act(self.observe(slot))
 
     def observe(self, slot: Slot) -> Turn:
-        """First half of a tick: read and estimate. `act` must follow, with what this returns.
+        """Run the first half of a tick: read and estimate. `act` must follow, with the result.
 
-        Between the two, `observation` is what the controller will be shown.
+        Between the two, `observation` is the one that the controller will receive.
         """
         started = self._now()
         self.seq += 1
         self.statistics.missed += slot.missed
         dt = (slot.index - self._index) * self.limits.tick
         self._index = slot.index
-        if self._awaited:
-            self._begin_awaited(*self._awaited)
+        if self._pending:
+            self._start_pending(*self._pending)
         if self.robot.panel:
             self._attend_panel(self.robot.panel, slot)
         if self.lease.active:
@@ -142,7 +146,9 @@ class ControlLoop:
         power = self.power.read(slot.deadline) if self.power.metered else None
         read = self._now()
         suspect = bool(measurement.suspect)
-        observation = self._estimate(self._once_more() if suspect else measurement, slot, dt)
+        observation = self._estimate(
+            self._last_trusted_measurement() if suspect else measurement, slot, dt
+        )
         if not (self.supervisor.failures and self.supervisor.sensor_lost):
             observation = self._follow_thrust(observation, suspect)
             if self.limits.tethered:
@@ -151,14 +157,14 @@ class ControlLoop:
         return Turn(slot, measurement, observation, (started, read, self._now()), power)
 
     def act(self, turn: Turn) -> None:
-        """Second half of a tick: let the controller choose, drive the servo, publish."""
+        """Run the second half of a tick: let the controller choose, drive the servo, publish."""
         slot, observation = turn.slot, turn.observation
         started, read, estimated = turn.marks
         before, self.applied = self.applied, self._update(observation, estimated)
         moved = before or self.applied
         self.neutral_for = 0.0 if moved else self.neutral_for + observation.dt
         updated = self._now()
-        self._write(neutral=not moved and self.settled)
+        self._write(neutral=not moved and self.has_settled)
         written = self._now()
         if self.reporter.publishes:
             self._publish(turn, written)
@@ -171,36 +177,40 @@ class ControlLoop:
             self._notify(started)
 
     def warm_up(self) -> None:
-        """Let the active controller warm up for the next tick, which is imminent."""
+        """Warm the active controller up for the imminent tick."""
         try:
             self.active.warm_up()
         except Exception as error:
             self._fail("controller-error", f"controller {self.active.name} failed", error)
 
     def set_controller(self, name: str, controller: Controller[Any]) -> None:
-        """Make a ready-made controller the active one, from the next tick on.
+        """Make a controller the active one, from the next tick on.
 
         Raises `Refused` while a fault or an emergency stop is latched.
         """
         self.supervisor.check_startable()
         if self._is_refused(controller):
             raise Refused("fy-reversed", self.lateral_sign.complaint)
-        self._await_nobody()
+        self._cancel_pending()
         self.active.replace(name, controller)
         active = self.active
         self.reporter.controller("controller", name, active.parameters, active.parameter_units)
         self.supervisor.start()
 
     def set_controller_after(self, seconds: float, name: str, controller: Controller[Any]) -> None:
-        """Make it the active one after so long at rest; whatever else is asked for comes first.
+        """Make a controller the active one after some seconds at rest [s].
 
-        So does another calibration of the servo: somebody tries it out, and the tail must wait.
+        Any other request cancels that. So does another calibration of the servo, since the operator
+        tries it out then, and the tail must not move.
         """
         rest = math.ceil(seconds / self.limits.tick - 1e-9)
-        self._awaited = (rest, name, controller, self._servo_calibration)
+        self._pending = (rest, name, controller, self._servo_calibration)
 
     def forget_force(self, *, scale: bool) -> None:
-        """The force sensor has another zero: find it anew; scale: all the rest is another, too."""
+        """Discard what depends on the zero of the force sensor, which was changed.
+
+        scale: whether the rest of its calibration was changed, too
+        """
         self._estimator.forget_zero()
         if scale:
             self.thrust.forget()
@@ -210,17 +220,17 @@ class ControlLoop:
             self.lateral_sign.rest()
 
     def stop(self) -> None:
-        """Fade to neutral and stay there; after a fault or estop there is nothing left to stop."""
-        self._await_nobody()
+        """Fade to neutral and stay there; has no effect while a fault or estop is latched."""
+        self._cancel_pending()
         self.supervisor.stop()
 
     def expire_lease(self) -> None:
-        """Where the lease, which is active, has run out: fade to neutral what its holder began."""
+        """End the active lease if it has expired; fade to neutral if its holder drives the fish."""
         swims = self.supervisor.mode is Mode.RUNNING and self.lease.drives
         former = self.lease.run_out(moving=swims)
         if former and self.lease.expired:
-            does = "the fish fades to neutral" if swims else "nothing that it began swims"
-            message = f"{self.lease.expired.message}: {does}"
+            effect = "the fish fades to neutral" if swims else "none of its controllers is active"
+            message = f"{self.lease.expired.message}: {effect}"
             name, host, pid = former.name, former.host, former.pid
             self.reporter.event("lease-expired", message, "warning", name=name, host=host, pid=pid)
             if swims:
@@ -235,40 +245,40 @@ class ControlLoop:
         self.supervisor.estop(message)
 
     def close(self) -> None:
-        """Let go of the active controller; nothing ticks after this."""
-        self._await_nobody()
+        """Close the active controller; no tick may follow."""
+        self._cancel_pending()
         self.active.rest()
 
     @property
     def _servo_calibration(self) -> ServoCalibration | None:
         return self.robot.calibrated.servo.calibration if self.robot.calibrated else None
 
-    def _begin_awaited(
+    def _start_pending(
         self, rest: int, name: str, controller: Controller[Any], servo: ServoCalibration | None
     ) -> None:
         if self._servo_calibration is not servo:
-            self._await_nobody()
+            self._cancel_pending()
             message = f"{name} does not begin by itself any more: the servo has another calibration"
             self.reporter.event("calibration", message, "warning")
         elif self.seq > rest:
-            self._awaited = None
+            self._pending = None
             try:
                 self.set_controller(name, controller)
             except Exception as error:
                 self._fail("controller-error", f"controller {name} cannot begin", error)
 
-    def _await_nobody(self) -> None:
-        if self._awaited:
-            _, name, controller, _ = self._awaited
-            self._awaited = None
+    def _cancel_pending(self) -> None:
+        if self._pending:
+            _, name, controller, _ = self._pending
+            self._pending = None
             self.active.dispose(controller, f"{name}, which was to begin,")
 
     def _mode_changed(self, before: Mode) -> None:
-        """All that a change of mode leads to, whatever caused it."""
+        """Handle a change of mode, whatever caused it."""
         mode = self.supervisor.mode
         if mode is Mode.ESTOP:
-            self._write(neutral=False)  # first of all
-        self._await_nobody()
+            self._write(neutral=False)  # before anything else
+        self._cancel_pending()
         if reason := self.supervisor.reason:
             self.lease.end(f"{mode}: {reason.message}")
         if mode is not Mode.RUNNING:
@@ -277,7 +287,7 @@ class ControlLoop:
         self.reporter.mode(before, mode, self.supervisor.reason)
 
     def _fail(self, code: str, what: str, error: Exception) -> None:
-        """Latch a fault; an error while one is latched is logged all the same, once."""
+        """Latch a fault, and log its error once, also while another fault is latched."""
         self.supervisor.fail(code, self.reporter.problem(what, error))
 
     def _attend_panel(self, panel: "RpiGpioPanel", slot: Slot) -> None:
@@ -296,26 +306,26 @@ class ControlLoop:
                 raise SensorError(f"it gave ({measurement.fx}, {measurement.fy}) N")
         except Exception as error:
             if isinstance(error, FishLost):
-                self._fail("fish-lost", "there is nothing to read any more", error)
+                self._fail("fish-lost", "the fish cannot be read any more", error)
             problem = f"the force sensor cannot be read: {text.named(error)}"
-            measurement = self._once_more()
+            measurement = self._last_trusted_measurement()
         else:
             if measurement.suspect or self.supervisor.failures:
                 self.supervisor.check("sensor-range", measurement.suspect)
-            if not measurement.samples:  # it says again what may have been suspect
-                measurement = replace(measurement, fx=self._believed.fx, fy=self._believed.fy)
+            if not measurement.samples:  # it repeats forces that may have been suspect
+                measurement = replace(measurement, fx=self._trusted.fx, fy=self._trusted.fy)
         if not measurement.suspect:
-            self._believed = measurement
+            self._trusted = measurement
         age = slot.now - measurement.time
-        if problem is None and age > STALE * self.limits.tick:
+        if problem is None and age > MAX_SAMPLE_AGE_PERIODS * self.limits.tick:
             problem = f"the newest force sample is {age * 1e3:.0f} ms old"
         if problem or self.supervisor.failures:
             self.supervisor.check("sensor-stale", problem)
         return measurement
 
-    def _once_more(self) -> Measurement:
-        """What was to be believed last, of which nothing is new."""
-        return replace(self._believed, samples=0, extremes=None)
+    def _last_trusted_measurement(self) -> Measurement:
+        """Return the last trusted measurement, marked as holding no new samples."""
+        return replace(self._trusted, samples=0, extremes=None)
 
     def _estimate(self, measurement: Measurement, slot: Slot, dt: float) -> Observation:
         try:
@@ -333,9 +343,9 @@ class ControlLoop:
             return Observation(slot.deadline, dt, fx, fy, 0.0, 0.0, angle, angle, 0.0, 0.0)
 
     def _follow_thrust(self, observation: Observation, suspect: bool) -> Observation:
-        """Add what is known of the thrust; where that fails, it begins anew.
+        """Return the observation with the factor of the thrust, which is reset if its update fails.
 
-        suspect: is the force of this tick not to be believed?
+        suspect: whether the force of this tick is suspect
         """
         try:
             if self._estimator.found_leak != self.found_leak:
@@ -347,7 +357,7 @@ class ControlLoop:
                 self.thrust.interrupt()
             known = self.thrust.factor
         except ArithmeticError as error:
-            self.reporter.problem("the thrust cannot be told, and is found anew", error)
+            self.reporter.problem("the estimate of the thrust failed and was reset", error)
             self.thrust.forget()
             known = None
         factor, ci95 = known or (None, None)
@@ -356,9 +366,9 @@ class ControlLoop:
         return replace(observation, thrust_factor=factor, thrust_factor_error=ci95)
 
     def _watch_sign(self, observation: Observation, fy: float, suspect: bool) -> None:
-        """Notice, when the tail sets off, that F_y is reversed.
+        """Check the sign of F_y when the tail starts to move, and report a reversed one.
 
-        fy: as it is measured [N]
+        fy: F_y as measured [N]
         """
         if suspect:
             self.lateral_sign.rest()
@@ -369,18 +379,20 @@ class ControlLoop:
                 if self._is_refused(self.active.controller):
                     self.supervisor.fail("fy-reversed", self.lateral_sign.complaint)
         except ArithmeticError as error:
-            self.reporter.problem("the sign of F_y cannot be told, and is found anew", error)
+            self.reporter.problem("the check of the sign of F_y failed and was reset", error)
             self.lateral_sign.forget()
 
     def _is_refused(self, controller: Controller[Any]) -> bool:
-        # `is not False`: what another package has made of it raises nothing here.
+        # `is not False`: a value of any type in third-party code raises nothing here.
         return self.lateral_sign.refuses and type(controller).uses_lateral_force is not False
 
-    def _update(self, observation: Observation, began: float, *, may_succeed: bool = True) -> float:
-        """The angle to apply: the controller's after the guard, or the next step to neutral [rad].
+    def _update(
+        self, observation: Observation, began: float, *, may_hand_over: bool = True
+    ) -> float:
+        """Return the angle to apply: that of the controller, guarded, or a step to neutral [rad].
 
-        began: when the controller's time begins [s, monotonic]
-        may_succeed: may a controller that gives up name another one? Once in a tick.
+        began: start of the time that the controller may take [s, monotonic]
+        may_hand_over: whether a controller that gives up may name a successor: once in a tick
         """
         if self.supervisor.mode is Mode.ESTOP:
             return self.applied
@@ -391,9 +403,9 @@ class ControlLoop:
             command = contained(self.active.update, observation)
             applied = self.guard.apply(command, self.applied)
         except ControllerFault as error:
-            code, successor = told(error)
-            if successor and may_succeed:
-                self._succeed(error, code, successor)
+            code, successor = fault_and_successor(error)
+            if successor and may_hand_over:
+                self._hand_over(error, code, successor)
             else:
                 self._fail(code, f"controller {name} gave up", error)
         except Exception as error:
@@ -403,28 +415,28 @@ class ControlLoop:
             if seconds > self._budget or self.supervisor.failures:
                 self._check_budget(name, seconds)
             return applied
-        return self._update(observation, self._now(), may_succeed=False)
+        return self._update(observation, self._now(), may_hand_over=False)
 
-    def _succeed(self, error: ControllerFault, code: str, successor: Successor) -> None:
+    def _hand_over(self, error: ControllerFault, code: str, successor: Successor) -> None:
         before = self.active.name
         try:
-            self.active.succeed(error, code, successor)
+            self.active.hand_over(error, code, successor)
             self.supervisor.start()
         except Exception as problem:
-            what = f"{successor[0]}, who was to follow {before}, failed"
+            what = f"{successor[0]}, the successor of {before}, failed"
             self._fail("controller-error", what, problem)
 
     def _check_budget(self, name: str, seconds: float) -> None:
         budget, problem = self._budget, None
         if seconds > budget:
-            took = f"{seconds * 1e3:.1f} ms of its {budget * 1e3:.1f} ms"
-            problem = f"controller {name} took {took}"
+            durations = f"{seconds * 1e3:.1f} ms of its {budget * 1e3:.1f} ms"
+            problem = f"controller {name} took {durations}"
         self.supervisor.check("controller-slow", problem)
 
     def _write(self, neutral: bool) -> None:
         """Send the applied angle, or release the servo, as the mode demands."""
         if self.servo.counts_down and (problem := self.servo.why_at_rest()):
-            self.applied = 0.0  # where the servo is: to begin elsewhere would make it jump
+            self.applied = 0.0  # the servo is there; another start would make it jump
             neutral = True
             self.supervisor.fail("overrun", problem)
         latched, lost = self.supervisor.reason, self.servo.lost
@@ -433,10 +445,10 @@ class ControlLoop:
             if lost:
                 self.reporter.event("servo", "the servo can be reached again")
         except Exception as error:
-            if problem := self.servo.why_silent():  # in the write itself: so it failed
+            if problem := self.servo.why_silent():  # the write itself took too long
                 self.supervisor.fail("overrun", problem)
             self._fail("servo-link", "the servo cannot be driven", error)
-            if latched and not lost:  # which the fault or the stop that is latched does not say
+            if latched and not lost:  # the latched reason does not say that
                 message = f"it may still have pulses, and cannot be released: {text.named(error)}"
                 self.reporter.event("servo", message, "error")
 

@@ -1,4 +1,4 @@
-"""What the loop tells the world: the record of each tick, and events."""
+"""The output of the loop to the outside: the record of each tick, and events."""
 
 import logging
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 
 class Publisher(Protocol):
-    """Where ticks and events go; must not block."""
+    """The receiver of ticks and events; must not block."""
 
     def tick(self, tick: Tick) -> None:
         """Publish one tick."""
@@ -30,10 +30,10 @@ class Publisher(Protocol):
 
 
 class Reporter:
-    """Stamps what the loop says with the time and hands it to the publisher."""
+    """Adds the wall-clock time to ticks and events, and passes them to the publisher."""
 
     def __init__(self, clock: Clock, publisher: Publisher | None) -> None:
-        """publisher: None where ticks and events have no reader; events are logged all the same"""
+        """publisher: None where ticks and events have no reader; events are logged nevertheless"""
         self.publishes = publisher is not None
         """Whether the records of ticks have a reader."""
         self._clock = clock
@@ -42,7 +42,7 @@ class Reporter:
         self._mode = Mode.IDLE.value
 
     def event(self, kind: EventKind, message: str, level: Level = "info", **data: Any) -> None:
-        """Publish and log an event; never raises, since bad news must not make things worse."""
+        """Publish and log an event; never raises, so that a report cannot cause another problem."""
         message = text.line(message)
         log.log(logging.getLevelNamesMapping()[level.upper()], "%s: %s", kind, message)
         if self._publisher is None:
@@ -59,12 +59,12 @@ class Reporter:
         parameters: Mapping[str, Any],
         units: Mapping[str, str],
     ) -> None:
-        """Tell that a controller is active now, or has new parameters: kind is `parameters`.
+        """Report that a controller is active now, or has new parameters (kind `parameters`).
 
-        units: those of its parameters, by their names
+        units: unit of each parameter, by name
         """
         does = "goes on with" if kind == "parameters" else "takes over with"
-        message = f"{name} {does} {_spelled(parameters, units)}"
+        message = f"{name} {does} {_format_parameters(parameters, units)}"
         self.event(kind, message, controller=name, parameters=parameters)
 
     def fallback(
@@ -75,10 +75,10 @@ class Reporter:
         units: Mapping[str, str],
         why: Reason,
     ) -> None:
-        """Tell that a controller gave up and another one is active now."""
+        """Report that a controller gave up and another one is active now."""
         self.event(
             "fallback",
-            f"{name} takes over with {_spelled(parameters, units)}: {why.message}",
+            f"{name} takes over with {_format_parameters(parameters, units)}: {why.message}",
             "warning",
             controller=name,
             parameters=parameters,
@@ -87,20 +87,20 @@ class Reporter:
         )
 
     def mode(self, before: Mode, mode: Mode, reason: Reason | None) -> None:
-        """Tell of a change of mode, and why; that to mode fault is an event of its own kind."""
+        """Report a change of mode and its reason; mode fault gives an event of kind `fault`."""
         self._mode = mode.value
         if mode is Mode.FAULT:
             assert reason is not None
             message = f"{reason.code}: {reason.message}"
             self.event("fault", message, "error", code=reason.code, mode=mode.value)
             return
-        self._latest_problem = ""  # what fails again after a clear is news
+        self._latest_problem = ""  # log a failure again if it returns after a clear
         message = f"{before} → {mode}" + (f": {reason.message}" if reason else "")
         level: Level = "error" if mode is Mode.ESTOP else "info"
         self.event("mode", message, level, before=before.value, mode=mode.value)
 
     def problem(self, what: str, error: Exception) -> str:
-        """Log that something failed, with its error, once; gives the two in one line."""
+        """Log that something failed, unless the latest problem was the same; return the line."""
         line = text.line(f"{what}: {text.named(error)}")
         if line != self._latest_problem:
             log.error("%s", line, exc_info=None if isinstance(error, FishdError) else error)
@@ -108,9 +108,9 @@ class Reporter:
         return line
 
     def tick(self, loop: "ControlLoop", turn: "Turn", now: float) -> None:
-        """Publish the record of a tick. The one place that says where each of its fields is from.
+        """Publish the record of a tick; all its fields are filled here.
 
-        now: the time after the servo was driven [s, monotonic]
+        now: time after the servo was driven [s, monotonic]
         """
         assert self._publisher
         slot, measurement, observation, power = (
@@ -119,11 +119,11 @@ class Reporter:
             turn.observation,
             turn.power,
         )
-        thrust, error = loop.known_thrust
+        thrust, thrust_ci95 = loop.known_thrust
         extremes = measurement.extremes
         swims = loop.supervisor.mode is Mode.RUNNING
         factor = observation.thrust_factor if swims else None
-        factor_error = observation.thrust_factor_error if swims else None
+        factor_ci95 = observation.thrust_factor_error if swims else None
         truth = loop.robot.truth() if loop.robot.truth else None
         course = truth.course if truth else None
         corrected = loop.fy_corrected
@@ -140,7 +140,7 @@ class Reporter:
                 phi_c=loop.applied,
                 servo_on=loop.servo.on,
                 thrust=thrust,
-                thrust_error=UNSET if error is None else error,
+                thrust_error=UNSET if thrust_ci95 is None else thrust_ci95,
                 frequency=observation.frequency,
                 samples=measurement.samples,
                 fx_min=extremes.fx_min if extremes else UNSET,
@@ -161,7 +161,7 @@ class Reporter:
                 speed=course.speed if course else UNSET,
                 heading=course.heading if course else UNSET,
                 thrust_factor=UNSET if factor is None else factor,
-                thrust_factor_error=UNSET if factor_error is None else factor_error,
+                thrust_factor_error=UNSET if factor_ci95 is None else factor_ci95,
                 power=UNSET if power is None else power,
                 leak=UNSET if loop.found_leak is None else loop.found_leak,
                 fy_corrected=True if corrected else UNSET,
@@ -170,5 +170,5 @@ class Reporter:
         )
 
 
-def _spelled(parameters: Mapping[str, Any], units: Mapping[str, str]) -> str:
+def _format_parameters(parameters: Mapping[str, Any], units: Mapping[str, str]) -> str:
     return format_values(parameters, units, ", ") or "no parameters"

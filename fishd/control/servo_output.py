@@ -1,4 +1,4 @@
-"""The servo as the loop drives it: what it gets in which mode, and what is known of its pulses."""
+"""The servo as the loop drives it: its command in each mode, and the state of its pulses."""
 
 import math
 from collections.abc import Callable
@@ -8,30 +8,30 @@ from fishd.hardware.base import Robot
 
 
 class ServoOutput:
-    """Sends angles to the servo of a robot, or releases it."""
+    """The output to the servo of a robot: sends angles, or releases the servo."""
 
     def __init__(self, robot: Robot, now: Callable[[], float]) -> None:
-        """now: the time [s, monotonic]"""
+        """now: clock [s, monotonic]"""
         self.on = False
-        """False once the servo is known to get no pulses."""
+        """Whether the servo may get pulses; False once it is known to get none."""
         self.lost = False
-        """True while the servo cannot be reached: if it was on, it may still have pulses."""
+        """Whether the servo cannot be reached; if it was on, it may still have pulses."""
         self._servo = robot.servo
         self._countdown = robot.countdown
         self.counts_down = robot.countdown < math.inf
-        """Whether the servo goes to rest by itself where writes do not come."""
+        """Whether the servo goes to rest by itself where writes stop."""
         self._now = now
         self._written = now()
 
     def why_at_rest(self) -> str:
-        """One line if no write came for so long that the servo went to rest; else empty.
+        """Return a line if writes stopped for longer than the countdown of a driven servo; else "".
 
-        It is at neutral, or has no pulses any more: it must not begin again by itself.
+        The servo then is at neutral, or has no pulses any more; it must not start again by itself.
         """
         return self.why_silent() if self.on and not self.lost else ""
 
     def why_silent(self) -> str:
-        """One line if the latest write began longer ago than the countdown lasts; else empty."""
+        """Return a line if the latest write began longer ago than the countdown lasts; else ""."""
         if not self.counts_down:
             return ""
         silence = self._now() - self._written
@@ -46,13 +46,13 @@ class ServoOutput:
     def command(self, mode: Mode, angle: float, neutral: bool) -> None:
         """Send an angle [rad], or release the servo: at once in estop, once `neutral` in fault.
 
-        In fault pulses never begin: a servo that was lost is released when it is back. Raises what
-        the driver raises; the servo is lost then.
+        In fault, pulses never begin: a servo that was lost is released when it can be reached
+        again. Raises what the driver raises; then `lost` is True.
         """
         fading = self.on and not self.lost and not neutral
         try:
             if mode is Mode.ESTOP or (mode is Mode.FAULT and not fading):
-                self._servo.release()  # in every tick: so a servo that is lost is noticed
+                self._servo.release()  # in every tick, so that a lost servo is noticed
                 self.on = False
             else:
                 if self.counts_down:

@@ -1,22 +1,22 @@
-"""How well the loop keeps its time, in constant memory however long it runs."""
+"""Timing statistics of the loop, in constant memory however long it runs."""
 
 from bisect import bisect_left
 from itertools import accumulate, pairwise
 
 from fishd.core.signals import Percentiles, Timing
 
-_STEPS = 3  # 2**3 buckets per octave: an error of at most 12 %
-_LONGEST = (1 << 40) - 1  # ns, 18 minutes; anything longer counts as this
-_LONGEST_S = _LONGEST * 1e-9
+_OCTAVE_BITS = 3  # 2**3 buckets per octave: an error of at most 12 %
+_MAX_NS = (1 << 40) - 1  # 18 minutes; a longer duration counts as this
+_MAX_S = _MAX_NS * 1e-9
 
 PHASES = ("read", "estimate", "update", "write", "publish")
 
 
 class Histogram:
-    """Counts durations in buckets whose width grows with the duration; keeps the worst exactly."""
+    """Counts of durations in buckets whose width grows with the duration; the worst is exact."""
 
     def __init__(self) -> None:
-        self._counts = [0] * (_LONGEST.bit_length() << _STEPS)
+        self._counts = [0] * (_MAX_NS.bit_length() << _OCTAVE_BITS)
         self._total = 0
         self._worst = 0.0
         self._worst_seq = 0
@@ -27,24 +27,24 @@ class Histogram:
         if seconds <= 0.0:
             self._counts[0] += 1
             return
-        nanoseconds = int(seconds * 1e9) if seconds < _LONGEST_S else _LONGEST
-        octave = nanoseconds.bit_length() - _STEPS - 1
+        nanoseconds = int(seconds * 1e9) if seconds < _MAX_S else _MAX_NS
+        octave = nanoseconds.bit_length() - _OCTAVE_BITS - 1
         if octave < 0:
             octave = 0
-        self._counts[(octave << _STEPS) + (nanoseconds >> octave)] += 1
+        self._counts[(octave << _OCTAVE_BITS) + (nanoseconds >> octave)] += 1
         if seconds > self._worst:
             self._worst = seconds
             self._worst_seq = seq
 
     def quantile(self, share: float) -> float:
-        """The duration that `share` of all counted ones do not exceed [s]; 0 without any."""
+        """Return the duration that a fraction `share` of all do not exceed [s]; 0 without data."""
         if not self._total:
             return 0.0
         bucket = bisect_left(list(accumulate(self._counts)), share * self._total)
         return min(_upper_edge(bucket), self._worst)
 
     def percentiles(self) -> Percentiles:
-        """Median, 99th percentile and worst [µs]."""
+        """Return median, 99th percentile and worst duration [µs]."""
         return Percentiles(
             p50=self.quantile(0.50) * 1e6,
             p99=self.quantile(0.99) * 1e6,
@@ -54,16 +54,16 @@ class Histogram:
 
 
 def _upper_edge(bucket: int) -> float:
-    """The longest duration that falls into a bucket [s]."""
-    octave = max(0, (bucket >> _STEPS) - 1)
-    return (((bucket - (octave << _STEPS)) + 1 << octave) - 1) * 1e-9
+    """Return the longest duration of a bucket [s]."""
+    octave = max(0, (bucket >> _OCTAVE_BITS) - 1)
+    return (((bucket - (octave << _OCTAVE_BITS)) + 1 << octave) - 1) * 1e-9
 
 
 class Statistics:
     """Lateness, time per phase, missed slots and overruns since start."""
 
     def __init__(self, period: float) -> None:
-        """period: of the loop [s]"""
+        """period: period of the loop [s]"""
         self.missed = 0
         self.overruns = 0
         self._period = period
@@ -73,16 +73,16 @@ class Statistics:
         self._phases = tuple(Histogram() for _ in PHASES)
 
     def add(self, seq: int, lateness: float, missed: int, marks: tuple[float, ...]) -> str | None:
-        """Count one tick.
+        """Count one tick, and return a line if it took too long or slots were skipped; else None.
 
-        One that took too long, or slots that were skipped for another reason, give a line on it.
+        Slots skipped because the tick before took too long give no second line.
 
-        lateness: start after the deadline [s]
-        missed: slots that were skipped just before it
+        lateness: start of the tick after its deadline [s]
+        missed: number of slots skipped just before the tick
         marks: times at the start of the tick and after each of PHASES [s]
         """
         busy = marks[-1] - marks[0]
-        if busy or lateness:  # in virtual time nothing takes any, and there is nothing to count
+        if busy or lateness:  # both are 0 in virtual time, where nothing is to be counted
             self._count(seq, lateness, marks)
         message = None
         if busy > self._period:
@@ -114,7 +114,7 @@ class Statistics:
         )
 
     def timing(self) -> Timing:
-        """The distributions so far."""
+        """Return the distributions since start."""
         return Timing(
             lateness=self._lateness.percentiles(),
             busy=self._busy.percentiles(),

@@ -16,12 +16,13 @@ from fishd.core.errors import Refused
 from fishd.core.signals import Reason
 
 OVERRUN_WINDOW = 100
+"""Number of ticks over which overruns are counted."""
 OVERRUN_SHARE = 0.2
-"""More than this share of overruns among the latest OVERRUN_WINDOW ticks is a fault."""
+"""Largest fraction of overruns among the latest OVERRUN_WINDOW ticks; more is a fault."""
 
 
 class Mode(StrEnum):
-    """What fishd is doing."""
+    """Mode of fishd."""
 
     IDLE = "idle"
     RUNNING = "running"
@@ -30,20 +31,20 @@ class Mode(StrEnum):
 
 
 class Supervisor:
-    """Keeps the mode and the latched reason, and counts what may go wrong a few times."""
+    """The mode and the latched reason; counts failures that are a fault only when repeated."""
 
     def __init__(self, changed: Callable[[Mode], None] = lambda before: None) -> None:
-        """changed: called after each change of mode, with the mode before it"""
+        """changed: called after each change of mode, with the previous mode"""
         self.mode = Mode.IDLE
         self.reason: Reason | None = None
         self._changed = changed
         self.failures: dict[str, int] = {}
-        """Number of failures in a row of each check that failed last, by the code of its fault."""
+        """Number of failures in a row of each check that failed last, by fault code."""
         self._overruns: deque[int] = deque()
-        """Numbers of the latest ticks that overran."""
+        """Sequence numbers of the latest ticks that overran."""
 
     def check_startable(self) -> None:
-        """Raises `Refused` while a fault or an emergency stop is latched."""
+        """Raise `Refused` while a fault or an emergency stop is latched."""
         if self.reason is not None:
             raise Refused(
                 self.mode.value,
@@ -52,70 +53,72 @@ class Supervisor:
             )
 
     def start(self) -> None:
-        """A controller takes over; raises `Refused` while a fault or estop is latched.
+        """Enter mode running for a new controller; raise `Refused` while a reason is latched.
 
-        It is not to blame for how slow the one before it was.
+        Slow updates of the previous controller do not count against the new one.
         """
         self.check_startable()
         self.failures.pop("controller-slow", None)
         self._enter(Mode.RUNNING)
 
     def stop(self) -> None:
-        """Go to idle; with a fault or an emergency stop latched the fish has stopped already."""
+        """Go to idle, unless a fault or an emergency stop is latched: then the fish has stopped."""
         if self.reason is None:
             self._enter(Mode.IDLE)
 
     def clear(self) -> None:
-        """Forget the latched reason, if there is one, and go to idle."""
+        """Clear the latched reason, if there is one, and go to idle."""
         if self.reason is not None:
             self.failures.clear()
             self._overruns.clear()
             self._enter(Mode.IDLE)
 
     def estop(self, message: str) -> None:
-        """Latch an emergency stop; the reason of an earlier one is kept."""
+        """Latch an emergency stop, which keeps the reason of an earlier emergency stop."""
         self.fail("estop", message)
 
     def fail(self, code: str, message: str) -> None:
-        """Latch a fault. The first reason is kept, but an emergency stop replaces that of a fault.
+        """Latch a fault. The first reason is kept, except that an emergency stop replaces a fault.
 
-        code: that of a row of FAULTS, or of a controller from another package
+        code: a key of FAULTS, or a code of a controller from another package
         """
-        row = FAULTS.get(code, UNLISTED)
-        mode = Mode.ESTOP if row.effect is Effect.RELEASE else Mode.FAULT
+        fault = FAULTS.get(code, UNLISTED)
+        mode = Mode.ESTOP if fault.effect is Effect.RELEASE else Mode.FAULT
         if self.reason is None or (mode is Mode.ESTOP and self.mode is Mode.FAULT):
-            self._enter(mode, Reason(text.quoted(code), text.line(message), row.remedy))
+            self._enter(mode, Reason(text.quoted(code), text.line(message), fault.remedy))
 
     def check(self, code: str, problem: str | None) -> None:
-        """Count a check, failed or passed (None or empty); `in_a_row` failures latch the fault.
+        """Count the result of a check; `in_a_row` failures in a row latch the fault.
 
-        One that passed makes a difference only while there are `failures`.
+        A passed check has an effect only while there are `failures`.
+
+        problem: what failed; None or empty if the check passed
         """
-        enough = FAULTS[code].in_a_row
+        limit = FAULTS[code].in_a_row
         if not problem:
             self.failures.pop(code, None)
             return
         self.failures[code] = count = self.failures.get(code, 0) + 1
-        if count >= enough:
-            self.fail(code, f"{problem}, {count} times in a row" if enough > 1 else problem)
+        if count >= limit:
+            self.fail(code, f"{problem}, {count} times in a row" if limit > 1 else problem)
 
     @property
     def sensor_lost(self) -> bool:
-        """Whether the latest reads gave no force, or none to believe."""
+        """Whether the latest reads gave no force, or only suspect ones."""
         return any(
             self.failures.get(code, 0) >= FAULTS[code].in_a_row
             for code in ("sensor-stale", "sensor-range")
         )
 
     def overran(self, seq: int) -> None:
-        """Note that the tick of this number overran; too many among the latest latch the fault."""
+        """Note that a tick overran; too many among the latest ticks latch the fault."""
         self._overruns.append(seq)
         while self._overruns[0] <= seq - OVERRUN_WINDOW:
             self._overruns.popleft()
         count = len(self._overruns)
         if count > OVERRUN_SHARE * OVERRUN_WINDOW:
-            late = f"{count} of the last {OVERRUN_WINDOW} ticks took too long or came late"
-            self.fail("overrun", late)
+            message = f"{count} of the last {OVERRUN_WINDOW} ticks took too long or came late"
+            self.fail("overrun", message)
 
     def _enter(self, mode: Mode, reason: Reason | None = None) -> None:
         before, self.mode, self.reason = self.mode, mode, reason

@@ -17,7 +17,7 @@ import click
 from fishd import __version__, assembly
 from fishd.config import Config, load
 from fishd.control.lease import Lease
-from fishd.control.loop import SETTLING
+from fishd.control.loop import SETTLE_TIME_S
 from fishd.control.supervisor import Mode
 from fishd.controllers import registry
 from fishd.controllers.policy.runtime import preload
@@ -183,9 +183,9 @@ class Daemon:
                 return
             log.info("stopping: fading to neutral")
             self._loop.stop()
-            deadline = self._clock.monotonic() + FADE_LIMIT + SETTLING
+            deadline = self._clock.monotonic() + FADE_LIMIT + SETTLE_TIME_S
             async for slot in ticker:
-                if self._loop.settled or slot.now > deadline:
+                if self._loop.has_settled or slot.now > deadline:
                     break
                 self._loop.tick(slot)
                 self._server.ticked()

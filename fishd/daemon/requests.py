@@ -12,7 +12,7 @@ from msgspec import Struct
 
 from fishd import __version__
 from fishd.config import Config
-from fishd.control.lease import RETURNED
+from fishd.control.lease import RETURN_REASON
 from fishd.control.loop import ControlLoop
 from fishd.control.supervisor import Mode
 from fishd.controllers import registry
@@ -239,7 +239,7 @@ class Operations:
     async def _end_lease(self, wanted: protocol.HeldLease) -> State:
         self._loop.lease.renew(wanted.lease)
         self._carried_out = self._arrive()
-        former = self._loop.lease.end(RETURNED)
+        former = self._loop.lease.end(RETURN_REASON)
         if self._loop.lease.drives:
             self._loop.stop()
         if former:

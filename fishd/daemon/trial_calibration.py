@@ -6,7 +6,7 @@ When the lease ends, for whatever reason, the previous calibration is used again
 import asyncio
 
 from fishd.config.consistency import check_neutral, check_pulses
-from fishd.control.lease import RETURNED
+from fishd.control.lease import RETURN_REASON
 from fishd.control.loop import ControlLoop
 from fishd.control.supervisor import Mode
 from fishd.core.calibration import ServoCalibration
@@ -150,7 +150,7 @@ class TrialCalibration:
                     self._loop.reporter.event(
                         "calibration",
                         f"servo: that of before is used again, as the lease has ended: {why}",
-                        "info" if why == RETURNED else "warning",
+                        "info" if why == RETURN_REASON else "warning",
                     )
                     return
 

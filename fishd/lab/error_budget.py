@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import UNSET
 
-from fishd.control.estimators.live_thrust import SWIM_SETTLES
+from fishd.control.estimators.live_thrust import SWIM_SETTLE_TIME_S
 from fishd.core import text
 from fishd.core.beats import upward_reversals
 from fishd.core.calibration import ForceCalibration
@@ -108,7 +108,7 @@ def rotation_remark(rotation: float) -> str:
     )
 
 
-def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLES) -> float:
+def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLE_TIME_S) -> float:
     """Return by what angle F_x and F_y are turned into each other while the fish swims [rad].
 
     Over whole beats of a symmetric gait the true F_x, at even harmonics, and the true F_y, at odd
@@ -136,8 +136,8 @@ def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLES) -> fl
 def lateral_force(ticks: Iterable[Tick]) -> float:
     """Return what swimming adds to the mean of F_y [N]; 0 without a whole beat and a rest."""
     ticks = list(ticks)
-    swimming = [tick.fy for swim in _steady_swims(ticks, SWIM_SETTLES) for tick in swim]
-    rests = _settled_phases(ticks, SWIM_SETTLES, swims=False)
+    swimming = [tick.fy for swim in _steady_swims(ticks, SWIM_SETTLE_TIME_S) for tick in swim]
+    rests = _settled_phases(ticks, SWIM_SETTLE_TIME_S, swims=False)
     resting = [tick.fy for rest in rests for tick in rest]
     if not swimming or not resting:
         return 0.0

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import UNSET, Struct
 
-from fishd.control.estimators.live_thrust import PIECE, REST_SETTLES, SWIM_SETTLES
+from fishd.control.estimators.live_thrust import PIECE_S, REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
 from fishd.core.beats import upward_reversals
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
@@ -120,7 +120,7 @@ def measure(
     controller: str,
     parameters: Mapping[str, Any],
     seconds: float = 60.0,
-    settle: float = SWIM_SETTLES,
+    settle: float = SWIM_SETTLE_TIME_S,
 ) -> Measured:
     """Swim and rest a controller in turn for `seconds`, and return its thrust.
 
@@ -240,7 +240,7 @@ def summary(found: Measured, tick: float) -> Summary:
 
 
 def plan(
-    seconds: float, parameters: Mapping[str, Any], settle: float = SWIM_SETTLES
+    seconds: float, parameters: Mapping[str, Any], settle: float = SWIM_SETTLE_TIME_S
 ) -> list[tuple[bool, float]]:
     """When to swim (True) and to rest, and for how long each [s]; `seconds` in all.
 
@@ -249,8 +249,8 @@ def plan(
     """
     frequency = parameters.get("frequency")
     slow = 3.0 / frequency if isinstance(frequency, int | float) and frequency > 0.0 else 0.0
-    swim = settle + max(SWIM - SWIM_SETTLES, slow)
-    rest = _still(settle) + REST - REST_SETTLES
+    swim = settle + max(SWIM - SWIM_SETTLE_TIME_S, slow)
+    rest = _still(settle) + REST - REST_SETTLE_TIME_S
     if not 2 * swim + 3 * rest <= seconds <= LONGEST:  # NaN is not
         raise ParameterError(
             f"a measurement of {seconds:g} s is not possible: two swims of {swim:.3g} s between "
@@ -258,7 +258,7 @@ def plan(
             "the most"
         )
     count = math.floor((seconds - rest) / (swim + rest) + 1e-9)
-    least = rest - REST + SHORT_REST, settle + max(SHORT_SWIM - SWIM_SETTLES, slow)
+    least = rest - REST + SHORT_REST, settle + max(SHORT_SWIM - SWIM_SETTLE_TIME_S, slow)
     shares = [((GOLDEN_RATIO * (index + 1) / 2) % 1.0) ** 2 for index in range(2 * count + 1)]
     spare = (seconds - count * sum(least) - least[False]) / sum(shares)
     return [
@@ -268,14 +268,14 @@ def plan(
 
 def _still(settle: float) -> float:
     """When the fin of a fish that takes so long to swim steadily hangs still [s]."""
-    return REST_SETTLES + max(0.0, settle - SWIM_SETTLES)
+    return REST_SETTLE_TIME_S + max(0.0, settle - SWIM_SETTLE_TIME_S)
 
 
 def evaluate(
     samples: Sequence[Sample],
     tick: float,
-    settles: float = SWIM_SETTLES,
-    stills: float = REST_SETTLES,
+    settles: float = SWIM_SETTLE_TIME_S,
+    stills: float = REST_SETTLE_TIME_S,
     alike: Sequence[Step] = (),
 ) -> Measured:
     """The thrust of a fish that swam and rested in turn; names no controller, and has no ticks.
@@ -451,7 +451,7 @@ def _blocks(phase: Sequence[Sample], tick: float, first: int, settles: float) ->
     cuts = [up for up in ups if up >= begin]
     beating = len(cuts) > 1
     if not beating:
-        cuts = list(range(begin, len(phase), max(1, round(PIECE / tick))))
+        cuts = list(range(begin, len(phase), max(1, round(PIECE_S / tick))))
     begun, beats = 0, 0
     for index in range(1, len(cuts)):
         beats += 1

@@ -1,4 +1,4 @@
-"""What an estimator is, which one there are to choose from, and what they have in common."""
+"""The base class of estimators, and their settings."""
 
 from abc import ABC, abstractmethod
 from typing import Annotated, Literal
@@ -10,29 +10,29 @@ from fishd.control.estimators.tail_beat import TailBeat
 from fishd.core.schema import note, unit
 from fishd.core.signals import Measurement, Observation
 
-LEAK, LONGEST_LEAK = 0.3, 100.0
-"""K/K_d is 0.323 s for the fish of Fu et al.; and the longest that is taken [s]."""
+DEFAULT_LEAK_S, MAX_LEAK_S = 0.3, 100.0
+"""Default and largest leak time [s]; K/K_d is 0.323 s for the fish of Fu et al."""
 
 
 class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How fin velocity and thrust are found."""
+    """Settings of the estimator of fin velocity and thrust."""
 
     kind: Annotated[
         Literal["lateral_force", "observer", "sensor"],
         note(
             "lateral_force integrates F_y and knows nothing of the fish; observer is a Kalman "
-            "filter on the fish of section plant, as fishctl identify finds it; sensor takes what "
-            "a swimmer feels: the angular velocity of its tail against its front body."
+            "filter on the fish of section plant, as fishctl identify finds it; sensor takes the "
+            "angular velocity of the tail against the front body, which a swimmer measures."
         ),
     ] = "lateral_force"
     leak: Annotated[
-        Annotated[float, Meta(gt=0, le=LONGEST_LEAK)] | Literal["auto"],
+        Annotated[float, Meta(gt=0, le=MAX_LEAK_S)] | Literal["auto"],
         unit(
             "s",
-            "Of lateral_force: time constant by which the integral of the lateral force forgets; "
-            "K/K_d is right. auto: begin with 0.3, and find what goes with F_x.",
+            "Of lateral_force: time constant with which the integral of the lateral force decays; "
+            "best is K/K_d. auto: start with 0.3, and search for the leak that fits F_x.",
         ),
-    ] = LEAK
+    ] = DEFAULT_LEAK_S
     bias_time: Annotated[
         float,
         unit(
@@ -46,8 +46,8 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         float,
         unit(
             "N/√s",
-            "How fast the zero of F_x wanders, standard deviation after a second: by this the "
-            "interval of the thrust grows.",
+            "How fast the zero of F_x drifts: standard deviation of its change in a second, by "
+            "which the interval of the thrust grows.",
             ge=0,
             le=1,
         ),
@@ -57,13 +57,19 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     ] = 1e-3
     offset_drift: Annotated[
         float,
-        unit("N/√s", "Of observer: by how much the offset of F_y wanders in a second.", ge=0, le=1),
+        unit(
+            "N/√s",
+            "Of observer: standard deviation of the change of the offset of F_y in a second.",
+            ge=0,
+            le=1,
+        ),
     ] = 1e-3
     disturbance: Annotated[
         float,
         unit(
             "rad/s/√s",
-            "Of observer: by how much what the model lacks changes the fin velocity in a second.",
+            "Of observer: standard deviation of the change of the fin velocity in a second by what "
+            "the model lacks.",
             gt=0,
             le=1000,
         ),
@@ -71,8 +77,8 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     reversed_fy: Annotated[
         Literal["correct", "refuse", "warn"],
         note(
-            "What follows when the first push of the tail shows that F_y is reversed. correct: "
-            "estimator and controllers take F_y with the other sign, and status says so. refuse: "
+            "Reaction to a first push of the tail that shows that F_y is reversed. correct: "
+            "estimator and controllers use F_y with the other sign, and status says so. refuse: "
             "mode fault, and no controller that uses F_y starts until F_y or the servo is "
             "calibrated. warn: status says so, and the fish swims badly."
         ),
@@ -89,27 +95,27 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class Estimator(ABC):
-    """Adds force rate, fin velocity, thrust and tail-beat frequency to each measurement."""
+    """An estimator: adds force rate, fin velocity, thrust and beat frequency to measurements."""
 
     def __init__(self) -> None:
         self.fy_corrected = False
-        """Whether F_y is taken with the other sign than it is measured with."""
+        """Whether the sign of the measured F_y is reversed before use."""
         self.found_leak: float | None = None
-        """The leak in use [s], where that is for the estimator to find; else None."""
+        """Leak time in use [s], if the estimator finds it; else None."""
         self._fy: float | None = None
         self._angle: float | None = None
         self._beat = TailBeat()
 
     def rest(self) -> None:
-        """Note that nobody moves the tail any more: it does not beat."""
+        """Note that no controller moves the tail any more, so it does not beat."""
         self._beat.rest()
 
     def forget_zero(self) -> None:
-        """The sensor's zero was set: the forces before tell nothing of those to come."""
+        """Discard earlier forces, since the zero of the sensor was set."""
         self._fy = None
 
     def reverse_fy(self) -> None:
-        """Take F_y with the other sign from now on, in what is remembered of it, too."""
+        """Reverse the sign of F_y from now on, also in the stored state."""
         self.fy_corrected = not self.fy_corrected
         if self._fy is not None:
             self._fy = -self._fy
@@ -122,12 +128,12 @@ class Estimator(ABC):
         dt: float,
         thrust_factor: tuple[float, float] | None = None,
     ) -> Observation:
-        """The observation for the tick at `time`.
+        """Return the observation of the tick at `time`.
 
-        instruction_angle: applied since the previous tick [rad]
+        instruction_angle: angle applied since the previous tick [rad]
         time: start of the tick [s, monotonic]
         dt: time since the previous tick [s]
-        thrust_factor: the one that is known so far, and its `error` [N]
+        thrust_factor: latest factor of the thrust, and the half-width of its interval [N]
         """
         factor, ci95 = thrust_factor or (None, None)
         if self.fy_corrected:
@@ -157,7 +163,7 @@ class Estimator(ABC):
 
     @abstractmethod
     def fin_velocity(self, measurement: Measurement, instruction_angle: float, dt: float) -> float:
-        """The fin velocity now, after one more measurement; called once a tick.
+        """Return the fin velocity at the end of a measurement; called once a tick.
 
-        measurement: with the sign of F_y that holds now
+        measurement: with the corrected sign of F_y
         """

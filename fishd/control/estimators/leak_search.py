@@ -1,9 +1,9 @@
-"""Which leak restores the fin velocity of this fish? Found from F_x, which the fin makes, too.
+"""The search for the leak time that restores the fin velocity of the fish, by means of F_x.
 
-With the leak T = K/K_d the leaky integral of F_y = −K (α̈ + α̇/T) is −K α̇, whatever the motion. Then
-its own integral and its own rate give the ripple of F_x = −K α α̈; with another T they are early or
-late against it (Fu et al., the two forces). So a bank of leaks runs beside one another, and the
-one whose product goes best with F_x is that of the fish.
+With the leak time T = K/K_d the leaky integral of F_y = −K (α̈ + α̇/T) is −K α̇, whatever the motion.
+The product of its integral and its rate then follows the ripple of F_x = −K α α̈. With another T
+the product leads or lags the ripple (Fu et al., the two forces). So several leak times run in
+parallel, and the one whose product correlates best with F_x is that of the fish.
 """
 
 import math
@@ -13,45 +13,46 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SHORTEST, LONGEST, LEAKS = 0.02, 1.0, 12
-"""The bank, evenly spaced in the logarithm [s]."""
-ANGLE_LEAK = 5.0
-"""The fin angle forgets with this time constant: far slower than a beat [s]."""
-RIPPLE = 0.5
-"""What changes more slowly than this is no ripple [s]."""
-MEMORY = 10.0
-"""So far back, about, the comparison looks [s]."""
-EVERY = 2.0
-"""Time between two looks at it [s]."""
-GOOD = 0.88
-"""No leak is believed whose ripple goes less well with that of F_x: a correlation."""
-BETTER = 2.0
-"""Nor one that does not leave so many times less of the ripple unexplained than the present one."""
-AGREE = 1.25
-"""Two looks must give the same one, within this factor."""
+MIN_LEAK_S, MAX_LEAK_S, BANK_SIZE = 0.02, 1.0, 12
+"""Shortest and longest leak time of the bank [s], and their number, spaced logarithmically."""
+ANGLE_LEAK_S = 5.0
+"""Leak time of the integral that gives the fin angle: far longer than a beat [s]."""
+RIPPLE_TIME_S = 0.5
+"""Time constant of the high pass that isolates the ripple [s]."""
+MEMORY_S = 10.0
+"""Time constant of the averages of the correlation [s]."""
+CHECK_INTERVAL_S = 2.0
+"""Time between two evaluations of the correlation [s]."""
+MIN_CORRELATION = 0.88
+"""Smallest correlation of a product with the ripple of F_x with which its leak time is accepted."""
+MIN_IMPROVEMENT = 2.0
+"""Smallest factor by which the unexplained share of the ripple must decrease with a new leak."""
+AGREEMENT_RATIO = 1.25
+"""Largest ratio of the leak times of two successive evaluations that confirm each other."""
 
 
 class LeakSearch:
-    """A bank of leaky integrals of F_y, each compared with F_x."""
+    """A bank of leaky integrals of F_y, whose products are correlated with F_x."""
 
     def __init__(self, leak: float, bias_time: float) -> None:
         """
-        leak: to begin with [s]
-        bias_time: of the average that is taken off F_y beforehand [s]
+        leak: initial leak time [s]
+        bias_time: time constant of the average that is subtracted from F_y beforehand [s]
         """
         self.leak = leak
-        """The best that is known [s]."""
-        self.leaks: Array = np.geomspace(SHORTEST, LONGEST, LEAKS)
-        # What is taken off F_y, and what the angle forgets, makes the product early. The forces are
-        # made as early: at twice the frequency, where the product is early by two of three factors.
-        hasten = 1.0 / (4.0 / bias_time + 2.0 / ANGLE_LEAK)
-        self._hastened, self._forces = _HighPass(hasten), _HighPass(RIPPLE)
-        self._ripples = _HighPass(RIPPLE)
-        zero = np.zeros(LEAKS)
+        """Leak time in use [s]."""
+        self.leaks: Array = np.geomspace(MIN_LEAK_S, MAX_LEAK_S, BANK_SIZE)
+        # The average subtracted from F_y and the leak of the angle make the product lead. This
+        # high pass makes the forces lead as much: it acts at twice the frequency, and only two of
+        # the three factors of the product lead.
+        time_constant = 1.0 / (4.0 / bias_time + 2.0 / ANGLE_LEAK_S)
+        self._leading, self._forces = _HighPass(time_constant), _HighPass(RIPPLE_TIME_S)
+        self._ripples = _HighPass(RIPPLE_TIME_S)
+        zero = np.zeros(BANK_SIZE)
         self._velocity, self._angle = zero, zero
         self._powers, self._products, self._across = zero, zero, zero
         self._power = self._mixed = self._lateral = 0.0
-        self._dt = self._time = self._found = 0.0
+        self._dt = self._time = self._candidate = 0.0
         self._decay = self._gain = zero
 
     def update(self, fx: float, fy: float, bias: float, dt: float) -> None:
@@ -62,11 +63,11 @@ class LeakSearch:
             self._gain = self.leaks * (1.0 - self._decay)
         before, angle = self._velocity, self._angle
         self._velocity = velocity = before * self._decay - self._gain * (fy - bias)
-        self._angle = angle * math.exp(-dt / ANGLE_LEAK) + (0.5 * dt) * (velocity + before)
-        ripple = self._ripples.of((before - velocity) * (self._angle + angle), dt)
-        forces = self._forces.of(self._hastened.of(np.array([fx, fy]), dt), dt)
+        self._angle = angle * math.exp(-dt / ANGLE_LEAK_S) + (0.5 * dt) * (velocity + before)
+        ripple = self._ripples.filter((before - velocity) * (self._angle + angle), dt)
+        forces = self._forces.filter(self._leading.filter(np.array([fx, fy]), dt), dt)
         force, lateral = forces.tolist()
-        kept = math.exp(-dt / MEMORY)
+        kept = math.exp(-dt / MEMORY_S)
         self._powers = self._powers * kept + ripple * ripple
         self._products = self._products * kept + ripple * force
         self._across = self._across * kept + ripple * lateral
@@ -74,30 +75,32 @@ class LeakSearch:
         self._mixed = self._mixed * kept + force * lateral
         self._lateral = self._lateral * kept + lateral * lateral
         self._time += dt
-        if self._time >= EVERY:
+        if self._time >= CHECK_INTERVAL_S:
             self._time = 0.0
-            self._look()
+            self._evaluate()
 
     def reverse_fy(self) -> None:
-        """Take F_y with the other sign from now on: what is odd in it changes its sign."""
+        """Reverse the sign of F_y from now on, also in the stored state that is odd in it."""
         self._velocity, self._angle = -self._velocity, -self._angle
         self._across, self._mixed = -self._across, -self._mixed
-        for filtered in (self._hastened, self._forces):
-            filtered.scale(np.array([1.0, -1.0]))
+        for high_pass in (self._leading, self._forces):
+            high_pass.scale(np.array([1.0, -1.0]))
 
-    def _look(self) -> None:
-        before, self._found = self._found, self._best()
-        if self._found and 1.0 / AGREE < before / self._found < AGREE:
-            self.leak = self._found
+    def _evaluate(self) -> None:
+        before, self._candidate = self._candidate, self._best()
+        if self._candidate and 1.0 / AGREEMENT_RATIO < before / self._candidate < AGREEMENT_RATIO:
+            self.leak = self._candidate
 
     def _best(self) -> float:
-        """The leak that fits best [s]; 0 where it is not to be believed, or hardly better."""
+        """Return the best leak time [s]; 0 if its correlation is low or hardly better."""
         fit, logs = self.fit, np.log(self.leaks)
         best = int(fit.argmax())
         present = float(np.interp(math.log(self.leak), logs, fit))
-        if fit[best] < GOOD or 1.0 - present**2 < BETTER * (1.0 - fit[best] ** 2):
+        if fit[best] < MIN_CORRELATION or 1.0 - present**2 < MIN_IMPROVEMENT * (
+            1.0 - fit[best] ** 2
+        ):
             return 0.0
-        middle = min(max(best, 1), LEAKS - 2)
+        middle = min(max(best, 1), BANK_SIZE - 2)
         left, top, right = fit[middle - 1 : middle + 2].tolist()
         bend = left - 2.0 * top + right
         aside = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
@@ -106,9 +109,9 @@ class LeakSearch:
 
     @property
     def fit(self) -> Array:
-        """Correlation of the ripple of F_x with that of each leak.
+        """Partial correlation of the ripple of F_x with each product, shape (BANK_SIZE,).
 
-        Of what neither has in common with F_y: a turned sensor shows some of that as F_x.
+        The part that both share with F_y is excluded, since a rotated sensor adds some F_y to F_x.
         """
         lateral = max(self._lateral, 1e-300)
         power = self._power - self._mixed**2 / lateral
@@ -118,20 +121,20 @@ class LeakSearch:
 
 
 class _HighPass:
-    """Takes off what changes slowly."""
+    """A first-order high pass."""
 
     def __init__(self, time: float) -> None:
-        """time: slower than that [s]"""
+        """time: time constant [s]"""
         self._time = time
         self._slow: Array | None = None
 
     def scale(self, factors: Array) -> None:
-        """Multiply what is known of each value."""
+        """Multiply the state of each channel by a factor."""
         if self._slow is not None:
             self._slow = self._slow * factors
 
-    def of(self, values: Array, dt: float) -> Array:
-        """What is left of these values, `dt` s after those before."""
+    def filter(self, values: Array, dt: float) -> Array:
+        """Return the filtered values, `dt` s after the previous ones."""
         slow = values if self._slow is None else self._slow
         self._slow = slow + (1.0 - math.exp(-dt / self._time)) * (values - slow)
         return values - self._slow

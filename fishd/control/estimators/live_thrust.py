@@ -16,42 +16,42 @@ import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 
-from fishd.control.estimators.thrust_factor import DRIFT_LAG, Drift, Factor, Level, Wave
+from fishd.control.estimators.thrust_factor import DRIFT_LAG_S, Drift, Factor, Level, Wave
 from fishd.core.calibration import Z95
 from fishd.core.signals import Observation
 
-SWIM_SETTLES = 1.5
+SWIM_SETTLE_TIME_S = 1.5
 """Time until a fin that has begun to swim swims steadily [s]."""
-REST_SETTLES = 1.0
+REST_SETTLE_TIME_S = 1.0
 """Time until a fin hangs still, fading to neutral included [s]."""
-STILL = 2.5
+REST_DELAY_S = 2.5
 """Time without a movement of the tail after which it rests, whichever controller is active [s]."""
-PIECE = 0.5
+PIECE_S = 0.5
 """Length of the pieces that a rest is cut into, and shortest block of whole beats [s]."""
-SPAN = 4.0
+SHOWN_SPAN_S = 4.0
 """Longest time over which the shown thrust is averaged, in whole beats [s]."""
-LONGEST_BEAT = 10.0
+MAX_BEAT_S = 10.0
 """Time without a reversal after which a tail does not beat [s]."""
-RETUNE_PAUSE = 4.0
+RETUNE_PAUSE_S = 4.0
 """Parameters may change more often than this; then beats count while the fin settles [s]."""
 BEAT_SCATTER = 0.01
 """Half-width by which the factor differs from beat to beat of one wave, as a fraction of it."""
 SIZE_STEP, SAME_SIZE = 0.2, 0.1
 """Change of the logarithm of speed or frequency that makes another size of a wave, and its largest
 deviation within one size."""
-CLEAR_STEP = 5.0
+CLEAR_STEP_SIGMAS = 5.0
 """Least change of the size, in standard deviations of the size of one block."""
-JUMP = 8.0
+JUMP_SIGMAS = 8.0
 """Number of standard deviations by which a spike or a step of the force differs from noise."""
-MAX_CI95 = 0.1
+MAX_CI95_N = 0.1
 """Largest half-width of a thrust that is shown as known [N]."""
 MIN_BLOCKS, MAX_BLOCKS = 2, 8
 """Least and most blocks over which the force before or after a change is averaged."""
-LONG_BLOCK = 1.0
+LONG_BLOCK_S = 1.0
 """One block of this length is enough, too [s]."""
-MIN_DRIFT_LAG = 1.0
+MIN_DRIFT_LAG_S = 1.0
 """Shortest time over which the drift is observed [s]."""
-INITIAL_NOISE = 1e-3
+INITIAL_NOISE_N = 1e-3
 """Standard deviation of the force of a block until two blocks have been compared [N]."""
 NOISE_MEMORY = 10
 """Number of comparisons over which the variance of blocks is averaged."""
@@ -85,7 +85,7 @@ class LiveThrust:
         self._settling_since = -math.inf
         self._block = _Block()
         self._shown: deque[_Block] = deque()
-        """The latest blocks of the swim, no longer than `SPAN` in all."""
+        """The latest blocks of the swim, no longer than `SHOWN_SPAN_S` in all."""
         self._run = _Run(None, self._factor)
 
     def forget_zero(self) -> None:
@@ -114,7 +114,7 @@ class LiveThrust:
         self._recording = False
         if self._swims:  # the fin velocity must settle again
             self._phase = 0.0
-            if self._shown and self._now - self._shown[-1].end > LONGEST_BEAT:
+            if self._shown and self._now - self._shown[-1].end > MAX_BEAT_S:
                 self._shown.clear()  # too old to be shown
 
     def calibrate(self, factor: float, error: float) -> None:
@@ -141,7 +141,7 @@ class LiveThrust:
         angle, self._now = seen.instruction_angle, seen.time
         self._still = 0.0 if angle != self._angle else self._still + seen.dt
         self._angle = angle
-        swims = running and self._still < STILL
+        swims = running and self._still < REST_DELAY_S
         if swims is not self._swims or (swims and wave is not self._wave):
             self._change(swims, wave)
         self._phase += seen.dt
@@ -152,15 +152,17 @@ class LiveThrust:
             # The angle of this window follows a reversal: the beat ended with the window before.
             if self._recording:
                 self._block.beats += 1
-                if self._block.duration >= PIECE - 1e-9:
+                if self._block.duration >= PIECE_S - 1e-9:
                     self._block.close(seen.time - seen.dt, swims)
                     self._recording = False
                     self._close(self._block)
-            if not self._recording and self._phase > (SWIM_SETTLES if swims else REST_SETTLES):
+            if not self._recording and self._phase > (
+                SWIM_SETTLE_TIME_S if swims else REST_SETTLE_TIME_S
+            ):
                 self._block, self._recording = _Block(), True
         if self._recording:
             self._block.add(seen)
-            if self._block.duration > LONGEST_BEAT:
+            if self._block.duration > MAX_BEAT_S:
                 self._recording = False
                 self._shown.clear()
         if not (self._shown if swims else self._run.blocks):
@@ -172,7 +174,7 @@ class LiveThrust:
         self._swims, self._wave = swims, wave
         self._noise = self._swim_noise if swims else self._rest_noise
         if goes_on:  # in another phase, or with other parameters: their effect shows in the beats
-            if self._now - self._settling_since > RETUNE_PAUSE:
+            if self._now - self._settling_since > RETUNE_PAUSE_S:
                 self._settling_since = self._now
                 self._recording, self._phase = False, 0.0
             return
@@ -191,7 +193,7 @@ class LiveThrust:
         """Take in a block of whole beats, or a piece of a rest."""
         if self._swims:
             self._shown.append(block)
-            while len(self._shown) > 1 and _duration(self._shown) > SPAN:
+            while len(self._shown) > 1 and _duration(self._shown) > SHOWN_SPAN_S:
                 self._shown.popleft()
         if not self._resizes(block) and not self._jumps(block):
             self._append(block)
@@ -213,7 +215,7 @@ class LiveThrust:
         """
         drift = self._drift.rate * duration
         best = math.sqrt(3.0 * self._noise.variance / drift) if drift else MAX_BLOCKS
-        least = MIN_BLOCKS if duration < LONG_BLOCK else 1
+        least = MIN_BLOCKS if duration < LONG_BLOCK_S else 1
         return round(max(least, min(MAX_BLOCKS, best)))
 
     def _level(self) -> Level | None:
@@ -248,7 +250,7 @@ class LiveThrust:
         odd, run.odd, run.doubt = run.odd, None, 0.0
         difference = self._difference(block)
         lag = block.end - run.blocks[-1].end
-        limit = JUMP**2 * (1.5 * self._noise.variance + self._drift.rate * lag)
+        limit = JUMP_SIGMAS**2 * (1.5 * self._noise.variance + self._drift.rate * lag)
         if difference**2 <= limit:
             return False  # and an odd block before it was a spike
         if odd is None:
@@ -271,18 +273,18 @@ class LiveThrust:
         run = self._run
         if block.size is None or run.size is None:
             return False
-        limit = max(SIZE_STEP, CLEAR_STEP * math.sqrt(self._noise.size_variance))
+        limit = max(SIZE_STEP, CLEAR_STEP_SIGMAS * math.sqrt(self._noise.size_variance))
         if abs(block.size - run.size) <= limit:
             run.resized.clear()
             return False
         count = max(MIN_BLOCKS, self._count(block.duration))
         resized = run.resized = [*run.resized, block][-count:]
-        mean = sum(each.size or 0j for each in resized) / len(resized)
-        alike = all(abs((each.size or 0j) - mean) < SAME_SIZE for each in resized)
+        mean = sum(other.size or 0j for other in resized) / len(resized)
+        alike = all(abs((other.size or 0j) - mean) < SAME_SIZE for other in resized)
         if alike and len(resized) >= MIN_BLOCKS:
             self._start_run(self._level())
-            for each in resized:
-                self._append(each)
+            for other in resized:
+                self._append(other)
         return True
 
     def _append(self, block: "_Block") -> None:
@@ -295,8 +297,8 @@ class LiveThrust:
             self._noise.add(self._difference(block, blocks[-1]), size)
         for other in blocks:
             lag = block.end - other.end
-            if lag <= DRIFT_LAG + 1e-9:
-                if lag >= MIN_DRIFT_LAG:
+            if lag <= DRIFT_LAG_S + 1e-9:
+                if lag >= MIN_DRIFT_LAG_S:
                     self._drift.add(self._difference(block, other), lag, self._noise.variance)
                 break
         blocks.append(block)
@@ -320,7 +322,7 @@ class LiveThrust:
         return thrust, level.thrust_variance + factor.variance * level.power**2
 
     def _show(self, thrust: float, ci95: float) -> None:
-        known = ci95 < MAX_CI95
+        known = ci95 < MAX_CI95_N
         self.thrust, self.error = (thrust, ci95) if known else (None, 0.0)
 
     def _show_factor(self) -> None:
@@ -417,8 +419,8 @@ class _Run:
 def _duration(blocks: Iterable[_Block]) -> float:
     """Return the time that some blocks take together [s]."""
     duration = 0.0
-    for each in blocks:
-        duration += each.duration
+    for block in blocks:
+        duration += block.duration
     return duration
 
 
@@ -426,11 +428,11 @@ def _level(blocks: Sequence[_Block], noise: "_Noise") -> Level:
     """Return the means over consecutive blocks."""
     duration = impulse = energy = 0.0
     beats = 0
-    for each in blocks:
-        duration += each.duration
-        impulse += each.force * each.duration
-        energy += each.power * each.duration
-        beats += each.beats
+    for block in blocks:
+        duration += block.duration
+        impulse += block.force * block.duration
+        energy += block.power * block.duration
+        beats += block.beats
     return Level(
         force=impulse / duration,
         variance=noise.variance / len(blocks),
@@ -449,7 +451,7 @@ class _Noise:
     """Variances of the force and of the size of blocks, from each to the next."""
 
     def __init__(self) -> None:
-        self.variance = INITIAL_NOISE**2
+        self.variance = INITIAL_NOISE_N**2
         self.size_variance = 0.0
         self._count = 1
 

@@ -4,21 +4,21 @@ import math
 
 
 class TailBeat:
-    """Sums half beats, from one reversal to the next.
+    """Sums over half beats, each from one reversal to the next.
 
-    A mean over whole beats carries none of the ripple that thrust has within a beat.
+    A mean over whole beats is free of the ripple of the thrust within a beat.
     """
 
-    _REST = 1.0
+    _REST_TIME_S = 1.0
     """Time constant of the mean force while the tail does not beat [s]."""
-    _LONGEST = 2.0
-    """A tail that stays longer at one side does not beat [s]."""
+    _MAX_SIDE_TIME_S = 2.0
+    """Largest `side_time`; a tail that stays longer on one side does not beat [s]."""
 
     def __init__(self, span: float = 4.0) -> None:
-        """`span` bounds the time that the means look back [s]; they cover at least one beat."""
+        """span: time that the means cover at most [s]; they cover at least one beat"""
         self._span = span
         self.thrust = 0.0
-        """Mean force over the same beats; over the last second or so when not beating [N]."""
+        """Mean force over the beats of `frequency`; over about a second when not beating [N]."""
         self.rest()
 
     def rest(self) -> None:
@@ -26,11 +26,11 @@ class TailBeat:
         self._halves: list[tuple[float, float]] = []  # (duration [s], impulse [N s])
         self._side = 0.0
         self.side_time = 0.0
-        """How long the angle has been on its side of neutral, signed as it is; up to 2 s [s]."""
+        """Time since the angle came to its side of neutral, up to 2 s, with its sign [s]."""
         self._open: tuple[float, float] | None = None
         self._longest = 0.0
         self.frequency = 0.0
-        """Beats per second over the latest whole beats; 0 when not beating [Hz]."""
+        """Frequency of the latest whole beats; 0 when not beating [Hz]."""
 
     def update(self, angle: float, force: float, duration: float) -> None:
         """Add a window.
@@ -45,7 +45,9 @@ class TailBeat:
             elapsed = duration
             if side * self.side_time > 0.0:
                 elapsed += side * self.side_time
-            self.side_time = side * (elapsed if elapsed < self._LONGEST else self._LONGEST)
+            self.side_time = side * (
+                elapsed if elapsed < self._MAX_SIDE_TIME_S else self._MAX_SIDE_TIME_S
+            )
         else:
             self.side_time = 0.0
         if side != self._side:
@@ -55,35 +57,35 @@ class TailBeat:
         if self._open is not None:
             elapsed, impulse = self._open
             self._open = (elapsed + duration, impulse + force * duration)
-            # Overdue by as much as the longest half beat took: the tail has stopped.
+            # Twice as long as the longest half beat: the tail has stopped.
             if self.frequency and elapsed > 2.0 * self._longest:
                 self._halves.clear()
                 self._open = None
                 self.frequency = 0.0
         if not self.frequency:
-            self.thrust -= math.expm1(-duration / self._REST) * (force - self.thrust)
+            self.thrust -= math.expm1(-duration / self._REST_TIME_S) * (force - self.thrust)
 
     def _reverse(self) -> None:
-        """Close the open half beat; one that began before the first reversal is no whole one."""
+        """Close the open half beat, unless it began before the first reversal and is incomplete."""
         halves = self._halves
         if self._open is not None:
             halves.append(self._open)
         self._open = (0.0, 0.0)
-        while len(halves) > 3 and _total(halves)[0] > self._span:
+        while len(halves) > 3 and _sums(halves)[0] > self._span:
             del halves[0]
         if len(halves) < 2:
             return
         whole = halves[len(halves) % 2 :]
         self._longest = max(whole)[0]
-        time, impulse = _total(whole)
+        time, impulse = _sums(whole)
         self.frequency = 0.5 * len(whole) / time
         self.thrust = impulse / time
 
 
-def _total(halves: list[tuple[float, float]]) -> tuple[float, float]:
+def _sums(halves: list[tuple[float, float]]) -> tuple[float, float]:
     """Return the sums of some half beats: durations [s] and impulses [N s]."""
     duration = impulse = 0.0
-    for lasts, push in halves:
-        duration += lasts
-        impulse += push
+    for half_duration, half_impulse in halves:
+        duration += half_duration
+        impulse += half_impulse
     return duration, impulse

@@ -17,18 +17,18 @@ that where `estimator.leak` is not that of the fish."""
 SIZE_SCATTER = 0.12
 """Standard deviation of the factor for each e-fold of the fin's speed or of the frequency, as a
 fraction of it: root mean square of 40 random simulated fish."""
-CONTRADICTION = 3.0
+CONTRADICTION_SIGMAS = 3.0
 """Number of standard deviations beyond which a change of the force contradicts the factor."""
-UNKNOWN_THRUST = 1.0
+UNKNOWN_THRUST_SD_N = 1.0
 """Standard deviation of a thrust of which nothing is known [N]."""
-DRIFT_NEAR = 8
+NEAR_COMPARISONS = 8
 """Number of comparisons from which the drift near a change is taken, before it and after it: about
 5 s of a swim."""
-CLEAR_DRIFT = 2.0
+CLEAR_DRIFT_SIGMAS = 2.0
 """Number of standard deviations of the noise beyond which a change of the force is a drift."""
-DRIFT_MEMORY = 64
+MEMORY_COMPARISONS = 64
 """Number of comparisons that the drift is averaged over: about 40 s."""
-DRIFT_LAG = 2.5
+DRIFT_LAG_S = 2.5
 """Time over which the drift is observed, about that from a rest to a steady swim [s]."""
 
 Wave = tuple[str, dict[str, Any]]
@@ -114,7 +114,7 @@ class Factor(NamedTuple):
         prior, change = self.at(after.end), after.force - before.force
         variance, known = prior.variance, math.isfinite(prior.variance)
         if not known:
-            variance = (UNKNOWN_THRUST / max(power, before.power)) ** 2
+            variance = (UNKNOWN_THRUST_SD_N / max(power, before.power)) ** 2
             if step:  # a first guess, for the scatter between the two sizes
                 guess = (change + before.thrust) / step
                 prior = prior._replace(value=guess, size=before.size)
@@ -128,7 +128,7 @@ class Factor(NamedTuple):
             other = 0.0
         surprise = change + before.thrust - value * step
         total = variance * step**2 + other * power**2 + noise
-        excess = max(0.0, surprise**2 - CONTRADICTION**2 * total)
+        excess = max(0.0, surprise**2 - CONTRADICTION_SIGMAS**2 * total)
         if excess:  # the zero has moved, or the factor is another: either is possible
             total += excess
             if power:
@@ -147,37 +147,37 @@ class Factor(NamedTuple):
 class Drift:
     """How fast the zero drifts: mean square of its change over some seconds, per second."""
 
-    def __init__(self, least: float) -> None:
-        """least: smallest rate, as configured [N²/s]"""
-        self._least = least
+    def __init__(self, min_rate: float) -> None:
+        """min_rate: smallest rate, as configured [N²/s]"""
+        self._min_rate = min_rate
         self._sum = 0.0
         self._count = self._fresh = self._total = 0
-        self._recent = 0.0
-        self._near = 0.0
+        self._recent_rate = 0.0
+        self._near_rate = 0.0
 
     def start(self) -> None:
         """Begin a swim or a rest: the drift before it counts as half of what is near the change."""
-        self._count = min(self._total, DRIFT_NEAR)
-        self._sum = self._recent * self._count
-        self._fresh, self._near = 0, 0.0
+        self._count = min(self._total, NEAR_COMPARISONS)
+        self._sum = self._recent_rate * self._count
+        self._fresh, self._near_rate = 0, 0.0
 
     def add(self, change: float, lag: float, noise: float) -> None:
         """Take in a change of the force in a steady swim or rest.
 
         change: change of the force, that of the power allowed for [N]
-        lag: time of that change, at most `DRIFT_LAG` [s]
+        lag: time of that change, at most `DRIFT_LAG_S` [s]
         noise: variance of either force by noise [N²]
         """
         rate = (change**2 - 2.0 * noise) / lag
-        if change**2 > CLEAR_DRIFT**2 * 2.0 * noise:  # it may go on at this speed
-            rate *= DRIFT_LAG / lag
+        if change**2 > CLEAR_DRIFT_SIGMAS**2 * 2.0 * noise:  # it may go on at this speed
+            rate *= DRIFT_LAG_S / lag
         self._sum += rate
         self._count += 1
         self._fresh += 1
         self._total += 1
-        self._recent += (rate - self._recent) / min(self._total, DRIFT_MEMORY)
-        if self._fresh == DRIFT_NEAR:
-            self._near = self._sum / self._count
+        self._recent_rate += (rate - self._recent_rate) / min(self._total, MEMORY_COMPARISONS)
+        if self._fresh == NEAR_COMPARISONS:
+            self._near_rate = self._sum / self._count
 
     @property
     def rate(self) -> float:
@@ -188,4 +188,4 @@ class Drift:
         for the change that began it.
         """
         mean = self._sum / self._count if self._count else 0.0
-        return max(self._least, self._recent, mean, self._near)
+        return max(self._min_rate, self._recent_rate, mean, self._near_rate)

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from fishd.control.estimators.base import LONGEST_LEAK
+from fishd.control.estimators.base import MAX_LEAK_S
 from fishd.lab.identification.response import Array
 
 UNITS = {
@@ -153,8 +153,8 @@ class Identification:
         """The `estimator.leak` that restores the fin velocity, K_y/K_d [s]; None without a drag."""
         drag = self["lateral_drag"].value
         inertia = self["lateral_inertia_ratio"].value * self["thrust_coefficient"].value
-        leak = inertia / drag if drag > 0.0 else LONGEST_LEAK
-        return leak if 0.0 < leak < LONGEST_LEAK else None
+        leak = inertia / drag if drag > 0.0 else MAX_LEAK_S
+        return leak if 0.0 < leak < MAX_LEAK_S else None
 
     def to_yaml(self, origin: str = "") -> str:
         """Both sections and the leak, as a file that `fishd --config` reads.

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from fishd.control.estimators.live_thrust import SWIM_SETTLES
+from fishd.control.estimators.live_thrust import SWIM_SETTLE_TIME_S
 from fishd.core.errors import ConfigError, ParameterError
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
@@ -164,7 +164,7 @@ def lengths(parameters: Mapping[str, Any]) -> tuple[float, float]:
     frequency = parameters.get("frequency")
     if isinstance(frequency, int | float) and frequency > 0.0:
         return WAVE_SETTLES, WAVE_SETTLES + max(STEADY, BEATS / frequency)
-    return SWIM_SETTLES, SWIM_SETTLES + STEADY
+    return SWIM_SETTLE_TIME_S, SWIM_SETTLE_TIME_S + STEADY
 
 
 def default_range(field: Field, session: Session) -> Range | None:

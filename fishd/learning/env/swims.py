@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from msgspec import Struct
 
-from fishd.control.estimators.live_thrust import REST_SETTLES, SWIM_SETTLES
+from fishd.control.estimators.live_thrust import REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
 from fishd.controllers.dwell import DwellLimit
 from fishd.core.errors import ControllerFault
 from fishd.lab.measurement import Block, Sample, block_of
@@ -13,7 +13,7 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Decide, beat_frequency, is_stalled
 from fishd.virtual.plant.optimum import best_square_wave
 
-REST = REST_SETTLES + 1.0
+REST = REST_SETTLE_TIME_S + 1.0
 """How long the fish rests before and after each swim [s]."""
 MEASURED, BEATS = 2.0, 3.0
 """A swim that is steady is measured for so long [s], or for so many beats where that is longer."""
@@ -57,8 +57,8 @@ class Swims:
         """
         self._env, self._stop, self._tick = env, stop, env.link.tick
         beat = 1.0 / best_square_wave(env.config.plant, env.link.amplitude).frequency
-        first = max(SWIM_SETTLES, FIRST_BEATS * beat)
-        longest = SWIM_SETTLES + max(MEASURED, BEATS * beat)
+        first = max(SWIM_SETTLE_TIME_S, FIRST_BEATS * beat)
+        longest = SWIM_SETTLE_TIME_S + max(MEASURED, BEATS * beat)
         self._parts = first, longest - first
         self._begun = env.tank_time
         self._rested = False
@@ -81,7 +81,7 @@ class Swims:
         stalled = self._stalls(decide, phase)
         frequency, fullness = self._beat(phase)
         self._rest()
-        found = block_of(phase, self._tick, SWIM_SETTLES)
+        found = block_of(phase, self._tick, SWIM_SETTLE_TIME_S)
         if found and found.beats:
             frequency = found.beats / found.lasts  # of whole beats: more exact
         thrust = None
@@ -114,7 +114,7 @@ class Swims:
         phase = list[Sample]()
         for _ in range(round(REST / self._tick)):
             self._step(0.0, False, phase)
-        self._zero, self._rested = block_of(phase, self._tick, REST_SETTLES), True
+        self._zero, self._rested = block_of(phase, self._tick, REST_SETTLE_TIME_S), True
 
     def _step(self, angle: float, swims: bool, phase: list[Sample]) -> None:
         """One tick at an angle [rad], which is added to a phase."""

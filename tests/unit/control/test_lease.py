@@ -5,7 +5,7 @@ from collections.abc import Callable
 import pytest
 from rigs.harness import Rig
 
-from fishd.control.lease import MAX_STEP
+from fishd.control.lease import MAX_STEP_S
 from fishd.core.errors import Refused
 
 SECONDS = 2.0
@@ -43,7 +43,7 @@ def test_a_fish_whose_lease_is_not_renewed_fades_to_neutral_in_time() -> None:
 def test_a_fishd_that_stood_still_gives_its_experiment_time_to_renew() -> None:
     rig = Rig()
     lease = experiment(rig)
-    rig.run_for(SECONDS - 2.0 * MAX_STEP)
+    rig.run_for(SECONDS - 2.0 * MAX_STEP_S)
     rig.run(missed=200)  # 10 s, in which it could hear nothing
     assert rig.mode == "running"
     for _ in range(5):
