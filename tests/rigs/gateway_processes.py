@@ -3,7 +3,7 @@
 import contextlib
 from pathlib import Path
 
-from rigs.processes import Daemon
+from rigs.processes import Daemon, wait_until
 
 
 def children(pid: int) -> list[int]:
@@ -30,6 +30,15 @@ def gateways(daemon: Daemon) -> dict[str, int]:
                 if not gone(pid) and name != "fishd-gateways":  # one that is being forked
                     found[name.removeprefix("fishd-")] = pid
     return found
+
+
+def both_gateways(daemon: Daemon) -> dict[str, int]:
+    """Wait until both gateways run, and return their processes by name.
+
+    fishd answers before the second one has its name.
+    """
+    wait_until(lambda: len(gateways(daemon)) == 2)
+    return gateways(daemon)
 
 
 def gone(pid: int) -> bool:

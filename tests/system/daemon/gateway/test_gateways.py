@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from rigs.documents import ROOT
-from rigs.gateway_processes import children, fork_server, gateways, gone
+from rigs.gateway_processes import both_gateways, children, fork_server, gateways, gone
 from rigs.processes import PATIENCE, Daemon, Process, Subscriber, call, running, wait_until
 
 from fishd.client import AsyncFish, Fish
@@ -58,7 +58,7 @@ def test_a_gateway_that_dies_is_started_again_and_its_subscribers_go_on(lasting:
     before = restarts(lasting, "telemetry")
     with Subscriber(lasting.telemetry) as subscriber:
         missed = subscriber.until(mode="running")["missed"]
-        os.kill(gateways(lasting)["telemetry"], signal.SIGKILL)
+        os.kill(both_gateways(lasting)["telemetry"], signal.SIGKILL)
         event = subscriber.until(kind="gateway")
         tick = subscriber.until(mode="running")
     assert event["message"] == (
@@ -88,7 +88,7 @@ if "fishd.daemon.gateway" in sys.orig_argv:
     ):
         subscriber.connected()
         slow.touch()
-        os.kill(gateways(daemon)["telemetry"], signal.SIGKILL)
+        os.kill(both_gateways(daemon)["telemetry"], signal.SIGKILL)
         assert subscriber.message()["kind"] == "gateway"
         # Its limit exceeded, it begins anew by itself; and says again that it serves.
         with attacking("idle-telemetry", daemon):
@@ -97,7 +97,7 @@ if "fishd.daemon.gateway" in sys.orig_argv:
 
 
 def test_while_the_gateway_of_telemetry_is_gone_requests_are_answered(daemon: Daemon) -> None:
-    os.kill(gateways(daemon)["telemetry"], signal.SIGSTOP)
+    os.kill(both_gateways(daemon)["telemetry"], signal.SIGSTOP)
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         assert fish.status().mode == "running"
         assert fish.estop().mode == "estop"
@@ -105,14 +105,14 @@ def test_while_the_gateway_of_telemetry_is_gone_requests_are_answered(daemon: Da
 
 def test_a_client_of_a_gateway_that_died_is_answered_by_the_next_one(lasting: Daemon) -> None:
     before = restarts(lasting, "control")
-    os.kill(gateways(lasting)["control"], signal.SIGKILL)
+    os.kill(both_gateways(lasting)["control"], signal.SIGKILL)
     assert restarts(lasting, "control") == before + 1
 
 
 @pytest.mark.parametrize("kind", ["control", "telemetry"])
 def test_a_gateway_that_hangs_is_replaced_and_costs_no_tick(lasting: Daemon, kind: str) -> None:
     before = lasting.status()
-    hung = gateways(lasting)[kind]
+    hung = both_gateways(lasting)[kind]
     with Subscriber(lasting.telemetry, b"event") as subscriber:
         if kind == "control":
             subscriber.connected()
@@ -131,17 +131,16 @@ def test_a_gateway_that_hangs_is_replaced_and_costs_no_tick(lasting: Daemon, kin
 
 def test_a_fork_server_that_hangs_is_replaced_with_its_gateways(daemon: Daemon) -> None:
     hung = fork_server(daemon)
-    former = gateways(daemon)
+    former = both_gateways(daemon)
     os.kill(hung, signal.SIGSTOP)
     wait_until(lambda: gone(hung))
-    wait_until(lambda: len(gateways(daemon)) == 2)
-    assert not set(former.values()) & set(gateways(daemon).values())
+    assert not set(former.values()) & set(both_gateways(daemon).values())
     assert all(gone(pid) for pid in former.values())
     wait_until(lambda: daemon.status().counters["control_restarts"] == 1)
 
 
 def test_an_estop_is_answered_while_every_gateway_is_stopped(daemon: Daemon) -> None:
-    for pid in (fork_server(daemon), *gateways(daemon).values()):
+    for pid in (fork_server(daemon), *both_gateways(daemon).values()):
         os.kill(pid, signal.SIGSTOP)
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         assert fish.estop("from a test").mode == "estop"
@@ -156,8 +155,7 @@ def test_an_estop_is_answered_while_every_gateway_is_stopped(daemon: Daemon) -> 
 def test_an_estop_is_answered_within_a_fifth_of_a_second_after_any_single_failure(
     lasting: Daemon, what: str, number: signal.Signals, connected: bool
 ) -> None:
-    wait_until(lambda: len(gateways(lasting)) == 2)
-    pid = fork_server(lasting) if what == "fork server" else gateways(lasting)[what]
+    pid = fork_server(lasting) if what == "fork server" else both_gateways(lasting)[what]
     with Fish(lasting.endpoint) as fish:
         if connected:
             fish.status()
@@ -176,7 +174,7 @@ def test_an_asyncio_client_has_its_estop_answered_then_too(daemon: Daemon) -> No
         async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as fish:
             return (await fish.estop()).mode
 
-    for pid in (fork_server(daemon), *gateways(daemon).values()):
+    for pid in (fork_server(daemon), *both_gateways(daemon).values()):
         os.kill(pid, signal.SIGSTOP)
     assert asyncio.run(stop()) == "estop"
 
@@ -198,7 +196,7 @@ def test_the_socket_for_an_estop_takes_nothing_else(lasting: Daemon) -> None:
 @pytest.mark.realtime
 def test_a_fishd_whose_gateways_hang_ends_in_time(tmp_path: Path) -> None:
     with running(tmp_path, "--set", "start.controller=swing") as daemon:
-        hung = gateways(daemon)
+        hung = both_gateways(daemon)
         for pid in hung.values():
             os.kill(pid, signal.SIGSTOP)
         begun = time.monotonic()
@@ -210,7 +208,7 @@ def test_a_fishd_whose_gateways_hang_ends_in_time(tmp_path: Path) -> None:
 def test_stopped_gateways_end_with_a_fishd_that_is_killed(tmp_path: Path) -> None:
     """So that the next fishd can have their addresses."""
     with running(tmp_path, *SWIMMING) as daemon:
-        pids = [fork_server(daemon), *gateways(daemon).values()]
+        pids = [fork_server(daemon), *both_gateways(daemon).values()]
         for pid in pids:
             os.kill(pid, signal.SIGSTOP)
         daemon.process.kill()
@@ -221,8 +219,7 @@ def test_stopped_gateways_end_with_a_fishd_that_is_killed(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV, signal.SIGTERM])
 def test_no_gateway_outlives_fishd(daemon: Daemon, number: int) -> None:
-    pids = list(gateways(daemon).values())
-    assert len(pids) == 2
+    pids = list(both_gateways(daemon).values())
     pids = [fork_server(daemon), *pids]
     daemon.end(number)
     wait_until(lambda: all(gone(pid) for pid in pids))
@@ -232,7 +229,7 @@ def test_no_gateway_outlives_fishd(daemon: Daemon, number: int) -> None:
 def test_a_signal_for_the_whole_group_leaves_the_gateways_to_fishd(daemon: Daemon) -> None:
     with Subscriber(daemon.telemetry) as subscriber:
         subscriber.until(mode="running")
-        for pid in gateways(daemon).values():
+        for pid in both_gateways(daemon).values():
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 os.kill(pid, number)
         daemon.process.send_signal(signal.SIGTERM)
@@ -257,7 +254,7 @@ def attacking(name: str, daemon: Daemon) -> Process:
 def memory(daemon: Daemon) -> float:
     """Of fishd and its gateways, pages that they share counted once [MB]."""
     total = 0
-    for pid in (daemon.process.pid, fork_server(daemon), *gateways(daemon).values()):
+    for pid in (daemon.process.pid, fork_server(daemon), *both_gateways(daemon).values()):
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
         total += next(int(line.split()[1]) for line in lines if line.startswith("Pss:"))
     return total / 1024
@@ -366,7 +363,7 @@ def test_a_reply_that_nobody_waits_for_any_more_reaches_no_other_client(tmp_path
     with running(tmp_path) as daemon, daemon.socket() as before:
         for _ in range(4):
             before.send(b'{"v":1,"id":"before","op":"policies"}')
-        killed = gateways(daemon)["control"]
+        killed = both_gateways(daemon)["control"]
         os.kill(killed, signal.SIGKILL)
         wait_until(lambda: gateways(daemon).get("control", killed) != killed)
         with daemon.socket() as after:
@@ -385,7 +382,7 @@ def test_fishd_waits_for_the_end_of_its_gateways_without_a_real_time_priority(
 
     if policy() != os.SCHED_FIFO:
         pytest.skip("no real-time priority is permitted here: run as root, or raise RLIMIT_RTPRIO")
-    for pid in gateways(daemon).values():
+    for pid in both_gateways(daemon).values():
         os.kill(pid, signal.SIGSTOP)
     daemon.process.send_signal(signal.SIGTERM)
     seen = set()
@@ -445,8 +442,7 @@ def test_gateways_are_as_nice_as_that(tmp_path: Path, more: int) -> None:
     with running(tmp_path, under=("nice", "-n", str(more))) as daemon:  # or, if forbidden, at 0
         fishd = nice(daemon.process.pid)
         expected = max(fishd, min(5, fishd + 5))
-        pids = gateways(daemon).values()
-        assert len(pids) == 2
+        pids = both_gateways(daemon).values()
         wait_until(lambda: {nice(pid) for pid in pids} == {expected})
 
 
