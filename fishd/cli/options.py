@@ -196,10 +196,12 @@ class ValuesType(ParameterType):
         """`0.4:4:0.2` or `0.3,0.6` from the command line to a list of values."""
         if not isinstance(value, str):
             return value
-        from fishd.lab.sweep.grid import spread
+        from fishd.lab.sweep.grid import expand_values
 
         try:
-            return [super(ValuesType, self).convert(each, param, ctx) for each in spread(value)]
+            return [
+                super(ValuesType, self).convert(each, param, ctx) for each in expand_values(value)
+            ]
         except ParameterError as error:
             self.fail(str(error), param, ctx)
 

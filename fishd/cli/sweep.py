@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fishd.lab.sweep.curves import Best, WholeTicks
     from fishd.lab.sweep.folder import SweepFolder
     from fishd.lab.sweep.grid import Point
-    from fishd.lab.sweep.results import Found, Quantity
+    from fishd.lab.sweep.results import PointResult, Quantity
 
 SECONDS = 30.0
 
@@ -107,7 +107,7 @@ def _sweep(
     names = [info.name for info in infos]
     takes = {info.name: [field.name for field in info.parameters] for info in infos}
     units = {field.name: field.unit for info in infos for field in info.parameters}
-    points = grid.points(names, parameters, takes, dict(_varied(text) for text in vary))
+    points = grid.make_points(names, parameters, takes, dict(_varied(text) for text in vary))
     task = _Sweep(points, units, place, fish, picture, as_json)
     if fish.on == "live":
         return task.measure(SECONDS if seconds is None else seconds)
@@ -115,12 +115,12 @@ def _sweep(
 
 
 def _varied(text: str) -> tuple[str, list[Any]]:
-    from fishd.lab.sweep.grid import spread, typed
+    from fishd.lab.sweep.grid import expand_values, parse_value
 
     key, equals, values = text.partition("=")
     if not (equals and key.strip()):
         raise click.UsageError(f"--vary {text}: write KEY=VALUES, such as plant.xi=0.6,1.2,2.4")
-    return key.strip(), list(dict.fromkeys(map(typed, spread(values))))
+    return key.strip(), list(dict.fromkeys(map(parse_value, expand_values(values))))
 
 
 @dataclass
@@ -151,7 +151,7 @@ class _Sweep:
             with showing(len(pairs), "points", err=self.as_json) as show:
                 show.at(self.finished)
 
-                def done(point: "Point", result: "Found") -> None:
+                def done(point: "Point", result: "PointResult") -> None:
                     show.done(self._line(folder, point, result), self.finished)
 
                 ending.is_interrupted = not swim_all(folder, pairs, lengths, done, **crew)
@@ -180,7 +180,7 @@ class _Sweep:
                 ):
                     session.progress = show.at
 
-                    def done(point: "Point", result: "Found") -> None:
+                    def done(point: "Point", result: "PointResult") -> None:
                         show.done(self._line(folder, point, result), session.used)
 
                     measure_all(folder, self.points, session, seconds, done)
@@ -221,7 +221,7 @@ class _Sweep:
         echo(f"{folder.path}: {counted(len(self.points), 'point')}{there}", err=self.as_json)
         return folder
 
-    def _line(self, folder: "SweepFolder", point: "Point", result: "Found") -> str:
+    def _line(self, folder: "SweepFolder", point: "Point", result: "PointResult") -> str:
         """Return a line on a point that is done."""
         self.finished += 1
         return f"{point.label()}: {_figures(result, folder.quantity)}"
@@ -231,14 +231,14 @@ class _Sweep:
         from fishd.lab.sweep import curves, figure
 
         points, quantity = self.points, folder.quantity
-        drawn = curves.curves(folder, points)
+        drawn = curves.make_curves(folder, points)
         bests = [
-            (curve, replace(best, whole_ticks=curves.whole_ticks(folder, curve)))
+            (curve, replace(best, whole_ticks=curves.find_best_of_whole_ticks(folder, curve)))
             for curve in drawn
-            if (best := curves.best(curve))
+            if (best := curves.find_best(curve))
         ]
         if self.as_json:
-            print_json([curves.plain(best, quantity) for _, best in bests])
+            print_json([curves.best_to_builtins(best, quantity) for _, best in bests])
         else:
             for curve, best in bests:
                 unit = self.units.get(best.over, "")
@@ -267,7 +267,7 @@ class _Sweep:
         return 1 if any(folder.results[folder.key(point)].trouble for point in points) else 0
 
 
-def _figures(result: "Found", quantity: "Quantity") -> str:
+def _figures(result: "PointResult", quantity: "Quantity") -> str:
     if result.value is None:
         return f"no {quantity.name}: {result.trouble}"
     beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""

@@ -1,4 +1,4 @@
-"""One point of a sweep with a fish that swims freely: its speed once that is settled."""
+"""Speed of a freely swimming fish at one point of a sweep, measured once the speed is steady."""
 
 import math
 from collections.abc import Callable
@@ -19,14 +19,17 @@ from fishd.virtual.swimmer.gait import gait
 from fishd.virtual.swimmer.track import Track
 
 Array = NDArray[np.float64]
-LONGEST = 24.0
-"""A fish whose speed still changes is judged all the same after so long [s]."""
-_ASK_EVERY = 50
-LEAST_TIME = 8.0
-"""The beats that are judged take as long at least: a fast wave has many in a moment [s]."""
-STEADY, SCATTERING = 0.02, 0.05
-"""The speed is steady where its two halves agree to the first share of it, or of a tenth of a
-length a second; or to the second one, and within the 95 % interval of their difference."""
+MAX_SWIM_S = 24.0
+"""Time after which the speed is measured even if it still changes [s]."""
+_STOP_CHECK_TICKS = 50
+MIN_MEASURED_S = 8.0
+"""Shortest duration of the beats that are measured, for waves of high frequency [s]."""
+STEADY_FRACTION, SCATTER_FRACTION = 0.02, 0.05
+"""Fractions of the speed, or of 0.1 body lengths per second if that is more.
+
+The speed is steady if the means of its two halves differ by less than the first fraction. A
+difference up to the second fraction is allowed if it lies within its 95 % confidence interval.
+"""
 
 
 def swim_freely(
@@ -34,18 +37,18 @@ def swim_freely(
     config: Config,
     lengths: Lengths,
     publisher: Publisher,
-    begun: Callable[[VirtualRun], None] = lambda run: None,
+    on_start: Callable[[VirtualRun], None] = lambda run: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> SpeedResult | None:
-    """The speed of a free swimmer at a point, over whole beats once it is settled.
+    """Return the steady speed of a free swimmer at a point, over whole beats.
 
-    It swims until the speeds of `lengths.periods` beats, and of the seconds that `settling` names,
-    show no trend, or for `LONGEST` seconds: then the later half is judged, or as many beats as that
-    where it has fewer, and `settled` is None.
+    The fish swims until the speeds of at least `lengths.periods` beats and `MIN_MEASURED_S` seconds
+    show no trend. After `MAX_SWIM_S` seconds the later half is measured, or `lengths.periods` beats
+    if the half has fewer, and `settled` is None.
 
-    publisher: gets every tick, and every event
-    begun: called before the first of them
-    stop: asked now and then whether to stop, and give None
+    publisher: receives every tick and every event
+    on_start: called before the first tick
+    stop: called regularly; if it returns True, the swim ends and None is returned
     Raises `ParameterError` and `UnknownController`.
     """
     config = replace(config, start=Start())
@@ -57,7 +60,7 @@ def swim_freely(
     with VirtualRun(config, publisher) as run:
         fish = run.swimmer
         assert fish
-        begun(run)
+        on_start(run)
         track.begin(fish)
         run.loop.set_controller(point.controller, controller)
         reversals = Reversals()
@@ -65,46 +68,48 @@ def swim_freely(
         while first is None and not _is_long_enough(track, begins, lengths, config.tick):
             command = run.loop.applied
             run.tick()
-            trouble = fish.trouble or run.loop.supervisor.reason or run.loop.active.fallback
-            if trouble:
-                message = getattr(trouble, "message", str(trouble))
+            problem = fish.trouble or run.loop.supervisor.reason or run.loop.active.fallback
+            if problem:
+                message = getattr(problem, "message", str(problem))
                 return SpeedResult(seconds=len(track) * config.tick, trouble=message)
             track.add(fish, command)
             if reversals.add(command) > 0 and len(track) * config.tick > lengths.settle:
                 begins.append(len(track) - 1)
-                first = _settled(track, begins, lengths, config)
-            if len(track) % _ASK_EVERY == 0 and stop():
+                first = _find_first_row(track, begins, lengths, config)
+            if len(track) % _STOP_CHECK_TICKS == 0 and stop():
                 return None
-    return _result(track, begins, first, lengths, config)
+    return _make_result(track, begins, first, lengths, config)
 
 
 def _is_long_enough(track: Track, begins: list[int], lengths: Lengths, tick: float) -> bool:
-    """A slow wave gets the time for its beats; what does not beat at all is not waited for."""
-    time, longest = len(track) * tick, max(LONGEST, 4.0 * lengths.settle)
+    """Return whether the swim ends; a slow wave gets time for its beats, a still fin does not."""
+    time, longest = len(track) * tick, max(MAX_SWIM_S, 4.0 * lengths.settle)
     waiting = 0 < len(begins) <= lengths.periods and time < 4.0 * longest
     return time >= longest and not waiting
 
 
-def _settled(track: Track, begins: list[int], lengths: Lengths, config: Config) -> int | None:
-    """The row of the first beat that is judged; None while the speed changes."""
+def _find_first_row(
+    track: Track, begins: list[int], lengths: Lengths, config: Config
+) -> int | None:
+    """Return the row of the first measured beat; None while the speed changes."""
     if len(begins) - 1 < lengths.periods:
         return None
-    time, x = _at(track, begins)
-    beat = judged_from(time, x)
+    time, x = _read_positions(track, begins)
+    beat = find_first_measured(time, x)
     if len(begins) - 1 - beat < lengths.periods:
         return None
-    steady = is_steady(time[beat:], x[beat:], config.swimmer.body.length)
-    return begins[beat] if steady else None
+    is_settled = is_steady(time[beat:], x[beat:], config.swimmer.body.length)
+    return begins[beat] if is_settled else None
 
 
-def _at(track: Track, begins: list[int]) -> tuple[Array, Array]:
-    """Time and place where beats begin: at the end of the tick before."""
+def _read_positions(track: Track, begins: list[int]) -> tuple[Array, Array]:
+    """Return the times [s] and positions [m] at which beats begin: the ends of the ticks before."""
     columns = track.columns()
     rows = np.array(begins) - 1
     return columns["time"][rows], columns["x"][rows]
 
 
-def _result(
+def _make_result(
     track: Track, begins: list[int], first: int | None, lengths: Lengths, config: Config
 ) -> SpeedResult:
     columns = track.columns()
@@ -113,31 +118,31 @@ def _result(
         count = len(begins) - 1
         beat = max(0, min(count // 2, count - lengths.periods))
         row = begins[beat] if begins else len(track) // 2
-    found = gait({name: values[row - 1 :] for name, values in columns.items()}, config.swimmer)
+    measured = gait({name: values[row - 1 :] for name, values in columns.items()}, config.swimmer)
     return SpeedResult(
-        speed=found.speed,
-        error=found.speed_error,
-        beat_frequency=found.frequency,
-        beats=found.beats,
+        speed=measured.speed,
+        error=measured.speed_error,
+        beat_frequency=measured.frequency,
+        beats=measured.beats,
         settled=None if first is None else float(columns["time"][first - 1]),
-        tail_width=found.tail_width,
-        muscle_power=found.muscle_power,
-        cost_of_transport=found.cost_of_transport,
-        strouhal=found.strouhal,
-        froude_efficiency=found.froude_efficiency,
+        tail_width=measured.tail_width,
+        muscle_power=measured.muscle_power,
+        cost_of_transport=measured.cost_of_transport,
+        strouhal=measured.strouhal,
+        froude_efficiency=measured.froude_efficiency,
         seconds=len(track) * config.tick,
     )
 
 
-def judged_from(begins: Array, x: Array) -> int:
-    """The number of the first beat that is judged.
+def find_first_measured(begins: Array, x: Array) -> int:
+    """Return the index of the first measured beat.
 
-    begins: when beats begin, and the last one ends, shape (beats + 1,) [s]
-    x: where the fish is then, shape (beats + 1,) [m]
+    begins: times at which beats begin, and the last one ends, shape (beats + 1,) [s]
+    x: positions of the fish at these times, shape (beats + 1,) [m]
 
-    So many beats are dropped that the standard error of the mean of the others is the smallest, but
-    not more than half of them (the rule MSER of White, "An effective truncation heuristic for bias
-    reduction in simulation output", Simulation 69, 1997, doi:10.1177/003754979706900601).
+    The number of dropped beats is the one that minimises the standard error of the mean of the
+    others, but at most half of them (the rule MSER of White, "An effective truncation heuristic for
+    bias reduction in simulation output", Simulation 69, 1997, doi:10.1177/003754979706900601).
     """
     speeds = -np.diff(x) / np.diff(begins)
     count = len(speeds)
@@ -146,20 +151,20 @@ def judged_from(begins: Array, x: Array) -> int:
 
 
 def is_steady(begins: Array, x: Array, length: float) -> bool:
-    """Whether the mean speeds over the two halves of these beats agree.
+    """Return whether the mean speeds over the two halves of these beats agree.
 
-    begins, x: as for `judged_from`; length: of the fish [m]
+    begins, x: as for `find_first_measured`; length: body length of the fish [m]
     """
     count = len(begins) - 1
-    if count < 2 or begins[-1] - begins[0] < LEAST_TIME:
+    if count < 2 or begins[-1] - begins[0] < MIN_MEASURED_S:
         return False
     speeds = -np.diff(x) / np.diff(begins)
     halves = speeds[: count // 2], speeds[count - count // 2 :]
-    apart = abs(float(halves[0].mean() - halves[1].mean()))
+    difference = abs(float(halves[0].mean() - halves[1].mean()))
     scale = max(abs(float(speeds.mean())), 0.1 * length)
-    allowed = STEADY * scale
+    tolerance = STEADY_FRACTION * scale
     if count >= 4:
         variance = sum(half.var(ddof=1) / len(half) for half in halves)
         interval = student95(count // 2 * 2 - 2) * math.sqrt(variance)
-        allowed = max(allowed, min(interval, SCATTERING * scale))
-    return apart <= allowed
+        tolerance = max(tolerance, min(interval, SCATTER_FRACTION * scale))
+    return difference <= tolerance

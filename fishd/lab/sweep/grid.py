@@ -1,6 +1,6 @@
-"""The points of a sweep: every combination of controllers, parameter values and configured keys.
+"""Points of a sweep: every combination of controllers, parameter values and configuration keys.
 
-And for how long a simulated fish swims at each.
+Also the duration for which a simulated fish swims at each point.
 """
 
 import itertools
@@ -17,38 +17,38 @@ from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError
 from fishd.core.schema import format_quantity, format_values, unit_at
 
-MOST = 100_000
-"""A grid has no more points."""
-_WHOLE = 2.0**53
-"""Below this, a number that is whole is exact."""
-PARAMETER = "parameters."
-"""What the column of a controller's parameter begins with; that of a configured key is its name."""
+MAX_POINTS = 100_000
+"""Largest number of points of a grid."""
+_EXACT_INTEGER_LIMIT = 2.0**53
+"""Limit below which a float that is an integer is exact."""
+PARAMETER_PREFIX = "parameters."
+"""Prefix of the column of a controller's parameter; the column of a configuration key has none."""
 
 
 class Point(Struct, frozen=True):
-    """One thing to measure."""
+    """One point to measure: a controller, its parameters and the configuration of the fish."""
 
     controller: str
     parameters: dict[str, Any]
-    """Those that were given; the others have their defaults."""
+    """Parameters that were given; the others have their defaults."""
     keys: dict[str, Any] = {}
-    """Keys of the configuration that differ from that of the sweep, in dotted form."""
+    """Keys that differ from the configuration of the sweep, in dotted form, with their values."""
 
     def columns(self) -> dict[str, Any]:
-        """Its columns in a table, by name."""
-        parameters = {PARAMETER + name: value for name, value in self.parameters.items()}
+        """Return the values of the point's columns in a table, by name."""
+        parameters = {PARAMETER_PREFIX + name: value for name, value in self.parameters.items()}
         return {"controller": self.controller, **parameters, **self.keys}
 
     def label(self, *, without: Collection[str] = ()) -> str:
-        """`square frequency=1.4 Hz amplitude=0.3 rad`: its columns in a line, but for some."""
+        """Return the columns, except those in `without`, as in `square frequency=1.4 Hz`."""
         units = registry.units(self.controller)
         values = {
-            PARAMETER + name: (value, units.get(name, ""))
+            PARAMETER_PREFIX + name: (value, units.get(name, ""))
             for name, value in self.parameters.items()
         }
         values |= {key: (value, unit_at(Config, key)) for key, value in self.keys.items()}
         words = (
-            f"{name.removeprefix(PARAMETER)}={format_quantity(value, unit)}"
+            f"{name.removeprefix(PARAMETER_PREFIX)}={format_quantity(value, unit)}"
             for name, (value, unit) in values.items()
             if name not in without
         )
@@ -56,16 +56,16 @@ class Point(Struct, frozen=True):
 
 
 class Lengths(Struct, frozen=True):
-    """How long a simulated fish swims at each point."""
+    """Duration for which a simulated fish swims at each point."""
 
     settle: float = 10.0
-    """Not judged [s]; a free swimmer takes longer where it has to."""
+    """Time at the start that is not measured [s]; a free swimmer may need longer."""
     periods: int = 20
-    """Tail beats that are judged; of a free swimmer, at least."""
+    """Number of measured tail beats; for a free swimmer, the smallest number."""
 
     @classmethod
     def of(cls, config: Config, settle: float | None, periods: int | None) -> "Lengths":
-        """As given, or as is usual with such a fish."""
+        """Return the given durations; None selects the default for the kind of fish."""
         usual = cls(4.0, 10) if config.robot == "swimmer" else cls()
         return cls(
             usual.settle if settle is None else settle,
@@ -73,34 +73,34 @@ class Lengths(Struct, frozen=True):
         )
 
 
-def spread(text: str) -> list[str]:
-    """The values of `0.4:4:0.2` (low:high:step, both ends included) or of a list `0.3,0.6,1`.
+def expand_values(text: str) -> list[str]:
+    """Return the values of `0.4:4:0.2` (low:high:step, with both ends) or of a list `0.3,0.6,1`.
 
-    Each is a text, exact in decimals. Raises `ParameterError`.
+    The values are texts, exact in decimals. Raises `ParameterError`.
     """
-    found: list[str] = []
+    values: list[str] = []
     for piece in text.split(","):
         piece = piece.strip()
-        found += _range(piece) if ":" in piece else [piece]
-        if len(found) > MOST:
-            raise ParameterError(f"'{text}' has more than {MOST} values")
-    if "" in found:
+        values += _expand_range(piece) if ":" in piece else [piece]
+        if len(values) > MAX_POINTS:
+            raise ParameterError(f"'{text}' has more than {MAX_POINTS} values")
+    if "" in values:
         raise ParameterError(f"'{text}' is not valid: a value is missing in it")
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(values))
 
 
-def typed(text: str) -> int | float | str:
-    """A number where it is one: a whole one without a fraction; else the text itself."""
+def parse_value(text: str) -> int | float | str:
+    """Return the number that the text stands for, an int if it is whole; else the text itself."""
     try:
         number = float(text)
     except ValueError:
         return text
     if not math.isfinite(number):
         return text
-    return int(number) if number.is_integer() and abs(number) < _WHOLE else number
+    return int(number) if number.is_integer() and abs(number) < _EXACT_INTEGER_LIMIT else number
 
 
-def _range(piece: str) -> list[str]:
+def _expand_range(piece: str) -> list[str]:
     try:
         low, high, step = (Decimal(part) for part in piece.split(":"))
         if step <= 0 or high < low or not (high - low).is_finite():
@@ -110,47 +110,47 @@ def _range(piece: str) -> list[str]:
         raise ParameterError(
             f"'{piece}' is not valid: LOW:HIGH:STEP is needed, such as 0.4:4:0.2"
         ) from None
-    if count > MOST:
-        raise ParameterError(f"'{piece}' has more than {MOST} values")
+    if count > MAX_POINTS:
+        raise ParameterError(f"'{piece}' has more than {MAX_POINTS} values")
     return [str((low + k * step).normalize()) for k in range(count)]
 
 
-def points(
+def make_points(
     controllers: Sequence[str],
     parameters: Mapping[str, Sequence[Any]],
     takes: Mapping[str, Sequence[str]],
     keys: Mapping[str, Sequence[Any]] | None = None,
 ) -> list[Point]:
-    """Every combination, in order: the last parameter changes first.
+    """Return every combination, in order; the last parameter changes fastest.
 
-    parameters: the values of each
-    takes: the names of the parameters of each controller; one that it does not know is left out
-    keys: the values of each key of the configuration
+    parameters: values of each parameter
+    takes: names of the parameters of each controller; a controller ignores the others
+    keys: values of each key of the configuration
 
     Raises `ParameterError` for a parameter that no controller has, and for too many points.
     """
     keys = keys or {}
     for name in parameters:
-        if not any(name in takes[each] for each in controllers):
+        if not any(name in takes[name_of_controller] for name_of_controller in controllers):
             if len(controllers) == 1:
                 raise ParameterError(f"{controllers[0]} has no parameter '{name}'")
             raise ParameterError(f"none of {', '.join(controllers)} has a parameter '{name}'")
-    found = []
-    for changed in _combinations(keys):
+    grid = []
+    for key_values in _combine(keys):
         for controller in dict.fromkeys(controllers):
-            own = {name: parameters[name] for name in parameters if name in takes[controller]}
-            found += [Point(controller, given, changed) for given in _combinations(own)]
-            if len(found) > MOST:
-                raise ParameterError(f"this grid has more than {MOST} points")
-    return found
+            values = {name: parameters[name] for name in parameters if name in takes[controller]}
+            grid += [Point(controller, given, key_values) for given in _combine(values)]
+            if len(grid) > MAX_POINTS:
+                raise ParameterError(f"this grid has more than {MAX_POINTS} points")
+    return grid
 
 
-def _combinations(values: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+def _combine(values: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
     count = 1
-    for each in values.values():
-        count *= len(each)
-    if count > MOST:
-        raise ParameterError(f"this grid has more than {MOST} points")
+    for options in values.values():
+        count *= len(options)
+    if count > MAX_POINTS:
+        raise ParameterError(f"this grid has more than {MAX_POINTS} points")
     return [
         dict(zip(values, combination, strict=True))
         for combination in itertools.product(*values.values())
@@ -158,7 +158,7 @@ def _combinations(values: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 
 def check(point: Point, limits: Limits) -> None:
-    """Raises `ParameterError` and `UnknownController` where it cannot swim within these limits."""
+    """Raise `ParameterError` or `UnknownController` if the point does not fit these limits."""
     try:
         registry.check(point.controller, point.parameters, limits)
     except ParameterError as error:
@@ -166,13 +166,13 @@ def check(point: Point, limits: Limits) -> None:
         raise ParameterError(f"{error}{f' (with {where})' if where else ''}", error.path) from None
 
 
-def check_remote(found: Sequence[Point], limits: Limits) -> None:
-    """The same for a fishd that may run on another machine.
+def check_remote(points: Sequence[Point], limits: Limits) -> None:
+    """Check points for a fishd that may run on another machine, as `check` does.
 
-    What only that can tell is left to it: a controller that is not installed here, a file.
+    Points that only that fishd can check are skipped: controllers not installed here, and files.
     """
     names = registry.names()
-    for point in found:
+    for point in points:
         if point.controller not in names:
             continue
         fields = registry.describe(point.controller).parameters
@@ -180,17 +180,20 @@ def check_remote(found: Sequence[Point], limits: Limits) -> None:
             check(point, limits)
 
 
-def axis(found: Sequence[Point]) -> str:
-    """The column to draw results over: the number with the most values; empty where all agree."""
+def find_axis(points: Sequence[Point]) -> str:
+    """Return the column for the horizontal axis: the numeric column with the most values.
+
+    Return an empty text if no column has two values.
+    """
     values: dict[str, set[Any]] = {}
-    for point in found:
+    for point in points:
         for name, value in point.columns().items():
             if is_number(value):
                 values.setdefault(name, set()).add(value)
-    counts = {name: len(each) for name, each in values.items() if len(each) > 1}
+    counts = {name: len(distinct) for name, distinct in values.items() if len(distinct) > 1}
     return max(counts, key=lambda name: counts[name]) if counts else ""
 
 
 def is_number(value: Any) -> bool:
-    """Can results be drawn over it?"""
+    """Return whether a value is a number, so that results can be drawn over it."""
     return isinstance(value, int | float) and not isinstance(value, bool)

@@ -1,4 +1,4 @@
-"""One point of a sweep: the true thrust or speed of a simulated fish, or the thrust of a rig."""
+"""Measurement of a sweep's points: true thrust or speed of a simulated fish, thrust of a rig."""
 
 import math
 import tempfile
@@ -21,22 +21,22 @@ from fishd.lab.simulation import Beats, VirtualRun
 from fishd.lab.statistics import per_watt, student95
 from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import Lengths, Point
-from fishd.lab.sweep.results import Found, Result
+from fishd.lab.sweep.results import PointResult, Result
 from fishd.recording.writer import RunWriter
 from fishd.virtual.plant.optimum import best_square_wave
 
-SLOWEST = 0.4
-"""A controller without a frequency is given the time of so slow a tail beat [Hz]."""
+SLOWEST_BEAT_HZ = 0.4
+"""Tail-beat frequency that limits the duration for a controller without a frequency [Hz]."""
 
 
-STOP = "stop"
-"""A file of this name in the folder ends a sweep in simulation."""
+STOP_FILE = "stop"
+"""Name of the file in the folder that ends a sweep in simulation."""
 
-Done = Callable[[Point, Found], None]
+PointCallback = Callable[[Point, PointResult], None]
 
 
 class Task(NamedTuple):
-    """A point, and all that a worker needs to measure it."""
+    """A point, and everything that a worker needs to measure it."""
 
     point: Point
     config: Config
@@ -44,29 +44,29 @@ class Task(NamedTuple):
     stop: Stop
 
 
-def simulated(task: Task) -> tuple[Found, bytes] | None:
-    """What a simulated fish does at a point, and its recording; None where told to stop."""
+def simulate_point(task: Task) -> tuple[PointResult, bytes] | None:
+    """Return the result and the recording of a simulated fish at a point; None if stopped."""
     if task.stop.asked()():
         return None
     with tempfile.TemporaryDirectory() as folder:
         extra = {name: str(value) for name, value in task.point.columns().items()}
         path = Path(folder) / "point.mcap"
         with RunWriter(path, source="simulation", note=task.point.label(), extra=extra) as writer:
-            result: Found
+            result: PointResult
 
-            def begun(run: VirtualRun) -> None:
+            def describe_run(run: VirtualRun) -> None:
                 writer.describe(run.config, run.about())
 
             if task.config.robot == "swimmer":
                 from fishd.lab.sweep.free_swimming import swim_freely
 
-                asked = (task.point, task.config, task.lengths, writer)
-                swum = swim_freely(*asked, begun, task.stop.asked())
-                if swum is None:
+                arguments = (task.point, task.config, task.lengths, writer)
+                speed = swim_freely(*arguments, describe_run, task.stop.asked())
+                if speed is None:
                     return None
-                result = swum
+                result = speed
             else:
-                result = swim(task.point, task.config, task.lengths, writer, begun)
+                result = swim(task.point, task.config, task.lengths, writer, describe_run)
         return result, path.read_bytes()
 
 
@@ -75,29 +75,33 @@ def swim(
     config: Config,
     lengths: Lengths,
     publisher: Publisher,
-    begun: Callable[[VirtualRun], None] = lambda run: None,
+    on_start: Callable[[VirtualRun], None] = lambda run: None,
 ) -> Result:
-    """The true thrust of a simulated fish at a point.
+    """Return the true thrust of a simulated fish at a point.
 
-    The error is that of the mean over the beats, as they differ from one another: by noise that
-    the controller answers, and by half beats that are no whole number of ticks.
+    The error is that of the mean over the beats. Beats differ because the controller reacts to
+    noise, and because half beats are not always whole ticks.
 
-    publisher: gets every tick, and every event
-    begun: called before the first of them
+    publisher: receives every tick and every event
+    on_start: called before the first tick
     Raises `ParameterError` and `UnknownController`.
     """
     config = replace(config, start=Start())
     limits = replace(config.limits, virtual=True)
     controller = registry.create(point.controller, point.parameters, limits)
-    asked = getattr(controller.parameters, "frequency", None)
-    slowest = min(asked, SLOWEST) if isinstance(asked, float) and asked > 0.0 else SLOWEST
+    frequency = getattr(controller.parameters, "frequency", None)
+    lowest_frequency = (
+        min(frequency, SLOWEST_BEAT_HZ)
+        if isinstance(frequency, float) and frequency > 0.0
+        else SLOWEST_BEAT_HZ
+    )
     settle = math.ceil(lengths.settle / config.tick)
-    most = settle + math.ceil((lengths.periods + 2) / slowest / config.tick)
+    max_ticks = settle + math.ceil((lengths.periods + 2) / lowest_frequency / config.tick)
     beats = Beats()
     with VirtualRun(config, publisher) as run:
-        begun(run)
+        on_start(run)
         run.loop.set_controller(point.controller, controller)
-        for index in range(most):
+        for index in range(max_ticks):
             angle = run.loop.applied
             window = run.tick()
             if index > settle:
@@ -130,74 +134,79 @@ def swim(
 def measure_point(point: Point, session: Session, seconds: float) -> Result:
     """Return the thrust measured at a point, without the drift of the sensor.
 
-    There is trouble, and no thrust, where fishd refuses this controller, or it gives up.
-
-    Raises as `fishd.lab.measurement.measure` what concerns the other points, too.
+    The result has `trouble` and no thrust if fishd refuses the controller, or if the controller
+    gives up. Errors of `fishd.lab.measurement.measure` that concern other points, too, are raised.
     """
     try:
-        found = measure(session, point.controller, point.parameters, seconds)
+        measured = measure(session, point.controller, point.parameters, seconds)
     except FishdError as error:
         if not concerns_one_controller(error):
             raise
         return Result(trouble=str(error))
-    gave, gave_error = per_watt(found.thrust, found.error, found.watts, found.watts_error)
+    per_watt_value, per_watt_error = per_watt(
+        measured.thrust, measured.error, measured.watts, measured.watts_error
+    )
     return Result(
-        thrust=found.thrust,
-        error=found.error,
-        beat_frequency=found.frequency,
-        power=found.watts,
-        thrust_per_watt=gave,
-        thrust_per_watt_error=gave_error,
-        seconds=len(found.ticks) * session.tick,
+        thrust=measured.thrust,
+        error=measured.error,
+        beat_frequency=measured.frequency,
+        power=measured.watts,
+        thrust_per_watt=per_watt_value,
+        thrust_per_watt_error=per_watt_error,
+        seconds=len(measured.ticks) * session.tick,
     )
 
 
 def swim_all(
     folder: SweepFolder,
-    found: Sequence[tuple[Point, Config]],
+    points: Sequence[tuple[Point, Config]],
     lengths: Lengths,
-    done: Done,
+    done: PointCallback,
     jobs: int | None = None,
     cluster: str | None = None,
 ) -> bool:
-    """Swim simulated fish at the points that are missing; False where a signal ended that before.
+    """Swim simulated fish at the missing points; return False if a signal ended the sweep early.
 
-    found: points, each with the configuration of its fish
-    done: called with each point that ends
+    points: the points, each with the configuration of its fish
+    done: called with each finished point
     jobs, cluster: as for `fishd.lab.parallel.workers`
-    Raises `FishdError`; the points before are kept.
+    Raises `FishdError`; the results of finished points are kept.
     """
-    missing = [each for each in found if folder.key(each[0]) not in folder.results]
+    missing = [pair for pair in points if folder.key(pair[0]) not in folder.results]
     is_whole = True
-    with workers(folder.path / STOP, jobs, cluster) as crew, on_signal(crew.ask_to_stop):
-        tasks = [Task(point, config, lengths, crew.stop) for point, config in missing]
-        for index, outcome in crew.run(simulated, tasks):
+    with workers(folder.path / STOP_FILE, jobs, cluster) as pool, on_signal(pool.ask_to_stop):
+        tasks = [Task(point, config, lengths, pool.stop) for point, config in missing]
+        for index, outcome in pool.run(simulate_point, tasks):
             if outcome is None:
                 is_whole = False
                 continue
             point = missing[index][0]
             result, recording = outcome
-            folder.keep(point, result, recording)
+            folder.add_result(point, result, recording)
             done(point, result)
     return is_whole
 
 
 def measure_all(
-    folder: SweepFolder, found: Sequence[Point], session: Session, seconds: float, done: Done
+    folder: SweepFolder,
+    points: Sequence[Point],
+    session: Session,
+    seconds: float,
+    done: PointCallback,
 ) -> None:
-    """Measure the missing points in a session, which the caller has entered.
+    """Measure the missing points in a session that the caller has entered.
 
-    A point whose controller is refused, or gives up, has trouble, and the next one is measured.
+    If a controller is refused or gives up, its point gets `trouble` and the next one is measured.
 
-    seconds: for each point [s]
-    Raises `FishdError`; the points before are kept.
+    seconds: duration of each point [s]
+    Raises `FishdError`; the results of finished points are kept.
     """
-    for point in found:
+    for point in points:
         if folder.key(point) in folder.results:
             continue
         extra = {name: str(value) for name, value in point.columns().items()}
-        path = folder.recording_of(point)
+        path = folder.recording_path(point)
         with session.recorded(path, point.label(), extra):
             result = measure_point(point, session, seconds)
-        folder.keep(point, result, path)
+        folder.add_result(point, result, path)
         done(point, result)

@@ -1,4 +1,4 @@
-"""What is found at a point of a sweep: a thrust, or the speed of a fish that swims freely."""
+"""Result at a point of a sweep: a thrust, or the speed of a freely swimming fish."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -8,72 +8,72 @@ from msgspec.structs import fields
 
 
 class Result(Struct, frozen=True):
-    """What was found at a point; the measured columns of a sweep's table."""
+    """Thrust at a point; the fields are the measured columns of a sweep's table."""
 
     thrust: float | None = None
-    """Mean over whole tail beats [N]; None where there is `trouble`."""
+    """Mean thrust over whole tail beats [N]; None if there is `trouble`."""
     error: float | None = None
-    """Half of its 95 % interval [N]; None where it is not known."""
+    """Half-width of the 95 % confidence interval of `thrust` [N]; None if unknown."""
     beat_frequency: float = 0.0
-    """Tail beats per second; 0 where the tail does not beat [Hz]."""
+    """Tail beats per second; 0 if the tail does not beat [Hz]."""
     relative_thrust: float | None = None
-    """Thrust over that of the best square wave; of a simulated fish."""
+    """Thrust divided by the thrust of the best square wave; of a simulated fish."""
     fin_amplitude: float | None = None
-    """Largest fin angle of a half beat, mean [rad]; of a simulated fish."""
+    """Mean over half beats of the largest fin angle [rad]; of a simulated fish."""
     power: float | None = None
-    """Electrical power of the servo [W]; None where it is not known."""
+    """Electrical power of the servo [W]; None if unknown."""
     thrust_per_watt: float | None = None
-    """[N/W]"""
+    """Thrust divided by `power` [N/W]."""
     thrust_per_watt_error: float | None = None
-    """Half of its 95 % interval [N/W]; of a simulated fish, as if its power had none."""
+    """Half-width of its 95 % confidence interval [N/W]; simulated power counts as exact."""
     seconds: float = 0.0
-    """How long it swam and rested [s]."""
+    """Duration of swimming and resting [s]."""
     trouble: str = ""
-    """Why there is no thrust."""
+    """Reason for a missing thrust; empty if there is a thrust."""
 
     @property
     def value(self) -> float | None:
-        """What curves are of."""
+        """Quantity that curves show."""
         return self.thrust
 
 
 class SpeedResult(Struct, frozen=True):
-    """The same of a fish that swims freely; powers are those of a fish one metre deep."""
+    """Speed at a point of a freely swimming fish; powers are those of a fish one metre deep."""
 
     speed: float | None = None
-    """Mean over whole tail beats, forwards [m/s]; None where there is `trouble`."""
+    """Mean forward speed over whole tail beats [m/s]; None if there is `trouble`."""
     error: float | None = None
-    """Half of its 95 % interval [m/s]; None where it is not known."""
+    """Half-width of the 95 % confidence interval of `speed` [m/s]; None if unknown."""
     beat_frequency: float = 0.0
-    """Tail beats per second; 0 where the tail does not beat [Hz]."""
+    """Tail beats per second; 0 if the tail does not beat [Hz]."""
     beats: int = 0
-    """How many were judged."""
+    """Number of measured beats."""
     settled: float | None = None
-    """From when on they were [s]; None where the speed still changed in the end."""
+    """Time at which the measured beats begin [s]; None if the speed still changed at the end."""
     tail_width: float | None = None
-    """How far the tip of the tail goes from side to side, over the length."""
+    """Distance of the tail tip from side to side, in body lengths."""
     muscle_power: float | None = None
-    """[W/m]"""
+    """Power of the muscles [W/m]."""
     cost_of_transport: float | None = None
-    """[J/(kg m)]"""
+    """Energy per mass and distance [J/(kg m)]."""
     strouhal: float | None = None
     froude_efficiency: float | None = None
     seconds: float = 0.0
-    """How long it swam [s]."""
+    """Duration of the swim [s]."""
     trouble: str = ""
-    """Why there is no speed."""
+    """Reason for a missing speed; empty if there is a speed."""
 
     @property
     def value(self) -> float | None:
-        """What curves are of."""
+        """Quantity that curves show."""
         return self.speed
 
 
-Found = Result | SpeedResult
+PointResult = Result | SpeedResult
 
 
 class Quantity(NamedTuple):
-    """What a sweep is about."""
+    """Quantity that a sweep measures."""
 
     name: str
     unit: str
@@ -81,12 +81,12 @@ class Quantity(NamedTuple):
 
     @property
     def measured(self) -> tuple[str, ...]:
-        """The measured columns of its table."""
+        """Names of the measured columns of the table."""
         return tuple(field.name for field in fields(self.result))
 
 
-def quantity_of(on: str, config: Mapping[str, Any], force_unit: str) -> Quantity:
-    """What is found of this fish; config: as plain data."""
+def select_quantity(on: str, config: Mapping[str, Any], force_unit: str) -> Quantity:
+    """Return the quantity that a sweep of this fish measures; config: as plain data."""
     if on == "simulation" and config.get("robot") == "swimmer":
         return Quantity("speed", "m/s", SpeedResult)
     return Quantity("thrust", force_unit, Result)

@@ -18,15 +18,15 @@ from fishd.core.signals import Event, Tick
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.rerun import rerun
 from fishd.lab.session import Disturbed, VirtualSession
-from fishd.lab.sweep.curves import WholeTicks, curves, whole_ticks
+from fishd.lab.sweep.curves import WholeTicks, find_best_of_whole_ticks, make_curves
 from fishd.lab.sweep.folder import SweepFolder
-from fishd.lab.sweep.grid import MOST, Lengths, Point
+from fishd.lab.sweep.grid import MAX_POINTS, Lengths, Point
 from fishd.lab.sweep.measuring import measure_all, swim
-from fishd.lab.sweep.results import Result, quantity_of
+from fishd.lab.sweep.results import Result, select_quantity
 from fishd.recording import open_run
 
 DRIFTS = ("simulation.noise=0.001", "simulation.drift=0.005", "simulation.offset_y=0.01")
-MEASURED = quantity_of("live", {}, "N").measured
+MEASURED = select_quantity("live", {}, "N").measured
 SQUARES = [Point("square", {"frequency": value}) for value in (1.25, 5.0 / 3.0, 2.0)]
 
 
@@ -166,7 +166,7 @@ def test_a_table_with_other_columns_is_refused_with_what_differs(
 def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
     folder = opened(tmp_path)
     for point in SQUARES:
-        folder.keep(point, Result(thrust=0.02, error=1e-4), b"a recording")
+        folder.add_result(point, Result(thrust=0.02, error=1e-4), b"a recording")
     table = tmp_path / "rows.csv"
     table.write_bytes(table.read_bytes()[:-30])
     assert len(opened(tmp_path).results) == 2
@@ -176,7 +176,7 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
 def test_a_row_that_is_cut_in_its_last_column_is_measured_again(tmp_path: Path) -> None:
     folder = opened(tmp_path)
     for point in SQUARES:
-        folder.keep(point, Result(thrust=0.02, error=1e-4), b"a recording")
+        folder.add_result(point, Result(thrust=0.02, error=1e-4), b"a recording")
     table = tmp_path / "rows.csv"
     whole = table.read_bytes()
     table.write_bytes(whole[:-1])
@@ -191,12 +191,12 @@ def test_a_sweep_of_as_many_points_as_are_permitted_is_gone_on_with(tmp_path: Pa
     third = 1.0 / 3.0
     result = Result(third, third, third, third, third, third, third, third, third)
     values = ",".join(map(str, msgspec.structs.astuple(result)))
-    rows = (f"square,{third + k},{values},ticks/{k}-square.mcap\n" for k in range(MOST))
+    rows = (f"square,{third + k},{values},ticks/{k}-square.mcap\n" for k in range(MAX_POINTS))
     with table.open("a", encoding="utf-8") as file:
         file.writelines(rows)
     folder = opened(tmp_path)
-    assert len(folder.results) == MOST
-    folder.sort([Point("square", {"frequency": third + k}) for k in range(MOST)])
+    assert len(folder.results) == MAX_POINTS
+    folder.sort([Point("square", {"frequency": third + k}) for k in range(MAX_POINTS)])
 
 
 def test_a_table_that_cannot_be_written_says_that_the_points_before_are_kept(
@@ -208,7 +208,7 @@ def test_a_table_that_cannot_be_written_says_that_the_points_before_are_kept(
     folder = opened(tmp_path)
     monkeypatch.setattr("fishd.lab.tables.Table.add", full)
     with pytest.raises(FishdError, match="No space left on device; what was measured before is k"):
-        folder.keep(SQUARES[0], Result(), b"a recording")
+        folder.add_result(SQUARES[0], Result(), b"a recording")
 
 
 def test_a_table_that_cannot_be_read_says_why(tmp_path: Path) -> None:
@@ -239,14 +239,14 @@ def test_a_curve_tells_the_best_frequency_of_whole_ticks_and_one_that_is_missing
     thrusts = {1.4: 0.0227, 1.6: 0.0251, 1.8: 0.0252, 2.0: 0.0238, 2.2: 0.0216, 2.5: 0.0176}
     found = [Point("square", {"frequency": value}) for value in thrusts]
     for point, thrust in zip(found, thrusts.values(), strict=True):
-        folder.keep(point, Result(thrust=thrust, error=1e-4), b"a recording")
-    (curve,) = curves(folder, found)
-    told = whole_ticks(folder, curve)
+        folder.add_result(point, Result(thrust=thrust, error=1e-4), b"a recording")
+    (curve,) = make_curves(folder, found)
+    told = find_best_of_whole_ticks(folder, curve)
     assert told == WholeTicks(2.0, 0.0238, 1e-4, pytest.approx(10 / 6))
     best = Point("square", {"frequency": 1.66667})
-    folder.keep(best, Result(thrust=0.02574, error=1e-4), b"a recording")
-    (curve,) = curves(folder, [*found, best])
-    assert whole_ticks(folder, curve) == WholeTicks(1.66667, 0.02574, 1e-4, None)
+    folder.add_result(best, Result(thrust=0.02574, error=1e-4), b"a recording")
+    (curve,) = make_curves(folder, [*found, best])
+    assert find_best_of_whole_ticks(folder, curve) == WholeTicks(1.66667, 0.02574, 1e-4, None)
 
 
 @pytest.mark.parametrize(("word", "shown"), [("auto", "auto"), (None, "default")])
@@ -256,8 +256,8 @@ def test_a_value_that_is_no_number_is_a_line_of_its_own_beside_the_curve(
     folder = opened(tmp_path, columns=["controller", "parameters.C"])
     found = [Point("swing", {"C": value}) for value in (word, 0.3, 0.6)]
     for point in found:
-        folder.keep(point, Result(thrust=0.02, error=1e-4), b"a recording")
-    shapes = [(curve.label, curve.over, curve.x) for curve in curves(folder, found)]
+        folder.add_result(point, Result(thrust=0.02, error=1e-4), b"a recording")
+    shapes = [(curve.label, curve.over, curve.x) for curve in make_curves(folder, found)]
     assert shapes == [(f"swing C={shown}", "", []), ("swing", "C", [0.3, 0.6])]
 
 

@@ -59,7 +59,7 @@ def test_figure_6_has_every_swim_and_at_least_ten_beats_of_each() -> None:
 @pytest.mark.slow
 def test_the_free_swimmer_still_swims_as_in_figure_6(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "fishd.lab.sweep.free_swimming.LEAST_TIME", 1.5
+        "fishd.lab.sweep.free_swimming.MIN_MEASURED_S", 1.5
     )  # its first steady beats do
     case = figure_6.Case("square", 3.0, 2.0)
     found, row = figure_6.swim(case, Lengths(settle=6.0, periods=6)), figure_6.row_of(case)

@@ -7,20 +7,29 @@ import pytest
 from rigs.documents import ROOT
 
 from fishd.core.errors import ParameterError
-from fishd.lab.sweep.grid import Point, axis, points, spread, typed
-from fishd.lab.sweep.peak import peak
+from fishd.lab.sweep.grid import Point, expand_values, find_axis, make_points, parse_value
+from fishd.lab.sweep.peak import find_peak
 
 
 def test_a_range_has_both_ends_and_decimals_that_are_exact() -> None:
-    assert list(map(float, spread("0.4:1.2:0.2"))) == [0.4, 0.6, 0.8, 1.0, 1.2]
-    assert list(map(float, spread("100:300:100,0.05, 1e-3"))) == [100.0, 200.0, 300.0, 0.05, 0.001]
+    assert list(map(float, expand_values("0.4:1.2:0.2"))) == [0.4, 0.6, 0.8, 1.0, 1.2]
+    assert list(map(float, expand_values("100:300:100,0.05, 1e-3"))) == [
+        100.0,
+        200.0,
+        300.0,
+        0.05,
+        0.001,
+    ]
 
 
 def test_a_value_is_a_number_where_it_is_one() -> None:
     texts = ["0.6", "1.0", "1E+1", "3", "on", "nan", "inf", "pi/servo", "1e400"]
-    assert [*map(typed, texts)] == [0.6, 1, 10, 3, "on", "nan", "inf", "pi/servo", "1e400"]
-    assert isinstance(typed("3"), int)  # as a seed must be
-    assert axis([Point("swing", {}, {"plant.xi": typed(x)}) for x in ("0.9", "1")]) == "plant.xi"
+    assert [*map(parse_value, texts)] == [0.6, 1, 10, 3, "on", "nan", "inf", "pi/servo", "1e400"]
+    assert isinstance(parse_value("3"), int)  # as a seed must be
+    assert (
+        find_axis([Point("swing", {}, {"plant.xi": parse_value(x)}) for x in ("0.9", "1")])
+        == "plant.xi"
+    )
 
 
 @pytest.mark.parametrize(
@@ -28,20 +37,20 @@ def test_a_value_is_a_number_where_it_is_one() -> None:
 )
 def test_what_is_no_range_says_what_is_needed(text: str) -> None:
     with pytest.raises(ParameterError, match=r"LOW:HIGH:STEP|missing|more than"):
-        spread(text)
+        expand_values(text)
 
 
 def test_a_grid_has_every_combination_and_each_controller_only_its_own_parameters() -> None:
     takes = {"square": ["frequency", "amplitude"], "swing": ["C", "amplitude"]}
     values = {"frequency": [1.0, 2.0], "C": [0.6], "amplitude": [0.3]}
-    found = points(["square", "swing"], values, takes, {"plant.xi": ["0.6", "1.2"]})
+    found = make_points(["square", "swing"], values, takes, {"plant.xi": ["0.6", "1.2"]})
     assert len(found) == 6
     assert found[-1] == Point("swing", {"C": 0.6, "amplitude": 0.3}, {"plant.xi": "1.2"})
-    assert axis(found) == "parameters.frequency"
+    assert find_axis(found) == "parameters.frequency"
     with pytest.raises(ParameterError, match=r"^square has no parameter 'phase'$"):
-        points(["square"], {"phase": [0.1]}, takes)
+        make_points(["square"], {"phase": [0.1]}, takes)
     with pytest.raises(ParameterError, match=r"^none of square, swing has a parameter 'phase'$"):
-        points(["square", "swing"], {"phase": [0.1]}, takes)
+        make_points(["square", "swing"], {"phase": [0.1]}, takes)
 
 
 def test_the_best_of_a_noisy_curve_is_within_its_interval_as_often_as_it_says() -> None:
@@ -51,7 +60,7 @@ def test_the_best_of_a_noisy_curve_is_within_its_interval_as_often_as_it_says() 
     for _ in range(300):
         truth = generator.uniform(1.5, 1.9)
         y = 25e-3 - 20e-3 * (x - truth) ** 2 + generator.normal(0.0, 0.3e-3, len(x))
-        found = peak(x.tolist(), y.tolist(), [0.6e-3] * len(x))
+        found = find_peak(x.tolist(), y.tolist(), [0.6e-3] * len(x))
         assert found.x_low is not None
         assert found.x_high is not None
         hits += found.x_low <= truth <= found.x_high
@@ -63,7 +72,7 @@ def test_the_best_is_that_of_the_curve_and_not_of_the_grid(waveform: str, freque
     with (ROOT / "tests/reference/thrust_vs_frequency.csv").open(encoding="utf-8") as file:
         own = [row for row in csv.DictReader(file) if row["waveform"] == waveform]
     x = [float(row["frequency_Hz"]) for row in own]
-    found = peak(x, [float(row["mean_thrust_mN"]) for row in own], [None] * len(x))
+    found = find_peak(x, [float(row["mean_thrust_mN"]) for row in own], [None] * len(x))
     assert found.x == pytest.approx(frequency, abs=0.02)
     assert found.x_low is not None
     assert found.x_high is not None
@@ -71,5 +80,5 @@ def test_the_best_is_that_of_the_curve_and_not_of_the_grid(waveform: str, freque
 
 
 def test_a_best_at_the_edge_is_told_and_has_no_interval() -> None:
-    found = peak([1.0, 1.2, 1.4], [1.0, 2.0, 3.0], [0.1, 0.1, 0.1])
+    found = find_peak([1.0, 1.2, 1.4], [1.0, 2.0, 3.0], [0.1, 0.1, 0.1])
     assert (found.x, found.at_edge, found.x_low) == (1.4, True, None)

@@ -14,9 +14,9 @@ from fishd.config import Config
 from fishd.core.signals import Event, Tick
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.sweep import figure, free_swimming
-from fishd.lab.sweep.curves import best, curves, plain
+from fishd.lab.sweep.curves import best_to_builtins, find_best, make_curves
 from fishd.lab.sweep.folder import SweepFolder
-from fishd.lab.sweep.free_swimming import is_steady, judged_from, swim_freely
+from fishd.lab.sweep.free_swimming import find_first_measured, is_steady, swim_freely
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import SpeedResult
 
@@ -47,9 +47,9 @@ def beats(speeds: np.ndarray, period: float = 0.5) -> tuple[np.ndarray, np.ndarr
 def test_the_start_is_dropped_until_the_mean_is_known_best() -> None:
     times = 0.5 * np.arange(40)
     noise = 1e-3 * np.random.default_rng(1).standard_normal(40)
-    first = judged_from(*beats(0.1 * (1.0 - np.exp(-times / 1.5)) + noise))
+    first = find_first_measured(*beats(0.1 * (1.0 - np.exp(-times / 1.5)) + noise))
     assert 6 <= first <= 15
-    assert judged_from(*beats(0.1 + noise)) <= 8
+    assert find_first_measured(*beats(0.1 + noise)) <= 8
 
 
 def test_a_speed_that_still_rises_is_not_steady_and_one_that_only_scatters_is() -> None:
@@ -76,8 +76,8 @@ def test_a_fish_whose_speed_still_changes_is_judged_by_the_later_half_and_that_i
 def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fishd.lab.sweep.free_swimming.LEAST_TIME", 0.5)
-    monkeypatch.setattr("fishd.lab.sweep.free_swimming.STEADY", 0.5)
+    monkeypatch.setattr("fishd.lab.sweep.free_swimming.MIN_MEASURED_S", 0.5)
+    monkeypatch.setattr("fishd.lab.sweep.free_swimming.STEADY_FRACTION", 0.5)
     found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
     assert found
     assert found.settled is not None
@@ -116,12 +116,12 @@ def test_a_table_of_speeds_is_gone_on_with_and_swing_is_drawn_among_the_waves(
     speeds = (0.02, 0.05, 0.07, 0.06, 0.03, 0.06, 0.07)
     for point, speed in zip(found, speeds, strict=True):
         result = SpeedResult(speed=speed, error=1e-3, beat_frequency=2.9, settled=4.0, beats=10)
-        folder.keep(point, result, b"a recording")
+        folder.add_result(point, result, b"a recording")
     assert opened(tmp_path, config).results == folder.results
-    drawn = curves(folder, found)
-    told = best(drawn[0])
+    drawn = make_curves(folder, found)
+    told = find_best(drawn[0])
     assert told
-    shown = plain(told, folder.quantity)
+    shown = best_to_builtins(told, folder.quantity)
     assert shown["speed"] == pytest.approx(0.07, abs=4e-3)
     assert "thrust" not in shown
     picture = tmp_path / "speed.svg"
