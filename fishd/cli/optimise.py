@@ -115,7 +115,7 @@ def _optimise(
     from fishd.lab import drawing
     from fishd.lab.measurement import REST
     from fishd.lab.optimise.aim import Aim
-    from fishd.lab.optimise.trials import lengths
+    from fishd.lab.optimise.trials import trial_durations
 
     drawing.check_installed()
     if picture:
@@ -125,9 +125,9 @@ def _optimise(
     aim = Aim(objective or "thrust", at_least * 1e-3 if at_least else None)
     with fish.session() as session:
         ranges = [_range(text, name, parameters, session) for text in dict.fromkeys(over)]
-        search = aim.search(ranges, seed)
+        search = aim.make_search(ranges, seed)
         _check_ends(name, parameters, ranges, session)
-        if budget < (least := 2.0 * REST + lengths(parameters)[1]):
+        if budget < (least := 2.0 * REST + trial_durations(parameters)[1]):
             raise ParameterError(
                 f"a budget of {budget:g} s is too short: one candidate takes {least:.3g} s"
             )
@@ -197,7 +197,7 @@ class _Optimisation:
             raise ParameterError(
                 f"a budget of {self.budget:g} s is too short for the first candidate"
             )
-        proposal = self.search.proposal()
+        proposal = self.search.propose()
         with ending.measuring():
             optimum = self._judge(proposal, waited)
             folder, unit = self.experiment.path, self.session.unit
@@ -231,7 +231,7 @@ class _Optimisation:
 
         Returns how long the fish waited for the next candidate [s].
         """
-        from fishd.lab.optimise.trials import keep_trial, trials
+        from fishd.lab.optimise.trials import measure_trials, write_trial
 
         search, session, experiment = self.search, self.session, self.experiment
         last = self.trials[-1] if self.trials else None
@@ -239,7 +239,7 @@ class _Optimisation:
         if last:
             there = counted(len(self.trials), "candidate")
             echo(f"{experiment.path}: {there} there already", err=self.as_json)
-            if self._is_done(search.proposal()):
+            if self._is_done(search.propose()):
                 return 0.0
         begin = time.monotonic()
         observe = partial(self.aim.observe, search)
@@ -250,12 +250,12 @@ class _Optimisation:
             showing(self.budget, "s", err=self.as_json) as show,
         ):
             session.progress = show.at
-            for trial in trials(
+            for trial in measure_trials(
                 session, self.controller, self.fixed, search, self.budget, last, observe
             ):
-                keep_trial(experiment, trial)
+                write_trial(experiment, trial)
                 self.trials.append(trial)
-                proposal = search.proposal()
+                proposal = search.propose()
                 best = proposal if search.is_warm else None
                 line = _line(search.trials, trial, best, session.unit, self.units)
                 show.done(line, trial.passed)
@@ -290,7 +290,9 @@ class _Optimisation:
 
         if not isinstance(self.search, LeastPower):
             return self.search
-        return self.search.alike((t.parameters, t.power, t.power_error) for t in self.trials)
+        return self.search.with_observations(
+            (t.parameters, t.power, t.power_error) for t in self.trials
+        )
 
 
 def _label(aim: "Aim", unit: str) -> str:
@@ -309,7 +311,7 @@ def _fields() -> dict[str, Field]:
 def _range(text: str, controller: str, given: dict[str, Any], session: "Session") -> "Range":
     """`frequency`, or `frequency=1:3`; raises `UsageError`."""
     from fishd.lab.optimise.search import Range
-    from fishd.lab.optimise.trials import check_bounds, default_range, whole_ticks
+    from fishd.lab.optimise.trials import check_bounds, default_range, restrict_to_whole_ticks
 
     name, equals, ends = text.partition("=")
     known = _fields()
@@ -325,7 +327,7 @@ def _range(text: str, controller: str, given: dict[str, Any], session: "Session"
             raise click.UsageError(
                 f"--over {name}: it has no bounds on both sides: write --over {name}=LOW:HIGH"
             )
-        return whole_ticks(found, session.tick) if name == "frequency" else found
+        return restrict_to_whole_ticks(found, session.tick) if name == "frequency" else found
     try:
         low, high = (float(end) for end in ends.split(":"))
     except ValueError:
@@ -335,7 +337,7 @@ def _range(text: str, controller: str, given: dict[str, Any], session: "Session"
     found = Range(name, low, high)
     found.check()
     check_bounds(found, known[name], session)
-    return whole_ticks(found, session.tick) if name == "frequency" else found
+    return restrict_to_whole_ticks(found, session.tick) if name == "frequency" else found
 
 
 class Optimum(Struct, frozen=True):
@@ -426,11 +428,11 @@ def _optimum_of(
 
     last = measured[-1]
     force = [(each.parameters, each.thrust, each.error) for each in measured]
-    thrust, error = search.alike(force).expected(found.parameters)
+    thrust, error = search.with_observations(force).predict(found.parameters)
     power = power_error = None
     if all(math.isfinite(each.power) for each in measured):
         taken = [(each.parameters, each.power, each.power_error) for each in measured]
-        power, power_error = search.alike(taken).expected(found.parameters)
+        power, power_error = search.with_observations(taken).predict(found.parameters)
     gives, gives_error = per_watt(thrust, error, power, power_error)
     if aim.objective == "thrust-per-watt" and aim.target is None:
         gives, gives_error = found.value, found.error

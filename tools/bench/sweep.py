@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from common.report import DOCS, Options, Report, progress, table
 from fishd.config import Config, load
 from fishd.lab.optimise.search import Range, Search
-from fishd.lab.optimise.trials import trials, whole_ticks
+from fishd.lab.optimise.trials import measure_trials, restrict_to_whole_ticks
 from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
 
@@ -62,11 +62,11 @@ def search(config: Config, seed: int) -> tuple[int, int, int, float, bool]:
     grid = [0.5 / (ticks * config.tick) for ticks in range(5, 8)]
     frequencies = [*np.arange(1.5, 2.0, 0.02).tolist(), *grid]
     best = max(frequencies, key=thrust)
-    found = Search([whole_ticks(Range("frequency", *RANGE), config.tick)], seed)
+    found = Search([restrict_to_whole_ticks(Range("frequency", *RANGE), config.tick)], seed)
     swum, shares = [], []
     with VirtualSession(config) as rig:
-        for trial in trials(rig, "square", {}, found, BUDGET):
-            proposal = found.proposal()
+        for trial in measure_trials(rig, "square", {}, found, BUDGET):
+            proposal = found.propose()
             swum.append(trial.swum)
             at = round(proposal.parameters["frequency"], 3)
             shares.append(thrust(at) / thrust(best))

@@ -1,1 +1,1 @@
-"""The best parameters of a controller on a rig, searched by Bayesian optimisation."""
+"""Search of the best parameters of a controller on a rig, by Bayesian optimisation."""

@@ -1,4 +1,4 @@
-"""What a search is for: thrust, thrust for each watt, or a thrust at the least power."""
+"""Aim of a search: most thrust, most thrust per watt, or a given thrust at the least power."""
 
 import math
 from collections.abc import Sequence
@@ -12,23 +12,23 @@ from fishd.lab.statistics import per_watt
 
 
 class Aim(NamedTuple):
-    """What is looked for."""
+    """Objective or target of a search."""
 
     objective: Literal["thrust", "thrust-per-watt"] = "thrust"
-    """What to maximise, unless there is a target."""
+    """Quantity to maximise; ignored if there is a target."""
     target: float | None = None
-    """The thrust that is to be reached at the least power [N]."""
+    """Thrust to reach at the least power [N]."""
 
-    def search(self, ranges: Sequence[Range], seed: int) -> Search | LeastPower:
-        """One that looks for it; raises `ParameterError`."""
+    def make_search(self, ranges: Sequence[Range], seed: int) -> Search | LeastPower:
+        """Return a new search with this aim; raises `ParameterError`."""
         if self.target is not None:
             return LeastPower(ranges, self.target, seed)
         return Search(ranges, seed)
 
     def observe(self, search: Search | LeastPower, trial: Trial) -> None:
-        """Tell a search what a candidate is worth.
+        """Add a measured candidate to a search, with the quantity of this aim.
 
-        Raises `ParameterError` where that needs the power, and it is not known.
+        Raises `ParameterError` if the aim needs the power, and the power is unknown.
         """
         thrust = trial.thrust, trial.error
         if self.objective == "thrust" and self.target is None:
@@ -38,7 +38,7 @@ class Aim(NamedTuple):
         if not (math.isfinite(trial.power) and trial.power > 0.0):
             raise ParameterError(
                 "this needs the power of the servo, and the fish has no power meter that can be "
-                "read: power_meter in its configuration, docs/how-to/power.md"
+                "read: set power_meter in its configuration, see docs/how-to/power.md"
             )
         if isinstance(search, LeastPower):
             search.observe(trial.parameters, thrust, (trial.power, trial.power_error))

@@ -1,9 +1,9 @@
-"""The parameters that give a thrust at the least power: two quantities, each with its own error.
+"""Search of the parameters that give a thrust at the least power, by constrained optimisation.
 
-A Gaussian process stands for the thrust and another for the logarithm of the power. What is
-measured next is where the improvement of the power, times the probability that the thrust is
-reached, is expected to be largest (Gardner et al., Bayesian Optimization with Inequality
-Constraints, ICML 2014); until it is reached somewhere, where that is most probable.
+One Gaussian process models the thrust, another the logarithm of the power. The next candidate
+maximises the expected improvement of the power times the probability that the thrust is reached
+(Gardner et al., Bayesian Optimization with Inequality Constraints, ICML 2014). Until a measured
+candidate reaches the thrust, the next one maximises that probability alone.
 """
 
 import math
@@ -15,15 +15,15 @@ from scipy.stats import norm
 from fishd.lab.optimise.search import Array, Proposal, Range, Search
 from fishd.lab.statistics import Z95
 
-CURVES = 400
-"""How many pairs of curves the interval of the best is found from."""
+SAMPLE_COUNT = 400
+"""Number of pairs of sampled curves from which the interval of the best is computed."""
 
 
 class LeastPower:
-    """What was measured, what to measure next, and what seems best; as `Search`."""
+    """Search of a thrust at the least power; its interface is that of `Search`."""
 
     def __init__(self, ranges: Sequence[Range], target: float, seed: int = 0) -> None:
-        """target: the thrust to reach [N]; raises `ParameterError` as `Search` does"""
+        """target: thrust to reach [N]; raises `ParameterError` as `Search` does"""
         self.target = target
         self._seed = seed
         self._thrust, self._power = Search(ranges, seed), Search(ranges, seed)
@@ -31,12 +31,12 @@ class LeastPower:
 
     @property
     def trials(self) -> int:
-        """How many candidates were measured."""
+        """Number of measured candidates."""
         return self._thrust.trials
 
     @property
     def is_warm(self) -> bool:
-        """Is there enough to judge an expected improvement?"""
+        """Whether enough was measured to judge an expected improvement."""
         return self._thrust.is_warm
 
     def observe(
@@ -45,32 +45,34 @@ class LeastPower:
         thrust: tuple[float, float],
         power: tuple[float, float],
     ) -> None:
-        """Take what a candidate gave [N] and took [W], each with half of its 95 % interval."""
+        """Add the thrust [N] and the power [W] of a candidate, each with its half-width (95 %)."""
         self._thrust.observe(parameters, *thrust)
         watts, error = power
         self._power.observe(parameters, math.log(watts), error / watts)
 
     def suggest(self) -> dict[str, float]:
-        """The next candidate: first some that fill the ranges, then what promises most."""
+        """Return the next candidate: first points that fill the ranges, then the most promising."""
         if not self._thrust.is_filled:
             return self._thrust.suggest()
-        places = self._thrust.places()
-        gain, _ = self._gain(places)
+        places = self._thrust.all_shares()
+        gain, _ = self._expected_gain(places)
         return self._thrust.parameters_at(places[int(np.argmax(gain))])
 
-    def proposal(self) -> Proposal:
-        """The least power among what reaches the thrust; the most thrust where nothing does."""
-        places = self._thrust.places()
-        thrust, thrust_covariance = self._thrust.expectation(places)
-        power, power_covariance = self._power.expectation(places)
-        gain, reached = self._gain(places)
+    def propose(self) -> Proposal:
+        """Return the place of least power that reaches the thrust; else that of the most thrust."""
+        places = self._thrust.all_shares()
+        thrust, thrust_covariance = self._thrust.predict_shares(places)
+        power, power_covariance = self._power.predict_shares(places)
+        gain, reached = self._expected_gain(places)
         if not (thrust >= self.target).any():
-            found = self._thrust.proposal()
-            return found._replace(improvement=max(found.improvement, math.exp(gain.max())))
+            most_thrust = self._thrust.propose()
+            return most_thrust._replace(
+                improvement=max(most_thrust.improvement, math.exp(gain.max()))
+            )
         best = int(np.argmin(np.where(thrust >= self.target, power, np.inf)))
         generator = np.random.default_rng(self._seed)
         draws = [
-            generator.multivariate_normal(mean, covariance, CURVES, "ignore", method="eigh")
+            generator.multivariate_normal(mean, covariance, SAMPLE_COUNT, "ignore", method="eigh")
             for mean, covariance in ((thrust, thrust_covariance), (power, power_covariance))
         ]
         reaching = draws[0] >= self.target
@@ -88,25 +90,27 @@ class LeastPower:
             float(gain.max()) if reached else 1.0,
         )
 
-    def alike(self, observed: Iterable[tuple[Mapping[str, float], float, float]]) -> Search:
-        """As of `Search`."""
-        return self._thrust.alike(observed)
+    def with_observations(
+        self, observed: Iterable[tuple[Mapping[str, float], float, float]]
+    ) -> Search:
+        """Return a search of one quantity, as `Search.with_observations` does."""
+        return self._thrust.with_observations(observed)
 
-    def _gain(self, places: Array) -> tuple[Array, bool]:
-        """The share of power that is expected to be saved there, and True.
+    def _expected_gain(self, places: Array) -> tuple[Array, bool]:
+        """Return the fraction of power that each place is expected to save, and True.
 
-        While the thrust is not expected to be reached at any place that was measured: the
-        logarithm of the probability that it is there, and False.
+        If no measured place is expected to reach the thrust, return the logarithm of the
+        probability that each place reaches it, and False.
         """
         tried = self._thrust.tried
-        both: Array = np.vstack((places, tried))
-        thrust, thrust_covariance = self._thrust.expectation(both)
-        power, power_covariance = self._power.expectation(both)
+        all_places: Array = np.vstack((places, tried))
+        thrust, thrust_covariance = self._thrust.predict_shares(all_places)
+        power, power_covariance = self._power.predict_shares(all_places)
         reaching = power[-len(tried) :][thrust[-len(tried) :] >= self.target]
         n = len(places)
         deviation, power_deviation = (
-            np.sqrt(np.maximum(np.diag(each)[:n], 1e-18))
-            for each in (thrust_covariance, power_covariance)
+            np.sqrt(np.maximum(np.diag(covariance)[:n], 1e-18))
+            for covariance in (thrust_covariance, power_covariance)
         )
         margin = (thrust[:n] - self.target) / deviation
         if not reaching.size:

@@ -1,4 +1,4 @@
-"""Measures the candidates of a search on a rig: the fish swims with each, and rests in between."""
+"""Measurement of a search's candidates on a rig: the fish swims with each, and rests between."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -15,56 +15,56 @@ from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.session import Session, refuse_lost
 
-STEADY = 1.5
-"""How long the fish swims with each candidate once it has settled, at least [s]."""
-BEATS = 2.0
-"""How many beats of a candidate it swims then, at least: so one at least is whole."""
-WAVE_SETTLES = 0.75
-"""A given wave is steady after so long [s]: there is no estimator in it, and the fin follows."""
-FREQUENCIES = 0.4
-"""The lowest frequency that is searched unless another is asked for [Hz]."""
-LONGEST = 200
-"""The longest half beat that is searched where the frequencies begin at 0 [ticks]."""
-FEWEST_VALUES = 3
-"""A search of fewer frequencies is none: `compare` or `sweep` measures them all."""
-SHORTEST = 2
-"""The shortest half beat that is searched unless another is asked for [ticks]."""
+MIN_STEADY_S = 1.5
+"""Shortest measured time of each candidate, after it has settled [s]."""
+MIN_BEATS = 2.0
+"""Smallest number of measured beats of each candidate; at least one of them is whole."""
+WAVE_SETTLE_S = 0.75
+"""Time until a wave of fixed frequency is steady [s]; no estimator has to converge."""
+MIN_FREQUENCY_HZ = 0.4
+"""Default lower end of the range of a frequency [Hz]."""
+MAX_HALF_BEAT_TICKS = 200
+"""Longest half beat of a search whose frequencies begin at 0 [ticks]."""
+MIN_VALUES = 3
+"""Smallest number of frequencies of a search; fewer can all be measured by `compare`."""
+MIN_HALF_BEAT_TICKS = 2
+"""Default shortest half beat of a search [ticks]."""
 
 
 class Trial(NamedTuple):
-    """One candidate, as it was measured."""
+    """Measured candidate."""
 
     parameters: dict[str, float]
-    """The searched ones."""
+    """Searched parameters."""
     thrust: float
-    """[N]"""
+    """Measured thrust [N]."""
     error: float
-    """Half of its 95 % interval [N]."""
+    """Half-width of the 95 % confidence interval of `thrust` [N]."""
     power: float
-    """Electrical power of the servo [W]; NaN where it is not known."""
+    """Electrical power of the servo [W]; NaN if unknown."""
     power_error: float
-    """Half of its 95 % interval [W]."""
+    """Half-width of the 95 % confidence interval of `power` [W]."""
     swum: int
-    """Ticks of swimming so far."""
+    """Ticks of swimming from the beginning of the search."""
     passed: float
-    """Time since the beginning, rest included [s]."""
+    """Tank time from the beginning of the search, rests included [s]."""
     rotation: float = 0.0
-    """Rotation of the sensor as this swim shows it; 0 for one that was read from a table [rad]."""
+    """Rotation of the sensor visible in this swim; 0 for a trial read from a table [rad]."""
 
 
-COLUMNS = ("thrust", "error", "power", "power_error", "swum", "passed")
-"""Columns of a table of trials, after those of the searched parameters."""
+TRIAL_COLUMNS = ("thrust", "error", "power", "power_error", "swum", "passed")
+"""Columns of a table of trials, after the columns of the searched parameters."""
 
 
 def read_trials(experiment: Experiment, names: Iterable[str]) -> list[Trial]:
-    """Return the trials that a search has kept so far.
+    """Return the trials that a search has written.
 
-    names: of the searched parameters
-    Raises `ConfigError` where the table is of something else.
+    names: names of the searched parameters
+    Raises `ConfigError` if the table is not that of such a search.
     """
     names = tuple(names)
     trials = []
-    for row in experiment.read_rows((*names, *COLUMNS)):
+    for row in experiment.read_rows((*names, *TRIAL_COLUMNS)):
         try:
             values = {name: float(text) for name, text in row.items()}
         except ValueError as error:
@@ -74,12 +74,14 @@ def read_trials(experiment: Experiment, names: Iterable[str]) -> list[Trial]:
     return trials
 
 
-def keep_trial(experiment: Experiment, trial: Trial) -> None:
+def write_trial(experiment: Experiment, trial: Trial) -> None:
     """Add a trial to the table of a search; raises `FishdError`."""
-    experiment.add_row({**trial.parameters, **{name: getattr(trial, name) for name in COLUMNS}})
+    experiment.add_row(
+        {**trial.parameters, **{name: getattr(trial, name) for name in TRIAL_COLUMNS}}
+    )
 
 
-def trials(
+def measure_trials(
     session: Session,
     controller: str,
     fixed: Mapping[str, Any],
@@ -90,23 +92,23 @@ def trials(
 ) -> Iterator[Trial]:
     """Measure candidates on a rig for as long as the budget lasts.
 
-    The fish swims with a candidate, and rests; its thrust is what swimming adds to the force,
-    beside a drift that is told apart by the rests before and after (`fishd.lab.measurement`).
+    The fish swims with a candidate, then rests. The thrust is the force while swimming minus a
+    drift that is interpolated between the rests before and after (`fishd.lab.measurement`).
 
     fixed: parameters that are not searched
     budget: time in the tank [s]
-    before: the last one of a search that is resumed, which `search` knows already
-    observe: told of each candidate, for `search` to know it; by default, its thrust
+    before: last trial of a resumed search, which `search` has observed already
+    observe: called with each trial to add it to `search`; by default its thrust is added
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """
     rest: list[Tick] = []
-    alike: list[Step] = []
+    steps: list[Step] = []
     swum, passed = (before.swum, before.passed) if before else (0, 0.0)
     passed += REST
     while True:
         candidate = search.suggest()
         parameters = {**fixed, **candidate}
-        settles, length = lengths(parameters)
+        settles, length = trial_durations(parameters)
         if passed + length + REST > budget:
             return
         if not rest:
@@ -115,16 +117,24 @@ def trials(
         after = session.rest(REST)
         ticks = [*rest, *swim, *after]
         refuse_lost(ticks, (REST, length, REST), session.tick)
-        found = evaluate(samples_of(ticks), session.tick, settles, alike=alike)
-        alike += found.steps
+        evaluation = evaluate(samples_of(ticks), session.tick, settles, alike=steps)
+        steps += evaluation.steps
         swum += len(swim)
         passed += length + REST
         power, power_error = (
-            math.nan if each is None else each for each in (found.watts, found.watts_error)
+            math.nan if value is None else value
+            for value in (evaluation.watts, evaluation.watts_error)
         )
         rotation = visible_rotation(swim, settles)
         trial = Trial(
-            candidate, found.thrust, found.error, power, power_error, swum, passed, rotation
+            candidate,
+            evaluation.thrust,
+            evaluation.error,
+            power,
+            power_error,
+            swum,
+            passed,
+            rotation,
         )
         if observe:
             observe(trial)
@@ -135,51 +145,55 @@ def trials(
         rest = after
 
 
-def whole_ticks(frequencies: Range, tick: float) -> Range:
-    """The same range, of the frequencies alone whose half beats are whole ticks.
+def restrict_to_whole_ticks(frequencies: Range, tick: float) -> Range:
+    """Return the range with only those frequencies whose half beats are whole ticks.
 
-    A few beats of one of those are like all others. Other half beats are dithered, over more beats
-    than a candidate swims.
+    All beats of such a frequency are alike. Other half beats are dithered, over more beats than
+    a candidate swims.
 
     tick: period of the loop [s]
-    Raises `ParameterError` where there are fewer than `FEWEST_VALUES`.
+    Raises `ParameterError` if there are fewer than `MIN_VALUES`.
     """
     name, low, high, _ = frequencies
-    longest = math.floor(0.5 / low / tick + 1e-9) if low > 0.0 else LONGEST
+    longest = math.floor(0.5 / low / tick + 1e-9) if low > 0.0 else MAX_HALF_BEAT_TICKS
     shortest = max(1, math.ceil(0.5 / high / tick - 1e-9))
     values = [0.5 / (ticks * tick) for ticks in range(longest, shortest - 1, -1)]
-    if len(values) < FEWEST_VALUES:
-        around = range(longest + 1, max(0, shortest - 2), -1)
-        near = ", ".join(f"{0.5 / (ticks * tick):.4g}" for ticks in around)
-        there = ", ".join(f"{value:.4g}" for value in values) or "none"
+    if len(values) < MIN_VALUES:
+        half_beats = range(longest + 1, max(0, shortest - 2), -1)
+        near = ", ".join(f"{0.5 / (ticks * tick):.4g}" for ticks in half_beats)
+        listed = ", ".join(f"{value:.4g}" for value in values) or "none"
         raise ParameterError(
             f"{name}: too few values from {low:g} to {high:g}: only half beats of whole ticks are "
-            f"compared, {FEWEST_VALUES} at least; there: {there}; around: {near}"
+            f"compared, {MIN_VALUES} at least; in this range: {listed}; near it: {near}"
         )
     return Range(name, low, high, tuple(values))
 
 
-def lengths(parameters: Mapping[str, Any]) -> tuple[float, float]:
-    """After how long a candidate is steady, and how long it swims in all [s]."""
+def trial_durations(parameters: Mapping[str, Any]) -> tuple[float, float]:
+    """Return the time until a candidate is steady, and the whole time of its swim [s]."""
     frequency = parameters.get("frequency")
     if isinstance(frequency, int | float) and frequency > 0.0:
-        return WAVE_SETTLES, WAVE_SETTLES + max(STEADY, BEATS / frequency)
-    return SWIM_SETTLE_TIME_S, SWIM_SETTLE_TIME_S + STEADY
+        return WAVE_SETTLE_S, WAVE_SETTLE_S + max(MIN_STEADY_S, MIN_BEATS / frequency)
+    return SWIM_SETTLE_TIME_S, SWIM_SETTLE_TIME_S + MIN_STEADY_S
 
 
 def default_range(field: Field, session: Session) -> Range | None:
-    """What is searched of a parameter unless more is said; None where its bounds leave it open.
+    """Return the default range of a parameter; None if it is not bounded on both sides.
 
-    A frequency from `FREQUENCIES` to half beats of `SHORTEST` ticks, an amplitude up to that of
-    the rig; an end that is no value itself is moved in by a twentieth.
+    A frequency is searched from `MIN_FREQUENCY_HZ` to half beats of `MIN_HALF_BEAT_TICKS`, an
+    amplitude up to that of the rig. An excluded end is moved inwards by a twentieth of the range.
     """
-    low, high = _ends(field)
+    low, high = _read_bounds(field)
     if field.name == "amplitude":
         return Range(field.name, session.amplitude / 20.0, session.amplitude)
     if math.isinf(low) or math.isinf(high):
         return None
     if field.name == "frequency":
-        return Range(field.name, max(low, FREQUENCIES), min(high, 0.5 / (SHORTEST * session.tick)))
+        return Range(
+            field.name,
+            max(low, MIN_FREQUENCY_HZ),
+            min(high, 0.5 / (MIN_HALF_BEAT_TICKS * session.tick)),
+        )
     margin = (high - low) / 20.0
     return Range(
         field.name,
@@ -188,22 +202,22 @@ def default_range(field: Field, session: Session) -> Range | None:
     )
 
 
-def check_bounds(asked: Range, field: Field, session: Session) -> None:
-    """Raises `ParameterError` where a parameter cannot be searched between these."""
-    low, high = _ends(field)
+def check_bounds(searched: Range, field: Field, session: Session) -> None:
+    """Raise `ParameterError` if a range exceeds the bounds of its parameter."""
+    low, high = _read_bounds(field)
     if field.name == "amplitude":
         high = min(high, session.amplitude)
-    is_open = field.interval.startswith("(") and asked.low == low
-    is_open |= field.interval.endswith(")") and asked.high == high
-    if asked.low < low or asked.high > high or is_open:
-        reach = f"{field.interval[:1] or '['}{low:g}, {high:g}{field.interval[-1:] or ']'}"
+    is_open = field.interval.startswith("(") and searched.low == low
+    is_open |= field.interval.endswith(")") and searched.high == high
+    if searched.low < low or searched.high > high or is_open:
+        bounds = f"{field.interval[:1] or '['}{low:g}, {high:g}{field.interval[-1:] or ']'}"
         raise ParameterError(
-            f"{asked.name}: from {asked.low:g} to {asked.high:g} is not within {reach}"
+            f"{searched.name}: from {searched.low:g} to {searched.high:g} is not within {bounds}"
         )
 
 
-def _ends(field: Field) -> tuple[float, float]:
-    """Between what its values are; infinite where nothing bounds them."""
+def _read_bounds(field: Field) -> tuple[float, float]:
+    """Return the bounds of a parameter; infinite if it has none."""
     parts = field.interval.strip("()[]").split(", ")
     if len(parts) != 2:
         return -math.inf, math.inf

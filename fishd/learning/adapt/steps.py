@@ -14,7 +14,12 @@ from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, id
 from fishd.lab.measurement import REST, SWIM
 from fishd.lab.measurement import plan as plan_of
 from fishd.lab.optimise.search import Range, Search
-from fishd.lab.optimise.trials import Trial, lengths, trials, whole_ticks
+from fishd.lab.optimise.trials import (
+    Trial,
+    measure_trials,
+    restrict_to_whole_ticks,
+    trial_durations,
+)
 from fishd.lab.session import Session
 from fishd.learning.adapt.cloud import cloud, identified
 from fishd.learning.adapt.prior import (
@@ -96,7 +101,7 @@ def square_waves(fitted: Fitted, session: Session, seed: int) -> Search:
         best = min(FASTEST / AROUND, max(SLOWEST * AROUND, best))
         low, high = best / AROUND, best * AROUND
     high = min(high, 0.5 / session.tick)
-    return Search([whole_ticks(Range("frequency", low, high), session.tick)], seed)
+    return Search([restrict_to_whole_ticks(Range("frequency", low, high), session.tick)], seed)
 
 
 def search_square_waves(
@@ -117,7 +122,7 @@ def search_square_waves(
             {"frequency": one.frequency}, one.thrust, one.error, *nobody, one.swum, one.passed
         )
         search.observe(last.parameters, last.thrust, last.error)
-    for each in trials(session, "square", {}, search, budget, last):
+    for each in measure_trials(session, "square", {}, search, budget, last):
         frequency = each.parameters["frequency"]
         keep(Tried(frequency, each.thrust, each.error, each.swum, each.passed))
 
@@ -146,12 +151,12 @@ def best_of(
         if not is_rejected(curves[0], spread, places, measured, ci95):
             thrusts, _ = combine(curves[0], spread, places, measured, ci95)
             return frequencies[int(np.argmax(thrusts))], True
-    return search.proposal().parameters["frequency"], False
+    return search.propose().parameters["frequency"], False
 
 
 def least_search(session: Session, search: Search) -> float:
     """Return the time of a search that tries the slowest wave once [s]."""
-    return 2.0 * REST + lengths({"frequency": search.ranges[0].values[0]})[1] + session.tick
+    return 2.0 * REST + trial_durations({"frequency": search.ranges[0].values[0]})[1] + session.tick
 
 
 def least_measurement(parameters: Mapping[str, Any]) -> float:

@@ -12,7 +12,7 @@ from fishd.core.errors import NoDaemon
 from fishd.core.protocol import Calibrations, State
 from fishd.lab.measurement import measure
 from fishd.lab.optimise.search import Range, Search
-from fishd.lab.optimise.trials import trials
+from fishd.lab.optimise.trials import measure_trials
 from fishd.lab.session import Disturbed, LiveSession
 
 
@@ -136,7 +136,7 @@ def test_a_few_ticks_may_be_lost_but_not_many() -> None:
 
     daemon.lost = set(range(500, 600, 10))
     with rig_of(daemon) as rig, pytest.raises(Disturbed, match="ticks were lost"):
-        list(trials(rig, "square", {}, Search([Range("frequency", 1.0, 2.0)]), 30.0))
+        list(measure_trials(rig, "square", {}, Search([Range("frequency", 1.0, 2.0)]), 30.0))
 
 
 def test_a_swim_of_which_nothing_came_is_told() -> None:

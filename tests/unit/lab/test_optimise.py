@@ -12,7 +12,13 @@ from rigs.processes import fishctl, one_line
 from fishd.config import load
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.optimise.search import Range, Search
-from fishd.lab.optimise.trials import Trial, keep_trial, read_trials, trials, whole_ticks
+from fishd.lab.optimise.trials import (
+    Trial,
+    measure_trials,
+    read_trials,
+    restrict_to_whole_ticks,
+    write_trial,
+)
 from fishd.lab.rerun import rerun
 from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import VirtualRun, simulate
@@ -32,7 +38,7 @@ def test_a_few_noisy_measurements_find_a_maximum_and_say_how_well() -> None:
         thrust = 0.02 * np.exp(-4.0 * np.log(found["frequency"] / 1.7) ** 2)
         thrust *= 1.0 - 20.0 * (found["amplitude"] - 0.3) ** 2
         search.observe(found, thrust + generator.normal(0.0, 0.3e-3), 0.6e-3)
-    best = search.proposal()
+    best = search.propose()
     assert best.parameters == pytest.approx({"frequency": 1.7, "amplitude": 0.3}, rel=0.15)
     for name, truth in (("frequency", 1.7), ("amplitude", 0.3)):
         assert best.low[name] <= truth <= best.high[name]
@@ -40,7 +46,7 @@ def test_a_few_noisy_measurements_find_a_maximum_and_say_how_well() -> None:
 
 
 def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> None:
-    search = Search([whole_ticks(Range("frequency", 1.2, 2.6), 0.05)])
+    search = Search([restrict_to_whole_ticks(Range("frequency", 1.2, 2.6), 0.05)])
     possible = (1.25, 10 / 7, 10 / 6, 2.0, 2.5)
     assert search.ranges[0].values == pytest.approx(possible)
     tried = set()
@@ -49,7 +55,7 @@ def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> N
         tried.add(found)
         thrust = 0.0257 - 0.02 * (found - 1.74) ** 2  # whose top is at none of them
         search.observe({"frequency": found}, thrust, 0.8e-3)
-        best = search.proposal()
+        best = search.propose()
         for each in (best.parameters, best.low, best.high):
             assert each["frequency"] in search.ranges[0].values
     assert best.parameters["frequency"] in tried
@@ -60,11 +66,11 @@ def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> N
 @pytest.mark.slow
 def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
     config = load("config/simulated.yaml")
-    search = Search([whole_ticks(Range("frequency", 0.4, 5.0), config.tick)], seed=1)
+    search = Search([restrict_to_whole_ticks(Range("frequency", 0.4, 5.0), config.tick)], seed=1)
     swum = 0
     with VirtualSession(config) as rig:
-        for trial in trials(rig, "square", {}, search, 300.0):
-            swum, found = trial.swum, search.proposal()
+        for trial in measure_trials(rig, "square", {}, search, 300.0):
+            swum, found = trial.swum, search.propose()
             if search.is_warm and found.improvement < 0.01:
                 break
     assert swum <= 360
@@ -149,7 +155,7 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
     with open_experiment(tmp_path / "run", header) as search:
         assert read_trials(search, ["frequency"]) == []
         trial = Trial({"frequency": 1.25}, 0.02, 0.001, 0.5, 0.01, 40, 12.5)
-        keep_trial(search, trial)
+        write_trial(search, trial)
     whole = table.read_text()
     table.write_text(whole + "2.0,0.023,0.001,0.7,0.01,80,24.7")  # of 24.75
     with open_experiment(tmp_path / "run", header, resume=True) as search:
@@ -165,7 +171,7 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
         (["--over", "frequency=1"], "LOW:HIGH"),
         (["--over", "frequency=1:30"], "frequency"),
         (["--over", "frequency=1:8", "--set", "tick=0.1"], "8 Hz is too fast for ticks of 0.1 s"),
-        (["--over", "frequency=1.5:1.9"], "there: 1.667; around: 1.429, 1.667, 2"),
+        (["--over", "frequency=1.5:1.9"], "in this range: 1.667; near it: 1.429, 1.667, 2"),
         (["--over", "frequency", "--frequency", "2"], "is given, too"),
         (["--over", "frequency", "--budget", "5"], "too short"),
     ],

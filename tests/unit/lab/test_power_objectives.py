@@ -64,7 +64,7 @@ def test_the_search_of_the_least_power_ends_where_the_thrust_is_just_reached() -
         thrust = 0.025 * math.exp(-(math.log(frequency / 1.7) ** 2) / 0.5)
         measured = thrust + generator.normal(0.0, 0.3e-3)
         search.observe(candidate, (measured, 0.6e-3), (0.1 + 0.3 * frequency, 1e-3))
-    found = search.proposal()
+    found = search.propose()
     least = 1.7 * math.exp(-math.sqrt(0.5 * math.log(0.025 / 0.015)))  # where it is 15 mN
     assert found.parameters["frequency"] == pytest.approx(least, rel=0.1)
     assert found.low["frequency"] <= least <= found.high["frequency"]
@@ -77,14 +77,14 @@ def test_a_thrust_that_nothing_reaches_leads_to_the_most_there_is() -> None:
         candidate = search.suggest()
         thrust = 0.025 * math.exp(-(math.log(candidate["frequency"] / 1.7) ** 2) / 0.5)
         search.observe(candidate, (thrust, 0.3e-3), (0.5, 1e-3))
-    assert search.proposal().parameters["frequency"] == pytest.approx(1.7, rel=0.2)
+    assert search.propose().parameters["frequency"] == pytest.approx(1.7, rel=0.2)
 
 
 @pytest.mark.parametrize("aim", [Aim("thrust-per-watt"), Aim("thrust", 0.015)])
 def test_without_a_power_meter_there_is_no_search_of_a_power(aim: Aim) -> None:
     trial = Trial({"frequency": 1.0}, 0.02, 1e-3, math.nan, math.nan, 40, 10.0)
     with pytest.raises(ParameterError, match="no power meter that can be read"):
-        aim.observe(aim.search([RANGE], 0), trial)
+        aim.observe(aim.make_search([RANGE], 0), trial)
 
 
 def _searched(tmp_path: Path, *words: str) -> dict[str, Any]:
