@@ -109,7 +109,7 @@ def _filmed(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[[Sw
     from fishd.lab.swimmer.film import Film
 
     with Film(options.film, config.swimmer) as film:
-        yield lambda fish: film.look(fish.fish)
+        yield lambda fish: film.add_frame(fish.fish)
 
 
 def _kept(swum: "Swum", options: SwimmerOptions) -> str:

@@ -9,8 +9,8 @@ from fishd.cli.output import counted, echo, print_json
 from fishd.cli.swimmer.options import picture_options
 from fishd.core import text
 from fishd.lab.swimmer import midline_figure
-from fishd.lab.swimmer.envelope import envelope
-from fishd.lab.swimmer.files import midlines_of
+from fishd.lab.swimmer.envelope import compute_envelope
+from fishd.lab.swimmer.files import read_midlines
 from fishd.recording.folder import check_new
 
 
@@ -35,12 +35,12 @@ def midlines(
     """
     path = target / f"{file.stem}-midlines.{form}"
     check_new([path], replace=force)
-    found = envelope(*midlines_of(file), settle)
-    beats = len(found.periods)
-    frequency = beats / float(found.periods.sum())
+    envelope = compute_envelope(*read_midlines(file), settle)
+    beats = len(envelope.periods)
+    frequency = beats / float(envelope.periods.sum())
     title = f"{text.line(file.stem)}: midlines of the last of {counted(beats, 'beat')}, "
-    midline_figure.picture(found, f"{title}{frequency:.2f} Hz".replace("$", r"\$"), path)
-    tail = float(found.amplitudes[:, -1].mean())
+    midline_figure.draw_midlines(envelope, f"{title}{frequency:.2f} Hz".replace("$", r"\$"), path)
+    tail = float(envelope.amplitudes[:, -1].mean())
     if as_json:
         gait = {"beats": beats, "frequency": frequency, "tail": tail}
         print_json({"path": path, **gait})

@@ -8,7 +8,7 @@ from fishd.cli.options import FiniteRange, json_option
 from fishd.cli.output import print_paths
 from fishd.cli.swimmer.options import picture_options
 from fishd.lab.swimmer import view, wake_figure
-from fishd.lab.swimmer.files import fish_of
+from fishd.lab.swimmer.files import restore_fish
 from fishd.recording.folder import check_new
 from fishd.virtual.swimmer import checkpoint
 
@@ -53,9 +53,9 @@ def wake(
         raise click.UsageError("--limit is of one field, and there are several: --field is needed")
     paths = {field: target / f"{file.stem}-{field}.{form}" for field in fields}
     check_new(paths.values(), replace=force)
-    fish = fish_of(checkpoint.load(file))
-    window = (view.whole if whole else view.around)(fish.settings)
+    fish = restore_fish(checkpoint.load(file))
+    window = (view.whole_window if whole else view.window_around)(fish.settings)
     for field, path in paths.items():
-        shown = view.view(fish, field, window, wake_figure.COLUMNS)
-        wake_figure.picture(shown, limit or view.scale(fish.settings, field), path)
+        scene = view.take_view(fish, field, window, wake_figure.COLUMNS)
+        wake_figure.draw_wake(scene, limit or view.choose_colour_limit(fish.settings, field), path)
     print_paths(paths.values(), as_json)

@@ -1,1 +1,1 @@
-"""What is shown and measured of a free swimmer: its wake, its midlines, its speed."""
+"""Pictures and measurements of a free swimmer: its wake, its midlines, its speed."""

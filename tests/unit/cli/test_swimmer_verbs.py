@@ -46,7 +46,7 @@ def test_midlines_are_drawn_from_a_saved_swim(swum: Path, tmp_path: Path) -> Non
     assert (done.returncode, done.stderr) == (0, "")
     assert (tmp_path / "swim-midlines.svg").stat().st_size > 10_000
     assert " Hz, tail ±0." in done.stdout
-    assert "does not beat once" in one_line(fishctl(*words, "--settle", "0.65"))
+    assert "does not complete a beat" in one_line(fishctl(*words, "--settle", "0.65"))
 
 
 @pytest.mark.parametrize(
@@ -55,8 +55,8 @@ def test_midlines_are_drawn_from_a_saved_swim(swum: Path, tmp_path: Path) -> Non
         (["wake", "swim.npz"], "it is no checkpoint of a swimmer"),
         (["wake", "none.npz"], "no such file"),
         (["wake", "end.npz", "--limit", "5"], "--limit is of one field"),
-        (["midlines", "end.npz"], "it holds no midlines"),
-        (["midlines", "wake.webp"], "it is no NPZ file"),
+        (["midlines", "end.npz"], "it contains no midlines"),
+        (["midlines", "wake.webp"], "not an NPZ file"),
     ],
 )
 def test_what_cannot_be_drawn_is_one_line(

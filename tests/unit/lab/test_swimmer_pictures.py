@@ -9,8 +9,8 @@ from PIL import Image
 
 from fishd.core.errors import FishdError
 from fishd.lab.swimmer import midline_figure, view, wake_figure
-from fishd.lab.swimmer.envelope import envelope
-from fishd.lab.swimmer.film import MOST, Film
+from fishd.lab.swimmer.envelope import compute_envelope
+from fishd.lab.swimmer.film import MAX_FRAMES, Film
 from fishd.virtual.swimmer.fish import Fish
 from fishd.virtual.swimmer.settings import Numerics, SwimmerSettings
 
@@ -27,7 +27,7 @@ def fish() -> Fish:
 
 
 def test_a_view_shows_the_water_where_it_is_in_the_laboratory(fish: Fish) -> None:
-    shown = view.view(fish, "speed", view.around(COARSE), 300)
+    shown = view.take_view(fish, "speed", view.window_around(COARSE), 300)
     window = shown.window
     assert window.left == pytest.approx(-0.09 + fish.travelled)
     assert shown.x == fish.motion().x
@@ -44,7 +44,7 @@ def test_between_the_nodes_of_a_stretched_grid_a_view_is_linear(fish: Fish) -> N
     grid = fish.flow.grid
     before = fish.flow.p.copy()
     fish.flow.p[:] = 3.0 * grid.xc[:, None] + 2.0 * grid.yc[None]
-    shown = view.view(fish, "pressure", view.around(COARSE), 50)
+    shown = view.take_view(fish, "pressure", view.window_around(COARSE), 50)
     fish.flow.p[:] = before
     middles = shown.window.left - fish.travelled + 0.3 * (np.arange(50) + 0.5) / 50
     assert shown.values.mean(axis=0) == pytest.approx(3e3 * middles)
@@ -52,8 +52,8 @@ def test_between_the_nodes_of_a_stretched_grid_a_view_is_linear(fish: Fish) -> N
 
 def test_the_colours_end_at_a_round_value_of_the_size_that_occurs(fish: Fish) -> None:
     for quantity in view.QUANTITIES:
-        limit = view.scale(COARSE, quantity)
-        shown = view.view(fish, quantity, view.around(COARSE), 300)
+        limit = view.choose_colour_limit(COARSE, quantity)
+        shown = view.take_view(fish, quantity, view.window_around(COARSE), 300)
         assert f"{limit:.0e}"[0] in "1235"
         assert 0.1 * limit < np.abs(shown.values).max() < 10.0 * limit
 
@@ -62,8 +62,8 @@ def test_the_colours_end_at_a_round_value_of_the_size_that_occurs(fish: Fish) ->
 def test_a_picture_of_the_wake_is_written(
     fish: Fish, quantity: view.Quantity, tmp_path: Path
 ) -> None:
-    shown = view.view(fish, quantity, view.whole(COARSE), 200)
-    wake_figure.picture(shown, view.scale(COARSE, quantity), tmp_path / "wake.png")
+    shown = view.take_view(fish, quantity, view.whole_window(COARSE), 200)
+    wake_figure.draw_wake(shown, view.choose_colour_limit(COARSE, quantity), tmp_path / "wake.png")
     with Image.open(tmp_path / "wake.png") as picture:
         assert picture.width > 2 * picture.height  # as long as the tank is
 
@@ -77,7 +77,7 @@ def test_a_film_has_a_frame_every_20_ms_and_shows_that_the_fish_moves(
     with Film(path, COARSE) as film:
         for _ in range(100):
             swimmer.step(1.0)
-            film.look(swimmer)
+            film.add_frame(swimmer)
     with Image.open(path) as shown:
         assert shown.n_frames == 11  # the first and the last among them
         first, *_, last = [frame.astype(int) for frame in pixels(shown)]
@@ -93,14 +93,14 @@ def pixels(film: Image.Image) -> Iterator[np.ndarray]:
 def test_a_long_film_leaves_frames_out_and_keeps_its_pace(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert MOST < 1000
-    monkeypatch.setattr("fishd.lab.swimmer.film.MOST", 4)
+    assert MAX_FRAMES < 1000
+    monkeypatch.setattr("fishd.lab.swimmer.film.MAX_FRAMES", 4)
     path = tmp_path / "wake.webp"
     swimmer = Fish(COARSE)
     with Film(path, COARSE) as film:
         for _ in range(160):
             swimmer.step(1.0)
-            film.look(swimmer)
+            film.add_frame(swimmer)
     with Image.open(path) as shown:
         assert shown.n_frames == 3  # of 17
         list(pixels(shown))
@@ -115,7 +115,7 @@ def test_a_film_is_half_as_fast_as_the_fish_where_ticks_are_long(kind: str, tmp_
         for step in range(1, 101):
             swimmer.step(1.0)
             if step % 25 == 0:
-                film.look(swimmer)
+                film.add_frame(swimmer)
     with Image.open(path) as shown:
         assert shown.n_frames == 4
         list(pixels(shown))
@@ -140,7 +140,7 @@ def swum(beats: float, frequency: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_midlines_are_relative_to_the_mean_motion_wherever_the_fish_goes() -> None:
-    found = envelope(*swum(5.5))
+    found = compute_envelope(*swum(5.5))
     assert found.periods == pytest.approx([0.5] * 4, rel=1e-3)
     assert found.amplitudes[:, -1] == pytest.approx(0.1, rel=5e-3)
     assert found.amplitudes[:, 20] == pytest.approx(0.025, rel=5e-3)
@@ -150,11 +150,13 @@ def test_midlines_are_relative_to_the_mean_motion_wherever_the_fish_goes() -> No
 
 
 def test_a_tail_that_does_not_beat_has_no_midlines_of_a_beat() -> None:
-    with pytest.raises(FishdError, match="does not beat once"):
-        envelope(*swum(0.7))
+    with pytest.raises(FishdError, match="does not complete a beat"):
+        compute_envelope(*swum(0.7))
 
 
 def test_a_picture_of_midlines_is_written(tmp_path: Path) -> None:
-    midline_figure.picture(envelope(*swum(3.5)), "a sine of 2 Hz", tmp_path / "midlines.png")
+    midline_figure.draw_midlines(
+        compute_envelope(*swum(3.5)), "a sine of 2 Hz", tmp_path / "midlines.png"
+    )
     with Image.open(tmp_path / "midlines.png") as picture:
         assert picture.width == 1440
