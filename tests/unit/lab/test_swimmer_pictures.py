@@ -125,7 +125,7 @@ def test_a_film_is_half_as_fast_as_the_fish_where_ticks_are_long(kind: str, tmp_
 def test_a_film_of_another_kind_is_refused_before_anything_swims(tmp_path: Path) -> None:
     with pytest.raises(FishdError, match=r"a film has no format \.mp4: \.webp or \.gif is needed"):
         Film(tmp_path / "wake.mp4", COARSE)
-    with pytest.raises(FishdError, match="there is no folder"):
+    with pytest.raises(FishdError, match="does not exist"):
         Film(tmp_path / "none" / "wake.webp", COARSE)
 
 
