@@ -31,7 +31,7 @@ from fishd.core.signals import Truth
 from fishd.hardware import ownership, release_recipe
 from fishd.hardware.base import CalibratedParts, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
-from fishd.hardware.driver import ServoDriver, survived
+from fishd.hardware.driver import ServoDriver, read_counters
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.registry import FORCE_SENSORS, POWER_METERS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
@@ -84,7 +84,7 @@ def open_robot(
         swimmer = open_swimmer(config)
         swimmer.compile()
         return swimmer.robot()
-    stack.enter_context(ownership.owned(parts_of(config)))
+    stack.enter_context(ownership.claim_parts(parts_of(config)))
     names = tuple(str(path) for path in (file, control) if path)
     for name in names:
         release_recipe.remove(name)  # of an earlier fishd
@@ -267,8 +267,8 @@ def assemble(
     for line in folder.ignored():
         log.warning("%s", line)
     meter = _open_power_meter(config, clock, stack, threaded=threaded)
-    beside = meter.catch_up if meter else _nothing
-    sensor = open_sensor(config, clock, threaded=threaded, beside=beside)
+    between_samples = meter.catch_up if meter else _nothing
+    sensor = open_sensor(config, clock, threaded=threaded, between_samples=between_samples)
     stack.callback(sensor.close)
     settings = config.servo
     with driver_packages(settings.driver):
@@ -320,7 +320,7 @@ def assemble(
         degraded=degraded,
         counters=lambda: {
             **sensor.counters(),
-            **survived(servo.driver),
+            **read_counters(servo.driver),
             **(meter.counters() if meter else {}),
         },
         power=meter.read if meter else None,
@@ -339,10 +339,10 @@ def _open_power_meter(
     settings = config.power_meter
     if settings is None:
         return None
-    from fishd.hardware.power_meter.sampled_power import SampledPower, interval_of
+    from fishd.hardware.power_meter.sampled_power import SampledPower, sample_interval
 
     with driver_packages(settings.driver):
-        driver = POWER_METERS.find(settings.driver)(settings, clock, interval_of(config.tick))
+        driver = POWER_METERS.find(settings.driver)(settings, clock, sample_interval(config.tick))
     meter = SampledPower(driver, clock, threaded=threaded, tick=config.tick)
     stack.callback(meter.close)
     return meter
@@ -353,11 +353,11 @@ def open_sensor(
     clock: Clock,
     *,
     threaded: bool,
-    beside: Callable[[], None] = _nothing,
+    between_samples: Callable[[], None] = _nothing,
 ) -> SampledSensor:
     """The force sensor alone, with the calibration that was saved last.
 
-    beside: as of `SampledSensor`
+    between_samples: as of `SampledSensor`
     Raises `StartupError` when a package is missing, and `ConfigError` for a damaged calibration.
     """
     settings = config.force_sensor
@@ -366,7 +366,12 @@ def open_sensor(
     with driver_packages(settings.driver):
         driver = FORCE_SENSORS.find(settings.driver)(settings, clock)
     return SampledSensor(
-        driver, calibration, clock, threaded=threaded, tick=config.tick, beside=beside
+        driver,
+        calibration,
+        clock,
+        threaded=threaded,
+        tick=config.tick,
+        between_samples=between_samples,
     )
 
 

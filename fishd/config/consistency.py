@@ -96,15 +96,18 @@ def check_neutral(servo: ServoSettings) -> None:
 def check_pulses(servo: ServoSettings, amplitude: float) -> None:
     """Pulse widths permit what Φ [rad] and the soft limits do; who wants less says so by those."""
     wanted = max(servo.lowest, -amplitude), min(servo.highest, amplitude)
-    possible = pulses.widest(servo)
-    if possible[0] <= wanted[0] + pulses.ROUNDING and wanted[1] - pulses.ROUNDING <= possible[1]:
+    possible = pulses.pulse_reach(servo)
+    if (
+        possible[0] <= wanted[0] + pulses.ANGLE_TOLERANCE_RAD
+        and wanted[1] - pulses.ANGLE_TOLERANCE_RAD <= possible[1]
+    ):
         return
     neutral = servo.centre + servo.trim
     below, above = sorted(servo.direction * servo.scale * angle for angle in wanted)
-    lowest, highest = pulses.SHORTEST - below, pulses.LONGEST - above
+    lowest, highest = pulses.MIN_PULSE_US - below, pulses.MAX_PULSE_US - above
     if lowest > highest:
         key = "scale"
-        most = (pulses.LONGEST - pulses.SHORTEST) / (wanted[1] - wanted[0])
+        most = (pulses.MAX_PULSE_US - pulses.MIN_PULSE_US) / (wanted[1] - wanted[0])
         right = f"at most {math.floor(most)} µs/rad"
     else:
         key = "trim" if servo.trim else "centre"

@@ -38,7 +38,7 @@ from fishd.daemon.requests import Operations
 from fishd.daemon.slow_motion import SlowMotion
 from fishd.daemon.warm_up import mock_ticks
 from fishd.hardware.base import Robot
-from fishd.hardware.servo.pulses import REST
+from fishd.hardware.servo.pulses import NEUTRAL_TIME_S
 
 log = logging.getLogger(__name__)
 console = logging.getLogger("console")
@@ -223,7 +223,7 @@ class Daemon:
                 servo = self._loop.robot.servo
                 servo.write(0.0)
                 servo.write(0.0)  # a driver that forgives a late answer may not have sent the first
-                self._clock.sleep(REST)
+                self._clock.sleep(NEUTRAL_TIME_S)
 
     def _release(self) -> None:
         """Before a controller is closed, which may never return."""

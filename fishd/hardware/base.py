@@ -1,4 +1,4 @@
-"""The seam between the loop and any fish: protocols, and the robot that joins them."""
+"""Interface between the loop and any fish: protocols, and the robot that joins them."""
 
 import math
 from collections.abc import Callable
@@ -42,7 +42,7 @@ class TaredSensor(Protocol):
         """Use another calibration from the next read on."""
 
     def watch(self) -> "VoltageWatch":
-        """Begin to add up the sensor's values from now on."""
+        """Return a watch that adds up the sensor's values from now on."""
 
 
 class Servo(Protocol):
@@ -89,7 +89,7 @@ class Robot:
     Raises `SensorError` if the power is not known.
     """
     countdown: float = math.inf
-    """Time that the servo goes on without a write [s]; see `ServoDriver.countdown`."""
+    """Time for which the servo continues without a write [s]; see `ServoDriver.countdown`."""
 
     @property
     def force_unit(self) -> str:

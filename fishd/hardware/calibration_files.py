@@ -1,6 +1,6 @@
-"""The dated files that calibrations are kept in.
+"""Dated files that contain calibrations.
 
-None is ever overwritten; the newest one of a kind is used.
+No file is ever overwritten; the newest file of each kind is used.
 """
 
 import datetime
@@ -24,28 +24,28 @@ _REQUIRED: dict[type[Struct], tuple[str, ...]] = {
     ForceCalibration: ("xx", "xy", "x0", "yx", "yy", "y0", "date"),
     ServoCalibration: ("trim", "direction", "scale", "lowest", "highest"),
 }
-_REMEDY = "mend it, or move it away"
+_REMEDY = "repair the file, or move it away"
 
 
 class CalibrationFolder:
-    """The folder with the dated files of one robot."""
+    """Folder with the dated calibration files of one robot."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     def newest(self, kind: type[C]) -> tuple[C, Path] | None:
-        """The newest calibration and its file; None where none was ever saved.
+        """Return the newest calibration and its file; None if none was ever saved.
 
-        Raises `ConfigError` where the folder cannot be read, or the newest file cannot, is not
-        whole or makes no sense: an older one, or a default, would be wrong silently.
+        Raises `ConfigError` if the folder or the newest file cannot be read, or if that file is
+        incomplete or invalid: an older calibration, or a default, would be silently wrong.
         """
-        names = self._names(kind)
+        names = self._dated_names(kind)
         if not names:
             return None
         path = self.folder / names[-1]
         try:
             text = files.read_text(path, files.SETTINGS, "a calibration")
-            return _whole(strict_yaml.parse(text).data, kind), path
+            return _load(strict_yaml.parse(text).data, kind), path
         except strict_yaml.YamlProblem as problem:
             raise ConfigError(f"{path}:{problem.line}: {problem}; {_REMEDY}") from None
         except Problem as problem:
@@ -54,15 +54,15 @@ class CalibrationFolder:
             raise ConfigError(f"{path}: {problem}; {_REMEDY}") from None
 
     def save(self, calibration: C, now: datetime.datetime) -> tuple[C, Path]:
-        """Write a new file, dated `now`; the calibration with its date, and the path.
+        """Write a new file, dated `now`; return the calibration with its date, and the path.
 
-        Raises OSError when it cannot be written, and `ConfigError` as `newest` does. An older file
-        is never touched, and the new one sorts after it, even where the clock went back.
+        Older files are never changed, and the new file sorts after them even if the clock was set
+        back. Raises OSError if the file cannot be written, and `ConfigError` as `newest` does.
         """
         dated = msgspec.structs.replace(calibration, date=now.isoformat(timespec="seconds"))
         self.folder.mkdir(parents=True, exist_ok=True)
         stem = f"{_NAMES[type(calibration)]}-{now.astimezone(datetime.UTC):{_STAMP}}"
-        names = self._names(type(calibration))
+        names = self._dated_names(type(calibration))
         if names and stem <= Path(names[-1]).stem:
             stem = f"{Path(names[-1]).stem}+"
         path = self.folder / f"{stem}.yaml"
@@ -77,50 +77,54 @@ class CalibrationFolder:
         Raises `ConfigError` if the folder cannot be read.
         """
         return [
-            f"{self.folder / name} is no dated calibration file and is ignored"
-            for name in sorted(self._all())
+            f"{self.folder / name} is not a dated calibration file and is ignored"
+            for name in sorted(self._file_names())
             if not _is_dated(name)
         ]
 
-    def _names(self, kind: type[C]) -> list[str]:
+    def _dated_names(self, kind: type[C]) -> list[str]:
         """Return the names of the files of a kind, oldest first."""
-        start = f"{_NAMES[kind]}-"
-        names = [name for name in self._all() if name.startswith(start) and _is_dated(name)]
+        prefix = f"{_NAMES[kind]}-"
+        names = [name for name in self._file_names() if name.startswith(prefix) and _is_dated(name)]
         return sorted(names, key=lambda name: Path(name).stem)
 
-    def _all(self) -> list[str]:
+    def _file_names(self) -> list[str]:
         try:
-            found = [path.name for path in self.folder.iterdir()]
+            names = [path.name for path in self.folder.iterdir()]
         except FileNotFoundError:
             return []
         except OSError as error:
             raise ConfigError(f"{self.folder}: cannot be read: {error.strerror}") from None
-        starts = tuple(f"{name}-" for name in _NAMES.values())
-        return [name for name in found if name.startswith(starts) and name.endswith(".yaml")]
+        prefixes = tuple(f"{name}-" for name in _NAMES.values())
+        return [name for name in names if name.startswith(prefixes) and name.endswith(".yaml")]
 
 
 def check(calibration: C) -> C:
-    """The same calibration; raises `Problem` unless it makes sense."""
+    """Return the same calibration; raise `Problem` if it is not valid."""
     for key, value in msgspec.structs.asdict(calibration).items():
         if isinstance(value, float) and not math.isfinite(value):
             raise Problem((key,), f"{value} is not a finite number")
         if key in ("date", "tared") and value and not _is_date(value):
-            raise Problem((key,), f"'{value}' is no date: one in ISO 8601 is needed")
+            raise Problem((key,), f"'{value}' is not a date: one in ISO 8601 is needed")
     if isinstance(calibration, ForceCalibration):
         if calibration.singular:
-            raise Problem((), "the matrix xx xy, yx yy says the same of both forces")
+            raise Problem(
+                (), "the matrix xx xy, yx yy is singular: it cannot tell the two forces apart"
+            )
         _check_uncertainty(calibration)
     return calibration
 
 
 def _check_uncertainty(calibration: ForceCalibration) -> None:
-    """Raise `Problem` where a number is not a possible uncertainty."""
+    """Raise `Problem` if a number is not a possible uncertainty."""
     for key in ("covariance_x", "covariance_y"):
         covariance = getattr(calibration, key)
         if covariance is None:
             continue
-        first, both, second = covariance
-        possible = min(first, second) >= 0.0 and both * both <= first * second * (1.0 + 1e-9)
+        variance_1, covariance_12, variance_2 = covariance
+        possible = min(variance_1, variance_2) >= 0.0 and (
+            covariance_12 * covariance_12 <= variance_1 * variance_2 * (1.0 + 1e-9)
+        )
         if not (possible and all(map(math.isfinite, covariance))):
             raise Problem(
                 (key,),
@@ -132,12 +136,12 @@ def _check_uncertainty(calibration: ForceCalibration) -> None:
 
 
 def _is_dated(name: str) -> bool:
-    """Is it the name of a file as `save` makes it?"""
-    found = _NAME.fullmatch(name)
-    if not found:
+    """Return whether `save` could have written a file of this name."""
+    match = _NAME.fullmatch(name)
+    if not match:
         return False
     try:
-        datetime.datetime.strptime(found["stamp"], _STAMP)
+        datetime.datetime.strptime(match["stamp"], _STAMP)
     except ValueError:
         return False
     return True
@@ -151,16 +155,16 @@ def _is_date(text: str) -> bool:
     return True
 
 
-def _whole(data: Any, kind: type[C]) -> C:
-    """The calibration that a file holds; raises `Problem` unless it is whole and makes sense."""
+def _load(data: Any, kind: type[C]) -> C:
+    """Return the calibration in a file; raise `Problem` if it is incomplete or not valid."""
     if not data:
-        raise Problem((), "there is nothing in this file")
+        raise Problem((), "the file is empty")
     if not isinstance(data, dict):
         raise Problem((), "a mapping of keys to values is needed")
     missing = [key for key in _REQUIRED[kind] if key not in data]
     if missing:
-        raise Problem((), f"without {', '.join(missing)}: nothing is filled in")
+        raise Problem((), f"{', '.join(missing)} missing: fishd fills in no default")
     calibration = convert(data, kind)
     if isinstance(calibration, ForceCalibration) and not calibration.date:
-        raise Problem(("date",), "'' is not when it was made")
+        raise Problem(("date",), "'' is not a date: one in ISO 8601 is needed")
     return check(calibration)

@@ -1,4 +1,4 @@
-"""Argument and result of a check of `fishctl doctor`: a machine and a verdict."""
+"""Argument and result of a check of `fishctl doctor`."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 START_VIRTUAL_PI = "fishctl virtual-pi run"
-"""Mends that no virtual Pi runs."""
+"""Remedy if no virtual Pi is running."""
 
 Level = Literal["ok", "warning", "FAIL", "skipped"]
 
 
 class Result(NamedTuple):
-    """One line about one thing, and how to mend it where that is needed."""
+    """One line about what was checked, and the remedy where one is needed."""
 
     level: Level
     message: str
@@ -21,7 +21,7 @@ class Result(NamedTuple):
 
 
 class Machine(ABC):
-    """The computer that the robot is wired to."""
+    """Computer that the robot is wired to."""
 
     root: Path = Path("/")
     """Folder that contains /sys, /proc, /dev and so on."""
@@ -49,35 +49,35 @@ class Machine(ABC):
 
     @abstractmethod
     def occupied(self, by_fishd: str) -> Result | None:
-        """Why a check leaves the hardware alone; None where no fishd uses it.
+        """Return a result that says why a check must not use the hardware, or None.
 
-        by_fishd: what to say of a running fishd, such as `owns the bus`
+        by_fishd: what a running fishd does, for the message, such as `owns the bus`
         """
 
     def plugged_in(self) -> AbstractContextManager[Any]:
-        """Within, the I2C buses and pins are those of the robot, a virtual one's too.
+        """Return a context in which I2C buses and pins are those of the robot, real or virtual.
 
-        Raises `StartupError` where no virtual Pi runs.
+        Raises `StartupError` if the robot needs a virtual Pi and none is running.
         """
         return nullcontext()
 
 
 class Check(NamedTuple):
-    """A function of the machine; it returns None if there is nothing to check."""
+    """Function of the machine, with its name; it returns None if there is nothing to check."""
 
     name: str
     function: Callable[[Any], Result | None]
     robots: tuple[str, ...] = ("simulated", "pi", "virtual-pi", "swimmer")
-    """For which robots it is made."""
+    """Names of the robots that it applies to."""
 
 
 def ok(message: str) -> Result:
-    """Nothing to do."""
+    """Return the result of a check that needs no action."""
     return Result("ok", message)
 
 
 def warning(message: str, mend: str) -> Result:
-    """It works, but could be better."""
+    """Return the result of a check of something that works but could be better."""
     return Result("warning", message, mend)
 
 

@@ -3,7 +3,7 @@
 docs/how-to/writing-a-driver.md explains how to write one.
 
 A driver knows one kind of hardware and nothing else: calibration, limits, windows, staleness,
-suspicion and reconnecting are above it, the same for all.
+suspicion and reconnecting are above it, the same for all drivers.
 """
 
 import math
@@ -87,12 +87,12 @@ class Driver(ABC, Generic[S]):
 
     @classmethod
     def claims(cls, settings: S) -> tuple[Claim, ...]:
-        """Return what no other fishd may use at the same time, and which pins it takes."""
+        """Return what no other fishd may use at the same time, with the pins that it takes."""
         return ()
 
     @classmethod
     def checks(cls, settings: S) -> tuple[Check, ...]:
-        """Return the checks of `fishctl doctor` before it tries the whole; nothing may move."""
+        """Return checks that `fishctl doctor` makes before it tries the driver, without motion."""
         return ()
 
     def counters(self) -> dict[str, int]:
@@ -100,8 +100,8 @@ class Driver(ABC, Generic[S]):
         return {}
 
 
-def survived(driver: Driver[Any]) -> dict[str, int]:
-    """Return the counters of a driver; none where it raises, which must not end fishd."""
+def read_counters(driver: Driver[Any]) -> dict[str, int]:
+    """Return the counters of a driver; none if it raises, because that must not end fishd."""
     try:
         return {str(name): int(count) for name, count in contained(driver.counters).items()}
     except Exception:
@@ -123,7 +123,7 @@ class Pair(NamedTuple):
 
 
 class SampledDriver(Driver[T]):
-    """Delivers samples. One thread calls `open`, `sample` and `close`."""
+    """Driver that delivers samples. One thread calls `open`, `sample` and `close`."""
 
     transport: ClassVar[str] = "sensor"
     """Prefix of the counters of errors: `i2c` makes `i2c_errors`."""
@@ -131,7 +131,10 @@ class SampledDriver(Driver[T]):
     """Time for which the hardware is left alone after an error [s]."""
 
     def __init__(self, settings: T, clock: Clock) -> None:
-        """Import what is needed; open nothing yet. clock: the only clock to read and sleep by."""
+        """Import what is needed; open nothing yet.
+
+        clock: the only clock that the driver may read and sleep by
+        """
         self.settings = settings
         self.clock = clock
 
@@ -149,8 +152,8 @@ class SampledDriver(Driver[T]):
         """Return the next sample, a `Pair` or a `PowerSample`, or None if it is not complete yet.
 
         Takes a few milliseconds at most: it sleeps in `clock.sleep`, and must sleep or transfer
-        something before it returns None. May raise any exception, which `explain` puts into words;
-        after three errors in a row the driver is closed and opened again.
+        something before it returns None. May raise any exception, which `explain` describes; after
+        three errors in a row the driver is closed and opened again.
         """
 
     @abstractmethod
@@ -158,12 +161,12 @@ class SampledDriver(Driver[T]):
         """Release the hardware; raises nothing, may be called twice, and before `open`."""
 
     def explain(self, error: Exception) -> str:
-        """Return one line about what went wrong, and what to check."""
+        """Return one line that says what went wrong and what to check."""
         return str(error) if isinstance(error, OSError) else f"{type(error).__name__}: {error}"
 
 
 class ForceSensorDriver(SampledDriver[F]):
-    """Delivers pairs of samples."""
+    """Driver of a force sensor, which delivers pairs of samples."""
 
     raw_unit: ClassVar[str] = "V"
     """Unit of the pairs, in which forces are shown until the sensor is calibrated."""
@@ -181,7 +184,7 @@ class ForceSensorDriver(SampledDriver[F]):
 
 
 class PowerSample(NamedTuple):
-    """A sample of a power meter."""
+    """Sample of a power meter."""
 
     time: float
     """Time at which the meter was read [s, monotonic]."""
@@ -192,10 +195,13 @@ class PowerSample(NamedTuple):
 
 
 class PowerMeterDriver(SampledDriver[P]):
-    """Delivers the electrical power of the servo, where the robot has a meter for it."""
+    """Driver of a meter for the electrical power of the servo."""
 
     def __init__(self, settings: P, clock: Clock, interval: float) -> None:
-        """interval: time between two calls of `sample`, which returns the mean over it [s]"""
+        """Do as `SampledDriver`.
+
+        interval: time between two calls of `sample`, which returns the mean over it [s]
+        """
         super().__init__(settings, clock)
         self.interval = interval
 
@@ -203,63 +209,64 @@ class PowerMeterDriver(SampledDriver[P]):
     def sample(self) -> PowerSample:
         """Read the meter with a few short transfers; it measures by itself.
 
-        Need not wait: it is not called too early. May raise any exception; see
+        It need not wait, because it is never called early. May raise any exception; see
         `SampledDriver.sample`.
         """
 
 
 class LastResort(NamedTuple):
-    """The function that ends the pulses when the process that made them is dead."""
+    """Function that ends the pulses after the process that made them has died."""
 
     function: str
     """Name as `module:function`; called with neutral [µs], then `arguments` by name.
 
     It sends a servo that gets pulses to neutral for 0.3 s, ends them and returns True. It leaves a
     servo without pulses alone and returns False. `fishd-release` imports it and has little time:
-    its module should need little but the standard library. Raises `ServoError`.
+    its module should import little beyond the standard library. Raises `ServoError`.
     """
     arguments: dict[str, Any]
     """Arguments of the function, all of which JSON can represent."""
 
 
 class ServoDriver(Driver[V]):
-    """Sends pulses. `write`, `off` and `close` may be called from any thread."""
+    """Driver that sends pulses. `write`, `off` and `close` may be called from any thread."""
 
     degraded: tuple[str, ...] = ()
     """Reasons why its pulses are not as good as they could be, a line each."""
     countdown: float = math.inf
-    """Time that the servo goes on without a write [s]; infinite if only this process stops it.
+    """Time for which the servo continues without a write [s]; infinite without such a limit.
 
-    Then it goes to neutral, and half a second later its pulses end.
+    After that time it goes to neutral, and half a second later its pulses end.
     """
 
     def __init__(
         self, settings: V, neutral: float, clock: Clock, *, tick: float, threaded: bool
     ) -> None:
-        """Store what all drivers have, and call `open`."""
+        """Store what all drivers need, and call `open`."""
         self.settings = settings
         self.neutral = neutral
-        """Pulse of neutral [µs]; it changes when the servo is calibrated."""
+        """Pulse width of neutral [µs]; it changes when the servo is calibrated."""
         self.clock = clock
-        """The only clock to read and sleep by."""
+        """The only clock that the driver may read and sleep by."""
         self.tick = tick
         """Period of the writes [s]."""
         self.threaded = threaded
-        """Whether time goes on by itself; in virtual time no thread may be started."""
+        """Whether time passes by itself; in virtual time no thread may be started."""
         self.open()
 
     @abstractmethod
     def open(self) -> None:
-        """Open the hardware, or go on without and try again in each write. No pulses begin here.
+        """Open the hardware, or continue without it and try again in each write; start no pulses.
 
-        Called once. Raises ImportError where a library is missing.
+        Called once. Raises ImportError if a library is missing.
         """
 
     @abstractmethod
     def write(self, pulse: float) -> None:
         """Send pulses of a width [µs] within 500 to 2500; start them if there are none.
 
-        In the tick: it must not wait long. Raises `ServoError` when the servo cannot be reached.
+        Called in the tick: it must not wait long. Raises `ServoError` when the servo cannot be
+        reached.
         """
 
     @abstractmethod

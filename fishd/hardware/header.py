@@ -1,4 +1,4 @@
-"""The pins of the Pi's header, through the module RPi.GPIO of either RPi.GPIO or rpi-lgpio."""
+"""Pins of the Pi's header, through the module RPi.GPIO of either RPi.GPIO or rpi-lgpio."""
 
 import logging
 import warnings
@@ -10,27 +10,27 @@ from fishd.core.errors import StartupError
 log = logging.getLogger(__name__)
 
 PACKAGE = "RPi.GPIO"
-"""Package that a driver that calls `load` lists in its `packages`."""
+"""Package that a driver lists in its `packages` if it calls `load`."""
 _PROVIDERS = ("RPi.GPIO", "rpi-lgpio")
 _EXTRAS = "fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio] (Pi 4 and older)"
 
 
 def installed() -> list[str]:
     """Return which of the two packages are installed; exactly one should be."""
-    from importlib import metadata  # which takes long to load, and only a Pi needs
+    from importlib import metadata  # takes long to load, and only a Pi needs it
 
-    found = []
+    names = []
     for name in _PROVIDERS:
         with suppress(metadata.PackageNotFoundError):
             metadata.distribution(name)
-            found.append(name)
-    return found
+            names.append(name)
+    return names
 
 
 def load() -> Any:
-    """The module RPi.GPIO, set to Broadcom numbers; raises `StartupError`.
+    """Return the module RPi.GPIO, set to Broadcom numbers; raise `StartupError` if that fails.
 
-    Imported only here, because that fails on whatever is not a Raspberry Pi.
+    Imported only here, because the import fails on any machine that is not a Raspberry Pi.
     """
     if len(installed()) > 1:
         raise StartupError(
@@ -56,16 +56,16 @@ def load() -> Any:
     except Exception as error:  # lgpio.error is a bare Exception
         raise StartupError(
             f"the pins of the header cannot be used: {one_line(error)}; "
-            "fishd has to be in group gpio"
+            "add the user of fishd to group gpio"
         ) from None
     return GPIO
 
 
 def claim(gpio_module: Any, gpio: int, direction: int, **options: int) -> None:
-    """Set up one pin; raises whatever the library does.
+    """Set up one pin; raise what the library raises.
 
-    RPi.GPIO warns of a pin that is in use, as after kill -9. That is logged and not switched off
-    with setwarnings(False): it is the only hint that another program drives the same pin.
+    RPi.GPIO warns of a pin that is in use, as after kill -9. The warning is logged and not
+    switched off with setwarnings(False): it is the only hint that another program drives the pin.
     """
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

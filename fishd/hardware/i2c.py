@@ -1,4 +1,4 @@
-"""An I2C bus for a driver: opening it, explaining its errors, and the checks of `fishctl doctor`.
+"""I2C bus for a driver: opening it, explaining its errors, and the checks of `fishctl doctor`.
 
 Each device has its own open file; the kernel keeps the transfers of several files apart.
 """
@@ -19,17 +19,19 @@ from fishd.hardware.driver import Claim
 log = logging.getLogger(__name__)
 
 Bus = Annotated[int, Meta(ge=0, le=255)]
-"""N of /dev/i2c-N."""
+"""Number N of the bus /dev/i2c-N."""
 
-FAST_BUS = 400_000
-"""[bit/s]"""
+FAST_BIT_RATE = 400_000
+"""Recommended bit rate of the bus [bit/s]."""
 _HEADER_BUS, _HEADER_PINS = 1, (2, 3)
-_I2C_TIMEOUT = 0x0702
-_TIMEOUT = 2  # [10 ms]; the kernel's own is 1 s
+_SET_TIMEOUT = 0x0702
+"""Number of the ioctl I2C_TIMEOUT."""
+_TIMEOUT_10MS = 2
+"""Timeout of a transfer [10 ms]; the kernel's default is 1 s."""
 _ADAPTERS = ("/sys/bus/i2c/devices", "/sys/class/i2c-adapter")
 """Folders in which the kernel lists its buses; the second only before Linux 6.12."""
 _CORE_CLOCK = re.compile(r"Raspberry Pi (3|4|Compute Module [34])")
-"""Pis whose bus slows down with the core clock."""
+"""Models of Pi whose bus slows down with the core clock."""
 
 _ADVICE = {
     errno.ENOENT: "{bus} does not exist: enable I2C (dtparam=i2c_arm=on in the Pi's config.txt), "
@@ -48,14 +50,14 @@ _ADVICE[errno.ENXIO] = _ADVICE[errno.EREMOTEIO]
 
 
 def claim(bus: int) -> Claim:
-    """A bus, whose key is `bus`; on it, drivers of one fishd do not disturb each other."""
+    """Return the claim of a bus, with the key `bus`; the drivers of one fishd may share a bus."""
     return Claim(f"i2c-{bus}", f"/dev/i2c-{bus}", "bus", _HEADER_PINS if bus == _HEADER_BUS else ())
 
 
 def open_bus(number: int) -> Any:
-    """Open /dev/i2c-`number`, on which a transfer may take 20 ms at most; as module busio's I2C.
+    """Open /dev/i2c-`number` with a timeout of 20 ms for a transfer; return it as busio.I2C does.
 
-    Raises OSError, and ImportError where adafruit-extended-bus is missing.
+    Raises OSError, and ImportError if adafruit-extended-bus is missing.
     """
     from adafruit_extended_bus import ExtendedI2C
     from Adafruit_PureIO import smbus
@@ -65,26 +67,26 @@ def open_bus(number: int) -> Any:
     except (ValueError, RuntimeError):
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)) from None
     driver = bus._i2c._i2c_bus
-    smbus.ioctl(driver._device.fileno(), _I2C_TIMEOUT, _TIMEOUT)
+    smbus.ioctl(driver._device.fileno(), _SET_TIMEOUT, _TIMEOUT_10MS)
     driver._device = _StrictFile(driver._device)
     return bus
 
 
 def close_bus(bus: Any) -> None:
-    """Close it now; the library would leave that to the garbage collector. Raises no OSError."""
+    """Close a bus now; the library leaves that to the garbage collector. Never raises OSError."""
     driver = bus._i2c._i2c_bus
     try:
         driver.close()
-    except OSError as error:  # Linux has closed it all the same
+    except OSError as error:  # Linux has closed it nevertheless
         log.warning("closing an I2C bus failed: %s", error)
-        driver._device = None  # else it would be closed again
+        driver._device = None  # otherwise it would be closed again
     bus.deinit()
 
 
 class _StrictFile:
-    """A device file on which a lost transfer is an error.
+    """Device file on which a lost transfer is an error.
 
-    A raw file of Python returns None for EAGAIN, and the driver takes that for success.
+    A raw file of Python returns None for EAGAIN, which the driver would treat as success.
     """
 
     def __init__(self, file: Any) -> None:
@@ -104,10 +106,10 @@ class _StrictFile:
 
 
 def explain(error: Exception, bus: int, address: int, chip: str, section: str) -> str:
-    """One line for people about what went wrong with a chip at `address` on /dev/i2c-`bus`.
+    """Return one line that explains an error of a chip at `address` on /dev/i2c-`bus`.
 
-    An error in other words than Linux's, such as one of a virtual Pi, is left to speak for itself.
-    section: where the keys `bus` and `address` are, `force_sensor` or `servo`
+    The text of an error that differs from Linux's text, such as one of a virtual Pi, is kept.
+    section: section with the keys `bus` and `address`, such as `force_sensor`
     """
     if not isinstance(error, OSError):
         return f"{type(error).__name__}: {error}"
@@ -116,8 +118,8 @@ def explain(error: Exception, bus: int, address: int, chip: str, section: str) -
     if error.strerror != os.strerror(error.errno):
         return f"{error.strerror} (error {error.errno})"
     advice = _ADVICE.get(error.errno, f"a transfer on {{bus}} failed: {error.strerror}")
-    words = {"bus": f"/dev/i2c-{bus}", "address": f"{address:#04x}"}
-    return f"{advice.format(**words, chip=chip, section=section)} (error {error.errno})"
+    names = {"bus": f"/dev/i2c-{bus}", "address": f"{address:#04x}"}
+    return f"{advice.format(**names, chip=chip, section=section)} (error {error.errno})"
 
 
 def checks(bus: int, section: str) -> tuple[Check, ...]:
@@ -129,20 +131,20 @@ def checks(bus: int, section: str) -> tuple[Check, ...]:
 
 
 def _bus(machine: Machine, number: int, section: str) -> Result:
-    """Check the device file, and whether this user may use it."""
+    """Check that the device file exists and that this user may use it."""
     device = machine.path(f"/dev/i2c-{number}")
     if not device.exists():
-        others = sorted(path.name for path in machine.path("/dev").glob("i2c-*"))
-        seen = f"; there is {', '.join(others)}: set {section}.bus" if others else ""
+        buses = sorted(path.name for path in machine.path("/dev").glob("i2c-*"))
+        hint = f"; there is {', '.join(buses)}: set {section}.bus" if buses else ""
         return fail(
-            f"/dev/i2c-{number} does not exist{seen}",
+            f"/dev/i2c-{number} does not exist{hint}",
             "dtparam=i2c_arm=on in /boot/firmware/config.txt, module i2c-dev loaded; restart",
         )
     if not os.access(device, os.R_OK | os.W_OK):
-        found = device.stat()
-        if found.st_gid == 0 or not found.st_mode & stat.S_IWGRP:
+        status = device.stat()
+        if status.st_gid == 0 or not status.st_mode & stat.S_IWGRP:
             return fail(
-                f"/dev/i2c-{number} may be used by user {name_of(found.st_uid)} only",
+                f"/dev/i2c-{number} may be used by user {name_of(status.st_uid)} only",
                 "sudo make install-pi, then restart: its udev rule gives the bus to group i2c",
             )
         group = device.group()
@@ -155,26 +157,27 @@ def _bus(machine: Machine, number: int, section: str) -> Result:
 
 def _speed(machine: Machine, number: int) -> Result:
     """Check the speed of the bus that the device tree states."""
-    found = _set_speed(machine, number)
-    if found is None:
-        return skipped("the kernel does not tell the speed of this bus")
-    if found < FAST_BUS:
+    bit_rate = _read_bit_rate(machine, number)
+    if bit_rate is None:
+        return skipped("the kernel does not state the speed of this bus")
+    if bit_rate < FAST_BIT_RATE:
         return warning(
-            f"{found / 1e3:.0f} kbit/s: fewer samples per tick than at {FAST_BUS / 1e3:.0f}",
-            f"dtparam=i2c_arm_baudrate={FAST_BUS} in /boot/firmware/config.txt, then restart",
+            f"{bit_rate / 1e3:.0f} kbit/s: fewer samples per tick than at "
+            f"{FAST_BIT_RATE / 1e3:.0f}",
+            f"dtparam=i2c_arm_baudrate={FAST_BIT_RATE} in /boot/firmware/config.txt, then restart",
         )
     if _CORE_CLOCK.search(machine.model):
         return ok(
-            f"{found / 1e3:.0f} kbit/s are set; less while this Pi's core clock is lowered, see "
+            f"{bit_rate / 1e3:.0f} kbit/s are set; less while this Pi's core clock is lowered, see "
             "docs/how-to/wiring.md"
         )
-    return ok(f"{found / 1e3:.0f} kbit/s")
+    return ok(f"{bit_rate / 1e3:.0f} kbit/s")
 
 
-def _set_speed(machine: Machine, number: int) -> int | None:
-    """The bus's clock in the device tree [bit/s]; None if the tree does not name it."""
+def _read_bit_rate(machine: Machine, number: int) -> int | None:
+    """Return the bit rate of the bus in the device tree [bit/s]; None if it is not there."""
     for folder in _ADAPTERS:
-        place = machine.path(f"{folder}/i2c-{number}/of_node/clock-frequency")
+        path = machine.path(f"{folder}/i2c-{number}/of_node/clock-frequency")
         with suppress(OSError):
-            return int.from_bytes(place.read_bytes(), "big")
+            return int.from_bytes(path.read_bytes(), "big")
     return None

@@ -1,4 +1,4 @@
-"""One fishd for one robot: what it drives, and how it is kept from a second fishd.
+"""Exclusive use of the robot's parts by one fishd.
 
 Two programs on one bus would take each other's samples, without an error.
 """
@@ -21,14 +21,14 @@ log = logging.getLogger(__name__)
 FOLDER = Path("/run/fishd-locks")
 """Folder of the lock files, which `make install-pi` makes: only root and the group fishd may enter.
 
-Elsewhere another user could hold a lock, or make the file of one, and so keep fishd from starting.
+In another folder any user could hold a lock, or create its file, and so keep fishd from starting.
 """
-TRIES, PAUSE = 50, 0.02
-"""How often a claim is tried, as a process may hold it for a look; and the time between [s]."""
+MAX_ATTEMPTS, RETRY_PAUSE_S = 50, 0.02
+"""Attempts to claim a part, which another process may hold briefly; pause between them [s]."""
 
 
 class Part(NamedTuple):
-    """A part of the robot that at most one fishd may drive."""
+    """Part of the robot that at most one fishd may drive."""
 
     path: Path
     """Path that is claimed; its lock file is beside it."""
@@ -39,33 +39,34 @@ class Part(NamedTuple):
 
 
 def lock_folder() -> Path:
-    """Return the folder for all users of the hardware, else one for this user."""
+    """Return the folder shared by all users of the hardware if it exists, else one of this user."""
     return FOLDER if FOLDER.is_dir() else Path(runtime_folder())
 
 
 def parts_of_pi(claims: Mapping[str, Iterable[Claim]]) -> tuple[Part, ...]:
-    """Return what robot pi drives: all that its drivers claim, by the section of each."""
+    """Return the parts that robot pi drives: what its drivers claim, by section."""
     folder = lock_folder()
     parts: dict[Path, Part] = {}
-    for section, found in claims.items():
-        for claim in found:
+    for section, section_claims in claims.items():
+        for claim in section_claims:
             path = folder / f"fishd-{claim.name.replace('/', '_')}"
             parts.setdefault(path, Part(path, claim.what, f"{section}.{claim.key}"))
     return tuple(parts.values())
 
 
 def parts_of_virtual_pi(socket: Path) -> tuple[Part, ...]:
-    """Return what robot virtual-pi drives: the virtual Pi that listens on `socket`."""
-    real = socket.resolve()  # it may have several names
+    """Return the part that robot virtual-pi drives: the virtual Pi that listens on `socket`."""
+    real = socket.resolve()  # a socket may have several names
     path = real.with_name(f"{real.name}.fishd")
     return (Part(path, f"the virtual Pi on {socket}", "virtual_pi.socket"),)
 
 
 @contextmanager
-def owned(parts: Iterable[Part]) -> Iterator[None]:
-    """Drive these parts alone; raises `StartupError` that names the process which does already.
+def claim_parts(parts: Iterable[Part]) -> Iterator[None]:
+    """Claim these parts within the context.
 
-    Where a lock file cannot be made, that is logged and no reason not to start.
+    Raises `StartupError`, which names the other process, if one already drives a part. A lock file
+    that cannot be created is only logged.
     """
     with ExitStack() as stack:
         for part in parts:
@@ -90,7 +91,7 @@ def owned(parts: Iterable[Part]) -> Iterator[None]:
 
 
 def owner(parts: Iterable[Part]) -> str:
-    """Return which fishd drives one of these parts, in words; empty where none is known to."""
+    """Return a line that names the fishd that drives one of these parts; empty if none is known."""
     for part in parts:
         if pid := holder(part.path):
             return f"a fishd (pid {pid}) drives {part.what}"
@@ -98,26 +99,26 @@ def owner(parts: Iterable[Part]) -> str:
 
 
 def owner_pid(parts: Iterable[Part]) -> str:
-    """Return the pid of a fishd that drives one of these parts; empty where none is known to."""
+    """Return the pid of a fishd that drives one of these parts; empty if none is known."""
     return next(filter(None, (holder(part.path) for part in parts)), "")
 
 
 def _make_private(folder: Path) -> None:
-    """Make the folder of this user; raises `StartupError` where another user may write to it."""
+    """Create the folder of this user; raise `StartupError` if another user may write to it."""
     folder.mkdir(mode=0o700, exist_ok=True)
     if why := stranger(folder / "fishd"):
-        raise StartupError(f"no place for lock files: {why}; remove that folder")
+        raise StartupError(f"lock files are not safe: {why}; remove that folder")
 
 
 def _claim(part: Part, stack: ExitStack) -> None:
-    for attempt in range(1, TRIES + 1):
+    for attempt in range(1, MAX_ATTEMPTS + 1):
         try:
             stack.enter_context(locked(part.path, shared=True))
             return
         except Taken as taken:
-            if attempt == TRIES:
+            if attempt == MAX_ATTEMPTS:
                 raise StartupError(
                     f"another fishd (pid {taken.pid}) drives {part.what}; end it, or give this "
                     f"one another {part.key}"
                 ) from None
-        time.sleep(PAUSE)
+        time.sleep(RETRY_PAUSE_S)

@@ -1,4 +1,4 @@
-"""The operator's panel on pins of the header: an E-stop button and a status light."""
+"""Operator's panel on pins of the header: an E-stop button and a status light."""
 
 import logging
 import threading
@@ -11,23 +11,23 @@ from fishd.hardware.settings import PanelSettings
 
 log = logging.getLogger(__name__)
 
-BOUNCE = 5
-"""How long the contact of a button may bounce [ms]."""
+BOUNCE_MS = 5
+"""Time for which the contact of a button may bounce [ms]."""
 RELEASED_POLLS = 2
-"""Polls in a row that must find the button released: a press acts at once, its end does not."""
+"""Number of polls in a row that must find the button released; a press takes effect at once."""
 
 
 class RpiGpioPanel:
-    """Button and light through RPi.GPIO or rpi-lgpio; either may be missing.
+    """Button and light through RPi.GPIO or rpi-lgpio; either may be absent.
 
-    The button is a contact to ground, and a pull-up makes the level high where it is open. One that
-    opens when it is pressed (`estop_pressed: high`) looks pressed with a broken wire, too.
+    The button is a contact to ground, and a pull-up makes the level high while it is open. A button
+    that opens when pressed (`estop_pressed: high`) also counts as pressed if its wire is broken.
     """
 
     def __init__(self, settings: PanelSettings, clock: Clock) -> None:
-        """Claim the pins; raises `StartupError` where that is not possible."""
+        """Claim the pins; raise `StartupError` if that is not possible."""
         self.on_press: Callable[[], None] = _nothing
-        """Called from any thread as soon as the button is pressed, without waiting for a tick."""
+        """Function called, from any thread, as soon as the button is pressed, between ticks too."""
         self._settings = settings
         self._pressed = False
         self._released_polls = 0
@@ -42,11 +42,12 @@ class RpiGpioPanel:
             self._claim(clock)
 
     def update(self, mode: str, now: float) -> bool:
-        """Show the mode on the light; True while the button is pressed. Called in every tick.
+        """Show the mode on the light in each tick; return True while the button is pressed.
 
-        now: time of the tick [s]. Raises OSError when the button cannot be read.
+        now: time of the tick [s]
+        Raises OSError when the button cannot be read.
         """
-        self._show(self._wanted(mode, now), now)
+        self._show(self._should_light(mode, now), now)
         if self._settings.estop_gpio is None:
             return False
         try:
@@ -96,11 +97,11 @@ class RpiGpioPanel:
             self._listen(settings.estop_gpio)
 
     def _listen(self, pin: int) -> None:
-        """Have presses reported at once; without that, the polls of the ticks have to do."""
+        """Ask the library to report presses at once; if it cannot, only ticks poll the button."""
         try:
-            self._gpio.add_event_detect(pin, self._gpio.BOTH, self._on_edge, BOUNCE)
+            self._gpio.add_event_detect(pin, self._gpio.BOTH, self._on_edge, BOUNCE_MS)
         except Exception as error:
-            # RPi.GPIO on kernels from 6.6 on
+            # RPi.GPIO cannot do it on Linux 6.6 and later.
             log.warning(
                 "E-stop button on GPIO %d is polled only, once a tick: %s; "
                 "rpi-lgpio instead of RPi.GPIO would report it at once",
@@ -110,7 +111,7 @@ class RpiGpioPanel:
 
     def _on_edge(self, pin: int) -> None:
         try:
-            down = self._is_down()  # and not a spike that has gone
+            down = self._is_down()  # a short spike has already gone
         except Exception as error:
             log.warning("E-stop button on GPIO %d: %s", pin, header.one_line(error))
             return
@@ -125,16 +126,17 @@ class RpiGpioPanel:
         level = self._gpio.input(self._settings.estop_gpio)
         return bool(level) == (self._settings.estop_pressed == "high")
 
-    def _wanted(self, mode: str, now: float) -> bool:
+    def _should_light(self, mode: str, now: float) -> bool:
         if mode == "running":
             return True
-        if mode == "idle":  # a flash each second, as long as the slowest tick
+        if mode == "idle":  # a flash each second, as long as the longest tick
             return now % 1.0 < 0.2
-        # 5 Hz, or slower where ticks are: by phase, some ticks would always meet the same half.
+        # Blink at 5 Hz, or at half the rate of slow ticks. The phase of the clock cannot be used:
+        # at some tick rates every tick would fall into the same half.
         return self._lit if now - self._changed < 0.09 else not self._lit
 
     def _show(self, lit: bool, now: float) -> None:
-        """A light that fails is reported once, and does not stop the fish."""
+        """Switch the light; a light that fails is reported once and does not stop the fish."""
         if self._dark or lit == self._lit:
             return
         self._lit = lit

@@ -1,4 +1,4 @@
-"""Finds drivers by name, fishd's own and those of other packages; says which library is missing."""
+"""Registries of drivers, fishd's and those of other packages, and errors of missing libraries."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -51,7 +51,7 @@ PACKAGES = {
     "busio": "Adafruit-Blinka",
     "pigpio": "pigpio",
 }
-"""The package of each module that a driver of fishd imports."""
+"""Package of each module that a driver of fishd imports."""
 
 
 @contextmanager
@@ -74,7 +74,7 @@ def driver_packages(driver: str = "") -> Iterator[None]:
 
 
 def why_not_imported(error: ImportError, driver: str = "") -> str:
-    """One line that names the package to blame for a failed import."""
+    """Return one line that names the package that caused a failed import."""
     module = (error.name or "").partition(".")[0]
     package = PACKAGES.get(module, module)
     if driver and package not in PACKAGES.values():

@@ -1,8 +1,8 @@
-"""A small file with which another process releases the servo without the configuration.
+"""Small file with which another process releases the servo without reading the configuration.
 
-fishd writes it when it opens a servo and at each calibration, for its configuration file and for
-its control socket: `fishd-release` finds it by the first, `fishctl estop` by the second. Needs only
-the standard library, and not pathlib, which takes longer to load than everything else here.
+fishd writes it when it opens a servo and at each calibration, once for its configuration file and
+once for its control socket: `fishd-release` uses the first, `fishctl estop` the second. This module
+needs only the standard library without pathlib, which takes longer to load than the rest.
 """
 
 import json
@@ -18,20 +18,21 @@ from fishd.core.process.runtime_folder import runtime_folder
 NOT_RELEASED = "the servo was not released and may still have pulses: cut its power"
 """Message of a failed release."""
 
-_LARGEST = 65_536
-_SHORTEST, _LONGEST = 500, 2500
+_MAX_BYTES = 65_536
+_MIN_NEUTRAL_US, _MAX_NEUTRAL_US = 500, 2500
 
 
 def carry_out(function: str, neutral: float, arguments: dict[str, Any]) -> bool:
-    """End the pulses as a driver's `LastResort` says; return True if there were any.
+    """End the pulses with the function of a driver's `LastResort`; return True if there were any.
 
-    neutral: pulse of neutral [µs]
-    Raises `ServoError` with one line, also for other exceptions of the function but ImportError.
+    neutral: pulse width of neutral [µs]
+    Raises `ServoError` with one line, also for any other exception of the function except
+    ImportError and `StartupError`, which pass through.
     """
     module, _, name = function.partition(":")
     try:
-        found = getattr(__import__(module, fromlist=[name]), name)
-        return bool(found(neutral, **arguments))
+        end_pulses = getattr(__import__(module, fromlist=[name]), name)
+        return bool(end_pulses(neutral, **arguments))
     except (ServoError, StartupError, ImportError):
         raise
     except Exception as error:
@@ -39,15 +40,16 @@ def carry_out(function: str, neutral: float, arguments: dict[str, Any]) -> bool:
 
 
 def outcome(done: bool) -> str:
-    """Return what a release has seen and done, in words."""
+    """Return a phrase that describes the result of a release."""
     return "pulses were on: neutral, then off" if done else "there were no pulses"
 
 
 def write(config: str, function: str, neutral: float, arguments: dict[str, Any]) -> None:
-    """Leave the recipe for the fishd that runs with a configuration file, or a socket; atomic.
+    """Write the recipe of a fishd atomically.
 
-    The rest is for `carry_out`; without a function, the robot has no servo. If it cannot be
-    written, `fishd-release` does without it, and takes its time.
+    config: its configuration file or its control socket
+    function, neutral, arguments: for `carry_out`; an empty function means a robot without a servo
+    An error is ignored: without the recipe `fishd-release` only takes longer.
     """
     recipe = {"function": function, "neutral": neutral, "arguments": arguments}
     path = _path(config)
@@ -55,7 +57,7 @@ def write(config: str, function: str, neutral: float, arguments: dict[str, Any])
     with suppress(OSError):
         text = json.dumps(recipe | {"config": os.path.realpath(config), "file": _signature(config)})
         os.makedirs(os.path.dirname(path), mode=0o700, exist_ok=True)
-        if not _ours(os.lstat(os.path.dirname(path)), stat.S_ISDIR):
+        if not _is_trusted(os.lstat(os.path.dirname(path)), stat.S_ISDIR):
             return
         with suppress(FileNotFoundError):
             os.unlink(temporary)
@@ -68,37 +70,37 @@ def write(config: str, function: str, neutral: float, arguments: dict[str, Any])
 
 
 def write_without_servo(control: str) -> None:
-    """Leave a recipe that says that the fishd at a control socket has no servo."""
+    """Write a recipe that says that the fishd at a control socket has no servo."""
     write(control, "", 1500.0, {})
 
 
 def remove(config: str) -> None:
-    """Remove the recipe: there is nothing to release, or nothing that is done quickly."""
+    """Remove the recipe, because there is nothing to release or no quick way to do it."""
     with suppress(OSError):
         os.unlink(_path(config))
 
 
 def read(config: str) -> dict[str, Any] | None:
-    """Return the recipe of the latest fishd with a configuration file, or a socket, if it left one.
+    """Return the recipe that the latest fishd left for a configuration file or socket, or None.
 
-    Its key `fresh` says whether the file has not changed since. A recipe that another user may
-    have written, or that is not complete, is ignored.
+    Its key `fresh` is True if that file has not changed since. A recipe that another user may have
+    written, or that is incomplete, is ignored.
     """
     try:
         file = os.open(_path(config), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
-            if not _ours(os.fstat(file), stat.S_ISREG):
+            if not _is_trusted(os.fstat(file), stat.S_ISREG):
                 return None
-            found = json.loads(os.read(file, _LARGEST))
+            recipe = json.loads(os.read(file, _MAX_BYTES))
         finally:
             os.close(file)
-        good = (
-            found["config"] == os.path.realpath(config)
-            and isinstance(found["function"], str)
-            and isinstance(found["arguments"], dict)
-            and _SHORTEST <= found["neutral"] <= _LONGEST
+        valid = (
+            recipe["config"] == os.path.realpath(config)
+            and isinstance(recipe["function"], str)
+            and isinstance(recipe["arguments"], dict)
+            and _MIN_NEUTRAL_US <= recipe["neutral"] <= _MAX_NEUTRAL_US
         )
-        return found | {"fresh": found["file"] == _signature(config)} if good else None
+        return recipe | {"fresh": recipe["file"] == _signature(config)} if valid else None
     except (OSError, ValueError, LookupError, TypeError):
         return None
 
@@ -108,14 +110,18 @@ def _path(config: str) -> str:
 
 
 def _signature(config: str) -> list[int]:
-    """Changes with the file."""
+    """Return numbers that change when the file changes; none without a file."""
     try:
-        found = os.stat(config)
+        status = os.stat(config)
     except OSError:
         return []
-    return [found.st_mtime_ns, found.st_size, found.st_ino]
+    return [status.st_mtime_ns, status.st_size, status.st_ino]
 
 
-def _ours(found: os.stat_result, kind: Any) -> bool:
+def _is_trusted(status: os.stat_result, has_kind: Any) -> bool:
     """Return whether a file has the right kind and can only come from this user or root."""
-    return kind(found.st_mode) and found.st_uid in (os.geteuid(), 0) and not found.st_mode & 0o022
+    return (
+        has_kind(status.st_mode)
+        and status.st_uid in (os.geteuid(), 0)
+        and not status.st_mode & 0o022
+    )

@@ -1,4 +1,4 @@
-"""Sampling of a driver, which is opened again after failures."""
+"""Sampler of a driver, which it opens again after failures."""
 
 import math
 from collections import deque
@@ -12,13 +12,13 @@ from fishd.hardware.driver import Pair, PowerSample, SampledDriver
 
 X = TypeVar("X", Pair, PowerSample)
 
-REMEMBERED = 4096
+MAX_SAMPLES = 4096
 """Largest number of samples kept until they are read; the oldest are dropped."""
-FEW = 3
+REOPEN_FAILURES = 3
 """Number of failures in a row after which the hardware is opened again."""
-LONGEST_PAUSE = 0.5
+MAX_PAUSE_S = 0.5
 """Longest time between two attempts [s]."""
-_SHORTEST_PAUSE = 1e-3
+_MIN_PAUSE_S = 1e-3
 
 
 class Sampler(Generic[X]):
@@ -28,7 +28,7 @@ class Sampler(Generic[X]):
         """Open nothing yet."""
         self._driver = driver
         self._clock = clock
-        self.samples: deque[X] = deque(maxlen=REMEMBERED)
+        self.samples: deque[X] = deque(maxlen=MAX_SAMPLES)
         """Samples received, for another thread to take with `popleft`."""
         self.trouble = ""
         """Reason why the latest attempt failed, one line; empty if it did not. For any thread."""
@@ -42,7 +42,7 @@ class Sampler(Generic[X]):
         self._open = False
 
     def step(self) -> None:
-        """Make one attempt; never raises. Takes as long as it takes, on its clock."""
+        """Make one attempt to sample, and wait on the clock until it is due; never raises."""
         wait = self.ready_at - self._clock.monotonic()
         if wait > 0.0:
             self._clock.sleep(wait)
@@ -51,12 +51,12 @@ class Sampler(Generic[X]):
                 contained(self._driver.open)
                 self._open = True
             sample = contained(self._driver.sample)
-        except Exception as error:  # the layers of drivers raise all kinds
+        except Exception as error:  # the libraries of drivers raise all kinds of exceptions
             self._recover(error)
         else:
             if sample is not None:
                 self.samples.append(sample)
-                self.reconnects += self._failures >= FEW
+                self.reconnects += self._failures >= REOPEN_FAILURES
                 self._failures = 0
                 self.trouble = ""
 
@@ -67,18 +67,18 @@ class Sampler(Generic[X]):
             contained(self._driver.close)
 
     def _recover(self, error: Exception) -> None:
-        """Leave the hardware time to settle, and more after several failures."""
-        self.trouble = self._explained(error)
+        """Give the hardware time to settle, and more after several failures."""
+        self.trouble = self._explain(error)
         self.errors += 1
         self._failures += 1
-        pause = max(self._driver.settling, _SHORTEST_PAUSE)
-        if self._failures >= FEW:
+        pause = max(self._driver.settling, _MIN_PAUSE_S)
+        if self._failures >= REOPEN_FAILURES:
             self.close()
-            pause = min(LONGEST_PAUSE, pause * 2.0 ** min(self._failures - FEW, 10))
+            pause = min(MAX_PAUSE_S, pause * 2.0 ** min(self._failures - REOPEN_FAILURES, 10))
         self.ready_at = self._clock.monotonic() + pause
 
-    def _explained(self, error: Exception) -> str:
+    def _explain(self, error: Exception) -> str:
         try:
             return contained(self._driver.explain, error)
-        except Exception:  # the words are lost, not the reason
+        except Exception:  # a failure of `explain` must not hide the error itself
             return text.named(error)

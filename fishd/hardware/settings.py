@@ -12,11 +12,11 @@ from fishd.core.calibration import Direction, Highest, Lowest, Scale, ServoCalib
 from fishd.core.schema import note, unit
 
 Gpio = Annotated[int, Meta(ge=0, le=27)]
-"""A pin of the Pi's 40-pin header, by its Broadcom number."""
+"""Pin of the Pi's 40-pin header, by its Broadcom number."""
 
 
 class ForceSensorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The dual force sensor; which further keys there are, its driver decides."""
+    """The dual force sensor; its driver adds further keys."""
 
     driver: Annotated[str, note("What reads the sensor: the name of a driver.")] = ""
     force_limit: Annotated[
@@ -62,15 +62,15 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     @property
     def calibration(self) -> ServoCalibration:
         """Calibration that the settings themselves contain."""
-        return ServoCalibration(**_found(self))
+        return ServoCalibration(**_calibration_values(self))
 
     def calibrated(self, calibration: ServoCalibration) -> Self:
         """Return the settings with the values of a calibration."""
-        return msgspec.structs.replace(self, **_found(calibration))
+        return msgspec.structs.replace(self, **_calibration_values(calibration))
 
 
 class PowerMeterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The power meter of the servo; which further keys there are, its driver decides."""
+    """The power meter of the servo; its driver adds further keys."""
 
     driver: Annotated[str, note("What reads the meter: the name of a driver.")] = ""
 
@@ -89,5 +89,7 @@ class PanelSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     led_gpio: Annotated[Gpio | None, note("Pin of the status light; null without one.")] = None
 
 
-def _found(of: ServoSettings | ServoCalibration) -> dict[str, Any]:
-    return {key: getattr(of, key) for key in ("trim", "direction", "scale", "lowest", "highest")}
+def _calibration_values(source: ServoSettings | ServoCalibration) -> dict[str, Any]:
+    return {
+        key: getattr(source, key) for key in ("trim", "direction", "scale", "lowest", "highest")
+    }

@@ -13,7 +13,7 @@ from fishd.core.clock import SystemClock, VirtualClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio, PigpioSettings
-from fishd.hardware.servo.pigpio_client import ANSWER, SCRIPTS, Client, opened
+from fishd.hardware.servo.pigpio_client import ANSWER_TIMEOUT_S, MAX_SCRIPTS, Client, open_client
 from fishd.hardware.servo.pigpio_link import PigpioLink
 from fishd.hardware.servo.pigpio_pulses import neutralise
 from fishd.virtual.pi.faults import Faults
@@ -77,14 +77,14 @@ class Bench:
         self.clock.sleep(seconds)
 
     def client(self) -> contextlib.AbstractContextManager[Client]:
-        return opened("127.0.0.1", self.daemon.port)
+        return open_client("127.0.0.1", self.daemon.port)
 
     def scripts(self) -> int:
         """How many scripts pigpiod holds."""
         found = 0
         with self.client() as client:
-            for script in range(SCRIPTS):
-                client.within(ANSWER)
+            for script in range(MAX_SCRIPTS):
+                client.within(ANSWER_TIMEOUT_S)
                 found += bool(client.script_status(script)[1])
         return found
 

@@ -21,7 +21,7 @@ def have_patience() -> None:
     """Lift the limits of time, in this process."""
     supervisor.OVERRUN_SHARE = math.inf
     loop.MAX_SAMPLE_AGE_PERIODS = 100.0
-    pigpio_link.LATE_STREAK = 1_000_000
+    pigpio_link.MAX_LATE_ANSWERS = 1_000_000
     FAULTS["controller-slow"] = replace(FAULTS["controller-slow"], in_a_row=1_000_000)
     session.MAX_LOST_FRACTION, session.IDLE_LIMIT = 1.0, 60.0
 

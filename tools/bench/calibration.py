@@ -16,7 +16,7 @@ from common.report import Options, Report, table
 from fishd.cli.calibrate.force_dialogue import PLAN
 from fishd.config import Config
 from fishd.core.calibration import ForceCalibration
-from fishd.hardware.force_sensor.calibration_fit import FEWEST_LOADS, Load, fit
+from fishd.hardware.force_sensor.calibration_fit import MIN_LOADS, Load, fit
 from fishd.lab.measurement import measure as measured
 from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
@@ -47,7 +47,7 @@ class Case(NamedTuple):
 CASES = {
     "nothing": Case(),
     "each load by 2 %": Case(weight=0.02),
-    "each load by 2 %, five loads": Case(weight=0.02, loads=FEWEST_LOADS),
+    "each load by 2 %, five loads": Case(weight=0.02, loads=MIN_LOADS),
     "each load by 2 %, each thread by 2°": Case(weight=0.02, thread=np.radians(2.0)),
     "all loads by the same 2 %, `--load-error 0.04`": Case(shared=0.02, load_error=0.04),
 }

@@ -233,7 +233,7 @@ def answers(machine: Machine, settings: Pca9685Settings) -> Result:
         return Result(
             "FAIL",
             i2c.explain(error, settings.bus, settings.address, "PCA9685", "servo"),
-            f"'i2cdetect -y {settings.bus}' (package i2c-tools) shows who answers",
+            f"'i2cdetect -y {settings.bus}' (package i2c-tools) lists which addresses answer",
         )
     if not silent:
         return Result("warning", "pulses are on, but no fishd is running", "fishctl release")

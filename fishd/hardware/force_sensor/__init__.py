@@ -1,1 +1,1 @@
-"""The force sensor: drivers that deliver samples, and what turns samples into forces."""
+"""Force sensor: drivers that deliver samples, and the conversion of samples into forces."""

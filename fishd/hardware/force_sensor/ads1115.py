@@ -1,6 +1,6 @@
-"""The dual force sensor on an ADS1115: two inputs of one chip, converted in turn.
+"""Dual force sensor on an ADS1115: two inputs of one chip, converted in turn.
 
-X Y Y X X Y …: so the lag of the second sample of each pair cancels out in their mean.
+The order is X Y Y X X Y …, so the lag of the second sample of a pair cancels out in their mean.
 """
 
 import math
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
     from fishd.hardware.force_sensor.ads1115_single_shot import SingleShot
 
 Channel = Literal["A0", "A1", "A2", "A3", "A0-A1", "A0-A3", "A1-A3", "A2-A3"]
-"""An input of the ADS1115: a pin against ground, or the difference of two."""
+"""Input of the ADS1115: a pin against ground, or the difference of two pins."""
 I2cAddress = Annotated[int, Meta(ge=0x48, le=0x4B)]
-"""Of an ADS1115."""
-FULL_SCALES = (6.144, 4.096, 2.048, 1.024, 0.512, 0.256)
-"""The ranges that the ADS1115 has, ± [V]."""
-STEPS = 32768
-"""Of the ADC, from zero to full scale."""
-SLOWEST = 1.25
-"""A conversion with its tolerance and its transfers, in units of 1 / data rate."""
-FEWEST_PAIRS = 8 / 0.05 / 860
-"""Pairs per conversion that a bus of 400 kbit/s leaves, at the least."""
+"""I2C address of an ADS1115."""
+FULL_SCALES_V = (6.144, 4.096, 2.048, 1.024, 0.512, 0.256)
+"""Ranges of the ADS1115, ± [V]."""
+ADC_STEPS = 32768
+"""Number of steps of the ADC from zero to full scale."""
+MAX_SAMPLE_PERIODS = 1.25
+"""Longest time of a conversion with its transfers, as a multiple of 1 / data rate."""
+MIN_PAIRS_PER_CONVERSION = 8 / 0.05 / 860
+"""Lowest number of pairs per nominal conversion on a bus of 400 kbit/s."""
 
 
 class Ads1115Settings(ForceSensorSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -78,20 +78,22 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
     transport = "i2c"
 
     def __init__(self, settings: Ads1115Settings, clock: Clock) -> None:
-        """Raises ImportError where the library is not installed; opens nothing yet."""
+        """Import the library and open nothing yet; raise ImportError if it is not installed."""
         from fishd.hardware.force_sensor import ads1115_single_shot as library
 
         super().__init__(settings, clock)
         self._single_shot = library.SingleShot
-        # A conversion goes on when the transfer that asks for it fails. While it does, the chip
-        # ignores a start, and would answer with a sample of the other channel.
-        self.settling = library.TOO_SLOW / settings.data_rate + 1e-3
+        # A conversion continues if the transfer that reads it fails. Until its end the chip
+        # ignores a start, and would then return a sample of the other channel.
+        self.settling = library.CONVERSION_TIMEOUT_PERIODS / settings.data_rate + 1e-3
         self.names = f"F_x (channel {settings.channel_x})", f"F_y (channel {settings.channel_y})"
         self._duration = 1.0 / settings.data_rate
-        self._step = settings.full_scale / STEPS
+        self._step = settings.full_scale / ADC_STEPS
         low, high = settings.saturation_low, settings.saturation_high
-        self._lowest = -STEPS if low is None else max(-STEPS, math.floor(low / self._step))
-        self._highest = STEPS - 1 if high is None else min(STEPS - 1, math.ceil(high / self._step))
+        self._lowest = -ADC_STEPS if low is None else max(-ADC_STEPS, math.floor(low / self._step))
+        self._highest = (
+            ADC_STEPS - 1 if high is None else min(ADC_STEPS - 1, math.ceil(high / self._step))
+        )
         self._in_doubt = True
         self._y_first = False
         self._first: tuple[float, int] | None = None
@@ -102,11 +104,11 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
 
     @property
     def place(self) -> str:
-        """Address and bus."""
+        """Chip, address and bus, for messages."""
         return f"the ADS1115 at {self.settings.address:#04x} on /dev/i2c-{self.settings.bus}"
 
     def open(self) -> None:
-        """Open the bus and find the chip; raises OSError."""
+        """Open the bus and find the chip; raise OSError if that fails."""
         settings = self.settings
         bus = i2c.open_bus(settings.bus)
         try:
@@ -119,46 +121,48 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
         self._bus = bus
 
     def sample(self) -> Pair | None:
-        """Convert once; with every second conversion a pair is complete. Raises OSError."""
+        """Convert once; return a pair after every second conversion. Raises OSError."""
         first, self._first = self._first, None
         if self._in_doubt:
             first = None
             self._chip.check_idle()
-        self._in_doubt = True  # until it has come to its end
+        self._in_doubt = True  # until the conversion has ended
         started = self.clock.monotonic()
         code = (self._y if self._y_first == (first is None) else self._x).value
         self._in_doubt = False
         if first is None:
             self._first = started, code
             return None
-        begun, other = first
-        x, y = (code, other) if self._y_first else (other, code)
+        first_started, first_code = first
+        x, y = (code, first_code) if self._y_first else (first_code, code)
         self._y_first = not self._y_first
         clipped = self._clipped(0, x) or self._clipped(1, y)
-        return Pair(begun, started + self._duration, x * self._step, y * self._step, clipped)
+        return Pair(
+            first_started, started + self._duration, x * self._step, y * self._step, clipped
+        )
 
     def close(self) -> None:
-        """Let go of the bus; never raises, may be called twice."""
+        """Close the bus; never raises, may be called twice."""
         bus, self._bus = self._bus, None
         if bus is not None:
             del self._chip, self._x, self._y
             i2c.close_bus(bus)
 
     def explain(self, error: Exception) -> str:
-        """What to check."""
+        """Return one line that says what went wrong and what to check."""
         settings = self.settings
         return i2c.explain(error, settings.bus, settings.address, "ADS1115", "force_sensor")
 
     @classmethod
     def pair_rate(cls, settings: Ads1115Settings) -> float:
-        """On a bus of 400 kbit/s."""
-        return FEWEST_PAIRS * settings.data_rate
+        """Return the lowest rate of pairs on a bus of 400 kbit/s [1/s]."""
+        return MIN_PAIRS_PER_CONVERSION * settings.data_rate
 
     @classmethod
     def check(cls, settings: Ads1115Settings, tick: float) -> None:
-        """The ADC has the range, each force an input of its own, and each tick a pair."""
-        if settings.full_scale not in FULL_SCALES:
-            permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES)
+        """Refuse an impossible range, one input for both forces, or too slow a rate."""
+        if settings.full_scale not in FULL_SCALES_V:
+            permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES_V)
             raise Problem(
                 ("full_scale",),
                 f"{settings.full_scale:g} is not valid: one of {permitted} V is needed",
@@ -170,33 +174,33 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
                 f"{low:g} is not valid: less than saturation_high, {high:g} V, is needed",
             )
         if settings.channel_x == settings.channel_y:
-            raise Problem(("channel_y",), f"'{settings.channel_y}' is what channel_x is wired to")
-        slowest = 2 * SLOWEST / settings.data_rate
-        if slowest > tick:
+            raise Problem(("channel_y",), f"'{settings.channel_y}' is already channel_x")
+        longest = 2 * MAX_SAMPLE_PERIODS / settings.data_rate
+        if longest > tick:
             raise Problem(
                 ("data_rate",),
                 f"{settings.data_rate} is not valid: a pair of samples would take up to "
-                f"{slowest * 1e3:.1f} ms, longer than a tick of {tick * 1e3:g} ms",
+                f"{longest * 1e3:.1f} ms, longer than a tick of {tick * 1e3:g} ms",
             )
 
     @classmethod
     def claims(cls, settings: Ads1115Settings) -> tuple[Claim, ...]:
-        """Two programs on one bus would take each other's samples, without an error."""
+        """Return the claim of the bus."""
         return (i2c.claim(settings.bus),)
 
     @classmethod
     def checks(cls, settings: Ads1115Settings) -> tuple[Check, ...]:
-        """Of bus, amplifier and chip."""
+        """Return the checks of bus, amplifier and chip."""
         from fishd.hardware.force_sensor import ads1115_checks
 
         return i2c.checks(settings.bus, "force_sensor") + ads1115_checks.checks(settings)
 
     def _clipped(self, channel: int, code: int) -> str:
-        """The ADC's own end of the range, or that of the amplifier before it."""
+        """Return why a code is clipped, by the ADC or by its amplifier; empty if it is not."""
         if self._lowest < code < self._highest:
             return ""
         name = self.names[channel]
-        if code in (-STEPS, STEPS - 1):
+        if code in (-ADC_STEPS, ADC_STEPS - 1):
             return f"{name} is clipped at {math.copysign(self.settings.full_scale, code):+g} V"
         key = "saturation_high" if code >= self._highest else "saturation_low"
         volts = code * self._step

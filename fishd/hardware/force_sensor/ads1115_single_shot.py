@@ -1,4 +1,4 @@
-"""The ADS1115 through its Adafruit driver, with what makes single-shot mode safe and cheap."""
+"""ADS1115 through its Adafruit driver, with single-shot mode made safe and cheap."""
 
 import os
 from typing import TYPE_CHECKING, Any
@@ -10,23 +10,24 @@ from fishd.core.clock import Clock
 if TYPE_CHECKING:
     from fishd.hardware.force_sensor.ads1115 import Ads1115Settings, Channel
 
-SLOWEST, TOO_SLOW = 1.1, 1.25
-"""Times of a conversion, as multiples of 1/data rate: the chip's tolerance, and what is wrong."""
+MAX_CONVERSION_PERIODS, CONVERSION_TIMEOUT_PERIODS = 1.1, 1.25
+"""Longest time of a conversion, and time after which it has failed, as multiples of 1/data rate."""
 
 _CONFIG = 1
 _IDLE_BIT = 0x8000
-_WAKE_UP = 25e-6  # of the chip, before a conversion [s]
+_WAKE_UP_S = 25e-6
+"""Time that the chip needs before a conversion [s]."""
 _GAINS = {6.144: 2 / 3, 4.096: 1, 2.048: 2, 1.024: 4, 0.512: 8, 0.256: 16}
 
 
 class SingleShot(ADS1115):  # type: ignore[misc]
-    """The driver, except that it sleeps while the chip converts and does not wait for ever."""
+    """The Adafruit driver, changed to sleep while the chip converts and to wait with a timeout."""
 
     def __init__(self, bus: Any, settings: "Ads1115Settings", clock: Clock) -> None:
-        """Find the chip on a bus and set it up; raises OSError."""
+        """Find the chip on a bus and set it up; raise OSError if that fails."""
         self._clock = clock
-        self._sleep = _WAKE_UP + SLOWEST / settings.data_rate
-        self._limit = TOO_SLOW / settings.data_rate
+        self._sleep = _WAKE_UP_S + MAX_CONVERSION_PERIODS / settings.data_rate
+        self._limit = CONVERSION_TIMEOUT_PERIODS / settings.data_rate
         self._pointer = bytearray(1)
         self._word = bytearray(2)
         try:
@@ -34,20 +35,20 @@ class SingleShot(ADS1115):  # type: ignore[misc]
                 bus,
                 gain=_GAINS[settings.full_scale],
                 data_rate=settings.data_rate,
-                # Without effect, as the comparator is off; but no config of ours is ever that of
-                # a chip after a reset, so that a reset can be told.
+                # It has no effect, as the comparator is off, but makes every config of fishd
+                # differ from that after a reset, so that a reset is detected.
                 comparator_mode=ads1x15.Comp_Mode.WINDOW,
                 address=settings.address,
             )
         except ValueError as error:
-            # No name for the cause: its traceback would keep this frame, and this frame the cause.
+            # The cause gets no name: its traceback refers to this frame, which would refer to it.
             number = getattr(error.__context__, "errno", None)
             if number is None:
                 raise
             raise OSError(number, os.strerror(number)) from None
 
     def input(self, channel: "Channel") -> Any:
-        """One input, whose `value` is converted when it is asked for."""
+        """Return an input; reading its `value` makes a conversion."""
         return AnalogIn(self, *(int(pin[1]) for pin in channel.split("-")))
 
     def check_idle(self) -> None:
@@ -56,21 +57,21 @@ class SingleShot(ADS1115):  # type: ignore[misc]
             raise TimeoutError("the ADS1115 stays busy: switch its power off and on")
 
     def _read(self, pin: int) -> int:
-        """Convert and return the code; raises OSError where it might not be that of `pin`."""
+        """Convert and return the code; raise OSError if it might not be that of `pin`."""
         clock = self._clock
         self._write_config(pin)
         settings = (self.buf[1] << 8 | self.buf[2]) & ~_IDLE_BIT
         started = clock.monotonic()
         clock.sleep(self._sleep)
         while True:
-            asked = clock.monotonic()
+            now = clock.monotonic()
             config = self._read_register(_CONFIG, fast=True)
             if config & ~_IDLE_BIT != settings:
                 raise OSError("the ADS1115 was reset while it converted: check its power")
             if config & _IDLE_BIT:
                 break
-            # What ends later than this is no conversion that was started here.
-            if asked - started > self._limit:
+            # A conversion that ends later was not started here.
+            if now - started > self._limit:
                 raise TimeoutError(
                     "the ADS1115 does not end its conversions: switch its power off and on"
                 )
@@ -78,11 +79,10 @@ class SingleShot(ADS1115):  # type: ignore[misc]
         return int(self._conversion_value(self.get_last_result()))
 
     def _read_register(self, reg: int, fast: bool = False) -> int:
-        """Read a register, or with `fast` the one that the pointer is at.
+        """Read a register, or with `fast` the register that the pointer is at.
 
-        The driver's own way, one combined transfer, takes four times as long in the interpreter
-        and leaves reference cycles behind, of which the garbage collector would have to make 4000
-        per second disappear.
+        The combined transfer of the Adafruit driver takes four times as long in the interpreter and
+        leaves reference cycles: the garbage collector would have to collect 4000 per second.
         """
         with self.i2c_device as i2c:
             if not fast:

@@ -1,7 +1,7 @@
-"""From known loads on the force sensor to its calibration; for `fishctl calibrate force`.
+"""Fit of the force sensor's calibration to known loads; for `fishctl calibrate force`.
 
-Force = C·[V_x, V_y, 1], least squares over the loads. The covariance of the gains follows from what
-the fit leaves over, and from the error that all loads share, which leaves nothing over.
+Force = C·[V_x, V_y, 1], least squares over the loads. The covariance of the gains follows from the
+residuals of the fit, and from the error that all loads share, which causes no residuals.
 """
 
 import math
@@ -14,56 +14,58 @@ from numpy.typing import NDArray
 from fishd.core.calibration import Covariance, ForceCalibration
 from fishd.core.errors import FishdError
 
-FEWEST_LOADS = 5
-WORST_CONDITION = 100.0
-"""Beyond this one direction is known so much worse than the other that the fit is refused."""
-WORST_RESIDUAL = 0.2
-"""A residual beyond this share of the loads, both as root mean squares, is no fit.
+MIN_LOADS = 5
+"""Smallest number of loads for a fit."""
+MAX_CONDITION = 100.0
+"""Largest condition number of a fit; beyond it, one direction is known too badly."""
+MAX_RESIDUAL_FRACTION = 0.2
+"""Largest residual of a fit, as a fraction of the loads, both as root mean squares.
 
-Voltages that have nothing to do with the loads leave about 0.7 with five of them; less than 0.2 is
-then rarer than one in five hundred. The worst sensors that are of use leave 0.02.
+Voltages unrelated to the loads leave about 0.7 with five loads, and less than 0.2 in fewer than one
+case of five hundred. The worst usable sensors leave 0.02.
 """
-_FLOOR = 0.1
-"""A small load is taken to have at least the error of this fraction of the largest load."""
+_ERROR_FLOOR_FRACTION = 0.1
+"""A small load is assumed to have at least the error of this fraction of the largest load."""
 _FREEDOM = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 12.0, 20.0, 60.0, math.inf)
 _STUDENT = (12.706, 6.017, 4.303, 3.182, 2.776, 2.571, 2.447, 2.306, 2.179, 2.086, 2.000, 1.960)
-"""Quantile 0.975 of Student's t for each of these degrees of freedom."""
-_NOTICEABLE = 0.01
-"""A load counts as one along an axis from this share of the largest load on."""
+"""Quantile 0.975 of Student's t for each of the degrees of freedom in `_FREEDOM`."""
+_MIN_LOAD_FRACTION = 0.01
+"""Smallest load that counts as a load along an axis, as a fraction of the largest load."""
 
 _Vectors = NDArray[Any]
 
 
 class Load(NamedTuple):
-    """One load, and what the sensor said under it."""
+    """One load, and the voltages of the sensor under it."""
 
     fx: float
     """Force on the fish [N]; forward is positive."""
     fy: float
-    """To the fish's left is positive [N]."""
+    """Lateral force on the fish [N]; to its left is positive."""
     vx: float
-    """[V]"""
+    """Voltage of channel x [V]."""
     vy: float
 
 
 class Fit(NamedTuple):
-    """A calibration, and how well it suits the loads that it comes from."""
+    """Calibration fitted to loads, with its error at each load."""
 
     calibration: ForceCalibration
     errors: list[tuple[float, float]]
-    """What it leaves over at each load, fitted less true, along x and y [N]."""
+    """Residual at each load, fitted minus true force, along x and y [N]."""
 
 
 class PoorLoads(FishdError, ValueError):
-    """These loads do not determine a calibration; the message says what is missing."""
+    """Loads that do not determine a calibration; the message says what is missing."""
 
 
 def fit(loads: Sequence[Load], load_error: float = 0.0) -> Fit:
-    """Return the calibration that suits the loads best, with the covariance of its gains.
+    """Return the calibration that fits the loads best, with the covariance of its gains.
 
     Its `residual` is the root mean square of all errors [N], its `condition` the ratio of the
     largest to the smallest spread of the voltages.
-    load_error: half-width of the 95 % interval of the error that all loads share, as a fraction
+    load_error: half-width of the 95 % confidence interval of the error that all loads share, as a
+        fraction
     Raises `PoorLoads`.
     """
     missing = missing_loads([(load.fx, load.fy) for load in loads])
@@ -74,12 +76,12 @@ def fit(loads: Sequence[Load], load_error: float = 0.0) -> Fit:
     if not np.isfinite(voltages).all():
         raise PoorLoads("a voltage is not a finite number; measure that load again")
     condition = _condition(voltages)
-    if condition > WORST_CONDITION:
+    if condition > MAX_CONDITION:
         raise PoorLoads(
             f"the voltages hardly tell x from y (condition number {condition:.3g}, at most "
-            f"{WORST_CONDITION:g}): {_dull(voltages)}"
+            f"{MAX_CONDITION:g}): {_describe_still_channel(voltages)}"
         )
-    # About their means, so that a large voltage without a force costs no digits.
+    # Fitting about the means keeps the digits of a large voltage without a force.
     middle = voltages.mean(axis=0)
     design = np.column_stack([voltages - middle, np.ones(len(loads))])
     solution = np.linalg.lstsq(design, forces, rcond=None)[0]
@@ -109,31 +111,31 @@ def fit(loads: Sequence[Load], load_error: float = 0.0) -> Fit:
 def _covariances(design: _Vectors, forces: _Vectors, errors: _Vectors) -> list[_Vectors]:
     """Return the covariance of the two gains of F_x, and of those of F_y, 2 x 2 each [N²/V²].
 
-    The errors of different loads are taken to be independent. That of a load along its force is in
-    proportion to it (its weight, friction of the pulley), with another factor across it (direction
-    of the thread). Both factors are found from the residuals of F_x and F_y together, and widened
-    by Student's t for as many degrees of freedom as determine them.
+    The errors of different loads are assumed to be independent. The error of a load along its force
+    is proportional to the load (its weight, friction of the pulley), and so is the error across it,
+    with another factor (direction of the thread). Both factors are estimated from the residuals of
+    F_x and F_y together, and widened by Student's t for their degrees of freedom.
     """
     solver = np.linalg.pinv(design)
-    leaves = np.eye(len(design)) - design @ solver
+    residual_projection = np.eye(len(design)) - design @ solver
     squares = forces**2
-    floor = _FLOOR**2 * squares.max()
+    floor = _ERROR_FLOOR_FRACTION**2 * squares.max()
     across = squares[:, ::-1]
-    factors = [_factor(leaves, errors, shape + floor) for shape in (squares, across)]
+    factors = [_factor(residual_projection, errors, shape + floor) for shape in (squares, across)]
     variances = factors[0] * (squares + floor) + factors[1] * across
     return [solver[:2] * variances[:, axis] @ solver[:2].T for axis in (0, 1)]
 
 
-def _factor(leaves: _Vectors, errors: _Vectors, shape: _Vectors) -> float:
+def _factor(residual_projection: _Vectors, errors: _Vectors, shape: _Vectors) -> float:
     """Return what to multiply `shape` by for the variances of these errors, widened by Student's t.
 
-    leaves: projection of the errors of the loads on those that the fit leaves over
+    residual_projection: projection of the errors of the loads on the residuals of the fit
     shape: variance of the error of each load, along x and y, up to that factor
     """
     weight = shape / shape.max()
     modes = []
     for axis in (0, 1):
-        spread = leaves * np.sqrt(shape[:, axis])
+        spread = residual_projection * np.sqrt(shape[:, axis])
         modes.append(np.linalg.eigvalsh(spread.T @ (weight[:, axis, np.newaxis] * spread)))
     expected = np.concatenate(modes)
     freedom = expected.sum() ** 2 / (expected**2).sum()
@@ -146,35 +148,35 @@ def _with_load_error(covariance: _Vectors, gains: _Vectors, load_error: float) -
 
     That error multiplies all gains by the same number.
     """
-    whole = covariance + (load_error / 1.96) ** 2 * np.outer(gains, gains)
-    return float(whole[0, 0]), float(whole[0, 1]), float(whole[1, 1])
+    total = covariance + (load_error / 1.96) ** 2 * np.outer(gains, gains)
+    return float(total[0, 0]), float(total[0, 1]), float(total[1, 1])
 
 
 def check(fitted: Fit, loads: Sequence[Load], names: Sequence[str]) -> None:
-    """Raises `PoorLoads`, which names the worst load, unless the fit has to do with the loads."""
+    """Raise `PoorLoads`, which names the worst load, if the residual of the fit is too large."""
     size = math.sqrt(sum(load.fx**2 + load.fy**2 for load in loads) / (2 * len(loads)))
     residual = fitted.calibration.residual
-    if residual > WORST_RESIDUAL * size:
+    if residual > MAX_RESIDUAL_FRACTION * size:
         raise PoorLoads(
             f"the voltages do not follow the loads: the residual is {residual / size:.0%} of them "
-            f"(rms), and at most {WORST_RESIDUAL:.0%} is a fit; measure {worst(fitted, names)} "
-            "again first"
+            f"(rms), and may be {MAX_RESIDUAL_FRACTION:.0%} at most; measure "
+            f"{worst(fitted, names)} again first"
         )
 
 
 def worst(fitted: Fit, names: Sequence[str]) -> str:
-    """The name of the load with the largest error."""
+    """Return the name of the load with the largest error."""
     sizes = [math.hypot(*error) for error in fitted.errors]
     return names[sizes.index(max(sizes))]
 
 
 def missing_loads(forces: Sequence[tuple[float, float]]) -> list[str]:
-    """What has to be added to these loads (F_x, F_y) [N] for a calibration; nothing if empty."""
+    """Return what these loads (F_x, F_y) [N] lack for a calibration; empty if they suffice."""
     if not all(math.isfinite(f) for force in forces for f in force):
         return ["every load must be a finite number"]
     largest = max((math.hypot(*force) for force in forces), default=0.0)
-    least = _NOTICEABLE * largest
-    there = {
+    least = _MIN_LOAD_FRACTION * largest
+    present = {
         "no load at all (zero)": any(math.hypot(*force) < least for force in forces),
         "a load along +x": any(fx > least for fx, _ in forces),
         "a load along -x": any(fx < -least for fx, _ in forces),
@@ -182,28 +184,28 @@ def missing_loads(forces: Sequence[tuple[float, float]]) -> list[str]:
         "a load along -y": any(fy < -least for _, fy in forces),
     }
     if largest == 0.0:
-        there["no load at all (zero)"] = bool(forces)
-    missing = [f"{name} is missing" for name, found in there.items() if not found]
-    if not missing and _condition(np.array(forces)) > WORST_CONDITION:
+        present["no load at all (zero)"] = bool(forces)
+    missing = [f"{name} is missing" for name, is_present in present.items() if not is_present]
+    if not missing and _condition(np.array(forces)) > MAX_CONDITION:
         missing.append("all loads are on one line; a load across it is missing")
-    if not missing and len(forces) < FEWEST_LOADS:
-        missing.append(f"{FEWEST_LOADS} loads are needed, there are {len(forces)}")
+    if not missing and len(forces) < MIN_LOADS:
+        missing.append(f"{MIN_LOADS} loads are needed, there are {len(forces)}")
     return missing
 
 
 def _condition(vectors: _Vectors) -> float:
-    """Largest spread of these points in the plane over their smallest; infinite on a line."""
+    """Return the ratio of the largest to the smallest spread of points; infinite on a line."""
     widths = np.linalg.svd(vectors - vectors.mean(axis=0), compute_uv=False)
     return float(widths[0] / widths[-1]) if widths[-1] > 0.0 else math.inf
 
 
-def _dull(voltages: _Vectors) -> str:
-    """Which channel hardly moves, in words."""
+def _describe_still_channel(voltages: _Vectors) -> str:
+    """Return a sentence that says which channel hardly moves."""
     spread = np.ptp(voltages, axis=0)
-    for mine, other, name in ((0, 1, "x"), (1, 0, "y")):
-        if spread[mine] < spread[other] / WORST_CONDITION:
+    for channel, other_channel, name in ((0, 1, "x"), (1, 0, "y")):
+        if spread[channel] < spread[other_channel] / MAX_CONDITION:
             return (
-                f"V_{name} moved by {spread[mine] * 1e3:.3g} mV only; is the sensor wired to "
+                f"V_{name} moved by {spread[channel] * 1e3:.3g} mV only; is the sensor wired to "
                 f"force_sensor.channel_{name}?"
             )
     return "both channels moved together; were loads along x and along y hung as planned?"

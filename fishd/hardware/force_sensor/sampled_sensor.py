@@ -1,6 +1,6 @@
-"""The dual force sensor, whatever its driver: a thread samples it, the tick takes what came in.
+"""Dual force sensor of every driver: a thread samples it, and each tick takes the new samples.
 
-In virtual time there is no thread: a read samples until its clock has come to the tick.
+In virtual time a read samples instead of a thread, until its clock has reached the tick.
 """
 
 import math
@@ -14,23 +14,24 @@ from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import Clock
 from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
-from fishd.hardware.driver import ForceSensorDriver, Pair, survived
+from fishd.hardware.driver import ForceSensorDriver, Pair, read_counters
 from fishd.hardware.force_sensor.window import VoltageWatch, WindowEvaluation
 from fishd.hardware.sampler import Sampler
 
-HOLD = 2.2e-3
-"""How long before a read all conversions have ended, at most an eighth of a tick [s].
+QUIET_TIME_S = 2.2e-3
+"""Time without conversions before and after a read, at most an eighth of a tick [s].
 
-As long as the ticker is awake before a deadline: two threads of one interpreter delay each other.
+It is the time for which the ticker is awake before a deadline: two threads of one interpreter delay
+each other.
 """
-CLOSE_LIMIT = 0.5
-"""How long to wait for the thread to end [s]."""
+CLOSE_TIMEOUT_S = 0.5
+"""Longest wait for the thread to end [s]."""
 
 
 class SampledSensor:
-    """A force sensor that measures voltages, and can be calibrated.
+    """Force sensor that measures voltages and can be calibrated.
 
-    What is read, watched and calibrated is for one thread, the one that ticks.
+    Only the thread that ticks may read, watch and calibrate it.
     """
 
     def __init__(
@@ -41,22 +42,23 @@ class SampledSensor:
         *,
         threaded: bool,
         tick: float,
-        beside: Callable[[], None] = lambda: None,
+        between_samples: Callable[[], None] = lambda: None,
     ) -> None:
-        """Begin to sample; hardware that is missing may come later.
+        """Start to sample; hardware that is missing may appear later.
 
-        clock: of the driver; in virtual time one of its own, which reads move on
-        threaded: sample in a thread, which needs a clock that moves by itself
+        clock: clock of the driver; in virtual time a separate clock, which reads advance
+        threaded: sample in a thread, which needs a clock that advances by itself
         tick: time between two reads [s]
-        beside: called again and again in virtual time, for what else uses its clock
+        between_samples: function called before each sample in virtual time, for other users of the
+            clock
         """
         self.calibration = calibration
-        """What turns voltages into forces."""
+        """Calibration that turns voltages into forces."""
         self._clock = clock
         self._tick = tick
-        self._hold = min(HOLD, 0.125 * tick)
+        self._quiet_time = min(QUIET_TIME_S, 0.125 * tick)
         self._step_time = 0.0
-        self._beside = beside
+        self._between_samples = between_samples
         self._place = driver.place
         self._transport = driver.transport
         self._driver = driver
@@ -76,11 +78,11 @@ class SampledSensor:
         self.calibration = calibration
 
     def read(self, now: float) -> Measurement:
-        """What was measured since the previous read; in real time it waits for nothing.
+        """Return the measurement since the previous read; never waits in real time.
 
-        Without a new pair of samples it is the previous measurement, its time included, of no
-        samples and under no suspicion. Raises `SensorError`, with what to check, while the hardware
-        cannot be read, before the first pair, and once closed.
+        Without a new pair of samples this is the previous measurement with its time, marked as
+        holding no samples and as not suspect. Raises `SensorError`, with what to check, while the
+        hardware cannot be read, before the first pair, and after `close`.
         """
         if self._closing.is_set():
             raise SensorError(f"{self._place} is closed")
@@ -100,44 +102,45 @@ class SampledSensor:
             self._evaluation.interrupt()
             raise SensorError(trouble)
         if self._latest is None:
-            raise SensorError(f"{self._place} has not delivered yet")
+            raise SensorError(f"{self._place} has not delivered a sample yet")
         return self._latest
 
     @property
     def unit(self) -> str:
-        """Of the forces: N, or that of the driver until the sensor is calibrated."""
+        """Unit of the forces: N, or that of the driver until the sensor is calibrated."""
         return self._evaluation.unit(self.calibration)
 
     def watch(self) -> VoltageWatch:
-        """Begin to add up the voltages of every pair that is sampled from now on."""
+        """Return a watch that adds up the voltages of every pair sampled from now on."""
         watch = VoltageWatch(self._clock.monotonic(), self.calibration)
         self._watches.append(watch)
         return watch
 
     def counters(self) -> dict[str, int]:
-        """Errors that were survived, since start."""
+        """Return the numbers of recovered errors since start."""
         sampler, transport = self._sampler, self._transport
         return {
             f"{transport}_errors": sampler.errors,
             f"{transport}_reconnects": sampler.reconnects,
-            **survived(self._driver),
+            **read_counters(self._driver),
         }
 
     def close(self) -> None:
-        """Stop to sample and let go of the hardware; may be called twice, and never hangs.
+        """Stop sampling and release the hardware; may be called twice, and never hangs.
 
-        A thread that is stuck in a transfer is left to end by itself.
+        A thread that hangs in a transfer is left to end by itself.
         """
         self._closing.set()
         if self._thread is None:
             self._sampler.close()
         else:
-            self._thread.join(CLOSE_LIMIT)
+            self._thread.join(CLOSE_TIMEOUT_S)
 
     def _take(self, now: float) -> list[Pair]:
-        """All that has come in; a deque needs no lock for that, so the tick waits for nobody.
+        """Return all new pairs; a deque needs no lock for that, so the tick never waits.
 
-        In virtual time the driver may have run ahead: what ended after `now` is for the next read.
+        In virtual time the driver may have run ahead: pairs that ended after `now` are left for the
+        next read.
         """
         pairs = self._sampler.samples
         count = len(pairs)
@@ -146,25 +149,25 @@ class SampledSensor:
         return [pairs.popleft() for _ in range(count)]
 
     def _catch_up(self, now: float) -> None:
-        """Sample until `now` as the thread would have done."""
+        """Sample until `now` as the thread would have done in real time."""
         clock, sampler = self._clock, self._sampler
-        while max(clock.monotonic(), sampler.ready_at) <= now - self._hold - self._step_time:
-            self._beside()
+        while max(clock.monotonic(), sampler.ready_at) <= now - self._quiet_time - self._step_time:
+            self._between_samples()
             self._step()
         clock.sleep(now - clock.monotonic())
 
     def _step(self) -> None:
-        """Make one attempt, and learn how long that takes: the longest of late, slowly forgotten.
+        """Make one attempt, and update the longest recent time of an attempt, which decays slowly.
 
-        What takes longer than an eighth of a tick is no sample but an error.
+        An attempt longer than an eighth of a tick is an error, and counts as an eighth of a tick.
         """
-        begun = self._clock.monotonic()
+        started = self._clock.monotonic()
         self._sampler.step()
-        took = min(self._clock.monotonic() - begun, 0.125 * self._tick)
-        self._step_time = max(took, self._step_time + 0.01 * (took - self._step_time))
+        duration = min(self._clock.monotonic() - started, 0.125 * self._tick)
+        self._step_time = max(duration, self._step_time + 0.01 * (duration - self._step_time))
 
     def _run(self) -> None:
-        """Sample until closed; what the thread does."""
+        """Sample until closed, in the thread."""
         clock, sampler = self._clock, self._sampler
         while not self._closing.is_set():
             pause = max(sampler.ready_at - clock.monotonic(), self._pause())
@@ -175,11 +178,11 @@ class SampledSensor:
         sampler.close()
 
     def _pause(self) -> float:
-        """How long to stay quiet, so that the tick does not have to wait for the interpreter [s].
+        """Return how long to pause so that the tick need not wait for the interpreter [s].
 
-        That is around an expected read, until it has come and had some time.
+        The pause is around an expected read: it ends some time after the read.
         """
         late = self._clock.monotonic() - self._next_read
-        if not -self._hold - self._step_time <= late < self._hold:
+        if not -self._quiet_time - self._step_time <= late < self._quiet_time:
             return 0.0
-        return 0.25 * self._hold - min(late, 0.0)
+        return 0.25 * self._quiet_time - min(late, 0.0)

@@ -1,4 +1,4 @@
-"""What the samples of one window amount to: forces and whether to believe them; voltages."""
+"""Evaluation of the samples of a window: forces, reasons to suspect them, and mean voltages."""
 
 import math
 from collections.abc import Sequence
@@ -10,25 +10,29 @@ from fishd.hardware.settings import ForceSensorSettings
 
 
 class WindowEvaluation:
-    """Turns pairs of voltages into measurements of the forces."""
+    """Evaluation of pairs of voltages as measurements of the forces."""
 
     def __init__(
         self, settings: ForceSensorSettings, names: tuple[str, str], raw_unit: str
     ) -> None:
-        """names: what messages call the two channels; raw_unit: that of the pairs"""
+        """Start without samples.
+
+        names: names of the two channels in messages
+        raw_unit: unit of the values of the pairs
+        """
         self._limit = settings.force_limit
         self._raw_unit = raw_unit
-        patience = math.inf if settings.frozen_after is None else settings.frozen_after
-        self._x, self._y = (_FrozenCode(name, patience, raw_unit) for name in names)
+        frozen_after = math.inf if settings.frozen_after is None else settings.frozen_after
+        self._x, self._y = (_FrozenCodeDetector(name, frozen_after, raw_unit) for name in names)
 
     def measure(self, pairs: Sequence[Pair], calibration: ForceCalibration) -> Measurement:
-        """Means of at least one pair."""
+        """Return the mean forces of at least one pair, with a reason if they are suspect."""
         _, times, vxs, vys, clipped = zip(*pairs, strict=True)
         count = len(pairs)
         fx, fy = calibration.forces(sum(vxs) / count, sum(vys) / count)
         newest = times[-1]
-        # Both channels see every window, else one that is not asked could not tell that it froze.
-        frozen_x, frozen_y = self._x.doubt(vxs, newest), self._y.doubt(vys, newest)
+        # Both detectors need every window, even if another reason makes this one suspect.
+        frozen_x, frozen_y = self._x.check(vxs, newest), self._y.check(vys, newest)
         extremes = _extremes(vxs, vys, calibration)
         suspect = (
             next(filter(None, clipped), "")
@@ -39,26 +43,26 @@ class WindowEvaluation:
         return Measurement(newest, fx, fy, count, suspect, extremes)
 
     def interrupt(self) -> None:
-        """Note that samples stopped coming in, so that nobody takes that for a frozen code."""
-        self._x.forget()
-        self._y.forget()
+        """Restart the detection of frozen codes, because samples stopped arriving."""
+        self._x.reset()
+        self._y.reset()
 
     def unit(self, calibration: ForceCalibration) -> str:
-        """Of the forces that this calibration gives."""
+        """Return the unit of the forces that this calibration gives."""
         return self._raw_unit if calibration.untouched else "N"
 
-    def _beyond_limit(self, found: Extremes, calibration: ForceCalibration) -> str:
+    def _beyond_limit(self, extremes: Extremes, calibration: ForceCalibration) -> str:
         limit = self._limit
         for name, low, high in (
-            ("F_x", found.fx_min, found.fx_max),
-            ("F_y", found.fy_min, found.fy_max),
+            ("F_x", extremes.fx_min, extremes.fx_max),
+            ("F_y", extremes.fy_min, extremes.fy_max),
         ):
             if not (low >= -limit and high <= limit):
                 force = high if high > limit else low
-                said = f"{name} is {force:+.4g} N, beyond force_sensor.force_limit, {limit:g} N"
+                reason = f"{name} is {force:+.4g} N, beyond force_sensor.force_limit, {limit:g} N"
                 if calibration.untouched:
-                    said += f" (not calibrated: 1 {self._raw_unit} counts as 1 N)"
-                return said
+                    reason += f" (not calibrated: 1 {self._raw_unit} counts as 1 N)"
+                return reason
         return ""
 
 
@@ -70,50 +74,53 @@ def _extremes(
     return Extremes(min(fxs), max(fxs), min(fys), max(fys))
 
 
-class _FrozenCode:
-    """Whether one channel says the same for too long."""
+class _FrozenCodeDetector:
+    """Detector of a channel whose code has not changed for too long."""
 
-    def __init__(self, name: str, patience: float, unit: str) -> None:
+    def __init__(self, name: str, frozen_after: float, unit: str) -> None:
         self._name = name
         self._unit = unit
-        self._patience = patience
-        self.forget()
+        self._frozen_after = frozen_after
+        self.reset()
 
-    def forget(self) -> None:
-        """Begin to watch anew."""
+    def reset(self) -> None:
+        """Forget the last code."""
         self._value: float | None = None
         self._since = math.inf
 
-    def doubt(self, values: Sequence[float], newest: float) -> str:
-        """Why not to believe these, empty if there is no reason; `newest` in seconds."""
+    def check(self, values: Sequence[float], newest: float) -> str:
+        """Return why the values are suspect, or an empty string.
+
+        newest: time of the last value [s, monotonic]
+        """
         last = values[-1]
         if not min(values) == max(values) == self._value:
             self._value = last
             self._since = newest
-        still = newest - self._since
-        if still < self._patience:
+        unchanged = newest - self._since
+        if unchanged < self._frozen_after:
             return ""
-        return f"{self._name} has been frozen at {last:+.6g} {self._unit} for {still:.1f} s"
+        return f"{self._name} has been frozen at {last:+.6g} {self._unit} for {unchanged:.1f} s"
 
 
 class VoltageWatch:
-    """The voltages of many windows, added up."""
+    """Sum of the voltages of many windows."""
 
-    def __init__(self, begun: float, calibration: ForceCalibration) -> None:
-        """Pairs from before `begun` [s, monotonic] do not count."""
+    def __init__(self, started: float, calibration: ForceCalibration) -> None:
+        """Start a sum; pairs from before `started` [s, monotonic] do not count."""
         self.closed = False
         self._calibration = calibration
-        self._begun = self._newest = begun
+        self._started = self._newest = started
         self._pairs = 0
-        # Sums of what is beyond the first pair: so their squares lose no digits.
+        # Sums of differences from the first pair: so their squares lose no digits.
         self._origin = (0.0, 0.0)
         self._x = self._y = self._xx = self._yy = 0.0
         self._suspect = ""
 
     def add(self, pairs: Sequence[Pair], suspect: str) -> None:
-        """Add a window, and why it is not to be believed."""
-        for begun, time, vx, vy, _ in pairs:
-            if begun >= self._begun:
+        """Add the pairs of a window, and the reason why it is suspect."""
+        for started, time, vx, vy, _ in pairs:
+            if started >= self._started:
                 if not self._pairs:
                     self._origin = vx, vy
                 x, y = vx - self._origin[0], vy - self._origin[1]
@@ -126,7 +133,7 @@ class VoltageWatch:
         self._suspect = self._suspect or suspect
 
     def close(self) -> ForceSample:
-        """Stop, and say what came in, all zero if nothing did; may be called twice."""
+        """Stop and return the sample, all zero if no pair arrived; may be called twice."""
         self.closed = True
         count = max(self._pairs, 1)
         x, y = self._x / count, self._y / count
@@ -134,7 +141,7 @@ class VoltageWatch:
         fx, fy = self._calibration.forces(vx, vy)
         return ForceSample(
             pairs=self._pairs,
-            seconds=self._newest - self._begun,
+            seconds=self._newest - self._started,
             vx=vx,
             vy=vy,
             vx_std=math.sqrt(max(0.0, self._xx / count - x * x)),

@@ -1,1 +1,1 @@
-"""The power meters: what the servo takes from its supply."""
+"""Power meters: the electrical power that the servo takes from its supply."""

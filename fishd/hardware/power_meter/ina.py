@@ -1,8 +1,9 @@
-"""What the INA219 and the INA226 of Texas Instruments have in common.
+"""Common part of the drivers of the INA219 and the INA226 of Texas Instruments.
 
-Both measure the voltage over a shunt and that of the supply behind it, one after the other and all
-the time, and average by themselves. Their registers for power and current are not used: those know
-of one shunt. How they average is lost with the chip's supply, so that is looked at now and then.
+Both chips measure the voltage over a shunt and that of the supply behind it, one after the other
+and continuously, and average by themselves. Their registers for power and current are not used:
+those assume a certain shunt. The settings of the averages are lost when the chip loses its supply,
+so they are read back at intervals.
 """
 
 import contextlib
@@ -19,12 +20,12 @@ from fishd.hardware import i2c
 from fishd.hardware.checks import START_VIRTUAL_PI, Check, Machine, Result, fail, ok, warning
 from fishd.hardware.driver import Claim, PowerMeterDriver, PowerMeterSettings, PowerSample
 
-TOLERANCE = 1.15
-"""Of the chips' own clocks, and of ours."""
-LOWEST_SUPPLY = 3.0
-"""Below this [V] no servo moves."""
-TRUSTED = 1.0
-"""For so long it is believed to average as it was told, unless a transfer fails [s]."""
+CLOCK_TOLERANCE = 1.15
+"""Tolerance of the chips' clocks and of this machine's, as a factor."""
+MIN_SUPPLY_V = 3.0
+"""Lowest supply voltage with which a servo moves [V]."""
+SETTINGS_CHECK_INTERVAL_S = 1.0
+"""Time after which the chip's settings are read back, unless a transfer fails before [s]."""
 
 
 Shunt = Annotated[
@@ -33,7 +34,7 @@ Shunt = Annotated[
 
 
 class InaSettings(PowerMeterSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where the chip is, and its shunt."""
+    """Address of the chip, and its shunt."""
 
     bus: Annotated[i2c.Bus, note("I2C bus: N of /dev/i2c-N.")] = 1
     address: Annotated[
@@ -47,29 +48,29 @@ N = TypeVar("N", bound=InaSettings)
 
 
 class Ina(PowerMeterDriver[N]):
-    """An INA on the I2C bus; which one, subclasses know."""
+    """An INA219 or INA226 on the I2C bus."""
 
     on_virtual_pi = True
     transport = "i2c_power"
     chip: ClassVar[str]
-    """Its name."""
+    """Name of the chip."""
     full_scale: ClassVar[float]
-    """Largest voltage over the shunt that it tells, ± [V]."""
+    """Largest voltage over the shunt that the chip measures, ± [V]."""
     _bus: Any = None
     _trusted_until = -math.inf
 
     @property
-    def least(self) -> float:
-        """How long it must measure for each value, so that each is read once at least [s]."""
-        return TOLERANCE * self.interval
+    def min_measuring_time(self) -> float:
+        """Shortest time to measure for one value, so that every value is read at least once [s]."""
+        return CLOCK_TOLERANCE * self.interval
 
     @property
     def place(self) -> str:
-        """Address and bus."""
+        """Chip, address and bus, for messages."""
         return f"the {self.chip} at {self.settings.address:#04x} on /dev/i2c-{self.settings.bus}"
 
     def open(self) -> None:
-        """Open the bus, find the chip and set it up; raises OSError."""
+        """Open the bus, find the chip and set it up; raise OSError if that fails."""
         bus = i2c.open_bus(self.settings.bus)
         try:
             self.set_up(bus)
@@ -80,55 +81,59 @@ class Ina(PowerMeterDriver[N]):
 
     @abstractmethod
     def set_up(self, bus: Any) -> None:
-        """Let it measure for `least` or longer for each value; raises OSError."""
+        """Set the chip to measure `min_measuring_time` or longer for each value; raise OSError."""
 
     @abstractmethod
     def is_set_up(self) -> bool:
-        """Whether the chip still measures as `set_up` told it to; raises OSError."""
+        """Return whether the chip still has the settings of `set_up`; raise OSError."""
 
     @abstractmethod
     def volts(self) -> tuple[float, float]:
-        """Voltage of the supply behind the shunt, and over the shunt [V]; raises OSError."""
+        """Return the voltage of the supply and that over the shunt [V]; raise OSError."""
 
     def sample(self) -> PowerSample:
-        """Two registers. Raises OSError, until it is opened anew where the chip was reset."""
+        """Read two registers.
+
+        Raises OSError if a transfer fails, and after a reset of the chip until it is opened again.
+        """
         now = self.clock.monotonic()
-        trusted_until, self._trusted_until = self._trusted_until, -math.inf  # where this fails
+        # If this method raises, the settings are checked in the next call.
+        trusted_until, self._trusted_until = self._trusted_until, -math.inf
         if now >= trusted_until:
             if not self.is_set_up():
                 raise OSError(
                     errno.EIO, f"{self.place} lost its settings: its supply was interrupted"
                 )
-            trusted_until = now + TRUSTED
+            trusted_until = now + SETTINGS_CHECK_INTERVAL_S
         supply, shunt = self.volts()
         self._trusted_until = trusted_until
         current = shunt / self.settings.shunt
         clipped = ""
         if abs(shunt) >= self.full_scale:
-            most = self.full_scale / self.settings.shunt
-            clipped = f"the {self.chip} ends at {most:.3g} A with a shunt of "
+            largest = self.full_scale / self.settings.shunt
+            clipped = f"the {self.chip} ends at {largest:.3g} A with a shunt of "
             clipped += f"{self.settings.shunt:g} Ω: a smaller one is needed"
         return PowerSample(self.clock.monotonic(), supply * current, clipped)
 
     def close(self) -> None:
-        """Let go of the bus; never raises, may be called twice. The chip measures on."""
+        """Close the bus; never raises, may be called twice. The chip continues to measure."""
         bus, self._bus = self._bus, None
         if bus is not None:
             i2c.close_bus(bus)
 
     def explain(self, error: Exception) -> str:
-        """What to check."""
+        """Return one line that says what went wrong and what to check."""
         settings = self.settings
         return i2c.explain(error, settings.bus, settings.address, self.chip, "power_meter")
 
     @classmethod
     def claims(cls, settings: N) -> tuple[Claim, ...]:
-        """The bus, which other drivers of the same fishd may use, too."""
+        """Return the claim of the bus, which other drivers of the same fishd may use too."""
         return (i2c.claim(settings.bus),)
 
     @classmethod
     def checks(cls, settings: N) -> tuple[Check, ...]:
-        """That it answers, and what it measures now."""
+        """Return the check that the meter answers, which shows what it measures now."""
         return (Check("power meter", lambda machine: cls._check(machine, settings)),)
 
     @classmethod
@@ -150,15 +155,15 @@ class Ina(PowerMeterDriver[N]):
         except (OSError, ValueError) as error:
             return fail(
                 meter.explain(error),
-                f"'i2cdetect -y {settings.bus}' (package i2c-tools) shows who answers",
+                f"'i2cdetect -y {settings.bus}' (package i2c-tools) lists which addresses answer",
             )
         amps = shunt / settings.shunt
-        seen = f"{supply:.2f} V, {amps * 1e3:.0f} mA at {meter.place}"
-        if supply < LOWEST_SUPPLY:
+        reading = f"{supply:.2f} V, {amps * 1e3:.0f} mA at {meter.place}"
+        if supply < MIN_SUPPLY_V:
             return warning(
-                f"{seen}: no supply of a servo is behind the shunt",
+                f"{reading}: no supply of a servo is behind the shunt",
                 "switch the servo's supply on; wire its plus to VIN+ and the servo to VIN-",
             )
         if amps < -5e-3:
-            return warning(f"{seen}: the current is negative", "swap VIN+ and VIN-")
-        return ok(f"{seen}; up to {meter.full_scale / settings.shunt:.3g} A")
+            return warning(f"{reading}: the current is negative", "swap VIN+ and VIN-")
+        return ok(f"{reading}; up to {meter.full_scale / settings.shunt:.3g} A")

@@ -1,4 +1,4 @@
-"""The INA219, through its Adafruit driver."""
+"""INA219 through its Adafruit driver."""
 
 import os
 from typing import Any
@@ -6,12 +6,12 @@ from typing import Any
 from fishd.core.clock import Clock
 from fishd.hardware.power_meter.ina import Ina, InaSettings
 
-SHUNT_STEP = 10e-6
-"""[V]"""
-SUPPLY_STEP = 4e-3
-"""[V]"""
-CONVERSION = 532e-6
-"""Of either voltage at 12 bits; the shunt's is averaged over some of them [s]."""
+SHUNT_STEP_V = 10e-6
+"""Step of the voltage over the shunt [V]."""
+SUPPLY_STEP_V = 4e-3
+"""Step of the supply voltage [V]."""
+CONVERSION_TIME_S = 532e-6
+"""Time of a conversion at 12 bits [s]; the shunt's voltage is averaged over several."""
 
 
 class Ina219Settings(InaSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -28,32 +28,32 @@ class Ina219(Ina[Ina219Settings]):
     _chip: Any
 
     def __init__(self, settings: Ina219Settings, clock: Clock, interval: float) -> None:
-        """Raises ImportError where the library is not installed."""
+        """Import the library; raise ImportError if it is not installed."""
         from adafruit_ina219 import INA219
 
         super().__init__(settings, clock, interval)
         self._library = INA219
 
     def set_up(self, bus: Any) -> None:
-        """As the library does, but with the shunt averaged, so that no current goes unseen."""
+        """Set up the chip as the library does, but average the shunt's voltage without gaps."""
         try:
             self._chip = self._library(bus, self.settings.address)
-        except ValueError as error:  # with which the library says that nothing answers
+        except ValueError as error:  # raised by the library if nothing answers
             number = getattr(error.__context__, "errno", None)
             if number is None:
                 raise
             raise OSError(number, os.strerror(number)) from None
         doublings = 1
-        while doublings < 7 and (2**doublings + 1) * CONVERSION < self.least:
+        while doublings < 7 and (2**doublings + 1) * CONVERSION_TIME_S < self.min_measuring_time:
             doublings += 1
         self._resolution = 0x8 | doublings  # 2, 4 … 128 samples
         self._chip.shunt_adc_resolution = self._resolution
 
     def is_set_up(self) -> bool:
-        """As `Ina.is_set_up`; the rest of its settings are those after a reset."""
+        """Do as `Ina.is_set_up`; the other settings are those after a reset."""
         return bool(self._chip.shunt_adc_resolution == self._resolution)
 
     def volts(self) -> tuple[float, float]:
-        """As `Ina.volts`."""
+        """Do as `Ina.volts`."""
         chip = self._chip
-        return chip.raw_bus_voltage * SUPPLY_STEP, chip.raw_shunt_voltage * SHUNT_STEP
+        return chip.raw_bus_voltage * SUPPLY_STEP_V, chip.raw_shunt_voltage * SHUNT_STEP_V

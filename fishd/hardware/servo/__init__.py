@@ -1,1 +1,1 @@
-"""The servo: drivers that send pulses, and what turns angles into pulses."""
+"""Servo: drivers that send pulses, and the conversion of angles into pulses."""

@@ -1,4 +1,4 @@
-"""The servo as the loop drives it: angles in, a driver's pulses out, by the newest calibration."""
+"""Servo as the loop drives it: it converts angles into pulses with the newest calibration."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from fishd.hardware.settings import ServoSettings
 
 
 class CalibratedServo:
-    """A servo whose pulses can be calibrated; may be called from any thread."""
+    """Servo whose pulses can be calibrated; may be called from any thread."""
 
     def __init__(
         self,
@@ -28,29 +28,29 @@ class CalibratedServo:
     ) -> None:
         """Open the driver.
 
-        kind: its class, or what else makes one from the same arguments
-        Raises what the driver raises, and `ServoError` for a calibration whose neutral is no pulse
-        for a servo.
+        kind: class of the driver, or a function that makes a driver from the same arguments
+        Raises what the driver raises, and `ServoError` for a calibration whose neutral is not a
+        valid pulse.
         """
         self.calibration = calibration
         self._settings = settings.calibrated(calibration)
         neutral = pulses.pulse_width(self._settings, 0.0)
         self.driver = kind(settings, neutral, clock, tick=tick, threaded=threaded)
-        """What sends the pulses."""
+        """Driver that sends the pulses."""
 
     @property
     def reach(self) -> tuple[float, float]:
-        """The lowest and highest angle [rad] that soft limits and pulse widths permit."""
+        """Lowest and highest angle [rad] that soft limits and pulse widths permit."""
         return pulses.reach(self._settings)
 
     def cut(self, amplitude: float) -> str:
-        """What `reach` leaves of ±Φ [rad], in words; empty for all of it."""
+        """Return the part of ±Φ [rad] within `reach` as a text; empty if it is all of ±Φ."""
         return pulses.cut(self._settings, amplitude)
 
     def recalibrate(self, calibration: ServoCalibration) -> None:
         """Use another calibration from the next write on.
 
-        Raises `ServoError`, and keeps the old one, if its neutral is no pulse for a servo.
+        Raises `ServoError`, and keeps the old calibration, if the new neutral is not a valid pulse.
         """
         settings = self._settings.calibrated(calibration)
         self.driver.neutral = pulses.pulse_width(settings, 0.0)
@@ -58,23 +58,23 @@ class CalibratedServo:
         self.calibration = calibration
 
     def write(self, angle: float) -> None:
-        """Send an instruction angle [rad], and with it pulses if there were none.
+        """Send an instruction angle [rad]; start the pulses if there are none.
 
-        Raises `ServoError` when the servo cannot be reached, and for an angle that it must not get.
+        Raises `ServoError` when the servo cannot be reached, and for an angle beyond its limits.
         """
         contained(self.driver.write, pulses.pulse_width(self._settings, angle))
 
     def release(self) -> None:
         """Stop the pulses; may be called twice. Raises `ServoError`."""
-        _ended(self.driver.off)
+        _end_pulses(self.driver.off)
 
     def close(self) -> None:
-        """Release the servo and let go of it; may be called twice. Raises `ServoError`."""
-        _ended(self.driver.close)
+        """Release the servo and close the driver; may be called twice. Raises `ServoError`."""
+        _end_pulses(self.driver.close)
 
 
-def _ended(end: Callable[[], None]) -> None:
-    """Call what ends the pulses; whatever it raises, they may still be on: a `ServoError`."""
+def _end_pulses(end: Callable[[], None]) -> None:
+    """Call a function that ends the pulses; turn every exception of it into a `ServoError`."""
     try:
         contained(end)
     except ServoError:

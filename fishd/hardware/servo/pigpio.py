@@ -1,6 +1,6 @@
-"""The servo on a Pi 4 or older: pulses by pigpiod, over a link that may come and go.
+"""Servo on a Pi 4 or older: pulses by pigpiod, over a link that is made again when it breaks.
 
-A countdown script inside pigpiod ends the pulses when fishd no longer writes, whatever ended it.
+A countdown script inside pigpiod ends the pulses when fishd stops writing for any reason.
 """
 
 import re
@@ -14,26 +14,26 @@ from fishd.hardware.checks import START_VIRTUAL_PI, Check, Machine, Result, fail
 from fishd.hardware.driver import Claim, LastResort, ServoDriver, pin
 from fishd.hardware.settings import Gpio, ServoSettings
 
-if TYPE_CHECKING:  # the library is loaded only by whoever drives a servo with it
+if TYPE_CHECKING:  # the library is loaded only if a servo is driven with it
     from fishd.hardware.servo.pigpio_client import Client
 
-SLOW_ANSWER = 5e-3
-"""An answer of pigpiod that takes longer may keep a tick waiting [s]."""
-_LOCAL = ("127.0.0.1", "localhost", "::1")
+SLOW_ANSWER_S = 5e-3
+"""Longest answer time of pigpiod that cannot delay a tick [s]."""
+_LOCAL_HOSTS = ("127.0.0.1", "localhost", "::1")
 
 
 class PigpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which pin, where pigpiod is, and how long it may take."""
+    """Pin of the servo, address of pigpiod, and its time limits."""
 
     gpio: Annotated[Gpio, note("Pin of the servo's signal, Broadcom number.")] = 18
     host: Annotated[str, note("Host of pigpiod.")] = "127.0.0.1"
-    port: Annotated[int, note("Its TCP port.", ge=1, le=65535)] = 8888
+    port: Annotated[int, note("TCP port of pigpiod.", ge=1, le=65535)] = 8888
     timeout: Annotated[
         float,
         unit(
             "s",
-            "Longest that pigpiod may keep a tick waiting; then the servo keeps its angle for a "
-            "tick. The third time in a row the link is lost.",
+            "Longest time that a tick waits for pigpiod; then the servo keeps its angle for that "
+            "tick. After the third time in a row, fishd connects again.",
             ge=0.001,
             le=0.1,
         ),
@@ -42,8 +42,9 @@ class PigpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw_
         float,
         unit(
             "s",
-            "Without a tick for this time, three ticks at least, pigpiod takes the servo to rest, "
-            "and fishd is in fault if it goes on. Longer forgives a busy machine.",
+            "Time without a tick, at least three ticks, after which pigpiod takes the servo to "
+            "neutral and ends its pulses; fishd is then in fault if it continues. A longer time "
+            "tolerates a busy machine.",
             ge=0.1,
             le=2.0,
         ),
@@ -60,20 +61,20 @@ class Pigpio(ServoDriver[PigpioSettings]):
     def __init__(
         self, *given: Any, standstill: Callable[[], bool] | None = None, **named: Any
     ) -> None:
-        """standstill: as for `PigpioLink`"""
+        """Do as `ServoDriver`; `standstill` is that of `PigpioLink`."""
         self._standstill = standstill
         super().__init__(*given, **named)
 
     def open(self) -> None:
-        """Connect within 2 s, or go on without and keep trying; in virtual time `write` does."""
+        """Connect within 2 s, or keep trying in a thread; in virtual time each write tries."""
         from fishd.hardware.servo import pigpio_link, pigpio_pulses
 
         self._pulses = pigpio_pulses
-        self._counts = pigpio_pulses.counts(self.settings.countdown, self.tick)
-        self.countdown = pigpio_pulses.COUNT * self._counts
+        self._counts = pigpio_pulses.countdown_counts(self.settings.countdown, self.tick)
+        self.countdown = pigpio_pulses.COUNT_S * self._counts
         self._script = -1
         self._energised = False
-        self._armed = 0.0  # when the latest countdown that pigpiod has confirmed was sent
+        self._armed = 0.0  # time when the latest countdown that pigpiod confirmed was sent
         self._closed = False
         self._link = pigpio_link.PigpioLink(
             self.settings,
@@ -86,17 +87,21 @@ class Pigpio(ServoDriver[PigpioSettings]):
     def write(self, pulse: float) -> None:
         """Arm the countdown, and send a pulse [µs].
 
-        An answer that comes late is no error: the servo keeps its angle for a tick. Raises
-        `ServoError` at the third in a row, or before the countdown could end.
+        A late answer is not an error: the servo keeps its angle for a tick. Raises `ServoError` at
+        the third late answer in a row, or before the countdown could end.
         """
-        with self._link.session(forgives=self._has_time) as client:
-            late = client.owed
+        with self._link.session(may_be_late=self._has_time) as client:
+            late = client.unanswered
             client.settle()
             now = self.clock.monotonic()
             if late and self._energised and now - self._armed > self.countdown:
-                raise ConnectionError("it answered so late that the servo may be at rest by now")
+                raise ConnectionError(
+                    "it answered so late that its countdown may have released the servo"
+                )
             # First the countdown: whatever happens next, these pulses will have an end.
-            countdown = self._pulses.armed(self.settings.gpio, self._counts, self.neutral)
+            countdown = self._pulses.armed_parameters(
+                self.settings.gpio, self._counts, self.neutral
+            )
             client.update_script(self._script, countdown)
             self._armed = now
             self._energised = True
@@ -110,7 +115,7 @@ class Pigpio(ServoDriver[PigpioSettings]):
     def close(self) -> None:
         """End the pulses, remove the script and disconnect; may be called twice.
 
-        Raises `ServoError`, once all that could be done is done, if pulses may still be on.
+        Raises `ServoError`, after all other steps, if pulses may still be on.
         """
         if self._closed:
             return
@@ -126,7 +131,7 @@ class Pigpio(ServoDriver[PigpioSettings]):
             self._link.close()
 
     def counters(self) -> dict[str, int]:
-        """How often the link was made again since start, and how many answers came late."""
+        """Return the numbers of reconnections and of late answers since start."""
         return {
             "servo_reconnects": self._link.reconnects,
             "servo_late_answers": self._link.late_answers,
@@ -134,7 +139,7 @@ class Pigpio(ServoDriver[PigpioSettings]):
 
     @classmethod
     def check(cls, settings: PigpioSettings, tick: float) -> None:
-        """There is a host."""
+        """Refuse a host that is empty or contains spaces."""
         if not re.fullmatch(r"\S+", settings.host):
             raise Problem(
                 ("host",), f"'{settings.host}' is not valid: a host is needed, such as 127.0.0.1"
@@ -142,21 +147,21 @@ class Pigpio(ServoDriver[PigpioSettings]):
 
     @classmethod
     def claims(cls, settings: PigpioSettings) -> tuple[Claim, ...]:
-        """Its pin, of this machine or of another one."""
+        """Return the claim of the pin, of this machine or of another one."""
         claim = pin(settings.gpio, "servo")
-        if settings.host in _LOCAL:
+        if settings.host in _LOCAL_HOSTS:
             return (claim,)
         place = f"{settings.host}:{settings.port}"
         return (Claim(f"{place}-{claim.name}", f"{claim.what} of {place}", claim.key),)
 
     @classmethod
     def checks(cls, settings: PigpioSettings) -> tuple[Check, ...]:
-        """Of pigpiod."""
+        """Return the check of pigpiod."""
         return (Check("pigpiod", lambda machine: _pigpiod(machine, settings)),)
 
     @classmethod
     def last_resort(cls, settings: PigpioSettings) -> LastResort:
-        """Pulses outlive fishd for as long as the countdown, and longer if others made them."""
+        """Return how to end pulses, which outlive fishd until the end of the countdown."""
         return LastResort(
             "fishd.hardware.servo.pigpio_pulses:neutralise",
             {"gpio": settings.gpio, "host": settings.host, "port": settings.port},
@@ -164,15 +169,15 @@ class Pigpio(ServoDriver[PigpioSettings]):
 
     @classmethod
     def read_pulses(cls, settings: PigpioSettings) -> bool:
-        """Ask pigpiod."""
-        from fishd.hardware.servo.pigpio_client import opened
+        """Read back from pigpiod whether there are pulses."""
+        from fishd.hardware.servo.pigpio_client import open_client
         from fishd.hardware.servo.pigpio_pulses import pulses_on
 
-        with opened(settings.host, settings.port) as client:
+        with open_client(settings.host, settings.port) as client:
             return pulses_on(client, settings.gpio, time.sleep)
 
     def _has_time(self) -> bool:
-        """Whether the countdown leaves time for another tick."""
+        """Return whether the countdown leaves time for another tick."""
         silence = self.clock.monotonic() - self._armed
         return not self._energised or silence + self.tick < self.countdown
 
@@ -180,8 +185,10 @@ class Pigpio(ServoDriver[PigpioSettings]):
         gpio = self.settings.gpio
         failure: Exception | None = None
         try:
-            # Not disarmed but armed with OFF: if this alone arrives, it ends the pulses.
-            client.update_script(self._script, self._pulses.armed(gpio, 1, self._pulses.OFF))
+            # Not disarmed but armed with OFF: if only this command arrives, it ends the pulses.
+            client.update_script(
+                self._script, self._pulses.armed_parameters(gpio, 1, self._pulses.OFF)
+            )
         except client.refusal as error:
             failure = error
         client.set_servo_pulsewidth(gpio, self._pulses.OFF)
@@ -190,16 +197,16 @@ class Pigpio(ServoDriver[PigpioSettings]):
             raise failure
 
     def _prepare(self, client: "Client") -> None:
-        """Put a new connection in order: no pulses go on unless the loop writes again.
+        """Prepare a new connection, so that no pulses continue unless the loop writes again.
 
-        The scripts of those before stay armed until that of this connection is. It ends pulses that
-        the bytes of a lost connection, or of a killed fishd, still bring.
+        The scripts of earlier connections stay armed until the script of this one is armed. It also
+        ends pulses that start when bytes of a lost connection, or of a killed fishd, arrive late.
         """
         gpio, sleep = self.settings.gpio, self.clock.sleep
-        former = self._pulses.countdowns(client, gpio)
+        former = self._pulses.find_countdowns(client, gpio)
         count, width = self._counts, float(self._pulses.OFF)
         if not self._energised and self._pulses.pulses_on(client, gpio, sleep):
-            count, width = 1, self.neutral  # of a killed fishd: gently
+            count, width = 1, self.neutral  # pulses of a killed fishd end at neutral
         self._script = self._pulses.install(client, gpio, count, width, sleep)
         if self._energised:
             client.set_servo_pulsewidth(gpio, self._pulses.OFF)
@@ -208,36 +215,36 @@ class Pigpio(ServoDriver[PigpioSettings]):
 
 
 def _pigpiod(machine: Machine, settings: PigpioSettings) -> Result:
-    """Through the client that fishd itself uses, whose every step has a time limit."""
+    """Check pigpiod through fishd's own client, which has a time limit for every step."""
     virtual = machine.robot == "virtual-pi"
     if not virtual and "Raspberry Pi 5" in machine.model:
         return fail("pigpio does not work on a Pi 5", "set servo.driver: sysfs-pwm")
-    from fishd.hardware.servo.pigpio_client import opened
+    from fishd.hardware.servo.pigpio_client import open_client
 
     try:
-        with opened(settings.host, settings.port) as client:
-            began = time.monotonic()
+        with open_client(settings.host, settings.port) as client:
+            started = time.monotonic()
             version = client.get_pigpio_version()
-            took = time.monotonic() - began
+            duration = time.monotonic() - started
     except ServoError as error:
-        frozen = "answer" in str(error)
+        is_frozen = "answer" in str(error)
         if virtual:
             mend = f"{START_VIRTUAL_PI}; its port must be that of servo.port"
-        elif frozen:
+        elif is_frozen:
             mend = "sudo systemctl restart pigpiod"
         else:
             mend = _start_pigpiod(machine)
         return fail(str(error), mend)
-    message = f"version {version} answers in {took * 1e3:.2f} ms"
-    if took > SLOW_ANSWER:
-        return warning(f"{message}: too slow for a tick", "see what else loads this machine")
+    message = f"version {version} answers in {duration * 1e3:.2f} ms"
+    if duration > SLOW_ANSWER_S:
+        return warning(f"{message}: too slow for a tick", "find out what else loads this machine")
     return ok(message)
 
 
 def _start_pigpiod(machine: Machine) -> str:
-    """What to do where nobody answers: Debian has no package of it, Raspberry Pi OS 12 has."""
+    """Return how to start or install pigpiod; Raspberry Pi OS 12 has a package, Debian has none."""
     if any(machine.path(f"{folder}/pigpiod").exists() for folder in ("/usr/bin", "/usr/local/bin")):
         return "sudo systemctl enable --now pigpiod"
     if machine.path("/etc/rpi-issue").exists():
-        return "sudo apt install pigpio; where there is no such package, servo.driver: sysfs-pwm"
+        return "sudo apt install pigpio; if there is no such package, set servo.driver: sysfs-pwm"
     return "Debian has no pigpiod: set servo.driver: sysfs-pwm, or build it from its sources"

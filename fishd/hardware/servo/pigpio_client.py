@@ -1,4 +1,4 @@
-"""The pigpio client with a time limit on everything, and words for what fails in it."""
+"""Client of pigpiod with a time limit on every step, and descriptions of its errors."""
 
 import contextlib
 import socket
@@ -11,46 +11,49 @@ import pigpio
 
 from fishd.core.errors import ServoError
 
-ANSWER = 1.0
-"""How long pigpiod may take to answer outside of a tick [s]."""
+ANSWER_TIMEOUT_S = 1.0
+"""Longest time for an answer of pigpiod outside of a tick [s]."""
 
-# A host name that cannot be one is a UnicodeError.
-FAILURES = (OSError, pigpio.error, UnicodeError)
-"""What a command raises."""
+# An impossible host name causes a UnicodeError.
+COMMAND_ERRORS = (OSError, pigpio.error, UnicodeError)
+"""Exceptions that a command raises."""
 
-SCRIPTS, PARAMETERS = 32, 10
+MAX_SCRIPTS, SCRIPT_PARAMETERS = 32, 10
+"""Number of scripts that pigpiod stores, and of the parameters of each."""
 
-_LOOK = 5e-3
-"""How often somebody who waits in virtual time looks whether pigpiod stands still [s]."""
+_STANDSTILL_POLL_S = 5e-3
+"""Period at which a wait in virtual time checks whether pigpiod stands still [s]."""
 
 UNKNOWN_SCRIPT = pigpio.error_text(pigpio.PI_BAD_SCRIPT_ID)
-_TAKEN_AWAY = "somebody else took fishd's script away, as 'fishctl release' does"
+_SCRIPT_DELETED = "another program deleted fishd's script, as 'fishctl release' does"
 _SCRIPT_STATUS = 45
 _ANSWER = struct.Struct("<3Ii")
 
 
 class TimedSocket:
-    """A socket with one deadline for all that goes through it, which tells late answers apart.
+    """Socket with one deadline for all transfers, which assigns late answers to their commands.
 
-    A command whose answer does not come in time ends with TimeoutError. That answer is owed from
-    then on, and is left out before the one to a later command: none is taken for that of another.
+    A command without an answer in time ends with TimeoutError. Its number is kept, and its late
+    answer is discarded before the answer to a later command is read, so the two are never confused.
     """
 
     def __init__(
         self, host: str, port: int, limit: float, standstill: Callable[[], bool] | None = None
     ) -> None:
-        """standstill: in virtual time, whether no answer can come before time moves on; nobody
-        waits for one then
+        """Connect within `limit` [s].
+
+        standstill: function that returns, in virtual time, whether no answer can arrive before
+            time advances; then no command waits for one
         """
         self._socket = socket.create_connection((host, port), limit)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.deadline = time.monotonic() + limit
         self._standstill = standstill
-        self.owed: deque[int] = deque()
-        """Numbers of the commands that are not answered yet."""
+        self.unanswered: deque[int] = deque()
+        """Numbers of the commands that are not answered yet, oldest first."""
         self._received = bytearray()
         self._rest = b""
-        """What the client has not read yet of the answer to its command."""
+        """Part of the answer to the latest command that the client has not read yet."""
 
     def send(self, data: bytes) -> int:
         """Send a command."""
@@ -58,35 +61,35 @@ class TimedSocket:
         return len(data)
 
     def sendall(self, data: bytes) -> None:
-        """The same, as the client calls it for a longer one."""
+        """Send a longer command; the pigpio module calls this method for it."""
         remaining = self.deadline - time.monotonic()
         if remaining <= 0.0:
-            # Held up for so long, what comes now may rest upon what is over: it is not sent.
+            # After such a delay the command may be based on an outdated state: do not send it.
             raise TimeoutError
         self._socket.settimeout(remaining)
         try:
             self._socket.sendall(data)
         except TimeoutError:
             raise ConnectionError("it takes no more commands") from None
-        self.owed.append(int.from_bytes(data[:4], "little"))
+        self.unanswered.append(int.from_bytes(data[:4], "little"))
         self._rest = b""
 
     def recv(self, count: int) -> bytes:
-        """Up to `count` bytes of the answer to the latest command."""
+        """Return up to `count` bytes of the answer to the latest command."""
         if not self._rest:
-            while len(self.owed) > 1:
+            while len(self.unanswered) > 1:
                 self._answer()
             self._rest = self._answer()
         data, self._rest = self._rest[:count], self._rest[count:]
         return data
 
     def settle(self) -> None:
-        """Wait for all answers that are owed."""
-        while self.owed:
+        """Wait for the answers to all commands."""
+        while self.unanswered:
             self._answer()
 
     def interrupt(self) -> None:
-        """End whatever another thread is waiting for."""
+        """End the wait of another thread."""
         with contextlib.suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
 
@@ -96,35 +99,39 @@ class TimedSocket:
         self._socket.close()
 
     def _answer(self) -> bytes:
-        """The answer to the oldest command, with what follows it; stays owed until it is whole."""
+        """Return the complete answer to the oldest command, then count it as answered."""
         self._fill(_ANSWER.size)
         echo, _, _, result = _ANSWER.unpack_from(self._received)
-        if echo != self.owed[0]:
-            raise ConnectionError(f"it answers command {echo} instead of {self.owed[0]}")
+        if echo != self.unanswered[0]:
+            raise ConnectionError(f"it answers command {echo} instead of {self.unanswered[0]}")
         size = _ANSWER.size + (max(0, result) if echo == _SCRIPT_STATUS else 0)
         self._fill(size)
         answer = bytes(self._received[:size])
         del self._received[:size]
-        self.owed.popleft()
+        self.unanswered.popleft()
         return answer
 
     def _fill(self, size: int) -> None:
-        """Wait until so many bytes have come; what is there already is taken at any time."""
+        """Wait until `size` bytes have arrived; after the deadline, read only what is there."""
         while len(self._received) < size:
             data = self._receive()
             if not data:
-                within = 0 < len(self._received) < _ANSWER.size
+                is_partial = 0 < len(self._received) < _ANSWER.size
                 raise ConnectionResetError(
-                    "it broke off in mid-answer" if within else "it closed the connection"
+                    "it closed the connection in the middle of an answer"
+                    if is_partial
+                    else "it closed the connection"
                 )
             self._received += data
 
     def _receive(self) -> bytes:
-        """What comes next before the deadline; empty where the connection is closed."""
+        """Return the next bytes before the deadline; empty if the connection is closed."""
         while True:
-            still = self._standstill is not None and self._standstill()
-            remaining = 0.0 if still else max(0.0, self.deadline - time.monotonic())
-            self._socket.settimeout(min(remaining, _LOOK) if self._standstill else remaining)
+            stands_still = self._standstill is not None and self._standstill()
+            remaining = 0.0 if stands_still else max(0.0, self.deadline - time.monotonic())
+            self._socket.settimeout(
+                min(remaining, _STANDSTILL_POLL_S) if self._standstill else remaining
+            )
             try:
                 return self._socket.recv(4096)
             except (BlockingIOError, TimeoutError):
@@ -133,19 +140,19 @@ class TimedSocket:
 
 
 class Client(pigpio.pi):  # type: ignore[misc]
-    """The pigpio client on one timed socket.
+    """Client of module pigpio on one timed socket.
 
-    Its own constructor is passed over: that one hangs on a frozen pigpiod, and opens a second
-    connection whose thread spins once pigpiod is gone. fishd needs no notifications.
+    The constructor of the base class is not called: it hangs on a frozen pigpiod, and opens a
+    second connection whose thread spins after pigpiod has ended. fishd needs no notifications.
     """
 
     refusal = pigpio.error
-    """Raised where pigpiod does not do what a command asks for."""
+    """Exception raised if pigpiod refuses a command."""
 
     def __init__(
         self, host: str, port: int, limit: float, standstill: Callable[[], bool] | None = None
     ) -> None:
-        """Connect within `limit` [s]; raises OSError. `standstill`: as for `TimedSocket`."""
+        """Connect within `limit` [s]; raise OSError. `standstill` is that of `TimedSocket`."""
         self._host, self._port = host, port
         self._notify = None
         self._socket = TimedSocket(host, port, limit, standstill)
@@ -154,20 +161,20 @@ class Client(pigpio.pi):  # type: ignore[misc]
         self.connected = True
 
     @property
-    def owed(self) -> int:
-        """How many answers have not come yet."""
-        return len(self._socket.owed)
+    def unanswered(self) -> int:
+        """Number of commands that are not answered yet."""
+        return len(self._socket.unanswered)
 
     def settle(self) -> None:
-        """Wait for the answers that are owed."""
+        """Wait for the answers to all commands."""
         self._socket.settle()
 
     def within(self, seconds: float) -> None:
-        """All commands from here to the next call must be answered within `seconds` from now."""
+        """Set the deadline of all commands until the next call to `seconds` from now."""
         self._socket.deadline = time.monotonic() + seconds
 
     def interrupt(self) -> None:
-        """Make the command that another thread waits for fail."""
+        """Make the command fail for which another thread waits."""
         self._socket.interrupt()
 
     def close(self) -> None:
@@ -176,32 +183,32 @@ class Client(pigpio.pi):  # type: ignore[misc]
         self._socket.close()
 
 
-def where(host: str, port: int) -> str:
-    """How messages name this pigpiod."""
+def pigpiod_at(host: str, port: int) -> str:
+    """Return the name of this pigpiod in messages."""
     return f"pigpiod at {host}:{port}"
 
 
-def reason(error: BaseException, limit: float) -> str:
-    """What went wrong, in a few words; `limit` is the time that pigpiod had [s]."""
+def describe_error(error: BaseException, limit: float) -> str:
+    """Return what went wrong as a short text; `limit` is the time that pigpiod had [s]."""
     if isinstance(error, TimeoutError):
         return f"no answer within {limit * 1e3:g} ms"
     if isinstance(error, pigpio.error):
-        return _TAKEN_AWAY if error.value == UNKNOWN_SCRIPT else str(error.value)
+        return _SCRIPT_DELETED if error.value == UNKNOWN_SCRIPT else str(error.value)
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
 
 
 @contextlib.contextmanager
-def opened(host: str, port: int, limit: float = ANSWER) -> Iterator[Client]:
-    """A client for a few commands, each `within` or all within `limit` [s].
+def open_client(host: str, port: int, limit: float = ANSWER_TIMEOUT_S) -> Iterator[Client]:
+    """Return a client for a few commands, each `within` or all within `limit` [s].
 
-    Raises `ServoError` with one line for whatever fails inside.
+    Raises `ServoError` with one line for every error inside the context.
     """
     client = None
     try:
         client = Client(host, port, limit)
         yield client
-    except FAILURES as error:
-        raise ServoError(f"{where(host, port)}: {reason(error, limit)}") from None
+    except COMMAND_ERRORS as error:
+        raise ServoError(f"{pigpiod_at(host, port)}: {describe_error(error, limit)}") from None
     finally:
         if client:
             client.close()

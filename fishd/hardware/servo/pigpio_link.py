@@ -1,4 +1,4 @@
-"""The link to pigpiod: one client at a time, thrown away after any failure and made again."""
+"""Link to pigpiod: one client at a time, replaced by a new one after any failure."""
 
 import contextlib
 import threading
@@ -8,33 +8,39 @@ from typing import TYPE_CHECKING
 
 from fishd.core.clock import Clock
 from fishd.core.errors import ServoError
-from fishd.hardware.servo.pigpio_client import ANSWER, FAILURES, Client, reason, where
+from fishd.hardware.servo.pigpio_client import (
+    ANSWER_TIMEOUT_S,
+    COMMAND_ERRORS,
+    Client,
+    describe_error,
+    pigpiod_at,
+)
 
 if TYPE_CHECKING:
     from fishd.hardware.servo.pigpio import PigpioSettings
 
-START = 2.0
-"""How long a new link waits for its first connection [s]."""
+START_TIMEOUT_S = 2.0
+"""Longest time that a new link waits for its first connection [s]."""
 
-PAUSES = 0.2, 1.0
+PAUSE_RANGE_S = 0.2, 1.0
 """Shortest and longest pause between two attempts to connect [s]."""
 
-LATE_STREAK = 3
-"""Ticks in a row without an answer that end a connection."""
+MAX_LATE_ANSWERS = 3
+"""Number of ticks in a row without an answer that ends a connection."""
 
-VIRTUAL_PAUSE = 0.5
+VIRTUAL_PAUSE_S = 0.5
 """Virtual time between two attempts to connect [s]."""
 
-VIRTUAL_PATIENCE = 20.0
-"""In virtual time, how long everything may take on this machine [s].
+VIRTUAL_TIMEOUT_S = 20.0
+"""Real-time limit of every step in virtual time [s].
 
-No tick waits there, and a busy machine must not pass for a frozen pigpiod: whether that answers
-in time is asked of pigpiod itself.
+In virtual time no tick waits, and a busy machine must not look like a frozen pigpiod: the virtual
+pigpiod itself says whether it answers in time.
 """
 
 
 class PigpioLink:
-    """One client at a time, kept connected."""
+    """Link that keeps one client connected."""
 
     def __init__(
         self,
@@ -45,21 +51,21 @@ class PigpioLink:
         threaded: bool,
         standstill: Callable[[], bool] | None = None,
     ) -> None:
-        """Wait up to 2 s for the first connection; without one, go on trying.
+        """Wait up to 2 s for the first connection; without one, keep trying.
 
-        prepare: called with every new client before anyone else has it; if it raises, the client
-            is thrown away
-        threaded: connect in a thread of its own. Otherwise within `session`, at most once per
-            0.5 s of `clock`
-        standstill: in virtual time, whether pigpiod answers nothing before time moves on: then
-            nobody waits, and no answer is late because the machine is busy
+        prepare: function called with every new client before its use; if it raises, the client is
+            closed
+        threaded: connect in a separate thread; otherwise in `session`, at most once per 0.5 s of
+            `clock`
+        standstill: function that returns, in virtual time, whether pigpiod answers nothing before
+            time advances; then no command waits, and no answer is late because the machine is busy
         """
         self.reconnects = 0
-        """How often a connection was made again."""
+        """Number of connections after the first."""
         self.late_answers = 0
-        """How many sessions ended without an answer in time."""
+        """Number of sessions that ended without an answer in time."""
         self._settings = settings
-        self._where = where(settings.host, settings.port)
+        self._where = pigpiod_at(settings.host, settings.port)
         self._clock = clock
         self._prepare = prepare
         self._standstill = standstill
@@ -67,7 +73,7 @@ class PigpioLink:
         self._opening: Client | None = None
         self._reason = "no answer yet"
         self._connections = 0
-        self._late = 0  # sessions in a row
+        self._late = 0  # number of late sessions in a row
         self._next_attempt = float("-inf")
         self._lock = threading.RLock()
         self._needed = threading.Event()
@@ -80,26 +86,25 @@ class PigpioLink:
                 target=self._keep_connected, name="pigpio-link", daemon=True
             )
             self._thread.start()
-            self._connected.wait(START)
+            self._connected.wait(START_TIMEOUT_S)
 
     @contextlib.contextmanager
     def session(
-        self, *, forgives: Callable[[], bool] | None = None, last: bool = False
+        self, *, may_be_late: Callable[[], bool] | None = None, last: bool = False
     ) -> Iterator[Client]:
-        """The client, all of whose commands must be done within the time limit of the settings.
+        """Return the client; all commands in the context share the time limit of the settings.
 
-        forgives: asked when an answer is late, whether that is no error: it is then waited for in
-            the next session, and what was to come after that command is left out
-        last: nobody will reconnect after it, and no tick waits: it may take 1 s
-        Raises `ServoError` where there is no connection, without waiting for one, and where a
-        command fails. That ends the connection, unless an answer is merely late, up to twice in a
-        row.
+        may_be_late: function called when an answer is late; if it returns True, the next session
+            waits for the answer, and the rest of this session is skipped without an error
+        last: True for the last session, which no tick waits for: it may take 1 s
+        Raises `ServoError` at once if not connected, and if a command fails. A failure ends the
+        connection, except for late answers, up to two in a row.
         """
-        limit = ANSWER if last else self._settings.timeout
+        limit = ANSWER_TIMEOUT_S if last else self._settings.timeout
         outlook = "" if last else "; reconnecting"
-        patience = self._patience(limit)
-        deadline = time.monotonic() + patience
-        if not self._lock.acquire(timeout=patience):
+        real_limit = self._real_limit(limit)
+        deadline = time.monotonic() + real_limit
+        if not self._lock.acquire(timeout=real_limit):
             raise ServoError(f"{self._where}: busy for more than {limit * 1e3:g} ms")
         try:
             client = self._current(outlook)
@@ -110,24 +115,28 @@ class PigpioLink:
             except TimeoutError as error:
                 self._late += 1
                 self.late_answers += 1
-                why = reason(error, limit)
-                if self._late >= LATE_STREAK or last or not (forgives is None or forgives()):
+                why = describe_error(error, limit)
+                if (
+                    self._late >= MAX_LATE_ANSWERS
+                    or last
+                    or not (may_be_late is None or may_be_late())
+                ):
                     self._drop(client, why)
-                elif forgives:
+                elif may_be_late:
                     return
                 else:
                     outlook = "; waiting for it"
                 raise ServoError(f"{self._where}: {why}{outlook}") from None
             except BaseException as error:
-                self._drop(client, reason(error, limit))
-                if not isinstance(error, FAILURES):
+                self._drop(client, describe_error(error, limit))
+                if not isinstance(error, COMMAND_ERRORS):
                     raise
                 raise ServoError(f"{self._where}: {self._reason}{outlook}") from None
         finally:
             self._lock.release()
 
     def close(self) -> None:
-        """Disconnect, and connect no more; may be called twice."""
+        """Disconnect, and do not connect again; may be called twice."""
         self._closed.set()
         self._needed.set()
         with self._lock:
@@ -137,19 +146,19 @@ class PigpioLink:
         if opening:
             opening.interrupt()
         if self._thread:
-            self._thread.join(ANSWER)
+            self._thread.join(ANSWER_TIMEOUT_S)
 
-    def _patience(self, limit: float) -> float:
-        """How long to wait by the clock of this machine for what has a limit [s]."""
-        return VIRTUAL_PATIENCE if self._standstill else limit
+    def _real_limit(self, limit: float) -> float:
+        """Return the wait in real time for a step with a time limit [s]."""
+        return VIRTUAL_TIMEOUT_S if self._standstill else limit
 
     def _current(self, outlook: str) -> Client:
         if self._closed.is_set():
             raise ServoError(f"{self._where}: closed")
         now = self._clock.monotonic()
         if not self._client and not self._thread and now >= self._next_attempt:
-            self._next_attempt = now + VIRTUAL_PAUSE
-            self._connect(ANSWER, 2.0 * ANSWER)
+            self._next_attempt = now + VIRTUAL_PAUSE_S
+            self._connect(ANSWER_TIMEOUT_S, 2.0 * ANSWER_TIMEOUT_S)
         if not self._client:
             raise ServoError(f"{self._where}: not connected: {self._reason}{outlook}")
         return self._client
@@ -165,19 +174,19 @@ class PigpioLink:
         allowed = limit
         try:
             client = self._opening = Client(
-                self._settings.host, self._settings.port, self._patience(limit), self._standstill
+                self._settings.host, self._settings.port, self._real_limit(limit), self._standstill
             )
-            if self._closed.is_set():  # by one who may not have seen it
+            if self._closed.is_set():  # `close` may have run before `_opening` was set
                 raise ConnectionError("closed")
             client.get_pigpio_version()
             allowed = preparation
-            client.within(self._patience(preparation))
+            client.within(self._real_limit(preparation))
             self._prepare(client)
         except BaseException as error:
-            self._reason = reason(error, allowed)
+            self._reason = describe_error(error, allowed)
             if client:
                 client.close()
-            if isinstance(error, Exception):  # whatever it is, the next attempt may do better
+            if isinstance(error, Exception):  # the next attempt may succeed
                 return False
             raise
         finally:
@@ -194,11 +203,13 @@ class PigpioLink:
         return True
 
     def _keep_connected(self) -> None:
-        shortest, longest = PAUSES
+        shortest, longest = PAUSE_RANGE_S
         while self._needed.wait() and not self._closed.is_set():
             self._needed.clear()
             pause = shortest
-            while not self._connect(ANSWER, 2.0 * ANSWER) and not self._closed.wait(pause):
+            while not self._connect(
+                ANSWER_TIMEOUT_S, 2.0 * ANSWER_TIMEOUT_S
+            ) and not self._closed.wait(pause):
                 pause = min(2.0 * pause, longest)
-            # A pigpiod that refuses every command would otherwise be connected to in every tick.
+            # Without this pause, fishd would connect in every tick to a pigpiod that refuses all.
             self._closed.wait(shortest)

@@ -1,8 +1,8 @@
-"""What keeps pigpiod's pulses from outliving whoever asked for them: a countdown inside of it.
+"""Countdown script inside pigpiod, which ends the pulses after their client has died.
 
 The script survives the client: unless it is armed again in time, it moves the servo to neutral, and
-half a second later it ends the pulses. The rule of this module and of the servo: whatever instant a
-client dies at, a running script is armed, or there are no pulses. Armed with OFF, it ends them.
+half a second later it ends the pulses. The rule of this module and of the servo: at every instant,
+either a running script is armed or pigpiod sends no pulses. A script armed with OFF ends them.
 """
 
 import math
@@ -14,78 +14,78 @@ import pigpio
 
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.pigpio_client import (
-    ANSWER,
-    PARAMETERS,
-    SCRIPTS,
+    ANSWER_TIMEOUT_S,
+    MAX_SCRIPTS,
+    SCRIPT_PARAMETERS,
     UNKNOWN_SCRIPT,
     Client,
-    opened,
+    open_client,
 )
-from fishd.hardware.servo.pulses import REST
+from fishd.hardware.servo.pulses import NEUTRAL_TIME_S
 
 OFF = 0
-"""A pulse width that stands for no pulses."""
+"""Pulse width that means no pulses."""
 
-COUNT = 0.01
-"""The script counts down once in so long [s]."""
+COUNT_S = 0.01
+"""Time of one count of the script [s]."""
 
-# p0: counts left, 0 is disarmed · p1: GPIO · p2: the pulse to end with, 0 for none · p9: MAGIC.
-# After the hold p0 tells whether the script was armed again meanwhile: then the pulses stay. There
-# is no hold after OFF, so that a servo that is written to again is under guard at once. While it is
-# disarmed it ends pulses again and again: a command that was under way when its sender died, and
-# arrives after the countdown, has no effect for longer than a count.
+# p0: counts left, 0 is disarmed · p1: GPIO · p2: the pulse to end with, 0 for none · p9: SCRIPT_ID.
+# After the hold, p0 shows whether the script was armed again in the meantime: then the pulses stay.
+# OFF is not followed by a hold: a servo that is written to again is guarded at once. While
+# disarmed, the script ends pulses in every count: a late command of a dead sender, which arrives
+# after the countdown, has an effect for one count at most.
 COUNTDOWN = (
     b"tag 0 mils 10 lda p0 cmp 0 jz 1 dcr p0 jnz 0 "
     b"s p1 p2 lda p2 cmp 0 jz 0 mils 500 lda p0 cmp 0 jnz 0 tag 1 s p1 0 jmp 0"
 )
 
-MAGIC = int.from_bytes(b"fish", "big")
-"""Tells fishd's scripts from those of others."""
+SCRIPT_ID = int.from_bytes(b"fish", "big")
+"""Number that identifies fishd's scripts among those of other programs."""
 
-_GUARD = 60
-"""What a last resort arms its own script with: longer than the pulses take [counts]."""
+_GUARD_COUNTS = 60
+"""Countdown of the script of `neutralise`, longer than its pulses [counts]."""
 
 _PWM_MODES = {12: 4, 13: 4, 18: 2, 19: 2}
-"""GPIO → the mode in which the PWM peripheral drives it."""
+"""Mode in which the PWM peripheral drives a pin, by GPIO."""
 _READ_BACKS, _READ_BACK_S = 10, 0.1
-"""How often it is read back at the end whether there are pulses, and the time before each [s]."""
-_LOOKS, _LOOK = 130, 4e-4
-"""How often a pin's level is looked at, and how long is waited between [s]: two frames, densely."""
+"""Number of checks at the end for pulses, and time before each check [s]."""
+_LEVEL_READS, _LEVEL_READ_S = 130, 4e-4
+"""Number of reads of a pin's level, and time between them [s]; together they cover two frames."""
 
 Sleep = Callable[[float], None]
 
 
-def counts(countdown: float, tick: float) -> int:
-    """What the script starts from: a countdown [s], or three ticks [s] of a slow loop."""
-    return math.ceil(round(max(countdown, 3.0 * tick) / COUNT, 6))
+def countdown_counts(countdown: float, tick: float) -> int:
+    """Return the counts of a countdown [s], which lasts three ticks [s] at least."""
+    return math.ceil(round(max(countdown, 3.0 * tick) / COUNT_S, 6))
 
 
-def armed(gpio: int, count: int, width: float) -> list[int]:
-    """The script's first parameters, to end with a pulse `width` [µs] after so many counts."""
+def armed_parameters(gpio: int, count: int, width: float) -> list[int]:
+    """Return the script's first parameters, to send a pulse `width` [µs] after `count` counts."""
     return [count, gpio, round(width)]
 
 
-def countdowns(client: Client, gpio: int, limit: float | None = None) -> list[int]:
-    """The scripts on this pin that an earlier connection or a killed fishd left behind.
+def find_countdowns(client: Client, gpio: int, limit: float | None = None) -> list[int]:
+    """Return the numbers of the scripts on this pin that earlier clients left behind.
 
-    limit: of each of its many commands [s]; without it all of them share that of the client
+    limit: time limit of each of the many commands [s]; without it they share the client's
     """
-    found = []
-    for script in range(SCRIPTS):
+    numbers = []
+    for script in range(MAX_SCRIPTS):
         if limit is not None:
             client.within(limit)
         _, parameters = client.script_status(script)
-        if parameters and parameters[1] == gpio and parameters[-1] == MAGIC:
-            found.append(script)
-    return found
+        if parameters and parameters[1] == gpio and parameters[-1] == SCRIPT_ID:
+            numbers.append(script)
+    return numbers
 
 
 def install(client: Client, gpio: int, count: int, width: float, sleep: Sleep) -> int:
-    """Store a countdown and run it, armed; the number of the script."""
+    """Store a countdown and run it, armed; return the number of the script."""
     script: int = client.store_script(COUNTDOWN)
-    parameters = armed(gpio, count, width)
-    parameters += [0] * (PARAMETERS - 1 - len(parameters)) + [MAGIC]
-    client.update_script(script, parameters)  # at once: nobody finds one without its name
+    parameters = armed_parameters(gpio, count, width)
+    parameters += [0] * (SCRIPT_PARAMETERS - 1 - len(parameters)) + [SCRIPT_ID]
+    client.update_script(script, parameters)  # at once, so that other programs can identify it
     while client.script_status(script)[0] == pigpio.PI_SCRIPT_INITING:
         sleep(0.001)
     client.run_script(script, parameters)
@@ -93,16 +93,16 @@ def install(client: Client, gpio: int, count: int, width: float, sleep: Sleep) -
 
 
 def remove(client: Client, scripts: list[int]) -> None:
-    """Delete countdowns, which must not be needed any more."""
+    """Delete countdowns that are no longer needed."""
     for script in scripts:
-        client.within(ANSWER)  # one that holds the servo at neutral ends its hold first
+        client.within(ANSWER_TIMEOUT_S)  # a script in its hold at neutral ends the hold first
         with _may_be_gone():
             client.delete_script(script)
 
 
 @contextmanager
 def _may_be_gone() -> Iterator[None]:
-    """Permit that another program, such as a fishd that connects again, has deleted a script."""
+    """Ignore the error that another program, such as another fishd, deleted a script."""
     try:
         yield
     except pigpio.error as error:
@@ -111,50 +111,50 @@ def _may_be_gone() -> Iterator[None]:
 
 
 def pulses_on(client: Client, gpio: int, sleep: Sleep) -> bool:
-    """Whether there are pulses on the pin, of this pigpiod or of one before it.
+    """Return whether there are pulses on the pin, of this pigpiod or of an earlier one.
 
-    Those of the PWM peripheral outlive the pigpiod that began them, and the next one knows nothing
-    of them: where the pin is in that mode, its level is watched for two frames.
+    Pulses of the PWM peripheral outlive the pigpiod that started them, and the next pigpiod does
+    not know of them: if the pin is in that mode, its level is read for two frames.
     """
-    for asked, otherwise in (
+    for read_width, no_pulses_error in (
         (client.get_servo_pulsewidth, pigpio.PI_NOT_SERVO_GPIO),
         (client.get_PWM_dutycycle, pigpio.PI_NOT_PWM_GPIO),
     ):
         try:
-            if asked(gpio):
+            if read_width(gpio):
                 return True
         except pigpio.error as error:
-            if error.value != pigpio.error_text(otherwise):
+            if error.value != pigpio.error_text(no_pulses_error):
                 raise
     if client.get_mode(gpio) != _PWM_MODES.get(gpio):
         return False
-    for _ in range(_LOOKS):
+    for _ in range(_LEVEL_READS):
         if client.read(gpio):
             return True
-        sleep(_LOOK)
+        sleep(_LEVEL_READ_S)
     return False
 
 
 def neutralise(
     neutral: float, *, gpio: int, host: str, port: int, sleep: Sleep = time.sleep
 ) -> bool:
-    """Last resort, from another process than fishd: neutral [µs] for 0.3 s, then off.
+    """Send neutral [µs] for 0.3 s and end the pulses, from a process other than fishd.
 
-    False if there are no pulses: then nothing moves. Removes fishd's scripts, so that a fishd that
-    still lives gets a fault. Raises `ServoError` unless pigpiod says at the end that there are no
-    pulses. When a step fails, the pulses are stopped all the same, if they can be.
+    Return False, without motion, if the pin has no pulses. Deletes fishd's scripts, so that a fishd
+    that is still alive gets a fault. If a step fails, it still tries to stop the pulses. Raises
+    `ServoError` unless pigpiod reports at the end that the pulses have stopped.
     """
     try:
-        with opened(host, port) as client:
+        with open_client(host, port) as client:
             energised = _neutralise(client, gpio, neutral, sleep)
             if energised:
                 _check_off(client, gpio, sleep)
             return energised
     except BaseException as failure:
         try:
-            with opened(host, port) as client:
+            with open_client(host, port) as client:
                 client.set_servo_pulsewidth(gpio, OFF)
-                remove(client, countdowns(client, gpio, ANSWER))
+                remove(client, find_countdowns(client, gpio, ANSWER_TIMEOUT_S))
                 _check_off(client, gpio, sleep)
         except ServoError:
             raise failure from None
@@ -164,31 +164,31 @@ def neutralise(
 
 
 def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool:
-    scripts = countdowns(client, gpio, ANSWER)
+    scripts = find_countdowns(client, gpio, ANSWER_TIMEOUT_S)
     energised = _pulses_on(client, gpio, sleep)
     if energised:
-        client.within(ANSWER)
-        # First a script of its own: this process may be killed, too.
-        guard = install(client, gpio, _GUARD, OFF, sleep)
+        client.within(ANSWER_TIMEOUT_S)
+        # First a new script guards the pulses: this process may be killed too.
+        guard = install(client, gpio, _GUARD_COUNTS, OFF, sleep)
         remove(client, scripts)
         scripts = [guard]
-        client.within(ANSWER)
+        client.within(ANSWER_TIMEOUT_S)
         with _may_be_gone():
-            client.update_script(guard, armed(gpio, _GUARD, OFF))
-        # This takes the pin from the PWM peripheral as well.
+            client.update_script(guard, armed_parameters(gpio, _GUARD_COUNTS, OFF))
+        # This also takes the pin from the PWM peripheral.
         client.set_servo_pulsewidth(gpio, round(neutral))
-        sleep(REST)
-        client.within(ANSWER)
+        sleep(NEUTRAL_TIME_S)
+        client.within(ANSWER_TIMEOUT_S)
         client.set_servo_pulsewidth(gpio, OFF)
     remove(client, scripts)
     return energised
 
 
 def _check_off(client: Client, gpio: int, sleep: Sleep) -> None:
-    """Read back that there are no pulses; raises `ServoError`.
+    """Read back that the pulses have stopped; raise `ServoError` if they return.
 
-    A program that drives the pin has a tick in which to write again. A fishd that connects again
-    may hold the servo at neutral for half a second.
+    Another program that drives the pin has time to write again. A fishd that reconnects may hold
+    the servo at neutral for half a second.
     """
     for _ in range(_READ_BACKS):
         sleep(_READ_BACK_S)
@@ -198,11 +198,11 @@ def _check_off(client: Client, gpio: int, sleep: Sleep) -> None:
 
 
 def _pulses_on(client: Client, gpio: int, sleep: Sleep) -> bool:
-    """Do as `pulses_on`, where each of many looks has its own time."""
+    """Do as `pulses_on`, with a separate time limit for each read of the level."""
 
-    def look(seconds: float) -> None:
+    def sleep_and_extend(seconds: float) -> None:
         sleep(seconds)
-        client.within(ANSWER)
+        client.within(ANSWER_TIMEOUT_S)
 
-    client.within(ANSWER)
-    return pulses_on(client, gpio, look)
+    client.within(ANSWER_TIMEOUT_S)
+    return pulses_on(client, gpio, sleep_and_extend)

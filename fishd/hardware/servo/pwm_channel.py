@@ -1,4 +1,4 @@
-"""A channel of a PWM chip of the kernel, as the files that Linux shows below /sys/class/pwm."""
+"""Channel of a PWM chip of the kernel, through its files below /sys/class/pwm."""
 
 import errno
 import os
@@ -10,71 +10,71 @@ from fishd.core.errors import ServoError
 _BROADCOM = {12: 0, 18: 0, 13: 1, 19: 1}
 
 HEADER_CHIPS: dict[str, dict[int, int]] = {
-    # Pi 5. Channels 0 and 1 by what `pinctrl funcs` lists there, not tried on one.
+    # Pi 5. Channels 0 and 1 are from the list of `pinctrl funcs`, not tested on hardware.
     "1f00098000.pwm": {18: 2, 19: 3, 12: 0, 13: 1},
-    # Pi 4. An estimate, like the two below: by the chip's address in the device tree.
+    # Pi 4. Not tested, like the two below: from the chip's address in the device tree.
     "fe20c000.pwm": _BROADCOM,
     "3f20c000.pwm": _BROADCOM,  # Pi 2, 3, Zero 2
     "2020c000.pwm": _BROADCOM,  # Pi 1, Zero
 }
-"""The chip of the 40-pin header, by device name, and the channel that a GPIO is wired to.
+"""Channels of the pins of the 40-pin header, by the device name of the chip.
 
-Devices keep their names; the N of pwmchipN changes from kernel to kernel.
+Device names are stable; the N of pwmchipN changes from kernel to kernel.
 """
 
 
 class Files(Protocol):
-    """The functions of module `os` that a channel needs; an emulated kernel has them too."""
+    """Functions of module `os` that a channel needs; an emulated kernel has them too."""
 
     def open(self, path: str, flags: int, /) -> int:
-        """As os.open."""
+        """Do as os.open."""
 
     def pread(self, fd: int, length: int, offset: int, /) -> bytes:
-        """As os.pread."""
+        """Do as os.pread."""
 
     def pwrite(self, fd: int, data: bytes, offset: int, /) -> int:
-        """As os.pwrite."""
+        """Do as os.pwrite."""
 
     def close(self, fd: int, /) -> None:
-        """As os.close."""
+        """Do as os.close."""
 
     def listdir(self, path: str, /) -> list[str]:
-        """As os.listdir."""
+        """Do as os.listdir."""
 
     def readlink(self, path: str, /) -> str:
-        """As os.readlink."""
+        """Do as os.readlink."""
 
 
 class Wires(NamedTuple):
-    """What a servo is wired to."""
+    """Pin and PWM channel that a servo is wired to."""
 
     gpio: int
     root: str
     """Folder of the PWM chips."""
     chip: str | None
-    """Device of the chip; None for that of the Pi's header."""
+    """Device of the chip; None for the chip of the Pi's header."""
     channel: int | None
-    """Its channel; None for the one that the pin is wired to."""
+    """Channel of the chip; None for the channel that the pin is wired to."""
 
 
 class Clock(Protocol):
-    """The clocks of fishd, and module `time`."""
+    """Clock: one of fishd's, or module `time`."""
 
     def monotonic(self) -> float:
-        """As time.monotonic."""
+        """Do as time.monotonic."""
 
     def sleep(self, seconds: float, /) -> None:
-        """As time.sleep."""
+        """Do as time.sleep."""
 
 
 class PwmChannel:
-    """One channel; each method raises `ServoError` with a line that says how to mend it."""
+    """One channel; each method raises `ServoError` with one line that gives the remedy."""
 
     NAMES = ("period", "duty_cycle", "enable")
-    """Its files with a number: two times [ns], and 1 for on."""
+    """Names of the files with a number: two times [ns], and 1 for on."""
 
     def __init__(self, servo: Wires, clock: Clock, files: Files = os) -> None:
-        """Nothing is looked for before `open`."""
+        """Store the arguments; `open` finds the channel."""
         self._servo = servo
         self._files = files
         self._clock = clock
@@ -82,14 +82,14 @@ class PwmChannel:
         self._chip = ""
         self._number = 0
         self.path = ""
-        """The channel's folder; empty before the first `open`."""
+        """Folder of the channel; empty before the first `open`."""
         self.exported = False
-        """Whether this object has made that folder appear."""
+        """Whether this object has exported the channel."""
 
-    def open(self, patience: float) -> None:
-        """Find the channel, export it if it is not, open its files; nothing where they are open.
+    def open(self, timeout: float) -> None:
+        """Find the channel, export it if necessary, and open its files if they are not open.
 
-        patience: how long to wait for udev to hand over the files of a new channel [s]
+        timeout: longest wait for udev to make the files of a new channel writable [s]
         """
         if self._fds:
             return
@@ -98,7 +98,7 @@ class PwmChannel:
         self.path = f"{self._chip}/pwm{self._number}"
         if not self._is_exported():
             self._export()
-        deadline = self._clock.monotonic() + patience
+        deadline = self._clock.monotonic() + timeout
         while True:
             try:
                 for name in self.NAMES:
@@ -108,16 +108,16 @@ class PwmChannel:
                 self.close()
                 late = self._clock.monotonic() >= deadline
                 if late or not isinstance(error, PermissionError | FileNotFoundError):
-                    raise _explained(f"{self.path}/{name}", error) from None
+                    raise _explain(f"{self.path}/{name}", error) from None
             self._clock.sleep(0.01)
 
     def read(self, name: str) -> int:
-        """The number in a file of the open channel."""
+        """Return the number in a file of the open channel."""
         try:
-            # A plain file of a test keeps the tail of a longer number; the kernel has no tails.
+            # A plain file, as in tests, keeps the tail of an earlier, longer text.
             return int(self._files.pread(self._fds[name], 32, 0).split()[0])
         except OSError as error:
-            raise _explained(f"{self.path}/{name}", error) from None
+            raise _explain(f"{self.path}/{name}", error) from None
         except (ValueError, IndexError):
             raise ServoError(f"{self.path}/{name} does not contain a number") from None
 
@@ -126,18 +126,18 @@ class PwmChannel:
         try:
             self._files.pwrite(self._fds[name], b"%d\n" % value, 0)
         except OSError as error:
-            raise _explained(f"{self.path}/{name}", error) from None
+            raise _explain(f"{self.path}/{name}", error) from None
 
     def inverted(self) -> bool:
-        """Whether it is low where it should be high, as others may have left it."""
+        """Return whether the polarity is inverted, as another program may have left it."""
         return self._polarity() == b"inversed"
 
     def make_normal(self) -> None:
-        """Let pulses be high; the channel must be off, and its period known."""
+        """Set the normal polarity; the channel must be off, and its period set."""
         self._polarity(b"normal\n")
 
     def _polarity(self, wanted: bytes = b"") -> bytes:
-        """Read or set it; a chip without one is normal."""
+        """Set the polarity if one is wanted; return it. A chip without polarity is normal."""
         path = f"{self.path}/polarity"
         try:
             fd = self._files.open(path, os.O_RDWR)
@@ -150,22 +150,22 @@ class PwmChannel:
         except FileNotFoundError:
             return b"normal"
         except OSError as error:
-            raise _explained(path, error) from None
+            raise _explain(path, error) from None
 
     def close(self) -> None:
-        """Close the files; the channel stays as it is."""
+        """Close the files without changing the channel."""
         while self._fds:
-            with suppress(OSError):  # it is closed all the same
+            with suppress(OSError):  # Linux closes it nevertheless
                 self._files.close(self._fds.popitem()[1])
 
     def unexport(self) -> None:
-        """Make the channel's files disappear; nothing if they have."""
+        """Unexport the channel if it is exported."""
         if self.path and self._is_exported():
-            self._tell("unexport")
+            self._write_chip("unexport")
         self.exported = False
 
     def _find_chip(self) -> tuple[str, str]:
-        """The chip's folder and its device."""
+        """Return the chip's folder and its device."""
         servo, root = self._servo, self._servo.root
         wanted = [servo.chip] if servo.chip else list(HEADER_CHIPS)
         chips = {}
@@ -192,19 +192,19 @@ class PwmChannel:
         try:
             return f"pwm{self._number}" in self._files.listdir(self._chip)
         except OSError as error:
-            raise _explained(self._chip, error) from None
+            raise _explain(self._chip, error) from None
 
     def _export(self) -> None:
         try:
-            self._tell("export")
+            self._write_chip("export")
         except ServoError:
-            # Somebody was quicker: the channel is there all the same.
+            # Another program may have exported it first.
             if not self._is_exported():
                 raise
         else:
             self.exported = True
 
-    def _tell(self, name: str) -> None:
+    def _write_chip(self, name: str) -> None:
         path = f"{self._chip}/{name}"
         try:
             fd = self._files.open(path, os.O_WRONLY)
@@ -222,7 +222,7 @@ class PwmChannel:
                     f"channel {self._number} of {self._chip} is in use by a driver of the kernel: "
                     "choose another pin with servo.gpio, or channel with servo.channel"
                 ) from None
-            raise _explained(path, error) from None
+            raise _explain(path, error) from None
 
 
 def _channel_number(servo: Wires, device: str) -> int:
@@ -242,8 +242,8 @@ def _channel_number(servo: Wires, device: str) -> int:
     return channels[servo.gpio]
 
 
-def _explained(path: str, error: OSError) -> ServoError:
-    """One line about an error of the file system, with its number."""
+def _explain(path: str, error: OSError) -> ServoError:
+    """Return an error with one line about an error of the file system."""
     hint = f"cannot be used: {error.strerror}"
     if isinstance(error, PermissionError):
         hint = (

@@ -1,7 +1,7 @@
-"""Pulses on a channel of the kernel's PWM: how they begin and end, for the servo and for whoever
-releases it.
+"""Start and end of pulses on a channel of the kernel's PWM, for the servo and its release.
 
-The hardware makes them, so they outlive their process. Needs nothing but the standard library.
+The hardware makes the pulses, so they outlive their process. This module needs only the standard
+library.
 """
 
 import os
@@ -11,26 +11,26 @@ from contextlib import suppress
 from typing import Any
 
 from fishd.core.errors import ServoError
-from fishd.hardware.servo.pulses import REST
+from fishd.hardware.servo.pulses import NEUTRAL_TIME_S
 from fishd.hardware.servo.pwm_channel import Clock, Files, PwmChannel, Wires
 
-PATIENCE = 2.0
-"""How long udev may take to hand over the files of a new channel [s]; ticks do not wait for it."""
+UDEV_TIMEOUT_S = 2.0
+"""Longest wait for udev to make a new channel's files writable [s]; ticks do not wait for it."""
 READ_BACK_S = 0.1
-"""Time in which a program that drives the channel writes again [s]."""
+"""Time within which another program that drives the channel writes again [s]."""
 
 
 def nanoseconds(width: float) -> int:
-    """A pulse [µs] as the kernel counts it."""
+    """Return the width of a pulse [µs] in nanoseconds."""
     return round(1000.0 * width)
 
 
-def begin(channel: PwmChannel, width: float, period: float) -> None:
-    """Start pulses [µs], one in each period [s], from whatever state the channel was left in.
+def start_pulses(channel: PwmChannel, width: float, period: float) -> None:
+    """Start pulses [µs], one in each period [s], from any state of the channel.
 
-    A channel that nobody has used has a period of 0, and older kernels then refuse a duty cycle,
-    even 0, and a polarity. A kernel that believes a channel to be on does nothing on enable 1, even
-    where the hardware is off because the channel was unexported: it is switched off first.
+    An unused channel has a period of 0, and older kernels then refuse a duty cycle, even 0, and a
+    polarity. A kernel that has recorded a channel as on ignores enable 1, even if the hardware is
+    off because the channel was unexported: so the channel is switched off first.
     """
     if channel.read("enable"):
         channel.write("enable", 0)
@@ -43,14 +43,14 @@ def begin(channel: PwmChannel, width: float, period: float) -> None:
     channel.write("enable", 1)
 
 
-def on(channel: PwmChannel) -> bool:
-    """Whether there are pulses."""
+def has_pulses(channel: PwmChannel) -> bool:
+    """Return whether there are pulses."""
     return bool(channel.read("enable") and channel.read("duty_cycle"))
 
 
 def switch_off(channel: PwmChannel, period: float, sleep: Callable[[float], None]) -> None:
     """Switch the channel off, once the last pulse before a duty cycle of 0 has ended."""
-    with suppress(ServoError):  # one that cannot be read may be on
+    with suppress(ServoError):  # a channel that cannot be read may be on
         if not channel.read("enable"):
             return
     sleep(period)
@@ -60,13 +60,13 @@ def switch_off(channel: PwmChannel, period: float, sleep: Callable[[float], None
 def neutralise(
     neutral: float, *, frequency: float, files: Files = os, clock: Clock = time, **wires: Any
 ) -> bool:
-    """Send a servo that gets pulses to neutral [µs] and stop them; False where there are none.
+    """Send neutral [µs] for 0.3 s and end the pulses; return False if there are none.
 
-    The last resort when fishd is dead. Should it be alive, its next write fails, because its pulses
-    are off. Raises `ServoError` when a step fails; the pulses are stopped all the same, if they can
-    be. A channel that was not exported is not left so.
+    For the case that fishd is dead; the next write of a fishd that is alive fails, because its
+    pulses are off. If a step fails, it still tries to stop the pulses, and raises `ServoError`. A
+    channel that was not exported is unexported again.
 
-    wires: those of `Wires`
+    wires: fields of `Wires`
     """
     channel = PwmChannel(Wires(**wires), clock, files)
     try:
@@ -80,21 +80,21 @@ def neutralise(
 def _neutralise(
     channel: PwmChannel, neutral: float, period: float, sleep: Callable[[float], None]
 ) -> bool:
-    channel.open(PATIENCE)
-    if not on(channel):
+    channel.open(UDEV_TIMEOUT_S)
+    if not has_pulses(channel):
         return False
     try:
-        if channel.inverted():  # what was a pulse was the gap between two
-            begin(channel, neutral, period)
+        if channel.inverted():  # a duty cycle would be the gap between two pulses
+            start_pulses(channel, neutral, period)
         else:
             channel.write("duty_cycle", nanoseconds(neutral))
-        sleep(REST)
+        sleep(NEUTRAL_TIME_S)
     finally:
         try:
             channel.write("duty_cycle", 0)
         finally:
             switch_off(channel, period, sleep)
     sleep(READ_BACK_S)
-    if on(channel):
+    if has_pulses(channel):
         raise ServoError(f"{channel.path}: has pulses again: another program drives it")
     return True

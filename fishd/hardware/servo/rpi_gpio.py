@@ -1,4 +1,4 @@
-"""The servo on software PWM of RPi.GPIO or rpi-lgpio: a last resort, whose pulses jitter."""
+"""Servo on software PWM of RPi.GPIO or rpi-lgpio: a last resort, because its pulses jitter."""
 
 from contextlib import suppress
 from typing import Annotated, Any
@@ -11,7 +11,7 @@ from fishd.hardware.settings import Gpio, ServoSettings
 
 
 class RpiGpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which pin of the header drives the servo."""
+    """Pin of the header that drives the servo."""
 
     gpio: Annotated[Gpio, note("Pin of the servo's signal, Broadcom number.")] = 18
     frequency: Annotated[
@@ -27,9 +27,9 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
     degraded = ("software PWM: pulses jitter by tens to hundreds of µs; use pigpio or sysfs-pwm",)
 
     def open(self) -> None:
-        """Claim the pin, or go on without and try again in each write.
+        """Claim the pin, or continue without it and try again in each write.
 
-        Raises `StartupError` where the library cannot be used.
+        Raises `StartupError` if the library cannot be used.
         """
         self._pwm: Any = None
         self._started = False
@@ -37,15 +37,15 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
         self._opened = 0
         self._closed = False
         self._gpio = header.load()
-        with suppress(ServoError):  # each write says so
+        with suppress(ServoError):  # each write raises it again
             self._open()
 
     def counters(self) -> dict[str, int]:
-        """How often the pin was claimed again since start."""
+        """Return the number of times that the pin was claimed again since start."""
         return {"servo_reconnects": max(0, self._opened - 1)}
 
     def write(self, pulse: float) -> None:
-        """Send a pulse [µs], and begin where there were none.
+        """Send a pulse [µs]; start the pulses if there are none.
 
         Raises `ServoError`; after that, each write tries to claim the pin again.
         """
@@ -54,7 +54,7 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
         self._send(1e-4 * pulse * self.settings.frequency)
 
     def off(self) -> None:
-        """Stop the pulses once the present one has ended; may be called twice.
+        """Stop the pulses at the end of the present one; may be called twice.
 
         Raises `ServoError` when the pin cannot be driven.
         """
@@ -62,9 +62,9 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
             self._send(0.0)
 
     def close(self) -> None:
-        """End the pulses and make its pin an input; may be called twice.
+        """End the pulses and make the pin an input; may be called twice.
 
-        Raises `ServoError` when the pulses cannot be stopped; the pin is given back all the same.
+        Raises `ServoError` when the pulses cannot be stopped; the pin is released nevertheless.
         """
         if self._closed:
             return
@@ -74,26 +74,26 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
                 self._send(0.0)
                 self.clock.sleep(1.0 / self.settings.frequency)  # lets the last pulse end
         finally:
-            self._give_back()
+            self._release_pin()
 
     @classmethod
     def claims(cls, settings: RpiGpioSettings) -> tuple[Claim, ...]:
-        """Its pin."""
+        """Return the claim of the pin."""
         return (pin(settings.gpio, "servo"),)
 
     @classmethod
     def last_resort(cls, settings: RpiGpioSettings) -> LastResort:
-        """Nothing pulses any more, but the pin may have been left high."""
+        """Return how to set the pin low: the pulses end with the process, but it may be high."""
         return LastResort(f"{__name__}:pull_low", {"gpio": settings.gpio})
 
     def _open(self) -> None:
         gpio = self.settings.gpio
         try:
-            # Again each time: another part of the program may have called GPIO.cleanup().
+            # Set it each time: another part of the program may have called GPIO.cleanup().
             self._gpio.setmode(self._gpio.BCM)
             header.claim(self._gpio, gpio, self._gpio.OUT, initial=self._gpio.LOW)
-            # One that failed must go first, as a pin takes only one, and only now: it writes to
-            # the pin when it goes.
+            # A failed PWM must be deleted first, as a pin takes only one, and not earlier: its
+            # destructor writes to the pin.
             self._pwm = None
             self._pwm = self._gpio.PWM(gpio, self.settings.frequency)
         except Exception as error:
@@ -103,9 +103,9 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
         self._opened += 1
 
     def _send(self, duty_cycle: float) -> None:
-        """Pulses of so many percent.
+        """Send pulses with this duty cycle [%].
 
-        Once started, it is never stopped: RPi.GPIO restarts a stopped PWM at 1 kHz, whatever its
+        A started PWM is never stopped: RPi.GPIO restarts a stopped PWM at 1 kHz, whatever its
         frequency was, while its old thread still writes to the pin.
         """
         try:
@@ -121,8 +121,8 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
         self._usable = False
         return ServoError(f"servo on GPIO {self.settings.gpio}: {header.one_line(error)}")
 
-    def _give_back(self) -> None:
-        """Only the own pin: cleanup() without one takes those of everybody."""
+    def _release_pin(self) -> None:
+        """Release this pin only: cleanup() without an argument releases all pins."""
         try:
             try:
                 if self._pwm is not None:
@@ -135,10 +135,10 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
 
 
 def pull_low(neutral: float, *, gpio: int) -> bool:
-    """Leave the pin low, where a killed process may have left it high; always False.
+    """Set the pin low, which a killed process may have left high; always return False.
 
-    Software PWM ends with its process, so there is nothing to move to neutral. Raises
-    `ServoError`, as when rpi-lgpio says that another process holds the pin.
+    Software PWM ends with its process, so no servo has to move to neutral. Raises `ServoError`,
+    for example when rpi-lgpio reports that another process holds the pin.
     """
     module = header.load()
     try:

@@ -153,14 +153,14 @@ def test_a_folder_of_lock_files_that_another_user_made_is_not_used(
     part = ownership.Part(folder / "fishd-bus", "/dev/i2c-7", "force_sensor.bus")
     with (
         pytest.raises(StartupError, match=f"others may write to {folder}"),
-        ownership.owned([part]),
+        ownership.claim_parts([part]),
     ):
         pass
 
 
 def test_the_kernel_tells_who_holds_a_lock_whatever_is_written_into_it(tmp_path: Path) -> None:
     part = ownership.Part(tmp_path / "fishd-bus", "/dev/i2c-7", "force_sensor.bus")
-    with ownership.owned([part]):
+    with ownership.claim_parts([part]):
         lock_path(part.path).write_text("1\n")
         assert ownership.owner_pid([part]) == str(os.getpid())
 
@@ -205,7 +205,7 @@ def test_without_a_place_for_lock_files_fishd_says_so_and_starts(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     part = ownership.Part(tmp_path / "nowhere" / "bus", "/dev/i2c-7", "force_sensor.bus")
-    with ownership.owned([part]):
+    with ownership.claim_parts([part]):
         assert "nothing keeps a second fishd from driving /dev/i2c-7" in caplog.text
     assert ownership.owner([part]) == ""
 
@@ -214,7 +214,7 @@ def test_a_link_that_somebody_put_there_is_not_followed(tmp_path: Path) -> None:
     victim = tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / "bus.lock").symlink_to(victim)
-    with ownership.owned([ownership.Part(tmp_path / "bus", "a bus", "force_sensor.bus")]):
+    with ownership.claim_parts([ownership.Part(tmp_path / "bus", "a bus", "force_sensor.bus")]):
         pass
     assert victim.read_text() == "precious"
 
@@ -233,5 +233,5 @@ def test_whoever_only_asks_who_the_owner_is_keeps_no_fishd_from_starting(
     monkeypatch.setattr("time.sleep", sleep)
     with lock_path(part.path).open("w") as asks:
         fcntl.flock(asks, fcntl.LOCK_SH)
-        with ownership.owned([part]):
+        with ownership.claim_parts([part]):
             assert asks.closed

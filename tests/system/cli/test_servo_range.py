@@ -96,7 +96,7 @@ def test_pulses_that_end_before_the_amplitude_are_refused(
 def test_each_remedy_for_pulses_that_end_too_early_is_one(remedy: str) -> None:
     config = load(None, ["servo.centre=2300", remedy])
     wanted = min(config.amplitude_limit, config.servo.highest)
-    assert pulses.reach(config.servo)[1] >= wanted - pulses.ROUNDING
+    assert pulses.reach(config.servo)[1] >= wanted - pulses.ANGLE_TOLERANCE_RAD
 
 
 def test_a_limit_that_is_off_by_rounding_cuts_nothing() -> None:

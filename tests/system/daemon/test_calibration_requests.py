@@ -332,5 +332,5 @@ def test_a_servo_calibration_is_saved_only_if_the_configuration_would_take_it(
 
 def test_a_date_that_a_file_could_not_hold_is_refused(rig: LockstepRig) -> None:
     request = ("calibrate-force", CalibrateForce(ForceCalibration(tared="today")))
-    with pytest.raises(Refused, match="tared: 'today' is no date: one in ISO 8601 is needed"):
+    with pytest.raises(Refused, match="tared: 'today' is not a date: one in ISO 8601 is needed"):
         perform(rig, subject(rig), request)

@@ -71,7 +71,7 @@ def complaint(folder: Path, kind: type[ForceCalibration | ServoCalibration], tex
     path.unlink()
     line = str(refusal.value)
     assert line.startswith(f"{path}:")
-    assert line.endswith("; mend it, or move it away")
+    assert line.endswith("; repair the file, or move it away")
     assert "\n" not in line
     return line
 
@@ -80,7 +80,7 @@ def complaint(folder: Path, kind: type[ForceCalibration | ServoCalibration], tex
 def test_a_file_without_one_of_its_keys_is_not_filled_in(tmp_path: Path, key: str) -> None:
     kind, whole = (ForceCalibration, FORCE) if key in FORCE else (ServoCalibration, SERVO)
     text = yaml.safe_dump({name: value for name, value in whole.items() if name != key})
-    assert f"without {key}: " in complaint(tmp_path, kind, text)
+    assert f"{key} missing: " in complaint(tmp_path, kind, text)
 
 
 @pytest.mark.parametrize("length", range(0, 80, 20))
@@ -96,9 +96,9 @@ def test_a_torn_file_is_an_error(tmp_path: Path, length: int) -> None:
     [
         ("xx: [", ":1: not valid YAML"),
         ("xx: 1e2\n", "1e2"),
-        ("", "nothing in this file"),
+        ("", "the file is empty"),
         ("- 1.0\n", "a mapping of keys to values is needed"),
-        ("xx: 1.0\nxy: 0.0\nx0: 0.0\nyx: 0.0\n", "without yy, y0, date: nothing is filled in"),
+        ("xx: 1.0\nxy: 0.0\nx0: 0.0\nyx: 0.0\n", "yy, y0, date missing: fishd fills in no default"),
     ],
 )
 def test_a_file_that_is_no_calibration_is_an_error(tmp_path: Path, text: str, words: str) -> None:
@@ -111,10 +111,10 @@ def test_a_file_that_is_no_calibration_is_an_error(tmp_path: Path, text: str, wo
         (ForceCalibration, FORCE, {"xx": float("nan")}, "xx: nan is not a finite number"),
         (ForceCalibration, FORCE, {"xx": "lots"}, "xx: 'lots' is not valid"),
         (ForceCalibration, FORCE, {"xxx": 1.0}, "xxx: unknown key"),
-        (ForceCalibration, FORCE, {"date": ""}, "date: '' is not when it was made"),
-        (ForceCalibration, FORCE, {"date": "soon"}, "date: 'soon' is no date: one in ISO 8601"),
-        (ForceCalibration, FORCE, {"xx": 0.0, "yy": 0.0}, "says the same of both forces"),
-        (ForceCalibration, FORCE, {"xy": 2.0, "yx": 0.5}, "says the same of both forces"),
+        (ForceCalibration, FORCE, {"date": ""}, "date: '' is not a date: one in ISO 8601"),
+        (ForceCalibration, FORCE, {"date": "soon"}, "date: 'soon' is not a date: one in ISO 8601"),
+        (ForceCalibration, FORCE, {"xx": 0.0, "yy": 0.0}, "xx xy, yx yy is singular"),
+        (ForceCalibration, FORCE, {"xy": 2.0, "yx": 0.5}, "xx xy, yx yy is singular"),
         (ForceCalibration, FORCE, {"covariance_x": [-1.0, 0.0, 1.0]}, "is not a covariance"),
         (ForceCalibration, FORCE, {"covariance_y": [1.0, 2.0, 1.0]}, "is not a covariance"),
         (ForceCalibration, FORCE, {"covariance_x": [1.0, 0.0]}, "covariance_x: [1.0, 0.0] is not"),
@@ -186,7 +186,7 @@ def test_a_file_without_a_date_in_its_name_is_ignored_and_told(tmp_path: Path, n
     (tmp_path / name).write_text("xx: 7.0\n")
     found = folder.newest(ForceCalibration), folder.newest(ServoCalibration)
     assert [each and each[0] for each in found] == [force, servo]
-    line = f"{tmp_path / name} is no dated calibration file and is ignored"
+    line = f"{tmp_path / name} is not a dated calibration file and is ignored"
     assert folder.ignored() == [line]
     _, path = folder.save(ForceCalibration(xx=3.0), NOON + HOUR)
     assert path.name == "force-2026-11-21T130000.000000Z.yaml"

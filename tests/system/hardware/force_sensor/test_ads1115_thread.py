@@ -13,7 +13,7 @@ from fishd.core.clock import SystemClock
 from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
-from fishd.hardware.force_sensor.sampled_sensor import CLOSE_LIMIT, SampledSensor
+from fishd.hardware.force_sensor.sampled_sensor import CLOSE_TIMEOUT_S, SampledSensor
 
 
 def threaded() -> SampledSensor:
@@ -94,11 +94,11 @@ def test_closing_does_not_wait_for_a_transfer_that_hangs() -> None:
         rig.device.transfer = hanging
         sensor = threaded()
         assert entered.wait(PATIENCE)
-        with pytest.raises(SensorError, match="has not delivered yet"):
+        with pytest.raises(SensorError, match="has not delivered a sample yet"):
             sensor.read(time.monotonic())
         begun = time.monotonic()
         sensor.close()
-        assert CLOSE_LIMIT <= time.monotonic() - begun < 30.0
+        assert CLOSE_TIMEOUT_S <= time.monotonic() - begun < 30.0
         (thread,) = sampler_threads()
         released.set()
         thread.join(PATIENCE)

@@ -15,7 +15,7 @@ from fishd.core.clock import SystemClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo import pigpio_link
 from fishd.hardware.servo.pigpio import PigpioSettings
-from fishd.hardware.servo.pigpio_client import Client, opened
+from fishd.hardware.servo.pigpio_client import Client, open_client
 from fishd.hardware.servo.pigpio_link import PigpioLink
 
 
@@ -52,7 +52,7 @@ HEADER = struct.pack("<IIII", 45, 0, 0, 44)
     [
         (HEADER, True, "it closed the connection"),
         (HEADER, False, "no answer within 200 ms"),
-        (HEADER[:9], True, "it broke off in mid-answer"),
+        (HEADER[:9], True, "it closed the connection in the middle of an answer"),
         (b"", True, "it closed the connection"),
     ],
 )
@@ -61,14 +61,17 @@ def test_an_answer_that_breaks_off_is_an_error(answer: bytes, dies: bool, messag
     try:
         host, port = server.settings.host, server.settings.port
         limit = PATIENCE if dies else 0.2
-        with pytest.raises(ServoError, match=message), opened(host, port, limit) as client:
+        with pytest.raises(ServoError, match=message), open_client(host, port, limit) as client:
             client.script_status(0)
     finally:
         server.close()
 
 
 def test_a_host_that_is_none_is_one_line_too() -> None:
-    with pytest.raises(ServoError, match=r"^pigpiod at a..b:8888: [^\n]+$"), opened("a..b", 8888):
+    with (
+        pytest.raises(ServoError, match=r"^pigpiod at a..b:8888: [^\n]+$"),
+        open_client("a..b", 8888),
+    ):
         pass
 
 
@@ -108,7 +111,7 @@ def test_a_link_that_is_closed_while_it_connects_asks_for_nothing_more(
             return 79
 
     monkeypatch.setattr(pigpio_link, "Client", Held)
-    monkeypatch.setattr(pigpio_link, "START", 0.0)
+    monkeypatch.setattr(pigpio_link, "START_TIMEOUT_S", 0.0)
     link = PigpioLink(bench.settings(), SystemClock(), asked.append, threaded=True)
     thread = link._thread
     assert thread

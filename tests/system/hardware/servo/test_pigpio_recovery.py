@@ -10,8 +10,8 @@ from rigs.pigpio_rig import FRAME, GPIO, Bench, connect
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import ServoError
-from fishd.hardware.servo.pigpio_pulses import countdowns, remove
-from fishd.hardware.servo.pulses import REST
+from fishd.hardware.servo.pigpio_pulses import find_countdowns, remove
+from fishd.hardware.servo.pulses import NEUTRAL_TIME_S
 
 ALT5 = 2
 READ = pigpio._PI_CMD_READ
@@ -125,9 +125,9 @@ def test_the_last_resort_succeeds_beside_a_fishd_that_takes_its_script_away(benc
     sleep = bench.clock.sleep
 
     def reconnect(seconds: float) -> None:
-        if seconds == REST:
+        if seconds == NEUTRAL_TIME_S:
             with bench.client() as client:
-                remove(client, countdowns(client, GPIO))
+                remove(client, find_countdowns(client, GPIO))
         sleep(seconds)
 
     bench.clock.sleep = reconnect  # type: ignore[method-assign]

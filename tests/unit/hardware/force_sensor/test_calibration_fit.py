@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fishd.hardware.force_sensor.calibration_fit import (
-    WORST_CONDITION,
+    MAX_CONDITION,
     Load,
     PoorLoads,
     check,
@@ -45,7 +45,7 @@ def test_without_noise_the_sensor_is_recovered_to_the_last_digits(
     gx: float, gy: float, cx: float, cy: float, x0: float, y0: float
 ) -> None:
     loads = measured(PLAN, sensor(gx, gy, cx, cy), (x0, y0))
-    if np.linalg.cond(sensor(gx, gy, cx, cy)) > 0.5 * WORST_CONDITION:
+    if np.linalg.cond(sensor(gx, gy, cx, cy)) > 0.5 * MAX_CONDITION:
         return
     calibration = fit(loads).calibration
     for load in loads:

@@ -12,7 +12,7 @@ from rigs.force_rig import STEP, ForceRig, take_pairs, volts
 
 from fishd.core.errors import MissingPackage
 from fishd.hardware.registry import driver_packages
-from fishd.hardware.sampler import LONGEST_PAUSE
+from fishd.hardware.sampler import MAX_PAUSE_S
 from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 
@@ -85,7 +85,7 @@ def test_while_a_chip_is_away_pauses_between_attempts_grow_to_half_a_second(rig:
         pauses.append(sampler.ready_at - rig.clock.now)
     assert pauses[0] == pytest.approx(1.25 / 860 + 1e-3)
     assert pauses == pytest.approx(sorted(pauses))
-    assert pauses[-1] == pytest.approx(LONGEST_PAUSE)
+    assert pauses[-1] == pytest.approx(MAX_PAUSE_S)
     rig.faults.clear()
     assert take_pairs(sampler, rig, 1.0)
     assert sampler.reconnects == 1

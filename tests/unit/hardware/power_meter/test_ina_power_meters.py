@@ -11,7 +11,7 @@ from fishd.core.errors import SensorError
 from fishd.hardware.power_meter.ina import Ina
 from fishd.hardware.power_meter.ina219 import Ina219, Ina219Settings
 from fishd.hardware.power_meter.ina226 import Ina226, Ina226Settings
-from fishd.hardware.power_meter.sampled_power import SampledPower, interval_of
+from fishd.hardware.power_meter.sampled_power import SampledPower, sample_interval
 from fishd.virtual.pi.ina import CHIPS
 
 TICK = 0.05
@@ -36,8 +36,8 @@ class MeterRig(Board):
     def driver(self, **settings: Any) -> Ina[Any]:  # type: ignore[override]
         given = {"bus": ABSENT_BUS, "shunt": self.shunt, **settings}
         if self.kind == "ina219":
-            return Ina219(Ina219Settings(**given), self.clock, interval_of(TICK))
-        return Ina226(Ina226Settings(**given), self.clock, interval_of(TICK))
+            return Ina219(Ina219Settings(**given), self.clock, sample_interval(TICK))
+        return Ina226(Ina226Settings(**given), self.clock, sample_interval(TICK))
 
     def meter(self) -> SampledPower:
         return SampledPower(self.driver(), self.clock, threaded=False, tick=TICK)
@@ -150,6 +150,6 @@ def test_a_closed_meter_says_so_and_can_be_closed_twice(rig: MeterRig) -> None:
 def test_another_chip_at_its_address_is_told_from_an_ina226() -> None:
     with MeterRig("ina219", 0.1) as rig:
         driver = Ina226(Ina226Settings(bus=ABSENT_BUS), rig.clock, 0.0125)
-        with pytest.raises(OSError, match="says that it is none") as caught:
+        with pytest.raises(OSError, match="identifies itself as another chip") as caught:
             driver.open()
         assert caught.value.errno == errno.ENODEV

@@ -11,7 +11,7 @@ from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
-from fishd.hardware.servo.pulses import LONGEST, SHORTEST, pulse_width, reach
+from fishd.hardware.servo.pulses import MAX_PULSE_US, MIN_PULSE_US, pulse_width, reach
 from fishd.hardware.settings import ServoSettings
 
 
@@ -149,7 +149,9 @@ def test_every_angle_within_reach_is_a_pulse_and_none_beyond(servo: ServoSetting
             pulse_width(servo, 0.0)
         return
     for share in (0.001, 0.5, 0.999):
-        assert SHORTEST <= pulse_width(servo, lowest + share * (highest - lowest)) <= LONGEST
+        assert (
+            MIN_PULSE_US <= pulse_width(servo, lowest + share * (highest - lowest)) <= MAX_PULSE_US
+        )
     for beyond in (lowest - 1e-3, highest + 1e-3):
         with pytest.raises(ServoError):
             pulse_width(servo, beyond)

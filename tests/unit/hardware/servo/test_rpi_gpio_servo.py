@@ -168,7 +168,7 @@ class TestALibraryThatCannotBeUsed:
         pins.present = False
         assert self.start() == (
             "the pins of the header cannot be used: can not open gpiochip; "
-            "fishd has to be in group gpio"
+            "add the user of fishd to group gpio"
         )
 
     def test_in_a_folder_that_lgpio_may_not_write_to(
