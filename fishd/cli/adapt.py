@@ -17,7 +17,7 @@ from fishd.cli.experiment_options import (
 )
 from fishd.cli.options import FiniteRange, json_option, seed_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.progress import showing
+from fishd.cli.progress import show_progress
 from fishd.core.errors import FishdError
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def adapt(
             with (
                 ending.measuring(FishdError),
                 session,
-                showing(budget, "s of tank time", err=as_json) as show,
+                show_progress(budget, "s of tank time", err=as_json) as show,
             ):
                 state = Adaptation(session, run, budget, steps, seed, show).run()
                 words = command_of(_chosen(state), fish)

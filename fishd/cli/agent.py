@@ -1,4 +1,4 @@
-"""The verb that lets a policy swim a fishd from outside: the agent of its controller `remote`."""
+"""The verb `agent`: a policy outside fishd swims the fish through the controller `remote`."""
 
 import threading
 import time
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     from fishd.controllers.policy.pilot import Pilot
     from fishd.learning.env.fishd_link import FishdLink
 
-GIVE_UP = 2.0
-"""After so long without frames the camera counts as lost [s]."""
-HAND_OVER = 20.0
-"""How long fishd may take to let another controller take over [s]."""
-REPORT = 1.0
-"""Time between two lines [s]."""
+CAMERA_LOST_AFTER_S = 2.0
+"""Time without frames after which the camera counts as lost [s]."""
+HAND_OVER_TIMEOUT_S = 20.0
+"""Longest time for fishd to let another controller take over [s]."""
+REPORT_INTERVAL_S = 1.0
+"""Time between two printed lines [s]."""
 
 
 @click.command()
@@ -37,15 +37,15 @@ REPORT = 1.0
 @click.option(
     "--camera",
     metavar="ENDPOINT",
-    help="Where fishd-camera takes requests, for a policy that sees pictures. [default: "
+    help="Request address of fishd-camera, for a policy that sees pictures. [default: "
     "$FISHD_CAMERA, else that of this machine]",
 )
 @click.option(
     "--agent",
     "address",
     metavar="ADDRESS",
-    help="Where fishd reaches this program, such as tcp://192.168.1.20:9873, where that is on "
-    "another machine. [default: any free port of this one]",
+    help="Address at which fishd reaches this program, such as tcp://192.168.1.20:9873, if fishd "
+    "runs on another machine. [default: any free port of this one]",
 )
 @for_option("End by itself after this time [s]; by default Ctrl-C ends it.")
 @endpoint_option
@@ -66,11 +66,11 @@ def agent(
     has no pictures: they come from a running fishd-camera. Policies that see forces swim, too.
 
     Without frames for 0.25 s the fish waits at neutral; after 2 s the camera counts as lost.
-    However this ends, the fish is at neutral. Exit status 1 where the policy does not fit the robot
+    However this ends, the fish is at neutral. Exit status 1 if the policy does not fit the robot
     or the camera, or one of them is lost.
     """
     for package in ("onnx", "onnxruntime"):
-        import_module(package)  # one that is missing is named with its extra, see `Verbs`
+        import_module(package)  # `Verbs` names the extra of a missing package
     from fishd.camera.live_sight import LiveSight
     from fishd.controllers.policy.pilot import Pilot
     from fishd.learning.env.fishd_link import FishdLink
@@ -82,7 +82,7 @@ def agent(
         pilot = Pilot(policy, adopt(fish.config()).limits)
         sight = None
         if pilot.card.pictures:
-            with _named(policy):
+            with _name_policy_in_errors(policy):
                 sight = stack.enter_context(LiveSight(camera, fish, pilot.card.pictures))
                 sight.await_frames()
         elif camera:
@@ -91,23 +91,23 @@ def agent(
         swim = _Swim(link, pilot, sight, unit, as_json)
         echo(f"{policy} swims; it sees {pilot.card.sees}; Ctrl-C ends it", err=as_json)
         try:
-            with _named(policy):
+            with _name_policy_in_errors(policy):
                 swim.run(stopping, seconds)
         except ControllerFault as fault:
-            with suppress(LinkLost):  # another controller swims already, or none
-                link.pause(HAND_OVER)
+            with suppress(LinkLost):  # another controller already swims, or no controller does
+                link.pause(HAND_OVER_TIMEOUT_S)
             raise PolicyError(f"{policy}: {fault}; {_hand_over(fish, fault)}") from None
         finally:
-            link.close()  # neutral first, then whatever takes time
-        if sight and pilot.blind > GIVE_UP:
+            link.close()  # first: this sends the fish to neutral
+        if sight and pilot.blind > CAMERA_LOST_AFTER_S:
             raise sight.lost()
-    echo(f"the fish rests, after {swim.swum:.0f} s", err=as_json)
+    echo(f"the fish rests, after {swim.duration:.0f} s", err=as_json)
     return 0
 
 
 @contextmanager
-def _named(policy: str) -> Iterator[None]:
-    """Let what a policy is refused for begin with its name."""
+def _name_policy_in_errors(policy: str) -> Iterator[None]:
+    """Put the name of the policy in front of the message of a `PolicyError`."""
     try:
         yield
     except PolicyError as error:
@@ -115,7 +115,7 @@ def _named(policy: str) -> Iterator[None]:
 
 
 def _hand_over(fish: Fish, fault: ControllerFault) -> str:
-    """Let another controller take over, as fishd does itself; who swims now."""
+    """Let the successor take over, as fishd does itself; return what swims now, in words."""
     if fault.successor is None:
         return "the fish rests"
     name, controller = fault.successor
@@ -124,7 +124,7 @@ def _hand_over(fish: Fish, fault: ControllerFault) -> str:
 
 
 class _Swim:
-    """One swim, from the take-over of the fish until something ends it."""
+    """One swim, from taking over the fish until its end."""
 
     def __init__(
         self,
@@ -134,68 +134,74 @@ class _Swim:
         unit: str,
         as_json: bool,
     ) -> None:
-        """unit: of the forces"""
+        """unit: unit of the forces"""
         self._as_json = as_json
         self._link, self._pilot, self._sight, self._unit = link, pilot, sight, unit
-        self.swum = 0.0
-        """How long, by the clock of fishd [s]."""
-        self._reported = time.monotonic()
+        self.duration = 0.0
+        """Duration of the swim until now, by the clock of fishd [s]."""
+        self._last_report_time = time.monotonic()
         self._angles: list[float] = []
-        self._lost = self._unseen = 0
-        """Ticks without an action in time, and without frames, since the latest report."""
+        self._late_ticks = self._blind_ticks = 0
+        """Ticks whose action was late, and ticks without frames, since the latest report."""
 
     def run(self, stopping: threading.Event, seconds: float | None) -> None:
-        """Swim until told to stop, for so long, or until frames have been missing for too long.
+        """Swim until `stopping` is set, or frames have been missing for too long.
 
-        Raises `LinkLost`, `CameraLost`, `PolicyError` and `ControllerFault`.
+        seconds: longest duration [s]; None for no end. Raises `LinkLost`, `CameraLost`,
+            `PolicyError` and `ControllerFault`.
         """
         link, pilot = self._link, self._pilot
-        seen = link.reset()
-        begun = seen.time
-        while not stopping.is_set() and pilot.blind <= GIVE_UP:
-            frames = self._sight.look(seen.time) if self._sight else None
-            waited = pilot.waits
-            angle = pilot.angle(seen, frames)
-            if pilot.waits and not waited:
+        observation = link.reset()
+        start = observation.time
+        while not stopping.is_set() and pilot.blind <= CAMERA_LOST_AFTER_S:
+            frames = self._sight.look(observation.time) if self._sight else None
+            was_waiting = pilot.waits
+            angle = pilot.angle(observation, frames)
+            if pilot.waits and not was_waiting:
                 echo("no frames: the fish waits at neutral", err=True)
-            elif waited and not pilot.waits:
+            elif was_waiting and not pilot.waits:
                 echo("frames are back: it swims on", err=True)
-            seen, lost, _ = link.step(angle)
-            self.swum = seen.time - begun
-            self._angles.append(abs(seen.instruction_angle))
-            self._lost += lost
-            self._unseen += pilot.blind > 0.0
-            if time.monotonic() - self._reported >= REPORT:
-                self._report(seen)
-            if seconds is not None and self.swum >= seconds - 0.5 * link.tick:
+            observation, late, _ = link.step(angle)
+            self.duration = observation.time - start
+            self._angles.append(abs(observation.instruction_angle))
+            self._late_ticks += late
+            self._blind_ticks += pilot.blind > 0.0
+            if time.monotonic() - self._last_report_time >= REPORT_INTERVAL_S:
+                self._report(observation)
+            if seconds is not None and self.duration >= seconds - 0.5 * link.tick:
                 return
 
-    def _report(self, seen: Observation) -> None:
-        full = sum(self._angles) / len(self._angles) / self._pilot.card.amplitude
+    def _report(self, observation: Observation) -> None:
+        fullness = sum(self._angles) / len(self._angles) / self._pilot.card.amplitude
         if self._as_json:
             print_json_line(
                 {
-                    "seconds": self.swum,
-                    "frequency": seen.frequency,
-                    "thrust": seen.thrust,
-                    "fullness": full,
-                    "unseen": self._unseen,
-                    "lost": self._lost,
+                    "seconds": self.duration,
+                    "frequency": observation.frequency,
+                    "thrust": observation.thrust,
+                    "fullness": fullness,
+                    "unseen": self._blind_ticks,
+                    "lost": self._late_ticks,
                     "ticks": len(self._angles),
                 }
             )
-            self._begin_report()
+            self._start_next_report()
             return
         line = (
-            f"{self.swum:6.1f} s  {seen.frequency:5.2f} Hz  thrust {seen.thrust * 1e3:6.2f} "
-            f"m{self._unit}  |φ_c| {full:4.0%} of Φ"
+            f"{self.duration:6.1f} s  {observation.frequency:5.2f} Hz  "
+            f"thrust {observation.thrust * 1e3:6.2f} m{self._unit}  |φ_c| {fullness:4.0%} of Φ"
         )
-        if self._unseen:
-            line += f"  without frames: {self._unseen} of {len(self._angles)} ticks"
-        if self._lost:
-            line += f"  late: {self._lost} ticks"
+        if self._blind_ticks:
+            line += f"  without frames: {self._blind_ticks} of {len(self._angles)} ticks"
+        if self._late_ticks:
+            line += f"  late: {self._late_ticks} ticks"
         echo(line)
-        self._begin_report()
+        self._start_next_report()
 
-    def _begin_report(self) -> None:
-        self._reported, self._angles, self._lost, self._unseen = time.monotonic(), [], 0, 0
+    def _start_next_report(self) -> None:
+        self._last_report_time, self._angles, self._late_ticks, self._blind_ticks = (
+            time.monotonic(),
+            [],
+            0,
+            0,
+        )

@@ -10,10 +10,10 @@ import msgspec
 from msgspec import to_builtins
 
 from fishd.cli.completion import complete_contestant
-from fishd.cli.experiment_options import ChosenFish, fish_choice, keep_option, kept
+from fishd.cli.experiment_options import ChosenFish, fish_choice, keep_option, keep_session
 from fishd.cli.options import for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.progress import showing
+from fishd.cli.progress import show_progress
 from fishd.config import Config, check_tethered
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
@@ -162,8 +162,8 @@ def _swim(task: _Task, settle: float) -> _Outcome:
             raise why
     able = [one for one in chosen if one not in (out for out, _ in left_out)] or chosen
     with (
-        kept(task.folder, task.fish, None, task.settings) as experiment,
-        showing(len(able) * task.runs * task.seconds, "s swum") as bar,
+        keep_session(task.folder, task.fish, None, task.settings) as experiment,
+        show_progress(len(able) * task.runs * task.seconds, "s swum") as bar,
     ):
         result = comparison.compare(config, able, task.seconds, settle, task.runs, bar.at, camera)
         task.keep(experiment, result[0])
@@ -191,8 +191,8 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
         live = LiveComparison(session, chosen)
         with (
             session,
-            kept(task.folder, task.fish, session, task.settings) as experiment,
-            showing(len(chosen) * task.runs * task.seconds, "s") as bar,
+            keep_session(task.folder, task.fish, session, task.settings) as experiment,
+            show_progress(len(chosen) * task.runs * task.seconds, "s") as bar,
         ):
             task.fish.announce(task.as_json)
             session.progress = bar.at

@@ -1,6 +1,6 @@
-"""What shells complete, and the verb that prints their script.
+"""Completion in shells: the words to complete with, and the verb that prints the script.
 
-`complete_…` are for the `shell_complete` of click's parameters.
+The functions `complete_…` are for the `shell_complete` of click's parameters.
 """
 
 from collections.abc import Iterable
@@ -12,11 +12,11 @@ from click.shell_completion import CompletionItem, get_completion_class
 from fishd.core.errors import FishError
 from fishd.core.schema import Field
 
-if TYPE_CHECKING:  # with zmq, which most completions do without
+if TYPE_CHECKING:  # imports zmq, which most completions do not need
     from fishd.client import Fish
 
-_PATIENCE = 1.0
-"""How long a key press may wait for a daemon [s]."""
+_DAEMON_TIMEOUT_S = 1.0
+"""Longest time that a key press waits for a daemon [s]."""
 
 
 @click.command()
@@ -35,80 +35,83 @@ def completion(shell: str) -> None:
 
 
 def endpoint_of(ctx: click.Context) -> str | None:
-    """The control socket that the command line names so far, at the verb or before it."""
-    found: str | None = ctx.params.get("endpoint") or ctx.find_root().params.get("endpoint")
-    return found
+    """Return the control socket that the command line names, at the verb or before it."""
+    endpoint: str | None = ctx.params.get("endpoint") or ctx.find_root().params.get("endpoint")
+    return endpoint
 
 
 def active_parameters(fish: "Fish") -> dict[str, Field]:
-    """Those of the active controller, by name."""
+    """Return the parameters of the active controller, by name."""
     active = fish.status().controller
     infos = (info for info in fish.controllers() if info.name == active)
     return {field.name: field for info in infos for field in info.parameters}
 
 
 def complete_key(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Keys of the configuration, for `--set KEY=VALUE`."""
+    """Return keys of the configuration, for `--set KEY=VALUE`."""
     from fishd.config import keys
 
-    every = keys()
-    sections = {key.rpartition(".")[0] for key in every}
-    return _matching((f"{key}=" for key in every if key not in sections), incomplete)
+    all_keys = keys()
+    sections = {key.rpartition(".")[0] for key in all_keys}
+    return _match_words((f"{key}=" for key in all_keys if key not in sections), incomplete)
 
 
 def complete_pair(
     ctx: click.Context, param: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
-    """Names of the parameters of the running controller, and values where there are few."""
+    """Return names of parameters of the running controller, or the choices for a value."""
     from fishd.client import Fish
 
     try:
-        with Fish(endpoint_of(ctx), timeout=_PATIENCE) as fish:
+        with Fish(endpoint_of(ctx), timeout=_DAEMON_TIMEOUT_S) as fish:
             fields = active_parameters(fish)
     except FishError:
         return []
-    given: tuple[str, ...] = ctx.params.get(param.name or "") or ()
-    if len(given) % 2 == 0:
-        return _matching(fields, incomplete)
-    field = fields.get(given[-1].lstrip("-").replace("-", "_"))
+    previous_words: tuple[str, ...] = ctx.params.get(param.name or "") or ()
+    if len(previous_words) % 2 == 0:
+        return _match_words(fields, incomplete)
+    field = fields.get(previous_words[-1].lstrip("-").replace("-", "_"))
     return complete_value(field, incomplete) if field else []
 
 
 def complete_contestant(
     _: click.Context, __: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
-    """Controllers that need no other program, named policies, and files."""
+    """Return controllers that need no other program, named policies, and files."""
     from fishd.controllers import registry
     from fishd.controllers.policy import library
 
     names = [name for name in registry.names() if name != "remote"]
-    return _matching([*names, *library.names()], incomplete, files=True)
+    return _match_words([*names, *library.names()], incomplete, files=True)
 
 
 def complete_policy(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Named policies, and files."""
+    """Return named policies, and files."""
     from fishd.controllers.policy import library
 
-    return _matching(library.names(), incomplete, files=True)
+    return _match_words(library.names(), incomplete, files=True)
 
 
 def complete_value(field: Field, incomplete: str) -> list[CompletionItem]:
-    """Values of a parameter: choices, named policies, files; nothing for numbers."""
+    """Return values of a parameter: choices, named policies, files; nothing for numbers."""
     if field.kind == "choice":
-        return _matching(field.interval.split(" | "), incomplete)
+        return _match_words(field.interval.split(" | "), incomplete)
     if field.kind == "boolean":
-        return _matching(("true", "false"), incomplete)
+        return _match_words(("true", "false"), incomplete)
     if not field.file:
-        return _matching(field.words, incomplete)
+        return _match_words(field.words, incomplete)
     from fishd.controllers.policy import library
 
     names = library.names() if field.file == library.SUFFIX else []
-    return _matching(names, incomplete, files=True)
+    return _match_words(names, incomplete, files=True)
 
 
-def _matching(
+def _match_words(
     words: Iterable[str], incomplete: str, *, files: bool = False
 ) -> list[CompletionItem]:
-    """Those words that begin so. Files come first: bash forgets what was listed before them."""
-    begun = [CompletionItem(word) for word in words if word.startswith(incomplete)]
-    return [*([CompletionItem(incomplete, type="file")] if files else []), *begun]
+    """Return the words that begin with `incomplete`.
+
+    Files come first: bash forgets what is listed before them.
+    """
+    matches = [CompletionItem(word) for word in words if word.startswith(incomplete)]
+    return [*([CompletionItem(incomplete, type="file")] if files else []), *matches]

@@ -31,11 +31,11 @@ from fishd.hardware.servo import pulses
 def _refuse_training(
     _ctx: click.Context, _param: click.Parameter, overrides: tuple[str, ...]
 ) -> tuple[str, ...]:
-    """Say where the settings of a training belong; raises `ConfigError`."""
-    of_fish = {field.name for field in fields_of(Config)}
+    """Raise `ConfigError` for settings of a training, and say where they belong."""
+    fish_keys = {field.name for field in fields_of(Config)}
     for override in overrides:
         name = override.partition("=")[0].partition(".")[0].strip()
-        if name not in of_fish and name in _of_training():
+        if name not in fish_keys and name in _training_keys():
             raise ConfigError(
                 f"--set {override}: --set is about the fish, {name} is a setting of a training: "
                 "write it into a YAML file, for 'fishctl learn ppo --settings FILE'"
@@ -43,7 +43,7 @@ def _refuse_training(
     return overrides
 
 
-def _of_training() -> tuple[str, ...]:
+def _training_keys() -> tuple[str, ...]:
     from fishd.learning.settings import TrainingSettings
 
     return TrainingSettings.__struct_fields__
@@ -61,13 +61,13 @@ set_option = click.option(
 
 
 def fish_options(function: F) -> F:
-    """`--config` and `--set` of verbs that are about a fish of one's own choice."""
+    """Add `--config` and `--set`, for verbs about a fish that the user chooses."""
     option = config_option("YAML file, as for fishd; without it, the defaults.")
     return option(set_option(function))
 
 
 def config_option(about: str) -> Callable[[F], F]:
-    """`--config`."""
+    """Return the option `--config`; about: its help text."""
     kind = click.Path(path_type=Path, readable=False)
     return click.option("--config", "file", type=kind, help=about)
 
@@ -76,7 +76,7 @@ service_option = config_option(
     f"YAML file of the daemon; default: ${FILE_VARIABLE}, else {SERVICE_FILE} where there is one, "
     "else the defaults."
 )
-"""`--config` of verbs that are about the fishd of this machine; goes with `load_service`."""
+"""Option `--config` of verbs about the fishd of this machine, for `load_service`."""
 
 
 @click.group()
@@ -93,25 +93,25 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
 
     Exit status 78 when fishd would refuse it.
     """
-    wrong = mistakes.find(file, overrides)
+    problems = mistakes.find(file, overrides)
     if as_json:
-        print_json({"file": file, "mistakes": wrong})
-        sys.exit(os.EX_CONFIG if wrong else 0)
-    if wrong:
-        for mistake in wrong:
+        print_json({"file": file, "mistakes": problems})
+        sys.exit(os.EX_CONFIG if problems else 0)
+    if problems:
+        for mistake in problems:
             echo(f"fishctl: {line(' '.join(mistake.split()), MAX_COMPLAINT)}", err=True)
         sys.exit(os.EX_CONFIG)
     loaded = load(file, overrides)
     echo(f"{file}: good")
-    left = pulses.cut(loaded.servo, loaded.amplitude_limit)
-    if left and loaded.has_hardware:
-        echo(f"servo.lowest and servo.highest permit {left}, amplitude_limit")
+    permitted = pulses.cut(loaded.servo, loaded.amplitude_limit)
+    if permitted and loaded.has_hardware:
+        echo(f"servo.lowest and servo.highest permit {permitted}, amplitude_limit")
 
 
 @config.command()
 @click.argument("file", type=click.Path(path_type=Path, readable=False), required=False)
 @set_option
-@click.option("--running", is_flag=True, help="What the fishd that runs was started with, instead.")
+@click.option("--running", is_flag=True, help="Print what the running fishd was started with.")
 @endpoint_option
 @json_option
 def show(
@@ -125,16 +125,16 @@ def show(
     if running:
         if file or overrides:
             raise click.UsageError("--running shows what fishd was started with: no FILE, no --set")
-        from fishd.client import Fish  # with zmq, which the other forms do without
+        from fishd.client import Fish  # imports zmq, which the other forms do not need
 
         with Fish(endpoint) as fish:
-            shown: Config | dict[str, Any] = fish.config()
+            settings: Config | dict[str, Any] = fish.config()
     else:
-        shown = load(file, overrides)
+        settings = load(file, overrides)
     if as_json:
-        print_json(shown)
+        print_json(settings)
     else:
-        echo(to_yaml(shown), nl=False)
+        echo(to_yaml(settings), nl=False)
 
 
 @config.command()
@@ -147,9 +147,9 @@ def schema() -> None:
 
 
 def load_service(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config, Path | None]:
-    """The configuration of the fishd of this machine, and its file; None for the defaults.
+    """Return the configuration of the fishd of this machine, and its file; None for the defaults.
 
-    file: what `--config` says. A file that nobody named is told on standard error.
+    file: value of `--config`. Without one, the file that is used is printed on standard error.
     """
     if file is None:
         file = service_file()

@@ -9,8 +9,8 @@ import click
 
 from fishd import client
 from fishd.cli.completion import active_parameters, complete_pair
-from fishd.cli.options import ControllerGroup, ParameterType, Words, daemon_options, describe
-from fishd.cli.output import echo, made_printable, print_json, state_line
+from fishd.cli.options import ControllerGroup, ParameterType, Utf8Text, daemon_options, describe
+from fishd.cli.output import echo, format_state, make_printable, print_json
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.core.addresses import ENDPOINT_VARIABLE
 from fishd.core.errors import NoDaemon, UnknownController
@@ -20,20 +20,23 @@ from fishd.core.schema import Field, nearest
 T = TypeVar("T")
 
 
-def asked(
+def list_from_daemon(
     endpoint: str | None,
     ask: "Callable[[client.Fish], list[T]]",
     look: Callable[[], list[T]],
-    what: str,
+    noun: str,
 ) -> list[T]:
-    """What the daemon knows; where none runs and none was named, what is found without it."""
+    """Return the list that the daemon gives, or that of this machine if none runs or was named.
+
+    ask: gets the list from the daemon; look: gets it without one; noun: plural noun of its items
+    """
     try:
         with client.Fish(endpoint) as fish:
             return ask(fish)
     except NoDaemon:
         if endpoint or os.environ.get(ENDPOINT_VARIABLE):
             raise
-        echo(f"fishctl: no fishd is running; these {what} are found from here", err=True)
+        echo(f"fishctl: no fishd is running; these are the {noun} of this machine", err=True)
         return look()
 
 
@@ -41,13 +44,15 @@ def asked(
 @click.argument("name", required=False, metavar="[NAME]")
 @daemon_options
 def controllers(name: str | None, endpoint: str | None, as_json: bool) -> None:
-    """List the controllers that the daemon knows, or show the one of that NAME.
+    """List the controllers that the daemon knows, or show the controller NAME.
 
-    Each with its parameters, as options, and the quantities of its own that telemetry shows.
+    Each has its parameters, as options, and the quantities that it adds to telemetry.
     """
     from fishd.controllers import registry
 
-    known = asked(endpoint, client.Fish.controllers, registry.describe_all, "controllers")
+    known = list_from_daemon(
+        endpoint, client.Fish.controllers, registry.describe_all, "controllers"
+    )
     if name is not None:
         names = [info.name for info in known]
         if name not in names:
@@ -57,7 +62,7 @@ def controllers(name: str | None, endpoint: str | None, as_json: bool) -> None:
     if as_json:
         print_json(known)
         return
-    for info in map(made_printable, known):
+    for info in map(make_printable, known):
         click.echo(f"{click.style(info.name, bold=True)}  {info.summary}")
         for field in info.parameters:
             echo(f"    --{field.name.replace('_', '-'):<22} {describe(field)}")
@@ -113,17 +118,17 @@ def _converted(field: Field, text: str) -> Any:
 
 
 def _pairs(words: Iterable[str]) -> Iterator[tuple[str, str]]:
-    """Names and values of `NAME VALUE`, `NAME=VALUE` and `--NAME VALUE`, in any mixture."""
-    rest, given = iter(words), set[str]()
-    for word in rest:
+    """Yield names and values of `NAME VALUE`, `NAME=VALUE` and `--NAME VALUE`, in any mixture."""
+    remaining, names = iter(words), set[str]()
+    for word in remaining:
         name, equals, text = word.partition("=")
-        value = text if equals else next(rest, None)
+        value = text if equals else next(remaining, None)
         if value is None:
             raise click.UsageError(f"every NAME needs a VALUE, such as: {name} 0.7, or {name}=0.7")
         name = name.lstrip("-").replace("-", "_")
-        if name in given:
+        if name in names:
             raise click.UsageError(f"{name} is given twice")
-        given.add(name)
+        names.add(name)
         yield name, value
 
 
@@ -142,7 +147,7 @@ def clear_fault(endpoint: str | None, as_json: bool) -> None:
 
 
 @click.command()
-@click.argument("words", metavar="TEXT", type=Words())
+@click.argument("words", metavar="TEXT", type=Utf8Text())
 @daemon_options
 def mark(words: str, endpoint: str | None, as_json: bool) -> None:
     """Put a mark in the event stream, such as what you just changed on the rig."""
@@ -155,13 +160,15 @@ def mark(words: str, endpoint: str | None, as_json: bool) -> None:
 
 
 def _change(endpoint: str | None, as_json: bool, change: "Callable[[client.Fish], State]") -> None:
-    """Ask for a change, and print the state afterwards."""
+    """Request a change, and print the state afterwards."""
     with client.Fish(endpoint) as fish:
         state = change(fish)
     if as_json:
         print_json(state)
         return
-    echo(state_line(state))
+    echo(format_state(state))
     if holder := state.took_from:
-        taken = made_printable(holder)
-        echo(f"fishctl: took the fish from {taken}, which had it for {holder.age:.0f} s", err=True)
+        previous = make_printable(holder)
+        echo(
+            f"fishctl: took the fish from {previous}, which had it for {holder.age:.0f} s", err=True
+        )

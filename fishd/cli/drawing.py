@@ -1,4 +1,4 @@
-"""The whole terminal to draw on, and how it is given back."""
+"""A full-screen display in the terminal, which restores the terminal at its end."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,13 +11,13 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def whole_screen() -> Iterator["Live"]:
-    """A screen of its own; that of before is shown again, whatever ends or interrupts this."""
+def open_full_screen() -> Iterator["Live"]:
+    """Yield a display on the alternate screen; restore the previous screen whatever ends this."""
     from rich.live import Live
 
     live = Live(screen=True, auto_refresh=False)
     try:
-        with held_back():  # rich does not undo a start that was interrupted half-way
+        with held_back():  # rich does not undo an interrupted start
             live.start()
         yield live
     finally:

@@ -1,4 +1,4 @@
-"""`fishctl estop`: the end of the pulses, by whichever way there is."""
+"""`fishctl estop`: ends the pulses through fishd, or without it if it does not answer."""
 
 import signal
 from pathlib import Path
@@ -8,7 +8,7 @@ import click
 import msgspec
 
 from fishd.cli.options import daemon_options
-from fishd.cli.output import echo, output_may_fail, print_json, state_line
+from fishd.cli.output import echo, format_state, output_may_fail, print_json
 from fishd.client import Fish
 from fishd.core.addresses import socket_path
 from fishd.core.errors import NoDaemon, StartupError, Untrusted
@@ -17,7 +17,7 @@ from fishd.core.protocol import State
 from fishd.hardware import release_recipe
 
 _TIMEOUT_S = 0.3
-"""Longest further time for an answer, once neither socket has answered at once [s]."""
+"""Longest further wait for an answer, if neither socket has answered at once [s]."""
 
 
 @click.command()
@@ -26,16 +26,16 @@ _TIMEOUT_S = 0.3
     "--config",
     "file",
     type=click.Path(path_type=Path, readable=False),
-    help="YAML file of the daemon, for the last resort; by default what the daemon has left, else "
-    "as for release.",
+    help="YAML file of the daemon, for the last resort. [default: the recipe that the daemon "
+    "wrote, else as for release]",
 )
 @daemon_options
 def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) -> int:
     """Emergency stop: no more pulses, at once, until 'fishctl clear-fault'.
 
-    Says which way it took: the control socket; or fishd's own socket for emergency stops, where
-    the first does not answer within 0.1 s; or the last resort without the daemon, as 'fishctl
-    release'. Exit status 0 where there are no more pulses.
+    Prints which way it took: the control socket; or fishd's separate socket for emergency stops,
+    if the first does not answer within 0.1 s; or the last resort without the daemon, as 'fishctl
+    release'. Exit status 0 if there are no more pulses.
     """
     with Fish(endpoint) as fish:
         path = socket_path(fish.endpoint)
@@ -43,45 +43,45 @@ def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) 
             state = fish.estop(message, timeout=_TIMEOUT_S if path else None)
         except Untrusted:
             raise
-        except NoDaemon as silence:
-            way, said = "last resort", _end_pulses(silence, path, file)
-            answer: dict[str, Any] = {"pulses": said}
+        except NoDaemon as no_answer:
+            way, summary = "last resort", _end_pulses(no_answer, path, file)
+            answer: dict[str, Any] = {"pulses": summary}
         else:
-            way, said = _way(fish, path), state_line(state)
-            answer = _builtins(state)
-    with output_may_fail(said):
+            way, summary = _describe_way(fish, path), format_state(state)
+            answer = _to_builtins(state)
+    with output_may_fail(summary):
         if as_json:
             print_json({"way": way, **answer})
         else:
-            echo(f"{said}\nway: {way}")
+            echo(f"{summary}\nway: {way}")
     return 0
 
 
-def _way(fish: Fish, path: Path | None) -> str:
+def _describe_way(fish: Fish, path: Path | None) -> str:
     if fish.estop_taken_by == "control":
         return "control socket"
     return f"fishd's own socket, {path}.estop, as the control socket did not answer at once"
 
 
-def _builtins(state: State) -> dict[str, Any]:
+def _to_builtins(state: State) -> dict[str, Any]:
     builtins: dict[str, Any] = msgspec.to_builtins(state)
     return builtins
 
 
-def _end_pulses(silence: NoDaemon, path: Path | None, file: Path | None) -> str:
-    """End the pulses without the daemon; returns what was done, in words."""
+def _end_pulses(no_answer: NoDaemon, path: Path | None, file: Path | None) -> str:
+    """End the pulses without the daemon; return what was result, in words."""
     recipe = release_recipe.read(str(path)) if path and not file else None
     if recipe is None:
         from fishd.cli.release import release_by_config
 
-        return release_by_config(silence, file)
+        return release_by_config(no_answer, file)
     if not recipe["function"]:
-        return f"no pulses: the fish is simulated, and its fishd does not answer ({silence})"
+        return f"no pulses: the fish is simulated, and its fishd does not answer ({no_answer})"
     try:
-        with handled(SIGNALS, signal.SIG_IGN):  # nothing ends it halfway
-            done = release_recipe.carry_out(
+        with handled(SIGNALS, signal.SIG_IGN):  # it must not end halfway
+            result = release_recipe.carry_out(
                 recipe["function"], recipe["neutral"], recipe["arguments"]
             )
     except (StartupError, ImportError, OSError) as error:
         raise click.ClickException(f"{error}; {release_recipe.NOT_RELEASED}") from None
-    return release_recipe.outcome(done)
+    return release_recipe.outcome(result)

@@ -1,4 +1,4 @@
-"""What all experiments share on the command line: which fish, which folder, and how one ends."""
+"""Command line that all experiments share: choice of the fish, folder, and how one ends."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from fishd.lab.session import Session
 
 On = Literal["live", "simulation"]
-_NOT_KEPT = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0}
-"""Options that a resumed experiment does not take over, and how many words follow each."""
-_WORDS = "fishd.words"
+_RUN_ONLY_OPTIONS = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0}
+"""Options that a resumed experiment does not take over, and the number of words after each."""
+_COMMAND_KEY = "fishd.words"
 
 
 class ChosenFish(NamedTuple):
@@ -77,10 +77,12 @@ class ChosenFish(NamedTuple):
         """Print which fish it is: the first line of an experiment."""
         echo(f"fish: {self}", err=as_json)
 
-    def refuse_other(self, of_simulation: dict[str, Any], of_live: dict[str, Any]) -> None:
-        """Raise `UsageError` for an option that means nothing for this fish."""
+    def refuse_other(
+        self, simulation_options: dict[str, Any], live_options: dict[str, Any]
+    ) -> None:
+        """Raise `UsageError` for an option that only applies to the other kind of fish."""
         live = self.on == "live"
-        for name, value in (of_simulation if live else of_live).items():
+        for name, value in (simulation_options if live else live_options).items():
             if value not in (None, (), False):
                 raise click.UsageError(f"{name} is for --on {'simulation' if live else 'live'}")
 
@@ -93,7 +95,7 @@ class Place(NamedTuple):
     path: Path
     resume: bool
     command: tuple[str, ...]
-    """Arguments of the verb, without those of this run alone."""
+    """Arguments of the verb that a resumed experiment takes over."""
 
     @contextmanager
     def open(
@@ -101,36 +103,37 @@ class Place(NamedTuple):
     ) -> "Iterator[Experiment]":
         """Begin or resume the experiment; raises `ConfigError`.
 
-        config: of the fish; settings: what else the rows depend on; unit: of the forces
+        config: configuration of the fish; settings: what else the rows depend on; unit: unit of the
+            forces
         """
         from fishd.lab.experiment import Header, open_experiment
 
-        where = ("--endpoint", fish.endpoint) if fish.endpoint else ()
+        endpoint_words = ("--endpoint", fish.endpoint) if fish.endpoint else ()
         header = Header(
             kind=self.kind,
             on=fish.on,
             config=config,
             settings=settings,
             force_unit=unit,
-            command=[*self.command, "--on", fish.on, *where],
+            command=[*self.command, "--on", fish.on, *endpoint_words],
         )
         with open_experiment(self.path, header, resume=self.resume) as experiment:
             yield experiment
 
 
 def fish_choice(function: F) -> F:
-    """`--on`, `--config`, `--set`, `--endpoint` and `--take`, as `fish`."""
+    """Add `--on`, `--config`, `--set`, `--endpoint` and `--take`, passed as `fish`."""
     return _fish_choice(function, live_config=False)
 
 
 def fish_choice_and_config(function: F) -> F:
-    """The same of a verb that has a use for `--config` with a live fish, too."""
+    """Add the same options to a verb that uses `--config` with a live fish, too."""
     return _fish_choice(function, live_config=True)
 
 
 def _fish_choice(function: F, *, live_config: bool) -> F:
     @wraps(function)
-    def chosen(
+    def wrapper(
         *args: Any,
         on: On | None,
         file: Path | None,
@@ -147,16 +150,16 @@ def _fish_choice(function: F, *, live_config: bool) -> F:
             raise click.UsageError(f"{what} is for --on simulation: fishd keeps its configuration")
         return function(*args, fish=ChosenFish(on, file, overrides, endpoint), **values)
 
-    where = "" if live_config else "In simulation: "
+    scope = "" if live_config else "In simulation: "
     for option in (
         take_option,
         endpoint_option,
         set_option,
-        config_option(f"{where}YAML file of the fish, as for fishd. [default: the defaults]"),
+        config_option(f"{scope}YAML file of the fish, as for fishd. [default: the defaults]"),
         on_option,
     ):
-        chosen = option(chosen)
-    return chosen  # type: ignore[return-value]
+        wrapper = option(wrapper)
+    return wrapper  # type: ignore[return-value]
 
 
 on_option = click.option(
@@ -168,14 +171,14 @@ on_option = click.option(
 
 
 def default_on(file: Path | None, overrides: tuple[str, ...], endpoint: str | None) -> On:
-    """Return which fish is meant where `--on` is not given."""
+    """Return the kind of fish for a command line without `--on`."""
     if file or overrides:
         return "simulation"
     return "live" if endpoint or is_fishd_running() else "simulation"
 
 
 def is_fishd_running() -> bool:
-    """Return whether a client would find a fishd here; one that $FISHD_ENDPOINT names counts."""
+    """Return whether a client would reach a fishd by default; $FISHD_ENDPOINT counts as one."""
     path = socket_path(find_control())
     return bool(os.environ.get(ENDPOINT_VARIABLE)) or bool(
         path and path.exists() and not unix_sockets.is_deserted(path)
@@ -183,20 +186,20 @@ def is_fishd_running() -> bool:
 
 
 def folder_options(function: F) -> F:
-    """`--folder` and `--resume`, as `place`."""
+    """Add `--folder` and `--resume`, passed as `place`."""
 
     @wraps(function)
-    def placed(*args: Any, folder: Path | None, resume: Path | None, **values: Any) -> Any:
+    def wrapper(*args: Any, folder: Path | None, resume: Path | None, **values: Any) -> Any:
         if folder and resume:
             raise click.UsageError("--folder is for a new experiment, --resume for one: give one")
         from fishd.lab.experiment import default_folder
 
         context = click.get_current_context()
         place = Place(
-            kind=verb(context),
-            path=resume or folder or default_folder(verb(context)),
+            kind=verb_words(context),
+            path=resume or folder or default_folder(verb_words(context)),
             resume=resume is not None,
-            command=tuple(context.meta.get(_WORDS, ())),
+            command=tuple(context.meta.get(_COMMAND_KEY, ())),
         )
         return function(*args, place=place, **values)
 
@@ -205,7 +208,7 @@ def folder_options(function: F) -> F:
             "--resume",
             type=click.Path(path_type=Path),
             metavar="FOLDER",
-            help="Go on with the experiment in this folder, with its options; nothing is measured "
+            help="Resume the experiment in this folder, with its options; nothing is measured "
             "again.",
         ),
         click.option(
@@ -215,8 +218,8 @@ def folder_options(function: F) -> F:
             "runs]",
         ),
     ):
-        placed = option(placed)
-    return placed  # type: ignore[return-value]
+        wrapper = option(wrapper)
+    return wrapper  # type: ignore[return-value]
 
 
 keep_option = click.option(
@@ -227,19 +230,19 @@ keep_option = click.option(
 
 
 @contextmanager
-def kept(
+def keep_session(
     folder: Path | None, fish: ChosenFish, session: "Session | None", settings: dict[str, Any]
 ) -> "Iterator[Experiment | None]":
-    """Record a session into a new folder, where there is one, and yield its experiment.
+    """Record a session into a new folder, and yield its experiment; without a folder, yield None.
 
-    session: entered; None for fish that are swum without one
+    session: an entered session; None for fish that swim without one
     settings: what the result depends on, besides the fish
     """
     if folder is None:
         yield None
         return
     context = click.get_current_context()
-    place = Place(verb(context), folder, False, tuple(context.meta.get(_WORDS, ())))
+    place = Place(verb_words(context), folder, False, tuple(context.meta.get(_COMMAND_KEY, ())))
     config = session.config if session else to_builtins(fish.load())
     unit = session.unit if session else "N"
     with place.open(fish, config, settings, unit) as experiment:
@@ -250,7 +253,7 @@ def kept(
             yield experiment
 
 
-def verb(context: click.Context) -> str:
+def verb_words(context: click.Context) -> str:
     """Return the words of a verb without a controller: `sweep`, `learn ppo`."""
     words = context.command_path.split()[1:]
     return " ".join(words[: 2 if words[0] in ("learn",) else 1])
@@ -263,44 +266,44 @@ def _header(folder: Path) -> "Header":
 
 
 def recall(context: click.Context, args: list[str]) -> list[str]:
-    """Return the arguments of a verb, after those that the experiment of `--resume` began with.
+    """Return the arguments of a verb, after those of the experiment that `--resume` names.
 
-    The arguments are remembered for the header of a new experiment.
+    The arguments are kept for the header of a new experiment.
     """
     folder = next((b for a, b in pairwise(args) if a == "--resume"), None)
     folder = folder or next((a[9:] for a in args if a.startswith("--resume=")), None)
     if folder is not None and (not args or args[0].startswith("-")):
         header = _header(Path(folder))
-        if header.kind != verb(context):
+        if header.kind != verb_words(context):
             raise click.UsageError(
                 f"--resume {folder}: it is of another verb: fishctl {header.kind} --resume {folder}"
             )
         args = [*header.command, *args]
-    context.meta[_WORDS] = list(_kept(args))
+    context.meta[_COMMAND_KEY] = list(_without_run_options(args))
     return args
 
 
-def _kept(args: Sequence[str]) -> Iterator[str]:
+def _without_run_options(args: Sequence[str]) -> Iterator[str]:
     """Yield the arguments that a resumed experiment takes over."""
     words = iter(args)
     for word in words:
         name, equals, _ = word.partition("=")
-        if name not in _NOT_KEPT:
+        if name not in _RUN_ONLY_OPTIONS:
             yield word
-        elif _NOT_KEPT[name] and not equals:
+        elif _RUN_ONLY_OPTIONS[name] and not equals:
             next(words, None)
 
 
 class Resumable(click.Command):
-    """A verb whose options are those of the experiment that `--resume` names, where it is given."""
+    """Verb for which `--resume` restores the options of the resumed experiment."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Begin with the options of that experiment."""
+        """Parse the arguments after those of the resumed experiment."""
         return super().parse_args(ctx, recall(ctx, args))
 
 
 class Ending:
-    """How an experiment ended, so far."""
+    """State of the end of an experiment: whether it was interrupted, and how to resume it."""
 
     def __init__(self, experiment: "Experiment") -> None:
         self._command = experiment.resume_command
@@ -310,8 +313,8 @@ class Ending:
     def measuring(self, *errors: type[FishdError]) -> Iterator[None]:
         """Let the first signal end this, with the fish at rest, and keep what was measured.
 
-        One of these errors, by default that the fish is lost, is raised with the command that
-        resumes the experiment.
+        An error of these types, by default those for a lost fish, is raised with the command
+        that resumes the experiment.
         """
         from fishd.lab.session import Disturbed
 
@@ -329,7 +332,7 @@ class Ending:
     def interrupted(self, done: str) -> int:
         """Print how an interrupted experiment is resumed; return the exit status.
 
-        done: how far it came
+        done: what was finished, in words
         """
         echo(f"fishctl: interrupted, {done}; resume with: {self._command}", err=True)
         return INTERRUPTED

@@ -1,7 +1,7 @@
 """`fishd-release`: what `fishctl release` does, in a fraction of its time.
 
-For that, fishd must have left a recipe. systemd runs it whenever the service has ended, and on a
-small Pi each import counts.
+It needs the recipe that fishd wrote. systemd runs it whenever the service has ended, and on a
+small Pi each import takes time.
 """
 
 import os
@@ -15,21 +15,25 @@ from fishd.hardware import release_recipe
 
 
 def main() -> None:
-    """Release the servo as the recipe says; without one, or with other options, as fishctl does.
+    """Release the servo by the recipe; without one, or with other options, as fishctl does.
 
-    Neither a lost session nor Ctrl-C ends it halfway, with pulses that go on.
+    Neither a lost session nor Ctrl-C ends it halfway while pulses go on.
     """
-    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(each, signal.SIG_IGN)
-    words = sys.argv[1:]
-    found = release_recipe.read(words[1]) if len(words) == 2 and words[0] == "--config" else None
-    status = _release(found) if found else 0
-    if found and found["fresh"]:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    arguments = sys.argv[1:]
+    recipe = (
+        release_recipe.read(arguments[1])
+        if len(arguments) == 2 and arguments[0] == "--config"
+        else None
+    )
+    status = _release(recipe) if recipe else 0
+    if recipe and recipe["fresh"]:
         sys.exit(status)
-    # The file has changed since that fishd began, and may mean another servo: that one as well.
+    # The file has changed since that fishd started, and may name another servo: release both.
     from fishd.cli.main import main as fishctl
 
-    sys.argv[:] = ["fishctl", "release", *words]
+    sys.argv[:] = ["fishctl", "release", *arguments]
     try:
         fishctl()
     except SystemExit as end:
@@ -38,9 +42,9 @@ def main() -> None:
 
 
 def _release(recipe: dict[str, Any]) -> int:
-    """The exit status; says what was done, in the words of `fishctl release`."""
-    ended = os.environ.get("SERVICE_RESULT")
-    why = f"the service ended with '{ended}': " if ended else ""
+    """Release the servo, print what was done as `fishctl release` does; return the exit status."""
+    service_result = os.environ.get("SERVICE_RESULT")
+    prefix = f"the service ended with '{service_result}': " if service_result else ""
     try:
         done = release_recipe.carry_out(recipe["function"], recipe["neutral"], recipe["arguments"])
     except (ServoError, StartupError, ImportError) as error:
@@ -48,7 +52,7 @@ def _release(recipe: dict[str, Any]) -> int:
             print(f"fishctl: {error}; {release_recipe.NOT_RELEASED}", file=sys.stderr)
         return 1
     with suppress(OSError):
-        print(why + release_recipe.outcome(done))
+        print(prefix + release_recipe.outcome(done))
     return 0
 
 

@@ -6,8 +6,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from fishd.cli.free_swim_options import SwimmerOptions
-from fishd.cli.output import echo, echo_rows, print_json, spelled
-from fishd.cli.progress import showing
+from fishd.cli.output import echo, echo_rows, format_controller, print_json
+from fishd.cli.progress import show_progress
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, MissingPackage
@@ -45,7 +45,7 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
     with (
         on_signal(interrupted.set),
         _filmed(asked[0], options) as film,
-        showing(asked[3], "s", err=as_json) as bar,
+        show_progress(asked[3], "s", err=as_json) as bar,
     ):
 
         def watch(fish: "Swimmer") -> None:
@@ -126,7 +126,7 @@ def _rows(report: "SwimReport") -> list[tuple[str, str]]:
     beats = f"over {report.beats} whole beat{plural}" if report.beats else "no whole beat"
     anew = f", anew from {report.resumed:.2f} s on" if report.resumed is not None else ""
     return [
-        ("controller", f"{spelled(report.controller, report.parameters)}{anew}"),
+        ("controller", f"{format_controller(report.controller, report.parameters)}{anew}"),
         ("speed", f"{text.format_measured(report.speed, report.speed_error, 'm/s')}, {beats}"),
         *_trend(report),
         ("frequency", f"{report.frequency:.3f} Hz" if report.frequency else "–"),

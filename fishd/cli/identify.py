@@ -8,10 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.experiment_options import ChosenFish, fish_choice_and_config, keep_option, kept
+from fishd.cli.experiment_options import (
+    ChosenFish,
+    fish_choice_and_config,
+    keep_option,
+    keep_session,
+)
 from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.progress import showing
+from fishd.cli.progress import show_progress
 from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.console import INTERRUPTED
@@ -145,8 +150,8 @@ def _swum(
         session.check_calibrated()
         with (
             session,
-            kept(folder, fish, session, {"for": seconds}),
-            showing(seconds, "s", err=as_json) as bar,
+            keep_session(folder, fish, session, {"for": seconds}),
+            show_progress(seconds, "s", err=as_json) as bar,
         ):
             fish.announce(as_json)
             session.progress = bar.at

@@ -1,4 +1,4 @@
-"""The `fishctl` command: its verbs, loaded when they are called, and how errors look."""
+"""The `fishctl` command: its verbs, loaded when they are called, and its error messages."""
 
 import gc
 import sys
@@ -27,7 +27,7 @@ VERBS = {
             "release", "release", "Last resort without the daemon: neutral, then no pulses."
         ),
         "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
-        "agent": Verb("agent", "agent", "Let a policy swim a fish from outside, as with pictures."),
+        "agent": Verb("agent", "agent", "Let a policy outside fishd swim the fish."),
         "policies": Verb("policies", "policies", "List the named policies, or show one."),
     },
     "Experiment": {
@@ -51,7 +51,7 @@ VERBS = {
         "camera": Verb("camera", "camera", "Look through the camera, set it up, record it."),
     },
     "Calibrate": {
-        "tare": Verb("calibrate", "tare", "Call the present force zero."),
+        "tare": Verb("calibrate", "tare", "Set the force zero to the present force."),
         "calibrate": Verb("calibrate", "calibrate", "Calibrate the force sensor or the servo."),
     },
     "Simulate and learn": {
@@ -69,26 +69,26 @@ VERBS = {
 }
 
 
-DAILY = (
+DAILY_VERBS = (
     *("status", "watch", "set-controller", "stop", "measure"),
     *("compare", "record", "runs", "plot", "simulate"),
 )
-"""Verbs for every day."""
-OTHER_WORDS = {
+"""Verbs that help marks as those for every day."""
+WORD_HINTS = {
     "help": "'fishctl --help' lists the verbs, 'fishctl VERB --help' explains one",
     "list": "did you mean 'controllers', 'policies' or 'runs'?",
     "run": "did you mean 'set-controller', 'simulate' or 'runs'?",
     "start": "did you mean 'set-controller'? 'fishd' starts the daemon",
     "swim": "did you mean 'set-controller', or 'simulate' for a fish in virtual time?",
 }
-"""What is meant by words that other programs have for a verb."""
+"""Hints for words that other programs use as verbs."""
 
 
 @click.group(
     cls=Verbs,
     verbs=VERBS,
-    daily=DAILY,
-    other_words=OTHER_WORDS,
+    daily=DAILY_VERBS,
+    word_hints=WORD_HINTS,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.option("--endpoint", metavar="ADDRESS", help="Control socket of the daemon to talk to.")
@@ -104,7 +104,7 @@ def main() -> None:
 
     Exit status: 0, 1 when the daemon refused or does not answer, 2 for a wrong command line.
     """
-    # Where there are no semaphores; a verb that needs them says so itself.
+    # joblib warns on systems without semaphores; a verb that needs them reports it itself.
     warnings.filterwarnings("ignore", message=".*joblib will operate in serial mode")
     try:
         sys.exit(run(fishctl, "fishctl"))
@@ -115,4 +115,4 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     finally:
-        gc.freeze()  # at its end Python would look through all that is loaded for garbage
+        gc.freeze()  # spares the collection at exit

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.experiment_options import ChosenFish, fish_choice, keep_option, kept
+from fishd.cli.experiment_options import ChosenFish, fish_choice, keep_option, keep_session
 from fishd.cli.options import ControllerGroup, FiniteRange, for_option, json_option, plot_option
-from fishd.cli.output import echo, print_json, spelled
-from fishd.cli.progress import showing
+from fishd.cli.output import echo, format_controller, print_json
+from fishd.cli.progress import show_progress
 from fishd.core.console import INTERRUPTED, power_words
 from fishd.core.process.interruption import interrupted_once
 
@@ -71,8 +71,8 @@ def _measure(
             interrupted_once(),
             fish.session() as session,
             session,
-            kept(folder, fish, session, settings) as experiment,
-            showing(seconds, "s") as bar,
+            keep_session(folder, fish, session, settings) as experiment,
+            show_progress(seconds, "s") as bar,
         ):
             fish.announce(as_json)
             session.progress = bar.at
@@ -102,7 +102,7 @@ def _line(found: "Measured") -> str:
     from fishd.lab import error_budget
     from fishd.lab.disturbances import spell
 
-    what = spelled(found.controller, dict(found.parameters))
+    what = format_controller(found.controller, dict(found.parameters))
     thrust = error_budget.spelled(
         found.thrust, found.error, found.calibration_ci95, found.total_ci95, found.unit
     )

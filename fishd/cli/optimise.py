@@ -21,8 +21,8 @@ from fishd.cli.options import (
     plot_option,
     seed_option,
 )
-from fishd.cli.output import counted, echo, print_json, warn_of_fin
-from fishd.cli.progress import showing
+from fishd.cli.output import echo, format_count, print_json, warn_of_fin
+from fishd.cli.progress import show_progress
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core import text
@@ -212,7 +212,7 @@ class _Optimisation:
             if not self.as_json:
                 echo(f"picture: {', '.join(map(str, paths))}")
         if ending.is_interrupted:
-            return ending.interrupted(f"{counted(len(self.trials), 'candidate')} are kept")
+            return ending.interrupted(f"{format_count(len(self.trials), 'candidate')} are kept")
         if not self._is_done(proposal):
             echo(
                 f"fishctl: the budget of {self.budget:g} s is used: another candidate is expected "
@@ -237,7 +237,7 @@ class _Optimisation:
         last = self.trials[-1] if self.trials else None
         before = session.used = last.passed if last else 0.0
         if last:
-            there = counted(len(self.trials), "candidate")
+            there = format_count(len(self.trials), "candidate")
             echo(f"{experiment.path}: {there} there already", err=self.as_json)
             if self._is_done(search.propose()):
                 return 0.0
@@ -247,7 +247,7 @@ class _Optimisation:
             ending.measuring(),
             session,
             session.recorded(experiment.recording("search"), "a search"),
-            showing(self.budget, "s", err=self.as_json) as show,
+            show_progress(self.budget, "s", err=self.as_json) as show,
         ):
             session.progress = show.at
             for trial in measure_trials(
@@ -501,6 +501,6 @@ def _print(found: Optimum, unit: str, units: dict[str, str]) -> None:
         )
     thinking = "" if found.thinking is None else f"; {found.thinking:.0f} s of thinking besides"
     echo(
-        f"{counted(found.trials, 'candidate')}, {found.ticks_swum} ticks of swimming, "
+        f"{format_count(found.trials, 'candidate')}, {found.ticks_swum} ticks of swimming, "
         f"{found.seconds:.0f} s with the rests{thinking}"
     )

@@ -11,7 +11,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from fishd.cli.completion import complete_value, endpoint_of
-from fishd.cli.output import made_printable
+from fishd.cli.output import make_printable
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.core import text
 from fishd.core.errors import FishError, ParameterError, UnknownController
@@ -26,14 +26,14 @@ F = TypeVar("F", bound=Callable[..., Any])
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 
 
-def _remember(ctx: click.Context, _: click.Parameter, value: str | None) -> str | None:
+def _choose_endpoint(ctx: click.Context, _: click.Parameter, value: str | None) -> str | None:
     return value or ctx.find_root().obj
 
 
 endpoint_option = click.option(
     "--endpoint",
     metavar="ADDRESS",
-    callback=_remember,
+    callback=_choose_endpoint,
     help="Control socket of the daemon; default: $FISHD_ENDPOINT, else the one on this machine.",
 )
 
@@ -72,7 +72,7 @@ def verb_lease() -> VerbLease:
 def for_option(
     about: str, *, default: float | None = None, kind: click.ParamType[Any] | None = None
 ) -> Callable[[F], F]:
-    """`--for`, a length in time; `--seconds` is another name for it."""
+    """Return the option `--for`, a duration; `--seconds` is another name for it."""
     return click.option(
         "--for",
         "--seconds",
@@ -86,7 +86,7 @@ def for_option(
 
 
 def plot_option(about: str) -> Callable[[F], F]:
-    """`--plot`, a picture; about: what is in it."""
+    """Return the option `--plot`, the file of a picture; about: what the picture shows."""
     return click.option(
         "--plot",
         "picture",
@@ -97,7 +97,7 @@ def plot_option(about: str) -> Callable[[F], F]:
 
 
 def seed_option(what: str, default: int | None = 0) -> Callable[[F], F]:
-    """`--seed`; what: what the random numbers are for."""
+    """Return the option `--seed`; what: what the random numbers are for."""
     return click.option(
         "--seed",
         type=click.IntRange(0, 2**32 - 1),
@@ -108,30 +108,30 @@ def seed_option(what: str, default: int | None = 0) -> Callable[[F], F]:
 
 
 def daemon_options(function: F) -> F:
-    """`--endpoint` and `--json`."""
+    """Add `--endpoint` and `--json`."""
     return endpoint_option(json_option(function))
 
 
 class FiniteRange(click.FloatRange):
-    """A number within bounds, and neither `nan` nor `inf`, which click's own range lets through."""
+    """Finite number within bounds; click's own range also accepts `nan` and `inf`."""
 
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
-        """Text to number."""
+        """Convert a text to a number."""
         number: float = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"'{value}' is not valid: a finite number is needed", param, ctx)
         return number
 
 
-class Words(click.ParamType[str]):
-    """Text for people, whatever encoding Python takes the command line for: it is UTF-8."""
+class Utf8Text(click.ParamType[str]):
+    """Text in UTF-8, whatever encoding Python assumes for the command line."""
 
     name = "text"
 
     def convert(self, value: str, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        """Bytes of the command line to text."""
+        """Convert the bytes of the command line to text."""
         try:
             return value if value.isprintable() else os.fsencode(value).decode()
         except UnicodeError:
@@ -139,14 +139,14 @@ class Words(click.ParamType[str]):
 
 
 class ParameterType(click.ParamType[Any]):
-    """A value for one parameter of a controller; whether it is in range the daemon decides."""
+    """Value of one parameter of a controller; the daemon checks whether it is in range."""
 
     def __init__(self, field: Field) -> None:
         self.field = field
         self.name = field.kind
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Text from the command line to number, boolean or text."""
+        """Convert a text of the command line to a number, boolean or text."""
         field = self.field
         if value is None or not isinstance(value, str):
             return value
@@ -166,7 +166,7 @@ class ParameterType(click.ParamType[Any]):
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        """What there is to choose from."""
+        """Return the values that complete a text."""
         return complete_value(self.field, incomplete)
 
 
@@ -190,17 +190,17 @@ _PREFIX = "parameter_"
 
 
 class ValuesType(ParameterType):
-    """Several values for one parameter: a list, or a range of numbers."""
+    """List of values of one parameter: spelled as a list, or as a range of numbers."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """`0.4:4:0.2` or `0.3,0.6` from the command line to a list of values."""
+        """Convert `0.4:4:0.2` or `0.3,0.6` to a list of values."""
         if not isinstance(value, str):
             return value
         from fishd.lab.sweep.grid import expand_values
 
         try:
             return [
-                super(ValuesType, self).convert(each, param, ctx) for each in expand_values(value)
+                super(ValuesType, self).convert(item, param, ctx) for item in expand_values(value)
             ]
         except ParameterError as error:
             self.fail(str(error), param, ctx)
@@ -209,13 +209,13 @@ class ValuesType(ParameterType):
 def parameter_options(
     fields: Iterable[Field], kind: type[ParameterType] = ParameterType
 ) -> list[click.Parameter]:
-    """One option for each parameter of a controller, its case kept (`--C`)."""
-    several = "|LOW:HIGH:STEP|VALUE,..." if kind is ValuesType else ""
+    """Return an option for each parameter of a controller, with its upper case (`--C`)."""
+    list_metavar = "|LOW:HIGH:STEP|VALUE,..." if kind is ValuesType else ""
     return [
         click.Option(
             [_PREFIX + field.name, "--" + field.name.replace("_", "-")],
             type=kind(field),
-            metavar=("NAME|FILE" if field.file else field.kind.upper()) + several,
+            metavar=("NAME|FILE" if field.file else field.kind.upper()) + list_metavar,
             help=describe(field),
             default=None,
         )
@@ -225,16 +225,16 @@ def parameter_options(
 
 def given_parameters(context: click.Context, values: dict[str, Any]) -> dict[str, Any]:
     """Take the parameters out of a command's values; keep those from the command line."""
-    taken = {name: values.pop(name) for name in list(values) if name.startswith(_PREFIX)}
+    all_parameters = {name: values.pop(name) for name in list(values) if name.startswith(_PREFIX)}
     return {
         name.removeprefix(_PREFIX): value
-        for name, value in taken.items()
+        for name, value in all_parameters.items()
         if context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE
     }
 
 
 def describe(field: Field) -> str:
-    """Description, permitted values, unit and default of a parameter in one line."""
+    """Return description, permitted values, unit and default of a parameter in one line."""
     permitted = wanted(field)
     default = "required" if field.required else f"default {spelled(field.default)}"
     return f"{field.description} {permitted[0].upper()}{permitted[1:]}; {default}."
@@ -243,13 +243,13 @@ def describe(field: Field) -> str:
 def _fish_of(values: dict[str, Any]) -> "Config | None":
     """Return the configuration of the fish that the options of a verb are about.
 
-    None where its forces are not in newtons. Raises `FishdError`.
+    None if its forces are not in newtons. Raises `FishdError`.
     """
     from fishd.config import load
 
     chosen = values.get("fish")
     if chosen.on == "live" if chosen else "endpoint" in values:
-        from fishd.client import Fish  # with zmq, which simulations do without
+        from fishd.client import Fish  # imports zmq, which simulations do not need
 
         with Fish(chosen.endpoint if chosen else values["endpoint"]) as fish:
             return running_config(fish)
@@ -257,26 +257,26 @@ def _fish_of(values: dict[str, Any]) -> "Config | None":
 
 
 class _ControllerCommand(click.Command):
-    """Takes a parameter as `NAME=VALUE`, too."""
+    """Command that also takes parameters as `NAME=VALUE`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """A word that begins as a name and `=` is an option whose dashes were left out."""
+        """Parse arguments, where `NAME=VALUE` is an option whose dashes were left out."""
         options = (param for param in self.params if isinstance(param, click.Option))
         take_value = {name for option in options if not option.is_flag for name in option.opts}
         words = []
-        for before, word in zip(["", *args], args, strict=False):
+        for previous, word in zip(["", *args], args, strict=False):
             name, equals, value = word.partition("=")
-            if equals and name.isidentifier() and before not in take_value:
+            if equals and name.isidentifier() and previous not in take_value:
                 word = f"--{name.replace('_', '-')}={value}"
             words.append(word)
         return super().parse_args(ctx, words)
 
 
 class ControllerGroup(click.Group):
-    """A verb whose sub-commands are the controllers, each with its parameters as options.
+    """Verb whose sub-commands are the controllers, each with its parameters as options.
 
-    Controllers that are installed here are known without a daemon. For any other name a verb that
-    is `remote` asks the daemon, which may run on a machine where more is installed.
+    Controllers that are installed here are known without a daemon. For any other name, a `remote`
+    verb asks the daemon, which may run on a machine where more controllers are installed.
     """
 
     def __init__(
@@ -305,13 +305,13 @@ class ControllerGroup(click.Group):
     def action(self, function: F) -> F:
         """Decorator: call `function(name, parameters, **options)` for each sub-command.
 
-        With several, it gets their `ControllerInfo`s for the name, and lists of values.
+        With several, `name` is a list of `ControllerInfo`s, and each parameter a list of values.
         """
         self._action = function
         return function
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read `square:frequency=1.7,amplitude=0.3`, and what `--resume` begins with."""
+        """Parse `square:frequency=1.7,amplitude=0.3`, and the arguments of a resumed experiment."""
         if self._resumable:
             from fishd.cli.experiment_options import recall
 
@@ -328,13 +328,13 @@ class ControllerGroup(click.Group):
         return super().parse_args(ctx, args)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """The controllers installed here."""
+        """Return the names of the controllers that are installed here."""
         from fishd.controllers import registry
 
         return [info.name for info in registry.describe_all()]
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete the name of a controller, and import only those that it may be."""
+        """Complete the name of a controller, and import only controllers whose name matches."""
         from fishd.controllers import registry
 
         known = registry.describe_all(incomplete)
@@ -342,7 +342,7 @@ class ControllerGroup(click.Group):
         return names + click.Command.shell_complete(self, ctx, incomplete)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The sub-command of one controller, or of several."""
+        """Return the sub-command of one controller, or of several."""
         names = list(filter(None, cmd_name.split(","))) if self._several else [cmd_name]
         infos = [self._info(ctx, name) for name in names]
         fields = {field.name: field for info in infos for field in info.parameters}
@@ -365,10 +365,10 @@ class ControllerGroup(click.Group):
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """List the options of the verb itself, which go after the controller, and the controllers.
 
-        'fishctl VERB CONTROLLER --help' has them with the parameters of that controller.
+        'fishctl VERB CONTROLLER --help' lists them with the parameters of that controller.
         """
-        own = self._options(cast(Any, lambda: None))
-        params = reversed(getattr(own, "__click_params__", []))
+        decorated = self._options(cast(Any, lambda: None))
+        params = reversed(getattr(decorated, "__click_params__", []))
         records = [record for param in params if (record := param.get_help_record(ctx))]
         with formatter.section("Options"):
             formatter.write_dl([*records, ("-h, --help", "Show this message and exit.")])
@@ -391,7 +391,7 @@ class ControllerGroup(click.Group):
 
         try:
             with Fish(endpoint_of(ctx)) as fish:
-                known = {info.name: info for info in map(made_printable, fish.controllers())}
+                known = {info.name: info for info in map(make_printable, fish.controllers())}
         except FishError:
             raise unknown from None
         if name not in known:

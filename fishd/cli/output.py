@@ -1,4 +1,4 @@
-"""How verbs print values: nothing that a daemon or a file says reaches the terminal as it is."""
+"""Printing of values: control characters of a daemon or a file never reach the terminal."""
 
 import re
 import time
@@ -20,20 +20,20 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_MOST = 1_000_000
-"""Longer output than any verb's [characters]."""
+_MAX_OUTPUT_CHARACTERS = 1_000_000
+"""Largest output that is not cut, more than any verb prints [characters]."""
 
 
 def echo(message: Any = "", *, err: bool = False, nl: bool = True) -> None:
-    """Print lines without any control character in them, on standard error where wanted."""
-    click.echo(text.block(str(message), _MOST), err=err, nl=nl)
+    """Print lines, with control characters removed; err: on standard error."""
+    click.echo(text.block(str(message), _MAX_OUTPUT_CHARACTERS), err=err, nl=nl)
 
 
 @contextmanager
 def output_may_fail(done: str) -> Iterator[None]:
-    """Let what is printed be lost where it cannot be written, and say so, with what was done.
+    """Discard output that cannot be written, and report that with what was done.
 
-    For verbs whose exit status tells of the servo.
+    For verbs whose exit status is that of the servo. done: what was done, in words
     """
     try:
         yield
@@ -44,7 +44,7 @@ def output_may_fail(done: str) -> Iterator[None]:
 
 
 def echo_rows(rows: Sequence[tuple[str, str]]) -> None:
-    """Print what each thing is called, and what it is, in two columns."""
+    """Print names and values in two columns."""
     width = max(12, *(len(name) + 1 for name, _ in rows))
     echo("\n".join(f"{name:<{width}}{what}" for name, what in rows))
 
@@ -68,50 +68,50 @@ def print_json_line(value: Any) -> None:
     click.echo(_escaped(msgspec.json.encode(value)))
 
 
-def made_printable(value: T) -> T:
-    """A struct, or a list of them, with all its texts in one printable line each."""
+def make_printable(value: T) -> T:
+    """Return a struct, or a list of them, with each of its texts as one printable line."""
     return msgspec.convert(_printable(msgspec.to_builtins(value)), type(value))
 
 
-def spelled(controller: str, parameters: dict[str, Any]) -> str:
+def format_controller(controller: str, parameters: dict[str, Any]) -> str:
     """Return a controller with its parameters, as `square frequency=1.7 Hz amplitude=default`."""
     if not parameters:
         return text.line(controller)
-    from fishd.controllers import registry  # as long as all else that most verbs load
+    from fishd.controllers import registry  # its import is slow
 
     return text.line(f"{controller} {format_values(parameters, registry.units(controller))}")
 
 
-def state_line(state: "State") -> str:
+def format_state(state: "State") -> str:
     """Return mode, reason and controller."""
-    state = made_printable(state)
+    state = make_printable(state)
     why = f" ({format_reason(state.reason)})" if state.reason else ""
-    return f"{state.mode}{why}: {spelled(state.controller, state.parameters)}"
+    return f"{state.mode}{why}: {format_controller(state.controller, state.parameters)}"
 
 
 def format_reason(reason: Reason) -> str:
-    """Return the reason of a mode, with its code where that says more."""
+    """Return the message of the reason of a mode, after its code unless that is `estop`."""
     return reason.message if reason.code == "estop" else f"{reason.code}: {reason.message}"
 
 
-def measured(quantities: dict[str, float], units: dict[str, str]) -> list[tuple[str, str]]:
-    """Names of quantities, and their values with units: `("top_speed", "2.31")`."""
-    spelled = []
+def format_quantities(quantities: dict[str, float], units: dict[str, str]) -> list[tuple[str, str]]:
+    """Return names of quantities, and their values with units: `("top_speed", "2.31")`."""
+    rows = []
     for name, value in quantities.items():
         unit = text.quoted(units.get(name, "1"))
-        spelled.append((text.quoted(name), f"{value:.3g}" + (f" {unit}" if unit != "1" else "")))
-    return spelled
+        rows.append((text.quoted(name), f"{value:.3g}" + (f" {unit}" if unit != "1" else "")))
+    return rows
 
 
-def counted(number: int, noun: str) -> str:
-    """A number of things: `1 warning`, `2 warnings`."""
+def format_count(number: int, noun: str) -> str:
+    """Return a number with its noun: `1 warning`, `2 warnings`."""
     return f"{number} {noun}" + ("" if number == 1 else "s")
 
 
 def warn_of_fin(amplitude: float, where: str = "") -> None:
-    """Say so where a simulated fin swings further than its equations hold.
+    """Warn if a simulated fin swings further than its equations hold.
 
-    amplitude: largest fin angle [rad]; where: that it does
+    amplitude: largest fin angle [rad]; where: place of that amplitude, in words
     """
     from fishd.virtual.plant.parameters import LARGEST_FIN
 
@@ -123,8 +123,8 @@ def warn_of_fin(amplitude: float, where: str = "") -> None:
         )
 
 
-def time_of_day(t: float) -> str:
-    """Of unix time [s], here: `13:05:59`."""
+def format_time_of_day(t: float) -> str:
+    """Return the local time of day of a unix time [s]: `13:05:59`."""
     return time.strftime("%H:%M:%S", time.localtime(t))
 
 
@@ -139,21 +139,21 @@ def _printable(value: Any) -> Any:
 
 
 def _escaped(document: bytes) -> str:
-    """JSON in which what is not printable is escaped; that can only be within its texts."""
+    """Return JSON with unprintable characters escaped; these can only be within its texts."""
 
-    def escape(found: re.Match[str]) -> str:
-        if found[0].isprintable():
-            return found[0]
-        units = found[0].encode("utf-16-be").hex()
+    def escape(match: re.Match[str]) -> str:
+        if match[0].isprintable():
+            return match[0]
+        units = match[0].encode("utf-16-be").hex()
         return "".join(f"\\u{units[i : i + 4]}" for i in range(0, len(units), 4))
 
     return re.sub(r"[^\x20-\x7e\n]", escape, document.decode())
 
 
-def criterion_words(quantities: Mapping[str, float], when: str) -> str:
+def format_criterion(quantities: Mapping[str, float], when: str) -> str:
     """Return the C that `swing --C auto` uses, from its quantities.
 
-    when: such as "at the end"
+    when: time of the quantities, such as "at the end"
     """
     lead = quantities.get("lead")
     ahead = f", of the speed that is predicted {lead:g} s ahead" if lead else ""

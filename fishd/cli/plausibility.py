@@ -1,4 +1,4 @@
-"""Says which values of a controller's parameters are valid, but more than the fish can do."""
+"""Warnings about values of parameters that are valid, but more than the fish can do."""
 
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
@@ -20,12 +20,12 @@ def warn_of_values(
     """Print a line for each value far beyond what makes sense, on standard error.
 
     parameters: a value for each name, or a list of values
-    config: that of the fish, None where its forces are in another unit; only read where a
-        parameter is a force, which the fish has to give
+    config: reads the configuration of the fish, or returns None if its forces are in another unit;
+        only called if a parameter is a force, which the fish has to produce
     """
     fields = list(fields)
     largest = {name: _largest(value) for name, value in parameters.items()}
-    forces = [each for each in fields if each.unit == "N" and is_valid_number(largest, each)]
+    forces = [force for force in fields if force.unit == "N" and is_valid_number(largest, force)]
     beyond = _beyond_best(forces, largest, config) if forces else {}
     lines = list(beyond.values())
     lines += find_doubts(largest, (field for field in fields if field.name not in beyond))
@@ -34,7 +34,7 @@ def warn_of_values(
 
 
 def running_config(fish: "Fish") -> "Config | None":
-    """Return the configuration of a running fishd; None where its forces are not in newtons."""
+    """Return the configuration of a running fishd; None if its forces are not in newtons."""
     from fishd.config import adopt
 
     return adopt(fish.config()) if fish.status().force_unit == "N" else None
@@ -43,7 +43,7 @@ def running_config(fish: "Fish") -> "Config | None":
 def _largest(value: Any) -> Any:
     if not isinstance(value, list):
         return value
-    return max((each for each in value if isinstance(each, int | float)), default=None)
+    return max((item for item in value if isinstance(item, int | float)), default=None)
 
 
 def _beyond_best(
@@ -54,7 +54,7 @@ def _beyond_best(
 
     try:
         config = read_config()
-    except FishdError:  # which the verb itself reports
+    except FishdError:  # the verb itself reports it
         return {}
     if config is None or config.robot == "swimmer":
         return {}

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from fishd.cli.control import asked
+from fishd.cli.control import list_from_daemon
 from fishd.cli.options import daemon_options
 from fishd.cli.output import echo, print_json
 from fishd.client import Fish
@@ -15,12 +15,12 @@ from fishd.core.errors import PolicyError
 from fishd.core.protocol import PolicyInfo
 from fishd.core.schema import names_file
 
-HEAD = (
+HEADER = (
     *("name", "sees", "Φ [rad]", "tick", "trained in", "steps", "relative thrust", "created"),
     "folder",
 )
-WIDEST = 40
-"""Longer cells are cut, but for the last."""
+MAX_CELL_CHARACTERS = 40
+"""Longest cell that is not cut, except in the last column [characters]."""
 
 
 @click.group(invoke_without_command=True)
@@ -29,15 +29,15 @@ WIDEST = 40
 def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
     """List the policies that have a name.
 
-    One that sees forces swims with 'fishctl set-controller ppo --policy NAME', one that sees
-    pictures with 'fishctl agent NAME'.
+    A policy that sees forces swims with 'fishctl set-controller ppo --policy NAME', one that
+    sees pictures with 'fishctl agent NAME'.
     Relative thrust is the share of the best square wave's thrust, as last evaluated in the
     training.
     """
     if ctx.invoked_subcommand:
         ctx.find_root().obj = endpoint
         return
-    known = _known(endpoint)
+    known = _list_policies(endpoint)
     if as_json:
         print_json(known)
     elif known:
@@ -56,28 +56,28 @@ def show(ctx: click.Context, policy: str, endpoint: str | None, as_json: bool) -
     Its inputs, what it fits, and how it was trained.
     """
     if names_file(policy, library.SUFFIX):
-        found = library.describe(policy)
+        policy_info = library.describe(policy)
     else:
-        known = {info.name: info for info in _known(endpoint)}
+        known = {info.name: info for info in _list_policies(endpoint)}
         if policy not in known:
             raise PolicyError(library.unknown(policy, sorted(known)))
-        found = known[policy]
-    if found.card is None:
-        raise PolicyError(f"{found.file}: {found.problem}")
+        policy_info = known[policy]
+    if policy_info.card is None:
+        raise PolicyError(f"{policy_info.file}: {policy_info.problem}")
     if as_json or (ctx.parent and ctx.parent.params["as_json"]):
-        print_json(found)
+        print_json(policy_info)
     else:
-        echo(_as_text(found), nl=False)
+        echo(_as_text(policy_info), nl=False)
 
 
-def _known(endpoint: str | None) -> list[PolicyInfo]:
-    """Those that the daemon finds; without one, those of this user and machine."""
-    return asked(endpoint, Fish.policies, library.describe_all, "policies")
+def _list_policies(endpoint: str | None) -> list[PolicyInfo]:
+    """Return the policies that the daemon finds, or those of this user and machine without one."""
+    return list_from_daemon(endpoint, Fish.policies, library.describe_all, "policies")
 
 
 def _table(known: list[PolicyInfo]) -> str:
-    rows = [HEAD, *(_row(info) for info in known)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(HEAD) - 1)]
+    rows = [HEADER, *(_row(info) for info in known)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(HEADER) - 1)]
     lines = []
     for row, info in zip(rows, (None, *known), strict=True):
         cells = (f"{cell:<{width}}" for cell, width in zip(row, (*widths, 0), strict=True))
@@ -90,22 +90,22 @@ def _table(known: list[PolicyInfo]) -> str:
 def _row(info: PolicyInfo) -> tuple[str, ...]:
     folder = text.line(str(Path(info.file).parent))
     if info.card is None:
-        return (text.line(info.name, WIDEST), *["–"] * (len(HEAD) - 2), folder)
+        return (text.line(info.name, MAX_CELL_CHARACTERS), *["–"] * (len(HEADER) - 2), folder)
     card: dict[str, Any] = info.card
-    past = card["provenance"]
-    relative_thrust = past.get("relative_thrust")
+    provenance = card["provenance"]
+    relative_thrust = provenance.get("relative_thrust")
     cells = (
         info.name,
         info.sees or "–",
         f"{card['amplitude']:g}",
         f"{card['tick'] * 1e3:g} ms",
-        past["on"],
-        str(past["steps"]),
+        provenance["on"],
+        str(provenance["steps"]),
         "–" if relative_thrust is None else f"{relative_thrust:.1%}",
-        past["created"][:10],
+        provenance["created"][:10],
         folder,
     )
-    return (*(text.line(cell, WIDEST) for cell in cells[:-1]), folder)
+    return (*(text.line(cell, MAX_CELL_CHARACTERS) for cell in cells[:-1]), folder)
 
 
 def _as_text(info: PolicyInfo) -> str:
@@ -113,7 +113,7 @@ def _as_text(info: PolicyInfo) -> str:
 
     head = {"name": info.name, "file": info.file}
     problem = {"problem": info.problem} if info.problem else {}
-    # YAML escapes what a stranger's file could tell a terminal.
+    # YAML escapes control characters of a file that may come from anywhere.
     return yaml.safe_dump(
         {**head, **problem, **(info.card or {})},
         sort_keys=False,

@@ -1,6 +1,6 @@
-"""What a person sees of an experiment: lines of what is done, and a bar with the time left.
+"""Progress of an experiment: a line for each result, and a bar with the time left.
 
-The bar goes to standard error, so that the output is clean for a program.
+The bar goes to standard error, so that programs can read the output.
 """
 
 import sys
@@ -16,26 +16,26 @@ if TYPE_CHECKING:
 
 
 class Lines:
-    """A line for each thing that is done."""
+    """Printer of a line for each step that is done."""
 
     def __init__(self, err: bool) -> None:
-        """err: on standard error"""
+        """err: whether the lines go to standard error"""
         self._err = err
 
     def done(self, line: str, amount: float) -> None:
-        """Say what was done; amount: how much of the total is done by now."""
+        """Print what was done; amount: amount of the total that is done."""
         echo(line, err=self._err)
 
-    def at(self, amount: float, found: str = "") -> None:
-        """Say how much of the total is done by now, and what was found so far."""
+    def at(self, amount: float, latest_result: str = "") -> None:
+        """Show the amount of the total that is done, and the latest result."""
 
     def warn(self, line: str) -> None:
-        """Say a line on standard error."""
+        """Print a line on standard error."""
         echo(line, err=True)
 
 
 class Bar(Lines):
-    """The same, above a bar where they are on a terminal, too."""
+    """Printer of the same lines, above a bar if they are on a terminal, too."""
 
     def __init__(self, progress: "Progress", task: "TaskID", err: bool) -> None:
         super().__init__(err)
@@ -51,22 +51,23 @@ class Bar(Lines):
             super().done(line, amount)
         self.at(amount)
 
-    def at(self, amount: float, found: str = "") -> None:
-        """Move the bar; what was found so far stands behind it."""
-        self._progress.update(self._task, completed=amount, description=text.line(found))
+    def at(self, amount: float, latest_result: str = "") -> None:
+        """Move the bar; the latest result stands to its right."""
+        self._progress.update(self._task, completed=amount, description=text.line(latest_result))
 
     def warn(self, line: str) -> None:
-        """Print it above the bar."""
+        """Print a line above the bar."""
         self._progress.console.print(
             text.block(line), markup=False, highlight=False, soft_wrap=True
         )
 
 
 @contextmanager
-def showing(total: float, unit: str, *, err: bool = False) -> Iterator[Lines]:
-    """Lines, and a bar where it can be seen.
+def show_progress(total: float, unit: str, *, err: bool = False) -> Iterator[Lines]:
+    """Yield a printer of lines, with a bar if standard error is a terminal.
 
-    total: in `unit`; err: the lines are on standard error, since the output is for a program
+    total: total amount [`unit`]; err: whether the lines go to standard error, since the output is
+        for a program
     """
     if not sys.stderr.isatty():
         yield Lines(err)
@@ -89,7 +90,7 @@ def showing(total: float, unit: str, *, err: bool = False) -> Iterator[Lines]:
         TextColumn("left"),
         TextColumn("{task.description}", markup=False),
     )
-    # What is printed elsewhere meanwhile is not the bar's to redirect.
+    # Output that other code prints meanwhile must not be redirected.
     console = Console(stderr=True)
     with Progress(*columns, console=console, redirect_stdout=False) as progress:
         yield Bar(progress, progress.add_task("", total=total), err)

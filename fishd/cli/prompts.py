@@ -1,4 +1,4 @@
-"""How verbs ask: a signal ends a prompt whenever it comes."""
+"""Prompts that a signal ends, whenever it comes."""
 
 import os
 import signal
@@ -10,53 +10,53 @@ import click
 
 from fishd.core.process.interruption import handled
 
-_AGAIN = 0.1
-"""Time after which a system call is interrupted again [s]."""
+_REPEAT_INTERVAL_S = 0.1
+"""Time between two interruptions of a system call [s]."""
 
 
 @contextmanager
 def input_interrupted() -> Iterator[None]:
-    """While this lasts, a signal that has a handler ends a wait for input, whenever it comes.
+    """Let a signal that has a handler end a wait for input, whenever it comes.
 
-    For the main thread. Python runs a handler between two of its own instructions, or where the
+    For the main thread. Python runs a handler between two of its instructions, or when the
     signal interrupts a system call. One that comes just before `read` begins would wait there for
-    the next line of input. So from the first signal on, a thread interrupts the main one again.
+    the next line of input. So after the first signal, a thread keeps interrupting the main thread.
     """
     main = threading.get_ident()
     reader, writer = os.pipe()
-    os.set_blocking(writer, False)  # as `signal.set_wakeup_fd` wants it
+    os.set_blocking(writer, False)  # required by `signal.set_wakeup_fd`
     ended = threading.Event()
 
     def interrupt() -> None:
-        if os.read(reader, 1):  # nothing where this ends without a signal
-            while not ended.wait(_AGAIN):
+        if os.read(reader, 1):  # empty if this ends without a signal
+            while not ended.wait(_REPEAT_INTERVAL_S):
                 signal.pthread_kill(main, signal.SIGURG)
 
     thread = threading.Thread(target=interrupt, name="interrupt", daemon=True)
     with handled([signal.SIGURG], lambda *_: None):
-        before = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        previous_fd = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         thread.start()
         try:
             yield
         finally:
             ended.set()
-            signal.set_wakeup_fd(before)
+            signal.set_wakeup_fd(previous_fd)
             os.close(writer)
             thread.join()
             os.close(reader)
 
 
 def choose(prompt: str, *words: str, suffix: str = ": ") -> str:
-    """Ask until the answer is one of `words`, of which an empty one stands for Enter alone."""
+    """Prompt until the answer is one of `words`; an empty word stands for Enter alone."""
 
-    def chosen(answer: str) -> str:
+    def parse(answer: str) -> str:
         word = answer.strip().lower()
         if word in words:
             return word
-        possible = " or ".join(each or "Enter" for each in words)
+        possible = " or ".join(choice or "Enter" for choice in words)
         raise click.UsageError(f"{possible} is needed, not '{answer}'; Ctrl-C ends without saving")
 
     answer: str = click.prompt(
-        prompt, default="", show_default=False, prompt_suffix=suffix, value_proc=chosen
+        prompt, default="", show_default=False, prompt_suffix=suffix, value_proc=parse
     )
     return answer

@@ -1,4 +1,4 @@
-"""`fishctl release`: the last resort, when fishd can no longer release the servo itself."""
+"""`fishctl release`: releases the servo when fishd can no longer do that itself."""
 
 import os
 import signal
@@ -20,9 +20,9 @@ from fishd.core.process.interruption import SIGNALS, handled
 from fishd.hardware.release_recipe import NOT_RELEASED, outcome
 
 _NO_FOLDER = "/proc/self/no-calibrations"
-"""A folder that cannot be made: as on a machine where nothing was ever calibrated."""
+"""Folder that cannot exist, which stands for a machine without calibrations."""
 _ANSWER_S = 0.3
-"""Longest time for a fishd that drives the servo to answer [s]."""
+"""Longest wait for an answer of a fishd that drives the servo [s]."""
 
 
 @click.command()
@@ -32,30 +32,30 @@ _ANSWER_S = 0.3
 def release(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Send the servo to neutral and stop its pulses, without the daemon.
 
-    A fishd that still drives the servo is asked first for an emergency stop; one that does not
-    answer is in fault when it goes on.
+    A fishd that still drives the servo is first sent an emergency stop; one that does not answer
+    is in fault when it resumes.
 
     systemd runs this when the service has ended (ExecStopPost). A servo without pulses is not
     touched. Exit status 1 when the servo cannot be reached or has pulses at the end, and when no
-    configuration says where a servo is: the defaults are those of a simulated fish. One that a file
-    says is simulated has nothing to release, which is a success. Once it has begun, neither a
-    lost session nor Ctrl-C ends it halfway.
+    configuration names a servo: the defaults are those of a simulated fish. If a file says that the
+    fish is simulated, there is nothing to release, which is a success. Once it has started, neither
+    a lost session nor Ctrl-C ends it halfway.
     """
-    config, source = _loaded(file, overrides)
-    ended = os.environ.get("SERVICE_RESULT")
-    why = f"the service ended with '{ended}': " if ended else ""
+    config, source = _load_without_bad_folder(file, overrides)
+    service_result = os.environ.get("SERVICE_RESULT")
+    prefix = f"the service ended with '{service_result}': " if service_result else ""
     if config.has_hardware:
-        done = why + _release(config)
+        done = prefix + _release(config)
         with output_may_fail(done):
             _print(done, as_json)
         return 0
     if source is None:
         raise click.ClickException(
-            f"{why}nothing was released: without a configuration file (${FILE_VARIABLE}, else "
+            f"{prefix}nothing was released: without a configuration file (${FILE_VARIABLE}, else "
             f"{SERVICE_FILE}) the robot is simulated; name the one that fishd runs with: "
             "fishctl release --config FILE"
         )
-    _print(f"{why}a simulated fish, by {source}, has nothing to release", as_json)
+    _print(f"{prefix}a simulated fish, by {source}, has nothing to release", as_json)
     return 0
 
 
@@ -66,45 +66,46 @@ def _print(done: str, as_json: bool) -> None:
         echo(done)
 
 
-def release_by_config(silence: NoDaemon, file: Path | None) -> str:
-    """Do as the verb, for a fishd that does not answer; returns what was done, in words.
+def release_by_config(no_answer: NoDaemon, file: Path | None) -> str:
+    """Do as the verb, for a fishd that does not answer; return what was done, in words.
 
-    silence: what is said where no configuration names a servo
+    no_answer: error to report if no configuration names a servo
     """
-    config, source = _loaded(file, ())
+    config, source = _load_without_bad_folder(file, ())
     if config.has_hardware:
         return _release(config)
     if source is None:
         raise click.ClickException(
-            f"{silence}; nothing was released: without a configuration file (${FILE_VARIABLE}, "
+            f"{no_answer}; nothing was released: without a configuration file (${FILE_VARIABLE}, "
             f"else {SERVICE_FILE}) no servo is known; fishctl estop --config FILE names one"
         )
-    return f"a simulated fish, by {source}, has no pulses; its fishd does not answer ({silence})"
+    return f"a simulated fish, by {source}, has no pulses; its fishd does not answer ({no_answer})"
 
 
 def _release(config: Config) -> str:
-    """Ask a fishd that drives the servo, or end the pulses; returns what was done, in words."""
+    """Stop a fishd that drives the servo, or end the pulses; return what was done, in words."""
     try:
         with handled(SIGNALS, signal.SIG_IGN):
-            driver = _driver(config)
-            if driver and (said := _ask(config, driver)):
-                return said
+            driver_pid = _find_driver(config)
+            if driver_pid and (summary := _stop_fishd(config, driver_pid)):
+                return summary
             done = outcome(_end_pulses(config))
     except ServoError as error:
         raise ServoError(f"{error}; {NOT_RELEASED}") from None
-    if not driver:
+    if not driver_pid:
         return done
     return (
-        f"fishd (pid {driver}) drives the servo and did not answer at {_endpoint(config)}: {done}"
+        f"fishd (pid {driver_pid}) drives the servo and did not answer at "
+        f"{_endpoint(config)}: {done}"
     )
 
 
-def _driver(config: Config) -> str:
-    """Return the pid of a fishd that drives this servo; empty where there is none."""
+def _find_driver(config: Config) -> str:
+    """Return the pid of a fishd that drives this servo; empty if there is none."""
     from fishd.assembly import parts_of
     from fishd.hardware.ownership import owner_pid
 
-    with suppress(StartupError):  # no good place for a virtual Pi: the release says so
+    with suppress(StartupError):  # invalid place of a virtual Pi: the release reports it
         return owner_pid(parts_of(config))
     return ""
 
@@ -113,13 +114,13 @@ def _endpoint(config: Config) -> str:
     return config.control.address or find_control()
 
 
-def _ask(config: Config, driver: str) -> str:
-    """Ask a fishd for an emergency stop, and read the pulses back; empty unless they have ended."""
+def _stop_fishd(config: Config, driver_pid: str) -> str:
+    """Send a fishd an emergency stop, and read the pulses back; empty unless they have ended."""
     from fishd.assembly import read_pulses
 
     try:
         with Fish(_endpoint(config), timeout=_ANSWER_S) as fish:
-            if str(fish.status(_ANSWER_S).pid) != driver:
+            if str(fish.status(_ANSWER_S).pid) != driver_pid:
                 return ""
             state = fish.estop("fishctl release", timeout=_ANSWER_S)
         pulses = read_pulses(config)
@@ -127,12 +128,16 @@ def _ask(config: Config, driver: str) -> str:
         return ""
     if pulses:
         return ""
-    seen = "there are no pulses" if pulses is False else "whether there are pulses is not known"
-    return f"fishd (pid {driver}) was asked: mode {state.mode}, {seen}"
+    pulse_state = (
+        "there are no pulses" if pulses is False else "whether there are pulses is not known"
+    )
+    return f"fishd (pid {driver_pid}) was asked: mode {state.mode}, {pulse_state}"
 
 
-def _loaded(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config, Path | None]:
-    """Do as `load_service`, but leave out a state folder that alone is wrong."""
+def _load_without_bad_folder(
+    file: Path | None, overrides: tuple[str, ...]
+) -> tuple[Config, Path | None]:
+    """Do as `load_service`, but ignore a state folder if that is all that is wrong."""
     try:
         return load_service(file, overrides)
     except ConfigError as error:
@@ -141,23 +146,26 @@ def _loaded(file: Path | None, overrides: tuple[str, ...]) -> tuple[Config, Path
             config = load(file, (*overrides, f"state_folder={_NO_FOLDER}"))
         except ConfigError:
             raise error from None
-        _go_on_without(error)
+        _report_skipped(error)
         return config, file
 
 
 def _end_pulses(config: Config) -> bool:
-    """Return whether there were any; with an unreadable calibration, neutral lacks its trim."""
+    """End the pulses; return whether there were any.
+
+    With an unreadable calibration, neutral lacks its trim.
+    """
     from fishd.assembly import end_pulses
 
     try:
         return end_pulses(config)
     except ServoError:
         raise
-    except (OSError, ValueError) as error:  # a ConfigError is one, too
-        _go_on_without(error)
+    except (OSError, ValueError) as error:  # ConfigError is a ValueError
+        _report_skipped(error)
         return end_pulses(replace(config, state_folder=_NO_FOLDER))
 
 
-def _go_on_without(error: Exception) -> None:
+def _report_skipped(error: Exception) -> None:
     with suppress(OSError):  # the terminal may be gone
         click.echo(f"fishctl: {text.line(str(error))}; going on without it", err=True)

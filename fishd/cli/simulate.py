@@ -10,7 +10,14 @@ import click
 from fishd.cli.config import fish_options
 from fishd.cli.free_swim_options import SETTLE, SwimmerOptions, swimmer_options
 from fishd.cli.options import ControllerGroup, for_option, json_option
-from fishd.cli.output import criterion_words, echo, echo_rows, print_json, spelled, warn_of_fin
+from fishd.cli.output import (
+    echo,
+    echo_rows,
+    format_controller,
+    format_criterion,
+    print_json,
+    warn_of_fin,
+)
 from fishd.config import Config, load
 from fishd.core.console import power_words
 from fishd.core.errors import MissingPackage
@@ -19,18 +26,20 @@ if TYPE_CHECKING:
     from fishd.lab.simulation import Report, VirtualRun
     from fishd.recording import RunWriter
 
-_ROUNDED = "(pigpiod sends pulses in steps of 5 µs, so that the tail swings a little more than ±Φ)"
+_ROUNDING_NOTE = (
+    "(pigpiod sends pulses in steps of 5 µs, so that the tail swings a little more than ±Φ)"
+)
 
 
 def run_options(function: Any) -> Any:
-    """The options of a run in virtual time."""
+    """Add the options of a run in virtual time."""
     for option in (
         json_option,
         fish_options,
         click.option(
             "--settle",
             type=float,
-            help="Time before figures are taken [s].  [default: 10; 8 of a swimmer]",
+            help="Time before measurements begin [s].  [default: 10; 8 for a swimmer]",
         ),
         for_option("Length of the run [s].", default=60.0, kind=click.FLOAT),
     ):
@@ -51,7 +60,7 @@ def _options(function: Any) -> Any:
 
 @click.group(cls=ControllerGroup, options=_options)
 def simulate() -> None:
-    """Swim a simulated fish in virtual time, with the very loop that runs on the robot."""
+    """Swim a simulated fish in virtual time, with the loop that runs on the robot."""
 
 
 @simulate.action
@@ -66,27 +75,27 @@ def _simulate(
     as_json: bool,
     **swimmers: Any,
 ) -> int:
-    of_swimmer = SwimmerOptions(**swimmers)
+    swimmer_options_given = SwimmerOptions(**swimmers)
     from fishd.lab.simulation import check_whole_beat
     from fishd.lab.simulation import simulate as run
 
     config = load(file, overrides)
-    free = config.robot == "swimmer"
+    is_swimmer = config.robot == "swimmer"
     if settle is None:
-        settle = SETTLE if free else 10.0
+        settle = SETTLE if is_swimmer else 10.0
     with ExitStack() as stack:
-        writer, begun = None, _nothing
-        if not free:
-            of_swimmer.refuse()
+        writer, on_start = None, _do_nothing
+        if not is_swimmer:
+            swimmer_options_given.refuse()
         if recording:
             writer = stack.enter_context(_recorder(recording))
-            begun = partial(_describe, writer, config)
-        if free:
+            on_start = partial(_describe, writer, config)
+        if is_swimmer:
             from fishd.cli.free_swim import swim
 
-            asked = (config, name, parameters, seconds, settle, writer, begun)
-            return swim(asked, of_swimmer, as_json)
-        report = run(config, name, parameters, seconds, settle, writer, begun)
+            run_arguments = (config, name, parameters, seconds, settle, writer, on_start)
+            return swim(run_arguments, swimmer_options_given, as_json)
+        report = run(config, name, parameters, seconds, settle, writer, on_start)
     check_whole_beat(report, seconds, settle)
     if as_json:
         print_json(report)
@@ -101,7 +110,7 @@ def _simulate(
     return 0
 
 
-def _nothing(_: "VirtualRun") -> None:
+def _do_nothing(_: "VirtualRun") -> None:
     pass
 
 
@@ -125,9 +134,10 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
     return [
         (
             "controller",
-            f"{spelled(report.controller, report.parameters)} {_until(report, settle)}".rstrip(),
+            f"{format_controller(report.controller, report.parameters)} "
+            f"{_until(report, settle)}".rstrip(),
         ),
-        *_chosen(report),
+        *_chosen_criterion(report),
         ("thrust", f"{report.mean_thrust * 1e3:.3f} mN"),
         *_power(report),
         ("frequency", _frequency(report, config.tick)),
@@ -142,7 +152,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
             f"{report.relative_thrust:.1%} of the best square wave at ±{report.amplitude:g} rad",
         ),
         ("", f"({best}, where half beats need not be whole ticks)"),
-        *([("", _ROUNDED)] if config.robot == "virtual-pi" else []),
+        *([("", _ROUNDING_NOTE)] if config.robot == "virtual-pi" else []),
         (
             "timing",
             f"{report.ticks} ticks of {report.microseconds_per_tick:.0f} µs, "
@@ -152,7 +162,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
 
 
 def _power(report: "Report") -> list[tuple[str, str]]:
-    """Into the servo, by its loss model; and what a watt of it gives."""
+    """Return the power into the servo, by its loss model, and the thrust per watt."""
     if not report.mean_power:
         return []
     per_watt = report.mean_thrust * 1e3 / report.mean_power
@@ -160,26 +170,26 @@ def _power(report: "Report") -> list[tuple[str, str]]:
 
 
 def _until(report: "Report", settle: float) -> str:
-    """Who swam, where that was not only the one that was asked to."""
+    """Return until when the requested controller swam, if another one took over."""
     if report.took_over is None:
         return ""
-    whose = "whose figures these are" if report.took_over <= settle else "the figures are of both"
-    return f"until {report.took_over:.2f} s, then {report.successor}; {whose}"
+    note = "whose figures these are" if report.took_over <= settle else "the figures are of both"
+    return f"until {report.took_over:.2f} s, then {report.successor}; {note}"
 
 
-def _chosen(report: "Report") -> list[tuple[str, str]]:
-    """What the controller chose where it was left to it."""
+def _chosen_criterion(report: "Report") -> list[tuple[str, str]]:
+    """Return the C that the controller chose, if that was left to it."""
     if report.parameters.get("C") != "auto" or "criterion" not in report.quantities:
         return []
-    return [("", criterion_words(report.quantities, "at the end"))]
+    return [("", format_criterion(report.quantities, "at the end"))]
 
 
 def _frequency(report: "Report", tick: float) -> str:
-    """Return the tail-beat frequency and the half beats swum: a reversal waits for a tick."""
+    """Return the tail-beat frequency, and the half beats, which are whole ticks."""
     lengths = sorted(set(report.half_beats) - {0})
     if not lengths:
         return "–, as nothing was reversed"
     ticks = " to ".join(map(str, lengths))
-    alone = " to ".join(f"{0.5 / (length * tick):.3f}" for length in lengths)
-    each = f" ({alone} Hz)" if len(lengths) > 1 else ""
-    return f"{report.frequency:.3f} Hz, in half beats of {ticks} ticks{each}"
+    frequencies = " to ".join(f"{0.5 / (length * tick):.3f}" for length in lengths)
+    spread = f" ({frequencies} Hz)" if len(lengths) > 1 else ""
+    return f"{report.frequency:.3f} Hz, in half beats of {ticks} ticks{spread}"

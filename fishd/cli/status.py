@@ -1,4 +1,4 @@
-"""`status`: what the fish and its daemon are doing, on one page."""
+"""`fishctl status`: the state of the fish and of its daemon, on one page."""
 
 import datetime
 
@@ -6,44 +6,44 @@ import click
 
 from fishd.cli.options import daemon_options
 from fishd.cli.output import (
-    criterion_words,
     echo_rows,
+    format_controller,
+    format_criterion,
+    format_quantities,
     format_reason,
-    made_printable,
-    measured,
+    make_printable,
     print_json,
-    spelled,
 )
 from fishd.client import Fish
 from fishd.core.console import power_words, thrust_words
 from fishd.core.schema import format_values
 from fishd.core.signals import Percentiles, Status
 
-_HELP = "docs/how-to/troubleshooting.md"
-_ZERO = "(its zero is not known: stop for 3 s, then swim on; or fishctl measure)"
+_REMEDIES_PAGE = "docs/how-to/troubleshooting.md"
+_ZERO_UNKNOWN_NOTE = "(its zero is not known: stop for 3 s, then swim on; or fishctl measure)"
 
 
 @click.command()
-@click.option("--timing", is_flag=True, help="Show how well the loop keeps its time, too.")
+@click.option("--timing", is_flag=True, help="Also show the timing of the loop.")
 @daemon_options
 def status(timing: bool, endpoint: str | None, as_json: bool) -> None:
     """Show what the fish and its daemon are doing."""
     with Fish(endpoint) as fish:
-        found = fish.status()
+        fish_status = fish.status()
     if as_json:
-        print_json(found)
+        print_json(fish_status)
         return
-    rows = _status_rows(found := made_printable(found))
+    rows = _status_rows(fish_status := make_printable(fish_status))
     if timing:
-        rows += _timing_rows(found)
+        rows += _timing_rows(fish_status)
     echo_rows(rows)
 
 
 def _status_rows(status: Status) -> list[tuple[str, str]]:
-    """The fish first, the daemon last."""
+    """Return names and values: those of the fish first, those of the daemon last."""
     mode = [("mode", status.mode)]
     if reason := status.reason:
-        remedy = f"{reason.remedy or 'mend the cause'} ({_HELP}, {reason.code})"
+        remedy = f"{reason.remedy or 'mend the cause'} ({_REMEDIES_PAGE}, {reason.code})"
         mode = [
             ("mode", f"{status.mode} ({format_reason(reason)})"),
             ("to do", f"{remedy}; then: fishctl clear-fault"),
@@ -51,23 +51,23 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
     if holder := status.lease:
         mode.append(("held by", f"{holder}, for {holder.age:.0f} s"))
     if expired := status.lease_expired:
-        mode.append(("rests, as", f"{expired.message} ({_HELP}, {expired.code})"))
+        mode.append(("rests, as", f"{expired.message} ({_REMEDIES_PAGE}, {expired.code})"))
     uptime = datetime.timedelta(seconds=int(status.uptime))
-    survived = {name: count for name, count in status.counters.items() if count}
+    errors = {name: count for name, count in status.counters.items() if count}
     missed = f"slots missed: {status.missed}, overruns: {status.overruns}; see --timing"
     return [
         ("fish", f"{status.name}, {status.robot}"),
         *mode,
-        ("controller", spelled(status.controller, status.parameters)),
+        ("controller", format_controller(status.controller, status.parameters)),
         *([("", f"took over: {format_reason(status.fallback)}")] if status.fallback else []),
         ("angle", f"{_angle(status)}, {_range(status)}"),
-        *_swum(status),
-        *([("leak", f"{status.leak:.3g} s, found")] if status.leak is not None else []),
+        *_thrust_rows(status),
+        *([("leak", f"{status.leak:.3g} s, estimated")] if status.leak is not None else []),
         *_criterion(status),
         *([("shows", shown)] if (shown := _quantities(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
-        *([("survived", format_values(survived, {}))] if survived else []),
+        *([("survived", format_values(errors, {}))] if errors else []),
         *([("late", missed)] if status.missed or status.overruns else []),
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),
@@ -75,20 +75,20 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
 
 
 def _criterion(status: Status) -> list[tuple[str, str]]:
-    """Return what `swing --C auto` has found, or tries."""
+    """Return the C that `swing --C auto` has chosen, or tries."""
     quantities = status.quantities
     if status.parameters.get("C") != "auto" or "criterion" not in quantities:
         return []
-    when = "on trial, or the best so far" if quantities.get("searching") else "found"
-    return [("C auto", criterion_words(quantities, when))]
+    when = "on trial, or the best so far" if quantities.get("searching") else "chosen"
+    return [("C auto", format_criterion(quantities, when))]
 
 
-def _swum(status: Status) -> list[tuple[str, str]]:
+def _thrust_rows(status: Status) -> list[tuple[str, str]]:
     if status.speed is not None:
         return [("speed", f"{status.speed * 1e3:.1f} mm/s at {status.frequency:.2f} Hz")]
     rows = [("thrust", f"{thrust_words(status)} at {status.frequency:.2f} Hz")]
     if status.thrust_error is None and not status.sensor_lost:
-        rows.append(("", _ZERO))
+        rows.append(("", _ZERO_UNKNOWN_NOTE))
     if status.power is not None:
         rows.append(("power", f"{power_words(status.power)} into the servo, mean of 2 s"))
     return rows
@@ -110,8 +110,8 @@ def _timing_rows(status: Status) -> list[tuple[str, str]]:
 
 
 def _quantities(status: Status) -> str:
-    each = measured(status.quantities, status.quantity_units)
-    return ", ".join(f"{name} {value}" for name, value in each)
+    pairs = format_quantities(status.quantities, status.quantity_units)
+    return ", ".join(f"{name} {value}" for name, value in pairs)
 
 
 def _angle(status: Status) -> str:
@@ -122,7 +122,7 @@ def _angle(status: Status) -> str:
 
 
 def _range(status: Status) -> str:
-    """The angles that the tail can be sent to."""
+    """Return the angles that the tail can be sent to."""
     limit = status.amplitude_limit
     if (status.lowest, status.highest) == (-limit, limit):
         return f"within ±{limit:g} rad"

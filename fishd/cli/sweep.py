@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from fishd.cli.experiment_options import ChosenFish, Ending, Place, fish_choice, folder_options
 from fishd.cli.options import ControllerGroup, FiniteRange, for_option, json_option, plot_option
-from fishd.cli.output import counted, echo, print_json, warn_of_fin
-from fishd.cli.progress import showing
+from fishd.cli.output import echo, format_count, print_json, warn_of_fin
+from fishd.cli.progress import show_progress
 from fishd.config import Config
 from fishd.controllers.base import Limits
 from fishd.core import text
@@ -148,7 +148,7 @@ class _Sweep:
         with self.place.open(self.fish, msgspec.to_builtins(config), settings) as experiment:
             folder = self._folder(experiment)
             ending = Ending(experiment)
-            with showing(len(pairs), "points", err=self.as_json) as show:
+            with show_progress(len(pairs), "points", err=self.as_json) as show:
                 show.at(self.finished)
 
                 def done(point: "Point", result: "PointResult") -> None:
@@ -176,7 +176,7 @@ class _Sweep:
                 with (
                     ending.measuring(),
                     session,
-                    showing(len(self.points) * seconds, "s", err=self.as_json) as show,
+                    show_progress(len(self.points) * seconds, "s", err=self.as_json) as show,
                 ):
                     session.progress = show.at
 
@@ -218,7 +218,7 @@ class _Sweep:
         self.finished = sum(folder.key(point) in folder.results for point in self.points)
         there = f", {self.finished} of them there already" if self.finished else ""
         self.fish.announce(self.as_json)
-        echo(f"{folder.path}: {counted(len(self.points), 'point')}{there}", err=self.as_json)
+        echo(f"{folder.path}: {format_count(len(self.points), 'point')}{there}", err=self.as_json)
         return folder
 
     def _line(self, folder: "SweepFolder", point: "Point", result: "PointResult") -> str:
@@ -263,7 +263,7 @@ class _Sweep:
             warn_of_fin(widest, f" at {where}")
         if ending.is_interrupted:
             done = sum(folder.key(point) in folder.results for point in points)
-            return ending.interrupted(f"{done} of {counted(len(points), 'point')} are kept")
+            return ending.interrupted(f"{done} of {format_count(len(points), 'point')} are kept")
         return 1 if any(folder.results[folder.key(point)].trouble for point in points) else 0
 
 

@@ -1,4 +1,4 @@
-"""Groups of verbs: each verb is imported only when it is called, help lists them by purpose."""
+"""Groups of verbs: each verb is imported when it is called, and help lists them by purpose."""
 
 import gc
 from collections.abc import Iterator, Mapping, Sequence
@@ -34,38 +34,38 @@ _EXTRAS = {
     "tensorboard": "learn",
     "torch": "learn",
 }
-"""The extra that brings a package."""
+"""Extra of fishd that installs a package, by module name."""
 
 
 class Verb(NamedTuple):
-    """Where a verb is, and what it is for."""
+    """Location of a verb, and its line of help."""
 
     module: str
-    """In fishd.cli."""
+    """Module below fishd.cli."""
     command: str
-    """In that module."""
+    """Name of the command in that module."""
     about: str
-    """One line of help."""
+    """Line of help."""
 
 
 class Verbs(click.Group):
-    """So that `fishctl status` does not wait for what others need."""
+    """Group that imports a verb when it is called, so that `fishctl status` starts fast."""
 
     def __init__(
         self,
         *args: Any,
         verbs: Mapping[str, Mapping[str, Verb]],
         daily: Sequence[str] = (),
-        other_words: Mapping[str, str] | None = None,
+        word_hints: Mapping[str, str] | None = None,
         **kwargs: Any,
     ) -> None:
         """
-        verbs: by the heading in help that they stand below, and by name
-        daily: those that help marks as verbs for every day
-        other_words: what is meant by words that are not verbs
+        verbs: verbs by heading in help and by name
+        daily: names of the verbs that help marks as those for every day
+        word_hints: hints for words that are not verbs
         """
         self._sections = verbs
-        self._other_words = other_words or {}
+        self._word_hints = word_hints or {}
         self._daily = daily
         self._verbs = {name: verb for section in verbs.values() for name, verb in section.items()}
         # click suggests the nearest of these for a name that is misspelled.
@@ -74,7 +74,7 @@ class Verbs(click.Group):
         self.commands.update(stubs)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a verb; a package of an extra that is missing is one line."""
+        """Run a verb; if a package of an extra is missing, print one line and exit with 1."""
         try:
             return super().invoke(ctx)
         except ModuleNotFoundError as error:
@@ -89,15 +89,15 @@ class Verbs(click.Group):
             )
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """All verbs, in the order of help."""
+        """Return the names of all verbs, in the order of help."""
         return list(self._verbs)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Import a verb."""
+        """Import and return a verb."""
         verb = self._verbs.get(cmd_name)
         if verb is None:
             return None
-        with _no_garbage():
+        with _pause_garbage_collector():
             module = import_module(f"fishd.cli.{verb.module}")
         command: click.Command = getattr(module, verb.command)
         return command
@@ -112,9 +112,9 @@ class Verbs(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Find a verb; a word that another program would have for one gets what is meant."""
-        if meant := self._other_words.get(args[0]):
-            raise click.UsageError(f"No such command '{args[0]}': {meant}", ctx)
+        """Find a verb; raise `UsageError` with a hint for a word that other programs use."""
+        if hint := self._word_hints.get(args[0]):
+            raise click.UsageError(f"No such command '{args[0]}': {hint}", ctx)
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -133,12 +133,12 @@ class Verbs(click.Group):
 
 
 @contextmanager
-def _no_garbage() -> Iterator[None]:
-    """Nothing that is loaded is garbage: to look for it takes a tenth of the time."""
-    before = gc.isenabled()
+def _pause_garbage_collector() -> Iterator[None]:
+    """Pause the garbage collector during an import, where it takes a tenth of the time."""
+    was_enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        if before:
+        if was_enabled:
             gc.enable()

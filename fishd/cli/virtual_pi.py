@@ -31,12 +31,16 @@ CHIP_PRIORITY = 60
 
 
 def _complete(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    return [CompletionItem(n, help=a) for n, a in FAULTS.items() if n.startswith(incomplete)]
+    return [
+        CompletionItem(name, help=about)
+        for name, about in FAULTS.items()
+        if name.startswith(incomplete)
+    ]
 
 
 @contextmanager
-def _remote(config: Config) -> Iterator[RemotePi]:
-    """The virtual Pi that is running; what it refuses is one line and exit status 2."""
+def _connect(config: Config) -> Iterator[RemotePi]:
+    """Yield the running virtual Pi; print a refused request as one line and exit with 2."""
     with RemotePi(virtual_pi_socket(config.virtual_pi.socket)) as pi:
         try:
             yield pi
@@ -50,7 +54,7 @@ def _remote(config: Config) -> Iterator[RemotePi]:
 def virtual_pi() -> None:
     """Run a virtual Raspberry Pi with sensor, servo and fish, and break it.
 
-    fishd drives it with robot: virtual-pi, through the very drivers of the robot.
+    fishd drives it with robot: virtual-pi, through the same drivers as on the robot.
     """
 
 
@@ -59,7 +63,7 @@ def virtual_pi() -> None:
 def run(file: Path | None, overrides: tuple[str, ...]) -> None:
     """Run a virtual Pi until Ctrl-C or SIGTERM."""
     config = load(file, overrides)
-    with contextlib.suppress(OSError):  # where permitted: chips do not wait for a busy machine
+    with contextlib.suppress(OSError):  # if permitted: chips must not wait for a busy machine
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(CHIP_PRIORITY))
     realtime.enter(priority=0, lock_memory=False)  # for the sleeps that stand for bus time
     settings = config.virtual_pi
@@ -67,7 +71,7 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
     pi = VirtualPi(settings, config.plant, config.simulation, config.tick, PunctualClock())
     if config.panel.estop_gpio is not None:
         pi.set_level(config.panel.estop_gpio, _level(config.panel, pressed=False))
-    with _signals() as stopped, LinkServer(pi, path):
+    with _catch_signals() as stopped, LinkServer(pi, path):
         echo(
             f"virtual Pi on {path}: ADS1115 {settings.address:#04x} on I2C bus {settings.bus}, "
             f"pigpiod on 127.0.0.1:{pi.pigpiod.port} with the servo on GPIO {settings.servo_gpio}"
@@ -75,18 +79,18 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
         realtime.quiet_garbage_collector()
         while not stopped(1.0):
             realtime.collect_garbage()
-            state = pi.state()  # also lets the fish swim on while nobody reads the sensor
+            state = pi.state()  # also advances the fish while no driver reads the sensor
             if sys.stdout.isatty():
                 echo(_line(state))
 
 
 @virtual_pi.command()
 @click.argument("name", shell_complete=_complete)
-@for_option("How long it lasts [s]; without this, until 'clear'.", kind=click.FLOAT)
+@for_option("Duration of the fault [s]; by default it lasts until 'clear'.", kind=click.FLOAT)
 @fish_options
 def inject(name: str, seconds: float | None, file: Path | None, overrides: tuple[str, ...]) -> None:
     """Begin the fault NAME; 'fishctl virtual-pi faults' lists them."""
-    with _remote(load(file, overrides)) as pi:
+    with _connect(load(file, overrides)) as pi:
         pi.inject(name, seconds)
 
 
@@ -95,7 +99,7 @@ def inject(name: str, seconds: float | None, file: Path | None, overrides: tuple
 @fish_options
 def clear(name: str | None, file: Path | None, overrides: tuple[str, ...]) -> None:
     """End the fault NAME, or all faults."""
-    with _remote(load(file, overrides)) as pi:
+    with _connect(load(file, overrides)) as pi:
         pi.clear(name)
 
 
@@ -115,7 +119,7 @@ def faults(as_json: bool) -> None:
 @json_option
 def status(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> None:
     """Show pulses, fish and faults of the virtual Pi that is running."""
-    with _remote(load(file, overrides)) as pi:
+    with _connect(load(file, overrides)) as pi:
         state = pi.state()
     if as_json:
         print_json(state)
@@ -141,13 +145,16 @@ def press(file: Path | None, overrides: tuple[str, ...]) -> None:
 @virtual_pi.command()
 @fish_options
 def unpress(file: Path | None, overrides: tuple[str, ...]) -> None:
-    """Let the E-stop button go."""
+    """Release the E-stop button."""
     _set_button(load(file, overrides), pressed=False)
 
 
 @contextmanager
-def _signals() -> Iterator[Callable[[float], bool]]:
-    """Lets one wait so many seconds for SIGINT or SIGTERM; True once it has come."""
+def _catch_signals() -> Iterator[Callable[[float], bool]]:
+    """Yield a function that waits for SIGINT or SIGTERM, up to some seconds.
+
+    It returns True once a signal has come.
+    """
     reader, writer = socket.socketpair()
     with reader, writer:
         writer.setblocking(False)
@@ -162,12 +169,12 @@ def _set_button(config: Config, pressed: bool) -> None:
     panel = config.panel
     if panel.estop_gpio is None:
         complain("fishctl", "no E-stop button: panel.estop_gpio is null, its GPIO is needed", 1)
-    with _remote(config) as pi:
+    with _connect(config) as pi:
         pi.set_level(panel.estop_gpio, _level(panel, pressed))
 
 
 def _level(panel: PanelSettings, pressed: bool) -> int:
-    """What the E-stop button drives its pin to."""
+    """Return the level to which the E-stop button drives its pin."""
     return int(pressed == (panel.estop_pressed == "high"))
 
 

@@ -11,15 +11,15 @@ from contextlib import suppress
 
 import click
 
-from fishd.cli.drawing import whole_screen
+from fishd.cli.drawing import open_full_screen
 from fishd.cli.options import daemon_options, for_option
-from fishd.cli.output import echo, measured, print_json_line, time_of_day
+from fishd.cli.output import echo, format_quantities, format_time_of_day, print_json_line
 from fishd.client import AsyncFish
 from fishd.core import text
 from fishd.core.console import status_line
 
-REDRAW = 0.1
-"""Least time from one drawing to the next [s]; every tick that came meanwhile is in it."""
+REDRAW_INTERVAL_S = 0.1
+"""Shortest time from one drawing to the next [s]; a drawing shows all ticks since the last."""
 
 
 @click.command()
@@ -29,8 +29,8 @@ def watch(endpoint: str | None, as_json: bool, seconds: float | None) -> None:
     """Watch force, command and timing live, until Ctrl-C.
 
     'late' and 'busy' are the worst of the last 5 s, 'missed' counts slots that the daemon skipped,
-    'lost' counts ticks that did not arrive here. Where standard output is not a terminal, a line
-    is printed every second instead; with --json, every tick as one line.
+    'lost' counts ticks that did not arrive here. If standard output is not a terminal, a line is
+    printed every second instead; with --json, every tick as one line.
     """
     can_draw = sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
     show = _print_ticks if as_json else _draw if can_draw else _print_lines
@@ -54,9 +54,12 @@ async def _print_ticks(fish: AsyncFish) -> None:
 async def _print_lines(fish: AsyncFish) -> None:
     while True:
         status = await fish.status()
-        own = measured(status.quantities, status.quantity_units)
-        more = "".join(f"  {name} {value}" for name, value in own)
-        echo(f"{time_of_day(status.t)}  {text.quoted(status.name)}  {status_line(status)}{more}")
+        pairs = format_quantities(status.quantities, status.quantity_units)
+        quantities = "".join(f"  {name} {value}" for name, value in pairs)
+        echo(
+            f"{format_time_of_day(status.t)}  {text.quoted(status.name)}  "
+            f"{status_line(status)}{quantities}"
+        )
         await asyncio.sleep(1.0)
 
 
@@ -68,11 +71,11 @@ async def _draw(fish: AsyncFish) -> None:
     events = asyncio.create_task(view.collect(fish.events()))
     drawn = -math.inf
     try:
-        with whole_screen() as live:
+        with open_full_screen() as live:
             async for tick in fish.ticks():
                 view.add(tick)
-                # Counted from the end of a drawing: what a slow terminal held up is read first.
-                if time.monotonic() - drawn >= REDRAW:
+                # From the end of a drawing, so that ticks held up by a slow terminal are read.
+                if time.monotonic() - drawn >= REDRAW_INTERVAL_S:
                     if view.outdated:
                         view.status = await fish.status()
                     live.update(view, refresh=True)

@@ -12,13 +12,13 @@ from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 from rich.text import Text
 
-from fishd.cli.output import measured, spelled, time_of_day
+from fishd.cli.output import format_controller, format_quantities, format_time_of_day
 from fishd.core import text
 from fishd.core.console import power_words, thrust_words
 from fishd.core.signals import Event, Status, Tick
 
-SPAN = 5.0
-"""How far back the traces go [s]."""
+TRACE_SPAN_S = 5.0
+"""Time that the traces show [s]."""
 MODES = {"idle": "cyan", "running": "green", "fault": "red", "estop": "red"}
 LEVELS = {"warning": "yellow", "error": "red"}
 
@@ -27,10 +27,10 @@ class Trace(NamedTuple):
     """One quantity against time."""
 
     name: str
-    """With its unit."""
+    """Name, with its unit."""
     style: str
-    least: float
-    """The scale reaches from minus this to plus this at least, so that noise looks small."""
+    min_end: float
+    """Smallest end of the scale, on either side, so that noise looks small."""
     value: Callable[[Tick], float]
 
 
@@ -39,14 +39,14 @@ TRACES = (
     Trace("fy m{force_unit}", "yellow", 2.0, lambda tick: tick.fy * 1e3),
     Trace("phi_c rad", "green", 0.1, lambda tick: tick.phi_c),
 )
-LABEL = 14
-"""Columns left of the axis: a name and a number."""
+LABEL_COLUMNS = 14
+"""Width of the labels left of the axis: a name and a number [columns]."""
 _DOTS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 """Bits of the dots of a braille character, four rows of two."""
 
 
 class View:
-    """What is on the screen; adapts to the size of the screen each time it is drawn."""
+    """Content of the screen; it adapts to the size of the screen each time it is drawn."""
 
     def __init__(self, status: Status) -> None:
         self.status = status
@@ -55,29 +55,29 @@ class View:
         self._lost = 0
 
     def add(self, tick: Tick) -> None:
-        """Take in a tick, and forget those of more than `SPAN` ago."""
+        """Add a tick, and drop those older than `TRACE_SPAN_S`."""
         ticks = self._ticks
         if ticks:
             # After a restart of the daemon, ticks are numbered from 1 again.
             self._lost += max(0, tick.seq - ticks[-1].seq - 1)
         ticks.append(tick)
-        while abs(tick.t - ticks[0].t) > SPAN:
+        while abs(tick.t - ticks[0].t) > TRACE_SPAN_S:
             ticks.popleft()
 
     async def collect(self, events: AsyncIterator[Event]) -> None:
-        """Keep the latest of `events`, for ever."""
+        """Keep the latest of `events`, until cancelled."""
         async for event in events:
             self._events.append(event)
 
     @property
     def outdated(self) -> bool:
-        """True once the status is a second old, or no longer that of the latest tick."""
+        """Whether the status is a second old, or does not match the latest tick."""
         tick, status = self._ticks[-1], self.status
         known = (status.mode, status.controller) == (tick.mode, tick.controller)
         return not known or abs(tick.t - status.t) >= 1.0
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Header, as many traces as there is room for, and events below them on a tall screen."""
+        """Yield the header, as many traces as fit, and events below them on a tall screen."""
         width, height = options.max_width, options.height or console.height
         header = [self._title()]
         reason, fallback = self.status.reason, self.status.fallback
@@ -89,21 +89,21 @@ class View:
         if holder := self.status.lease:
             header.append(_one_line(text.line(f"held by {holder}, for {holder.age:.0f} s")))
         yield from header
-        own = self._quantities()
+        quantities = self._quantities()
         yield self._figures()
-        yield from own
+        yield from quantities
         events = max(0, min(3, (height - 14) // 3))
         # 2 rows of figures, 1 for the time axis.
-        room = height - len(header) - 2 - len(own) - events - 1
-        traces = TRACES[: max(0, room // 2)] if width >= 2 * LABEL else ()
+        free_rows = height - len(header) - 2 - len(quantities) - events - 1
+        traces = TRACES[: max(0, free_rows // 2)] if width >= 2 * LABEL_COLUMNS else ()
         for trace in traces:
-            yield self._plot(trace, width, room // len(traces))
+            yield self._plot(trace, width, free_rows // len(traces))
         if traces:
-            ago = f"-{SPAN:g} s"
-            yield Text(f"{'':{LABEL + 1}}{ago:<{width - LABEL - 4}}now", "dim")
+            ago = f"-{TRACE_SPAN_S:g} s"
+            yield Text(f"{'':{LABEL_COLUMNS + 1}}{ago:<{width - LABEL_COLUMNS - 4}}now", "dim")
         for event in list(self._events)[-events:] if events else ():
             yield _one_line(
-                (f"{time_of_day(event.t)} ", "dim"),
+                (f"{format_time_of_day(event.t)} ", "dim"),
                 (text.line(f"{event.kind}: {event.message}"), LEVELS.get(event.level, "none")),
             )
 
@@ -113,14 +113,14 @@ class View:
             f"{text.quoted(self.status.name)} " if self.status.name else "",
             (f" {text.quoted(tick.mode).upper()} ", f"bold reverse {MODES.get(tick.mode, 'none')}"),
             (f" {text.quoted(tick.controller)} ", "bold"),
-            spelled(self.status.controller, self.status.parameters).partition(" ")[2],
+            format_controller(self.status.controller, self.status.parameters).partition(" ")[2],
             "" if tick.servo_on else ("  no pulses", "dim"),
             ("  servo not reached", "red") if self.status.servo_lost else "",
         )
 
     def _figures(self) -> Table:
         tick = self._ticks[-1]
-        known = replace(
+        current = replace(
             self.status,
             thrust=tick.thrust,
             thrust_error=None if tick.thrust_error is UNSET else tick.thrust_error,
@@ -128,7 +128,7 @@ class View:
         speed, power = tick.speed, self.status.power
         figures = {
             **({"speed": f"{speed * 1e3:.1f} mm/s"} if isinstance(speed, float) else {}),
-            "thrust": thrust_words(known),
+            "thrust": thrust_words(current),
             **({} if power is None else {"power": power_words(power)}),
             "tail beat": f"{tick.frequency:.2f} Hz",
             **({} if self.status.robot == "swimmer" else self._timing()),
@@ -142,7 +142,7 @@ class View:
         return table
 
     def _timing(self) -> dict[str, str]:
-        """How late ticks are; in slow motion none is."""
+        """Return lateness, busy time and missed slots; not shown in slow motion."""
         return {
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
             "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",
@@ -150,21 +150,21 @@ class View:
         }
 
     def _quantities(self) -> list[Text]:
-        """The controller's own, in one line; no line where it has none."""
+        """Return the quantities of the controller in one line; no line if it has none."""
         now = self._ticks[-1].quantities
         if not isinstance(now, dict):
             return []
         parts: list[str | tuple[str, str]] = []
-        for name, value in measured(now, self.status.quantity_units):
+        for name, value in format_quantities(now, self.status.quantity_units):
             parts += [(f"{name} ", "dim"), (f"{value}   ", "bold")]
         return [_one_line(*parts)]
 
     def _plot(self, trace: Trace, width: int, rows: int) -> Text:
-        """A trace with its name and scale to the left; lost ticks leave a gap."""
+        """Return a trace with its name and scale to the left; lost ticks leave a gap."""
         values = [trace.value(tick) for tick in self._ticks]
-        low, high = _scale(values, trace.least)
+        low, high = _scale(values, trace.min_end)
         now = self._ticks[-1].t
-        points = [(now - SPAN, math.nan)]
+        points = [(now - TRACE_SPAN_S, math.nan)]
         for before, tick, value in zip((None, *self._ticks), self._ticks, values, strict=False):
             if before and tick.seq - before.seq != 1:
                 points.append((before.t, math.nan))
@@ -173,20 +173,22 @@ class View:
         labels[round(high / (high - low) * (rows - 1))] = "0"
         labels[-1] = f"{low:g}"
         name = trace.name.format(force_unit=text.quoted(self.status.force_unit))
-        labels[0] = f"{name:<9}{high:>{LABEL - 9}g}"
-        drawn = _curve(points, now - SPAN, now, rows, width - LABEL - 1)
-        lines = (f"{label:>{LABEL}}┤{line}" for label, line in zip(labels, drawn, strict=True))
+        labels[0] = f"{name:<9}{high:>{LABEL_COLUMNS - 9}g}"
+        drawn = _curve(points, now - TRACE_SPAN_S, now, rows, width - LABEL_COLUMNS - 1)
+        lines = (
+            f"{label:>{LABEL_COLUMNS}}┤{line}" for label, line in zip(labels, drawn, strict=True)
+        )
         return Text("\n".join(lines), trace.style, no_wrap=True)
 
 
 def _one_line(*parts: str | tuple[str, str]) -> Text:
-    """Text that is cut where the screen ends; each part with its style."""
+    """Return a text that is cut where the screen ends; parts: each with its style."""
     return Text.assemble(*parts, no_wrap=True, overflow="ellipsis")
 
 
-def _scale(values: Sequence[float], least: float) -> tuple[float, float]:
-    """Round limits around `values`, zero and ±`least`, so that the scale seldom changes."""
-    low, high = min([-least, *values]), max([least, *values])
+def _scale(values: Sequence[float], min_end: float) -> tuple[float, float]:
+    """Return round limits around `values`, zero and ±`min_end`, that seldom change."""
+    low, high = min([-min_end, *values]), max([min_end, *values])
     step = 10.0 ** math.floor(math.log10(high - low)) / 2.0
     return step * math.floor(low / step), step * math.ceil(high / step)
 
@@ -197,7 +199,7 @@ def _curve(
     """Draw the line through `points`, as `rows` strings of `columns` braille characters.
 
     points: x in rising order, and y from 0 at the bottom to 1 at the top; NaN leaves a gap
-    start, end: what x is at the left and at the right edge
+    start, end: x at the left and at the right edge
     """
     x, y = np.array(points).T
     across = np.linspace(start, end, 2 * columns)

@@ -5,7 +5,7 @@ from itertools import pairwise
 from fishd.camera.latency import Force
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.simulated.settings import SimulatedCameraSettings
-from fishd.cli.camera.latency import forces_of
+from fishd.cli.camera.latency import force_windows
 from fishd.config import load
 from fishd.core.camera_frames import Frame
 from fishd.core.signals import Tick
@@ -26,4 +26,4 @@ def filmed(ticks: list[Tick], camera: SimulatedCameraSettings) -> list[Frame]:
 
 
 def felt(ticks: list[Tick]) -> list[Force]:
-    return forces_of(ticks, 0.05)
+    return force_windows(ticks, 0.05)

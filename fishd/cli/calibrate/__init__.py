@@ -22,14 +22,14 @@ def calibrate() -> None:
 
 
 @click.command()
-@for_option("How long to measure [s].", default=2.0, kind=FiniteRange(0.1, 60.0))
+@for_option("Duration of the measurement [s].", default=2.0, kind=FiniteRange(0.1, 60.0))
 @daemon_options
 def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
-    """Call the present force zero; the fish must hang still.
+    """Set the zero of the force sensor to the present force; the fish must hang still.
 
-    Refused while it swims, while the force varies, and for a force that is too large to be an
-    offset. It is saved as a new calibration file, but for a simulated fish. Ctrl-C while it
-    measures: nothing changes.
+    Refused while the fish swims, while the force varies, and for a force that is too large to be an
+    offset. The result is saved as a new calibration file, except for a simulated fish. After
+    Ctrl-C during the measurement, nothing changes.
     """
     with Fish(endpoint) as fish:
         simulated = fish.status().robot in ("simulated", "swimmer")
@@ -42,5 +42,5 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
         if force is None:
             continue
         echo(f"{when:<7} x0 {force.x0 * 1e3:+9.2f} mN   y0 {force.y0 * 1e3:+9.2f} mN")
-    kept = f"and saved in {after.force_file}" if after.force_file else "until this fish ends"
-    echo(text.line(f"in use, {kept}"))
+    storage = f"and saved in {after.force_file}" if after.force_file else "until this fish ends"
+    echo(text.line(f"in use, {storage}"))

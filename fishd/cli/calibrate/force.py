@@ -1,4 +1,4 @@
-"""`fishctl calibrate force`: measure known loads or read them, fit, and ask before saving."""
+"""`fishctl calibrate force`: measures known loads or reads them, fits, and saves if confirmed."""
 
 import math
 from collections.abc import Callable
@@ -29,10 +29,10 @@ from fishd.hardware.force_sensor.calibration_fit import (
 
 T = TypeVar("T")
 
-LOAD_ERROR = 0.01
-"""Default of `--load-error`: kitchen scales, weights of a school set, a pulley with friction."""
-_POOR_FIT = 0.02
-"""A residual beyond this share of the largest load is worth a warning."""
+DEFAULT_LOAD_ERROR = 0.01
+"""Default of `--load-error`, for kitchen scales, school weights or a pulley with friction."""
+_POOR_RESIDUAL = 0.02
+"""Residual above which a warning is printed, as a fraction of the largest load."""
 
 
 @click.command()
@@ -43,11 +43,11 @@ _POOR_FIT = 0.02
     show_default=True,
     help="Unit of the loads: newtons, or grams hung over a pulley.",
 )
-@for_option("How long to measure each load [s].", default=5.0, kind=FiniteRange(0.1, 60.0))
+@for_option("Duration of each measurement [s].", default=5.0, kind=FiniteRange(0.1, 60.0))
 @click.option(
     "--load-error",
     type=FiniteRange(0.0, 0.5),
-    default=LOAD_ERROR,
+    default=DEFAULT_LOAD_ERROR,
     show_default=True,
     help="Largest error that all loads have in common, as a fraction of a load, such as that of "
     "the scale. No fit can see it; it becomes part of the calibration's uncertainty.",
@@ -56,7 +56,7 @@ _POOR_FIT = 0.02
     "--loads",
     "plan",
     type=click.Path(path_type=Path),
-    help="CSV with a plan of loads of your own (columns fx_N,fy_N), or with loads measured "
+    help="CSV file with a plan of loads (columns fx_N,fy_N), or with loads measured "
     "earlier (fx_N,fy_N,vx_V,vy_V), which are fitted at once.",
 )
 @click.option(
@@ -64,9 +64,7 @@ _POOR_FIT = 0.02
     type=click.Path(path_type=Path),
     help="Write each measured load to this CSV file, which --loads reads.",
 )
-@click.option(
-    "--force", "replace", is_flag=True, help="Replace the file of --record if it is there already."
-)
+@click.option("--force", "replace", is_flag=True, help="Replace the file of --record if it exists.")
 @click.option("--yes", is_flag=True, help="Save without asking.")
 @endpoint_option
 def force(
@@ -81,9 +79,10 @@ def force(
 ) -> int:
     """Calibrate the force sensor with known loads.
 
-    You hang them: none at first, then one each along +x, -x, +y and -y, and these four again: how
-    the two differ says how well the gains are known. F_x is positive forward, F_y to the fish's
-    left. The daemon measures. Nothing changes before you have seen the fit and said yes.
+    You hang the loads: none at first, then one each along +x, -x, +y and -y, and these four
+    again: how the two differ shows how well the gains are known. F_x is positive forward, F_y to
+    the fish's left. The daemon measures. Nothing changes before you have seen the fit and
+    confirmed it.
     """
     steps = load_files.read(plan, unit) if plan else []
     if steps and (missing := missing_loads([(step.fx, step.fy) for step in steps])):
@@ -97,38 +96,39 @@ def force(
     if record:
         load_files.check_new(record, replace=replace)
     with Fish(endpoint) as fish, input_interrupted():
-        present = fish.calibrations()  # refused where there is nothing to calibrate
+        present = fish.calibrations()  # refused if there is nothing to calibrate
         limit = present.force_limit
         load_files.check_limit(steps, limit)
         try:
             if measured:
                 names = [f"load {n}" for n in range(1, len(steps) + 1)]
-                fitted = _fitted(names, measured, load_error)
+                fitted = _fit_loads(names, measured, load_error)
             else:
                 dialogue = Dialogue(fish, unit, seconds, record, limit)
                 dialogue.run([(step.fx, step.fy) for step in steps])
-                fitted = _fitted_with_help(dialogue, load_error)
-            seen = _answered(fish.status, plan if measured else None).fy_reversed
-            if doubt := _doubtful_sign(seen, present.force, fitted.calibration):
+                fitted = _fit_with_more_loads(dialogue, load_error)
+            is_reversed = _request_with_help(fish.status, plan if measured else None).fy_reversed
+            if doubt := _explain_doubtful_sign(is_reversed, present.force, fitted.calibration):
                 echo(f"warning: {doubt}", err=True)
-            good = yes or click.confirm("Use this calibration from now on, and save it?")
+            is_accepted = yes or click.confirm("Use this calibration from now on, and save it?")
         except (click.Abort, KeyboardInterrupt):
             echo("\nnothing was changed", err=True)
             raise
-        if not good:
+        if not is_accepted:
             echo("nothing was changed", err=True)
             return 1
-        saved = _answered(
+        saved = _request_with_help(
             lambda: fish.calibrate_force(fitted.calibration), plan if measured else None
         )
     echo(text.line(f"in use, and saved in {saved.force_file}"))
     return 0
 
 
-def _answered(ask: Callable[[], T], loads: Path | None) -> T:
-    """What fishd answers; while it does not, or refuses, the operator may mend that.
+def _request_with_help(ask: Callable[[], T], loads: Path | None) -> T:
+    """Return the reply of fishd; after an error, let the operator mend the cause and try again.
 
-    loads: the file where the loads are; None where they are nowhere else, and are to be kept
+    loads: file that holds the loads, for which the error is raised; None if only this process
+        holds them
     """
     while True:
         try:
@@ -141,15 +141,15 @@ def _answered(ask: Callable[[], T], loads: Path | None) -> T:
             choose("Mend that, then Enter to try again", "")
 
 
-def _doubtful_sign(
+def _explain_doubtful_sign(
     reversed_now: bool | None, present: ForceCalibration, new: ForceCalibration
 ) -> str:
-    """Why the sign of F_y is not to be believed, by what the tail did last; empty if it may be.
+    """Return why the last motion of the tail contradicts the sign of F_y; empty if it does not.
 
-    reversed_now: is F_y reversed with the present calibration? None where nobody knows
+    reversed_now: whether F_y is reversed with the present calibration; None if not known
     """
-    same = present.yx * new.yx + present.yy * new.yy > 0.0
-    if reversed_now is None or same is not reversed_now:
+    same_sign = present.yx * new.yx + present.yy * new.yy > 0.0
+    if reversed_now is None or same_sign is not reversed_now:
         return ""
     if reversed_now:
         return (
@@ -163,14 +163,14 @@ def _doubtful_sign(
     )
 
 
-def _fitted(names: list[str], loads: list[Load], load_error: float) -> Fit:
-    """Fit the loads and show how well that went; raises `PoorLoads`."""
+def _fit_loads(names: list[str], loads: list[Load], load_error: float) -> Fit:
+    """Fit the loads and print the quality of the fit; raise `PoorLoads` if it is bad."""
     fitted = fit(loads, load_error)
-    _show(names, loads, fitted)
+    _print_fit(names, loads, fitted)
     check(fitted, loads, names)
     largest = max(math.hypot(load.fx, load.fy) for load in loads)
     residual = fitted.calibration.residual
-    if residual > _POOR_FIT * largest:
+    if residual > _POOR_RESIDUAL * largest:
         echo(
             f"warning: the residual is {residual / largest:.0%} of the largest load; look at "
             f"{worst(fitted, names)} first",
@@ -179,43 +179,43 @@ def _fitted(names: list[str], loads: list[Load], load_error: float) -> Fit:
     return fitted
 
 
-def _fitted_with_help(dialogue: Dialogue, load_error: float) -> Fit:
-    """Fit what was measured. While the fit is refused, ask for more loads; none is lost."""
+def _fit_with_more_loads(dialogue: Dialogue, load_error: float) -> Fit:
+    """Fit the measured loads; while the fit is refused, ask for more loads and keep them all."""
     while True:
         dialogue.amend()
         try:
-            return _fitted(*dialogue.result(), load_error)
+            return _fit_loads(*dialogue.result(), load_error)
         except PoorLoads as error:
             echo(f"\n{error}", err=True)
 
 
-def _show(names: list[str], loads: list[Load], fitted: Fit) -> None:
-    wide = max(len("load"), *map(len, names))
-    echo(f"\n{'load':<{wide}}   F_x [mN]   F_y [mN]     V_x [V]     V_y [V]   errors [mN]")
+def _print_fit(names: list[str], loads: list[Load], fitted: Fit) -> None:
+    width = max(len("load"), *map(len, names))
+    echo(f"\n{'load':<{width}}   F_x [mN]   F_y [mN]     V_x [V]     V_y [V]   errors [mN]")
     for name, load, (ex, ey) in zip(names, loads, fitted.errors, strict=True):
         echo(
-            f"{name:<{wide}} {load.fx * 1e3:10.2f} {load.fy * 1e3:10.2f} {load.vx:11.5f} "
+            f"{name:<{width}} {load.fx * 1e3:10.2f} {load.fy * 1e3:10.2f} {load.vx:11.5f} "
             f"{load.vy:11.5f} {ex * 1e3:+8.2f} {ey * 1e3:+8.2f}"
         )
-    found = fitted.calibration
-    echo(f"\nF_x = {found.xx:+.5g} V_x {found.xy:+.5g} V_y {found.x0:+.5g}   [N, V]")
-    echo(f"F_y = {found.yx:+.5g} V_x {found.yy:+.5g} V_y {found.y0:+.5g}")
+    best = fitted.calibration
+    echo(f"\nF_x = {best.xx:+.5g} V_x {best.xy:+.5g} V_y {best.x0:+.5g}   [N, V]")
+    echo(f"F_y = {best.yx:+.5g} V_x {best.yy:+.5g} V_y {best.y0:+.5g}")
     echo(
-        f"residual {found.residual * 1e3:.3f} mN rms over {found.loads} loads, "
-        f"condition number {found.condition:.3g}"
+        f"residual {best.residual * 1e3:.3f} mN rms over {best.loads} loads, "
+        f"condition number {best.condition:.3g}"
     )
     for row, covariance in (
-        (("xx", "xy"), found.covariance_x),
-        (("yx", "yy"), found.covariance_y),
+        (("xx", "xy"), best.covariance_x),
+        (("yx", "yy"), best.covariance_y),
     ):
-        assert covariance is not None  # of a fit
-        first, both, second = covariance
-        correlation = both / math.sqrt(first * second) if first * second > 0.0 else 0.0
+        assert covariance is not None  # a fit has one
+        first, product, second = covariance
+        correlation = product / math.sqrt(first * second) if first * second > 0.0 else 0.0
         echo(
             f"{row[0]} ± {Z95 * math.sqrt(first):.2g}, {row[1]} ± {Z95 * math.sqrt(second):.2g} "
             f"N/V (95 %), correlation {correlation:+.2f}"
         )
-    share, load_error = found.thrust_ci95(1.0), found.load_error
+    share, load_error = best.thrust_ci95(1.0), best.load_error
     assert share is not None
     assert load_error is not None
     scatter = math.sqrt(max(0.0, share**2 - load_error**2))

@@ -15,23 +15,23 @@ from fishd.core.calibration import ForceSample
 G0 = 9.80665
 """Standard gravity [m/s²]: the weight of a gram is G0 millinewtons."""
 NEWTONS = {"N": 1.0, "g": G0 * 1e-3}
-"""One of each unit, in newtons."""
+"""Size of each unit [N]."""
 
 
 class Step(NamedTuple):
-    """One line of a file: forces [N], and voltages [V] where they were measured."""
+    """Line of a file: forces [N], and voltages [V] if they were measured."""
 
     fx: float
     fy: float
     volts: tuple[float, float] | None
     where: str
-    """File and line."""
+    """Name of the file and number of the line."""
     unit: str
-    """That the forces are given in."""
+    """Unit of the forces in the file."""
 
 
-def beyond(fx: float, fy: float, limit: float) -> str:
-    """Why a load [N] is none for a sensor that believes forces within ±`limit`; empty if it is."""
+def explain_excess(fx: float, fy: float, limit: float) -> str:
+    """Return why a load [N] is outside ±`limit` of the sensor; empty if it is inside."""
     largest = max(fx, fy, key=abs)
     if abs(largest) <= limit:
         return ""
@@ -39,17 +39,18 @@ def beyond(fx: float, fy: float, limit: float) -> str:
 
 
 def check_limit(steps: Sequence[Step], limit: float) -> None:
-    """Raises `click.ClickException` for the first load that is `beyond` the limit [N]."""
+    """Raise `click.ClickException` for the first load that is `explain_excess` the limit [N]."""
     for step in steps:
-        if why := beyond(step.fx, step.fy, limit):
+        if problem := explain_excess(step.fx, step.fy, limit):
             hint = "; are these grams? Then name the columns fx_g,fy_g" if step.unit == "N" else ""
-            raise click.ClickException(f"{step.where}: {why}{hint}")
+            raise click.ClickException(f"{step.where}: {problem}{hint}")
 
 
 def read(path: Path, unit: str) -> list[Step]:
-    """The loads of a file with columns fx_N and fy_N (or _g, or none: then in `unit`), vx_V, vy_V.
+    """Return the loads of a file with columns fx_N and fy_N, and vx_V, vy_V if measured.
 
-    Raises `click.ClickException` with one line that names file and line.
+    The suffix may be _g, too; columns without one are in `unit`. Raises `click.ClickException`
+    with one line that names file and line.
     """
     try:
         text = files.read_text(path, files.TABLE, "a table of loads", "utf-8-sig")
@@ -68,7 +69,7 @@ def read(path: Path, unit: str) -> list[Step]:
 
 
 def check_new(path: Path, *, replace: bool) -> None:
-    """Find out before the first load whether `write` may, and can; raises `ClickException`."""
+    """Raise `ClickException` if `write` would fail, or would replace a file without permission."""
     try:
         files.check_writable(path)
     except files.FileProblem as problem:
@@ -78,7 +79,7 @@ def check_new(path: Path, *, replace: bool) -> None:
 
 
 def write(path: Path, measured: Sequence[tuple[tuple[float, float], ForceSample]]) -> None:
-    """Write loads [N] and what was measured [V], as `read` takes it; raises OSError."""
+    """Write loads [N] and their samples [V] in the format of `read`; raises OSError."""
     table = io.StringIO()
     writer = csv.writer(table)
     writer.writerow(["fx_N", "fy_N", "vx_V", "vy_V", "vx_std_V", "vy_std_V", "pairs"])
@@ -89,18 +90,18 @@ def write(path: Path, measured: Sequence[tuple[tuple[float, float], ForceSample]
 
 
 def _columns(path: Path, names: list[str], unit: str) -> dict[str, tuple[str, float]]:
-    """For each quantity the column that holds it, and one of the column in SI."""
+    """Return for each quantity its column, and the unit of that column in SI."""
     columns = {}
     for quantity in ("fx", "fy"):
-        spellings = {f"{quantity}_{each}": factor for each, factor in NEWTONS.items()}
+        spellings = {f"{quantity}_{suffix}": factor for suffix, factor in NEWTONS.items()}
         spellings[quantity] = NEWTONS[unit]
-        found = [(name, spellings[name]) for name in names if name in spellings]
-        if len(found) != 1:
+        candidates = [(name, spellings[name]) for name in names if name in spellings]
+        if len(candidates) != 1:
             raise click.ClickException(
                 f"{path}:1: one column {quantity}_N or {quantity}_g is needed, such as in the "
                 "header fx_N,fy_N,vx_V,vy_V"
             )
-        columns[quantity] = found[0]
+        columns[quantity] = candidates[0]
     measured = [name for name in ("vx_V", "vy_V") if name in names]
     if len(measured) == 1:
         raise click.ClickException(f"{path}:1: vx_V and vy_V are needed, or neither for a plan")

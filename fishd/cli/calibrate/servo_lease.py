@@ -1,4 +1,4 @@
-"""The lease of `fishctl calibrate servo`: kept at prompts, ended on any way out."""
+"""The lease of `fishctl calibrate servo`: held during prompts, ended however the verb ends."""
 
 import contextlib
 import signal
@@ -16,23 +16,23 @@ from fishd.core.errors import FishError, Refused
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status
 
-_LOOK = 0.1
-"""Time between two looks at what fishd does [s]."""
-_PATIENCE = 15.0
-"""How long the way to neutral may take [s]."""
-_BRIEFLY = 2.0
-"""How long the end of a lease may take where the tail stays where it is [s]."""
+_POLL_INTERVAL_S = 0.1
+"""Time between two requests for the state of fishd [s]."""
+_NEUTRAL_TIMEOUT_S = 15.0
+"""Longest time for the tail to reach neutral [s]."""
+_ESTOP_TIMEOUT_S = 2.0
+"""Longest time for the end of a lease in mode estop, where the tail may stay in place [s]."""
 
 
 @contextlib.contextmanager
-def leased(
+def hold_lease(
     fish: Fish, before: ServoCalibration, begin: Callable[[], object]
 ) -> Iterator[LeaseRenewal]:
-    """Hold the fish meanwhile; on an error or a signal end the lease, and print the state then.
+    """Hold the lease of the fish; after an error or a signal, end it and print the state.
 
-    begin: begins the trial of a calibration, or raises why that cannot be
-    A lease that is lost raises `LeaseLost`, at a prompt too: set `when_lost` to nothing before the
-    calibration is saved. For the main thread, which alone can be interrupted.
+    A lost lease raises `LeaseLost`, at a prompt too: set `when_lost` to a function that does
+    nothing before the calibration is saved. For the main thread, which alone can be interrupted.
+    begin: begins the trial of a calibration, or raises an error
     """
     with fish.lease(*verb_lease(), idle_limit=None) as lease:
         begin()
@@ -43,7 +43,7 @@ def leased(
             if lease.lost:
                 raise lease.lost
 
-        # A terminal that is lost (ssh) must not leave the tail where it is.
+        # A lost terminal (ssh) must not leave the tail deflected.
         numbers = (signal.SIGINT, signal.SIGHUP, signal.SIGTERM, signal.SIGUSR1)
         handlers = {number: signal.signal(number, interrupt) for number in numbers}
         main = threading.get_ident()
@@ -55,8 +55,8 @@ def leased(
                 signal.signal(number, signal.SIG_IGN)
             lease.stop()
             lease.returned = True
-            outcome = _end(fish.endpoint, lease.token, before)
-            with contextlib.suppress(OSError):  # of the lost terminal
+            outcome = _end_lease(fish.endpoint, lease.token, before)
+            with contextlib.suppress(OSError):  # the terminal may be lost
                 echo(f"\n{outcome}", err=True)
             raise
         finally:
@@ -64,37 +64,39 @@ def leased(
                 signal.signal(number, handler)
 
 
-def _end(endpoint: str, lease: str, before: ServoCalibration) -> str:
-    """End a lease, wait until `before` is used again; one line on how things are then.
+def _end_lease(endpoint: str, lease: str, before: ServoCalibration) -> str:
+    """End a lease, wait until `before` is used again; return the state then, in one line.
 
-    On a connection of its own: no half-made request is on it.
+    It opens a new connection, without an unfinished request on it.
     """
     try:
         with Fish(endpoint) as fish:
             with contextlib.suppress(Refused):  # it has ended already
                 fish.end_lease(lease)
-            found, status = _settled(fish)
+            calibrations, status = _await_end_of_trial(fish)
     except FishError as error:
         return (
-            f"where the servo is cannot be told: {error}; a fishd that still runs goes back to "
+            f"the position of the servo is unknown: {error}; a fishd that still runs returns to "
             "the previous calibration by itself, within seconds"
         )
-    return f"{_servo(status)}; {_calibration(found, before)}"
+    return f"{_describe_servo(status)}; {_describe_calibration(calibrations, before)}"
 
 
-def _settled(fish: Fish) -> tuple[Calibrations, Status]:
+def _await_end_of_trial(fish: Fish) -> tuple[Calibrations, Status]:
     """Wait until the trial has ended and, in fault, the pulses, too."""
-    begun = time.monotonic()
+    start = time.monotonic()
     while True:
-        found, status = fish.calibrations(), fish.status()
-        done = not found.on_trial and not (status.mode == "fault" and status.servo_on)
-        stays = status.mode == "estop"  # the tail may stay where it is, and the lease with it
-        if done or time.monotonic() - begun > (_BRIEFLY if stays else _PATIENCE):
-            return found, status
-        time.sleep(_LOOK)
+        report, status = fish.calibrations(), fish.status()
+        done = not report.on_trial and not (status.mode == "fault" and status.servo_on)
+        is_estop = status.mode == "estop"  # the tail may stay in place, and the lease with it
+        if done or time.monotonic() - start > (
+            _ESTOP_TIMEOUT_S if is_estop else _NEUTRAL_TIMEOUT_S
+        ):
+            return report, status
+        time.sleep(_POLL_INTERVAL_S)
 
 
-def _servo(status: Status) -> str:
+def _describe_servo(status: Status) -> str:
     if status.reason:
         pulses = "cannot be released and may have pulses" if status.servo_on else "is released"
         return f"fishd is in {status.mode}, the servo {pulses}"
@@ -103,9 +105,9 @@ def _servo(status: Status) -> str:
     return "the servo is at neutral"
 
 
-def _calibration(found: Calibrations, before: ServoCalibration) -> str:
-    if found.on_trial:
+def _describe_calibration(calibrations: Calibrations, before: ServoCalibration) -> str:
+    if calibrations.on_trial:
         return "its calibration will be that of before as soon as the tail is at neutral"
-    if found.servo == before:
+    if calibrations.servo == before:
         return "its calibration is as before"
-    return f"its calibration is another one: {found.servo_file or 'on trial'}"
+    return f"its calibration is another one: {calibrations.servo_file or 'on trial'}"

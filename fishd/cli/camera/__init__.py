@@ -6,13 +6,13 @@ from fishd.cli.verbs import Verb, Verbs
 
 VERBS = {
     "Look": {
-        "status": Verb("camera.status", "status", "Show what the camera says of itself."),
+        "status": Verb("camera.status", "status", "Show the state of the camera."),
         "view": Verb("camera.view", "view", "Show its picture in the terminal, or write a PNG."),
         "page": Verb("camera.page", "page", "Show its picture live on a web page."),
     },
     "Set up": {
-        "align": Verb("camera.align", "align", "Find the axis of motion, and say how to turn it."),
-        "latency": Verb("camera.latency", "latency", "Measure how old its pictures are."),
+        "align": Verb("camera.align", "align", "Find the axis of motion, and how to turn it."),
+        "latency": Verb("camera.latency", "latency", "Measure the delay of its pictures."),
     },
     "Record": {
         "record": Verb("camera.record", "record", "Record its frames together with the fish."),

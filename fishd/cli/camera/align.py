@@ -1,4 +1,4 @@
-"""The verb that finds the axis of motion, and says how to turn the camera."""
+"""The verb that finds the axis of motion, and how to turn the camera."""
 
 import math
 import os
@@ -21,7 +21,7 @@ from fishd.cli.camera.options import (
 )
 from fishd.cli.options import FiniteRange, endpoint_option, for_option, json_option, take_option
 from fishd.cli.output import echo, echo_rows, print_json
-from fishd.cli.progress import showing
+from fishd.cli.progress import show_progress
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, NoDaemon
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from fishd.client import Fish
     from fishd.core.camera_frames import Frame
 
-LET_IT_SWIM = "let it swim, with 'fishctl set-controller swing', or add --swim"
+SWIM_REMEDY = "let it swim, with 'fishctl set-controller swing', or add --swim"
 
 
 @click.command()
@@ -39,7 +39,9 @@ LET_IT_SWIM = "let it swim, with 'fishctl set-controller swing', or add --swim"
 @endpoint_option
 @take_option
 @png_option
-@for_option("How long to look [s].", default=10.0, kind=FiniteRange(min=2.0, max=600.0))
+@for_option(
+    "Duration of the frames that are used [s].", default=10.0, kind=FiniteRange(min=2.0, max=600.0)
+)
 @click.option("--swim", is_flag=True, help="Let the fish swim meanwhile; it rests afterwards.")
 @json_option
 def align(
@@ -50,11 +52,11 @@ def align(
     swim: bool,
     as_json: bool,
 ) -> int:
-    """Find the axis of motion in frames, and say how to turn the camera, or what to set.
+    """Find the axis of motion in frames, and how to turn the camera, or what to set.
 
     The fish must swim. Frames should show its axis along their middle row, its head to the left:
-    what a policy learns on one side is then worth as much on the other. The picture shows what
-    moves, and the axis. Exit status: 0 where an axis was found, however it lies.
+    then what a policy learns on one side applies to the other. The picture shows what moves, and
+    the axis. Exit status: 0 if an axis was detected, wherever it lies.
     """
     from fishd.camera.alignment import judge
     from fishd.camera.axis import find_motion
@@ -64,50 +66,50 @@ def align(
     with ExitStack() as stack:
         fish = fish_of(endpoint, stack)
         if swim and fish is None:
-            raise NoDaemon("no fishd is running, so no fish can be let swim; leave --swim out")
+            raise NoDaemon("no fishd is running, so no fish can swim; leave --swim out")
         client = stack.enter_context(CameraClient(address, fish=fish if swim else None))
         settings = client.settings()
         try:
             if swim:
                 assert fish
-                frames = _while_it_swims(client, fish, seconds)
+                frames = _film_swim(client, fish, seconds)
             else:
                 _refuse_rest(client, fish, settings.source)
-                frames = _collected(client, seconds)
+                frames = _collect_frames(client, seconds)
         except KeyboardInterrupt:
-            echo("fishctl: interrupted: no axis is found", err=True)
+            echo("fishctl: interrupted: no axis was detected", err=True)
             return INTERRUPTED
         import numpy as np
 
         motion = find_motion(np.stack([frame.pixels for frame in frames]))
         state = client.status()
-    found = judge(motion, (state.picture_height, state.picture_width), settings)
+    alignment = judge(motion, (state.picture_height, state.picture_width), settings)
     if as_json:
-        print_json(_as_json(found, len(frames)))
+        print_json(_to_json(alignment, len(frames)))
     else:
-        _print(found, len(frames))
-    _draw(found, png, as_json)
+        _print_alignment(alignment, len(frames))
+    _draw_alignment(alignment, png, as_json)
     return 0
 
 
-def _collected(client: "CameraClient", seconds: float) -> list["Frame"]:
-    """The frames of so long, on the camera's clock; raises `CameraLost`."""
+def _collect_frames(client: "CameraClient", seconds: float) -> list["Frame"]:
+    """Return the frames of some seconds, by the camera's clock; raise `CameraLost`."""
     frames: list[Frame] = []
-    with showing(seconds, "s") as bar:
+    with show_progress(seconds, "s") as bar:
         for frame in client.frames():
             frames.append(frame)
-            passed = frame.time - frames[0].time
-            if passed < 0.0:
+            elapsed = frame.time - frames[0].time
+            if elapsed < 0.0:
                 raise FishdError("the camera was started again meanwhile: try again")
-            bar.at(passed)
-            if passed >= seconds:
+            bar.at(elapsed)
+            if elapsed >= seconds:
                 return frames
     return frames
 
 
-def _while_it_swims(client: "CameraClient", fish: "Fish", seconds: float) -> list["Frame"]:
+def _film_swim(client: "CameraClient", fish: "Fish", seconds: float) -> list["Frame"]:
     refuse_lockstep(client.state.virtual)
-    with rig_of(fish, seconds) as rig, showing(seconds, "s") as bar:
+    with rig_of(fish, seconds) as rig, show_progress(seconds, "s") as bar:
         watcher = Watcher(client, bar.at)
         rig.listener = watcher
         rig.swim("swing", {}, seconds)
@@ -118,15 +120,15 @@ def _while_it_swims(client: "CameraClient", fish: "Fish", seconds: float) -> lis
 
 
 def _refuse_rest(client: "CameraClient", fish: "Fish | None", source: str) -> None:
-    """Raise `FishdError` where the fish is known to rest."""
+    """Raise `FishdError` if the fish is known to rest."""
     if fish is not None and source != "stream" and not client.state.virtual:
         mode = fish.status().mode
         if mode != "running":
-            raise FishdError(f"the fish rests (mode {mode}), so nothing moves: {LET_IT_SWIM}")
+            raise FishdError(f"the fish rests (mode {mode}), so nothing moves: {SWIM_REMEDY}")
 
 
-def _print(found: "Alignment", frames: int) -> None:
-    axis, place = found.motion.axis, found.place
+def _print_alignment(alignment: "Alignment", frames: int) -> None:
+    axis, place = alignment.motion.axis, alignment.place
     side = "below" if axis.offset >= 0.0 else "above"
     slope = "down" if axis.tilt >= 0.0 else "up"
     echo_rows(
@@ -136,40 +138,40 @@ def _print(found: "Alignment", frames: int) -> None:
             (
                 "motion",
                 f"rows {place.top} to {place.bottom}, columns {place.left} to {place.right} of "
-                f"{found.motion.energy.shape[1]}",
+                f"{alignment.motion.energy.shape[1]}",
             ),
             ("from", f"{frames} frames"),
         ]
     )
-    if found.good:
+    if alignment.good:
         echo("well aligned")
-    for line in found.advice:
+    for line in alignment.advice:
         echo(line)
-    if found.settings:
+    if alignment.settings:
         echo("write into the file of the camera:")
-        echo(yaml_of(found.settings))
-        words = " ".join(f"--set {key}={value}" for key, value in found.settings.items())
-        echo(f"or try: fishd-camera {words}")
+        echo(yaml_of(alignment.settings))
+        options = " ".join(f"--set {key}={value}" for key, value in alignment.settings.items())
+        echo(f"or try: fishd-camera {options}")
 
 
-def _as_json(found: "Alignment", frames: int) -> dict[str, Any]:
-    axis = found.motion.axis
+def _to_json(alignment: "Alignment", frames: int) -> dict[str, Any]:
+    axis = alignment.motion.axis
     return {
         "offset": axis.offset,
         "tilt": axis.tilt,
-        "motion": found.place._asdict(),
+        "motion": alignment.place._asdict(),
         "frames": frames,
-        "sure": found.motion.sure,
-        "good": found.good,
-        "advice": found.advice,
-        "settings": found.settings,
+        "sure": alignment.motion.sure,
+        "good": alignment.good,
+        "advice": alignment.advice,
+        "settings": alignment.settings,
     }
 
 
-def _draw(found: "Alignment", png: Path | None, as_json: bool) -> None:
+def _draw_alignment(alignment: "Alignment", png: Path | None, as_json: bool) -> None:
     from fishd.camera import drawing
 
-    energy, axis = found.motion.energy, found.motion.axis
+    energy, axis = alignment.motion.energy, alignment.motion.axis
     colours = drawing.with_axis(drawing.motion_colours(energy), axis, len(energy))
     if png:
         large = drawing.enlarged(drawing.motion_colours(energy))

@@ -1,4 +1,4 @@
-"""What the verbs about a camera share: which camera, where a picture goes, and who swims."""
+"""Options and helpers of the verbs about a camera: its address, pictures, and the fish."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ camera_option = click.option(
     "--camera",
     "address",
     metavar="ADDRESS",
-    help="Where the camera takes requests; default: $FISHD_CAMERA, else the one of this machine.",
+    help="Request address of the camera; default: $FISHD_CAMERA, else the one of this machine.",
 )
 png_option = click.option(
     "--plot",
@@ -36,20 +36,20 @@ png_option = click.option(
 
 
 def check_png(path: Path | None) -> None:
-    """Refuse a picture that cannot be written, before anything moves or is looked at."""
+    """Raise `UsageError` if a picture cannot be written, before the verb does anything."""
     if path is None:
         return
-    refused, folder = f"'{path}' is not valid for --plot: ", path.parent
+    prefix, folder = f"'{path}' is not valid for --plot: ", path.parent
     if path.suffix.lower() != ".png":
-        raise click.UsageError(f"{refused}a name ending in .png is needed")
+        raise click.UsageError(f"{prefix}a name ending in .png is needed")
     if not folder.is_dir():
-        raise click.UsageError(f"{refused}there is no folder {folder}")
+        raise click.UsageError(f"{prefix}there is no folder {folder}")
     if not os.access(folder, os.W_OK | os.X_OK):
-        raise click.UsageError(f"{refused}nothing may be written into the folder {folder}")
+        raise click.UsageError(f"{prefix}nothing may be written into the folder {folder}")
 
 
 def yaml_of(settings: dict[str, Any]) -> str:
-    """Lines to be pasted into a file of settings; the keys of their sections have dots."""
+    """Return YAML lines for a file of settings; dots in the keys separate sections."""
     data: dict[str, Any] = {}
     for key, value in settings.items():
         *sections, name = key.split(".")
@@ -61,28 +61,28 @@ def yaml_of(settings: dict[str, Any]) -> str:
 
 
 class Watcher:
-    """Collects the frames that come while a fish swims, and its ticks."""
+    """Collector of the frames that come while a fish swims, and of its ticks."""
 
     def __init__(self, client: "CameraClient", passed: Callable[[float], None]) -> None:
-        """passed: gets how long it has swum so far [s]"""
+        """passed: called with the time that the fish has swum [s]"""
         self.frames: list[Frame] = []
         self.ticks: list[Tick] = []
         self._client = client
-        self._passed = passed
+        self._on_progress = passed
 
     def tick(self, tick: Tick) -> None:
-        """Take what has come meanwhile."""
+        """Add a tick, and the frames that have come since the last one."""
         self.ticks.append(tick)
         self.frames += self._client.poll()
-        self._passed(tick.time - self.ticks[0].time)
+        self._on_progress(tick.time - self.ticks[0].time)
 
     def event(self, event: Event) -> None:
-        """Nothing is needed of it."""
+        """Ignore an event."""
 
 
 @contextmanager
 def rig_of(fish: Fish, seconds: float) -> Iterator["LiveSession"]:
-    """The fish of a running fishd, at rest again afterwards; says that it swims."""
+    """Yield a session with the fish of a running fishd, which rests afterwards; print a notice."""
     from fishd.lab.session import LiveSession
 
     with ExitStack() as stack:
@@ -93,7 +93,7 @@ def rig_of(fish: Fish, seconds: float) -> Iterator["LiveSession"]:
 
 
 def fish_of(endpoint: str | None, stack: ExitStack) -> Fish | None:
-    """The fishd that runs, until `stack` is closed; None if none runs and none was named."""
+    """Return the running fishd, until `stack` is closed; None if none runs and none was named."""
     fish = stack.enter_context(Fish(endpoint))
     try:
         fish.status()
@@ -105,9 +105,9 @@ def fish_of(endpoint: str | None, stack: ExitStack) -> Fish | None:
 
 
 def refuse_lockstep(virtual: bool) -> None:
-    """Raise `FishdError` where time stands still unless an agent lets it pass."""
+    """Raise `FishdError` for a fishd in lockstep, whose time only advances with an agent."""
     if virtual:
         raise FishdError(
-            "this fishd is in lockstep: its fish swims only while an agent lets it; let it run "
+            "this fishd is in lockstep: its fish swims only while an agent steps it; run it "
             "with lockstep: false"
         )

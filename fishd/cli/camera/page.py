@@ -12,9 +12,9 @@ from fishd.cli.output import echo, print_json_line
 from fishd.core.errors import StartupError
 from fishd.core.process.interruption import on_signal
 
-PORT = 9876
-LEAVING = 1.0
-"""A camera that does not answer is waited for no longer at the end [s]."""
+DEFAULT_PORT = 9876
+JOIN_TIMEOUT_S = 1.0
+"""Longest wait for the thread of the camera at the end [s]."""
 
 
 @click.command()
@@ -22,7 +22,7 @@ LEAVING = 1.0
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
-    default=PORT,
+    default=DEFAULT_PORT,
     show_default=True,
     help="Port of the page; 0: any.",
 )
@@ -31,14 +31,14 @@ LEAVING = 1.0
     default="127.0.0.1",
     show_default=True,
     metavar="ADDRESS",
-    help="Address to serve it at. Whoever reaches another one than that of this machine sees what "
-    "the camera sees.",
+    help="Address of the page. The default is for this machine only; with another one, every "
+    "computer that reaches it can see the pictures.",
 )
 @json_option
 def page(address: str | None, port: int, host: str, as_json: bool) -> None:
     """Show what the camera sees on a web page, live, with the axis of motion, until Ctrl-C.
 
-    It needs nothing from the internet, and takes no request that changes anything.
+    It needs nothing from the internet, and accepts no request that changes anything.
     """
     with suppress(KeyboardInterrupt):
         asyncio.run(_serve(address, host, port, as_json))
@@ -53,7 +53,7 @@ async def _serve(address: str | None, host: str, port: int, as_json: bool) -> No
     server = PageServer(host, port)
 
     def tell(news: News) -> None:
-        with suppress(RuntimeError):  # the loop has ended meanwhile
+        with suppress(RuntimeError):  # the loop has ended
             loop.call_soon_threadsafe(server.show, news)
 
     feed = Feed(address, tell)
@@ -77,7 +77,7 @@ async def _serve(address: str | None, host: str, port: int, as_json: bool) -> No
                     echo(f"the camera is at {server.url}; Ctrl-C ends it")
                 await ended.wait()
             feed.stop()
-            await asyncio.to_thread(thread.join, LEAVING)
+            await asyncio.to_thread(thread.join, JOIN_TIMEOUT_S)
     except StartupError:
         feed.close()
         raise

@@ -27,7 +27,8 @@ def record(
     """Record a running fish and the frames of the camera above it in one file.
 
     RUN is a name in the folder of recordings or a path; by default the date and time. As `fishctl
-    record --camera`. A camera that is lost meanwhile ends nothing: that is said, and counted.
+    record --camera`. If the camera is lost, the
+    recording goes on; the loss is reported and counted.
     """
     from fishd.recording.camera_tap import CameraTap
 

@@ -1,4 +1,4 @@
-"""Pictures in a terminal: two pixels a character, or shades of grey where there are no colours."""
+"""Pictures in a terminal: two pixels a character, or shades of grey without colours."""
 
 import numpy as np
 from rich.color import Color
@@ -10,18 +10,18 @@ from fishd.camera.drawing import Colours
 from fishd.camera.picture import scaled
 
 _SHADES = " ░▒▓█"
-_STEP = 8
-"""Colours are told apart in steps of so many levels, so that few escape sequences are written."""
+_COLOUR_STEP = 8
+"""Levels that count as one colour, so that few escape sequences are written."""
 
 
 class TerminalPicture:
-    """A picture that fits the room that it is given."""
+    """Picture that is scaled to the space available."""
 
     def __init__(self, colours: Colours) -> None:
         self._colours = colours
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Lines of characters, each one pixel wide and two high."""
+        """Yield lines of characters, each one pixel wide and two high."""
         height, width = self._colours.shape[:2]
         room = 2 * max(1, (options.height or console.height) - 4)
         scale = min(1.0, options.max_width / width, room / height)
@@ -34,8 +34,8 @@ class TerminalPicture:
 
 
 def _blocks(upper: Colours, lower: Colours) -> RenderResult:
-    """Upper halves in the colour of the character, lower ones in that behind it."""
-    pairs = np.concatenate([upper, lower], axis=1) // _STEP * _STEP
+    """Yield half blocks: the upper pixel as foreground colour, the lower one as background."""
+    pairs = np.concatenate([upper, lower], axis=1) // _COLOUR_STEP * _COLOUR_STEP
     begin = 0
     changes = np.flatnonzero((pairs[1:] != pairs[:-1]).any(axis=1)) + 1
     for end in [*changes.tolist(), len(pairs)]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from fishd.cli.camera.options import camera_option, check_png, png_option
-from fishd.cli.drawing import whole_screen
+from fishd.cli.drawing import open_full_screen
 from fishd.cli.output import echo
 from fishd.core.errors import FishdError
 
@@ -20,24 +20,26 @@ if TYPE_CHECKING:
     from fishd.camera.client import CameraClient
     from fishd.camera.drawing import Colours
 
-LOOK = 8.0
-"""How long to look for an axis [s]."""
-REDRAW = 0.2
-"""Least time from one drawing to the next [s]."""
+AXIS_SEARCH_S = 8.0
+"""Duration of the search for an axis [s]."""
+REDRAW_INTERVAL_S = 0.2
+"""Shortest time from one drawing to the next [s]."""
 
 
 @click.command()
 @camera_option
 @png_option
-@click.option("--follow", is_flag=True, help="Go on until Ctrl-C; axis and numbers are renewed.")
-@click.option("--axis", is_flag=True, help="Look for some seconds first, to find the axis.")
-@click.option("--whole", is_flag=True, help="The camera's whole picture, not what frames show.")
+@click.option("--follow", is_flag=True, help="Update picture, axis and numbers until Ctrl-C.")
+@click.option("--axis", is_flag=True, help="Watch for some seconds to detect the axis.")
+@click.option(
+    "--whole", is_flag=True, help="Show the whole picture of the camera, not only the crop."
+)
 def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole: bool) -> None:
     """Show the camera's picture in the terminal: what frames show, with the axis of motion.
 
     With --follow and --axis the axis of motion is drawn in, once the tail has moved for some
-    seconds. Where standard output is not a terminal, a line is printed instead, with --follow one
-    a second.
+    seconds. If standard output is not a terminal, a line is printed instead; with --follow, one a
+    second.
     """
     from fishd.camera.axis_watch import AxisWatch
     from fishd.camera.client import CameraClient
@@ -52,25 +54,25 @@ def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole:
             with suppress(KeyboardInterrupt):
                 _follow(client, watch, whole)
             return
-        _await(client, watch, whole)
+        _await_picture(client, watch, whole)
         if axis:
             _find_axis(client, watch)
         if png:
-            _write(client, watch, whole, png)
+            _write_png(client, watch, whole, png)
         elif _can_draw():
             from rich.console import Console
 
             from fishd.cli.camera.terminal import TerminalPicture
 
             console = Console()
-            console.print(TerminalPicture(_picture(client, watch, whole)))
-            echo(facts(client, watch))
+            console.print(TerminalPicture(_draw_picture(client, watch, whole)))
+            echo(format_facts(client, watch))
         else:
-            echo(facts(client, watch))
+            echo(format_facts(client, watch))
 
 
-def facts(client: "CameraClient", watch: "AxisWatch") -> str:
-    """The latest frame in one line: its number, age, rate, losses, and the axis."""
+def format_facts(client: "CameraClient", watch: "AxisWatch") -> str:
+    """Return the latest frame in one line: its number, age, rate, losses, and the axis."""
     assert client.latest
     header = client.latest.header
     parts = [f"frame {header.seq}"]
@@ -84,57 +86,61 @@ def facts(client: "CameraClient", watch: "AxisWatch") -> str:
     return ", ".join(parts)
 
 
-def _await(client: "CameraClient", watch: "AxisWatch", whole: bool) -> None:
-    """Until there is a picture; raises `CameraLost`."""
+def _await_picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> None:
+    """Wait for the first picture; raise `CameraLost`."""
     pictures = client.views() if whole else client.frames()
     next(pictures)
     while client.latest is None:
-        _take(client, watch, 0.1)
+        _read_frames(client, watch, 0.1)
         client.check()
 
 
 def _find_axis(client: "CameraClient", watch: "AxisWatch") -> None:
-    """Look for `LOOK`; raises `FishdError` where nothing moves."""
-    _pass(client, watch, LOOK)
+    """Watch for `AXIS_SEARCH_S`; raise `FishdError` if nothing moves."""
+    _read_for(client, watch, AXIS_SEARCH_S)
     watch.find()
     if watch.axis is None:
-        raise FishdError("no axis is found, as no tail moves: let the fish swim, or omit --axis")
+        raise FishdError(
+            "no axis was detected, as no tail moves: let the fish swim, or omit --axis"
+        )
 
 
-def _take(client: "CameraClient", watch: "AxisWatch", seconds: float) -> None:
+def _read_frames(client: "CameraClient", watch: "AxisWatch", seconds: float) -> None:
     for frame in client.poll(seconds):
         watch.add(frame)
 
 
 def _follow(client: "CameraClient", watch: "AxisWatch", whole: bool) -> None:
-    _await(client, watch, whole)
+    _await_picture(client, watch, whole)
     if not _can_draw():
         while True:
-            echo(facts(client, watch))
-            _pass(client, watch, 1.0)
+            echo(format_facts(client, watch))
+            _read_for(client, watch, 1.0)
     from rich.console import Group
     from rich.text import Text
 
     from fishd.cli.camera.terminal import TerminalPicture
 
-    with whole_screen() as live:
+    with open_full_screen() as live:
         while True:
-            drawn = TerminalPicture(_picture(client, watch, whole))
-            live.update(Group(drawn, Text(facts(client, watch), no_wrap=True)), refresh=True)
-            _pass(client, watch, REDRAW)
+            drawing = TerminalPicture(_draw_picture(client, watch, whole))
+            live.update(
+                Group(drawing, Text(format_facts(client, watch), no_wrap=True)), refresh=True
+            )
+            _read_for(client, watch, REDRAW_INTERVAL_S)
 
 
-def _pass(client: "CameraClient", watch: "AxisWatch", seconds: float) -> None:
-    """Take what comes in so long [s]; raises `CameraLost` when nothing comes any more."""
+def _read_for(client: "CameraClient", watch: "AxisWatch", seconds: float) -> None:
+    """Read frames for some seconds; raise `CameraLost` if they have stopped."""
     end = time.monotonic() + seconds
     while (left := end - time.monotonic()) > 0.0:
-        _take(client, watch, left)
+        _read_frames(client, watch, left)
     client.check()
     if watch.due:
         watch.find()
 
 
-def _picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "Colours":
+def _draw_picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "Colours":
     from fishd.camera import drawing
 
     assert client.latest
@@ -147,12 +153,12 @@ def _picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "Colour
     return drawing.with_axis(drawing.coloured(pixels), watch.axis, len(pixels))
 
 
-def _write(client: "CameraClient", watch: "AxisWatch", whole: bool, png: Path) -> None:
+def _write_png(client: "CameraClient", watch: "AxisWatch", whole: bool, png: Path) -> None:
     from fishd.camera import drawing
 
-    colours = _picture(client, watch, whole)
+    colours = _draw_picture(client, watch, whole)
     drawing.write_png(png, colours if whole else drawing.enlarged(colours))
-    echo(f"{png}: {facts(client, watch)}")
+    echo(f"{png}: {format_facts(client, watch)}")
 
 
 def _can_draw() -> bool:

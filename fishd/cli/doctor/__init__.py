@@ -1,4 +1,4 @@
-"""`fishctl doctor`: looks at everything that fishd needs, and says how to mend what is wrong."""
+"""`fishctl doctor`: checks everything that fishd needs, and prints remedies."""
 
 import sys
 from collections import Counter
@@ -11,7 +11,7 @@ from fishd.cli.config import load_service, service_option, set_option
 from fishd.cli.doctor import computer, drivers, service, software, timing
 from fishd.cli.doctor.base import INSTALL, Context
 from fishd.cli.options import endpoint_option, json_option
-from fishd.cli.output import counted, echo, print_json
+from fishd.cli.output import echo, format_count, print_json
 from fishd.core import text
 from fishd.core.errors import MissingPackage
 from fishd.hardware.checks import Check, Result, fail
@@ -34,8 +34,8 @@ def doctor(
     running fishd is asked and not disturbed. Exit status 1 when a check failed, 78 when the
     configuration is wrong.
     """
-    config, found = load_service(file, overrides)
-    context = Context(config, found, endpoint or config.control.address)
+    config, used_file = load_service(file, overrides)
+    context = Context(config, used_file, endpoint or config.control.address)
     findings = []
     for name, result in examine(context):
         result = result._replace(message=text.line(result.message))
@@ -47,8 +47,9 @@ def doctor(
         print_json(findings)
     else:
         echo(
-            f"robot {config.robot}: {counts['ok']} ok, {counted(counts['warning'], 'warning')}, "
-            f"{counts['FAIL']} failed, {counts['skipped']} skipped"
+            f"robot {config.robot}: {counts['ok']} ok, "
+            f"{format_count(counts['warning'], 'warning')}, {counts['FAIL']} failed, "
+            f"{counts['skipped']} skipped"
         )
         if not config.has_hardware:
             echo("a simulated fish needs no hardware, so none was checked")
@@ -63,21 +64,21 @@ def _print(name: str, result: Result) -> None:
 
 
 def checks(context: Context) -> Iterator[Check]:
-    """Those that concern the configured robot, in the order in which they are made."""
-    every = (
+    """Return the checks for the configured robot, in their order."""
+    all_checks = (
         *software.CHECKS,
         *computer.CHECKS,
         *timing.CHECKS,
         *(drivers.checks(context) if context.config.has_hardware else ()),
         *service.CHECKS,
     )
-    return (check for check in every if context.robot in check.robots)
+    return (check for check in all_checks if context.robot in check.robots)
 
 
 def examine(context: Context) -> Iterator[tuple[str, Result]]:
-    """Make every check that concerns the configured robot: its name and what came out.
+    """Run every check for the configured robot; yield its name and result.
 
-    A check that fails to be made is itself a failure, and does not keep the others from being made.
+    A check that raises an error counts as failed, and the next ones still run.
     """
     for check in checks(context):
         try:
@@ -87,7 +88,7 @@ def examine(context: Context) -> Iterator[tuple[str, Result]]:
             mend = INSTALL if "fishd[pi]" in str(error) else f"{sys.executable} -m pip install it"
             result = fail(str(error), mend)
         except Exception as error:
-            what = f"this check broke off: {type(error).__name__}: {error}"
-            result = fail(what, "please report this, with the output of 'fishctl doctor --json'")
+            message = f"this check broke off: {type(error).__name__}: {error}"
+            result = fail(message, "please report this, with the output of 'fishctl doctor --json'")
         if result is not None:
             yield check.name, result

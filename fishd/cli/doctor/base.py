@@ -1,4 +1,4 @@
-"""What all checks of `fishctl doctor` look at: configuration, machine, and a running fishd."""
+"""Context of all checks of `fishctl doctor`: configuration, machine, and a running fishd."""
 
 import os
 import shlex
@@ -26,55 +26,58 @@ from fishd.hardware import ownership
 from fishd.hardware.checks import Machine, Result, skipped
 
 INSTALL = f"{sys.executable} -m pip install 'fishd[pi]'"
-"""Mends a missing driver."""
-PATIENCE = TIMEOUT
-"""How long a daemon may take to answer [s]."""
+"""Command that installs missing drivers."""
+ANSWER_TIMEOUT_S = TIMEOUT
+"""Longest wait for an answer of a daemon [s]."""
 
 
 class Running(NamedTuple):
-    """What a running daemon says."""
+    """State of a running daemon."""
 
     status: Status
     tick: Tick | None
-    """The latest; None where telemetry is silent."""
+    """Latest tick; None if telemetry is silent."""
     calibrations: Calibrations | None
-    """None for a robot that has none."""
+    """Calibrations in use; None for a robot that has none."""
     endpoint: str
 
 
 class Unreachable(NamedTuple):
-    """Something is at the endpoint, perhaps a fishd that owns the hardware, but does not answer."""
+    """Endpoint where a process, perhaps a fishd that owns the hardware, does not answer."""
 
     why: str
     forbidden: bool
-    """It is this user who may not ask."""
+    """Whether this user lacks the permission to connect."""
 
 
-def ask(endpoint: str | None) -> Running | Unreachable | None:
-    """What the daemon at an endpoint says; None where it is certain that nobody listens there.
+def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
+    """Return the state of the daemon at an endpoint; None if certainly no process listens there.
 
-    A fishd at another control.address cannot be known, even if it owns the same bus.
+    A fishd at another control.address stays undetected, even if it owns the same bus.
     """
     named, endpoint = endpoint, endpoint or find_control()
     try:
-        if is_nobody_at(endpoint):
+        if is_unused(endpoint):
             return None
     except PermissionError:
         return Unreachable(f"there may be a fishd at {endpoint}, but this user may not ask", True)
     try:
-        with Fish(named, timeout=PATIENCE) as fish:
+        with Fish(named, timeout=ANSWER_TIMEOUT_S) as fish:
             return Running(fish.status(), _latest_tick(fish), _calibrations(fish), endpoint)
     except Untrusted as error:
         why = str(error)
     except NoDaemon:
-        why = f"no answer from {endpoint} within {PATIENCE:g} s, but a fishd may be there"
+        why = f"no answer from {endpoint} within {ANSWER_TIMEOUT_S:g} s, but a fishd may be there"
     except FishError as error:
         why = str(error)
     return Unreachable(why, False)
 
 
-def is_nobody_at(endpoint: str) -> bool:
-    """True where it is certain; raises PermissionError where this user cannot know."""
+def is_unused(endpoint: str) -> bool:
+    """Return whether certainly no process listens there.
+
+    Raises PermissionError if this user cannot find out.
+    """
     path = socket_path(endpoint)
     if path is None:
         return _is_refused(endpoint)
@@ -88,7 +91,7 @@ def is_nobody_at(endpoint: str) -> bool:
 def _is_refused(endpoint: str) -> bool:
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     try:
-        socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
+        socket.create_connection((host.strip("[]"), int(port)), ANSWER_TIMEOUT_S).close()
     except ConnectionRefusedError:
         return True
     except (OSError, ValueError):
@@ -112,48 +115,48 @@ def _calibrations(fish: Fish) -> Calibrations | None:
 
 @dataclass
 class Context(Machine):
-    """What the checks look at: this machine, the configuration and a daemon, if one runs."""
+    """Context of the checks: this machine, the configuration and a daemon, if one runs."""
 
     config: Config
     file: Path | None = None
-    """The configuration file; None for the defaults."""
+    """Configuration file; None for the defaults."""
     endpoint: str | None = None
     root: Path = field(default_factory=lambda: Path("/"))
-    """Where /sys, /proc, /dev and so on are looked for."""
+    """Folder that holds /sys, /proc, /dev and so on."""
 
     @property
     def robot(self) -> str:
-        """That of the configuration."""
+        """Robot of the configuration."""
         return self.config.robot
 
     @cached_property
     def daemon(self) -> Running | Unreachable | None:
-        """What the daemon says, or why it cannot be asked; None where there certainly is none.
+        """State of the daemon, or why it does not answer; None if there certainly is none.
 
-        That is about the endpoint: of a fishd at another one, `occupied` may know.
+        This is the daemon at the endpoint; `occupied` may detect a fishd at another one.
         """
-        return ask(self.endpoint)
+        return ask_daemon(self.endpoint)
 
     @property
     def running(self) -> Running | None:
-        """What the daemon of this robot says; None where none answers, or that of another robot."""
-        found = self.daemon
-        if isinstance(found, Running) and found.status.robot == self.config.robot:
-            return found
+        """State of the daemon of this robot; None if none answers, or one of another robot."""
+        daemon = self.daemon
+        if isinstance(daemon, Running) and daemon.status.robot == self.config.robot:
+            return daemon
         return None
 
     @cached_property
     def owner(self) -> str:
-        """Which fishd, at whatever endpoint, drives a part of this robot; empty where none does."""
+        """Description of the fishd that drives a part of this robot, at any endpoint, or empty."""
         try:
             return ownership.owner(assembly.parts_of(self.config))
-        except StartupError:  # where a virtual Pi would be is no good place; the check will say so
+        except StartupError:  # invalid place of a virtual Pi; its check reports that
             return ""
 
     def occupied(self, by_fishd: str) -> Result | None:
-        """Why a check leaves the hardware alone; None where no fishd uses it.
+        """Return the result of a check if a fishd uses the hardware; None if no fishd does.
 
-        by_fishd: what to say of a running fishd
+        by_fishd: what a running fishd does with the hardware, such as "owns the sensor"
         """
         if isinstance(self.daemon, Unreachable):
             return skipped(f"{self.daemon.why}; {self.reach(self.daemon)}")
@@ -167,24 +170,24 @@ class Context(Machine):
         return skipped(f"{self.owner}; name it with --endpoint") if self.owner else None
 
     def reach(self, daemon: Unreachable) -> str:
-        """What to do so that the daemon can be asked."""
+        """Return the remedy for a daemon that does not answer."""
         if daemon.forbidden:
             return f"{self.as_fishd}, or name another with --endpoint"
         return "stop what hangs there, or name the fishd with --endpoint"
 
     @property
     def as_fishd(self) -> str:
-        """The command that makes these checks as the user of the service."""
+        """Command that runs these checks as the user of the service."""
         return self.as_user("fishd")
 
     def as_user(self, name: str) -> str:
-        """The command that makes these checks as another user."""
+        """Return the command that runs these checks as another user."""
         file = f" --config {self.file}" if self.file else ""
         return f"sudo -u {shlex.quote(name)} fishctl doctor{file}"
 
     @contextmanager
     def plugged_in(self) -> Iterator[None]:
-        """Where the robot is a virtual Pi: with its bus in this process. Raises `StartupError`."""
+        """Attach the bus to this process if the robot is a virtual Pi; raise `StartupError`."""
         with ExitStack() as stack:
             if self.robot == "virtual-pi":
                 assembly.plug_in_virtual_pi(self.config, stack)
@@ -192,11 +195,11 @@ class Context(Machine):
 
     @property
     def drivers(self) -> tuple[tuple[str, Plugins[Any], Any], ...]:
-        """Section, kind and settings of each driver: sensor, servo, and a power meter if any."""
+        """Section, plugins and settings of each driver: sensor, servo, and a power meter if any."""
         chosen = self.config.driver_settings.sections()
         return tuple((name, CHOICES[name].plugins, settings) for name, settings in chosen.items())
 
 
 def sudo_unless(uid: int) -> str:
-    """`sudo ` for a command that only this user, or root, may give; empty where that is us."""
+    """Return `sudo ` for a command of root or user `uid`; empty if this process is one of them."""
     return "" if os.geteuid() in (0, uid) else "sudo "

@@ -13,26 +13,26 @@ from fishd.core.errors import ConfigError
 from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.checks import Check, Result, fail, name_of, ok, skipped, warning
 
-LITTLE_DISK, NO_DISK = 1e9, 50e6
-"""Free space that is worth a warning, and that is too little [bytes]."""
+LOW_DISK_BYTES, FULL_DISK_BYTES = 1e9, 50e6
+"""Free space below which there is a warning, and below which the check fails [bytes]."""
 _THROTTLED = "/sys/devices/platform/soc/soc:firmware/get_throttled"
-_BEFORE = 16
-"""A flag of what happened since start is so many bits above that of what happens now."""
-_OLDEST = "brcm,bcm2835"
-"""The one slow core of a Pi 1, Zero and Zero W, in the device tree."""
+_HISTORY_SHIFT_BITS = 16
+"""Distance of the flag for the time since start from the flag for now [bits]."""
+_TOO_SLOW_PROCESSOR = "brcm,bcm2835"
+"""Processor of a Pi 1, Zero and Zero W, with one slow core, in the device tree."""
 _HEADER_OF_PI_5 = "1f000*"
-"""Devices of the RP1, the chip that a Pi 5 has its header on, where the kernel knows it."""
+"""Devices of the RP1, the chip of the header of a Pi 5, if the kernel supports it."""
 _RASPBERRY_PI_OS = "use Raspberry Pi OS, or see 'Which system' in docs/how-to/installing.md"
 
 
 def model(context: Context) -> Result:
-    """Robot `pi` is for a Raspberry Pi that is fast enough."""
+    """Check that the machine is a Raspberry Pi that is fast enough."""
     if "Raspberry Pi" not in context.model:
         return warning(
-            f"this machine is no Raspberry Pi: {context.model or 'it does not say what it is'}",
+            f"this machine is not a Raspberry Pi: {context.model or 'unknown model'}",
             "run fishd on the Pi, or set robot: simulated or virtual-pi",
         )
-    if _OLDEST in context.text("/proc/device-tree/compatible").split("\0"):
+    if _TOO_SLOW_PROCESSOR in context.text("/proc/device-tree/compatible").split("\0"):
         return fail(
             f"{context.model} has one core of ARMv6, too slow: its ticks would take 7 ms, one in a "
             "hundred more than 10 ms, and a release of the servo 7 s",
@@ -42,10 +42,10 @@ def model(context: Context) -> Result:
 
 
 def system(context: Context) -> Result | None:
-    """Raspberry Pi OS and plain Debian look alike, but only one knows all of the Pi."""
+    """Check for Raspberry Pi OS: plain Debian looks alike, but does not support all of the Pi."""
     if "Raspberry Pi" not in context.model:
         return None
-    name = _name(context)
+    name = _system_name(context)
     kernel = context.text("/proc/sys/kernel/osrelease") or "unknown"
     if "Raspberry Pi 5" in context.model and not any(
         context.path("/sys/bus/platform/devices").glob(_HEADER_OF_PI_5)
@@ -66,8 +66,11 @@ def system(context: Context) -> Result | None:
     return ok(f"{name}, kernel {kernel}")
 
 
-def _name(context: Context) -> str:
-    """Such as Raspberry Pi OS (Debian GNU/Linux 12 (bookworm)); the two have one os-release."""
+def _system_name(context: Context) -> str:
+    """Return a name such as Raspberry Pi OS (Debian GNU/Linux 12 (bookworm)).
+
+    Both systems have the same os-release.
+    """
     lines = dict(
         line.split("=", 1) for line in context.text("/etc/os-release").splitlines() if "=" in line
     )
@@ -76,58 +79,60 @@ def _name(context: Context) -> str:
 
 
 def power(context: Context) -> Result:
-    """What the firmware says, or the kernel's own under-voltage alarm."""
+    """Check the power supply, by the firmware or the under-voltage alarm of the kernel."""
     if text := context.text(_THROTTLED):
-        return _firmware(int(text, 16))
+        return _judge_flags(int(text, 16))
     for monitor in sorted(context.path("/sys/class/hwmon").glob("hwmon*")):
         if context.text(f"/sys/class/hwmon/{monitor.name}/name") == "rpi_volt":
             alarm = context.text(f"/sys/class/hwmon/{monitor.name}/in0_lcrit_alarm") == "1"
-            return _firmware(1) if alarm else ok("no under-voltage")
-    return skipped("this machine does not tell whether its power suffices")
+            return _judge_flags(1) if alarm else ok("no under-voltage")
+    return skipped("this machine does not report whether its power suffices")
 
 
-def _firmware(flags: int) -> Result:
+def _judge_flags(flags: int) -> Result:
     if flags & 1:
         return fail(
             "under-voltage: the Pi gets less than 4.63 V",
-            f"use a stronger power supply and a shorter cable; {_APART}",
+            f"use a stronger power supply and a shorter cable; {_SUPPLY_REMEDY}",
         )
     if now := [text for bit, text in _FLAGS.items() if flags >> bit & 1]:
-        return warning(f"the Pi is {' and '.join(now)}", _COOL)
-    if before := [text for bit, text in _FLAGS.items() if flags >> bit + _BEFORE & 1]:
-        since = f"since it was started, the Pi has been {' and '.join(before)}"
-        return warning(since, f"{_COOL}; {_APART}")
+        return warning(f"the Pi is {' and '.join(now)}", _COOL_REMEDY)
+    if past := [text for bit, text in _FLAGS.items() if flags >> bit + _HISTORY_SHIFT_BITS & 1]:
+        message = f"since it was started, the Pi has been {' and '.join(past)}"
+        return warning(message, f"{_COOL_REMEDY}; {_SUPPLY_REMEDY}")
     return ok("no under-voltage, not throttled")
 
 
 _FLAGS = {0: "under-voltage", 1: "slowed down", 2: "throttled", 3: "too hot"}
-_COOL = "cool it, and check its power supply"
-_APART = "give the servo a supply of its own"
+_COOL_REMEDY = "cool it, and check its power supply"
+_SUPPLY_REMEDY = "power the servo from a separate supply"
 
 
 def state(context: Context) -> Result:
-    """Calibrations and whatever else outlives the daemon are kept there."""
+    """Check the folder that keeps calibrations and other state of the daemon."""
     if context.running and context.running.calibrations:
         return skipped("fishd is running: it writes to its own folder")
     folder = state_folder(context.config)
-    there = _nearest(folder)
-    if not there.is_dir():
+    parent = _visible_folder(folder)
+    if not parent.is_dir():
         return fail(
-            f"{there} is no folder", f"move it away, or set state_folder; {folder} is needed"
+            f"{parent} is not a folder", f"move it away, or set state_folder; {folder} is needed"
         )
-    if os.statvfs(there).f_flag & os.ST_RDONLY:
+    if os.statvfs(parent).f_flag & os.ST_RDONLY:
         return fail(
-            f"{folder}: {there} is on a read-only file system",
+            f"{folder}: {parent} is on a read-only file system",
             "mount it read-write ('mount' shows how it is mounted, 'dmesg' whether it broke), or "
             "set state_folder",
         )
-    if not os.access(there, os.W_OK | os.X_OK):
-        return fail(f"{folder}: no permission to write to {there}", _permit(context, there))
-    return ok(f"{folder}" + ("" if there == folder else ", which will be made when it is needed"))
+    if not os.access(parent, os.W_OK | os.X_OK):
+        return fail(
+            f"{folder}: no permission to write to {parent}", _suggest_permission(context, parent)
+        )
+    return ok(f"{folder}" + ("" if parent == folder else ", which will be made when it is needed"))
 
 
-def _permit(context: Context, folder: Path) -> str:
-    """How to be one who may write to a folder; it is not taken away from its owner."""
+def _suggest_permission(context: Context, folder: Path) -> str:
+    """Return the remedy for a folder without write permission; its owner does not change."""
     uid = folder.stat().st_uid
     if uid == os.geteuid():
         return f"chmod u+wx {folder}, or set state_folder"
@@ -136,70 +141,70 @@ def _permit(context: Context, folder: Path) -> str:
     user = name_of(uid)
     return (
         f"it belongs to user {user}: run fishd and this as {user} ({context.as_user(user)}), or "
-        "set state_folder to a folder of your own"
+        "set state_folder to a folder that you own"
     )
 
 
 def disk(context: Context) -> Result:
-    """A full disk loses calibrations and logs."""
-    there = _nearest(state_folder(context.config))
-    free = shutil.disk_usage(there).free
-    message = f"{free / 1e9:.1f} GB free at {there}"
+    """Check the free space: a full disk loses calibrations and logs."""
+    parent = _visible_folder(state_folder(context.config))
+    free = shutil.disk_usage(parent).free
+    message = f"{free / 1e9:.1f} GB free at {parent}"
     mend = "remove old recordings and logs (journalctl --vacuum-size=100M)"
-    if free < NO_DISK:
+    if free < FULL_DISK_BYTES:
         return fail(message, mend)
-    return warning(message, mend) if free < LITTLE_DISK else ok(message)
+    return warning(message, mend) if free < LOW_DISK_BYTES else ok(message)
 
 
 def calibrations(context: Context) -> Result:
-    """Both calibrations that fishd uses, or would use."""
+    """Check both calibrations that fishd uses, or would use."""
     folder = CalibrationFolder(state_folder(context.config))
-    if context.running and (found := context.running.calibrations):
-        file = found.force_file or found.servo_file
+    if context.running and (in_use := context.running.calibrations):
+        file = in_use.force_file or in_use.servo_file
         if file:
             folder = CalibrationFolder(Path(file).parent)
-        result = _in_force(found.force, found.servo.date)
+        result = _judge_calibrations(in_use.force, in_use.servo.date)
     else:
         try:
             newest_force = folder.newest(ForceCalibration)
             newest_servo = folder.newest(ServoCalibration)
         except ConfigError as error:
-            return _unreadable(context, folder.folder, str(error))
+            return _judge_unreadable(context, folder.folder, str(error))
         force = newest_force[0] if newest_force else ForceCalibration()
-        result = _in_force(force, newest_servo[0].date if newest_servo else "")
-    with suppress(ConfigError):  # that of a fishd which answers is not always for us to read
+        result = _judge_calibrations(force, newest_servo[0].date if newest_servo else "")
+    with suppress(ConfigError):  # the folder of a running fishd may be unreadable
         if ignored := folder.ignored():
-            mend = result.mend or "rename it as it was, or move it away"
+            mend = result.mend or "restore its name, or move it away"
             return warning("; ".join([result.message, *ignored]), mend)
     return result
 
 
-def _in_force(force: ForceCalibration, servo: str) -> Result:
-    """servo: the date of its calibration"""
+def _judge_calibrations(force: ForceCalibration, servo: str) -> Result:
+    """Judge the calibrations in use; servo: date of that of the servo, or empty."""
     if force.untouched:
         tared = f"tared {force.tared}, but never calibrated" if force.tared else "not calibrated"
         return warning(f"the force sensor is {tared}: forces are volts", "fishctl calibrate force")
     share = force.thrust_ci95(1.0)
-    known = "its uncertainty is unknown" if share is None else f"a thrust is known to ± {share:.2%}"
+    error = "its uncertainty is unknown" if share is None else f"a thrust is known to ± {share:.2%}"
     if not servo:
         return warning(
-            f"force of {force.date} ({known}); the servo has no calibration but that of the "
+            f"force of {force.date} ({error}); the servo has no calibration but that of the "
             "configuration",
             "fishctl calibrate servo",
         )
-    return ok(f"force of {force.date} ({known}), servo of {servo}")
+    return ok(f"force of {force.date} ({error}), servo of {servo}")
 
 
-def _unreadable(context: Context, folder: Path, complaint: str) -> Result:
+def _judge_unreadable(context: Context, folder: Path, complaint: str) -> Result:
     if os.strerror(errno.EACCES) in complaint:
         return warning(complaint, f"run this as the user of fishd: {context.as_fishd}")
-    if not _nearest(folder).is_dir():
+    if not _visible_folder(folder).is_dir():
         return fail(complaint, "mend the state folder first, see 'state folder'")
     return fail(complaint, "mend that file, or remove it: the one before is used then")
 
 
-def _nearest(folder: Path) -> Path:
-    """The folder, or the nearest above it that this user can see."""
+def _visible_folder(folder: Path) -> Path:
+    """Return the folder, or the nearest folder above it that this user can see."""
     return next(path for path in (folder, *folder.parents) if os.access(path, os.F_OK))
 
 

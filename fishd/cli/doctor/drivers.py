@@ -1,6 +1,6 @@
 """Checks of the robot's drivers: their own, those that are the same for all, and their pins.
 
-A running fishd is asked instead of its hardware.
+While a fishd runs, they ask it and leave its hardware alone.
 """
 
 import os
@@ -19,24 +19,24 @@ from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
 
-TRIAL = 1.0
-"""How long the sensor is tried [s]."""
+TRIAL_S = 1.0
+"""Duration of the trial of the sensor [s]."""
 _DEBUG = "/sys/kernel/debug"
-_LINE = re.compile(r"\(GPIO(?P<pin>\d+)\s*\|(?P<user>[^)]*?)\s*\)")
+_GPIO_LINE = re.compile(r"\(GPIO(?P<pin>\d+)\s*\|(?P<user>[^)]*?)\s*\)")
 
 
 def checks(context: Context) -> tuple[Check, ...]:
-    """All of them, for the drivers of the configuration."""
-    (_, sensor, sensor_settings), (_, servo, servo_settings), *others = context.drivers
-    of_servo = servo.find(servo_settings.driver).checks(servo_settings)
+    """Return all checks, for the drivers of the configuration."""
+    (_, sensor, sensor_settings), (_, servo, servo_settings), *meters = context.drivers
+    servo_checks = servo.find(servo_settings.driver).checks(servo_settings)
     return (
         Check("drivers", drivers),
         *sensor.find(sensor_settings.driver).checks(sensor_settings),
         Check("force", force),
-        *(of_servo or (Check("servo", servo_opens),)),
+        *(servo_checks or (Check("servo", servo_opens),)),
         *(
             check
-            for _, meter, settings in others
+            for _, meter, settings in meters
             for check in meter.find(settings.driver).checks(settings)
         ),
         Check("gpio pins", pins, ("pi",)),
@@ -44,7 +44,7 @@ def checks(context: Context) -> tuple[Check, ...]:
 
 
 def drivers(context: Context) -> Result:
-    """Which ones, and whose."""
+    """Report each driver, and its package."""
     return ok(
         ", ".join(
             f"{section} {settings.driver} of {plugins.package(settings.driver)}"
@@ -54,7 +54,7 @@ def drivers(context: Context) -> Result:
 
 
 def servo_opens(context: Context) -> Result:
-    """That a driver without checks of its own can be opened; no pulses begin."""
+    """Check that a servo driver that defines no checks can be opened; no pulses begin."""
     if occupied := context.occupied("drives the servo; see daemon"):
         return occupied
     settings, tick = context.config.servo, context.config.tick
@@ -71,7 +71,7 @@ def servo_opens(context: Context) -> Result:
 
 
 def force(context: Context) -> Result:
-    """What the running daemon measures; without one, the same driver for a second."""
+    """Check the measurements of the running daemon, or of the driver for a second."""
     if context.running:
         return _force_of_daemon(context)
     if occupied := context.occupied("owns the sensor"):
@@ -81,7 +81,7 @@ def force(context: Context) -> Result:
         with context.plugged_in(), ExitStack() as stack:
             sensor = open_sensor(config, SystemClock(), threaded=True)
             stack.callback(sensor.close)
-            trials = list(_windows(sensor, config.tick))
+            trials = list(_trial_windows(sensor, config.tick))
     except MissingPackage:
         raise
     except (ConfigError, StartupError) as error:
@@ -89,7 +89,7 @@ def force(context: Context) -> Result:
         return fail(str(error), START_VIRTUAL_PI if virtual else "mend what this line says")
     except SensorError as error:
         return fail(str(error), "mend what the lines above say first")
-    suspicions = [why for _, why in trials if why]
+    suspicions = [suspicion for _, suspicion in trials if suspicion]
     per_tick = sum(count for count, _ in trials) / len(trials)
     if not per_tick:
         return fail("the sensor answers, but delivers nothing", "switch its power off and on")
@@ -98,7 +98,7 @@ def force(context: Context) -> Result:
             f"not to be believed in {len(suspicions)} of {len(trials)} ticks: {suspicions[-1]}",
             "check the wires of the sensor, its amplifier, and its range",
         )
-    return _enough(per_tick, context, "not clipped, not frozen")
+    return _judge_rate(per_tick, context, "not clipped, not frozen")
 
 
 def _force_of_daemon(context: Context) -> Result:
@@ -112,7 +112,7 @@ def _force_of_daemon(context: Context) -> Result:
             "mend the cause, then fishctl clear-fault",
         )
     transport = FORCE_SENSORS.find(context.config.force_sensor.driver).transport
-    survived = ", ".join(
+    errors = ", ".join(
         f"{n} {name}" for name, n in status.counters.items() if name.startswith(transport) and n
     )
     if tick.samples == 0:
@@ -120,13 +120,13 @@ def _force_of_daemon(context: Context) -> Result:
             f"no new sample in the latest tick, the newest is {tick.age_ms:.0f} ms old",
             "fishctl watch; check the wires if this goes on",
         )
-    return _enough(
-        tick.samples, context, f"the newest {tick.age_ms:.0f} ms old, {survived or 'no errors'}"
+    return _judge_rate(
+        tick.samples, context, f"the newest {tick.age_ms:.0f} ms old, {errors or 'no errors'}"
     )
 
 
-def _enough(per_tick: float, context: Context, details: str) -> Result:
-    """Compare with what a healthy bus gives at this data rate and tick."""
+def _judge_rate(per_tick: float, context: Context, details: str) -> Result:
+    """Compare the sample rate with that of a healthy bus at this data rate and tick."""
     config = context.config
     driver = FORCE_SENSORS.find(config.force_sensor.driver)
     expected = driver.pair_rate(config.force_sensor) * config.tick
@@ -140,12 +140,12 @@ def _enough(per_tick: float, context: Context, details: str) -> Result:
     return ok(message)
 
 
-def _windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str]]:
-    """Samples and suspicion of each window; the first, in which the sampler starts, is left out."""
+def _trial_windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str]]:
+    """Yield samples and suspicion of each window, without the first, when the sampler starts."""
     latest: SensorError | None = None
-    began = time.monotonic()
+    start = time.monotonic()
     first = True
-    while time.monotonic() - began < TRIAL:
+    while time.monotonic() - start < TRIAL_S:
         time.sleep(tick)
         try:
             measurement = sensor.read(time.monotonic())
@@ -160,7 +160,7 @@ def _windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str]]:
 
 
 def pins(context: Context) -> Result | None:
-    """Who holds the pins that are configured, as far as the kernel knows."""
+    """Check that no program holds the configured pins, as far as the kernel knows."""
     config = context.config
     wanted = {config.panel.estop_gpio: "panel.estop_gpio", config.panel.led_gpio: "panel.led_gpio"}
     wanted |= {
@@ -168,15 +168,15 @@ def pins(context: Context) -> Result | None:
         for section, claims in claims_of(config.driver_settings).items()
         for claim in claims
         for pin in claim.pins
-        if claim.key != "bus"  # whose pins the kernel drives
+        if claim.key != "bus"  # the kernel drives the pins of a bus
     }
     wanted.pop(None, None)
     text = context.text(f"{_DEBUG}/gpio")
     if not text:
-        return skipped(_why_unseen(context))
+        return skipped(_explain_unseen(context))
     if occupied := context.occupied("uses its pins"):
         return occupied
-    users = {int(found["pin"]): found["user"].strip() for found in _LINE.finditer(text)}
+    users = {int(match["pin"]): match["user"].strip() for match in _GPIO_LINE.finditer(text)}
     taken = [
         f"GPIO{pin} ({key}) is used by {users[pin]}"
         for pin, key in wanted.items()
@@ -189,7 +189,7 @@ def pins(context: Context) -> Result | None:
     return ok(", ".join(f"GPIO{pin}" for pin in wanted) + " free")
 
 
-def _why_unseen(context: Context) -> str:
+def _explain_unseen(context: Context) -> str:
     if os.geteuid() != 0:
         return "only root can see who uses GPIO pins: sudo fishctl doctor"
     try:

@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import zmq
 
-from fishd.cli.doctor.base import PATIENCE, Context, Running, Unreachable, is_nobody_at
+from fishd.cli.doctor.base import ANSWER_TIMEOUT_S, Context, Running, Unreachable, is_unused
 from fishd.core import addresses
 from fishd.core.errors import FishError, StartupError
 from fishd.hardware.checks import Check, Result, fail, ok, skipped, warning
@@ -16,7 +16,7 @@ _UNIT_FOLDERS = ("/etc/systemd/system", "/usr/local/lib/systemd/system", "/usr/l
 
 
 def daemon(context: Context) -> Result:
-    """Whether one runs, and what it is doing."""
+    """Check whether a fishd runs, and its state."""
     if context.daemon is None:
         if context.owner:
             return warning(
@@ -46,49 +46,49 @@ def daemon(context: Context) -> Result:
 
 
 def telemetry(context: Context) -> Result:
-    """Free, or the daemon's."""
-    return _address(context, context.config.telemetry.address, "telemetry.address")
+    """Check that the address of telemetry is free, or used by the daemon."""
+    return _check_address(context, context.config.telemetry.address, "telemetry.address")
 
 
 def control(context: Context) -> Result:
-    """Free, or the daemon's."""
+    """Check that the control address is free, or used by the daemon."""
     served = context.daemon.endpoint if isinstance(context.daemon, Running) else None
     try:
         address = context.config.control.address or served or addresses.control_address()
     except StartupError as error:
         return fail(str(error), "set control.address, or run this as the user whose folder it is")
-    return _address(context, address, "control.address")
+    return _check_address(context, address, "control.address")
 
 
 def unit(context: Context) -> Result:
-    """Installed and enabled, by the files that systemd goes by."""
+    """Check that the systemd unit is installed and enabled, by the files that systemd reads."""
     if not context.path("/run/systemd/system").is_dir():
         return skipped("systemd does not run on this machine")
-    found = [folder for folder in _UNIT_FOLDERS if context.path(f"{folder}/{UNIT}").exists()]
-    if not found:
+    folders = [folder for folder in _UNIT_FOLDERS if context.path(f"{folder}/{UNIT}").exists()]
+    if not folders:
         return warning(
             f"{UNIT} is not installed: fishd does not start by itself", "make install-pi"
         )
     wants = context.path(_UNIT_FOLDERS[0]).glob(f"*.wants/{UNIT}")
     if not any(True for _ in wants):
         return warning(f"{UNIT} is not enabled", f"sudo systemctl enable --now {UNIT}")
-    return ok(f"{Path(found[0]) / UNIT}, enabled")
+    return ok(f"{Path(folders[0]) / UNIT}, enabled")
 
 
 def camera(context: Context) -> Result | None:
-    """What a fishd-camera of this machine says, where there is one."""
+    """Check the fishd-camera of this machine, if one runs."""
     try:
-        from fishd.camera import requests  # numpy, which nothing else here needs
+        from fishd.camera import requests  # imports numpy, which no other check needs
     except ImportError:
         return None
     address = requests.find_camera()
     with suppress(PermissionError):
-        if is_nobody_at(address):
+        if is_unused(address):
             return None
     zmq_context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     try:
-        asking = requests.CameraRequests(address, zmq_context, PATIENCE)
-        state = asking.status()
+        client = requests.CameraRequests(address, zmq_context, ANSWER_TIMEOUT_S)
+        state = client.status()
     except (FishError, msgspec.MsgspecError) as error:
         return warning(str(error), "see what listens there, or restart fishd-camera")
     finally:
@@ -102,11 +102,11 @@ def camera(context: Context) -> Result | None:
     return ok(message)
 
 
-def _address(context: Context, address: str, key: str) -> Result:
-    found = context.daemon
-    if isinstance(found, Unreachable):  # to bind could take its socket away
+def _check_address(context: Context, address: str, key: str) -> Result:
+    daemon = context.daemon
+    if isinstance(daemon, Unreachable):  # binding could take its socket away
         return skipped("not tried: a fishd may use it; see 'daemon'")
-    if found and address in (found.status.telemetry, found.endpoint):
+    if daemon and address in (daemon.status.telemetry, daemon.endpoint):
         return ok(f"{address} is served by the running fishd")
     try:
         with addresses.claimed(address), addresses.listen(address, key):

@@ -1,4 +1,4 @@
-"""Checks of fishd's own software: Python, packages, configuration file."""
+"""Checks of the software of fishd: Python, packages, configuration file."""
 
 import importlib
 import re
@@ -12,38 +12,38 @@ from fishd.hardware.checks import Check, Result, fail, ok, warning
 from fishd.hardware.registry import PACKAGES
 
 _MODULES = {package: module for module, package in PACKAGES.items()} | {
-    "adafruit-blinka": "adafruit_blinka",  # not one of its own, such as board, which looks for pins
+    "adafruit-blinka": "adafruit_blinka",  # not its module board, which needs pins
     "pyyaml": "yaml",
     "pyzmq": "zmq",
 }
-"""Where the module has another name than its package."""
+"""Module of each package whose module has another name."""
 _REQUIREMENT = re.compile(
     r"(?P<name>[\w.-]+)\s*(?P<bounds>[^;]*)(;.*extra == [\"'](?P<extra>.+)[\"'])?"
 )
-_SWIMMER = {("swimmer", "numba"), ("lab", "scipy")}
-"""Extra and package of what `robot: swimmer` needs."""
+_SWIMMER_PACKAGES = {("swimmer", "numba"), ("lab", "scipy")}
+"""Extra and package of each requirement of `robot: swimmer`."""
 _BOUND = re.compile(r"(>=|<|==)\s*([\d.]+)")
 
 
 def configuration(context: Context) -> Result:
-    """That it is valid is known by now; whether strangers may change it is not."""
+    """Check whether every user may change the configuration file, which is valid."""
     file = context.file
     if file is None:
         return ok(f"the defaults: robot {context.config.robot}; --config FILE to check a file")
     try:
-        found = file.stat()
+        status = file.stat()
     except OSError as error:
         return warning(f"{file}: {error.strerror}", "give a file that exists")
-    if stat.S_ISREG(found.st_mode) and found.st_mode & stat.S_IWOTH:
+    if stat.S_ISREG(status.st_mode) and status.st_mode & stat.S_IWOTH:
         return warning(
             f"{file}: good, but everybody on this machine may change it",
-            f"{sudo_unless(found.st_uid)}chmod o-w {file}",
+            f"{sudo_unless(status.st_uid)}chmod o-w {file}",
         )
     return ok(f"{file}: good, robot {context.config.robot}")
 
 
 def packages(context: Context) -> Result:
-    """Those that this configuration needs, as fishd's own metadata demands them."""
+    """Check the packages that this configuration needs, by the metadata of fishd."""
     robot, wanted, drivers = context.robot, [], list[str]()
     texts, packages = list(metadata.requires("fishd") or []), set[str]()
     if context.config.has_hardware:
@@ -52,22 +52,22 @@ def packages(context: Context) -> Result:
             texts += plugins.requirements(settings.driver)
             drivers.append(settings.driver)
     for text in texts:
-        found = _REQUIREMENT.match(text)
-        assert found
-        name, extra = found["name"].lower(), found["extra"]
-        of_swimmer = robot == "swimmer" and (extra, name) in _SWIMMER
-        if extra is None or (extra == "pi" and name in packages) or of_swimmer:
-            wanted.append((name, found["bounds"]))
-    problems = [problem for name, bounds in wanted if (problem := _problem(name, bounds))]
+        match = _REQUIREMENT.match(text)
+        assert match
+        name, extra = match["name"].lower(), match["extra"]
+        is_for_swimmer = robot == "swimmer" and (extra, name) in _SWIMMER_PACKAGES
+        if extra is None or (extra == "pi" and name in packages) or is_for_swimmer:
+            wanted.append((name, match["bounds"]))
+    problems = [problem for name, bounds in wanted if (problem := _find_problem(name, bounds))]
     if problems:
         extra = {"simulated": "fishd", "swimmer": "fishd[swimmer]"}.get(robot, "fishd[pi]")
         return fail("; ".join(problems), f"{sys.executable} -m pip install '{extra}'")
-    who = f"robot {robot} with {' and '.join(drivers)}" if drivers else f"robot {robot}"
-    return ok(f"all {len(wanted)} that {who} needs, under {sys.executable}")
+    user = f"robot {robot} with {' and '.join(drivers)}" if drivers else f"robot {robot}"
+    return ok(f"all {len(wanted)} that {user} needs, under {sys.executable}")
 
 
 def gpio_package(context: Context) -> Result | None:
-    """RPi.GPIO and rpi-lgpio overwrite each other."""
+    """Check that only one of RPi.GPIO and rpi-lgpio is installed: they overwrite each other."""
     panel = context.config.panel
     pins = {panel.estop_gpio, panel.led_gpio} != {None} or any(
         header.PACKAGE in plugins.find(settings.driver).packages
@@ -97,15 +97,15 @@ def gpio_package(context: Context) -> Result | None:
     return ok(installed[0])
 
 
-def _problem(name: str, bounds: str) -> str:
-    """What is wrong with an installed package; empty if nothing is."""
+def _find_problem(name: str, bounds: str) -> str:
+    """Return what is wrong with an installed package; empty if nothing is."""
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
         return f"{name} is not installed"
     for relation, bound in _BOUND.findall(bounds):
-        mine, limit = _numbers(version), _numbers(bound)
-        if (relation == ">=" and mine < limit) or (relation == "<" and mine >= limit):
+        installed, limit = _parse_version(version), _parse_version(bound)
+        if (relation == ">=" and installed < limit) or (relation == "<" and installed >= limit):
             return f"{name} is {version}, {relation} {bound} is needed"
     try:
         importlib.import_module(_MODULES.get(name, name))
@@ -116,7 +116,7 @@ def _problem(name: str, bounds: str) -> str:
     return ""
 
 
-def _numbers(version: str) -> list[int]:
+def _parse_version(version: str) -> list[int]:
     return [int(part) for part in re.findall(r"\d+", version)]
 
 

@@ -1,4 +1,4 @@
-"""Checks of what makes ticks late, and of the clock that stamps them."""
+"""Checks of the causes of late ticks, and of the clock that stamps ticks."""
 
 import ctypes
 import getpass
@@ -10,28 +10,28 @@ from fishd.core.process import safe_path
 from fishd.core.process.realtime import limit_for
 from fishd.hardware.checks import Check, Result, ok, skipped, warning
 
-_TRY = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"
-_LIMITS = "/etc/security/limits.d/fishd.conf"
-ENOUGH_MEMORY = 512 * 2**20
-"""Limit on locked memory that is no limit to fishd [bytes]."""
-OF_SERVICE = 51
-"""LimitRTPRIO= of fishd.service as it is installed."""
+_TRIAL = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"
+_LIMITS_FILE = "/etc/security/limits.d/fishd.conf"
+SUFFICIENT_LOCKED_BYTES = 512 * 2**20
+"""Limit on locked memory that suffices for fishd [bytes]."""
+SERVICE_PRIORITY_LIMIT = 51
+"""LimitRTPRIO= of the installed fishd.service."""
 _CAP_IPC_LOCK = 14
-_ON_TIME = ("simulated", "pi", "virtual-pi")
-"""Robots whose ticks can be late; a swimmer's cannot, in slow motion."""
+_REAL_TIME_ROBOTS = ("simulated", "pi", "virtual-pi")
+"""Robots whose ticks can be late; those of a swimmer, in slow motion, cannot."""
 _UNSYNCHRONISED = 0x40
 _TIME_ERROR = 5
 
 
 def realtime(context: Context) -> Result:
-    """Try it, in a process that ends at once."""
+    """Check real-time scheduling: try it in a process that ends at once."""
     priority = context.config.realtime.priority
     if not priority:
         return ok("not asked for (realtime.priority: 0)")
     if context.running:
         if context.running.status.realtime:
             return ok("the running fishd has real-time scheduling")
-        return warning("the running fishd has no real-time scheduling", _permit_priority(priority))
+        return warning("the running fishd has no real-time scheduling", _allow_priority(priority))
     if _is_permitted(priority):
         above = limit_for(priority)
         if _is_permitted(above):
@@ -39,21 +39,21 @@ def realtime(context: Context) -> Result:
         return warning(
             f"SCHED_FIFO {priority} is permitted, but not {above}, which the thread needs that "
             "ends a fishd that hangs",
-            _permit_priority(priority),
+            _allow_priority(priority),
         )
     return warning(
         f"user {getpass.getuser()} may not use SCHED_FIFO {priority}: ticks come late under load",
-        _permit_priority(priority),
+        _allow_priority(priority),
     )
 
 
 def _is_permitted(priority: int) -> bool:
-    command = safe_path.python("-I", "-S", "-c", _TRY, str(priority))
+    command = safe_path.python("-I", "-S", "-c", _TRIAL, str(priority))
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
 def memory(context: Context) -> Result:
-    """Locked memory is never waited for."""
+    """Check that memory may be locked, so that no tick waits for the disk."""
     if not context.config.realtime.lock_memory:
         return ok("not to be locked (realtime.lock_memory: false)")
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
@@ -63,17 +63,17 @@ def memory(context: Context) -> Result:
         if line.startswith("CapEff:")
     ]
     privileged = any(mask >> _CAP_IPC_LOCK & 1 for mask in capabilities)
-    if privileged or limit == resource.RLIM_INFINITY or limit >= ENOUGH_MEMORY:
+    if privileged or limit == resource.RLIM_INFINITY or limit >= SUFFICIENT_LOCKED_BYTES:
         return ok("may be locked")
     return warning(
         f"user {getpass.getuser()} may lock only {limit // 1024} kB of memory: a tick may wait for "
         "the disk",
-        _permit("memlock unlimited"),
+        _allow("memlock unlimited"),
     )
 
 
 def governor(context: Context) -> Result:
-    """A processor that first has to speed up makes ticks late."""
+    """Check the governor: a processor that first has to speed up makes ticks late."""
     names = {
         context.text(f"/sys/devices/system/cpu/{cpu.parent.name}/cpufreq/scaling_governor")
         for cpu in context.path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq")
@@ -90,7 +90,7 @@ def governor(context: Context) -> Result:
 
 
 def clock(context: Context) -> Result:
-    """Ticks are stamped with unix time; a Pi without a network starts in the past."""
+    """Check the clock: ticks have unix time, and a Pi without a network starts in the past."""
     if context.path("/run/systemd/timesync/synchronized").exists() or _kernel_is_synchronised():
         return ok("synchronised")
     return warning(
@@ -108,19 +108,19 @@ def _kernel_is_synchronised() -> bool:
     return 0 <= state < _TIME_ERROR and not status & _UNSYNCHRONISED
 
 
-def _permit_priority(priority: int) -> str:
+def _allow_priority(priority: int) -> str:
     needed = limit_for(priority)
-    more = f" with LimitRTPRIO={needed} (sudo systemctl edit fishd)"
-    return _permit(f"rtprio {needed}", more if needed > OF_SERVICE else "")
+    extra = f" with LimitRTPRIO={needed} (sudo systemctl edit fishd)"
+    return _allow(f"rtprio {needed}", extra if needed > SERVICE_PRIORITY_LIMIT else "")
 
 
-def _permit(limit: str, more: str = "") -> str:
-    return f"run fishd as its systemd service{more}, or allow '{limit}' in {_LIMITS}"
+def _allow(limit: str, more: str = "") -> str:
+    return f"run fishd as its systemd service{more}, or allow '{limit}' in {_LIMITS_FILE}"
 
 
 CHECKS = (
-    Check("real time", realtime, _ON_TIME),
-    Check("memory", memory, _ON_TIME),
+    Check("real time", realtime, _REAL_TIME_ROBOTS),
+    Check("memory", memory, _REAL_TIME_ROBOTS),
     Check("governor", governor, ("pi",)),
     Check("clock", clock),
 )

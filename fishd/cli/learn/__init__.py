@@ -1,4 +1,4 @@
-"""The verbs about learning, loaded when they are called; they need the extra `learn`."""
+"""The verbs about learning, loaded when they are called (extra: learn)."""
 
 import click
 
@@ -9,7 +9,7 @@ VERBS = {
         "ppo": Verb("learn.ppo", "ppo", "Train a policy, in simulation or on the robot."),
         "export": Verb("learn.export", "export", "Write a trained policy to one .onnx file."),
         "evaluate": Verb(
-            "learn.evaluate", "evaluate", "How a policy or controller swims many other fish."
+            "learn.evaluate", "evaluate", "Let a policy or controller swim many other fish."
         ),
         "look": Verb("learn.look", "look", "Show what a policy that sees pictures looks at."),
     }
@@ -18,4 +18,4 @@ VERBS = {
 
 @click.group(cls=Verbs, verbs=VERBS)
 def learn() -> None:
-    """Learn to swim: train policies, try them on other fish, and write them to files."""
+    """Train policies, test them on other fish, and write them to files."""

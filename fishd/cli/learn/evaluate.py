@@ -12,7 +12,7 @@ from fishd.cli.completion import complete_contestant
 from fishd.cli.config import fish_options
 from fishd.cli.options import for_option, json_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.progress import showing
+from fishd.cli.progress import show_progress
 from fishd.config import load
 
 if TYPE_CHECKING:
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
     from fishd.lab.compare.survey import Surveyed, Swum
 
-WIDE = 1000
-"""Columns of a table in a file or a pipe, where nothing is wrapped."""
+PIPE_COLUMNS = 1000
+"""Width of a table in a file or a pipe, so that nothing is wrapped [columns]."""
 
 
 @click.command()
@@ -47,7 +47,7 @@ WIDE = 1000
     type=float,
     default=10.0,
     show_default=True,
-    help="Time of it before figures are taken [s].",
+    help="Time of each run before measurements begin [s].",
 )
 @fish_options
 @json_option
@@ -63,9 +63,9 @@ def evaluate(
     """Let policies and controllers swim many other fish, in virtual time.
 
     A contestant is a policy by name or file, or a controller with parameters, as for `fishctl
-    compare`. Figures are shares of each fish's own best square wave, of its true thrust. The fish
-    differ from the configured one, by the keys that --json shows. "another took over" counts the
-    runs in which a policy was replaced because it insisted on reversing too fast; "shaken" is the
+    compare`. Figures are fractions of the true thrust of the best square wave of the same fish. The
+    fish differ from the configured one by the keys that --json shows. "another took over" counts
+    the runs in which a policy was replaced because it kept reversing too fast; "shaken" is the
     longest stretch of reversals in consecutive ticks.
     Exit status 1 when a run ends in mode fault.
     """
@@ -77,49 +77,52 @@ def evaluate(
     fish = list(other_fish.CHANGES) if which != "random" else []
     singles = len(fish)
     fish += other_fish.harsh_fish() if which != "changes" else ()
-    configs = [(each, load(file, (*overrides, *each.overrides))) for each in fish]
-    with showing(len(chosen) * len(fish) * seconds, "s swum") as bar:
-        found = survey(configs, chosen, seconds, settle, bar.at)
+    configs = [(changed, load(file, (*overrides, *changed.overrides))) for changed in fish]
+    with show_progress(len(chosen) * len(fish) * seconds, "s swum") as bar:
+        surveys = survey(configs, chosen, seconds, settle, bar.at)
     if as_json:
-        print_json(found)
+        print_json(surveys)
     else:
         from rich.console import Console
 
-        Console(width=None if sys.stdout.isatty() else WIDE, markup=False).print(
-            _table(found, singles)
+        Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(
+            _table(surveys, singles)
         )
-    faults = [(one, swum) for one in found for swum in one.fish if swum.fault]
-    for one, swum in faults:
-        echo(f"fishctl: {one.contestant}: {swum.fish}: ended in fault: {swum.fault}", err=True)
+    faults = [(surveyed, swum) for surveyed in surveys for swum in surveyed.fish if swum.fault]
+    for surveyed, swum in faults:
+        echo(f"fishctl: {surveyed.contestant}: {swum.fish}: ended in fault: {swum.fault}", err=True)
     return 1 if faults else 0
 
 
-def _table(found: "list[Surveyed]", singles: int) -> "Table":
-    """A row for each of the first fish, so many as `singles`; figures of all the others."""
+def _table(surveys: "list[Surveyed]", singles: int) -> "Table":
+    """Return a table: a row for each of the first `singles` fish, and figures of all others."""
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
     table.add_column("fish", overflow="fold")
-    for one in found:
-        table.add_column(one.contestant, justify="right", overflow="fold")
+    for surveyed in surveys:
+        table.add_column(surveyed.contestant, justify="right", overflow="fold")
     for row in range(singles):
-        swums = [one.fish[row] for one in found]
-        table.add_row(swums[0].fish, *(f"{swum.relative_thrust:.1%}" for swum in swums))
-    others = [one.fish[singles:] for one in found]
-    if others[0]:
-        what = f"{len(others[0])} harsh fish"
+        runs = [surveyed.fish[row] for surveyed in surveys]
+        table.add_row(runs[0].fish, *(f"{swum.relative_thrust:.1%}" for swum in runs))
+    harsh_runs = [surveyed.fish[singles:] for surveyed in surveys]
+    if harsh_runs[0]:
+        label = f"{len(harsh_runs[0])} harsh fish"
         table.add_row(
-            f"{what}, median",
-            *(f"{statistics.median(swum.relative_thrust for swum in row):.1%}" for row in others),
+            f"{label}, median",
+            *(
+                f"{statistics.median(swum.relative_thrust for swum in row):.1%}"
+                for row in harsh_runs
+            ),
         )
         table.add_row(
-            f"{what}, worst",
-            *(f"{min(swum.relative_thrust for swum in row):.1%}" for row in others),
+            f"{label}, worst",
+            *(f"{min(swum.relative_thrust for swum in row):.1%}" for row in harsh_runs),
         )
 
-    def of_all(name: str, figure: "Callable[[list[Swum]], str]") -> None:
-        table.add_row(name, *(figure(one.fish) for one in found))
+    def add_figure(name: str, figure: "Callable[[list[Swum]], str]") -> None:
+        table.add_row(name, *(figure(surveyed.fish) for surveyed in surveys))
 
-    of_all("another took over", lambda row: f"{sum(swum.fallback is not None for swum in row)}")
-    of_all("shaken, at most", lambda row: f"{max(swum.shaken for swum in row):.1f} s")
+    add_figure("another took over", lambda row: f"{sum(swum.fallback is not None for swum in row)}")
+    add_figure("shaken, at most", lambda row: f"{max(swum.shaken for swum in row):.1f} s")
     return table

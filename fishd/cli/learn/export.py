@@ -17,11 +17,11 @@ from fishd.core.errors import PolicyError
     "target",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="The file to write. [default: the name of the run and .onnx, in this folder]",
+    help="File to write. [default: the name of the run and .onnx, in this folder]",
 )
-@click.option("--newest", is_flag=True, help="The newest checkpoint rather than the best.")
+@click.option("--newest", is_flag=True, help="Export the newest checkpoint instead of the best.")
 @click.option("--force", is_flag=True, help="Overwrite FILE; and export a policy that stalls, too.")
-@click.option("--note", default="", help="A remark for people, kept in the file.")
+@click.option("--note", default="", help="Remark that is stored in the file.")
 @json_option
 def export(
     run: Path, target: Path | None, newest: bool, force: bool, note: str, as_json: bool
@@ -35,26 +35,26 @@ def export(
     if target and target.suffix != SUFFIX:
         raise PolicyError(f"{target}: the name of a policy file must end in {SUFFIX}")
     checkpoint = checkpoints.find(run, latest=newest)
-    whole = run if checkpoint != run else run.resolve().parent
-    target = target or Path(f"{whole.resolve().name}{SUFFIX}")
+    run_folder = run if checkpoint != run else run.resolve().parent
+    target = target or Path(f"{run_folder.resolve().name}{SUFFIX}")
     if target.is_file() and not force:
         raise PolicyError(f"{target}: exists already; --force overwrites it, --to names another")
-    found = write(checkpoint, target, force=force, note=note)
-    past = found.card.provenance
+    exported = write(checkpoint, target, force=force, note=note)
+    provenance = exported.card.provenance
     if as_json:
-        where = {"path": found.path, "checkpoint": found.checkpoint, "bytes": found.size}
-        print_json({**where, "evaluation": found.evaluation})
+        files = {"path": exported.path, "checkpoint": exported.checkpoint, "bytes": exported.size}
+        print_json({**files, "evaluation": exported.evaluation})
         return
     click.echo(
-        f"{found.path}: {found.size / 1024:.0f} kB from {found.checkpoint}, {past.steps} steps "
-        f"in {past.on}"
+        f"{exported.path}: {exported.size / 1024:.0f} kB from {exported.checkpoint}, "
+        f"{provenance.steps} steps in {provenance.on}"
     )
-    if found.evaluation.stalled:
+    if exported.evaluation.stalled:
         click.echo("careful: it stalls without exploration")
     else:
-        click.echo(f"it swims with {summary(found.evaluation)}")
-    path = shlex.quote(str(found.path))
-    if found.card.pictures:
-        click.echo(f"it sees {found.card.sees}; to let it swim: fishctl agent {path}")
+        click.echo(f"it swims with {summary(exported.evaluation)}")
+    path = shlex.quote(str(exported.path))
+    if exported.card.pictures:
+        click.echo(f"it sees {exported.card.sees}; to let it swim: fishctl agent {path}")
     else:
         click.echo(f"to let it swim: fishctl set-controller ppo --policy {path}")

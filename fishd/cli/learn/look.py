@@ -1,4 +1,4 @@
-"""The verb that shows what a policy looks at."""
+"""The verb that shows at which parts of pictures a policy looks."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from fishd.config import load
     metavar="FILE",
     help="YAML file of a simulated camera, such as config/camera-web.yaml. [default: a good one]",
 )
-@for_option("Length of the swim [s]; the first 5 are left out.", default=15.0, kind=click.FLOAT)
+@for_option("Length of the swim [s]; the first 5 s are left out.", default=15.0, kind=click.FLOAT)
 @json_option
 @fish_options
 def look(
@@ -33,8 +33,8 @@ def look(
 ) -> None:
     """Show what a policy that sees pictures looks at.
 
-    It swims a simulated fish; then a patch of the mean picture hides one part of the frames after
-    the other. Where that changes the action most, the policy looks.
+    The policy swims a simulated fish; then a patch of the mean picture hides one part of the frames
+    after another. The policy looks at those parts that change its action most.
     """
     from fishd.camera import settings as cameras
     from fishd.lab import drawing
@@ -42,15 +42,15 @@ def look(
 
     if picture:
         drawing.check(picture)
-    config, seen = load(file, overrides), cameras.simulated(camera)
-    found = looking.look(policy, config, seen, seconds)
+    config, camera_settings = load(file, overrides), cameras.simulated(camera)
+    result = looking.look(policy, config, camera_settings, seconds)
     if as_json:
-        print_json({"policy": policy, "share": found.share, "area": found.area})
+        print_json({"policy": policy, "share": result.share, "area": result.area})
     else:
         click.echo(
-            f"{policy}: {found.share:.0%} of the sensitivity lies where the tail moves, on "
-            f"{found.area:.0%} of the picture"
+            f"{policy}: {result.share:.0%} of the sensitivity lies where the tail moves, on "
+            f"{result.area:.0%} of the picture"
         )
     if picture:
-        looking.draw(picture, found, f"what {Path(policy).name} looks at")
+        looking.draw(picture, result, f"what {Path(policy).name} looks at")
         click.echo(f"drawn: {picture}", err=as_json)

@@ -1,4 +1,4 @@
-"""The verb that trains."""
+"""The verb that trains a policy with PPO."""
 
 import statistics
 import threading
@@ -14,7 +14,7 @@ from fishd.cli.config import config_option, set_option
 from fishd.cli.experiment_options import On, default_on, on_option
 from fishd.cli.options import endpoint_option, json_option, seed_option, take_option, verb_lease
 from fishd.cli.output import echo, print_json
-from fishd.cli.progress import showing
+from fishd.cli.progress import show_progress
 from fishd.config import adopt, load
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import ConfigError
@@ -23,9 +23,9 @@ from fishd.core.process.interruption import on_signal
 if TYPE_CHECKING:
     from fishd.learning.train.jobs import Job, Outcome
 
-IMPLAUSIBLE = 1.03
-"""Largest relative thrust that can be true; above it the measurement is wrong."""
-AS_IT_BEGAN = "with --resume, which goes on as the run began"
+MAX_RELATIVE_THRUST = 1.03
+"""Largest plausible relative thrust; above it the measurement is wrong."""
+BY_RESUME = "with --resume, which keeps the options of the run"
 
 
 @click.command()
@@ -41,21 +41,21 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
 @click.option(
     "--see",
     type=click.Choice(["force", "camera", "both"]),
-    help="What the agent sees of the fish; settings such as config/learning-cnn.yaml say how "
+    help="Observations of the agent; settings such as config/learning-cnn.yaml say how "
     "pictures become numbers. [default: that of the settings, force]",
 )
 @click.option(
     "--camera",
     metavar="FILE|ENDPOINT",
     help="With --see: in simulation, the YAML file of a simulated camera, such as "
-    "config/camera-web.yaml; live, where its fishd-camera takes requests. [default: a good "
+    "config/camera-web.yaml; live, the request address of its fishd-camera. [default: a good "
     "simulated one; $FISHD_CAMERA, else that of this machine]",
 )
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
     help="Control steps to learn from, in all; rounded up to whole rollouts of ppo.n_steps. A "
-    "simulated training ends sooner, with a good policy, once its evaluations show no better one; "
+    "simulated training ends earlier, with a good policy, once its evaluations stop improving; "
     "evaluation.patience: null in the settings makes it do all steps.",
 )
 @seed_option("the training", None)
@@ -68,15 +68,15 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
     "--resume",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Go on with the training in this folder, from its newest checkpoint and with its "
-    "settings; of several seeds, each has a folder of its own: runs/ten/seed-3.",
+    help="Resume the training in this folder, from its newest checkpoint and with its settings; "
+    "each of several seeds has its folder: runs/ten/seed-3.",
 )
 @click.option(
     "--from",
     "parent",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Begin with the networks of another run, its best, or of one of its checkpoints: "
+    help="Begin with the best networks of another run, or with those of one of its checkpoints: "
     "to fine-tune on the robot what was trained in simulation.",
 )
 @endpoint_option
@@ -84,15 +84,17 @@ AS_IT_BEGAN = "with --resume, which goes on as the run began"
 @click.option(
     "--agent",
     metavar="ADDRESS",
-    help="On a robot elsewhere: where its fishd reaches this program, such as "
+    help="For a robot elsewhere: address at which its fishd reaches this program, such as "
     "tcp://127.0.0.1:9873 at the end of an ssh tunnel. [default: any free port of this machine]",
 )
-@click.option("--seeds", type=click.IntRange(min=1), help="Train with so many seeds, in parallel.")
+@click.option("--seeds", type=click.IntRange(min=1), help="Number of seeds to train, in parallel.")
 @click.option(
-    "--jobs", type=click.IntRange(min=1), help="With --seeds: processes. [default: one per core]"
+    "--jobs",
+    type=click.IntRange(min=1),
+    help="With --seeds: number of processes. [default: one per core]",
 )
 @click.option(
-    "--cluster", metavar="ADDRESS", help="With --seeds: Dask scheduler that runs them instead."
+    "--cluster", metavar="ADDRESS", help="With --seeds: address of a Dask scheduler that runs them."
 )
 @json_option
 def ppo(
@@ -116,29 +118,33 @@ def ppo(
 ) -> int:
     """Train a policy with PPO: checkpoints, tables and TensorBoard logs in a run folder.
 
-    Ctrl-C leaves the fish at neutral and a checkpoint from which --resume goes on.
+    After Ctrl-C the fish is at neutral, and --resume continues from the last checkpoint.
     """
-    own: dict[str, Any] = {"--config": file, "--set": overrides, "--settings": settings_file}
-    own |= {"--see": see, "--seed": seed}
-    new = {"--folder": folder, "--from": parent}
+    run_options: dict[str, Any] = {
+        "--config": file,
+        "--set": overrides,
+        "--settings": settings_file,
+    }
+    run_options |= {"--see": see, "--seed": seed}
+    new_run_options = {"--folder": folder, "--from": parent}
     if resume:
-        _refuse(AS_IT_BEGAN, {**own, **new, "--seeds": seeds})
+        _refuse(BY_RESUME, {**run_options, **new_run_options, "--seeds": seeds})
     if seeds is None:
         _refuse("without --seeds", {"--jobs": jobs, "--cluster": cluster})
     elif on == "live":
         raise click.UsageError("--seeds is for simulated fish: there is only one live fish")
     if not resume:
         on = on or ("simulation" if seeds else default_on(file, overrides, endpoint))
-    job = _job(on, file, overrides, settings_file, folder, resume, parent, endpoint)
+    job = _prepare_job(on, file, overrides, settings_file, folder, resume, parent, endpoint)
     if job.on == "simulation":
         _refuse(
             "here: this swims in this process, and no fishd has to reach it", {"--agent": agent}
         )
         if resume:
-            _refuse(AS_IT_BEGAN, {"--camera": camera})
+            _refuse(BY_RESUME, {"--camera": camera})
     given = {"steps": steps, "seed": seed, "see": see}
     changed = {name: value for name, value in given.items() if value is not None}
-    job = _with_camera(replace(job, agent=agent, settings=replace(job.settings, **changed)), camera)
+    job = _add_camera(replace(job, agent=agent, settings=replace(job.settings, **changed)), camera)
     if seeds is not None:
         return _train_seeds(job, seeds, jobs, cluster, as_json)
     return _train(job, as_json)
@@ -150,7 +156,7 @@ def _refuse(why: str, options: dict[str, Any]) -> None:
         raise click.UsageError(f"{given[0]} cannot be given {why}")
 
 
-def _job(
+def _prepare_job(
     on: On | None,
     file: Path | None,
     overrides: tuple[str, ...],
@@ -160,7 +166,7 @@ def _job(
     parent: Path | None,
     endpoint: str | None,
 ) -> "Job":
-    """The run to resume, or a new one, with the settings of its parent where none are given.
+    """Return the run to resume, or a new run, by default with the settings of its parent.
 
     Raises `ConfigError` and `CheckpointError`.
     """
@@ -174,18 +180,22 @@ def _job(
         checkpoints.refuse_several(resume)
         config, settings = runs.read(resume)
         on = on or checkpoints.read_state(checkpoints.newest(resume)).on
-    running = config_of(endpoint) if on == "live" else {}
-    plant = dict(running.get("plant", {}))  # to adopt it changes it
+    running_config = config_of(endpoint) if on == "live" else {}
+    plant = dict(running_config.get("plant", {}))  # `adopt` changes it
     if not resume:
-        of_parent = runs.read(_run_of(parent))[1] if parent else None
-        settings = of_parent if of_parent and not settings_file else training.load(settings_file)
-        adopts = running and not file
-        config = adopt(running, overrides) if adopts else load(file, overrides)
-    # The inputs are scaled by the plant, and fishd's is most likely meant.
-    if running and (other := other_plant(config, plant)):
+        parent_settings = runs.read(_find_run_folder(parent))[1] if parent else None
+        settings = (
+            parent_settings
+            if parent_settings and not settings_file
+            else training.load(settings_file)
+        )
+        is_adopted = running_config and not file
+        config = adopt(running_config, overrides) if is_adopted else load(file, overrides)
+    # The plant scales the inputs, and that of fishd is most likely right.
+    if running_config and (difference := other_plant(config, plant)):
         echo(
             "fishctl: careful: scales and relative thrust are made for another plant than "
-            f"that of the fishd that runs: {other}",
+            f"that of the fishd that runs: {difference}",
             err=True,
         )
     return Job(
@@ -200,8 +210,8 @@ def _job(
     )
 
 
-def _with_camera(job: "Job", camera: str | None) -> "Job":
-    """The job with what looks at its fish; raises `ConfigError` and `ParameterError`."""
+def _add_camera(job: "Job", camera: str | None) -> "Job":
+    """Return the job with its camera, if any; raise `ConfigError` and `ParameterError`."""
     from fishd.camera import settings as cameras
     from fishd.learning.run_folder import runs
     from fishd.learning.settings import check
@@ -221,36 +231,43 @@ def _train(job: "Job", as_json: bool) -> int:
     from fishd.learning.train.progress import ShownDisplay
     from fishd.learning.train.training import train
 
-    asked = threading.Event()
-    with on_signal(asked.set), showing(job.last_step(), "steps", err=as_json) as show:
-        outcome = train(job, ShownDisplay(show), asked.is_set)
+    stopping = threading.Event()
+    with on_signal(stopping.set), show_progress(job.last_step(), "steps", err=as_json) as progress:
+        outcome = train(job, ShownDisplay(progress), stopping.is_set)
     if as_json:
         print_json(outcome)
-    return report(outcome, job, as_json)
+    return print_outcome(outcome, job, as_json)
 
 
-def report(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
-    """Say how it ended; the exit status."""
+def print_outcome(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
+    """Print how a training ended; return the exit status."""
     from fishd.learning.train.progress import NOT_COUNTED, described, minutes
 
-    again = f"fishctl learn ppo --resume {outcome.folder}"
+    resume_command = f"fishctl learn ppo --resume {outcome.folder}"
     for option, address in (
         ("--endpoint", job.endpoint),
         ("--agent", job.agent),
         ("--camera", job.camera_endpoint),
     ):
         if address:
-            again += f" {option} {address}"
-    if outcome.ended == "diverged":  # and would again
-        best = f"; the best so far: fishctl learn export {outcome.folder}" if outcome.best else ""
+            resume_command += f" {option} {address}"
+    if outcome.ended == "diverged":  # a resumed run would diverge, too
+        best = (
+            f"; to export the best policy: fishctl learn export {outcome.folder}"
+            if outcome.best
+            else ""
+        )
         echo(f"fishctl: {outcome.message}{best}", err=True)
         return 1
     if outcome.ended == "lost":
-        echo(f"fishctl: {outcome.message}; resume with: {again}", err=True)
+        echo(f"fishctl: {outcome.message}; resume with: {resume_command}", err=True)
         return 1
     if outcome.ended == "interrupted":
         lost = f", {outcome.dropped} of an unfinished rollout dropped" if outcome.dropped else ""
-        echo(f"fishctl: stopped after {outcome.steps} steps{lost}; resume with: {again}", err=True)
+        echo(
+            f"fishctl: stopped after {outcome.steps} steps{lost}; resume with: {resume_command}",
+            err=True,
+        )
         return INTERRUPTED
     rest = NOT_COUNTED if job.on == "simulation" else ""
     why = f"; {outcome.message}" if outcome.message else ""
@@ -258,10 +275,10 @@ def report(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
         f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time{rest}{why}",
         err=as_json,
     )
-    if found := outcome.best_evaluation:
-        echo(f"best: {described(found).strip()}", err=as_json)
-        off = found.error / found.thrust if found.error else 0.0
-        if found.relative_thrust * (1.0 - off) > IMPLAUSIBLE:
+    if evaluation := outcome.best_evaluation:
+        echo(f"best: {described(evaluation).strip()}", err=as_json)
+        relative_error = evaluation.error / evaluation.thrust if evaluation.error else 0.0
+        if evaluation.relative_thrust * (1.0 - relative_error) > MAX_RELATIVE_THRUST:
             echo(
                 "careful: that is more than the best square wave of the configured plant; the fish "
                 "is another one, or F_x is not calibrated, or it drifts",
@@ -275,8 +292,8 @@ def report(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
     return 0
 
 
-def _run_of(path: Path) -> Path:
-    """The run folder of a run or of one of its checkpoints; raises `ConfigError`."""
+def _find_run_folder(path: Path) -> Path:
+    """Return the folder of a run or of one of its checkpoints; raise `ConfigError`."""
     from fishd.learning.run_folder.runs import SETTINGS
 
     if not path.is_dir():
@@ -288,10 +305,10 @@ def _run_of(path: Path) -> Path:
 def _train_seeds(
     job: "Job", seeds: int, jobs: int | None, cluster: str | None, as_json: bool
 ) -> int:
-    """Train them all, a line as each ends, and a summary; the exit status."""
+    """Train all seeds, print a line as each ends, and a summary; return the exit status."""
     from fishd.learning.train import seeds as training
 
-    if not cluster and find_spec("torch") is None:  # only the processes that train will load it
+    if not cluster and find_spec("torch") is None:  # only the training processes load it
         raise ModuleNotFoundError("torch is missing", name="torch")
     echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps", err=as_json)
     ended = partial(_print_seed, err=as_json)

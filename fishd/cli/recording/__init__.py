@@ -1,1 +1,1 @@
-"""The verbs about recordings, loaded when they are called; they need the extra `record`."""
+"""The verbs about recordings, loaded when they are called (extra: record)."""

@@ -1,10 +1,10 @@
-"""Which recording a verb is about, and what its reader must know of it first."""
+"""Choice of the recording that a verb reads, with a warning about damage."""
 
 from pathlib import Path
 
 import click
 
-from fishd.cli.output import counted, echo
+from fishd.cli.output import echo, format_count
 from fishd.recording import Run, open_run
 from fishd.recording.folder import FOLDER_VARIABLE, find
 
@@ -16,17 +16,17 @@ folder_option = click.option(
 )
 
 
-def opened(name: str, folder: Path | None) -> Run:
-    """The recording that a name means; says on standard error where it is damaged.
+def open_recording(name: str, folder: Path | None) -> Run:
+    """Open the recording of a name; print on standard error if it is damaged.
 
     Raises `RecordingError`.
     """
     run = open_run(find(name, folder))
     if run.is_damaged:
-        echo(f"fishctl: {run.path}: {damage(run.damaged, run.damage_reason)}", err=True)
+        echo(f"fishctl: {run.path}: {format_damage(run.damaged, run.damage_reason)}", err=True)
     return run
 
 
-def damage(ticks: int, reason: str = "") -> str:
-    """Return what a damaged file has cost: `damaged: 10 ticks lost`, and why, where known."""
-    return f"damaged: {counted(ticks, 'tick')} lost" + (f" ({reason})" if reason else "")
+def format_damage(ticks: int, reason: str = "") -> str:
+    """Return the loss of a damaged file, `damaged: 10 ticks lost`, with the reason if known."""
+    return f"damaged: {format_count(ticks, 'tick')} lost" + (f" ({reason})" if reason else "")

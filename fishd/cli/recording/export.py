@@ -6,23 +6,28 @@ import click
 
 from fishd.cli.options import json_option
 from fishd.cli.output import print_paths
-from fishd.cli.recording.choice import folder_option, opened
+from fishd.cli.recording.choice import folder_option, open_recording
 from fishd.recording.export import Format
 from fishd.recording.export import export as write
 
 
 @click.command()
 @click.argument("run")
-@click.option("--csv", "form", flag_value="csv", help="Text, which every program reads.")
-@click.option("--parquet", "form", flag_value="parquet", help="Smaller, and faster to read.")
+@click.option("--csv", "form", flag_value="csv", help="Write text, which every program reads.")
+@click.option(
+    "--parquet",
+    "form",
+    flag_value="parquet",
+    help="Write Parquet, which is smaller and faster to read.",
+)
 @click.option(
     "--to",
     "target",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path(),
-    help="The folder to write to; default: this one.",
+    help="Folder to write to; default: this one.",
 )
-@click.option("--force", is_flag=True, help="Replace files that are there already.")
+@click.option("--force", is_flag=True, help="Replace existing files.")
 @folder_option
 @json_option
 def export(
@@ -35,8 +40,8 @@ def export(
 ) -> None:
     """Write a recording as tables: one row a tick, and a second file with its events.
 
-    RUN is a path, a name in the folder of recordings, or 'latest'. No digit of a number is lost.
+    RUN is a path, a name in the folder of recordings, or 'latest'. All digits of a number are kept.
     """
     if form is None:
         raise click.UsageError("--csv or --parquet is needed")
-    print_paths(write(opened(run, folder), target, form, replace=force), as_json)
+    print_paths(write(open_recording(run, folder), target, form, replace=force), as_json)

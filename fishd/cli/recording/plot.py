@@ -7,7 +7,7 @@ import click
 
 from fishd.cli.options import FiniteRange, json_option
 from fishd.cli.output import print_paths
-from fishd.cli.recording.choice import folder_option, opened
+from fishd.cli.recording.choice import folder_option, open_recording
 from fishd.lab.run_figure import picture
 from fishd.lab.run_traces import traces
 from fishd.recording.folder import check_new
@@ -15,18 +15,22 @@ from fishd.recording.folder import check_new
 
 @click.command()
 @click.argument("run")
-@click.option("--from", "begin", type=FiniteRange(min=0), default=0.0, help="Begin here [s].")
-@click.option("--until", "end", type=FiniteRange(min=0), help="End here [s]; default: the end.")
+@click.option(
+    "--from", "begin", type=FiniteRange(min=0), default=0.0, help="Begin at this time [s]."
+)
+@click.option(
+    "--until", "end", type=FiniteRange(min=0), help="End at this time [s]; default: the end."
+)
 @click.option(
     "--to",
     "target",
     type=click.Path(path_type=Path, file_okay=False, exists=True),
     default=Path(),
-    help="The folder to write to; default: this one.",
+    help="Folder to write to; default: this one.",
 )
-@click.option("--png", "only", flag_value="png", help="The picture alone.")
-@click.option("--html", "only", flag_value="html", help="The interactive page alone.")
-@click.option("--force", is_flag=True, help="Replace files that are there already.")
+@click.option("--png", "only", flag_value="png", help="Draw only the picture.")
+@click.option("--html", "only", flag_value="html", help="Draw only the interactive page.")
+@click.option("--force", is_flag=True, help="Replace existing files.")
 @folder_option
 @json_option
 def plot(
@@ -44,7 +48,7 @@ def plot(
     RUN is a path, a name in the folder of recordings, or 'latest'. NAME.png is a picture; NAME.html
     is a page to zoom into, which needs no network.
     """
-    recorded = opened(run, folder)
+    recorded = open_recording(run, folder)
     drawn = traces(recorded, begin, math.inf if end is None else end)
     forms = [only] if only else ["png", "html"]
     paths = {form: target / f"{recorded.name}.{form}" for form in forms}

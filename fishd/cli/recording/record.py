@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from msgspec.structs import asdict
 
-from fishd.cli.options import Words, endpoint_option, for_option, json_option
-from fishd.cli.output import counted, echo, print_json
+from fishd.cli.options import Utf8Text, endpoint_option, for_option, json_option
+from fishd.cli.output import echo, format_count, print_json
 from fishd.cli.recording.choice import folder_option
 from fishd.client import Fish
 from fishd.core import text
@@ -28,43 +28,46 @@ if TYPE_CHECKING:
     from fishd.recording.camera_tap import CameraTap
 
 F = TypeVar("F", bound=Callable[..., Any])
-UNITS = {"MB": 10**6, "GB": 10**9}
-LEAST = 10**7
-"""A black box is no smaller than this [bytes]."""
-MOST = 10**15
-"""Nor larger [bytes]."""
+UNIT_BYTES = {"MB": 10**6, "GB": 10**9}
+MIN_BLACK_BOX_BYTES = 10**7
+"""Smallest size of a black box [bytes]."""
+MAX_BLACK_BOX_BYTES = 10**15
+"""Largest size of a black box [bytes]."""
 
 
-class Size(click.ParamType[int]):
-    """A size such as `500MB` or `2GB`, in bytes."""
+class BlackBoxSize(click.ParamType[int]):
+    """Size such as `500MB` or `2GB`, in bytes."""
 
     name = "size"
 
     def convert(
         self, value: str | int, param: click.Parameter | None, ctx: click.Context | None
     ) -> int:
-        """Text to bytes."""
+        """Convert a text to a number of bytes."""
         if isinstance(value, int):
             return value
-        found = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?(MB|GB)", value.strip(), re.IGNORECASE)
-        size = float(found[1]) * UNITS[found[2].upper()] if found else 0.0
-        if not LEAST <= size <= MOST:
-            shown = text.quoted(value)
+        match = re.fullmatch(r"([0-9]+(?:\.[0-9]+)?) ?(MB|GB)", value.strip(), re.IGNORECASE)
+        size = float(match[1]) * UNIT_BYTES[match[2].upper()] if match else 0.0
+        if not MIN_BLACK_BOX_BYTES <= size <= MAX_BLACK_BOX_BYTES:
+            quoted = text.quoted(value)
             self.fail(
-                f"'{shown}' is not valid: 10MB to 1000000GB is needed, such as 2GB", param, ctx
+                f"'{quoted}' is not valid: 10MB to 1000000GB is needed, such as 2GB", param, ctx
             )
         return round(size)
 
 
 def recording_options(function: F) -> F:
-    """RUN, and the options of every verb that records."""
+    """Add RUN, and the options of every verb that records."""
     for decorate in (
         json_option,
         for_option("End by itself after this time [s]; by default Ctrl-C ends it."),
-        click.option("--note", type=Words(), default="", help="What for."),
-        click.option("--subject", type=Words(), default="", help="Which fish, such as its number."),
+        click.option("--note", type=Utf8Text(), default="", help="Purpose of the recording."),
+        click.option("--subject", type=Utf8Text(), default="", help="Name or number of the fish."),
         click.option(
-            "--operator", type=Words(), default="", help="Who records; default: this user."
+            "--operator",
+            type=Utf8Text(),
+            default="",
+            help="Name of the operator; default: this user.",
         ),
         folder_option,
         endpoint_option,
@@ -75,14 +78,14 @@ def recording_options(function: F) -> F:
 
 
 class _Record(click.Command):
-    """`--camera` may stand alone: what follows it is its address only where it looks like one."""
+    """Verb whose `--camera` may stand alone: the next word is an address if it looks like one."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """A file of settings is no RUN either; it is refused as an address."""
+        """Parse arguments; a file of settings after `--camera` is refused as an address."""
         words = []
-        for word, after in pairwise([*args, ""]):
-            alone = "://" not in after and not after.endswith((".yaml", ".yml"))
-            words.append("--camera=" if word == "--camera" and alone else word)
+        for word, next_word in pairwise([*args, ""]):
+            stands_alone = "://" not in next_word and not next_word.endswith((".yaml", ".yml"))
+            words.append("--camera=" if word == "--camera" and stands_alone else word)
         return super().parse_args(ctx, words)
 
 
@@ -91,20 +94,20 @@ class _Record(click.Command):
 @click.option(
     "--camera",
     metavar="[ADDRESS]",
-    help="The frames of the camera, too: of the one that takes requests at ADDRESS, else at "
-    "$FISHD_CAMERA, else of this machine.",
+    help="Record the frames of a camera, too: that with the request address ADDRESS, else "
+    "$FISHD_CAMERA, else that of this machine.",
 )
 @click.option(
     "--black-box",
     is_flag=True,
-    help="Record for ever, a file an hour, and remove the oldest; waits for a fishd.",
+    help="Record without end, a file an hour, and remove the oldest; waits for a fishd.",
 )
 @click.option(
     "--keep",
-    type=Size(),
+    type=BlackBoxSize(),
     default="2GB",
     show_default=True,
-    help="Size of all files of the black box together.",
+    help="Total size of all files of the black box.",
 )
 def record(
     run: str | None,
@@ -131,8 +134,8 @@ def record(
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     if black_box:
         box = BlackBox(made(folder or runs_folder()), keep, begin)
-        open_recorder = partial(Recorder, endpoint, box.open, tell=_tell, due=box.due)
-        _record_for_ever(open_recorder, _Signals(), seconds, as_json)
+        open_recorder = partial(Recorder, endpoint, box.open, tell=_print_line, due=box.due)
+        _record_endlessly(open_recorder, _StopSignals(), seconds, as_json)
         return
     if camera is None:
         record_one(run, endpoint, folder, begin, seconds, as_json)
@@ -152,44 +155,44 @@ def record_one(
     as_json: bool,
     camera: "CameraTap | None" = None,
 ) -> None:
-    """Record until a signal, or for so long [s].
+    """Record until a signal, or until a time has passed.
 
-    begin: opens the recording at a path
+    begin: opens the recording at a path; seconds: longest duration [s]
     """
-    stopping = _Signals()
+    stopping = _StopSignals()
     place = made(folder or runs_folder())
     progress = _draw if sys.stdout.isatty() and not as_json else lambda writer: None
     path = named(run, place) if run else new_path(place)
     recorder = Recorder(
-        endpoint, partial(begin, path), tell=_tell, progress=progress, camera=camera
+        endpoint, partial(begin, path), tell=_print_line, progress=progress, camera=camera
     )
     try:
         with recorder:
             echo(f"recording to {recorder.writer.path}; Ctrl-C ends it", err=as_json)
             if (mode := recorder.status.mode) != "running":
-                first = "fishctl clear-fault, then " if mode in ("fault", "estop") else ""
-                _tell(
-                    f"the fish is at rest (mode {mode}); it swims with: {first}fishctl "
+                clearing = "fishctl clear-fault, then " if mode in ("fault", "estop") else ""
+                _print_line(
+                    f"the fish is at rest (mode {mode}); it swims with: {clearing}fishctl "
                     "set-controller"
                 )
             recorder.run(stopping, seconds)
     except RecordingError as error:
         if recorder.began:
-            _tell_fishd(endpoint, f"recording {recorder.writer.path.name} ended: {error}")
+            _mark_in_fishd(endpoint, f"recording {recorder.writer.path.name} ended: {error}")
         raise
     finally:
         if recorder.began:
             _end_line()
-            _print(recorder.writer, as_json)
+            _print_summary(recorder.writer, as_json)
 
 
-def _record_for_ever(
+def _record_endlessly(
     open_recorder: Callable[[], Recorder],
-    stopping: "_Signals",
+    stopping: "_StopSignals",
     seconds: float | None,
     as_json: bool,
 ) -> None:
-    """Wait for a fishd, record it, and go on after any restart of it."""
+    """Wait for a fishd, record it, and continue after its restarts."""
     waiting = False
     while not stopping():
         try:
@@ -199,39 +202,39 @@ def _record_for_ever(
                 return
         except NoDaemon as error:
             if not waiting:
-                _tell(f"waiting: {error}")
+                _print_line(f"waiting: {error}")
             waiting = True
             stopping.wait(1.0)
 
 
-class _Signals:
-    """True once somebody asked for the end: Ctrl-C, SIGTERM, or a terminal that closes."""
+class _StopSignals:
+    """Stop request: true after Ctrl-C, SIGTERM, or when the terminal closes."""
 
     def __init__(self) -> None:
-        self._asked = False
+        self._is_set = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is not signal.SIG_IGN:  # as below nohup
-                signal.signal(number, self._ask)
+            if signal.getsignal(number) is not signal.SIG_IGN:  # ignored below nohup
+                signal.signal(number, self._set)
 
     def __call__(self) -> bool:
-        return self._asked
+        return self._is_set
 
     def wait(self, seconds: float) -> None:
-        """Wait for a signal, but no longer than this."""
-        if not self._asked:
+        """Wait for a signal, up to some seconds."""
+        if not self._is_set:
             signal.sigtimedwait((), seconds)
 
-    def _ask(self, *_: object) -> None:
-        self._asked = True
+    def _set(self, *_: object) -> None:
+        self._is_set = True
 
 
-def _tell(line: str) -> None:
+def _print_line(line: str) -> None:
     _end_line()
     echo(f"fishctl: {line}", err=True)
 
 
 def _draw(writer: RunWriter) -> None:
-    click.echo(f"\r{_amount(writer)}", nl=False)
+    click.echo(f"\r{_format_amount(writer)}", nl=False)
 
 
 def _end_line() -> None:
@@ -239,30 +242,30 @@ def _end_line() -> None:
         click.echo("\r\x1b[K", nl=False)
 
 
-def _print(writer: RunWriter, as_json: bool) -> None:
-    """Print what a recording holds that has ended."""
+def _print_summary(writer: RunWriter, as_json: bool) -> None:
+    """Print the contents of a recording that has ended."""
     if as_json:
         print_json({"path": writer.path, "bytes": writer.size, **asdict(writer.summary)})
     else:
-        echo(f"{writer.path.name}: {_amount(writer)}")
+        echo(f"{writer.path.name}: {_format_amount(writer)}")
 
 
-def _amount(writer: RunWriter) -> str:
+def _format_amount(writer: RunWriter) -> str:
     summary = writer.summary
-    frames = counted(summary.frames, "frame")
+    frames = format_count(summary.frames, "frame")
     return ", ".join(
         (
             f"{summary.duration:.1f} s",
-            counted(summary.ticks, "tick"),
+            format_count(summary.ticks, "tick"),
             f"{summary.lost} lost",
             *([frames, f"{summary.frames_lost} lost"] if summary.frames else []),
-            counted(summary.events, "event"),
+            format_count(summary.events, "event"),
             f"{writer.size / 1e3:.0f} kB",
         )
     )
 
 
-def _tell_fishd(endpoint: str | None, what: str) -> None:
-    """Put it into the event stream, where an operator looks."""
+def _mark_in_fishd(endpoint: str | None, message: str) -> None:
+    """Put a message into the event stream, which operators watch."""
     with suppress(FishError), Fish(endpoint) as fish:
-        fish.mark(text.line(what))
+        fish.mark(text.line(message))

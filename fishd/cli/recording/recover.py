@@ -6,8 +6,8 @@ import click
 from msgspec.structs import asdict
 
 from fishd.cli.options import json_option
-from fishd.cli.output import counted, echo, print_json
-from fishd.cli.recording.choice import damage, folder_option
+from fishd.cli.output import echo, format_count, print_json
+from fishd.cli.recording.choice import folder_option, format_damage
 from fishd.recording import open_run
 from fishd.recording.folder import find
 from fishd.recording.recover import recover as finish
@@ -31,9 +31,11 @@ def recover(file: str, folder: Path | None, as_json: bool) -> None:
         lost = damaged.damaged if damaged.is_damaged else None
         print_json({"path": run.path, "damaged": lost, **asdict(summary)})
         return
-    frames = f", {counted(summary.frames, 'frame')}" if summary.frames else ""
-    what = f"; {damage(damaged.damaged, damaged.damage_reason)}" if damaged.is_damaged else ""
+    frames = f", {format_count(summary.frames, 'frame')}" if summary.frames else ""
+    loss = (
+        f"; {format_damage(damaged.damaged, damaged.damage_reason)}" if damaged.is_damaged else ""
+    )
     echo(
-        f"{run.path}: {summary.duration:.1f} s, {counted(summary.ticks, 'tick')}, "
-        f"{summary.lost} lost, {counted(summary.events, 'event')}{frames}{what}"
+        f"{run.path}: {summary.duration:.1f} s, {format_count(summary.ticks, 'tick')}, "
+        f"{summary.lost} lost, {format_count(summary.events, 'event')}{frames}{loss}"
     )

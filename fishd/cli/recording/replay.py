@@ -7,13 +7,13 @@ from pathlib import Path
 import click
 
 from fishd.cli.options import FiniteRange, json_option
-from fishd.cli.output import counted, echo, print_json_line
-from fishd.cli.recording.choice import folder_option, opened
+from fishd.cli.output import echo, format_count, print_json_line
+from fishd.cli.recording.choice import folder_option, open_recording
 from fishd.core.addresses import control_address, find_control
 from fishd.core.process.interruption import interrupted_once
 from fishd.recording.replay import Replay
 
-TELEMETRY = "tcp://127.0.0.1:9872"
+DEFAULT_ADDRESS = "tcp://127.0.0.1:9872"
 
 
 @click.command()
@@ -23,19 +23,19 @@ TELEMETRY = "tcp://127.0.0.1:9872"
     type=FiniteRange(0.01, 1000),
     default=1.0,
     show_default=True,
-    help="How much faster than it was recorded.",
+    help="Factor by which it is faster than the recording.",
 )
 @click.option(
     "--address",
-    default=TELEMETRY,
+    default=DEFAULT_ADDRESS,
     show_default=True,
     metavar="ADDRESS",
-    help="Where ticks, events and statuses are published.",
+    help="Address at which ticks, events and statuses are published.",
 )
 @click.option(
     "--control",
     metavar="ADDRESS",
-    help="Where 'fishctl watch' asks for the status; default: where fishd would be.",
+    help="Control address, for 'fishctl watch'; default: that of fishd.",
 )
 @folder_option
 @json_option
@@ -50,9 +50,9 @@ def replay(
     """Publish a recording as fishd would, so that `fishctl watch` and PlotJuggler show it.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. It ends with the recording, or
-    with Ctrl-C. A silence of more than 5 s is cut short.
+    with Ctrl-C. A gap of more than 5 s is shortened.
     """
-    recorded = opened(run, folder)
+    recorded = open_recording(run, folder)
     with (
         suppress(KeyboardInterrupt),
         interrupted_once(),
@@ -60,14 +60,14 @@ def replay(
     ):
         seconds = recorded.summary.duration / speed
         if as_json:
-            where = {"telemetry": player.telemetry, "control": player.control}
-            print_json_line({"name": recorded.name, "seconds": seconds, **where})
+            addresses = {"telemetry": player.telemetry, "control": player.control}
+            print_json_line({"name": recorded.name, "seconds": seconds, **addresses})
             player.play(speed)
             return
         echo(f"{recorded.name}: {seconds:.0f} s at {player.telemetry}; Ctrl-C ends it")
         if recorded.frame_heads:
-            echo(f"its {counted(len(recorded.frame_heads), 'frame')} of a camera are left out")
-        found = find_control() == player.control
-        endpoint = "" if found else f"--endpoint {shlex.quote(player.control)} "
+            echo(f"its {format_count(len(recorded.frame_heads), 'frame')} of a camera are left out")
+        is_default = find_control() == player.control
+        endpoint = "" if is_default else f"--endpoint {shlex.quote(player.control)} "
         echo(f"watch it with: fishctl {endpoint}watch")
         player.play(speed)

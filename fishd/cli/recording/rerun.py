@@ -7,8 +7,8 @@ import click
 
 from fishd.cli.config import set_option
 from fishd.cli.options import ParameterType, json_option
-from fishd.cli.output import counted, echo, print_json, spelled
-from fishd.cli.recording.choice import folder_option, opened
+from fishd.cli.output import echo, format_controller, format_count, print_json
+from fishd.cli.recording.choice import folder_option, open_recording
 from fishd.controllers import registry
 from fishd.lab.rerun import Estimates, Stretch
 from fishd.lab.rerun import rerun as choose_again
@@ -36,33 +36,33 @@ def rerun(
     """Let a controller choose again in each recorded tick, and compare its commands.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. The controller sees the recorded
-    forces and angles. The one that swam gives the same commands to the last bit, from each of its
-    starts that is in the recording; exit status 1 where it does not, or where none swam. One that
-    swam already when the recording began is compared, too, but not judged.
+    forces and angles. The controller that swam gives the same commands to the last bit, from each
+    of its starts in the recording; exit status 1 if it does not, or if none swam. A controller that
+    swam before the recording began is compared, too, but not judged.
 
     fishctl rerun latest --controller swing C=0.4
     """
     if controller:
         controller, pairs = registry.split_spec(controller)
         parameters = (*(f"{key}={value}" for key, value in pairs), *parameters)
-    given = _parameters(controller, parameters)
-    recorded = opened(run, folder)
+    given = _convert_parameters(controller, parameters)
+    recorded = open_recording(run, folder)
     result = choose_again(recorded, controller, given, overrides)
     if as_json:
         print_json(result)
     else:
         for stretch in result.stretches:
-            _print(stretch)
+            _print_stretch(stretch)
         _print_estimates(result.estimates)
     if not result.stretches:
         echo(f"fishctl: {recorded.path}: no controller swam, so none can choose again", err=True)
         return 1
-    same = controller is None and not given and not overrides
-    wrong = [s for s in result.stretches if s.from_start and s.equal < s.ticks]
-    return 1 if same and wrong else 0
+    is_unchanged = controller is None and not given and not overrides
+    differing = [s for s in result.stretches if s.from_start and s.equal < s.ticks]
+    return 1 if is_unchanged and differing else 0
 
 
-def _parameters(controller: str | None, words: tuple[str, ...]) -> dict[str, Any]:
+def _convert_parameters(controller: str | None, words: tuple[str, ...]) -> dict[str, Any]:
     if not words:
         return {}
     if controller is None:
@@ -80,11 +80,11 @@ def _parameters(controller: str | None, words: tuple[str, ...]) -> dict[str, Any
     return given
 
 
-def _print(stretch: Stretch) -> None:
-    who = spelled(stretch.recorded, stretch.parameters)
-    again = "" if stretch.controller == stretch.recorded else f", {stretch.controller} again"
-    echo(f"from tick {stretch.seq}: {who}{again}")
-    share = f"{stretch.equal} of {counted(stretch.ticks, 'command')} equal to the last bit"
+def _print_stretch(stretch: Stretch) -> None:
+    controller = format_controller(stretch.recorded, stretch.parameters)
+    rerun_by = "" if stretch.controller == stretch.recorded else f", {stretch.controller} again"
+    echo(f"from tick {stretch.seq}: {controller}{rerun_by}")
+    share = f"{stretch.equal} of {format_count(stretch.ticks, 'command')} equal to the last bit"
     if stretch.equal == stretch.ticks:
         echo(f"  all {share}")
     else:
@@ -98,7 +98,8 @@ def _print(stretch: Stretch) -> None:
 
 def _print_estimates(estimates: Estimates) -> None:
     echo(
-        f"estimates: {estimates.equal} of {counted(estimates.ticks, 'tick')} equal to the last bit"
+        f"estimates: {estimates.equal} of {format_count(estimates.ticks, 'tick')} "
+        "equal to the last bit"
     )
     if not estimates.from_start:
         echo("  fishd estimated already when these ticks begin, so its past is not known")

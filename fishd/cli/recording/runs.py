@@ -10,8 +10,8 @@ import msgspec
 from msgspec import Struct
 
 from fishd.cli.options import json_option
-from fishd.cli.output import counted, echo, print_json
-from fishd.cli.recording.choice import damage, folder_option
+from fishd.cli.output import echo, format_count, print_json
+from fishd.cli.recording.choice import folder_option, format_damage
 from fishd.core import text
 from fishd.core.console import power_words
 from fishd.core.errors import ConfigError, RecordingError
@@ -19,9 +19,9 @@ from fishd.lab.experiment import Header, count_rows, list_experiments
 from fishd.recording.folder import Glance, glances, runs_folder
 from fishd.recording.summary import Summary
 
-WIDE = 1000
-LONGEST = 1e9
-"""No recording is longer than these thirty years [s]."""
+PIPE_COLUMNS = 1000
+MAX_DURATION_S = 1e9
+"""Longest duration that is shown as hours and minutes, about thirty years [s]."""
 
 
 @click.command()
@@ -30,33 +30,33 @@ LONGEST = 1e9
 def runs(folder: Path | None, as_json: bool) -> int:
     """List recordings and experiments, each the oldest first.
 
-    'thrust' is the mean while it swam, in mN unless another unit is shown, with its 95 % interval.
-    Where the zero of the sensor was never known, it is the mean force as measured, drift
-    and offset included, ± ?. 'power' went into the servo meanwhile. 'lost' are ticks that fishd
-    made and that are not in the file.
+    'thrust' is the mean while the fish swam, in mN unless another unit is shown, with its 95 %
+    confidence interval. If the zero of the sensor was never known, it is the mean measured force,
+    drift and offset included, ± ?. 'power' is the mean power into the servo. 'lost' counts ticks of
+    fishd that are not in the file.
     """
     place = folder or runs_folder()
-    found = list(glances(place))
-    good = [each for each in found if isinstance(each, Glance)]
-    experiments = [_Listed.read(*each) for each in list_experiments(place)]
+    recordings = list(glances(place))
+    good = [entry for entry in recordings if isinstance(entry, Glance)]
+    experiments = [_ExperimentSummary.read(*entry) for entry in list_experiments(place)]
     if as_json:
-        print_json([*map(_as_json, good), *experiments])
+        print_json([*map(_to_json, good), *experiments])
     else:
         if good:
-            _print(good)
+            _print_recordings(good)
         if experiments:
             _print_experiments(experiments)
         if not good and not experiments:
             echo(f"there is no recording in {place} yet; see 'fishctl record --help'")
-    wrong = [each for each in found if isinstance(each, RecordingError)]
+    wrong = [entry for entry in recordings if isinstance(entry, RecordingError)]
     problems = [str(error) for error in wrong] + [e.problem for e in experiments if e.problem]
     for problem in problems:
         echo(f"fishctl: {problem}", err=True)
     return 1 if problems else 0
 
 
-class _Listed(Struct):
-    """An experiment in short."""
+class _ExperimentSummary(Struct):
+    """Summary of an experiment."""
 
     name: str
     path: str
@@ -64,20 +64,20 @@ class _Listed(Struct):
     on: str
     began: str
     rows: int | None
-    """Rows of its table; None where it has none."""
+    """Number of rows of its table; None without a table."""
     problem: str = ""
-    """Why it cannot be read, where it cannot."""
+    """Reason why it cannot be read; empty if it can."""
 
     @classmethod
-    def read(cls, path: Path, header: "Header | ConfigError") -> "_Listed":
-        """Return what the list shows of an experiment."""
+    def read(cls, path: Path, header: "Header | ConfigError") -> "_ExperimentSummary":
+        """Return the summary of an experiment."""
         if isinstance(header, ConfigError):
             return cls(path.name, str(path), "–", "–", "", None, str(header))
         rows = count_rows(path)
         return cls(path.name, str(path), header.kind, header.on, header.began, rows)
 
 
-def _print_experiments(experiments: list[_Listed]) -> None:
+def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -86,18 +86,24 @@ def _print_experiments(experiments: list[_Listed]) -> None:
     for head in ("began", "kind", "fish"):
         table.add_column(head, no_wrap=True)
     table.add_column("rows", justify="right", no_wrap=True)
-    for each in experiments:
-        rows = "–" if each.rows is None else str(each.rows)
-        table.add_row(text.line(each.name), _began(each.began), each.kind, each.on, rows)
-    Console(width=None if sys.stdout.isatty() else WIDE, markup=False).print(table)
+    for experiment in experiments:
+        rows = "–" if experiment.rows is None else str(experiment.rows)
+        table.add_row(
+            text.line(experiment.name),
+            _format_start(experiment.began),
+            experiment.kind,
+            experiment.on,
+            rows,
+        )
+    Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
 
 
-def _as_json(glance: Glance) -> dict[str, Any]:
+def _to_json(glance: Glance) -> dict[str, Any]:
     return {
         "kind": "recording",
         "name": glance.name,
         "path": str(glance.path),
-        "state": _state(glance),
+        "state": _format_state(glance),
         "damaged": glance.damaged,
         "duration": glance.summary.duration,
         **msgspec.structs.asdict(glance.summary),
@@ -105,7 +111,7 @@ def _as_json(glance: Glance) -> dict[str, Any]:
     }
 
 
-def _print(found: list[Glance]) -> None:
+def _print_recordings(recordings: list[Glance]) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -115,13 +121,13 @@ def _print(found: list[Glance]) -> None:
         table.add_column(head, justify="right", no_wrap=True)
     for head in ("swam", "about"):
         table.add_column(head, overflow="fold")
-    for glance in found:
+    for glance in recordings:
         summary = glance.summary
         table.add_row(
             text.line(glance.name),
-            _began(glance.about.get("started", "")),
-            _length(summary.duration),
-            _thrust(summary),
+            _format_start(glance.about.get("started", "")),
+            _format_duration(summary.duration),
+            _format_thrust(summary),
             "–" if summary.power is None else power_words(summary.power),
             str(summary.ticks),
             str(summary.lost),
@@ -129,65 +135,65 @@ def _print(found: list[Glance]) -> None:
             text.line(", ".join(summary.swimming) or "–"),
             text.line("; ".join(_remarks(glance))),
         )
-    # In a file or a pipe nothing is wrapped.
-    Console(width=None if sys.stdout.isatty() else WIDE, markup=False).print(table)
+    # Nothing is wrapped in a file or a pipe.
+    Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
 
 
-def _thrust(summary: Summary) -> str:
-    """In mN, or thousandths of another unit; with its interval where the zero was known."""
+def _format_thrust(summary: Summary) -> str:
+    """Return the thrust in mN, or thousandths of another unit, with its interval if known."""
     if summary.thrust is None:
         return "–"
-    error = "?" if summary.thrust_error is None else _thousandths(summary.thrust_error)
+    error = "?" if summary.thrust_error is None else _format_thousandths(summary.thrust_error)
     unit = "" if summary.force_unit == "N" else f" m{text.quoted(summary.force_unit)}"
-    if error == "0.00":  # of no noise
+    if error == "0.00":  # a thrust without noise
         name = "" if summary.force_unit == "N" else summary.force_unit
         return text.format_measured(summary.thrust, summary.thrust_error, name)
-    return f"{_thousandths(summary.thrust)} ± {error}{unit}"
+    return f"{_format_thousandths(summary.thrust)} ± {error}{unit}"
 
 
-def _thousandths(value: float) -> str:
-    shown = value * 1e3
-    return f"{shown:.2f}" if abs(shown) < 1e6 else f"{shown:.3g}"
+def _format_thousandths(value: float) -> str:
+    thousandths = value * 1e3
+    return f"{thousandths:.2f}" if abs(thousandths) < 1e6 else f"{thousandths:.3g}"
 
 
 def _remarks(glance: Glance) -> list[str]:
-    state = _state(glance)
+    state = _format_state(glance)
     restarts = glance.summary.restarts
     return [
         *([state] if state != "finished" else []),
-        *([damage(glance.damaged)] if glance.damaged is not None else []),
-        *([counted(restarts, "restart")] if restarts else []),
-        *([_frames(glance.summary)] if glance.summary.frames else []),
+        *([format_damage(glance.damaged)] if glance.damaged is not None else []),
+        *([format_count(restarts, "restart")] if restarts else []),
+        *([_format_frames(glance.summary)] if glance.summary.frames else []),
         *(glance.about[key] for key in ("subject", "note") if glance.about.get(key)),
     ]
 
 
-def _frames(summary: Summary) -> str:
-    found = counted(summary.frames, "frame")
+def _format_frames(summary: Summary) -> str:
+    frames = format_count(summary.frames, "frame")
     if summary.frames_lost:
-        return f"{found}, {summary.frames_lost} lost"
-    gaps = counted(summary.frame_gaps, "gap")
-    return f"{found}, {gaps}" if summary.frame_gaps else found
+        return f"{frames}, {summary.frames_lost} lost"
+    gaps = format_count(summary.frame_gaps, "gap")
+    return f"{frames}, {gaps}" if summary.frame_gaps else frames
 
 
-def _state(glance: Glance) -> str:
+def _format_state(glance: Glance) -> str:
     if glance.writing:
         return "recording"
     return "finished" if glance.finished else "unfinished"
 
 
-def _began(iso: str) -> str:
+def _format_start(iso: str) -> str:
     try:
         return f"{datetime.fromisoformat(iso):%Y-%m-%d %H:%M}"
     except ValueError:
         return "–"
 
 
-def _length(seconds: float) -> str:
-    if not 0.0 <= seconds <= LONGEST:  # of a file in which no times stand
+def _format_duration(seconds: float) -> str:
+    if not 0.0 <= seconds <= MAX_DURATION_S:  # a file without times
         return f"{seconds:.3g} s"
-    minutes, rest = divmod(seconds, 60.0)
+    minutes, remainder = divmod(seconds, 60.0)
     hours, minutes = divmod(int(minutes), 60)
     if hours:
-        return f"{hours}:{minutes:02}:{rest:02.0f}"
-    return f"{minutes}:{rest:04.1f}" if minutes else f"{rest:.1f} s"
+        return f"{hours}:{minutes:02}:{remainder:02.0f}"
+    return f"{minutes}:{remainder:04.1f}" if minutes else f"{remainder:.1f} s"

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from fishd.cli.options import FiniteRange, json_option
-from fishd.cli.output import counted, echo, print_json
+from fishd.cli.output import echo, format_count, print_json
 from fishd.cli.swimmer.options import picture_options
 from fishd.core import text
 from fishd.lab.swimmer import midline_figure
@@ -38,7 +38,7 @@ def midlines(
     envelope = compute_envelope(*read_midlines(file), settle)
     beats = len(envelope.periods)
     frequency = beats / float(envelope.periods.sum())
-    title = f"{text.line(file.stem)}: midlines of the last of {counted(beats, 'beat')}, "
+    title = f"{text.line(file.stem)}: midlines of the last of {format_count(beats, 'beat')}, "
     midline_figure.draw_midlines(envelope, f"{title}{frequency:.2f} Hz".replace("$", r"\$"), path)
     tail = float(envelope.amplitudes[:, -1].mean())
     if as_json:
@@ -46,4 +46,4 @@ def midlines(
         print_json({"path": path, **gait})
         return
     echo(path)
-    echo(f"{counted(beats, 'beat')} of {frequency:.3f} Hz, tail ±{tail:.3f} lengths")
+    echo(f"{format_count(beats, 'beat')} of {frequency:.3f} Hz, tail ±{tail:.3f} lengths")

@@ -21,14 +21,14 @@ Shared = tuple[Bench, Daemon]
 def _patient_doctor(monkeypatch: pytest.MonkeyPatch) -> None:
     """A fishd that answers does so, however busy the machine is."""
     for module in (base, service):
-        monkeypatch.setattr(module, "PATIENCE", 10.0)
+        monkeypatch.setattr(module, "ANSWER_TIMEOUT_S", 10.0)
 
 
 @pytest.fixture
 def hurried_doctor(_patient_doctor: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """It gives up soon, where nothing answers and that is the point."""
     for module in (base, service):
-        monkeypatch.setattr(module, "PATIENCE", 0.5)
+        monkeypatch.setattr(module, "ANSWER_TIMEOUT_S", 0.5)
 
 
 @pytest.fixture

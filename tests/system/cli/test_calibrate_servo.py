@@ -199,7 +199,8 @@ def test_the_death_of_the_daemon_ends_it_in_one_line(talk: Talk, pi: Bench) -> N
     dialogue.answer("", "+")
     assert dialogue.finish() == 1
     assert re.search(
-        r"where the servo is cannot be told: [^\n]+\nfishctl: no fishd at [^\n]+\n$", dialogue.text
+        r"the position of the servo is unknown: [^\n]+\nfishctl: no fishd at [^\n]+\n$",
+        dialogue.text,
     )
 
 
@@ -229,7 +230,7 @@ class Lagging(VirtualDaemon):
 def test_a_tick_from_before_a_request_is_not_taken_for_a_tail_that_stands_still(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(servo, "PAUSE", 0.0)
+    monkeypatch.setattr(servo, "MOVE_INTERVAL_S", 0.0)
     daemon = Lagging()
     for _ in range(10):
         daemon.run.tick()

@@ -130,7 +130,7 @@ def test_status_says_how_the_camera_is(camera: CameraProcess, daemon: Daemon) ->
     )
     assert re.search(r"^state +streaming for 0:\d\d:\d\d$", shown, re.M)
     assert re.search(r"^rate +(29|30|31)\.\d frames a second$", shown, re.M)
-    assert re.search(r"^age +\d+\.\d ms when it can be had, exposed for 10\.0 ms$", shown, re.M)
+    assert re.search(r"^age +\d+\.\d ms when available, exposed for 10\.0 ms$", shown, re.M)
     assert re.search(rf"^process +fishd-camera .*, pid {camera.process.pid}, up 0:", shown, re.M)
     assert as_json("status")["session"] == camera.status().session
 
@@ -194,7 +194,7 @@ def test_no_axis_is_found_while_the_fish_rests(daemon: Daemon) -> None:
         ticks = fish.ticks()
         wait_until(lambda: abs(float(next(ticks).alpha)) < 1e-4)  # type: ignore[arg-type]
     complaint = one_line(fishctl("camera", "view", "--axis"))
-    assert complaint.startswith("fishctl: no axis is found, as no tail moves: let the fish swim")
+    assert complaint.startswith("fishctl: no axis was detected, as no tail moves: let the fish")
 
 
 def test_a_picture_of_another_kind_is_refused_at_once(tmp_path: Path) -> None:

@@ -124,7 +124,7 @@ CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
     ("systemd", "warning", "enable --now", SYSTEMD | UNIT, []),
     ("systemd", "ok", "", SYSTEMD | UNIT | WANTED, []),
     ("state folder", "ok", "", {}, []),
-    ("state folder", "FAIL", "is no folder", {"state": "a file"}, []),
+    ("state folder", "FAIL", "is not a folder", {"state": "a file"}, []),
     ("calibrations", "warning", "fishctl calibrate force", {}, []),
     ("calibrations", "warning", "fishctl calibrate servo", FORCE, []),
     ("calibrations", "ok", "2026-01-02 (its uncertainty is unknown), servo of 2026-01-03",

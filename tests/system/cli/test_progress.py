@@ -8,9 +8,9 @@ import sys
 import pytest
 
 SHOWS = """
-from fishd.cli.progress import showing
+from fishd.cli.progress import show_progress
 from fishd.cli.output import print_json
-with showing(2.0, "s", err={err}) as show:
+with show_progress(2.0, "s", err={err}) as show:
     show.done("one is done", 1.0)
     show.at(2.0)
 print_json([1])

@@ -184,7 +184,7 @@ def test_the_camera_gives_way_to_fishd_and_reaches_video_devices_only() -> None:
 
 def test_the_daemon_and_the_unit_agree_on_real_time() -> None:
     priority = int(setting("fishd.service", "LimitRTPRIO")[0])
-    assert priority == timing.OF_SERVICE
+    assert priority == timing.SERVICE_PRIORITY_LIMIT
     assert priority > Config().realtime.priority  # one above it ends a fishd that hangs
     assert int(setting("pigpiod.service.d/fishd.conf", "CPUSchedulingPriority")[0]) > priority
 

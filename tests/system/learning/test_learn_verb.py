@@ -13,7 +13,7 @@ import pytest
 from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line
 from rigs.swimming import brief_job, rows, wait_for, while_it_trains
 
-from fishd.cli.learn.ppo import report
+from fishd.cli.learn.ppo import print_outcome
 from fishd.cli.main import fishctl as commands
 from fishd.client import Fish
 from fishd.config import load
@@ -285,7 +285,7 @@ def test_more_thrust_than_is_possible_is_said_to_be_so(
         latest_evaluation=best,
         best_evaluation=best,
     )
-    assert report(outcome, brief_job(tmp_path / "tank")) == 0
+    assert print_outcome(outcome, brief_job(tmp_path / "tank")) == 0
     said = capsys.readouterr().out
     assert ("careful: that is more than the best square wave" in said) is careful
     assert "learn export" in said
