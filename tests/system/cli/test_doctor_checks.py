@@ -266,7 +266,7 @@ def test_a_button_that_nothing_can_read_is_not_passed_over(
 def test_whoever_may_not_be_in_real_time_is_told_which_limit_suffices(
     examine: Examine, monkeypatch: pytest.MonkeyPatch, priority: int, words: str
 ) -> None:
-    monkeypatch.setattr(timing, "_TRY", "raise SystemExit(1)")
+    monkeypatch.setattr(timing, "_TRIAL", "raise SystemExit(1)")
     level, _, mend = examine("real time", f"realtime.priority={priority}")
     assert (level, words in mend) == ("warning", True), mend
 
@@ -275,7 +275,7 @@ def test_whoever_may_not_be_in_real_time_is_told_which_limit_suffices(
 def test_a_limit_that_leaves_nothing_above_the_loop_is_a_warning(
     examine: Examine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(timing, "_TRY", "import sys; sys.exit(int(sys.argv[1]) > 50)")
+    monkeypatch.setattr(timing, "_TRIAL", "import sys; sys.exit(int(sys.argv[1]) > 50)")
     level, message, mend = examine("real time", "realtime.priority=50")
     assert level == "warning"
     assert message.startswith("SCHED_FIFO 50 is permitted, but not 51, which the thread needs")
