@@ -1,6 +1,6 @@
-"""How a camera stands over the fish, judged by what moves in its frames, and what would be better.
+"""Alignment of a camera above the fish, derived from the motion in its frames.
 
-Frames should show the fish's axis along their middle row, its head to the left, its tail inside.
+Frames should show the fish's axis along their middle row, its head to the left, its whole tail.
 """
 
 import math
@@ -11,18 +11,20 @@ import numpy as np
 from fishd.camera.axis import Axis, Floats, Motion, find_axis, likeness
 from fishd.camera.settings import CameraSettings, Square
 
-NEAR = 0.5
-"""An axis is in the middle when it is no further off [px]."""
-LEVEL = math.radians(0.5)
-"""It is level when its tilt is no more [rad]."""
-_CLEARER = 1.3
-"""Motion is upright when it is so much more its own mirror image that way."""
-_EDGE = 0.1
-"""Motion is cut off when a tenth of an edge shows more than this share of the strongest."""
+MAX_OFFSET_PX = 0.5
+"""Largest offset of an axis that counts as centred [px]."""
+MAX_TILT_RAD = math.radians(0.5)
+"""Largest tilt of an axis that counts as level [rad]."""
+_UPRIGHT_LIKENESS_RATIO = 1.3
+"""Ratio of the symmetry of the transposed motion to that of the motion, above which the fish lies
+along the columns of the picture."""
+_EDGE_FRACTION = 0.1
+"""Fraction of the 90 % quantile of the motion; the motion is cut off where a tenth of an edge
+exceeds it."""
 
 
 class Place(NamedTuple):
-    """Where the motion is: the rows and columns that hold nine tenths of it [px]."""
+    """Rows and columns that hold nine tenths of the motion [px]."""
 
     top: int
     bottom: int
@@ -31,47 +33,49 @@ class Place(NamedTuple):
 
 
 class Alignment(NamedTuple):
-    """How a camera stands over the fish."""
+    """Result of a check of a camera's alignment."""
 
     motion: Motion
     place: Place
     good: bool
     advice: tuple[str, ...]
-    """What to do, a line each; nothing where all is well."""
+    """Instructions, one line each; empty where the alignment is good."""
     settings: dict[str, object]
-    """What to write into the camera's settings, by dotted key."""
+    """New values for the camera's settings, by dotted key."""
 
 
 def judge(motion: Motion, picture: tuple[int, int], settings: CameraSettings) -> Alignment:
-    """Judge the motion in frames.
+    """Return the alignment that the motion in frames shows.
 
-    picture: height and width of the camera's whole pictures as frames are cut from them [px]
-    settings: of the camera
+    picture: height and width of the camera's whole pictures, from which frames are cut [px]
+    settings: the camera's settings
     """
     place = _place(motion.energy)
-    edges = _cut_off(motion.energy)
+    edges = _edges_reached(motion.energy)
     advice = [f"the motion is cut off at {' and '.join(edges)}: show more around the tail"] * bool(
         edges
     )
-    better: dict[str, object] = {}
-    if turn := _turn(motion):
-        better["picture.rotate"] = (settings.picture.rotate + turn) % 360
+    new_settings: dict[str, object] = {}
+    if turn := _needed_turn(motion):
+        new_settings["picture.rotate"] = (settings.picture.rotate + turn) % 360
         advice.append(
             "the fish does not lie along the rows of the picture with its head to the left: turn it"
         )
-        return Alignment(motion, place, False, tuple(advice), better)
+        return Alignment(motion, place, False, tuple(advice), new_settings)
     axis = motion.axis
     if not motion.sure:
         advice.append(
-            "the axis lies at the edge of what is looked at, and may be further off or steeper: "
+            "the axis lies at the edge of the search range, and may be further off or steeper: "
             "turn or move the camera, then align again"
         )
-    level, near = abs(axis.tilt) <= LEVEL, abs(axis.offset) <= NEAR
+    level, centred = abs(axis.tilt) <= MAX_TILT_RAD, abs(axis.offset) <= MAX_OFFSET_PX
     if settings.source == "simulated":
-        if not near:
-            better["simulated.off_axis"] = round(settings.simulated.off_axis - axis.offset, 1) + 0.0
+        if not centred:
+            new_settings["simulated.off_axis"] = (
+                round(settings.simulated.off_axis - axis.offset, 1) + 0.0
+            )
         if not level:
-            better["simulated.tilt"] = round(settings.simulated.tilt - axis.tilt, 3) + 0.0
+            new_settings["simulated.tilt"] = round(settings.simulated.tilt - axis.tilt, 3) + 0.0
     else:
         if not level:
             way = "clockwise" if axis.tilt > 0.0 else "counter-clockwise"
@@ -79,38 +83,40 @@ def judge(motion: Motion, picture: tuple[int, int], settings: CameraSettings) ->
                 f"turn the camera {way}, as seen from behind it, by "
                 f"{abs(math.degrees(axis.tilt)):.1f}°"
             )
-        if not near:
-            crop = _centred(axis, motion.energy.shape[0], picture, settings.picture.crop)
+        if not centred:
+            crop = _centred_crop(axis, motion.energy.shape[0], picture, settings.picture.crop)
             for name in ("y", "side"):
                 value = round(getattr(crop, name), 3)
                 if value != round(getattr(settings.picture.crop, name), 3):
-                    better[f"picture.crop.{name}"] = value
-    good = level and near and motion.sure and not edges
-    return Alignment(motion, place, good, tuple(advice), better)
+                    new_settings[f"picture.crop.{name}"] = value
+    good = level and centred and motion.sure and not edges
+    return Alignment(motion, place, good, tuple(advice), new_settings)
 
 
-def _centred(axis: Axis, size: int, picture: tuple[int, int], crop: Square) -> Square:
-    """The square whose middle row is the axis; a smaller one where that needs more room."""
+def _centred_crop(axis: Axis, size: int, picture: tuple[int, int], crop: Square) -> Square:
+    """Return the square whose middle row is the axis, smaller where the picture is too small."""
     height, shorter = picture[0], min(picture)
     side = crop.side * shorter
     half = 0.5 * side / height
-    middle = min(max(crop.y, half), 1.0 - half)  # as the picture is truly cut
+    middle = min(
+        max(crop.y, half), 1.0 - half
+    )  # where the square is after it was moved inside the picture
     middle += axis.offset * side / size / height
     room = 2.0 * min(middle, 1.0 - middle) * height
     return Square(x=crop.x, y=middle, side=max(0.05, min(side, room) / shorter))
 
 
-def _turn(motion: Motion) -> int:
-    """By how many degrees the picture must be turned clockwise for the head to be at the left."""
+def _needed_turn(motion: Motion) -> int:
+    """Return the clockwise turn of the picture that puts the head at the left [degrees]."""
     energy = motion.energy
     upright = find_axis(np.ascontiguousarray(energy.T))
-    if likeness(energy.T, upright) > _CLEARER * likeness(energy, motion.axis):
-        return 270 if _behind(energy.T) else 90
-    return 0 if _behind(energy) else 180
+    if likeness(energy.T, upright) > _UPRIGHT_LIKENESS_RATIO * likeness(energy, motion.axis):
+        return 270 if _tail_is_right(energy.T) else 90
+    return 0 if _tail_is_right(energy) else 180
 
 
-def _behind(energy: Floats) -> bool:
-    """Does the motion grow towards the right, as that of a tail does whose root is at the left?"""
+def _tail_is_right(energy: Floats) -> bool:
+    """Return whether the motion grows towards the right, as if the tail's root is at the left."""
     strength = energy.sum(axis=0)
     moving = np.flatnonzero(strength > 0.05 * strength.max())
     middle = 0.5 * (moving[0] + moving[-1])
@@ -119,18 +125,18 @@ def _behind(energy: Floats) -> bool:
 
 
 def _place(energy: Floats) -> Place:
-    return Place(*_middle(energy.sum(axis=1)), *_middle(energy.sum(axis=0)))
+    return Place(*_middle_range(energy.sum(axis=1)), *_middle_range(energy.sum(axis=0)))
 
 
-def _middle(strength: Floats) -> tuple[int, int]:
-    """First and last of those that hold nine tenths."""
+def _middle_range(strength: Floats) -> tuple[int, int]:
+    """Return the first and last index of the middle nine tenths of `strength`."""
     share = np.cumsum(strength) / strength.sum()
     return int(np.searchsorted(share, 0.05)), int(np.searchsorted(share, 0.95))
 
 
-def _cut_off(energy: Floats) -> list[str]:
-    """The edges of the picture that motion reaches in strength."""
-    limit = _EDGE * float(np.quantile(energy[energy > 0.0], 0.9))
+def _edges_reached(energy: Floats) -> list[str]:
+    """Return the edges of the picture that strong motion reaches."""
+    limit = _EDGE_FRACTION * float(np.quantile(energy[energy > 0.0], 0.9))
     edges = {
         "the upper edge": energy[:2],
         "the lower edge": energy[-2:],

@@ -1,4 +1,4 @@
-"""Follows the axis of motion while frames come: known once the tail has moved for a while."""
+"""Estimate of the axis of motion that is updated while frames arrive."""
 
 import random
 import time
@@ -10,60 +10,62 @@ import numpy as np
 from fishd.camera.axis import Axis, NoMotion, find_motion
 from fishd.core.camera_frames import Frame, Pixels
 
-SPAN = 20.0
-"""It is found in the frames of so long [s]."""
-APART = (0.02, 0.08)
-"""The time from one frame to the next that is kept is at least a random one between these [s]: at
-even distances, a beat would be seen in the same few phases again and again."""
-AGAIN = 3.0
-"""It is looked for so often at most, as that takes a tenth of a second [s]."""
-_NONE = np.zeros((1, 1), np.uint8)
-FEWEST = 40
-"""Frames that are needed."""
+FRAME_SPAN_S = 20.0
+"""Age of the oldest frame that the estimate uses [s]."""
+FRAME_GAPS_S = (0.02, 0.08)
+"""Range of the random minimum time between two kept frames [s]. With a fixed time, all kept frames
+could show the same few phases of the beat."""
+SEARCH_PERIOD_S = 3.0
+"""Shortest time between two estimates, because one takes a tenth of a second [s]."""
+_EMPTY_PICTURE = np.zeros((1, 1), np.uint8)
+MIN_FRAMES = 40
+"""Smallest number of frames for an estimate."""
 
 
 class AxisWatch:
-    """Is shown every frame."""
+    """Estimator of the axis; `add` takes every frame."""
 
     def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
         self.axis: Axis | None = None
-        """The latest that was found; the camera stands still while the fish rests."""
+        """Latest axis; it stays valid while the fish rests, because the camera does not move."""
         self.moving = False
-        """Did anything move when it was looked for last?"""
+        """Whether there was motion in the latest search."""
         self._now = now
-        self._frames: deque[tuple[float, Pixels]] = deque(maxlen=round(SPAN / APART[0]))
+        self._frames: deque[tuple[float, Pixels]] = deque(
+            maxlen=round(FRAME_SPAN_S / FRAME_GAPS_S[0])
+        )
         self._random = random.Random(0)
-        self._apart = 0.0
-        self._next = now() + AGAIN
+        self._gap = 0.0
+        self._next_search = now() + SEARCH_PERIOD_S
 
     def __len__(self) -> int:
-        """How many frames it would look at."""
+        """Return the number of frames that the next search will use."""
         return len(self._frames)
 
     def add(self, frame: Frame) -> None:
-        """Take a frame; another size, or an earlier time, begins anew."""
+        """Take a frame; reset on a frame of another size or with an earlier time."""
         if self._frames:
-            before, pixels = self._frames[-1]
-            if pixels.shape != frame.pixels.shape or frame.time < before:
+            latest_time, pixels = self._frames[-1]
+            if pixels.shape != frame.pixels.shape or frame.time < latest_time:
                 self._frames.clear()
                 self.axis, self.moving = None, False
-            elif frame.time - before < self._apart:
+            elif frame.time - latest_time < self._gap:
                 return
-            self._apart = self._random.uniform(*APART)
+            self._gap = self._random.uniform(*FRAME_GAPS_S)
         self._frames.append((frame.time, frame.pixels))
-        while frame.time - self._frames[0][0] > SPAN:
+        while frame.time - self._frames[0][0] > FRAME_SPAN_S:
             self._frames.popleft()
 
     @property
     def due(self) -> bool:
-        """Is it time to look for the axis?"""
-        return len(self._frames) >= FEWEST and self._now() >= self._next
+        """Whether it is time to search for the axis."""
+        return len(self._frames) >= MIN_FRAMES and self._now() >= self._next_search
 
     def find(self) -> None:
-        """Look for the axis; takes a tenth of a second."""
-        self._next = self._now() + AGAIN
+        """Search for the axis; this takes a tenth of a second."""
+        self._next_search = self._now() + SEARCH_PERIOD_S
         try:
-            pictures = np.stack([pixels for _, pixels in self._frames or [(0.0, _NONE)]])
+            pictures = np.stack([pixels for _, pixels in self._frames or [(0.0, _EMPTY_PICTURE)]])
             self.axis = find_motion(pictures).axis
             self.moving = True
         except NoMotion:

@@ -1,8 +1,8 @@
-"""The offset between two monotonic clocks, estimated from round trips.
+"""Offset between two monotonic clocks, estimated from round trips.
 
-The answer was given at some time between question and answer. Taken as the middle, it is wrong by
-half of the round trip at most; so the shortest of several tells most (Cristian, "Probabilistic
-clock synchronization", Distributed Computing 3, 1989).
+The other program reads its clock at some time between request and reply. The middle of the two is
+wrong by half of the round trip at most, so the shortest of several round trips gives the smallest
+uncertainty (Cristian, "Probabilistic clock synchronization", Distributed Computing 3, 1989).
 """
 
 import math
@@ -16,46 +16,47 @@ from fishd.client import Fish
 from fishd.core.clock import boot_id
 from fishd.core.errors import FishError
 
-DRIFT = 1e-4
-"""By so much two clocks may run apart: twice what crystals do [s/s]."""
-ROUNDS = 8
-"""Round trips for a first estimate."""
-AGAIN = 5.0
-"""Time between two further ones [s]."""
-QUICK = 0.05
-"""How long a further one may take at least; a slow network gets four times its best [s]."""
-PAUSE = 1.0
-"""Time between two tries to begin anew [s]."""
+MAX_DRIFT = 1e-4
+"""Largest relative drift between two clocks, twice that of crystal oscillators [s/s]."""
+FIRST_ROUND_TRIPS = 8
+"""Number of round trips of the first estimate."""
+UPDATE_PERIOD_S = 5.0
+"""Time between two later round trips [s]."""
+MIN_UPDATE_TIMEOUT_S = 0.05
+"""Smallest timeout of a later round trip; on a slow network it is four times the shortest one
+[s]."""
+RETRY_PERIOD_S = 1.0
+"""Time between two attempts to restart the estimate [s]."""
 
 
 class Reading(NamedTuple):
-    """What a program says of its clock."""
+    """Reading of a program's clock."""
 
     clock: float
-    """[s]"""
+    """Time of the program's monotonic clock [s]."""
     boot: str
-    """Names the start of its machine; see `fishd.core.clock.boot_id`."""
+    """Identifier of the boot of its machine; see `fishd.core.clock.boot_id`."""
 
 
 class Offset(NamedTuple):
-    """How far their clock is ahead of that of this machine."""
+    """Lead of the other program's clock over that of this machine."""
 
     seconds: float
     uncertainty: float
-    """It is wrong by no more [s]."""
+    """Largest error of `seconds` [s]."""
 
 
-SAME = Offset(0.0, 0.0)
+NO_OFFSET = Offset(0.0, 0.0)
 
 Ask = Callable[[float | None], Reading]
-"""Asks a program for its clock, and waits so long [s]; None: as long as it likes."""
+"""Function that reads a program's clock; its argument is the timeout [s], None for its default."""
 
 
 def clock_of(fish: Fish) -> Ask:
-    """Asks a fishd."""
+    """Return a function that reads the clock of a fishd."""
 
-    def ask(patience: float | None) -> Reading:
-        status = fish.status(patience)
+    def ask(timeout: float | None) -> Reading:
+        status = fish.status(timeout)
         return Reading(status.clock, status.boot)
 
     return ask
@@ -63,88 +64,93 @@ def clock_of(fish: Fish) -> Ask:
 
 class _Exchange(NamedTuple):
     offset: float
-    half: float
-    when: float
+    half_trip: float
+    received: float
 
 
 class ClockOffset:
-    """Asks for the time of another program, and knows how far its clock is ahead.
+    """Estimator of the lead of another program's clock.
 
-    It waits for an answer only until the first one has come; later it keeps what it knows where
-    none comes at once, so that it may be asked within a tick.
+    Only the first estimate waits for answers. Later updates keep the estimate where no answer comes
+    at once, so `update` may be called within a tick.
     """
 
     def __init__(self, ask: Ask, now: Callable[[], float] = time.monotonic) -> None:
-        """ask: gives the other program's clock, or raises what it likes; now: this one [s]"""
+        """ask: reads the other program's clock, or raises an error; now: reads this clock [s]"""
         self._ask = ask
         self._now = now
         self._boot = boot_id()
-        self._theirs = ""
-        self._exchanges: deque[_Exchange] = deque(maxlen=2 * ROUNDS)
-        self._asked = 0.0
+        self._other_boot = ""
+        self._exchanges: deque[_Exchange] = deque(maxlen=2 * FIRST_ROUND_TRIPS)
+        self._last_request_time = 0.0
         self._shortest: float | None = None
-        """Of all round trips so far [s]."""
+        """Shortest of all round trips [s]."""
         self._failure: FishError | None = None
-        """Why it could not begin anew."""
+        """Error of the latest attempt to restart the estimate."""
 
     def update(self) -> Offset:
-        """The offset; asks once more when the latest answer is old.
+        """Return the offset, after another round trip when the latest one is old.
 
-        Raises what `ask` raises as long as nothing is known.
+        Raises what `ask` raises before the first estimate.
         """
         if not self._exchanges:
             self._begin()
-        elif not self._same and self._now() - self._asked > AGAIN:
+        elif not self._is_local and self._now() - self._last_request_time > UPDATE_PERIOD_S:
             with suppress(FishError):
                 self._exchange()
-                if len(self._exchanges) == 1:  # another machine, or another start of it
+                if len(self._exchanges) == 1:  # the machine is another one, or has rebooted
                     self._begin()
         return self.offset
 
     @property
-    def known(self) -> bool:
-        """Has it ever had an answer?"""
+    def has_answered(self) -> bool:
+        """Whether there has ever been an answer."""
         return self._shortest is not None
 
     @property
-    def _same(self) -> bool:
-        """Is it a program on this machine?"""
-        return bool(self._exchanges and self._theirs) and self._theirs == self._boot
+    def _is_local(self) -> bool:
+        """Whether the other program runs on this machine."""
+        return bool(self._exchanges and self._other_boot) and self._other_boot == self._boot
 
     @property
     def offset(self) -> Offset:
-        """As far as it is known; exactly 0 for a program on this machine."""
-        if self._same or not self._exchanges:
-            return SAME
+        """Current estimate; exactly 0 for a program on this machine."""
+        if self._is_local or not self._exchanges:
+            return NO_OFFSET
         now = self._now()
-        best = min(self._exchanges, key=lambda each: each.half + DRIFT * (now - each.when))
-        return Offset(best.offset, best.half + DRIFT * (now - best.when))
+        best = min(
+            self._exchanges,
+            key=lambda exchange: exchange.half_trip + MAX_DRIFT * (now - exchange.received),
+        )
+        return Offset(best.offset, best.half_trip + MAX_DRIFT * (now - best.received))
 
     def forget(self) -> None:
-        """Begin anew: the other program was started again, perhaps on another machine."""
+        """Reset the estimate: the other program has restarted, perhaps on another machine."""
         self._exchanges.clear()
 
     def _begin(self) -> None:
-        """Exchange until the offset is known well; raises what `ask` raises where it is not."""
-        if self._failure and self._now() - self._asked < PAUSE:
+        """Make the first round trips; raises what `ask` raises where none succeeds."""
+        if self._failure and self._now() - self._last_request_time < RETRY_PERIOD_S:
             raise self._failure.with_traceback(None)
         self._failure = None
         try:
-            while len(self._exchanges) < ROUNDS and not self._same:
+            while len(self._exchanges) < FIRST_ROUND_TRIPS and not self._is_local:
                 self._exchange()
         except FishError as error:
             if not self._exchanges:
-                self._failure = error if self.known else None
+                self._failure = error if self.has_answered else None
                 raise
 
     def _exchange(self) -> None:
-        patience = None if self._shortest is None else max(QUICK, 4.0 * self._shortest)
-        sent = self._asked = self._now()
-        reading = self._ask(patience)
+        timeout = (
+            None if self._shortest is None else max(MIN_UPDATE_TIMEOUT_S, 4.0 * self._shortest)
+        )
+        sent = self._last_request_time = self._now()
+        reading = self._ask(timeout)
         received = self._now()
-        if reading.boot != self._theirs:
+        if reading.boot != self._other_boot:
             self.forget()
-            self._theirs = reading.boot
+            self._other_boot = reading.boot
         self._shortest = min(received - sent, self._shortest or math.inf)
-        half = 0.5 * (received - sent)
-        self._exchanges.append(_Exchange(reading.clock - (sent + half), half, received))
+        half_trip = 0.5 * (received - sent)
+        self._exchanges.append(_Exchange(reading.clock - (sent + half_trip), half_trip, received))

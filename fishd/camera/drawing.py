@@ -1,4 +1,4 @@
-"""Pictures for people: frames and motion in colours, the axis drawn in, as PNG."""
+"""Pictures for people as PNG: frames and motion in colours, with the axis drawn in."""
 
 from pathlib import Path
 
@@ -13,39 +13,39 @@ from fishd.core.errors import FishdError
 from fishd.core.files import write_atomically
 
 Colours = NDArray[np.uint8]
-"""Red, green and blue, shape (height, width, 3)."""
+"""Red, green and blue of each pixel, shape (height, width, 3)."""
 
-AXIS = (255, 90, 60)
+AXIS_COLOUR = (255, 90, 60)
 """Colour of the axis."""
-CROP = (90, 200, 255)
-"""Colour of the edge of what frames show."""
-_LARGE = 640
-"""A frame is enlarged to about so many pixels for a file."""
+CROP_COLOUR = (90, 200, 255)
+"""Colour of the outline of the part that frames show."""
+_ENLARGED_SIZE_PX = 640
+"""Approximate width or height to which a frame is enlarged for a file [px]."""
 
 
-def coloured(pixels: Pixels) -> Colours:
-    """Grey levels as colours."""
+def to_colours(pixels: Pixels) -> Colours:
+    """Return grey levels as colours."""
     return np.repeat(pixels[:, :, np.newaxis], 3, axis=2)
 
 
 def motion_colours(energy: Floats) -> Colours:
-    """A picture of motion: dark where nothing moves, yellow where most does."""
+    """Return a picture of motion, from black where nothing moves to yellow where most moves."""
     strength = np.sqrt(energy / max(float(np.quantile(energy, 0.995)), 1e-12))
     levels = np.asarray(np.clip(255.0 * strength, 0.0, 255.0), np.uint8)
-    return _swapped(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO))
+    return _swap_red_and_blue(cv2.applyColorMap(levels, cv2.COLORMAP_INFERNO))
 
 
-def enlarged(colours: Colours) -> Colours:
-    """The same with larger pixels."""
-    factor = max(1, _LARGE // max(colours.shape[:2]))
+def enlarge(colours: Colours) -> Colours:
+    """Return the picture with larger pixels."""
+    factor = max(1, _ENLARGED_SIZE_PX // max(colours.shape[:2]))
     return np.asarray(colours.repeat(factor, axis=0).repeat(factor, axis=1))
 
 
-def with_axis(colours: Colours, axis: Axis | None, size: int, crop: Crop | None = None) -> Colours:
-    """The same with an axis drawn in.
+def draw_axis(colours: Colours, axis: Axis | None, size: int, crop: Crop | None = None) -> Colours:
+    """Return the picture with an axis drawn in.
 
-    axis: in frames of `size` rows and columns; None draws nothing
-    crop: where in the picture frames are cut from; None where it shows what they show
+    axis: axis in frames of `size` rows and columns; None draws nothing
+    crop: part of the picture that frames show; None where the picture shows the same part
     """
     drawn = np.ascontiguousarray(colours)
     height, width = drawn.shape[:2]
@@ -57,33 +57,33 @@ def with_axis(colours: Colours, axis: Axis | None, size: int, crop: Crop | None 
         return round(x), round(y)
 
     if (crop.width, crop.height) != (1.0, 1.0):
-        corner, other = point(-0.5, -0.5), point(size - 0.5, size - 0.5)
-        cv2.rectangle(drawn, corner, other, CROP, 1)
+        corner, opposite_corner = point(-0.5, -0.5), point(size - 0.5, size - 0.5)
+        cv2.rectangle(drawn, corner, opposite_corner, CROP_COLOUR, 1)
     if axis is not None:
         rows = axis.rows(size, size)
         ends = point(0.0, float(rows[0])), point(size - 1.0, float(rows[-1]))
         thickness = max(1, min(height, width) // 240)
-        cv2.line(drawn, *ends, AXIS, thickness, cv2.LINE_AA if thickness > 1 else cv2.LINE_8)
+        cv2.line(drawn, *ends, AXIS_COLOUR, thickness, cv2.LINE_AA if thickness > 1 else cv2.LINE_8)
     return drawn
 
 
-def whole_picture(view: PublishedView) -> Colours:
-    """The camera's whole picture; raises `FishdError` where it is no picture."""
+def decode_view(view: PublishedView) -> Colours:
+    """Return the camera's whole picture; raises `FishdError` where it cannot be decoded."""
     grey = cv2.imdecode(np.frombuffer(view.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
     if grey is None:
-        raise FishdError("what the camera sends as its view is no JPEG picture")
-    return coloured(np.asarray(grey, np.uint8))
+        raise FishdError("the view that the camera sends is not a JPEG picture")
+    return to_colours(np.asarray(grey, np.uint8))
 
 
 def write_png(path: Path, colours: Colours) -> None:
     """Write a picture; raises `FishdError`."""
-    _, data = cv2.imencode(".png", _swapped(colours))
+    _, data = cv2.imencode(".png", _swap_red_and_blue(colours))
     try:
         write_atomically(path, data.tobytes())
     except OSError as error:
         raise FishdError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
-def _swapped(colours: object) -> Colours:
-    """Between the order of OpenCV, blue first, and that of everybody else."""
+def _swap_red_and_blue(colours: object) -> Colours:
+    """Return a picture with red and blue exchanged, because OpenCV stores blue first."""
     return np.ascontiguousarray(np.asarray(colours, np.uint8)[:, :, ::-1])

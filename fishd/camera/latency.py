@@ -1,8 +1,8 @@
-"""The delay of a camera's whole path, measured against the lateral force of the fish it looks at.
+"""Delay of a camera's whole path, measured against the lateral force of the fish.
 
-The force of a swinging tail is F_y = −K α̈ − K_d α̇. Integrated twice it gives the fin angle up to
-its scale, a drift, and one unknown rate K_d/K; the pictures show the same angle. The delay is that
-by which the two agree best. Neither K nor K_d nor the geometry of the camera is needed.
+The force of a swinging tail is F_y = −K α̈ − K_d α̇. Integrated twice, it gives the fin angle up to
+a scale, a drift, and one unknown rate K_d/K; the pictures show the same angle. The estimate is the
+delay at which the two agree best. It needs neither K nor K_d nor the geometry of the camera.
 """
 
 import math
@@ -18,80 +18,85 @@ from fishd.core.errors import FishdError
 
 Floats = NDArray[np.float64]
 
-LATEST, EARLIEST = 0.5, -0.1
-"""Delays that are looked for [s]."""
-SHORTEST = 10.0
-"""Less swimming tells too little [s]."""
-PARTS = 12
-"""The jackknife leaves out one of so many parts of the swim."""
+MAX_DELAY_S, MIN_DELAY_S = 0.5, -0.1
+"""Largest and smallest delay that is searched [s]."""
+MIN_SWIM_S = 10.0
+"""Shortest swim from which the delay is estimated [s]."""
+JACKKNIFE_PARTS = 12
+"""Number of parts of the swim; the jackknife leaves out one of them at a time."""
 _STUDENT = 2.201
-"""97.5 % quantile of Student's t with `PARTS` - 1 degrees of freedom."""
-_SLOWEST = 0.35
-"""What is slower is drift of the sensor, not swimming [Hz]."""
-_STEP = 5e-3
-"""Of the integration [s]."""
-_RATES = (0.3, 30.0)
-"""K_d/K is looked for between these [1/s]."""
-_ENOUGH = 0.8
-"""Pictures and forces that agree less are not those of one tail."""
+"""97.5 % quantile of Student's t with `JACKKNIFE_PARTS` - 1 degrees of freedom."""
+_MIN_FREQUENCY_HZ = 0.35
+"""Lowest frequency of swimming; slower changes are drift of the sensor [Hz]."""
+_STEP_S = 5e-3
+"""Step of the integration [s]."""
+_RATE_RANGE = (0.3, 30.0)
+"""Range in which K_d/K is searched [1/s]."""
+_MIN_AGREEMENT = 0.8
+"""Smallest agreement of pictures and forces that belong to the same tail."""
 
 
 class NoDelay(FishdError, ValueError):
-    """The delay cannot be told from these pictures and forces; the message says why."""
+    """The delay cannot be estimated from these pictures and forces; the message says why."""
 
 
 class Force(NamedTuple):
-    """The lateral force of one tick."""
+    """Lateral force of one tick."""
 
     begin: float
-    """Begin of the window that it is the mean of [s, clock of fishd]."""
+    """Begin of the window over which the force is averaged [s, clock of fishd]."""
     end: float
+    """End of the window [s, clock of fishd]."""
     fy: float
-    """[N]"""
+    """Mean lateral force [N]."""
 
 
 class Latency(NamedTuple):
-    """How old pictures are."""
+    """Latency of a camera's frames."""
 
     stamps: float
-    """So much later than the middle of its exposure is the time of a frame [s]."""
+    """Delay of a frame's time stamp after the middle of its exposure [s]."""
     error: float
-    """Half of the 95 % interval of that, by a jackknife over parts of the swim [s]."""
+    """Half-width of the 95 % confidence interval of `stamps`, from a jackknife [s]."""
     arrival: float
-    """From the time of a frame until it could be had, mean [s]."""
+    """Mean time from a frame's time stamp until the frame is available [s]."""
     latest: float
-    """The same, exceeded by one in a hundred [s]."""
+    """99 % quantile of the time from a frame's time stamp until the frame is available [s]."""
     agreement: float
-    """Share of the force's motion that the pictures show, 0 to 1."""
+    """Fraction of the variance of the fin angle that the pictures explain, 0 to 1."""
     frames: int
-    """How many were used."""
+    """Number of frames in the estimate."""
 
     @property
-    def whole(self) -> float:
-        """From the middle of the exposure until the frame could be had, mean [s]."""
+    def total(self) -> float:
+        """Mean time from the middle of the exposure until the frame is available [s]."""
         return self.stamps + self.arrival
 
 
 def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
-    """The delay in a swim with many frequencies in it; frames and forces in order of time.
+    """Return the latency, estimated from a swim with many frequencies.
 
-    Raises `NoMotion`, and `NoDelay` where frames or forces are too few, or do not agree.
+    frames, forces: in order of time
+
+    Raises `NoMotion`, and `NoDelay` where there are too few frames or forces, or they disagree.
     """
-    if not forces or forces[-1].end - forces[0].begin < SHORTEST:
-        raise NoDelay(f"{SHORTEST:g} s of swimming are needed to tell a delay")
+    if not forces or forces[-1].end - forces[0].begin < MIN_SWIM_S:
+        raise NoDelay(f"{MIN_SWIM_S:g} s of swimming are needed to measure a delay")
     angle = _Angle(forces)
     inside = [
-        frame for frame in frames if angle.first + LATEST < frame.time < angle.last + EARLIEST
+        frame
+        for frame in frames
+        if angle.first + MAX_DELAY_S < frame.time < angle.last + MIN_DELAY_S
     ]
     if len(inside) < 100:
-        raise NoDelay(f"{len(inside)} frames are too few to tell a delay; 100 are needed")
+        raise NoDelay(f"{len(inside)} frames are too few to measure a delay; 100 are needed")
     times = np.array([frame.time for frame in inside])
     position = find_tails(np.stack([frame.pixels for frame in inside])).positions
     position /= position.std()
     fit = _Fit(angle, times, position)
     delay, log_rate = fit.best()
     agreement = 1.0 - fit.misfit(delay, log_rate)
-    if agreement < _ENOUGH:
+    if agreement < _MIN_AGREEMENT:
         raise NoDelay(
             f"pictures and forces agree by {max(0.0, agreement):.0%} only: is it the same fish, "
             "and does the camera see its whole tail?"
@@ -100,7 +105,7 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
         _Fit(angle, times[kept], position[kept]).near(delay, log_rate)[0]
         for kept in _all_but_one_part(len(times))
     ]
-    error = _STUDENT * math.sqrt((PARTS - 1) * float(np.var(left_out)))
+    error = _STUDENT * math.sqrt((JACKKNIFE_PARTS - 1) * float(np.var(left_out)))
     late = [frame.available - frame.time for frame in inside]
     return Latency(
         stamps=delay,
@@ -113,12 +118,12 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
 
 
 def _all_but_one_part(number: int) -> list[NDArray[np.bool_]]:
-    part = np.arange(number) * PARTS // number
-    return [part != left_out for left_out in range(PARTS)]
+    part = np.arange(number) * JACKKNIFE_PARTS // number
+    return [part != left_out for left_out in range(JACKKNIFE_PARTS)]
 
 
 class _Angle:
-    """The fin angle that forces tell of, up to its scale and a drift."""
+    """Fin angle that follows from the forces, up to a scale and a drift."""
 
     def __init__(self, forces: Sequence[Force]) -> None:
         ends = np.array([force.end for force in forces])
@@ -127,54 +132,54 @@ class _Angle:
         edges = np.concatenate(([forces[0].begin], ends))
         impulse = np.concatenate(([0.0], np.cumsum(fy * np.diff(edges))))
         self.first, self.last = float(edges[0]), float(edges[-1])
-        self._fine = np.arange(self.first, self.last, _STEP)
-        self._impulse = -_smooth(self._fine, edges, impulse)
-        # A power of two is the quickest; of twice the length, so that nothing comes round again.
+        self._fine = np.arange(self.first, self.last, _STEP_S)
+        self._impulse = -_interpolate_spline(self._fine, edges, impulse)
+        # A power of two is fastest; twice the length keeps the circular convolution from wrapping.
         self._size = 2 ** (2 * len(self._fine) - 1).bit_length()
         self._spectrum = np.fft.rfft(self._impulse, self._size)
-        self._kept: dict[float, Floats] = {}
+        self._angles_by_rate: dict[float, Floats] = {}
 
     def at(self, times: Floats, rate: float) -> Floats:
-        """α · K where K_d/K is `rate` [1/s]: the solution of α̇ + rate · α = −(∫ F_y dt)/K."""
-        course = self._kept.get(rate)
-        if course is None:
-            kernel = np.exp(-rate * _STEP * np.arange(len(self._fine)))
+        """Return α · K for K_d/K = `rate` [1/s], the solution of α̇ + rate · α = −(∫ F_y dt)/K."""
+        angles = self._angles_by_rate.get(rate)
+        if angles is None:
+            kernel = np.exp(-rate * _STEP_S * np.arange(len(self._fine)))
             spectrum = self._spectrum * np.fft.rfft(kernel, self._size)
-            course = np.fft.irfft(spectrum, self._size)[: len(self._fine)] * _STEP
-            # Each step holds half of what is added at its own point.
-            course -= 0.5 * _STEP * self._impulse
-            self._kept = {rate: course}
-        return np.asarray(np.interp(times, self._fine, course))
+            angles = np.fft.irfft(spectrum, self._size)[: len(self._fine)] * _STEP_S
+            # The trapezoidal rule counts half of the last point.
+            angles -= 0.5 * _STEP_S * self._impulse
+            self._angles_by_rate = {rate: angles}
+        return np.asarray(np.interp(times, self._fine, angles))
 
 
 class _Fit:
-    """How well pictures agree with forces, for any delay and any rate K_d/K."""
+    """Fit of pictures to forces, over the delay and the rate K_d/K."""
 
     def __init__(self, angle: _Angle, times: Floats, position: Floats) -> None:
         self._angle, self._times = angle, times
         span = times[-1] - times[0]
         along = (times - times[0]) / span
-        slow = [np.cos(math.pi * k * along) for k in range(int(2 * _SLOWEST * span) + 1)]
+        slow = [np.cos(math.pi * k * along) for k in range(int(2 * _MIN_FREQUENCY_HZ * span) + 1)]
         self._drift = np.linalg.qr(np.stack([*slow, along, along**2, along**3], axis=1))[0]
         seen = np.stack([position, position**3], axis=1)
-        self._seen = np.linalg.qr(_without(self._drift, seen))[0]
+        self._seen = np.linalg.qr(_residual_after(self._drift, seen))[0]
 
     def misfit(self, delay: float, log_rate: float) -> float:
-        """Share of the angle's variance that the pictures do not show."""
+        """Return the fraction of the angle's variance that the pictures do not explain."""
         residual = self._residual(delay, log_rate)
         return float(residual @ residual)
 
     def best(self) -> tuple[float, float]:
-        """Delay [s] and logarithm of the rate of the best agreement."""
+        """Return the delay [s] and the logarithm of the rate of the best fit."""
         grid = [
             (float(delay), float(log_rate))
-            for log_rate in np.linspace(math.log(_RATES[0]), math.log(_RATES[1]), 10)
-            for delay in np.arange(EARLIEST, LATEST, 0.02)
+            for log_rate in np.linspace(math.log(_RATE_RANGE[0]), math.log(_RATE_RANGE[1]), 10)
+            for delay in np.arange(MIN_DELAY_S, MAX_DELAY_S, 0.02)
         ]
         return self.near(*min(grid, key=lambda point: self.misfit(*point)))
 
     def near(self, delay: float, log_rate: float) -> tuple[float, float]:
-        """The same from a point close to it: Levenberg and Marquardt's method."""
+        """Return the best fit close to a point, by the Levenberg-Marquardt method."""
         point, damping = np.array([delay, log_rate]), 1e-3
         residual = self._residual(*point)
         for _ in range(40):
@@ -185,34 +190,36 @@ class _Fit:
             normal = slopes.T @ slopes
             damped = normal + damping * np.diag(np.diag(normal))
             move = np.linalg.lstsq(damped, -slopes.T @ residual, rcond=None)[0]
-            tried = self._residual(*(point + move))
-            if not tried @ tried < residual @ residual:
+            new_residual = self._residual(*(point + move))
+            if not new_residual @ new_residual < residual @ residual:
                 damping *= 10.0
                 if damping > 1e6:
                     break
                 continue
-            point, residual, damping = point + move, tried, 0.1 * damping
+            point, residual, damping = point + move, new_residual, 0.1 * damping
             if abs(move[0]) < 1e-6:
                 break
         return float(point[0]), float(point[1])
 
     def _residual(self, delay: float, log_rate: float) -> Floats:
-        angle = _without(self._drift, self._angle.at(self._times - delay, math.exp(log_rate)))
+        angle = _residual_after(
+            self._drift, self._angle.at(self._times - delay, math.exp(log_rate))
+        )
         angle /= np.linalg.norm(angle)
-        return _without(self._seen, angle)
+        return _residual_after(self._seen, angle)
 
 
 _PROBES = np.diag([1e-4, 1e-3])
-"""Steps of delay [s] and logarithm of the rate by which slopes are found."""
+"""Steps of the delay [s] and of the logarithm of the rate for numerical derivatives."""
 
 
-def _without(basis: Floats, values: Floats) -> Floats:
-    """What is left of values once their part in an orthonormal basis is taken off."""
+def _residual_after(basis: Floats, values: Floats) -> Floats:
+    """Return the residual of values after projection on an orthonormal basis."""
     return np.asarray(values - basis @ (basis.T @ values))
 
 
-def _smooth(at: Floats, x: Floats, y: Floats) -> Floats:
-    """The cubic spline through points of about even distance, as Catmull and Rom have it."""
+def _interpolate_spline(at: Floats, x: Floats, y: Floats) -> Floats:
+    """Return the Catmull-Rom spline through points with about equal distances."""
     slopes = np.gradient(y, x)
     index = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
     h = x[index + 1] - x[index]

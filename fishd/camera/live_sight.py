@@ -1,4 +1,4 @@
-"""What a running `fishd-camera` shows a policy; refuses a camera that does not suit it."""
+"""Stacks of frames for a policy from a running `fishd-camera`; refuses an unsuitable camera."""
 
 import math
 import time
@@ -9,22 +9,22 @@ from fishd.client import Fish
 from fishd.core.camera_frames import Stack, StackSettings
 from fishd.core.errors import PolicyError
 
-FIRST_FRAMES = 5.0
-"""How long a camera may take until it has shown enough to be judged [s]."""
-ENOUGH = 10
-"""Frames by which its rate is judged."""
-_SHARE = 0.8
-"""Of the rate that a stack needs: so much less is still good."""
+FIRST_FRAMES_TIMEOUT_S = 5.0
+"""Longest wait for the frames from which a camera is checked [s]."""
+MIN_CHECKED_FRAMES = 10
+"""Number of frames from which the camera's rate is checked."""
+_MIN_RATE_FRACTION = 0.8
+"""Smallest usable rate of a camera, as a fraction of the rate that a stack needs."""
 
 
 class LiveSight:
-    """The stacks that one policy is shown, and whether they fit it; a context manager."""
+    """Source of the stacks for one policy, which checks the camera; a context manager."""
 
     def __init__(self, endpoint: str | None, fish: Fish, stack: StackSettings) -> None:
         """
-        endpoint: where the camera takes requests; None: as for `CameraClient`
+        endpoint: address of the camera's requests; None: as for `CameraClient`
         fish: the fishd that swims
-        stack: what the policy is to be shown
+        stack: the frames that the policy needs
 
         Raises `CameraLost` where no camera answers, and `PolicyError` where its frames have another
         size.
@@ -32,8 +32,8 @@ class LiveSight:
         self._lockstep = bool(fish.config()["lockstep"])
         self._stack = stack
         self._client = CameraClient(endpoint, fish=fish, stack=stack)
-        self._judged = False
-        self._begun = time.monotonic()
+        self._checked = False
+        self._start = time.monotonic()
         size = self._client.state.width
         if size != stack.size:
             self.close()
@@ -54,72 +54,72 @@ class LiveSight:
         self._client.close()
 
     def await_frames(self) -> None:
-        """Wait until the camera has shown enough, before anything moves; not in lockstep.
+        """Wait until enough frames have arrived, and check them, before the fish moves.
 
-        There, time stands still until the fish swims. Raises `CameraLost`, and `PolicyError` where
-        frames come too seldom or too late.
+        In lockstep, return at once, because time stands still until the fish swims. Raises
+        `CameraLost`, and `PolicyError` where frames are too infrequent or too late.
         """
         if self._lockstep:
             return
-        seen = 0
-        deadline = time.monotonic() + FIRST_FRAMES
-        while seen < ENOUGH and time.monotonic() < deadline:
-            seen += len(self._client.poll(0.1))
-        if not seen:
+        received = 0
+        deadline = time.monotonic() + FIRST_FRAMES_TIMEOUT_S
+        while received < MIN_CHECKED_FRAMES and time.monotonic() < deadline:
+            received += len(self._client.poll(0.1))
+        if not received:
             raise self.lost()
-        self._judge()
+        self._check()
 
     def look(self, tick: float) -> Stack | None:
-        """The stack for the tick at `tick` [s, clock of fishd]; None where the camera lags behind.
+        """Return the stack for the tick at `tick` [s, clock of fishd]; None without enough frames.
 
         Raises `PolicyError` as `await_frames` does, and in lockstep `CameraLost`.
         """
         if self._lockstep:
-            followed = self._client.state.virtual
+            was_virtual = self._client.state.virtual
             try:
-                found = self._client.stack_at(tick)
+                frames = self._client.stack_at(tick)
             except CameraLost:
-                if followed:
+                if was_virtual:
                     raise
-                return None  # it does not follow this fishd yet, which has not ticked for it
-            if not self._judged and self._client.state.seq >= ENOUGH:
-                self._judge()
-            return found
+                return None  # the camera does not follow this fishd yet, which has not ticked since
+            if not self._checked and self._client.state.seq >= MIN_CHECKED_FRAMES:
+                self._check()
+            return frames
         self.listen()
         return self._client.history.stack(tick)
 
     def listen(self) -> None:
-        """Take the frames that have come, so that none pile up."""
+        """Take the frames that have arrived, so that they do not accumulate."""
         while self._client.poll():
             pass
 
     def lost(self) -> CameraLost:
-        """Why no frames come; it may take a while to find out."""
+        """Return the error that says why no frames arrive; this may wait for the camera."""
         try:
             self._client.check()
             state = self._client.status()
-            self._judge()
+            self._check()
         except CameraLost as error:
             return error
         except PolicyError as error:
             return CameraLost(str(error))
-        why = f": {state.problem}" if state.problem else ""
+        problem = f": {state.problem}" if state.problem else ""
         return CameraLost(
             f"the camera at {self._client.endpoint} is {state.state}, but has shown no whole stack "
-            f"of frames{why}"
+            f"of frames{problem}"
         )
 
-    def _judge(self) -> None:
-        """Raise `PolicyError` where frames come too seldom or too late for this policy."""
-        self._judged = True
+    def _check(self) -> None:
+        """Raise `PolicyError` where frames are too infrequent or too late for this policy."""
+        self._checked = True
         state, stack = self._client.status(), self._stack
         camera = f"the camera at {self._client.endpoint}"
-        if stack.frames > 1 and 0.0 < state.rate < _SHARE / stack.interval:
+        if stack.frames > 1 and 0.0 < state.rate < _MIN_RATE_FRACTION / stack.interval:
             raise PolicyError(
                 f"{1.0 / stack.interval:.3g} frames a second are needed, as those that are shown "
                 f"are {stack.interval * 1e3:g} ms apart (camera.stack.interval); {camera} gives "
                 f"{state.rate:.3g} a second: a faster camera is needed, or a training with "
-                f"camera.stack.interval: {_rounded_up(_SHARE / state.rate):g}"
+                f"camera.stack.interval: {_rounded_up(_MIN_RATE_FRACTION / state.rate):g}"
             )
         if not state.rate or state.latency is None:
             return
@@ -135,5 +135,5 @@ class LiveSight:
 
 
 def _rounded_up(seconds: float) -> float:
-    """To 5 ms."""
+    """Return a time rounded up to 5 ms [s]."""
     return round(math.ceil(seconds / 5e-3 - 1e-6) * 5e-3, 3)

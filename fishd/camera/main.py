@@ -1,4 +1,4 @@
-"""The command `fishd-camera`: from settings to a camera that publishes until a signal ends it."""
+"""Command `fishd-camera`, which publishes the frames of a camera until a signal ends it."""
 
 import logging
 import stat
@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from fishd import __version__
-from fishd.camera.settings import CameraSettings, load, public
+from fishd.camera.settings import CameraSettings, hide_secrets, load
 from fishd.camera.sources.base import Source
 from fishd.core import text
 from fishd.core.console import complain, run
@@ -23,7 +23,7 @@ NAME = "fishd-camera"
 
 
 def open_source(settings: CameraSettings) -> Source:
-    """What the settings name; nothing is opened yet."""
+    """Return the source that the settings name; it does not open the camera yet."""
     if settings.source == "v4l2":
         from fishd.camera.sources.v4l2 import V4l2Source
 
@@ -94,7 +94,7 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
 def warn_of_readers(path: Path, settings: CameraSettings) -> None:
     """Log a warning where every user of this machine can read the password of a camera."""
     url = settings.stream.url
-    if url is None or public(url) == url:
+    if url is None or hide_secrets(url) == url:
         return
     with suppress(OSError):
         if path.stat().st_mode & stat.S_IROTH:
@@ -106,5 +106,5 @@ def warn_of_readers(path: Path, settings: CameraSettings) -> None:
 
 
 def main() -> None:
-    """The `fishd-camera` command."""
+    """Run the command `fishd-camera`."""
     leave(run(camera, NAME))

@@ -1,7 +1,7 @@
-"""What `fishd-camera` says: frames, views for people, its state; see docs/how-to/camera.md.
+"""Messages of `fishd-camera`: frames, views for people, its state; see docs/how-to/camera.md.
 
-Each message of the PUB socket is a topic and one JSON object; behind that of a frame or a view
-comes the picture. Requests are those of fishd's control protocol (`fishd.core.protocol`).
+Each message of the PUB socket is a topic and one JSON object, followed by the picture in a frame or
+a view. Requests have the format of fishd's control protocol (`fishd.core.protocol`).
 """
 
 from collections.abc import Callable, Sequence
@@ -18,40 +18,42 @@ from fishd.core.schema import note, unit
 
 VERSION = 1
 FRAME, VIEW, STATE, UNTIL = b"frame", b"view", b"state", b"until"
-"""The topics."""
-LARGEST = 256
-"""Height and width of a frame [px]."""
+"""Topics of the messages."""
+MAX_FRAME_SIZE_PX = 256
+"""Largest height and width of a frame [px]."""
 
-EARLIEST = -2.0
-"""No frame is there so long before the middle of its exposure: `delay` of a camera's settings may
-move its time by a second [s]."""
-_POSSIBLE = {"ge": -1e9, "le": 1e9}
-"""Times: 30 years, beyond which nothing could be told from the clock of a machine [s]."""
+MIN_AGE_S = -2.0
+"""Smallest time from the middle of a frame's exposure until the frame is available; it may be
+negative, because `delay` of a camera's settings moves the time of a frame [s]."""
+_TIME_RANGE = {"ge": -1e9, "le": 1e9}
+"""Range of valid times, 30 years, in which a clock has a good resolution [s]."""
 
 _Version = Annotated[int, note("Version of these messages: 1.")]
 _Session = Annotated[
     str,
-    note("Names one run of the camera on one clock; in another one, times and numbers restart."),
+    note(
+        "Identifier of a run of the camera on one clock; in a new one, times and numbers restart."
+    ),
 ]
 _Width = Annotated[int, unit("px", "Columns of the picture.", ge=1, le=8192)]
-_Height = Annotated[int, unit("px", "Its rows.", ge=1, le=8192)]
+_Height = Annotated[int, unit("px", "Rows of the picture.", ge=1, le=8192)]
 _FrameTime = Annotated[
     float,
     unit(
         "s",
-        "Middle of the exposure, on the camera's clock: the monotonic one of its machine; of a "
-        "simulated camera that of fishd, which in lockstep is virtual.",
-        **_POSSIBLE,
+        "Middle of the exposure, on the camera's clock: the monotonic clock of its machine, or for "
+        "a simulated camera that of fishd, which is virtual in lockstep.",
+        **_TIME_RANGE,
     ),
 ]
 
 
 class BadMessage(FishdError, ValueError):
-    """What came is no message of a camera, or one of another version."""
+    """A message is not one of a camera, or has another version."""
 
 
 class FrameHeader(Struct, frozen=True, kw_only=True, gc=False):
-    """Topic `frame`; behind it height · width bytes, grey levels row by row."""
+    """Topic `frame`, followed by height · width bytes, grey levels row by row."""
 
     v: _Version = VERSION
     session: _Session
@@ -61,19 +63,19 @@ class FrameHeader(Struct, frozen=True, kw_only=True, gc=False):
     time: _FrameTime
     available: Annotated[
         float,
-        unit("s", "When it could first be had, on the same clock.", **_POSSIBLE),
+        unit("s", "Time at which the frame became available, on the same clock.", **_TIME_RANGE),
     ]
-    exposure: Annotated[float | None, unit("s", "Its length; null where it is not known.")] = None
+    exposure: Annotated[float | None, unit("s", "Exposure time; null where it is unknown.")] = None
     dropped: Annotated[
-        int, note("Frames that the camera took but did not deliver, since its process began.", ge=0)
+        int, note("Number of frames that were taken but not delivered, since start.", ge=0)
     ] = 0
     virtual: Annotated[bool, note("True where the clock is the virtual one of a lockstep.")] = False
-    width: Annotated[int, unit("px", "Columns of the picture.", ge=1, le=LARGEST)]
-    height: Annotated[int, unit("px", "Its rows.", ge=1, le=LARGEST)]
+    width: Annotated[int, unit("px", "Columns of the picture.", ge=1, le=MAX_FRAME_SIZE_PX)]
+    height: Annotated[int, unit("px", "Rows of the picture.", ge=1, le=MAX_FRAME_SIZE_PX)]
 
 
 class Crop(Struct, frozen=True, kw_only=True):
-    """A rectangle in a picture, as shares of its width and height."""
+    """Rectangle in a picture, as fractions of the picture's width and height."""
 
     left: float
     top: float
@@ -82,7 +84,7 @@ class Crop(Struct, frozen=True, kw_only=True):
 
 
 class ViewHeader(Struct, frozen=True, kw_only=True):
-    """Topic `view`; behind it a JPEG of the camera's whole picture, rotated as frames are."""
+    """Topic `view`, followed by a JPEG of the camera's whole picture, rotated as frames are."""
 
     v: _Version = VERSION
     session: _Session
@@ -91,86 +93,92 @@ class ViewHeader(Struct, frozen=True, kw_only=True):
     width: _Width
     height: _Height
     crop: Annotated[
-        Crop, note("What frames show of it: `left`, `top`, `width`, `height`, as shares of it.")
+        Crop,
+        note(
+            "The part that frames show: `left`, `top`, `width`, `height`, as fractions of the view."
+        ),
     ]
 
 
 class Until(Struct, frozen=True, kw_only=True, gc=False):
-    """Topic `until`, in lockstep only: all frames that were to be had by then are published."""
+    """Topic `until`, in lockstep only: all frames available by that time have been published."""
 
     v: _Version = VERSION
     session: _Session
-    until: Annotated[float, unit("s", "On the camera's clock.", **_POSSIBLE)]
+    until: Annotated[float, unit("s", "Time on the camera's clock.", **_TIME_RANGE)]
 
 
 Condition = Literal["starting", "waiting", "streaming", "stalled", "unplugged", "unusable", "ended"]
 CONDITIONS: dict[Condition, str] = {
     "starting": "the process has just begun",
-    "waiting": "a simulated camera: there is no fishd, or it does not tick",
-    "streaming": "frames come",
-    "stalled": "the camera is there, but no whole frame has come for a while; it is opened again",
-    "unplugged": "there is no such camera, file or stream; it is looked for",
-    "unusable": "it is there, but cannot be used as the settings say; it is tried again",
-    "ended": "the file is at its end, and is not played again",
+    "waiting": "a simulated camera waits for a fishd that ticks",
+    "streaming": "frames arrive",
+    "stalled": "the camera is connected, but no complete frame has arrived for a while; it is "
+    "opened again",
+    "unplugged": "there is no such camera, file or stream; fishd-camera keeps looking for it",
+    "unusable": "it cannot be used with these settings; fishd-camera keeps trying",
+    "ended": "the file is at its end, and is not repeated",
 }
-"""What a camera may be in, and what that means."""
+"""Conditions of a camera and their meanings."""
 
 
 class CameraState(Struct, frozen=True, kw_only=True):
-    """Topic `state`, twice a second and after every change; also the answer to `status`."""
+    """Topic `state`, sent twice a second and after every change; also the answer to `status`."""
 
     v: _Version = VERSION
-    t: Annotated[float, unit("s", "When, unix.")]
+    t: Annotated[float, unit("s", "Time of the message, Unix time.")]
     version: Annotated[str, note("Version of fishd.")]
-    pid: Annotated[int, note("The camera's process.")]
-    uptime: Annotated[float, unit("s", "Since it began.")]
+    pid: Annotated[int, note("Process id of fishd-camera.")]
+    uptime: Annotated[float, unit("s", "Time since the process began.")]
     session: _Session
     source: Annotated[str, note("`simulated`, `v4l2` or `stream`.")]
-    device: Annotated[str, note("What it opens: a device, a file or URL, or the address of fishd.")]
-    state: Annotated[Condition, note("What it is in, see below.")]
-    since: Annotated[float, unit("s", "Since when, unix.")]
-    problem: Annotated[str, note("One line that says why; empty while frames come.")] = ""
-    remedy: Annotated[str, note("What to do about it.")] = ""
+    device: Annotated[str, note("Device, file, URL, or address of fishd that it opens.")]
+    state: Annotated[Condition, note("Condition, see below.")]
+    since: Annotated[float, unit("s", "Start of the condition, Unix time.")]
+    problem: Annotated[str, note("Reason in one line; empty while frames arrive.")] = ""
+    remedy: Annotated[str, note("Instruction that solves the problem.")] = ""
     degraded: Annotated[
-        tuple[str, ...], note("What keeps the times or pictures from being as good as could be.")
+        tuple[str, ...], note("Reasons why the times or pictures are worse than possible.")
     ] = ()
-    rate: Annotated[float, unit("1/s", "Frames a second of late; 0.0 where none come.")] = 0.0
+    rate: Annotated[float, unit("1/s", "Recent frames per second; 0.0 where none arrive.")] = 0.0
     latency: Annotated[
         float | None,
-        unit("s", "From the middle of the exposure until the frame could be had, mean of late."),
+        unit("s", "Recent mean time from the middle of the exposure until the frame is available."),
     ] = None
-    exposure: Annotated[float | None, unit("s", "Length of the exposure; null: not known.")] = None
-    seq: Annotated[int, note("Number of the latest frame; 0 for none.")] = 0
+    exposure: Annotated[float | None, unit("s", "Exposure time; null: unknown.")] = None
+    seq: Annotated[int, note("Number of the latest frame; 0: none yet.")] = 0
     dropped: Annotated[
-        int, note("Frames that the camera took but did not deliver, since start.")
+        int, note("Number of frames that were taken but not delivered, since start.")
     ] = 0
-    broken: Annotated[int, note("Frames that could not be decoded, since start.")] = 0
+    broken: Annotated[int, note("Number of frames that could not be decoded, since start.")] = 0
     width: Annotated[int, unit("px", "Width of frames.")]
     height: Annotated[int, unit("px", "Height of frames.")]
-    picture_width: Annotated[int, unit("px", "Width of the camera's own pictures; 0: none yet.")]
-    picture_height: Annotated[int, unit("px", "Their height.")]
+    picture_width: Annotated[int, unit("px", "Width of the camera's whole pictures; 0: none yet.")]
+    picture_height: Annotated[int, unit("px", "Height of the camera's whole pictures.")]
     virtual: Annotated[bool, note("True where the clock is the virtual one of a lockstep.")] = False
     until: Annotated[
-        Annotated[float, Meta(**_POSSIBLE)] | None,
-        unit("s", "That of the latest message `until` of this session."),
+        Annotated[float, Meta(**_TIME_RANGE)] | None,
+        unit("s", "Time in the latest message `until` of this session."),
     ] = None
     clock: Annotated[
-        Annotated[float, Meta(**_POSSIBLE)] | None,
-        unit("s", "Now, on the camera's clock; null where that is virtual, or not known yet."),
+        Annotated[float, Meta(**_TIME_RANGE)] | None,
+        unit("s", "Current time of the camera's clock; null where virtual, or unknown yet."),
     ] = None
-    boot: Annotated[str, note("Names the start of the machine from which that clock counts.")] = ""
+    boot: Annotated[
+        str, note("Identifier of the boot of the machine from which that clock counts.")
+    ] = ""
     frames: Annotated[str, note("Address of the PUB socket.")]
 
 
 class PublishedFrame(NamedTuple):
-    """A frame as it came."""
+    """Received frame."""
 
     header: FrameHeader
     pixels: Pixels
 
 
 class PublishedView(NamedTuple):
-    """A view as it came."""
+    """Received view."""
 
     header: ViewHeader
     jpeg: bytes
@@ -181,23 +189,23 @@ Message = PublishedFrame | PublishedView | CameraState | Until
 _encode = msgspec.json.Encoder().encode
 
 
-def frame(header: FrameHeader, pixels: Pixels) -> list[bytes]:
-    """The parts of a message."""
+def encode_frame(header: FrameHeader, pixels: Pixels) -> list[bytes]:
+    """Return the parts of a message with a frame."""
     return [FRAME, _encode(header), pixels.tobytes()]
 
 
-def view(header: ViewHeader, jpeg: bytes) -> list[bytes]:
-    """The parts of a message."""
+def encode_view(header: ViewHeader, jpeg: bytes) -> list[bytes]:
+    """Return the parts of a message with a view."""
     return [VIEW, _encode(header), jpeg]
 
 
-def state(state: CameraState) -> list[bytes]:
-    """The parts of a message."""
+def encode_state(state: CameraState) -> list[bytes]:
+    """Return the parts of a message with the state."""
     return [STATE, _encode(state)]
 
 
-def until(until: Until) -> list[bytes]:
-    """The parts of a message."""
+def encode_until(until: Until) -> list[bytes]:
+    """Return the parts of a message `until`."""
     return [UNTIL, _encode(until)]
 
 
@@ -217,27 +225,27 @@ _decode_version: Callable[[bytes], _OnlyVersion] = decoder(_OnlyVersion)
 
 
 def decode(parts: Sequence[bytes]) -> Message:
-    """The message in these parts; raises `BadMessage`."""
+    """Return the message in these parts; raises `BadMessage`."""
     topic = parts[0]
     if topic not in _decoders:
-        raise BadMessage(f"topic {topic[:20]!r} is none of a camera's")
-    name, wanted = topic.decode(), 3 if topic in (FRAME, VIEW) else 2
-    if len(parts) != wanted:
-        raise BadMessage(f"a message of topic {name} has {wanted} parts, not {len(parts)}")
+        raise BadMessage(f"topic {topic[:20]!r} is not a topic of a camera")
+    name, part_count = topic.decode(), 3 if topic in (FRAME, VIEW) else 2
+    if len(parts) != part_count:
+        raise BadMessage(f"a message of topic {name} has {part_count} parts, not {len(parts)}")
     try:
         version = _decode_version(parts[1]).v
         if version != VERSION:
             raise BadMessage(
                 f"a message of topic {name} in version {version}; version {VERSION} is needed: "
-                "let camera and client be of the same fishd"
+                "install the same version of fishd for camera and client"
             )
         header: FrameHeader | ViewHeader | CameraState | Until = _decoders[topic](parts[1])
     except msgspec.DecodeError as error:
         raise BadMessage(f"a message of topic {name} that cannot be read: {error}") from None
     if isinstance(header, FrameHeader):
         age = header.available - header.time
-        if age < EARLIEST:
-            raise BadMessage(f"a frame that was there {-age:g} s before it was exposed")
+        if age < MIN_AGE_S:
+            raise BadMessage(f"a frame was available {-age:g} s before its exposure")
         size = header.height * header.width
         if len(parts[2]) != size:
             raise BadMessage(

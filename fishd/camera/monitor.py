@@ -1,4 +1,4 @@
-"""What a camera says of itself: its state and since when, rate, latency, what was lost."""
+"""State of a camera: condition, start of the condition, rate, latency and lost frames."""
 
 import os
 import time
@@ -11,11 +11,11 @@ from fishd.camera.messages import CameraState, Condition
 from fishd.camera.settings import CameraSettings
 from fishd.camera.sources.base import Timeline, Trouble
 
-_LATE = 30
-"""Frames that count as those of late."""
-_OLD = 2.0
-"""They are not of late any more when none has come for so long, or for three times as long as from
-one to the next [s]."""
+_RECENT_FRAMES = 30
+"""Number of latest frames from which rate and latency are computed."""
+_MAX_SILENCE_S = 2.0
+"""Time without a frame after which rate and latency are reset; at low rates it is three periods
+[s]."""
 
 
 class _Recent(NamedTuple):
@@ -25,7 +25,7 @@ class _Recent(NamedTuple):
 
 
 class Monitor:
-    """Keeps count; for one thread."""
+    """Counters and condition of a camera; for one thread."""
 
     def __init__(
         self,
@@ -34,13 +34,13 @@ class Monitor:
         frames: str,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """device: what is opened, for people; frames: address of the PUB socket; now: [s]"""
+        """device: camera for people; frames: address of the PUB socket; now: reads the clock [s]"""
         self._now = now
         self._settings = settings
         self._device = device
         self._frames = frames
-        self._began = now()
-        self._recent: deque[_Recent] = deque(maxlen=_LATE)
+        self._start = now()
+        self._recent: deque[_Recent] = deque(maxlen=_RECENT_FRAMES)
         self._trouble: Trouble | None = None
         self._exposure: float | None = None
         self._picture = (0, 0)
@@ -54,14 +54,14 @@ class Monitor:
 
     @property
     def line(self) -> str:
-        """The state in one line, for a log."""
+        """Condition in one line, for a log."""
         if self._trouble is None:
             return f"{self.condition} from {self._device}"
         remedy = f"; {self._trouble.remedy}" if self._trouble.remedy else ""
         return f"{self.condition}: {self._trouble}{remedy}"
 
     def begin(self, session: str, timeline: Timeline, degraded: tuple[str, ...]) -> None:
-        """Another session."""
+        """Start a new session."""
         self.session, self.timeline, self.degraded = session, timeline, degraded
         self.seq, self.until = 0, None
         self._recent.clear()
@@ -69,9 +69,10 @@ class Monitor:
     def frame(
         self, moment: float, available: float, exposure: float | None, picture: tuple[int, int]
     ) -> bool:
-        """Count a frame; true where the state is another one now.
+        """Count a frame; return whether the condition has changed.
 
-        moment, available: its times [s]; exposure: its length [s]; picture: height and width [px]
+        moment, available: times of the frame [s]; exposure: exposure time [s]
+        picture: height and width of the whole picture [px]
         """
         self.seq += 1
         self._recent.append(_Recent(moment, available - moment, self._now()))
@@ -79,19 +80,19 @@ class Monitor:
         return self._enter("streaming", None)
 
     def trouble(self, trouble: Trouble) -> bool:
-        """There are no frames; true where that is news."""
+        """Enter a condition without frames; return whether it or its reason has changed."""
         self._recent.clear()
         return self._enter(trouble.condition, trouble)
 
     def _enter(self, condition: Condition, trouble: Trouble | None) -> bool:
-        news = condition != self.condition or str(trouble) != str(self._trouble)
+        changed = condition != self.condition or str(trouble) != str(self._trouble)
         if condition != self.condition:
             self.condition, self.since = condition, time.time()
         self._trouble = trouble
-        return news
+        return changed
 
     def state(self) -> CameraState:
-        """All of it, now."""
+        """Return the current state."""
         self._forget_old()
         size = self._settings.picture.size
         timeline = self.timeline
@@ -99,7 +100,7 @@ class Monitor:
             t=time.time(),
             version=__version__,
             pid=os.getpid(),
-            uptime=self._now() - self._began,
+            uptime=self._now() - self._start,
             session=self.session,
             source=self._settings.source,
             device=self._device,
@@ -126,21 +127,21 @@ class Monitor:
         )
 
     def _forget_old(self) -> None:
-        """Virtual time stands still while no frames come: there, none grow old."""
+        """Reset the recent frames after a silence, except on a virtual clock, which stops then."""
         if self.timeline.virtual or not self._recent:
             return
         first, last = self._recent[0].arrived, self._recent[-1].arrived
-        usual = (last - first) / max(1, len(self._recent) - 1)
-        if self._now() - last > max(_OLD, 3.0 * usual):
+        mean_period = (last - first) / max(1, len(self._recent) - 1)
+        if self._now() - last > max(_MAX_SILENCE_S, 3.0 * mean_period):
             self._recent.clear()
 
     def _rate(self) -> float:
         if len(self._recent) < 2:
             return 0.0
-        passed = self._recent[-1].time - self._recent[0].time
-        return (len(self._recent) - 1) / passed if passed > 0.0 else 0.0
+        duration = self._recent[-1].time - self._recent[0].time
+        return (len(self._recent) - 1) / duration if duration > 0.0 else 0.0
 
     def _latency(self) -> float | None:
         if not self._recent:
             return None
-        return sum(each.latency for each in self._recent) / len(self._recent)
+        return sum(frame.latency for frame in self._recent) / len(self._recent)

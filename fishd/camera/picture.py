@@ -1,4 +1,4 @@
-"""From a camera's picture to the frame for learners and the view for people."""
+"""Conversion of a camera's picture to the frame for learners and the view for people."""
 
 import cv2
 import numpy as np
@@ -12,13 +12,13 @@ _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_C
 
 
 def turned(picture: Pixels, settings: PictureSettings) -> Pixels:
-    """The picture as frames show it, the fish's head to the left."""
+    """Return the picture turned so that the fish's head is at the left."""
     turn = _TURNS.get(settings.rotate)
     return picture if turn is None else np.asarray(cv2.rotate(picture, turn), np.uint8)
 
 
 def cropped(picture: Pixels, settings: PictureSettings) -> tuple[Pixels, Crop]:
-    """The square of a turned picture that frames show, and where it is."""
+    """Return the square of a turned picture that frames show, and its place."""
     height, width = picture.shape
     side = max(1, round(settings.crop.side * min(height, width)))
     left = min(max(0, round(settings.crop.x * width - 0.5 * side)), width - side)
@@ -28,22 +28,22 @@ def cropped(picture: Pixels, settings: PictureSettings) -> tuple[Pixels, Crop]:
 
 
 def frame(picture: Pixels, settings: PictureSettings) -> Pixels:
-    """What learners are shown of a turned picture, shape (size, size)."""
+    """Return the frame for learners from a turned picture, shape (size, size)."""
     part, _ = cropped(picture, settings)
     return scaled(part, settings.size, settings.size)
 
 
 def scaled(picture: Pixels, width: int, height: int) -> Pixels:
-    """The picture in another size [px]: averaged over areas, or with larger pixels."""
+    """Return the picture in another size [px]: averaged over areas, or with larger pixels."""
     if picture.shape[:2] == (height, width):
         return picture
     smaller = width <= picture.shape[1] and height <= picture.shape[0]
-    way = cv2.INTER_AREA if smaller else cv2.INTER_NEAREST
-    return np.asarray(cv2.resize(picture, (width, height), interpolation=way), np.uint8)
+    interpolation = cv2.INTER_AREA if smaller else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=interpolation), np.uint8)
 
 
 def jpeg(picture: Pixels, settings: PublishSettings) -> tuple[bytes, int, int]:
-    """A turned picture for people as JPEG, and its width and height [px]."""
+    """Return a turned picture as JPEG for people, and its width and height [px]."""
     height, width = picture.shape
     scale = settings.view_width / width
     if scale > 1.0:  # larger pixels, in whole steps

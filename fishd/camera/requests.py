@@ -1,4 +1,4 @@
-"""Requests to a running `fishd-camera`, and how its addresses are reached."""
+"""Requests to a running `fishd-camera`, and connections to its addresses."""
 
 import itertools
 import os
@@ -17,10 +17,10 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, Refused
 
 ENDPOINT_VARIABLE = "FISHD_CAMERA"
-LONGEST = 16 * 2**20
-"""Of a message that is received [bytes]."""
-_SECOND_LOOK = 300
-"""How long it takes at most to find out that a silent address is that of frames [ms]."""
+MAX_MESSAGE_BYTES = 16 * 2**20
+"""Largest size of a received message [bytes]."""
+_PUBLISHER_CHECK_MS = 300
+"""Longest check whether an address without answers is that of frames [ms]."""
 
 T = TypeVar("T")
 
@@ -30,17 +30,17 @@ class CameraLost(FishError, ConnectionError):
 
 
 def find_camera() -> str:
-    """Where a camera takes requests: $FISHD_CAMERA, else that of this machine."""
+    """Return the address of a camera's requests: $FISHD_CAMERA, else that of this machine."""
     return os.environ.get(ENDPOINT_VARIABLE) or PublishSettings().requests
 
 
 class CameraRequests:
-    """Asks a camera; for one thread. Raises `CameraLost` when nobody answers in time."""
+    """Requests to a camera, for one thread; they raise `CameraLost` without a timely answer."""
 
     def __init__(
         self, endpoint: str, context: "zmq.Context[zmq.Socket[bytes]]", timeout: float
     ) -> None:
-        """timeout: how long to wait for an answer [s]"""
+        """timeout: longest wait for an answer [s]"""
         self.endpoint = endpoint
         self.timeout = timeout
         self._context = context
@@ -48,29 +48,29 @@ class CameraRequests:
         self._socket = context.socket(zmq.DEALER)
         self._socket.set(zmq.LINGER, 0)
         self._socket.set(zmq.IMMEDIATE, 1)
-        self._socket.set(zmq.MAXMSGSIZE, LONGEST)
+        self._socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         connect(self._socket, endpoint)
 
     def status(self, timeout: float | None = None) -> CameraState:
-        """What the camera says of itself; timeout: how long to wait [s], None: as for others."""
+        """Return the camera's state; timeout: longest wait [s], None: that of the object."""
         return self._call(CameraState, "status", timeout)
 
     def settings(self) -> CameraSettings:
-        """The settings that it was started with, but for a password."""
+        """Return the camera's settings, without a password."""
         return self._call(CameraSettings, "config")
 
     def _call(self, kind: type[T], op: str, timeout: float | None = None) -> T:
-        """Ask; raises `CameraLost` and `Refused`."""
+        """Send a request and return its result; raises `CameraLost` and `Refused`."""
         identity = next(self._ids)
         request = protocol.Request(v=protocol.VERSION, id=identity, op=op)
-        patience = self.timeout if timeout is None else timeout
-        wanted = zmq.POLLOUT
-        hurry = timeout is not None  # within a tick there is no time for more
-        for deadline in deadlines(patience, again=not hurry):
-            while self._socket.poll(milliseconds_until(deadline), wanted):
-                if wanted == zmq.POLLOUT:
+        timeout_s = self.timeout if timeout is None else timeout
+        event = zmq.POLLOUT
+        single_attempt = timeout is not None  # a call within a tick has no time for retries
+        for deadline in deadlines(timeout_s, again=not single_attempt):
+            while self._socket.poll(milliseconds_until(deadline), event):
+                if event == zmq.POLLOUT:
                     self._socket.send(protocol.encode(request))
-                    wanted = zmq.POLLIN
+                    event = zmq.POLLIN
                     continue
                 with suppress(msgspec.DecodeError):
                     reply = protocol.decode_reply(self._socket.recv_multipart()[-1])
@@ -80,51 +80,55 @@ class CameraRequests:
                         raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
                     if reply.result:
                         return cast(T, decoder(kind)(reply.result))
-        if not hurry and self._publishes():
+        if not single_attempt and self._publishes():
             raise CameraLost(
-                f"at {self.endpoint} a camera publishes its frames; requests go to another address "
-                f"of it: its publish.requests, {PublishSettings().requests} by default"
+                f"{self.endpoint} is the address of a camera's frames; use the address of its "
+                f"requests, publish.requests, {PublishSettings().requests} by default"
             )
         raise CameraLost(
-            f"no camera at {self.endpoint}: no answer within {patience:g} s; start one with "
+            f"no camera at {self.endpoint}: no answer within {timeout_s:g} s; start one with "
             f"'fishd-camera', or name another with --camera or ${ENDPOINT_VARIABLE}"
         )
 
     def _publishes(self) -> bool:
-        """Do frames go out there? Each subscriber to the state of a camera gets it at once."""
+        """Return whether the address sends its state to a new subscriber, as one of frames does."""
         with self._context.socket(zmq.SUB) as socket:
             socket.set(zmq.LINGER, 0)
-            socket.set(zmq.MAXMSGSIZE, LONGEST)
+            socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
             socket.subscribe(STATE)
             connect(socket, self.endpoint)
-            return bool(socket.poll(_SECOND_LOOK)) and socket.recv_multipart()[0] == STATE
+            return bool(socket.poll(_PUBLISHER_CHECK_MS)) and socket.recv_multipart()[0] == STATE
 
 
-def reachable(frames: str, endpoint: str) -> str:
-    """Where the camera that takes requests at `endpoint` publishes, as seen from here."""
-    ours, theirs = addresses.parse(endpoint), addresses.parse(frames)
-    if isinstance(ours, addresses.Ipc) or isinstance(theirs, addresses.Ipc):
+def resolve_frames_address(frames: str, endpoint: str) -> str:
+    """Return the address of a camera's frames for a connection from this machine.
+
+    frames: address that the camera states; endpoint: address of its requests
+    """
+    request_address, frames_address = addresses.parse(endpoint), addresses.parse(frames)
+    if isinstance(request_address, addresses.Ipc) or isinstance(frames_address, addresses.Ipc):
         return frames
-    if theirs.host not in ("0.0.0.0", "::"):
+    if frames_address.host not in ("0.0.0.0", "::"):
         return frames
-    host = f"[{ours.host}]" if ":" in ours.host else ours.host
-    return f"tcp://{host}:{theirs.port}"  # of all its addresses, the one that answers
+    # The camera listens on all its addresses; use the one that answers.
+    host = f"[{request_address.host}]" if ":" in request_address.host else request_address.host
+    return f"tcp://{host}:{frames_address.port}"
 
 
 def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
-    """Raises `CameraLost` when the address is none."""
+    """Connect a socket to an address; raises `CameraLost` when the address is not valid."""
     if address.endswith((".yaml", ".yml")) and "://" not in address:
         raise CameraLost(
             f"'{text.quoted(address)}' is a file, for 'fishd-camera --config' and for simulated "
-            "fish; here the address at which a running fishd-camera takes requests is needed, such "
-            f"as {PublishSettings().requests}"
+            "fish; give the address at which a running fishd-camera takes requests, such as "
+            f"{PublishSettings().requests}"
         )
     if complaint := addresses.why_not_connected(address):
-        raise CameraLost(f"'{address}' is no address of a camera: {complaint}")
+        raise CameraLost(f"'{address}' is not an address of a camera: {complaint}")
     try:
         socket.set(zmq.IPV6, addresses.is_ipv6(address))
         socket.connect(address)
     except zmq.ZMQError as error:
         raise CameraLost(
-            f"'{address}' is no address of a camera: {zmq.strerror(error.errno or 0)}"
+            f"'{address}' is not an address of a camera: {zmq.strerror(error.errno or 0)}"
         ) from None

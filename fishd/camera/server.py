@@ -1,4 +1,4 @@
-"""The loop of `fishd-camera`: takes what the source has, publishes it, and answers requests."""
+"""Main loop of `fishd-camera`: publish the frames of the source, and answer requests."""
 
 import logging
 import os
@@ -24,38 +24,38 @@ from fishd.core.process.systemd_notify import SystemdNotifier
 log = logging.getLogger(__name__)
 
 STATE_PERIOD = 0.5
-"""Time between two messages that tell the state [s]."""
-HANGS = 10.0
-"""A source that is silent for so long hangs [s]."""
-GIVEN_UP = 30.0
-"""From then on systemd's watchdog is not fed any more [s]."""
-AGAIN = 1.0
-"""A source that has failed begins anew after so long [s]."""
-LEAVING = 2.0
-"""How long the source may take to let go of its camera [s]."""
+"""Time between two messages with the state [s]."""
+SOURCE_TIMEOUT_S = 10.0
+"""Time without a sign of life after which a source counts as hung [s]."""
+WATCHDOG_TIMEOUT_S = 30.0
+"""Time without a sign of life from the source after which systemd's watchdog is not fed [s]."""
+RESTART_DELAY_S = 1.0
+"""Delay before a source that has failed is started again [s]."""
+STOP_TIMEOUT_S = 2.0
+"""Longest wait for the source to release its camera [s]."""
 WARNING_PERIOD_S = 60.0
 """Shortest time between two warnings of subscribers that were disconnected [s]."""
-_LOOK = 50
-"""Longest time between two looks at the rest [ms]."""
-_WAITING = 4096
-"""What may wait from the source; frames beyond it are dropped."""
+_POLL_TIMEOUT_MS = 50
+"""Longest wait for sockets between two checks of timers [ms]."""
+_MAX_QUEUED_JOBS = 4096
+"""Largest number of jobs from the source that wait; further frames are dropped."""
 
 
 class Server:
-    """A source in a thread of its own, and the sockets; use it as a context manager.
+    """Server of a source, which runs in a separate thread, and of the sockets; a context manager.
 
-    It is the sink of its source: what that has waits in one queue, in its order.
+    It is the sink of its source: the calls of the source wait in one queue, in their order.
     """
 
     def __init__(self, settings: CameraSettings, source: Source) -> None:
         self._settings = settings
         self._source = source
         self._queue: deque[Callable[[], None]] = deque()
-        self._news = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._alive = time.monotonic()
+        self._job_event = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        self._last_sign_of_life = time.monotonic()
         self._stopping = threading.Event()
-        self._failure = ""
-        """The latest error that nobody had expected."""
+        self._last_error = ""
+        """Latest unexpected error of the source."""
         self._sessions = 0
         self._next_view = self._next_state = self._next_warning = 0.0
         self._stack = ExitStack()
@@ -63,7 +63,7 @@ class Server:
     def __enter__(self) -> Self:
         """Listen; raises `StartupError`."""
         with ExitStack() as stack:
-            stack.callback(os.close, self._news)
+            stack.callback(os.close, self._job_event)
             self._publisher = Publisher(self._settings.publish.frames, stack)
             self._requests = Requests(self._settings.publish.requests, stack)
             self._notifier = SystemdNotifier()
@@ -81,34 +81,34 @@ class Server:
         self._stack.close()
 
     def run(self, stopping: Callable[[], bool]) -> None:
-        """Serve until `stopping`."""
+        """Serve until `stopping` returns true."""
         log.info(
             "a camera, %s: frames at %s, requests at %s",
             self._source.device,
             self._publisher.address,
             self._requests.address,
         )
-        self._watch()
+        self._register_sockets()
         thread = threading.Thread(target=self._run_source, name="source", daemon=True)
         thread.start()
         try:
             while not stopping():
-                self._turn({source for source, _ in self._poller.poll(_LOOK)})
+                self._serve_ready({source for source, _ in self._poller.poll(_POLL_TIMEOUT_MS)})
         finally:
             self._notifier.stopping()
             self._stopping.set()
-            thread.join(LEAVING)
+            thread.join(STOP_TIMEOUT_S)
 
-    def _watch(self) -> None:
+    def _register_sockets(self) -> None:
         self._poller = zmq.Poller()
-        for source in (self._publisher.socket, self._requests.socket, self._news):
+        for source in (self._publisher.socket, self._requests.socket, self._job_event):
             if source is not None:
                 self._poller.register(source, zmq.POLLIN)
 
     def _renew_publisher(self, now: float) -> None:
         if not self._publisher.renew(now):
             return
-        self._watch()
+        self._register_sockets()
         if self._publisher.socket is None and now >= self._next_warning:
             self._next_warning = now + WARNING_PERIOD_S
             log.warning(
@@ -118,103 +118,104 @@ class Server:
                 MAX_UNKNOWN_BYTES // 1000,
             )
 
-    def _turn(self, ready: set[object]) -> None:
-        if self._news in ready:
-            self._take()
+    def _serve_ready(self, ready: set[object]) -> None:
+        if self._job_event in ready:
+            self._run_jobs()
         if self._requests.socket in ready:
             self._requests.answer()
-        asked = self._publisher.socket in ready and self._publisher.take_subscriptions()
+        state_requested = self._publisher.socket in ready and self._publisher.take_subscriptions()
         now = time.monotonic()
         self._renew_publisher(now)
-        silent = now - self._alive
-        if silent > HANGS:
-            self._tell(
+        silence = now - self._last_sign_of_life
+        if silence > SOURCE_TIMEOUT_S:
+            self._publish_state(
                 self._monitor.trouble(
                     Trouble(
                         "stalled",
-                        f"{self._source.device} has not answered for {HANGS:g} s: it hangs",
+                        f"{self._source.device} has not answered for {SOURCE_TIMEOUT_S:g} s: "
+                        "it hangs",
                         "plug it in again; if that does not help, restart fishd-camera",
                     )
                 ),
-                only=True,
+                only_changes=True,
             )
-        if silent < GIVEN_UP:
+        if silence < WATCHDOG_TIMEOUT_S:
             self._notifier.ticked(now)
-        if asked or now >= self._next_state:
-            self._tell(False)
+        if state_requested or now >= self._next_state:
+            self._publish_state(False)
 
     def _run_source(self) -> None:
-        """A driver or library that fails unexpectedly must not end the process: try again."""
+        """Run the source, and again after an unexpected failure of a driver or library."""
         while not self._stopping.is_set():
             try:
                 self._source.run(self, self._stopping.wait)
             except Exception as error:
-                why = f"{self._source.device} cannot be used: {text.named(error)}"
-                if str(error) != self._failure:
-                    log.exception("%s", why)
-                self._failure = str(error)
-                self.trouble(Trouble("unusable", why, "the log of fishd-camera says where"))
-                self._stopping.wait(AGAIN)
+                problem = f"{self._source.device} cannot be used: {text.named(error)}"
+                if str(error) != self._last_error:
+                    log.exception("%s", problem)
+                self._last_error = str(error)
+                self.trouble(Trouble("unusable", problem, "the log of fishd-camera says where"))
+                self._stopping.wait(RESTART_DELAY_S)
 
-    # The sink: called by the source, in its thread.
+    # The sink: called by the source in its thread.
 
     def begin(self, timeline: Timeline, degraded: tuple[str, ...] = ()) -> None:
-        """Frames follow, in a new session."""
-        self._pass_on(lambda: self._monitor.begin(self._new_session(), timeline, degraded))
+        """Start a new session."""
+        self._enqueue(lambda: self._monitor.begin(self._new_session(), timeline, degraded))
 
     def put(self, shot: Shot) -> None:
-        """Make a frame of it, and let that be published."""
-        if len(self._queue) > _WAITING:
+        """Convert a shot to a frame, and queue it."""
+        if len(self._queue) > _MAX_QUEUED_JOBS:
             self.lost(dropped=1)
             return
         turned = picture.turned(shot.picture, self._settings.picture)
         pixels = picture.frame(turned, self._settings.picture)
         shot = shot._replace(picture=turned)
-        self._pass_on(lambda: self._publish(shot, pixels))
+        self._enqueue(lambda: self._publish(shot, pixels))
 
     def covered(self, until: float) -> None:
-        """Tell until when there are frames."""
-        self._pass_on(lambda: self._publish_until(until))
+        """Queue a message that all frames until a time have been put [s]."""
+        self._enqueue(lambda: self._publish_until(until))
 
     def lost(self, dropped: int = 0, broken: int = 0) -> None:
-        """Count them."""
+        """Count lost frames."""
 
         def count() -> None:
             self._monitor.dropped += dropped
             self._monitor.broken += broken
 
-        self._pass_on(count)
+        self._enqueue(count)
 
     def trouble(self, trouble: Trouble) -> None:
-        """Tell of it."""
-        self._pass_on(lambda: self._tell(self._monitor.trouble(trouble), only=True))
+        """Queue a change to a condition without frames."""
+        self._enqueue(
+            lambda: self._publish_state(self._monitor.trouble(trouble), only_changes=True)
+        )
 
     def alive(self) -> None:
-        """Note that the source does not hang."""
-        self._alive = time.monotonic()
+        """Record a sign of life from the source."""
+        self._last_sign_of_life = time.monotonic()
 
-    def _pass_on(self, job: Callable[[], None]) -> None:
+    def _enqueue(self, job: Callable[[], None]) -> None:
         self.alive()
         self._queue.append(job)
         self._wake()
 
     def _wake(self) -> None:
-        os.eventfd_write(self._news, 1)
+        os.eventfd_write(self._job_event, 1)
 
-    # In the thread of the sockets.
+    # The rest runs in the thread of the sockets.
 
-    def _take(self) -> None:
-        os.eventfd_read(self._news)
-        for _ in range(
-            len(self._queue)
-        ):  # what comes meanwhile waits until requests had their turn
+    def _run_jobs(self) -> None:
+        os.eventfd_read(self._job_event)
+        for _ in range(len(self._queue)):  # later jobs wait until requests have been answered
             self._queue.popleft()()
         if self._queue:
             self._wake()
 
     def _publish(self, shot: Shot, pixels: Pixels) -> None:
         monitor = self._monitor
-        news = monitor.frame(shot.time, shot.available, shot.exposure, shot.picture.shape)
+        changed = monitor.frame(shot.time, shot.available, shot.exposure, shot.picture.shape)
         header = FrameHeader(
             session=monitor.session,
             seq=monitor.seq,
@@ -226,13 +227,13 @@ class Server:
             width=pixels.shape[1],
             height=pixels.shape[0],
         )
-        self._publisher.send(messages.frame(header, pixels))
-        self._show(shot)
-        if news:
-            self._tell(True)
+        self._publisher.send(messages.encode_frame(header, pixels))
+        self._publish_view(shot)
+        if changed:
+            self._publish_state(True)
 
-    def _show(self, shot: Shot) -> None:
-        """Publish a picture for people, if it is time for one and somebody wants it."""
+    def _publish_view(self, shot: Shot) -> None:
+        """Publish a picture for people, if one is due and there is a subscriber."""
         now, rate = time.monotonic(), self._settings.publish.view_rate
         if not rate or now < self._next_view or not self._publisher.views_wanted:
             return
@@ -247,24 +248,28 @@ class Server:
             height=height,
             crop=crop,
         )
-        self._publisher.send(messages.view(header, jpeg))
+        self._publisher.send(messages.encode_view(header, jpeg))
 
     def _publish_until(self, until: float) -> None:
         self._monitor.until = until
         message = Until(session=self._monitor.session, until=until)
-        self._publisher.send(messages.until(message))
+        self._publisher.send(messages.encode_until(message))
 
-    def _tell(self, news: bool, *, only: bool = False) -> None:
-        """Publish the state; news: log it, too; only: do nothing unless it is news."""
-        if only and not news:
+    def _publish_state(self, changed: bool, *, only_changes: bool = False) -> None:
+        """Publish the state.
+
+        changed: whether the condition has changed, which is logged
+        only: publish nothing unless it has changed
+        """
+        if only_changes and not changed:
             return
-        if news:
+        if changed:
             line = text.line(self._monitor.line)
             level = logging.INFO if self._monitor.condition == "streaming" else logging.WARNING
             log.log(level, "%s", line)
             self._notifier.status(line)
         self._next_state = time.monotonic() + STATE_PERIOD
-        self._publisher.send(messages.state(self._monitor.state()))
+        self._publisher.send(messages.encode_state(self._monitor.state()))
 
     def _new_session(self) -> str:
         self._sessions += 1

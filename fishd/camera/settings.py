@@ -1,4 +1,4 @@
-"""The settings of `fishd-camera`, from a YAML file: what it opens, shows and publishes."""
+"""Settings of `fishd-camera` from a YAML file: the source, the picture and the addresses."""
 
 import os
 import re
@@ -20,8 +20,8 @@ _Delay = Annotated[
     float,
     unit(
         "s",
-        "So much earlier than its time stamp says was the middle of a frame's exposure, beyond "
-        "what the exposure explains.",
+        "Delay of a frame's time stamp after the middle of its exposure, in addition to the "
+        "delay that follows from the exposure time.",
         ge=-1,
         le=5,
     ),
@@ -32,73 +32,79 @@ _Text = Annotated[str, Meta(min_length=1, max_length=500, pattern=PRINTABLE)]
 
 
 class V4l2Settings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A camera of this machine."""
+    """Settings of a camera of this machine."""
 
     device: Annotated[
         str,
         note(
-            "Its file: /dev/video0, or a lasting name in /dev/v4l/by-id.",
+            "Device file of the camera: /dev/video0, or a persistent name in /dev/v4l/by-id.",
             min_length=1,
             max_length=500,
             pattern=PRINTABLE,
         ),
     ] = "/dev/video0"
-    width: Annotated[int, unit("px", "Width of its pictures.", ge=16, le=8192)] = 640
-    height: Annotated[int, unit("px", "Their height.", ge=16, le=8192)] = 480
+    width: Annotated[int, unit("px", "Width of the camera's pictures.", ge=16, le=8192)] = 640
+    height: Annotated[int, unit("px", "Height of the camera's pictures.", ge=16, le=8192)] = 480
     rate: Annotated[float, unit("1/s", "Frames per second.", gt=0, le=1000)] = 30.0
     format: Annotated[
         Literal["MJPG", "YUYV", "GREY"],
-        note("How it sends them; most web cameras reach their rate with MJPG only."),
+        note("Pixel format; most web cameras reach their full rate with MJPG only."),
     ] = "MJPG"
     controls: Annotated[
         dict[str, Any],
         note(
-            "Controls to set, by name as 'v4l2-ctl --list-ctrls' shows them: fixed exposure and "
-            "gain, so that light and rate stay, such as auto_exposure: 1."
+            "Controls to set, by the names that 'v4l2-ctl --list-ctrls' shows, such as "
+            "auto_exposure: 1. A fixed exposure and gain keep brightness and rate constant."
         ),
     ] = {}
     delay: _Delay = 0.0
 
 
 class StreamSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A video file, or the stream of a network camera."""
+    """Settings of a video file, or of the stream of a network camera."""
 
     url: Annotated[
         _Text | None,
-        note("Path of a video file, or rtsp://USER:PASSWORD@HOST/PATH; source stream needs it."),
+        note(
+            "Path of a video file, or rtsp://USER:PASSWORD@HOST/PATH; required for source stream."
+        ),
     ] = None
     rate: Annotated[
         Annotated[float, Meta(gt=0, le=1000)] | None,
-        unit("1/s", "Frames per second of a file; null: its own."),
+        unit("1/s", "Frames per second of a file; null: the rate that the file states."),
     ] = None
-    loop: Annotated[bool, note("Play a file again and again.")] = True
+    loop: Annotated[bool, note("Whether to repeat a file.")] = True
     delay: _Delay = 0.0
 
 
 class SimulatedSettings(SimulatedCameraSettings, frozen=True, kw_only=True):
-    """A camera above a simulated fish, which draws the tail from fishd's telemetry."""
+    """Settings of a camera above a simulated fish, which draws the tail from fishd's telemetry."""
 
     fishd: Annotated[
         str | None,
-        note("Control address of fishd; null: that of this machine, as fishctl finds it."),
+        note("Control address of fishd; null: the address that fishctl uses on this machine."),
     ] = None
 
 
 class Square(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A square in a picture; one that would reach beyond its edge is moved inside."""
+    """Square in a picture; a square that extends beyond the picture's edge is moved inside."""
 
-    x: Annotated[float, unit("1", "Its middle, as a share of the width.", ge=0, le=1)] = 0.5
-    y: Annotated[float, unit("1", "Its middle, as a share of the height.", ge=0, le=1)] = 0.5
-    side: Annotated[float, unit("1", "Its side, as a share of the shorter one.", ge=0.05, le=1)] = (
-        1.0
-    )
+    x: Annotated[
+        float, unit("1", "Middle of the square, as a fraction of the width.", ge=0, le=1)
+    ] = 0.5
+    y: Annotated[
+        float, unit("1", "Middle of the square, as a fraction of the height.", ge=0, le=1)
+    ] = 0.5
+    side: Annotated[
+        float, unit("1", "Side of the square, as a fraction of the shorter side.", ge=0.05, le=1)
+    ] = 1.0
 
 
 class PictureSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What frames show: the fish's axis along the rows, its head to the left."""
+    """Settings of frames, which show the fish's axis along the rows, its head to the left."""
 
     rotate: Annotated[
-        Literal[0, 90, 180, 270], note("Turn the camera's picture clockwise by this angle.")
+        Literal[0, 90, 180, 270], note("Clockwise rotation of the camera's picture [degrees].")
     ] = 0
     crop: Annotated[Square, note("The part of the turned picture that frames show.")] = Square()
     size: Annotated[
@@ -107,53 +113,58 @@ class PictureSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class PublishSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where frames go."""
+    """Addresses at which frames are published and requests are answered."""
 
     frames: Annotated[
         str,
         note(
-            "ZeroMQ address of the PUB socket: tcp://HOST:PORT or ipc://PATH. Whoever reaches it "
-            "sees what the camera sees."
+            "ZeroMQ address of the PUB socket: tcp://HOST:PORT or ipc://PATH. Every program that "
+            "can connect receives the camera's pictures."
         ),
     ] = "tcp://127.0.0.1:9874"
     requests: Annotated[str, note("ZeroMQ address of the socket for requests, likewise.")] = (
         "tcp://127.0.0.1:9875"
     )
     view_rate: Annotated[
-        float, unit("1/s", "Most pictures for people a second; 0: none.", ge=0, le=5)
+        float, unit("1/s", "Largest number of pictures for people per second; 0: none.", ge=0, le=5)
     ] = 5.0
-    view_width: Annotated[int, unit("px", "Their width at most.", ge=84, le=1920)] = 480
-    view_quality: Annotated[int, note("Their JPEG quality.", ge=10, le=100)] = 80
+    view_width: Annotated[
+        int, unit("px", "Largest width of pictures for people.", ge=84, le=1920)
+    ] = 480
+    view_quality: Annotated[int, note("JPEG quality of pictures for people.", ge=10, le=100)] = 80
 
 
 class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """All of them; the defaults are a simulated camera above the fish of this machine."""
+    """All settings; the defaults are a simulated camera above the fish of this machine."""
 
     source: Annotated[
         Literal["simulated", "v4l2", "stream"],
         note("A simulated camera, a camera of this machine, or a file or network camera."),
     ] = "simulated"
     simulated: Annotated[
-        SimulatedSettings, note("The simulated camera: what it sees, and how badly.")
+        SimulatedSettings, note("The simulated camera: timing, optics and light.")
     ] = SimulatedSettings()
     v4l2: Annotated[V4l2Settings, note("A camera of this machine.")] = V4l2Settings()
     stream: Annotated[StreamSettings, note("A file or a network camera.")] = StreamSettings()
     picture: Annotated[
         PictureSettings,
         note(
-            "What frames show. The picture of a simulated camera has `size`, and is turned and "
-            "cropped like any other; learning in simulation has no `picture`."
+            "The part of the picture that frames show. The picture of a simulated camera has "
+            "`size`, and is turned and cropped like any other; learning in simulation does not use "
+            "`picture`."
         ),
     ] = PictureSettings()
-    publish: Annotated[PublishSettings, note("Where frames go.")] = PublishSettings()
+    publish: Annotated[PublishSettings, note("Addresses of frames and requests.")] = (
+        PublishSettings()
+    )
 
 
 def load(
     path: str | os.PathLike[str] | None = None, overrides: Iterable[str] = ()
 ) -> CameraSettings:
-    """The settings in a file, or the defaults, with `KEY=VALUE` overrides.
+    """Return the settings in a file, or the defaults, with `KEY=VALUE` overrides.
 
-    Raises `ConfigError` that names file, line and key.
+    Raises `ConfigError`, which names file, line and key.
     """
     data, sources = (
         strict_yaml.read(path, "a camera", "source: v4l2") if path is not None else ({}, {})
@@ -168,9 +179,9 @@ def load(
 
 
 def simulated(path: str | os.PathLike[str] | None = None) -> SimulatedSettings:
-    """The simulated camera in a file, or the default one.
+    """Return the simulated camera in a file, or the default one.
 
-    Raises `ConfigError` as `load` does, for a file whose source is another, and for an address.
+    Raises `ConfigError` as `load` does, and for a file with another source and for an address.
     """
     needed = "in simulation a simulated camera is needed, such as config/camera-web.yaml"
     if path is not None and "://" in str(path):
@@ -185,29 +196,29 @@ def simulated(path: str | os.PathLike[str] | None = None) -> SimulatedSettings:
 
 
 def without_password(settings: CameraSettings) -> CameraSettings:
-    """The same for whoever asks."""
+    """Return settings that clients may read, without a password."""
     url = settings.stream.url
     if url is None:
         return settings
-    return replace(settings, stream=replace(settings.stream, url=public(url)))
+    return replace(settings, stream=replace(settings.stream, url=hide_secrets(url)))
 
 
-def public(url: str) -> str:
-    """The path of a file, or a URL without what may be a secret: user, password, and any value."""
-    scheme, network, rest = url.partition("://")
-    if not network:
+def hide_secrets(url: str) -> str:
+    """Return the path of a file, or a URL without possible secrets: user, password and values."""
+    scheme, separator, rest = url.partition("://")
+    if not separator:
         return url
     place, slash, path = rest.partition("/")
     return f"{scheme}://{place.rpartition('@')[2]}{slash}{_VALUE.sub('=…', path)}"
 
 
 def to_yaml(settings: CameraSettings) -> str:
-    """All settings, defaults included, as YAML that `load` reads back."""
+    """Return all settings, including defaults, as YAML that `load` reads."""
     return strict_yaml.dump(msgspec.to_builtins(settings))
 
 
 def _check(settings: CameraSettings) -> None:
-    """Refuse values that are valid one by one but not together."""
+    """Raise `Problem` for values that are valid on their own but not together."""
     publish, stream = settings.publish, settings.stream
     for key, address in (("frames", publish.frames), ("requests", publish.requests)):
         if complaint := why_not_served(address):
@@ -218,8 +229,8 @@ def _check(settings: CameraSettings) -> None:
         raise Problem(
             ("stream", "url"), "is missing: the path of a video file, or rtsp://HOST/PATH is needed"
         )
-    scheme, network, _ = (stream.url or "").partition("://")
-    if network and scheme not in _SCHEMES:
+    scheme, separator, _ = (stream.url or "").partition("://")
+    if separator and scheme not in _SCHEMES:
         raise Problem(
             ("stream", "url"),
             f"'{text.quoted(scheme)}://' is not valid: the path of a file, or a URL that begins "

@@ -1,4 +1,4 @@
-"""The two sockets of `fishd-camera`: frames go out of one, requests come in at the other."""
+"""Sockets of `fishd-camera`: one publishes frames, the other receives requests."""
 
 import ctypes
 import os
@@ -14,40 +14,40 @@ from fishd.core import addresses, protocol, text
 from fishd.core.errors import Refused
 from fishd.core.schema import nearest
 
-QUEUE = 256
-"""Messages kept for a slow subscriber; later ones are dropped for it."""
-LONGEST_TOPIC = 512
-"""Of what a subscriber sends [bytes]."""
-GREETING = 2000
-"""How long a connection may take until it speaks ZeroMQ [ms]."""
+MAX_QUEUED_MESSAGES = 256
+"""Largest number of messages that wait for a slow subscriber; later ones are dropped for it."""
+MAX_TOPIC_BYTES = 512
+"""Largest message from a subscriber [bytes]."""
+HANDSHAKE_TIMEOUT_MS = 2000
+"""Longest time until a new connection has completed the ZeroMQ handshake [ms]."""
 MAX_UNKNOWN_BYTES = 50_000
 """Largest total size of the unknown topics of all subscribers [bytes]."""
 RENEWAL_PAUSE_S = 0.3
 """Time without connections after one has sent too many topics [s]."""
 _TOPICS = (FRAME, VIEW, STATE, UNTIL)
-_AT_ONCE = 20
-"""Requests that are taken before frames are looked at."""
-_SUBSCRIPTIONS_AT_ONCE = 1000
-"""Subscriptions that are taken before frames are looked at."""
+_MAX_REQUESTS_PER_TURN = 20
+"""Largest number of requests that are answered before frames are published."""
+_MAX_SUBSCRIPTIONS_PER_TURN = 1000
+"""Largest number of subscriptions that are read before frames are published."""
 _RIVAL = "another fishd-camera"
-_IN_USE = "it is in use, by another fishd-camera perhaps; end that, or choose another address"
+_IN_USE = "it is in use, perhaps by another fishd-camera; end that, or choose another address"
 _ADVICE = "end it, or give this one another publish.frames and publish.requests"
 
 
 class Publisher:
-    """The socket for frames, an XPUB, which tells what its subscribers want. It never blocks.
+    """Non-blocking XPUB socket for frames, which reports the topics of its subscribers.
 
-    ZeroMQ stores each topic that a subscriber sends, and gives back what it stored only when the
-    connection ends. Subscribers that send more unknown topics than `MAX_UNKNOWN_BYTES` are
-    therefore disconnected, and all others with them, who connect again by themselves.
+    ZeroMQ stores each topic that a subscriber sends, and releases the memory only when the
+    connection ends. When the unknown topics exceed `MAX_UNKNOWN_BYTES`, all subscribers are
+    therefore disconnected; well-behaved ones reconnect by themselves.
     """
 
     def __init__(self, address: str, stack: ExitStack) -> None:
-        """Raises `StartupError`."""
+        """Listen at an address; raises `StartupError`."""
         self._listener, self.address = _listen(address, "publish.frames", stack)
         self._topics: set[bytes] = set()
-        """Subscriptions that views match: `view`, or a beginning of it."""
-        self._open_again = 0.0
+        """Subscriptions that match views: `view`, or a prefix of it."""
+        self._reopen_time = 0.0
         self._open()
         stack.callback(self._close)
 
@@ -64,7 +64,7 @@ class Publisher:
     def take_subscriptions(self) -> bool:
         """Note which topics are wanted; return whether a new subscription is to the state."""
         state = False
-        for (message,) in _waiting(self.socket, 1, _SUBSCRIPTIONS_AT_ONCE):
+        for (message,) in _receive(self.socket, 1, _MAX_SUBSCRIPTIONS_PER_TURN):
             kind, topic = message[:1], message[1:]
             if not any(known.startswith(topic) for known in _TOPICS):
                 self._unknown_bytes += len(message) * (kind == b"\x01")
@@ -82,20 +82,20 @@ class Publisher:
 
         now: time of a monotonic clock [s]; returns whether `socket` was replaced
         """
-        if self.socket is None and now >= self._open_again:
+        if self.socket is None and now >= self._reopen_time:
             self._open()
             return True
         if self.socket is None or self._unknown_bytes <= MAX_UNKNOWN_BYTES:
             return False
         self._close()
-        self._open_again = now + RENEWAL_PAUSE_S
+        self._reopen_time = now + RENEWAL_PAUSE_S
         return True
 
     def _open(self) -> None:
         self._unknown_bytes = 0
         self._topics.clear()
         self._stack = ExitStack()
-        self.socket: zmq.Socket[bytes] | None = _bound(
+        self.socket: zmq.Socket[bytes] | None = _bind(
             zmq.XPUB, self.address, self._listener, self._stack
         )
 
@@ -106,18 +106,18 @@ class Publisher:
 
 
 class Requests:
-    """The socket for requests, each answered at once."""
+    """Socket for requests, each answered at once."""
 
     def __init__(self, address: str, stack: ExitStack) -> None:
-        """Raises `StartupError`."""
+        """Listen at an address; raises `StartupError`."""
         listener, self.address = _listen(address, "publish.requests", stack)
-        self.socket = _bound(zmq.ROUTER, self.address, listener, stack)
+        self.socket = _bind(zmq.ROUTER, self.address, listener, stack)
         self.operations: dict[str, Callable[[], Any]] = {}
-        """What can be asked for, by name."""
+        """Functions that compute the results of requests, by name of the operation."""
 
     def answer(self) -> None:
-        """Answer what waits; what is no request gets an error, or nothing."""
-        for frames in _waiting(self.socket):
+        """Answer the waiting requests; an invalid message gets an error, or no answer."""
+        for frames in _receive(self.socket):
             envelope, payload = frames[:-1], frames[-1]
             if len(envelope) == 1 or (len(envelope) == 2 and not envelope[1]):
                 self.socket.send_multipart([*envelope, self._reply(payload)], zmq.DONTWAIT)
@@ -135,10 +135,12 @@ class Requests:
         return protocol.success(request.id, self.operations[request.op]())
 
 
-def _waiting(
-    socket: "zmq.Socket[bytes] | None", parts: int | None = None, count: int = _AT_ONCE
+def _receive(
+    socket: "zmq.Socket[bytes] | None",
+    parts: int | None = None,
+    count: int = _MAX_REQUESTS_PER_TURN,
 ) -> Iterator[list[bytes]]:
-    """Yield messages that wait, at most `count`, and only those of this number of parts."""
+    """Yield at most `count` waiting messages, and only those with this number of parts."""
     for _ in range(count if socket is not None else 0):
         assert socket is not None
         try:
@@ -160,7 +162,7 @@ def _listen(address: str, key: str, stack: ExitStack) -> tuple[sockets.socket, s
     return listener, addresses.served(address, listener)
 
 
-def _bound(
+def _bind(
     kind: int, address: str, listener: sockets.socket, stack: ExitStack
 ) -> "zmq.Socket[bytes]":
     """Return a ZeroMQ socket for the connections of a listener, until `stack` is closed."""
@@ -168,11 +170,11 @@ def _bound(
     stack.callback(context.destroy, linger=0)
     socket = context.socket(kind)
     socket.set(zmq.LINGER, 0)
-    socket.set(zmq.SNDHWM, QUEUE)
-    socket.set(zmq.RCVHWM, _AT_ONCE)
-    socket.set(zmq.HANDSHAKE_IVL, GREETING)
-    longest = LONGEST_TOPIC if kind == zmq.XPUB else protocol.MAX_MESSAGE
-    socket.set(zmq.MAXMSGSIZE, longest)
+    socket.set(zmq.SNDHWM, MAX_QUEUED_MESSAGES)
+    socket.set(zmq.RCVHWM, _MAX_REQUESTS_PER_TURN)
+    socket.set(zmq.HANDSHAKE_IVL, HANDSHAKE_TIMEOUT_MS)
+    max_bytes = MAX_TOPIC_BYTES if kind == zmq.XPUB else protocol.MAX_MESSAGE
+    socket.set(zmq.MAXMSGSIZE, max_bytes)
     if kind == zmq.XPUB:
         socket.set(zmq.XPUB_VERBOSE, 1)
     socket.set(zmq.USE_FD, os.dup(listener.fileno()))

@@ -1,4 +1,4 @@
-"""Where the tail is in each picture, as one number: what is measured against forces."""
+"""Position of the tail in each picture, as one number that can be compared with forces."""
 
 from typing import NamedTuple
 
@@ -7,29 +7,31 @@ from numpy.typing import NDArray
 
 from fishd.camera.axis import Floats, Motion, find_motion
 
-_SHARE = 0.25
-"""A pixel shows the tail where it differs by more than this share of how far any differs."""
-_REACH = 0.05
-"""Motion is where its energy is more than this share of the largest."""
+_TAIL_THRESHOLD = 0.25
+"""Difference from the median picture above which a pixel shows the tail, as a fraction of the 99 %
+quantile of the differences."""
+_MOTION_THRESHOLD = 0.05
+"""Energy above which a pixel belongs to the motion, as a fraction of the largest energy."""
 
 
 class Tails(NamedTuple):
-    """The tail in a set of pictures."""
+    """Tail in a set of pictures."""
 
     positions: Floats
-    """How far it is bent to the side of the higher rows, shape (number,) [px]."""
+    """Deflection of the tail towards the higher rows, shape (number,) [px]."""
     motion: Motion
 
 
 def find_tails(pictures: NDArray[np.uint8]) -> Tails:
-    """The tail's position in pictures of shape (number, height, width), ten or more.
+    """Return the tail's position in pictures of shape (number, height, width), ten or more.
 
-    The tail is what differs from the median picture, towards dark or light, whichever differs more.
-    Its position is the mean distance of its pixels from the axis of motion. Raises `NoMotion`.
+    The tail consists of the pixels that differ from the median picture, towards dark or light,
+    whichever differs more. Its position is the mean distance of its pixels from the axis of motion.
+    Raises `NoMotion`.
     """
     motion = find_motion(pictures)
     height, width = motion.energy.shape
-    moving = motion.energy > _REACH * motion.energy.max()
+    moving = motion.energy > _MOTION_THRESHOLD * motion.energy.max()
     rows, columns = np.nonzero(moving)
     values = pictures[:, rows, columns].astype(np.float32)
     light = pictures.mean(axis=(1, 2), dtype=np.float32)
@@ -37,7 +39,7 @@ def find_tails(pictures: NDArray[np.uint8]) -> Tails:
     values -= np.median(values, axis=0)
     if float(np.einsum("ij,ij,ij->", values, values, values, dtype=np.float64)) < 0.0:
         values = -values
-    values -= _SHARE * float(np.quantile(values, 0.99))
+    values -= _TAIL_THRESHOLD * float(np.quantile(values, 0.99))
     np.maximum(values, 0.0, out=values)
     distance = (rows - motion.axis.rows(height, width)[columns]).astype(np.float32)
     mass = values.sum(axis=1)

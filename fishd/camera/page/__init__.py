@@ -1,1 +1,1 @@
-"""A web page that shows what the camera sees, live; it needs nothing from the internet."""
+"""Web page that shows the camera's pictures live; it loads nothing from the internet."""

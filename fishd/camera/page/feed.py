@@ -1,4 +1,4 @@
-"""Follows a camera in a thread of its own, and keeps the newest picture for the page."""
+"""Feed of the page: a thread that receives the camera's pictures and state."""
 
 import threading
 import time
@@ -11,38 +11,38 @@ from fishd.camera.axis_watch import AxisWatch
 from fishd.camera.client import CameraClient
 from fishd.core.errors import FishError
 
-TOLD = 0.5
-"""Without a picture, the state is told so often [s]."""
+STATE_PERIOD_S = 0.5
+"""Time between two updates of the state without pictures [s]."""
 
 
 class News(NamedTuple):
-    """What the page is to show from now on."""
+    """Update for the page."""
 
     facts: bytes
     """State, rate, age, losses and axis, as one JSON object."""
     jpeg: bytes | None
-    """The picture; None if it is not new."""
+    """New picture; None if there is none."""
 
 
 class Feed:
-    """The camera as the page shows it; `run` is for a thread of its own."""
+    """Source of updates for the page; run `run` in a separate thread."""
 
     def __init__(self, address: str | None, tell: Callable[[News], None]) -> None:
         """
-        address: where the camera takes requests; None as `CameraClient` finds it
-        tell: gets each news, in the thread of `run`
+        address: address of the camera's requests; None: as for `CameraClient`
+        tell: receives each update, in the thread of `run`
 
-        Raises `CameraLost` where there is no camera at the start.
+        Raises `CameraLost` where no camera answers.
         """
         self._client = CameraClient(address, views=True)
         self._watch = AxisWatch()
         self._tell = tell
-        self._heard = self._told = time.monotonic()
+        self._last_frame_time = self._last_update = time.monotonic()
         self._stopping = threading.Event()
         self._lost = ""
 
     def run(self) -> None:
-        """Follow the camera, through any restart of it, until told to stop."""
+        """Follow the camera, also after it restarts, until `stop` is called."""
         try:
             shown = None
             while not self._stopping.is_set():
@@ -50,26 +50,26 @@ class Feed:
                 now = time.monotonic()
                 for frame in frames:
                     self._watch.add(frame)
-                    self._heard, self._lost = now, ""
+                    self._last_frame_time, self._lost = now, ""
                 if self._watch.due:
                     self._watch.find()
                 view = self._client.view
                 if view is not None and view is not shown:
-                    shown, self._told = view, now
+                    shown, self._last_update = view, now
                     self._tell(News(self._facts(), view.jpeg))
-                elif now - self._told > TOLD:
-                    self._told = now
+                elif now - self._last_update > STATE_PERIOD_S:
+                    self._last_update = now
                     self._check()
                     self._tell(News(self._facts(), None))
         finally:
             self.close()
 
     def stop(self) -> None:
-        """End `run` soon."""
+        """Request the end of `run`."""
         self._stopping.set()
 
     def close(self) -> None:
-        """Leave the camera, where `run` has not begun; it does so itself at its end."""
+        """Disconnect from the camera if `run` was not called; `run` disconnects at its end."""
         self._client.close()
 
     def _check(self) -> None:
@@ -77,7 +77,7 @@ class Feed:
             self._client.check()
         except FishError as error:
             self._lost = str(error)
-            # Each question waits for an answer; no more than one a second is asked.
+            # Limit the requests to one a second, because each waits for an answer.
             self._stopping.wait(1.0)
 
     def _facts(self) -> bytes:
@@ -98,7 +98,7 @@ class Feed:
                 "seq": header.seq,
                 "size": header.height,
                 "dropped": header.dropped,
-                "age": header.available - header.time + time.monotonic() - self._heard,
+                "age": header.available - header.time + time.monotonic() - self._last_frame_time,
             }
             if watch.axis is not None:
                 facts["axis"] = {"offset": watch.axis.offset, "tilt": watch.axis.tilt}

@@ -1,1 +1,1 @@
-"""A simulated camera: draws the tail as fin angle and light say."""
+"""Simulated camera, which draws the tail for a fin angle and a light."""

@@ -1,4 +1,4 @@
-"""A simulated camera: which frames it takes while the tail moves from one tick to the next."""
+"""Simulated camera: the frames that it takes while the tail moves from one tick to the next."""
 
 import math
 from typing import NamedTuple
@@ -11,18 +11,18 @@ from fishd.core.camera_frames import EQUAL, Frame
 
 
 class Tail(NamedTuple):
-    """Where the tail is, and how fast it moves."""
+    """Position and velocity of the tail."""
 
     time: float
-    """[s]"""
+    """Time [s]."""
     alpha: float
     """Fin angle [rad]."""
     alpha_rate: float
-    """[rad/s]"""
+    """Angular velocity of the fin [rad/s]."""
 
 
 class SimulatedCamera:
-    """Takes its frames from the course of the fin angle."""
+    """Camera that takes its frames from the fin angle over time."""
 
     def __init__(self, settings: SimulatedCameraSettings, size: int) -> None:
         """size: height and width of a frame [px]"""
@@ -30,28 +30,28 @@ class SimulatedCamera:
         self._painter = TailPainter(settings, size)
         self._random = np.random.default_rng([settings.seed, 1])
         self._phase = float(self._random.uniform())
-        """Of the frames against time zero, in periods."""
+        """Phase of the frames relative to time zero, in periods."""
         self._available = -math.inf
 
     def frames(self, before: Tail, after: Tail) -> list[Frame]:
-        """The frames exposed after `before` and up to `after`, at their times of arrival.
+        """Return the frames exposed after `before` and up to `after`.
 
-        Between the two the fin angle is the cubic that has their angles and rates.
+        Between the two, the fin angle is the cubic polynomial through their angles and rates.
         """
-        found = []
+        frames = []
         for time in self._times(before.time, after.time):
-            alpha, alpha_rate = _between(before, after, time)
+            alpha, alpha_rate = _interpolate(before, after, time)
             pixels = self._painter.paint(alpha, alpha_rate, time)
-            late = self._settings.latency
+            latency = self._settings.latency
             if self._settings.jitter:
-                late += float(self._random.normal(0.0, self._settings.jitter))
-            self._available = max(self._available, time + max(0.0, late))
-            found.append(Frame(time, self._available, pixels))
-        return found
+                latency += float(self._random.normal(0.0, self._settings.jitter))
+            self._available = max(self._available, time + max(0.0, latency))
+            frames.append(Frame(time, self._available, pixels))
+        return frames
 
     def _times(self, begin: float, end: float) -> list[float]:
         rate = self._settings.rate
-        if rate is None:  # there when a tick begins
+        if rate is None:  # frames are available when a tick begins
             tick = end - begin
             ticks = math.floor((self._settings.latency + EQUAL) / tick)
             return [end - max(0.0, self._settings.latency - ticks * tick)]
@@ -60,8 +60,8 @@ class SimulatedCamera:
         return [(number + self._phase) / rate for number in range(first, last + 1)]
 
 
-def _between(before: Tail, after: Tail, time: float) -> tuple[float, float]:
-    """Angle and rate on the cubic Hermite polynomial through both ends."""
+def _interpolate(before: Tail, after: Tail, time: float) -> tuple[float, float]:
+    """Return angle and rate on the cubic Hermite polynomial through both ends."""
     h = after.time - before.time
     s = (time - before.time) / h
     left, right = before.alpha_rate * h, after.alpha_rate * h

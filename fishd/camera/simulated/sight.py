@@ -1,4 +1,4 @@
-"""What a simulated camera shows of a simulated fish in this process, tick by tick."""
+"""Stacks of frames of a simulated camera above a simulated fish in this process."""
 
 from collections.abc import Callable
 
@@ -9,7 +9,7 @@ from fishd.core.signals import Truth
 
 
 class SimulatedSight:
-    """Follows one fish from its first tick on; to be asked in each."""
+    """Simulated camera above one fish; call `look` in every tick from the first one on."""
 
     def __init__(
         self,
@@ -20,7 +20,7 @@ class SimulatedSight:
     ) -> None:
         """
         tick: period of the loop [s]
-        truth: where the fish is now
+        truth: returns the current state of the fish
         """
         self._camera = SimulatedCamera(camera, stack.size)
         self._history = FrameHistory(stack)
@@ -28,7 +28,7 @@ class SimulatedSight:
         self._before: Tail | None = None
 
     def look(self, time: float) -> Stack | None:
-        """The stack that a policy is shown at a tick [s]; None before there are enough frames."""
+        """Return the stack for a policy at a tick [s]; None before there are enough frames."""
         now = self._truth()
         after = Tail(time, now.alpha, now.alpha_rate)
         before = self._before or Tail(time - self._tick, now.alpha, 0.0)

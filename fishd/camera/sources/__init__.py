@@ -1,1 +1,1 @@
-"""Where frames come from: a camera of this machine, a stream, or a simulation."""
+"""Sources of frames: a camera of this machine, a stream, or a simulation."""

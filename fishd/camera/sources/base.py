@@ -1,4 +1,4 @@
-"""What a source of frames is, and where it puts them."""
+"""Interfaces of a source of frames and of the sink that receives them."""
 
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
@@ -9,30 +9,30 @@ from fishd.core.errors import FishdError
 
 
 class Shot(NamedTuple):
-    """One picture as a source has it."""
+    """One picture from a source."""
 
     time: float
-    """Middle of its exposure [s, clock of the source]."""
+    """Middle of the exposure [s, clock of the source]."""
     available: float
-    """When it could first be had, on the same clock [s]."""
+    """Time at which the picture became available, on the same clock [s]."""
     picture: Pixels
-    """The whole of it, shape (height, width)."""
+    """Whole picture, shape (height, width)."""
     exposure: float | None = None
-    """Its length [s]; None where it is not known."""
+    """Exposure time [s]; None where unknown."""
 
 
 class Timeline(NamedTuple):
-    """The clock on which a source tells its times; another one is another session."""
+    """Clock of a source's times; each session has one clock."""
 
     virtual: bool
     boot: str
-    """Names the start of the machine whose monotonic clock it is."""
+    """Identifier of the boot of the machine whose monotonic clock it is."""
     now: Callable[[], float] | None
-    """[s]; None where it is virtual."""
+    """Function that reads the clock [s]; None where it is virtual."""
 
 
 class Trouble(FishdError):
-    """A source has no frames just now; the message is one line that says why."""
+    """A source has no frames at present; the message is one line with the reason."""
 
     def __init__(self, condition: Condition, problem: str, remedy: str = "") -> None:
         super().__init__(problem)
@@ -41,32 +41,35 @@ class Trouble(FishdError):
 
 
 class Sink(Protocol):
-    """Takes what a source has; its methods wait for nobody and may be called in any thread."""
+    """Receiver of frames; its methods do not block and may be called in any thread."""
 
     def begin(self, timeline: Timeline, degraded: tuple[str, ...] = ()) -> None:
-        """Frames follow, in a new session; what keeps them from being as good as could be."""
+        """Start a new session; degraded: reasons why times or pictures are worse than possible."""
 
     def put(self, shot: Shot) -> None:
         """Publish a frame."""
 
     def covered(self, until: float) -> None:
-        """All frames that were to be had by then [s] have been put; for a virtual clock."""
+        """Declare that all frames available by a time [s] have been put; for a virtual clock."""
 
     def lost(self, dropped: int = 0, broken: int = 0) -> None:
-        """Count frames that nobody got, and such as could not be decoded."""
+        """Count frames that were not delivered, and frames that could not be decoded."""
 
     def trouble(self, trouble: Trouble) -> None:
-        """There are no frames just now, and why; `put` says that it is over."""
+        """Declare a condition without frames; the next `put` ends it."""
 
     def alive(self) -> None:
-        """The source does not hang; to be called once a second at least."""
+        """Declare that the source does not hang; call it at least once a second."""
 
 
 class Source(Protocol):
-    """Puts frames into a sink until it is told to stop; runs in a thread of its own."""
+    """Source that puts frames into a sink until it is stopped; runs in a separate thread."""
 
     device: str
-    """What it opens, for people; never a password."""
+    """Name of the camera for people, without a password."""
 
     def run(self, sink: Sink, stopping: Callable[[float], bool]) -> None:
-        """stopping: waits for so long [s], and is true as soon as the source is to end."""
+        """Put frames into `sink` until `stopping` returns true.
+
+        stopping: waits for a time [s], and returns true at once when the source must end
+        """

@@ -1,4 +1,4 @@
-"""From what a camera sends to grey levels: MJPEG, YUYV and grey as V4L2 names them."""
+"""Decoding of V4L2 pixel formats MJPG, YUYV and GREY to grey levels."""
 
 import numpy as np
 import simplejpeg
@@ -10,38 +10,38 @@ class Broken(ValueError):
     """A frame cannot be decoded."""
 
 
-def grey(data: bytes, fourcc: str, width: int, height: int, line: int) -> Pixels:
-    """The picture, shape (height, width); raises `Broken`.
+def decode_grey(data: bytes, fourcc: str, width: int, height: int, line: int) -> Pixels:
+    """Return the picture, shape (height, width); raises `Broken`.
 
     fourcc: MJPG, YUYV or GREY; line: bytes per line of an uncompressed format
     """
     if fourcc == "MJPG":
-        picture = _jpeg(data)
+        picture = _decode_jpeg(data)
         if picture.shape != (height, width):
-            raise Broken(f"{picture.shape[1]} x {picture.shape[0]} px came")
+            raise Broken(f"the picture has {picture.shape[1]} x {picture.shape[0]} px")
         return picture
     step = 2 if fourcc == "YUYV" else 1
     line = max(line, step * width)
     if len(data) < line * (height - 1) + step * width:
-        raise Broken(f"{len(data)} bytes came")
+        raise Broken(f"the frame has only {len(data)} bytes")
     lines = np.zeros(height * line, np.uint8)
-    found = np.frombuffer(data, np.uint8)[: height * line]
-    lines[: len(found)] = found
+    received = np.frombuffer(data, np.uint8)[: height * line]
+    lines[: len(received)] = received
     return np.ascontiguousarray(lines.reshape(height, line)[:, : step * width : step])
 
 
-def _jpeg(data: bytes) -> Pixels:
+def _decode_jpeg(data: bytes) -> Pixels:
     try:
-        found = _decoded(data, strict=True)
+        pixels = _run_decoder(data, strict=True)
     except ValueError as error:
         if "extraneous" not in str(error).lower():  # harmless, and many cameras send such bytes
             raise Broken(str(error)) from None
-        found = _decoded(data, strict=False)
-    return found
+        pixels = _run_decoder(data, strict=False)
+    return pixels
 
 
-def _decoded(data: bytes, *, strict: bool) -> Pixels:
-    found = simplejpeg.decode_jpeg(
+def _run_decoder(data: bytes, *, strict: bool) -> Pixels:
+    pixels = simplejpeg.decode_jpeg(
         data, colorspace="GRAY", fastdct=True, fastupsample=True, strict=strict
     )
-    return np.asarray(found, np.uint8)[:, :, 0]
+    return np.asarray(pixels, np.uint8)[:, :, 0]

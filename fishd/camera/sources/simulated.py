@@ -1,7 +1,8 @@
-"""A simulated camera above the fish of a running fishd: draws its tail from telemetry.
+"""Simulated camera above the fish of a running fishd, which draws the tail from telemetry.
 
-fishd publishes a tick at its end, but the command of that tick holds until the next one. So the
-motion until then is known: a model of the same fish swims one tick ahead from the true state.
+fishd publishes a tick at its end, but the command of that tick is active until the next one. The
+motion until then is therefore known: a model of the same fish is advanced by one tick from the true
+state.
 """
 
 import math
@@ -31,16 +32,16 @@ from fishd.virtual.plant.base import PlantState
 from fishd.virtual.plant.parameters import TETHERED, PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
 
-AGAIN = 0.3
-"""Time between two looks for a fishd [s]."""
-SILENCE = 1.0
-"""After so long without a tick, fishd is asked whether it is there [s]."""
-ANSWER = 1.0
-"""How long fishd may take for an answer [s]."""
+RETRY_PERIOD_S = 0.3
+"""Time between two attempts to connect to fishd [s]."""
+MAX_SILENCE_S = 1.0
+"""Time without a tick after which the status of fishd is requested [s]."""
+ANSWER_TIMEOUT_S = 1.0
+"""Longest wait for an answer of fishd [s]."""
 
 
 class TickTruth(Struct, frozen=True, gc=False):
-    """What is needed of a tick."""
+    """Fields of a tick that the camera needs."""
 
     seq: int
     phi_c: float
@@ -52,51 +53,51 @@ class TickTruth(Struct, frozen=True, gc=False):
 
 
 class Swimmer(NamedTuple):
-    """What fishd says of the fish that it simulates."""
+    """Description by fishd of its simulated fish."""
 
     tick: float
-    """Period of its loop [s]."""
+    """Period of fishd's loop [s]."""
     plant: PlantParameters
     sample_rate: float
-    """Force samples per second, which decide the steps of the integration."""
+    """Rate of the force samples, which sets the steps of the integration [1/s]."""
     lockstep: bool
 
 
 class Foresight:
-    """The course of the tail from each tick to the next."""
+    """Prediction of the tail's motion from each tick to the next."""
 
     def __init__(self, swimmer: Swimmer) -> None:
         self._swimmer = swimmer
         self._fish = TetheredFish(swimmer.plant)
-        self._latest: TickTruth | None = None
+        self._last_seq: TickTruth | None = None
         self._end = Tail(0.0, 0.0, 0.0)
 
     def follow(self, tick: TickTruth) -> list[tuple[Tail, Tail]]:
-        """The parts of the course that a tick makes known, one after the other."""
+        """Return the parts of the motion that follow from a tick, as pairs of begin and end."""
         assert isinstance(tick.alpha, float)
-        period, latest = self._swimmer.tick, self._latest
+        period, last_seq = self._swimmer.tick, self._last_seq
         command = tick.phi_c if tick.servo_on else None
         now = Tail(tick.time, tick.alpha, tick.alpha_rate)
         parts = []
-        if latest is None or tick.seq != latest.seq + 1:
+        if last_seq is None or tick.seq != last_seq.seq + 1:
             self._fish = TetheredFish(self._swimmer.plant, PlantState(phi=tick.phi))
-            if self._swimmer.plant.servo_delay:  # what is under way to the servo is not known
+            if self._swimmer.plant.servo_delay:  # the commands within the servo's delay are unknown
                 self._swim(command, self._swimmer.plant.servo_delay + period)
-        elif tick.time > self._end.time + EQUAL:  # after slots that fishd has skipped
-            self._swim(latest.phi_c if latest.servo_on else None, tick.time - self._end.time)
+        elif tick.time > self._end.time + EQUAL:  # after ticks that fishd has skipped
+            self._swim(last_seq.phi_c if last_seq.servo_on else None, tick.time - self._end.time)
             parts.append((self._end, now))
         self._fish.state = PlantState(tick.phi, tick.alpha, tick.alpha_rate)
         end = tick.time + period
-        if self._swimmer.lockstep:  # as fishd's own clock counts
+        if self._swimmer.lockstep:  # on the grid of fishd's virtual clock
             end = (round(tick.time / period) + 1) * period
         self._swim(command, end - tick.time)
         state = self._fish.state
-        self._latest, self._end = tick, Tail(end, state.alpha, state.alpha_rate)
+        self._last_seq, self._end = tick, Tail(end, state.alpha, state.alpha_rate)
         return [*parts, (now, self._end)]
 
     @property
     def end(self) -> float:
-        """Until when the course is known [s]."""
+        """End of the predicted motion [s]."""
         return self._end.time
 
     def _swim(self, command: float | None, duration: float) -> None:
@@ -106,7 +107,7 @@ class Foresight:
 
 
 class SimulatedSource:
-    """Follows a fishd, through any restart of it."""
+    """Source of the frames above the fish of a fishd, also after fishd restarts."""
 
     def __init__(self, settings: SimulatedSettings, size: int) -> None:
         """size: height and width of a picture [px]"""
@@ -117,20 +118,20 @@ class SimulatedSource:
         self.device = f"a simulated camera above the fish at {where}"
 
     def run(self, sink: Sink, stopping: Callable[[float], bool]) -> None:
-        """Draw until told to stop."""
+        """Draw frames until `stopping` returns true."""
         while not stopping(0.0):
             try:
-                with Fish(self._settings.fishd, timeout=ANSWER) as fish:
+                with Fish(self._settings.fishd, timeout=ANSWER_TIMEOUT_S) as fish:
                     self._follow(fish, sink, stopping)
             except FishError as error:
                 sink.trouble(Trouble("waiting", str(error)))
             except Trouble as trouble:
                 sink.trouble(trouble)
-            stopping(AGAIN)
+            stopping(RETRY_PERIOD_S)
             sink.alive()
 
     def _follow(self, fish: Fish, sink: Sink, stopping: Callable[[float], bool]) -> None:
-        """Draw what one fishd does, until it is gone or another one."""
+        """Draw the fish of one fishd, until that ends or is replaced."""
         status = fish.status()
         swimmer = _swimmer(fish.config())
         view = _View(self._settings, self._size, swimmer, sink)
@@ -139,24 +140,24 @@ class SimulatedSource:
             socket = subscriber(context, status.telemetry, b"tick")
             offset = ClockOffset(clock_of(fish))
             view.ahead = offset.update().seconds
-            heard, latest = time.monotonic(), 0
+            last_tick_time, last_seq = time.monotonic(), 0
             while not stopping(0.0):
                 sink.alive()
-                if socket.poll(view.patience()):
+                if socket.poll(view.poll_timeout()):
                     topic, payload = (*socket.recv_multipart(), b"")[:2]
                     tick = self._decoded(payload) if topic == b"tick" else None
                     if tick is not None:
-                        if tick.seq <= latest:
-                            return  # of a fishd that was started again
-                        heard, latest = time.monotonic(), tick.seq
+                        if tick.seq <= last_seq:
+                            return  # from a fishd that has restarted
+                        last_tick_time, last_seq = time.monotonic(), tick.seq
                         view.follow(tick, status)
                 view.publish()
-                if time.monotonic() - heard > SILENCE:
-                    heard = time.monotonic()
+                if time.monotonic() - last_tick_time > MAX_SILENCE_S:
+                    last_tick_time = time.monotonic()
                     if fish.status().pid != status.pid:
                         return
-                    if not socket.poll(SECOND_LOOK):  # else this process itself was held up
-                        view.idle()
+                    if not socket.poll(SECOND_LOOK):  # otherwise this process was delayed itself
+                        view.report_idle()
                 view.ahead = offset.update().seconds
         finally:
             context.destroy(linger=0)
@@ -169,7 +170,7 @@ class SimulatedSource:
 
 
 class _View:
-    """What a camera sees of one fishd, each frame at its time."""
+    """View of the fish of one fishd, which puts each frame at its time."""
 
     def __init__(
         self, settings: SimulatedSettings, size: int, swimmer: Swimmer, sink: Sink
@@ -180,29 +181,29 @@ class _View:
         self._swimmer = swimmer
         self._sink = sink
         self._due: deque[Shot] = deque()
-        self._latest = 0
+        self._last_seq = 0
         self.ahead = 0.0
-        """Of fishd's clock over that of this machine [s]."""
+        """Lead of fishd's clock over that of this machine [s]."""
 
     def follow(self, tick: TickTruth, status: Status) -> None:
-        """Take the frames until the next tick; raises `Trouble` where there is no simulated fish.
+        """Compute the frames until the next tick; raises `Trouble` without a simulated fish.
 
-        status: of the fishd that has ticked
+        status: status of the fishd that has ticked
         """
         if status.robot == "swimmer" or not isinstance(tick.alpha, float):
-            raise _blind(status.robot)
+            raise _no_sight(status.robot)
         if math.isnan(tick.time):
             raise Trouble(
                 "unusable",
-                f"fishd {status.version} does not tell the times of its ticks: it is older than "
+                f"fishd {status.version} does not publish the times of its ticks: it is older than "
                 "this camera",
-                "let both be of the same version",
+                "install the same version of both",
             )
-        if not self._latest:
+        if not self._last_seq:
             self._begin(status)
-        elif tick.seq > self._latest + 1:
-            self._sink.lost(dropped=self._frames_in(tick.seq - self._latest - 1))
-        self._latest = tick.seq
+        elif tick.seq > self._last_seq + 1:
+            self._sink.lost(dropped=self._frames_in(tick.seq - self._last_seq - 1))
+        self._last_seq = tick.seq
         for before, after in self._foresight.follow(tick):
             for frame in self._camera.frames(before, after):
                 self._due.append(Shot(*frame, self._settings.exposure))
@@ -212,24 +213,26 @@ class _View:
             self._sink.covered(self._foresight.end)
 
     def publish(self) -> None:
-        """Hand over the frames that are due."""
+        """Put the frames that are due."""
         while self._due and self._due[0].available <= (now := self._now()):
             self._sink.put(self._due.popleft()._replace(available=now))
 
-    def patience(self) -> int:
-        """How long to wait for the next tick [ms]."""
+    def poll_timeout(self) -> int:
+        """Return the longest wait for the next tick [ms]; wait here for a frame due within 1 ms."""
         if not self._due:
             return 200
-        left = self._due[0].available - self._now()
-        if left < 1e-3:
-            time.sleep(max(0.0, left))
+        remaining = self._due[0].available - self._now()
+        if remaining < 1e-3:
+            time.sleep(max(0.0, remaining))
             return 0
-        return min(200, int(left * 1e3))
+        return min(200, int(remaining * 1e3))
 
-    def idle(self) -> None:
-        """Tell that fishd answers, but does not tick."""
-        why = "as in lockstep while it waits for its agent" if self._swimmer.lockstep else "so far"
-        self._sink.trouble(Trouble("waiting", f"fishd answers, but does not tick, {why}"))
+    def report_idle(self) -> None:
+        """Report that fishd answers, but does not tick."""
+        reason = (
+            "as in lockstep while it waits for its agent" if self._swimmer.lockstep else "so far"
+        )
+        self._sink.trouble(Trouble("waiting", f"fishd answers, but does not tick, {reason}"))
 
     def _begin(self, status: Status) -> None:
         if self._swimmer.lockstep:
@@ -246,11 +249,11 @@ class _View:
 
 
 def _swimmer(config: dict[str, Any]) -> Swimmer:
-    """Raises `Trouble` where the configuration is of another version."""
+    """Return the fish of a configuration; raises `Trouble` where that is of another version."""
     try:
         plant = dict(config["plant"])
         if plant.get("model", TETHERED) != TETHERED:
-            # It has keys of its own. Until the next tick it goes on as the tethered fish would.
+            # Another model has other keys. Until the next tick, the tethered fish approximates it.
             plant = {name: plant[name] for name in PlantParameters.__struct_fields__}
         return Swimmer(
             tick=float(config["tick"]),
@@ -261,17 +264,17 @@ def _swimmer(config: dict[str, Any]) -> Swimmer:
     except (Problem, KeyError, TypeError, ValueError) as error:
         raise Trouble(
             "unusable",
-            f"this fishd describes its fish in another way: {error}",
-            "let fishd and fishd-camera be of the same version",
+            f"the description of the fish by this fishd is not valid: {error}",
+            "install the same version of fishd and fishd-camera",
         ) from None
 
 
-def _blind(robot: str) -> Trouble:
-    """Why nothing can be drawn."""
-    why = {
-        "virtual-pi": "a virtual Pi does not tell where the tail is",
-        "swimmer": "a swimmer swims out of its sight",
+def _no_sight(robot: str) -> Trouble:
+    """Return the reason why a robot's fish cannot be drawn."""
+    reason = {
+        "virtual-pi": "a virtual Pi does not publish the position of the tail",
+        "swimmer": "a swimmer leaves the camera's view",
     }.get(robot)
-    if why:
-        return Trouble("unusable", why, "let fishd drive robot: simulated")
+    if reason:
+        return Trouble("unusable", reason, "start fishd with robot: simulated")
     return Trouble("unusable", "this fishd drives a real fish", "use source: v4l2")

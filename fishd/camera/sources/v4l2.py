@@ -1,6 +1,6 @@
-"""A camera of this machine, through V4L2: each frame with the kernel's time and number.
+"""Camera of this machine, read through V4L2: each frame has the kernel's time stamp and number.
 
-The kernel's API: docs.kernel.org, "Video for Linux API"; linuxpy speaks it.
+The kernel's API is described at docs.kernel.org, "Video for Linux API"; linuxpy implements it.
 """
 
 import select
@@ -11,151 +11,158 @@ from linuxpy.video.device import Frame
 
 from fishd.camera.settings import V4l2Settings
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
-from fishd.camera.sources.decoding import Broken, grey
-from fishd.camera.sources.v4l2_device import BUFFERS, OpenCamera, explained, opened
+from fishd.camera.sources.decoding import Broken, decode_grey
+from fishd.camera.sources.v4l2_device import BUFFERS, OpenCamera, explain_error, open_camera
 from fishd.core.clock import boot_id
 
-AGAIN = 1.0
-"""Time between two tries to open the camera [s]."""
-STALLED = 2.0
-"""After so long without a whole frame it is opened anew [s]."""
-_LOOK = 200
-"""Longest time between two looks at the rest [ms]."""
+RETRY_PERIOD_S = 1.0
+"""Time between two attempts to open the camera [s]."""
+STALL_TIMEOUT_S = 2.0
+"""Time without a complete frame after which the camera is opened again [s]."""
+_POLL_TIMEOUT_MS = 200
+"""Longest wait for a frame between two checks of `stopping` [ms]."""
 _MONOTONIC, _CLOCK_MASK = 0x2000, 0xE000
 _START_OF_EXPOSURE, _SOURCE_MASK = 0x10000, 0x70000
 _ERROR = 0x40
-_OLDEST = 2.0
-"""A time stamp that is older than this, or of the future, is of another clock [s]."""
-_FUTURE = 0.01
-_MOST_LOST = 10_000
-"""A larger gap in the numbers of frames is a counter that began anew."""
+_MAX_AGE_S = 2.0
+"""Largest age of a valid time stamp; an older one belongs to another clock [s]."""
+_MAX_LEAD_S = 0.01
+"""Largest lead of a valid time stamp over the current time [s]."""
+_MAX_LOST_FRAMES = 10_000
+"""Largest gap in the numbers of frames; a larger one is a counter that was reset."""
 _ARRIVAL = (
-    "the driver's time stamps are not of the monotonic clock: times are those of arrival, late by "
-    "what the camera takes"
+    "the driver's time stamps are not those of the monotonic clock: times are those of arrival, "
+    "which include the camera's delay"
 )
 
 
 class V4l2Source:
-    """Opens the camera again whenever it is gone, stalls or fails."""
+    """Source that opens the camera again whenever it is unplugged, stalls or fails."""
 
     def __init__(self, settings: V4l2Settings) -> None:
         self._settings = settings
         self.device = settings.device
 
     def run(self, sink: Sink, stopping: Callable[[float], bool]) -> None:
-        """Take frames until told to stop."""
+        """Read frames until `stopping` returns true."""
         while not stopping(0.0):
             try:
-                with opened(self._settings) as camera:
-                    _Stream(self._settings, camera).take(sink, stopping)
+                with open_camera(self._settings) as camera:
+                    _Stream(self._settings, camera).run(sink, stopping)
             except Trouble as trouble:
                 sink.trouble(trouble)
             except OSError as error:
-                sink.trouble(explained(error, self.device))
+                sink.trouble(explain_error(error, self.device))
             sink.alive()
-            stopping(AGAIN)
+            stopping(RETRY_PERIOD_S)
 
 
 class _Stream:
-    """A camera that streams."""
+    """Open camera that streams."""
 
     def __init__(self, settings: V4l2Settings, camera: OpenCamera) -> None:
         self._settings = settings
         self._capture, self._format, self._exposure, self._degraded = camera
-        self._stamped: bool | None = None
-        """Do its time stamps count?"""
-        self._late = 0
-        """Frames in a row that were too old."""
+        self._has_valid_stamp: bool | None = None
+        """Whether the driver's time stamps are used; None before the first frame."""
+        self._late_count = 0
+        """Number of consecutive frames that were too old."""
         self._number: int | None = None
 
-    def take(self, sink: Sink, stopping: Callable[[float], bool]) -> None:
-        """Until told to stop; raises `Trouble` when no frames come, and OSError."""
+    def run(self, sink: Sink, stopping: Callable[[float], bool]) -> None:
+        """Read frames until `stopping` returns true; raises `Trouble` and OSError."""
         waiting = select.poll()
         waiting.register(self._capture.device.fileno(), select.POLLIN)
-        whole = heard = time.monotonic()
+        last_complete = last_arrival = time.monotonic()
         while not stopping(0.0):
             sink.alive()
-            if events := waiting.poll(_LOOK):
+            if events := waiting.poll(_POLL_TIMEOUT_MS):
                 try:
                     frame = self._capture.buffer.raw_read()
                 except BlockingIOError:
                     if events[0][1] & select.POLLERR:
                         raise self._stalled("reports an error") from None
                     continue
-                heard = time.monotonic()
-                if broken := self._use(frame, heard, sink):
-                    if heard - whole > STALLED:
+                last_arrival = time.monotonic()
+                if broken := self._put_frame(frame, last_arrival, sink):
+                    if last_arrival - last_complete > STALL_TIMEOUT_S:
                         raise self._only_broken(broken)
                 else:
-                    whole = heard
-            elif time.monotonic() - heard > STALLED:
-                raise self._stalled(f"has sent no frame for {STALLED:g} s")
+                    last_complete = last_arrival
+            elif time.monotonic() - last_arrival > STALL_TIMEOUT_S:
+                raise self._stalled(f"has sent no frame for {STALL_TIMEOUT_S:g} s")
 
-    def _stalled(self, what: str) -> Trouble:
+    def _stalled(self, symptom: str) -> Trouble:
         return Trouble(
             "stalled",
-            f"{self._settings.device} {what}; it is opened anew",
+            f"{self._settings.device} {symptom}; it is opened again",
             "plug it in again, into another port if that does not help; a lower v4l2.rate or size "
-            "needs less of the bus",
+            "needs less bandwidth",
         )
 
-    def _only_broken(self, why: Broken) -> Trouble:
+    def _only_broken(self, error: Broken) -> Trouble:
         return Trouble(
             "stalled",
-            f"{self._settings.device} has sent only broken frames for {STALLED:g} s ({why}); it is "
-            "opened anew",
-            "another cable or port, without a hub; a lower v4l2.rate or size; another v4l2.format: "
-            "'v4l2-ctl --list-formats-ext' shows what it sends",
+            f"{self._settings.device} has sent only broken frames for {STALL_TIMEOUT_S:g} s "
+            f"({error}); it is opened again",
+            "try another cable or port, without a hub, a lower v4l2.rate or size, or another "
+            "v4l2.format: 'v4l2-ctl --list-formats-ext' lists its formats",
         )
 
-    def _use(self, frame: Frame, arrived: float, sink: Sink) -> Broken | None:
-        """Pass it on; why it is broken, where it is."""
+    def _put_frame(self, frame: Frame, arrived: float, sink: Sink) -> Broken | None:
+        """Put a frame; return the error where it is broken."""
         number = frame.frame_nb
         if self._number is not None:
             lost = (number - self._number - 1) % 2**32
-            if 0 < lost < _MOST_LOST:
+            if 0 < lost < _MAX_LOST_FRAMES:
                 sink.lost(dropped=lost)
         self._number = number
         if self._is_late(frame, arrived):
             sink.lost(dropped=1)
             return None
-        found = self._format
+        camera_format = self._format
         try:
             if frame.buff.flags & _ERROR:
-                raise Broken("the driver says so")
-            picture = grey(
-                frame.data, self._settings.format, found.width, found.height, found.bytes_per_line
+                raise Broken("the driver reports an error")
+            picture = decode_grey(
+                frame.data,
+                self._settings.format,
+                camera_format.width,
+                camera_format.height,
+                camera_format.bytes_per_line,
             )
         except Broken as broken:
             sink.lost(broken=1)
             return broken
-        moment = self._moment(frame, arrived, sink)
+        moment = self._exposure_middle(frame, arrived, sink)
         sink.put(Shot(moment, time.monotonic(), picture, self._exposure))
         return None
 
     def _is_late(self, frame: Frame, arrived: float) -> bool:
-        """Did it wait in the driver while this process stood still?
+        """Return whether a frame waited in the driver while this process was stopped.
 
-        No more can wait than the driver holds: if all that come are as old, it is another clock.
+        At most `BUFFERS` frames can wait there; when more are old, the clock is another one.
         """
-        late = (
-            self._stamped is True
+        is_late = (
+            self._has_valid_stamp is True
             and frame.buff.flags & _CLOCK_MASK == _MONOTONIC
-            and arrived - frame.timestamp >= _OLDEST
-            and self._late < BUFFERS
+            and arrived - frame.timestamp >= _MAX_AGE_S
+            and self._late_count < BUFFERS
         )
-        self._late = self._late + 1 if late else 0
-        return late
+        self._late_count = self._late_count + 1 if is_late else 0
+        return is_late
 
-    def _moment(self, frame: Frame, arrived: float, sink: Sink) -> float:
-        """Middle of the exposure [s, monotonic]."""
+    def _exposure_middle(self, frame: Frame, arrived: float, sink: Sink) -> float:
+        """Return the middle of the exposure [s, monotonic clock]."""
         flags, stamp = frame.buff.flags, frame.timestamp
-        stamped = flags & _CLOCK_MASK == _MONOTONIC and -_FUTURE < arrived - stamp < _OLDEST
-        if stamped is not self._stamped:
-            self._stamped = stamped
-            more = () if stamped else (_ARRIVAL,)
-            sink.begin(Timeline(False, boot_id(), time.monotonic), (*self._degraded, *more))
+        has_valid_stamp = (
+            flags & _CLOCK_MASK == _MONOTONIC and -_MAX_LEAD_S < arrived - stamp < _MAX_AGE_S
+        )
+        if has_valid_stamp is not self._has_valid_stamp:
+            self._has_valid_stamp = has_valid_stamp
+            arrival_note = () if has_valid_stamp else (_ARRIVAL,)
+            sink.begin(Timeline(False, boot_id(), time.monotonic), (*self._degraded, *arrival_note))
         half = 0.5 * (self._exposure or 0.0)
-        if stamped and flags & _SOURCE_MASK == _START_OF_EXPOSURE:
+        if has_valid_stamp and flags & _SOURCE_MASK == _START_OF_EXPOSURE:
             half = -half
-        return (stamp if stamped else arrived) - half - self._settings.delay
+        return (stamp if has_valid_stamp else arrived) - half - self._settings.delay

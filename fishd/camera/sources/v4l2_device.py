@@ -1,4 +1,4 @@
-"""Opens a V4L2 camera as the settings say, and puts the kernel's errors into words."""
+"""Opening of a V4L2 camera with its settings, and explanations of the kernel's errors."""
 
 import errno
 from collections.abc import Iterator
@@ -14,34 +14,34 @@ from fishd.core import text
 from fishd.core.schema import nearest
 
 BUFFERS = 4
-"""Frames that the kernel can hold."""
-_EXPOSURE_UNIT = 1e-4
-"""Of the control exposure_time_absolute [s]."""
+"""Number of frames that the kernel can hold."""
+_EXPOSURE_UNIT_S = 1e-4
+"""Unit of the control exposure_time_absolute [s]."""
 
 
 class OpenCamera(NamedTuple):
-    """A camera that streams."""
+    """Open camera that streams."""
 
     capture: VideoCapture
     format: Format
     exposure: float | None
-    """Its length, where it is fixed [s]."""
+    """Exposure time, where it is fixed [s]."""
     degraded: tuple[str, ...]
-    """What it does in another way than the settings say."""
+    """Differences between the camera's behaviour and its settings."""
 
 
 @contextmanager
-def opened(settings: V4l2Settings) -> Iterator[OpenCamera]:
-    """A camera that streams as the settings say; raises `Trouble` and OSError."""
+def open_camera(settings: V4l2Settings) -> Iterator[OpenCamera]:
+    """Open a camera with its settings, and close it at the end; raises `Trouble` and OSError."""
     device = Device(settings.device)
     capture = VideoCapture(device, BUFFERS)
     try:
         device.open()
-        found = _set_format(capture, settings)
-        degraded = _complaints(capture, settings, found)
+        camera_format = _set_format(capture, settings)
+        degraded = _set_rate_and_compare(capture, settings, camera_format)
         exposure = _set_controls(device, settings)
         capture.open()
-        yield OpenCamera(capture, found, exposure, degraded)
+        yield OpenCamera(capture, camera_format, exposure, degraded)
     except V4L2Error as error:
         raise _no_camera(settings.device, text.said(error)) from None
     finally:
@@ -49,13 +49,13 @@ def opened(settings: V4l2Settings) -> Iterator[OpenCamera]:
 
 
 def _close(device: Device, capture: VideoCapture) -> None:
-    """Let go of everything, whatever state the camera is in."""
+    """Release the device and its buffers, in any state of the camera."""
     memory = capture.buffer
     with suppress(OSError, ValueError):
         capture.close()
-    for each in getattr(memory, "buffers", None) or ():
+    for item in getattr(memory, "buffers", None) or ():
         with suppress(OSError, ValueError):
-            each.close()
+            item.close()
     with suppress(OSError):
         device.close()
 
@@ -63,61 +63,63 @@ def _close(device: Device, capture: VideoCapture) -> None:
 def _set_format(capture: VideoCapture, settings: V4l2Settings) -> Format:
     try:
         capture.set_format(settings.width, settings.height, settings.format)
-        found: Format = capture.get_format()
-        sends = found.pixel_format.human_str()
+        camera_format: Format = capture.get_format()
+        format_name = camera_format.pixel_format.human_str()
     except ValueError:  # a format that linuxpy does not know
-        sends = "another format"
+        format_name = "another format"
     except OSError as error:
         if error.errno == errno.ENOTTY:
-            raise _no_camera(settings.device, "it is no video device") from None
+            raise _no_camera(settings.device, "it is not a video device") from None
         if error.errno == errno.EINVAL:
             raise _no_camera(settings.device, "it takes no pictures") from None
         raise
-    if sends != settings.format:
-        offered = ", ".join(_formats(capture)) or sends
+    if format_name != settings.format:
+        offered = ", ".join(_formats(capture)) or format_name
         raise Trouble(
             "unusable",
             f"{settings.device} does not send {settings.format}",
             f"set v4l2.format to one of MJPG, YUYV, GREY that it sends: {offered}",
         )
-    return found
+    return camera_format
 
 
 def _formats(capture: VideoCapture) -> list[str]:
     with suppress(OSError, ValueError):
-        return [each.pixel_format.human_str() for each in capture.formats()]
+        return [item.pixel_format.human_str() for item in capture.formats()]
     return []
 
 
-def _complaints(capture: VideoCapture, settings: V4l2Settings, found: Format) -> tuple[str, ...]:
-    """What the camera does in another way than the settings say."""
-    complaints = []
-    if (found.width, found.height) != (settings.width, settings.height):
-        complaints.append(
-            f"its pictures are {found.width} x {found.height} px: it has none of "
-            f"{settings.width} x {settings.height}"
+def _set_rate_and_compare(
+    capture: VideoCapture, settings: V4l2Settings, camera_format: Format
+) -> tuple[str, ...]:
+    """Set the rate, and return the differences between the camera and its settings."""
+    differences = []
+    if (camera_format.width, camera_format.height) != (settings.width, settings.height):
+        differences.append(
+            f"its pictures are {camera_format.width} x {camera_format.height} px: it does "
+            f"not support {settings.width} x {settings.height}"
         )
     rate = None
     with suppress(OSError, ZeroDivisionError):
         capture.set_fps(settings.rate)
         rate = float(capture.get_fps())
     if rate is None:
-        complaints.append("its rate cannot be set")
+        differences.append("its rate cannot be set")
     elif abs(rate - settings.rate) > 0.01 * settings.rate:
-        complaints.append(f"it takes {rate:g} frames a second, not {settings.rate:g}")
-    return tuple(complaints)
+        differences.append(f"it takes {rate:g} frames a second, not {settings.rate:g}")
+    return tuple(differences)
 
 
 def _set_controls(device: Device, settings: V4l2Settings) -> float | None:
-    """Set what the settings name, in their order; the exposure, where it is fixed [s]."""
-    controls = {each.config_name: each for each in device.controls.values()}
+    """Set the controls of the settings in their order; return the exposure time where fixed [s]."""
+    controls = {item.config_name: item for item in device.controls.values()}
     for name, value in settings.controls.items():
         control = controls.get(name)
         if control is None:
             raise _bad_control(settings, name, f"there is none; {nearest(name, list(controls))}")
         if not control.minimum <= value <= control.maximum:
-            permitted = f"{control.minimum} to {control.maximum} is needed"
-            raise _bad_control(settings, name, f"{value} is not valid: {permitted}")
+            range_text = f"{control.minimum} to {control.maximum} is needed"
+            raise _bad_control(settings, name, f"{value} is not valid: {range_text}")
         try:
             control.value = int(value)
         except (AttributeError, ValueError) as error:
@@ -130,7 +132,7 @@ def _set_controls(device: Device, settings: V4l2Settings) -> float | None:
     with suppress(KeyError, OSError):
         automatic = controls["auto_exposure"].value
         if automatic in (raw.ExposureAutoType.MANUAL, raw.ExposureAutoType.SHUTTER_PRIORITY):
-            return float(controls["exposure_time_absolute"].value) * _EXPOSURE_UNIT
+            return float(controls["exposure_time_absolute"].value) * _EXPOSURE_UNIT_S
     return None
 
 
@@ -138,8 +140,8 @@ def _bad_control(settings: V4l2Settings, name: str, why: str) -> Trouble:
     return Trouble(
         "unusable",
         f"v4l2.controls.{name}: {why}",
-        f"'v4l2-ctl -d {settings.device} --list-ctrls' shows them; some follow from others that "
-        "have to be set first, as exposure_time_absolute from auto_exposure",
+        f"'v4l2-ctl -d {settings.device} --list-ctrls' lists the controls; some depend on others "
+        "that must be set first, such as exposure_time_absolute on auto_exposure",
     )
 
 
@@ -151,8 +153,8 @@ def _no_camera(device: str, why: str) -> Trouble:
     )
 
 
-def explained(error: OSError, device: str) -> Trouble:
-    """An error of the kernel in words."""
+def explain_error(error: OSError, device: str) -> Trouble:
+    """Return an explanation of the kernel's error."""
     number = error.errno
     if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO, errno.ENOTDIR):
         return Trouble(
@@ -170,18 +172,18 @@ def explained(error: OSError, device: str) -> Trouble:
         return Trouble(
             "unusable",
             f"{device}: another program uses it",
-            "end that, such as a video call or another fishd-camera",
+            "close that program, such as a video call or another fishd-camera",
         )
     if number == errno.ENOSPC:
         return Trouble(
             "unusable",
             f"{device}: the USB bus has no room for it",
-            "choose a smaller size or rate, MJPG, or a port of its own",
+            "choose a smaller size or rate, MJPG, or a separate USB port",
         )
     if number == errno.ENOTTY:
-        return _no_camera(device, "it is no video device")
+        return _no_camera(device, "it is not a video device")
     return Trouble(
         "stalled",
-        f"{device}: {error.strerror or text.said(error)}; it is opened anew",
+        f"{device}: {error.strerror or text.said(error)}; it is opened again",
         "plug it in again, into another port if that does not help",
     )

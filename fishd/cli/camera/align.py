@@ -172,10 +172,10 @@ def _draw_alignment(alignment: "Alignment", png: Path | None, as_json: bool) -> 
     from fishd.camera import drawing
 
     energy, axis = alignment.motion.energy, alignment.motion.axis
-    colours = drawing.with_axis(drawing.motion_colours(energy), axis, len(energy))
+    colours = drawing.draw_axis(drawing.motion_colours(energy), axis, len(energy))
     if png:
-        large = drawing.enlarged(drawing.motion_colours(energy))
-        drawing.write_png(png, drawing.with_axis(large, axis, len(energy)))
+        large = drawing.enlarge(drawing.motion_colours(energy))
+        drawing.write_png(png, drawing.draw_axis(large, axis, len(energy)))
         echo(f"{png}: what moves, and the axis", err=as_json)
     if not as_json and sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):
         from rich.console import Console

@@ -85,7 +85,7 @@ def _print_latency(delays: "Latency", clock_error: float, settings: "CameraSetti
     error = f"± {delays.error * 1e3:.1f} ms"
     echo_rows(
         [
-            ("delay", f"{delays.whole * 1e3:.1f} {error}, from exposure until the frame is there"),
+            ("delay", f"{delays.total * 1e3:.1f} {error}, from exposure until the frame is there"),
             ("time stamps", f"{delays.stamps * 1e3:+.1f} {error} late"),
             ("arrival", f"{delays.arrival * 1e3:.1f} ms after its time stamp, 99 % within "
              f"{delays.latest * 1e3:.1f} ms"),
@@ -139,7 +139,7 @@ def suggest_settings(delays: "Latency", settings: "CameraSettings") -> list[str]
 
 def _to_json(delays: "Latency", clock_error: float, settings: "CameraSettings") -> dict[str, Any]:
     return {
-        "delay": delays.whole,
+        "delay": delays.total,
         "error": delays.error,
         "stamps": delays.stamps,
         "arrival": delays.arrival,

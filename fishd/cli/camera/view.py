@@ -148,16 +148,16 @@ def _draw_picture(client: "CameraClient", watch: "AxisWatch", whole: bool) -> "C
     if whole:
         if client.view is None:
             raise FishdError("the camera sends no views: publish.view_rate of its settings is 0")
-        colours, crop = drawing.whole_picture(client.view), client.view.header.crop
-        return drawing.with_axis(colours, watch.axis, len(pixels), crop)
-    return drawing.with_axis(drawing.coloured(pixels), watch.axis, len(pixels))
+        colours, crop = drawing.decode_view(client.view), client.view.header.crop
+        return drawing.draw_axis(colours, watch.axis, len(pixels), crop)
+    return drawing.draw_axis(drawing.to_colours(pixels), watch.axis, len(pixels))
 
 
 def _write_png(client: "CameraClient", watch: "AxisWatch", whole: bool, png: Path) -> None:
     from fishd.camera import drawing
 
     colours = _draw_picture(client, watch, whole)
-    drawing.write_png(png, colours if whole else drawing.enlarged(colours))
+    drawing.write_png(png, colours if whole else drawing.enlarge(colours))
     echo(f"{png}: {format_facts(client, watch)}")
 
 

@@ -107,7 +107,7 @@ def test_an_error_that_nobody_expected_is_said_and_the_camera_opened_again(tmp_p
 def test_a_driver_that_hangs_is_said_while_requests_are_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server, "HANGS", 0.1)
+    monkeypatch.setattr(server, "SOURCE_TIMEOUT_S", 0.1)
     source = Hangs()
     with serving(tmp_path, source) as client:
         wait_until(lambda: client.status().state == "stalled")

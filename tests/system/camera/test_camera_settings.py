@@ -11,7 +11,7 @@ from rigs.documents import ROOT
 from rigs.processes import call, one_line
 
 from fishd.camera import main
-from fishd.camera.settings import CameraSettings, SimulatedSettings, load, public
+from fishd.camera.settings import CameraSettings, SimulatedSettings, hide_secrets, load
 from fishd.camera.simulated.settings import WEB
 from fishd.core.errors import ConfigError
 
@@ -81,7 +81,7 @@ def test_a_package_that_is_missing_is_said_in_one_line(tmp_path: Path, module: s
     ],
 )
 def test_nobody_is_told_a_password_wherever_a_camera_wants_it(url: str, shown: str) -> None:
-    assert public(url) == shown
+    assert hide_secrets(url) == shown
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from rigs.processes import PATIENCE, Daemon, call, running, sets, wait_until
 
 from fishd.camera import requests
 from fishd.camera.client import CameraClient, CameraLost
-from fishd.camera.requests import CameraRequests, reachable
+from fishd.camera.requests import CameraRequests, resolve_frames_address
 from fishd.cli.doctor import service
 from fishd.cli.doctor.base import Context
 from fishd.config import Config
@@ -145,13 +145,13 @@ def resident(camera: CameraProcess) -> float:
 def test_within_a_tick_there_is_no_time_to_find_out_why_no_answer_comes(
     camera: CameraProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(requests, "_SECOND_LOOK", int(PATIENCE * 1e3))
+    monkeypatch.setattr(requests, "_PUBLISHER_CHECK_MS", int(PATIENCE * 1e3))
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     try:
         asking = CameraRequests(camera.frames, context, timeout=0.3)
         with pytest.raises(CameraLost, match=r"no answer within 0\.05 s"):
             asking.status(0.05)
-        with pytest.raises(CameraLost, match=r"at .+ a camera publishes its frames"):
+        with pytest.raises(CameraLost, match=r".+ is the address of a camera's frames"):
             asking.status()
     finally:
         context.destroy(linger=0)
@@ -190,7 +190,7 @@ def test_no_camera_is_said_in_one_line(tmp_path: Path) -> None:
 def test_a_camera_that_serves_the_network_is_reached_where_it_answers(
     frames: str, endpoint: str, seen: str
 ) -> None:
-    assert reachable(frames, endpoint) == seen
+    assert resolve_frames_address(frames, endpoint) == seen
 
 
 def test_the_doctor_says_how_the_camera_is(
@@ -212,7 +212,7 @@ def test_a_port_that_is_taken_is_that_of_another_camera_perhaps(tmp_path: Path) 
         own = sets(f"publish.frames={address}", f"publish.requests=ipc://{tmp_path}/requests")
         done = call(*COMMAND, *own)
     assert done.returncode == 1
-    assert f"{address}: it is in use, by another fishd-camera perhaps; end that" in done.stderr
+    assert f"{address}: it is in use, perhaps by another fishd-camera; end that" in done.stderr
 
 
 @pytest.mark.realtime

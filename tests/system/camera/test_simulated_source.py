@@ -87,8 +87,8 @@ def test_a_fishd_that_drives_no_simulated_fish_is_named(tmp_path: Path) -> None:
         running_camera(tmp_path, *settings(daemon)) as camera,
     ):
         state = camera.is_in("unusable")
-    assert state.problem == "a virtual Pi does not tell where the tail is"
-    assert state.remedy == "let fishd drive robot: simulated"
+    assert state.problem == "a virtual Pi does not publish the position of the tail"
+    assert state.remedy == "start fishd with robot: simulated"
 
 
 class Lockstep:

@@ -43,7 +43,7 @@ def test_a_file_is_played_at_its_own_rate_again_and_again(tmp_path: Path, video:
     # After a stop of the machine it catches up: the longest time of 30 frames is judged.
     longest = max(b.time - a.time for a, b in zip(frames[:-29], frames[29:], strict=True))
     assert longest >= 29 / 50.0 - 0.03
-    assert state.degraded == ("times are those of playing: a file is no camera",)
+    assert state.degraded == ("times are those of playback: a file has no times of exposure",)
     assert (state.picture_width, state.picture_height) == (160, 120)
 
 
@@ -59,7 +59,7 @@ def test_a_file_that_is_no_video_is_said(tmp_path: Path, content: bytes) -> None
     file = tmp_path / "fish.avi"
     file.write_bytes(content)
     with running_camera(tmp_path, "source=stream", f"stream.url={file}") as camera:
-        assert camera.is_in("unusable").problem == f"{file}: it is no video"
+        assert camera.is_in("unusable").problem == f"{file} is not a video"
 
 
 @contextmanager
@@ -83,7 +83,7 @@ def test_a_network_camera_that_goes_and_comes_back_is_followed(tmp_path: Path, v
             first = camera.until(lambda state: state.seq > 3)
             assert "times are those of arrival" in first.degraded[0]
             state = camera.is_in("stalled")
-            assert "it is opened anew" in state.problem
+            assert "it is opened again" in state.problem
             camera.until(lambda state: state.session != first.session)
 
 

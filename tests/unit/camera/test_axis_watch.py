@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from rigs import filmed_swim
 from rigs.filmed_swim import filmed
 
-from fishd.camera.axis_watch import AGAIN, AxisWatch
+from fishd.camera.axis_watch import SEARCH_PERIOD_S, AxisWatch
 from fishd.camera.simulated.settings import DEFAULT, WEB
 from fishd.core.camera_frames import Frame
 
@@ -40,7 +40,7 @@ def test_it_is_found_once_the_tail_has_moved_for_some_seconds_and_kept_while_it_
     watch = AxisWatch(clock)
     swims = filmed(swum(12.0, controller="swing"), CAMERA)
     looked = shown(watch, clock, swims)
-    assert 2 <= looked <= 12.0 / AGAIN
+    assert 2 <= looked <= 12.0 / SEARCH_PERIOD_S
     assert watch.moving
     assert watch.axis
     assert watch.axis.offset == pytest.approx(3.0, abs=0.2)

@@ -4,7 +4,14 @@ import random
 
 import pytest
 
-from fishd.camera.clock_offset import AGAIN, PAUSE, QUICK, SAME, ClockOffset, Reading
+from fishd.camera.clock_offset import (
+    MIN_UPDATE_TIMEOUT_S,
+    NO_OFFSET,
+    RETRY_PERIOD_S,
+    UPDATE_PERIOD_S,
+    ClockOffset,
+    Reading,
+)
 from fishd.core.clock import boot_id
 from fishd.core.errors import NoDaemon
 
@@ -50,7 +57,7 @@ def test_on_one_machine_it_is_exactly_zero_and_asked_once() -> None:
         return Reading(123.0, boot_id())
 
     clock = ClockOffset(ask)
-    assert [clock.update() for _ in range(3)] == [SAME] * 3
+    assert [clock.update() for _ in range(3)] == [NO_OFFSET] * 3
     assert len(asked) == 1
 
 
@@ -73,7 +80,7 @@ def test_it_is_asked_seldom_and_an_answer_that_fails_keeps_the_latest() -> None:
     clock.update()
     assert network.asked == asked
     network.down = True
-    network.now += AGAIN + 1.0
+    network.now += UPDATE_PERIOD_S + 1.0
     assert clock.update().seconds == before.seconds
     assert network.asked == asked + 1
 
@@ -84,7 +91,7 @@ def test_another_start_of_their_machine_begins_anew(boot: str) -> None:
     clock = ClockOffset(network.ask, lambda: network.now)
     clock.update()
     network.ahead, network.boot = -50.0, boot
-    network.now += AGAIN + 1.0
+    network.now += UPDATE_PERIOD_S + 1.0
     offset = clock.update()
     assert abs(offset.seconds + 50.0) <= offset.uncertainty <= 0.05
 
@@ -93,16 +100,16 @@ def test_only_the_first_answer_is_waited_for() -> None:
     network = Network(shortest=1e-3, longest=2e-3)
     clock = ClockOffset(network.ask, lambda: network.now)
     clock.update()
-    network.now += AGAIN + 1.0
+    network.now += UPDATE_PERIOD_S + 1.0
     clock.update()
-    assert network.patience == QUICK
+    assert network.patience == MIN_UPDATE_TIMEOUT_S
 
 
 def test_a_slow_network_is_given_the_time_that_it_takes() -> None:
     network = Network(shortest=0.1, longest=0.11)
     clock = ClockOffset(network.ask, lambda: network.now)
     clock.update()
-    network.now += AGAIN + 1.0
+    network.now += UPDATE_PERIOD_S + 1.0
     clock.update()
     assert network.patience == pytest.approx(0.8, rel=0.1)
 
@@ -119,6 +126,6 @@ def test_beginning_anew_is_tried_in_pauses() -> None:
             clock.update()
     assert network.asked == asked + 1
     network.down = False
-    network.now += PAUSE + 0.1
+    network.now += RETRY_PERIOD_S + 0.1
     offset = clock.update()
     assert abs(offset.seconds - AHEAD) <= offset.uncertainty

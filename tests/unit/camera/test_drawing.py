@@ -19,25 +19,25 @@ def rows_of(colours: drawing.Colours, colour: tuple[int, int, int], column: int)
 
 
 def test_the_axis_is_drawn_where_it_lies() -> None:
-    drawn = drawing.with_axis(drawing.coloured(GREY[:40, :40]), Axis(offset=4.5, tilt=0.1), 40)
-    assert rows_of(drawn, drawing.AXIS, 0) == [22]
-    assert rows_of(drawn, drawing.AXIS, 20) == [24]
-    assert rows_of(drawn, drawing.AXIS, 39) == [26]
+    drawn = drawing.draw_axis(drawing.to_colours(GREY[:40, :40]), Axis(offset=4.5, tilt=0.1), 40)
+    assert rows_of(drawn, drawing.AXIS_COLOUR, 0) == [22]
+    assert rows_of(drawn, drawing.AXIS_COLOUR, 20) == [24]
+    assert rows_of(drawn, drawing.AXIS_COLOUR, 39) == [26]
 
 
 def test_in_a_whole_picture_it_is_drawn_within_what_frames_show() -> None:
     crop = Crop(left=0.25, top=0.25, width=0.5, height=0.5)
-    drawn = drawing.with_axis(drawing.coloured(GREY), Axis(offset=0.0), 84, crop)
-    assert rows_of(drawn, drawing.AXIS, 30) == [20]
-    assert rows_of(drawn, drawing.AXIS, 5) == []
-    assert rows_of(drawn, drawing.CROP, 30) == [10, 30]
+    drawn = drawing.draw_axis(drawing.to_colours(GREY), Axis(offset=0.0), 84, crop)
+    assert rows_of(drawn, drawing.AXIS_COLOUR, 30) == [20]
+    assert rows_of(drawn, drawing.AXIS_COLOUR, 5) == []
+    assert rows_of(drawn, drawing.CROP_COLOUR, 30) == [10, 30]
 
 
 def test_a_file_shows_the_same_colours(tmp_path: Path) -> None:
-    drawing.write_png(tmp_path / "a.png", drawing.with_axis(drawing.coloured(GREY), None, 40))
+    drawing.write_png(tmp_path / "a.png", drawing.draw_axis(drawing.to_colours(GREY), None, 40))
     red = np.zeros((4, 4, 3), np.uint8)
     red[:, :, 0] = 255
-    drawing.write_png(tmp_path / "red.png", drawing.enlarged(red))
+    drawing.write_png(tmp_path / "red.png", drawing.enlarge(red))
     found = cv2.imread(str(tmp_path / "red.png"))
     assert found is not None
     assert found.shape == (640, 640, 3)
@@ -46,11 +46,11 @@ def test_a_file_shows_the_same_colours(tmp_path: Path) -> None:
 
 def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(FishdError, match=r"a\.png cannot be written: No such file or directory"):
-        drawing.write_png(tmp_path / "none" / "a.png", drawing.coloured(GREY))
+        drawing.write_png(tmp_path / "none" / "a.png", drawing.to_colours(GREY))
 
 
 def test_a_view_that_is_no_picture_is_refused() -> None:
     crop = Crop(left=0.0, top=0.0, width=1.0, height=1.0)
     header = ViewHeader(session="a", seq=1, time=0.0, width=4, height=4, crop=crop)
-    with pytest.raises(FishdError, match="no JPEG"):
-        drawing.whole_picture(PublishedView(header, b"nonsense"))
+    with pytest.raises(FishdError, match="not a JPEG"):
+        drawing.decode_view(PublishedView(header, b"nonsense"))

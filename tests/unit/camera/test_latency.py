@@ -40,7 +40,7 @@ def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_ar
     ticks = swum(40.0)
     found = find_latency(stamped_late(film(camera), late), felt(ticks))
     assert found.stamps == pytest.approx(late, abs=within)
-    assert found.whole == pytest.approx(camera.latency, abs=within + 1e-3)
+    assert found.total == pytest.approx(camera.latency, abs=within + 1e-3)
     assert abs(found.stamps - late) < 1.5 * found.error
     assert found.error < 3e-3
     assert found.agreement > 0.95

@@ -82,7 +82,7 @@ def test_a_file_in_place_of_the_address_of_a_camera_is_refused(verb: str) -> Non
         line = one_line(fishctl("camera", verb, "--camera", "config/web.yaml", *port))
     assert line == (
         "fishctl: 'config/web.yaml' is a file, for 'fishd-camera --config' and for simulated "
-        "fish; here the address at which a running fishd-camera takes requests is needed, such as "
+        "fish; give the address at which a running fishd-camera takes requests, such as "
         "tcp://127.0.0.1:9875\n"
     )
 

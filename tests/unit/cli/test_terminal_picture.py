@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fishd.camera.drawing import coloured
+from fishd.camera.drawing import to_colours
 from fishd.cli.camera.terminal import TerminalPicture
 
 
@@ -17,7 +17,7 @@ def drawn(picture: np.ndarray, width: int, height: int, system: str | None) -> l
         file=out, width=width, height=height, force_terminal=True,
         color_system=system, no_color=system is None, legacy_windows=False,
     )  # type: ignore[arg-type]  # fmt: skip
-    console.print(TerminalPicture(coloured(picture)))
+    console.print(TerminalPicture(to_colours(picture)))
     return out.getvalue().splitlines()
 
 

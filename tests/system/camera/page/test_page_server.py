@@ -182,7 +182,7 @@ def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone(
                 for _ in range(page_server.MAX_VIEWERS_PER_ADDRESS)
             ]
             await refused(session)
-            while len(socks) < page_server.MOST_VIEWERS:
+            while len(socks) < page_server.MAX_VIEWERS:
                 socks.append(await other.ws_connect("/live"))
             await refused(other)
             await socks[0].close()
