@@ -1,4 +1,4 @@
-"""The verb that makes a gait for a fish that was never measured before."""
+"""The verb `fishctl adapt`, which finds a gait for a fish that was never measured before."""
 
 import shlex
 from importlib import import_module
@@ -23,7 +23,7 @@ from fishd.core.errors import FishdError
 if TYPE_CHECKING:
     from fishd.learning.adapt.state import Contender, State
 
-STEPS = 6400
+DEFAULT_STEPS = 6400
 
 
 @click.command(cls=Resumable)
@@ -33,21 +33,21 @@ STEPS = 6400
     metavar="SECONDS",
     default=300.0,
     show_default=True,
-    help="Largest tank time, rests included [s]: a fifth of it excitation, a seventh the "
-    "search of swing, a fifth that of square waves, the rest the comparison.",
+    help="Largest tank time, rests included [s]: a fifth for the excitation, a seventh for the "
+    "search of swing, a fifth for that of square waves, the rest for the comparison.",
 )
 @click.option(
     "--steps",
     type=click.IntRange(min=640),
-    default=STEPS,
+    default=DEFAULT_STEPS,
     show_default=True,
-    help="Control steps of the training, in simulation, while the fish rests.",
+    help="Control steps of the training, which runs in simulation while the fish rests.",
 )
 @seed_option("cloud and training")
 @click.option(
     "--no-command",
     is_flag=True,
-    help="Live: leave the fish at rest; without it, the chosen gait swims on.",
+    help="Live: leave the fish at rest at the end. [default: swim the chosen gait]",
 )
 @fish_choice
 @folder_options
@@ -61,17 +61,20 @@ def adapt(
     place: Place,
     as_json: bool,
 ) -> int:
-    """Find the best gait of a fish that nobody has seen, in five minutes of tank time.
+    """Find the best gait of an unknown fish, in five minutes of tank time.
 
-    It swims excitation, and a fish is fitted to its forces. swing --C auto finds its C, and a
-    search the best square wave. A policy is trained on the cloud of fish that the fit leaves
-    possible. All three are measured on the fish, and the best one swims it from then on;
-    where the measurement leaves that undecided, the simplest of those that may be it. Nothing is
-    assumed of plant and rig, even if the configuration describes them.
+    The fish first swims an excitation, and a model is fitted to its forces. swing --C auto finds
+    its C, and a search finds the best square wave. A policy is trained on the cloud of models that
+    agree with the fit. All three gaits are measured on the fish, and it swims the best one
+    from then on. If the measurement does not decide, it swims the simplest of the gaits that may
+    be the best. plant and simulation of the configuration are not used.
 
-    Ctrl-C lets the fish rest; --resume goes on, and measures nothing again.
+    Ctrl-C lets the fish rest; --resume continues without repeating measurements.
     """
-    for package in ("onnxruntime", "tensorboard"):  # missing ones are named before the fish swims
+    for package in (
+        "onnxruntime",
+        "tensorboard",
+    ):  # raises for a missing package before the fish swims
         import_module(package)
     from fishd.lab import drawing
     from fishd.lab.session import LiveSession
@@ -94,16 +97,16 @@ def adapt(
                 show_progress(budget, "s of tank time", err=as_json) as show,
             ):
                 state = Adaptation(session, run, budget, steps, seed, show).run()
-                words = command_of(_chosen(state), fish)
+                words = format_command(_chosen_gait(state), fish)
                 files = report.write(run, session.amplitude, words)
             if ending.is_interrupted:
                 return ending.interrupted(f"{run.state.tank_time:.0f} s of tank time are kept")
         if as_json:
             print_json(msgspec.to_builtins(state))
         else:
-            _print(state)
+            _print_state(state)
             echo(f"report: {files[1]}, picture: {files[0]}")
-        chosen = _chosen(state)
+        chosen = _chosen_gait(state)
         if isinstance(session, LiveSession) and not no_command:
             session.fish.set_controller(chosen.controller, **chosen.parameters)
             echo(f"{chosen.name} swims the fish now; to swim it again: {words}", err=as_json)
@@ -112,13 +115,15 @@ def adapt(
     return 0
 
 
-def _chosen(state: "State") -> "Contender":
+def _chosen_gait(state: "State") -> "Contender":
     assert state.verdict
-    return next(one for one in state.contenders if one.name == state.verdict.chosen)
+    return next(
+        contender for contender in state.contenders if contender.name == state.verdict.chosen
+    )
 
 
-def command_of(gait: "Contender", fish: ChosenFish) -> str:
-    """Return the command line with which a gait swims the same fish."""
+def format_command(gait: "Contender", fish: ChosenFish) -> str:
+    """Return the command line that swims the same fish with a gait."""
     verb = "set-controller" if fish.on == "live" else "simulate"
     words = ["fishctl", verb, gait.controller]
     for name, value in gait.parameters.items():
@@ -130,14 +135,14 @@ def command_of(gait: "Contender", fish: ChosenFish) -> str:
     return shlex.join(words)
 
 
-def _print(state: "State") -> None:
+def _print_state(state: "State") -> None:
     assert state.verdict
     echo(f"{state.verdict.claim[0].upper()}{state.verdict.claim[1:]}.")
-    for one in state.contenders:
-        if one.true_thrust is not None:
+    for contender in state.contenders:
+        if contender.true_thrust is not None:
             echo(
-                f"{one.name}: truly {1e3 * one.true_thrust:.2f} mN, "
-                f"{one.true_relative_thrust:.1%} of "
+                f"{contender.name}: truly {1e3 * contender.true_thrust:.2f} mN, "
+                f"{contender.true_relative_thrust:.1%} of "
                 "the best of all square waves"
             )
     echo(f"{state.tank_time:.0f} s of tank time")

@@ -1,4 +1,4 @@
-"""The verb that compares policies and controllers on the same fish, simulated or live."""
+"""The verb `fishctl compare`, which compares policies and controllers on the same fish."""
 
 import sys
 from importlib.util import find_spec
@@ -27,19 +27,19 @@ if TYPE_CHECKING:
     from fishd.lab.compare.contestants import Contestant
     from fishd.lab.experiment import Experiment
 
-WIDE = 1000
-"""Columns of a table in a file or a pipe, where nothing is wrapped."""
-SECONDS, SETTLE = 60.0, 10.0
+PIPE_TABLE_COLUMNS = 1000
+"""Width of a table in a file or a pipe, where lines are not wrapped [columns]."""
+DEFAULT_RUN_S, DEFAULT_SETTLE_S = 60.0, 10.0
 
 
 class _Outcome(NamedTuple):
     standings: "list[Standing]"
     traces: "list[Trace]"
-    left_out: "list[tuple[Contestant, FishdError, int]]"  # why, and after how many runs
+    left_out: "list[tuple[Contestant, FishdError, int]]"  # reason, and number of runs before
     amplitude: float  # rad
     unit: str = "N"
     is_random: bool = True  # whether runs depend on the seed
-    ended: str = ""  # why before everyone had swum, if so
+    ended: str = ""  # reason of an early end; empty otherwise
     status: int = 0
 
 
@@ -55,14 +55,14 @@ class _Outcome(NamedTuple):
     help="Runs of each contestant; in simulation, with different noise.",
 )
 @for_option(
-    "Length of each run [s]; live, swimming and resting in turn.",
-    default=SECONDS,
+    "Duration of each run [s]; live, with rests.",
+    default=DEFAULT_RUN_S,
     kind=click.FLOAT,
 )
 @click.option(
     "--settle",
     type=float,
-    help=f"In simulation: time before figures are taken [s]. [default: {SETTLE}]",
+    help=f"In simulation: time before the measurement [s]. [default: {DEFAULT_SETTLE_S}]",
 )
 @fish_choice
 @click.option(
@@ -96,21 +96,21 @@ def compare(
     """Compare policies and controllers on the same fish.
 
     A contestant is the name of a policy (see `fishctl policies`), an .onnx file, or a controller
-    with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. Without any: the
+    with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. The default is the
     best square wave, swing, and the named policies that are made for this fish.
 
-    In simulation thrust is the true one, and relative thrust its share of that of the best square
-    wave. The thrust of a live fish is measured, by swimming and resting in turn; Ctrl-C lets it
-    rest, and shows what was measured. To a policy that sees pictures the fish is shown by a
-    simulated camera, a live one by a running fishd-camera. ± is the 95 % interval of the mean
-    thrust of all runs, from how they differ and, live, from the error of each measurement
+    In simulation the thrust is the true thrust, and relative thrust is its ratio to the best square
+    wave. The thrust of a live fish is measured, with rests between swims; Ctrl-C lets the fish
+    rest, and shows the results until then. A policy that sees pictures gets those of a simulated
+    camera, or of a running fishd-camera for a live fish. ± is the 95 % interval of the mean thrust
+    of all runs. It includes the differences between runs and, live, the error of each measurement
     and of the sensor's calibration, which is the same fraction of all thrusts.
-    The verdict names those that may be the best one, by intervals that hold together in 95 % of
-    cases, and chooses the simplest of them.
-    |φ_c|/Φ is the mean size of the command, square its mean size over its rms: square wave 1, sine
-    0.900, triangle 0.866.
-    Exit status 1 when one is refused on this fish, such as a policy for another amplitude, or ends
-    in mode fault; the others swim all the same.
+    The verdict names the contestants that may be the best, by intervals that hold together in 95 %
+    of cases, and chooses the simplest of them.
+    |φ_c|/Φ is the mean magnitude of the command. square is that divided by the rms: square wave 1,
+    sine 0.900, triangle 0.866.
+    Exit status 1 if this fish refuses a contestant, such as a policy for another amplitude, or if
+    a run ends in mode fault; the other contestants are still compared.
     """
     fish.refuse_other({"--settle": settle}, {"--agent": agent})
     if picture:
@@ -122,7 +122,7 @@ def compare(
     if fish.on == "live":
         outcome = _measure(task, agent)
     else:
-        outcome = _swim(task, SETTLE if settle is None else settle)
+        outcome = _swim(task, DEFAULT_SETTLE_S if settle is None else settle)
     status = _report(outcome, runs, as_json)
     if picture and outcome.standings:
         from fishd.lab.compare.figures import draw
@@ -141,8 +141,8 @@ class _Task(NamedTuple):
     settings: dict[str, Any]
     as_json: bool
 
-    def keep(self, experiment: "Experiment | None", standings: "list[Standing]") -> None:
-        """Write the result into the folder of the experiment, where there is one."""
+    def write_result(self, experiment: "Experiment | None", standings: "list[Standing]") -> None:
+        """Write the result into the folder of the experiment, if there is one."""
         if experiment:
             experiment.write("result.json", msgspec.json.encode(standings))
 
@@ -154,23 +154,29 @@ def _swim(task: _Task, settle: float) -> _Outcome:
 
     config, camera = task.fish.load(), cameras.simulated(task.camera)
     check_tethered(config.robot, "compare")
-    chosen = [parse(text) for text in task.texts] or _all(config)
-    _check_seen(task.camera, chosen)
-    left_out = [(one, why) for one in chosen if (why := refusal(config, one))]
-    for one, why in left_out:
-        if is_missing(one):  # a misspelt path, and no policy for another fish
-            raise why
-    able = [one for one in chosen if one not in (out for out, _ in left_out)] or chosen
+    chosen = [parse(text) for text in task.texts] or _default_contestants(config)
+    _check_camera(task.camera, chosen)
+    left_out = [
+        (contestant, reason) for contestant in chosen if (reason := refusal(config, contestant))
+    ]
+    for contestant, reason in left_out:
+        if is_missing(contestant):  # a misspelt path, not a policy for another fish
+            raise reason
+    able = [
+        contestant
+        for contestant in chosen
+        if contestant not in (refused for refused, _ in left_out)
+    ] or chosen
     with (
         keep_session(task.folder, task.fish, None, task.settings) as experiment,
         show_progress(len(able) * task.runs * task.seconds, "s swum") as bar,
     ):
         result = comparison.compare(config, able, task.seconds, settle, task.runs, bar.at, camera)
-        task.keep(experiment, result[0])
+        task.write_result(experiment, result[0])
     task.fish.announce(task.as_json)
     return _Outcome(
         *result,
-        [(*each, 0) for each in left_out],
+        [(*omitted, 0) for omitted in left_out],
         config.amplitude_limit,
         is_random=config.simulation.is_random,
     )
@@ -182,12 +188,12 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
 
     ended, status = "", 0
     chosen = [absolute(parse(text)) for text in task.texts]
-    with (  # whatever ends it leaves the fish at rest
+    with (  # the fish is at rest after any kind of end
         interrupted_once(),
         task.fish.session(camera=task.camera, agent=agent) as session,
     ):
-        chosen = chosen or _all(session.read_config())
-        _check_seen(task.camera, chosen)
+        chosen = chosen or _default_contestants(session.read_config())
+        _check_camera(task.camera, chosen)
         live = LiveComparison(session, chosen)
         with (
             session,
@@ -204,24 +210,28 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
                 raise
             except FishdError as error:
                 ended, status = str(error), 1
-            task.keep(experiment, live.standings())
+            task.write_result(experiment, live.standings())
     return _Outcome(
         live.standings(), live.traces(), live.left_out, session.amplitude, session.unit, True,
         ended, status,
     )  # fmt: skip
 
 
-def _check_seen(camera: str | None, chosen: "list[Contestant]") -> None:
-    """Refuse a camera that nobody looks through."""
+def _check_camera(camera: str | None, chosen: "list[Contestant]") -> None:
+    """Raise `UsageError` for a camera if no contestant sees pictures."""
     from fishd.lab.compare.seeing import may_see_pictures
 
-    policies = (one.parameters.get("policy") for one in chosen if one.controller == "ppo")
+    policies = (
+        contestant.parameters.get("policy")
+        for contestant in chosen
+        if contestant.controller == "ppo"
+    )
     if camera is not None and not any(map(may_see_pictures, policies)):
         raise click.UsageError("--camera cannot be given here: no contestant sees pictures")
 
 
-def _all(config: Config) -> "list[Contestant]":
-    """Those that swim where none is named; says which cannot, for want of a package."""
+def _default_contestants(config: Config) -> "list[Contestant]":
+    """Return the default contestants; print the policies for which a package is missing."""
     from fishd.controllers.policy import library
     from fishd.lab.compare.contestants import default_contestants
 
@@ -237,9 +247,9 @@ def _all(config: Config) -> "list[Contestant]":
 
 
 def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
-    """Print it; gives the exit status.
+    """Print the outcome; return the exit status.
 
-    runs: that each should have swum
+    runs: requested runs of each contestant
     """
     from fishd.lab.compare.comparison import judge_standings
 
@@ -247,15 +257,17 @@ def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
     verdict = judge_standings(standings, outcome.is_random)
     if as_json:
         best = verdict.best if verdict else ()
-        print_json([to_builtins(s) | {"verdict": _role(s.contestant, best)} for s in standings])
+        print_json(
+            [to_builtins(s) | {"verdict": _verdict_on(s.contestant, best)} for s in standings]
+        )
     elif standings:
         from rich.console import Console
 
-        Console(width=None if sys.stdout.isatty() else WIDE, markup=False).print(
-            _table(standings, outcome.unit)
+        Console(width=None if sys.stdout.isatty() else PIPE_TABLE_COLUMNS, markup=False).print(
+            _make_table(standings, outcome.unit)
         )
-        if said := _of_simulated(standings):
-            echo(said)
+        if sentence := _describe_best_square(standings):
+            echo(sentence)
         if verdict:
             echo(f"Verdict: {verdict.sentence}.")
     measured = [standing for standing in standings if not standing.runs]
@@ -264,12 +276,15 @@ def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
 
         if line := unknown_calibration(measured[0].calibration_ci95, outcome.unit):
             echo(f"fishctl: {line}", err=True)
-    for one, why, swum in outcome.left_out:
+    for omitted, reason, swum in outcome.left_out:
         when = f" after {swum} of {runs} runs, which stand in the table" if swum else ""
-        echo(f"fishctl: {one.label}: left out{when}: {why}", err=True)
+        echo(f"fishctl: {omitted.label}: left out{when}: {reason}", err=True)
     for standing in standings:
-        for took_over in standing.fallbacks:
-            echo(f"fishctl: {standing.contestant}: another took over: {took_over}", err=True)
+        for fallback in standing.fallbacks:
+            echo(
+                f"fishctl: {standing.contestant}: another controller took over: {fallback}",
+                err=True,
+            )
     faults = [(standing.contestant, fault) for standing in standings for fault in standing.faults]
     for contestant, fault in faults:
         echo(f"fishctl: {contestant}: a run ended in mode fault: {fault}", err=True)
@@ -278,10 +293,10 @@ def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
     return outcome.status or (1 if faults or outcome.left_out else 0)
 
 
-def _role(contestant: str, best: tuple[str, ...]) -> str | None:
-    """Return what the verdict says of one, for JSON; None without a verdict.
+def _verdict_on(contestant: str, best: tuple[str, ...]) -> str | None:
+    """Return the verdict on a contestant, for JSON; None without a verdict.
 
-    best: those that may be the best one, the chosen one first
+    best: contestants that may be the best, the chosen one first
     """
     if not best:
         return None
@@ -292,7 +307,7 @@ def _role(contestant: str, best: tuple[str, ...]) -> str | None:
     return "chosen" if contestant == best[0] else "undecided"
 
 
-def _table(standings: "list[Standing]", unit: str) -> "Table":
+def _make_table(standings: "list[Standing]", unit: str) -> "Table":
     from rich.table import Table
 
     simulated = all(standing.runs for standing in standings)
@@ -314,9 +329,11 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
         table.add_row(
             standing.contestant,
             *cells,
-            text.format_measured(standing.thrust, _whole(standing.error, standing.total_ci95)),
-            *([] if simulated else _parts(standing)),
-            *(_costs(standing) if metered else []),
+            text.format_measured(
+                standing.thrust, _select_half_width(standing.error, standing.total_ci95)
+            ),
+            *([] if simulated else _error_cells(standing)),
+            *(_power_cells(standing) if metered else []),
             f"{standing.frequency:.3f}" if standing.frequency else "–",
             f"{standing.fullness:.3f}",
             f"{standing.squareness:.3f}",
@@ -324,29 +341,33 @@ def _table(standings: "list[Standing]", unit: str) -> "Table":
     return table
 
 
-def _costs(standing: "Standing") -> list[str]:
-    """Power, and what each watt gave."""
-    whole = _whole(standing.thrust_per_watt_error, standing.thrust_per_watt_total_ci95)
+def _power_cells(standing: "Standing") -> list[str]:
+    """Return the cells of the power and the thrust per watt."""
+    half_width = _select_half_width(
+        standing.thrust_per_watt_error, standing.thrust_per_watt_total_ci95
+    )
     return [
         f"{standing.power or 0.0:.3f}",
-        text.format_measured(standing.thrust_per_watt or 0.0, whole),
+        text.format_measured(standing.thrust_per_watt or 0.0, half_width),
     ]
 
 
-def _whole(statistical_ci95: float | None, total_ci95: float | None) -> float | None:
+def _select_half_width(statistical_ci95: float | None, total_ci95: float | None) -> float | None:
     """Return the error of a mean, with that of the calibration where it is known."""
     return statistical_ci95 if total_ci95 is None else total_ci95
 
 
-def _parts(standing: "Standing") -> list[str]:
-    """What the interval of a measured thrust is made of."""
-    part = standing.calibration_ci95
-    calibration = "unknown" if part is None else text.format_half_width(part)
+def _error_cells(standing: "Standing") -> list[str]:
+    """Return the cells of the statistical and the calibration error of a thrust."""
+    calibration_ci95 = standing.calibration_ci95
+    calibration = (
+        "unknown" if calibration_ci95 is None else text.format_half_width(calibration_ci95)
+    )
     return [text.format_half_width(standing.error or 0.0), calibration]
 
 
-def _of_simulated(standings: "list[Standing]") -> str | None:
-    """Name the best square wave, where it is the same for all; None on a robot."""
+def _describe_best_square(standings: "list[Standing]") -> str | None:
+    """Return a sentence on the best square wave, if it is the same for all; None on a robot."""
     best = {
         (run.best_square_thrust, run.best_square_frequency)
         for standing in standings

@@ -1,4 +1,4 @@
-"""Swims a free swimmer for `fishctl simulate`, and prints what it tells."""
+"""Simulation of a free swimmer for `fishctl simulate`, and the printing of its report."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from fishd.virtual.swimmer.robot import Swimmer
 
 
-def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
-    """Swim, and print; the exit status.
+def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
+    """Swim, and print the report; return the exit status.
 
-    asked: configuration, controller, parameters, seconds, time to settle, publisher, begun
+    arguments: configuration, controller, parameters, seconds, settle time, publisher, begun
     Raises `FishdError` and OSError.
     """
     try:
@@ -44,8 +44,8 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
     midlines = Midlines()
     with (
         on_signal(interrupted.set),
-        _filmed(asked[0], options) as film,
-        show_progress(asked[3], "s", err=as_json) as bar,
+        _open_film(arguments[0], options) as film,
+        show_progress(arguments[3], "s", err=as_json) as bar,
     ):
 
         def watch(fish: "Swimmer") -> None:
@@ -54,7 +54,7 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
                 midlines.add(fish)
 
         swum = run(
-            *asked,
+            *arguments,
             progress=lambda passed, speed: bar.at(passed, f"{speed * 1e3:.1f} mm/s"),
             keeping=keeping,
             resume=resume,
@@ -65,31 +65,31 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
                 f"{error.strerror or error}; the fish swims on"
             ),
         )
-    unsaved = False
+    is_unsaved = False
     if options.save and len(swum.track):
         if resume and options.save.suffix == ".npz":
             midlines.put_before(options.save, swum.track.rows())
             if len(midlines) < len(swum.track):
                 start = min(midlines.start, resume.time)
                 echo(
-                    f"fishctl: {options.save}: its midlines begin at {start:.2f} s: those before "
-                    "are kept where --save names the NPZ file of the first part",
+                    f"fishctl: {options.save}: its midlines begin at {start:.2f} s: to keep "
+                    "earlier ones, give --save the NPZ file of the first part",
                     err=True,
                 )
         try:
             track.save(swum.track, options.save, midlines.arrays())
         except OSError as error:
-            unsaved = True
-            why = error.strerror or error
-            echo(f"fishctl: {options.save}: the track cannot be written: {why}", err=True)
+            is_unsaved = True
+            reason = error.strerror or error
+            echo(f"fishctl: {options.save}: the track cannot be written: {reason}", err=True)
     if swum.report and as_json:
         print_json(swum.report)
     elif swum.report:
-        echo_rows(_rows(swum.report))
+        echo_rows(_report_rows(swum.report))
     if swum.trouble:
-        raise FishdError(f"{swum.trouble}; {_kept(swum, options)}")
+        raise FishdError(f"{swum.trouble}; {_describe_checkpoint(swum, options)}")
     if not swum.complete:
-        echo(f"fishctl: interrupted; {_kept(swum, options)}", err=True)
+        echo(f"fishctl: interrupted; {_describe_checkpoint(swum, options)}", err=True)
         return INTERRUPTED
     report = swum.report
     if report and report.fallback:
@@ -97,12 +97,12 @@ def swim(asked: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
     if report and report.reason:
         echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
         return 1
-    return 1 if unsaved or swum.lost else 0
+    return 1 if is_unsaved or swum.lost else 0
 
 
 @contextmanager
-def _filmed(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[[Swimmer], None]]":
-    """What paints a fish, where a film is wanted, which is written in the end."""
+def _open_film(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[[Swimmer], None]]":
+    """Yield a function that paints the fish if there is a film; the film is written at the end."""
     if options.film is None:
         yield lambda fish: None
         return
@@ -112,23 +112,25 @@ def _filmed(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[[Sw
         yield lambda fish: film.add_frame(fish.fish)
 
 
-def _kept(swum: "Swum", options: SwimmerOptions) -> str:
-    """What of the run is left."""
+def _describe_checkpoint(swum: "Swum", options: SwimmerOptions) -> str:
+    """Return a clause about the checkpoint from which the run can be resumed."""
     if swum.kept is not None:
         return f"its last checkpoint is of {swum.kept:.2f} s: --resume {options.checkpoint}"
     if options.resume:
         return f"its last checkpoint is {options.resume}"
-    return "there is no checkpoint of it" + ("" if options.checkpoint else ": --checkpoint FILE")
+    return "no checkpoint was written" + (
+        "" if options.checkpoint else ": --checkpoint FILE writes one"
+    )
 
 
-def _rows(report: "SwimReport") -> list[tuple[str, str]]:
+def _report_rows(report: "SwimReport") -> list[tuple[str, str]]:
     plural = "" if report.beats == 1 else "s"
     beats = f"over {report.beats} whole beat{plural}" if report.beats else "no whole beat"
-    anew = f", anew from {report.resumed:.2f} s on" if report.resumed is not None else ""
+    resumed = f", started again at {report.resumed:.2f} s" if report.resumed is not None else ""
     return [
-        ("controller", f"{format_controller(report.controller, report.parameters)}{anew}"),
+        ("controller", f"{format_controller(report.controller, report.parameters)}{resumed}"),
         ("speed", f"{text.format_measured(report.speed, report.speed_error, 'm/s')}, {beats}"),
-        *_trend(report),
+        *_trend_rows(report),
         ("frequency", f"{report.frequency:.3f} Hz" if report.frequency else "–"),
         ("heading", f"{report.heading:+.3f} rad"),
         ("tail", f"{report.tail_width:.3f} lengths from side to side"),
@@ -137,9 +139,12 @@ def _rows(report: "SwimReport") -> list[tuple[str, str]]:
             f"{report.muscle_power:.4g} W/m of the muscles, {report.water_power:.4g} W/m to the "
             f"water, {report.steering_power:.2g} W/m of the steering",
         ),
-        ("cost", _or_none(report.cost_of_transport, "{:.4g} J/(kg m)")),
-        ("Strouhal", _or_none(report.strouhal, "{:.3f}") + f", Reynolds {report.reynolds:.0f}"),
-        ("Froude", _or_none(report.froude_efficiency, "{:.1%}")),
+        ("cost", _format_or_dash(report.cost_of_transport, "{:.4g} J/(kg m)")),
+        (
+            "Strouhal",
+            _format_or_dash(report.strouhal, "{:.3f}") + f", Reynolds {report.reynolds:.0f}",
+        ),
+        ("Froude", _format_or_dash(report.froude_efficiency, "{:.1%}")),
         (
             "timing",
             f"{report.seconds:.2f} s in {report.ticks} ticks, "
@@ -148,8 +153,8 @@ def _rows(report: "SwimReport") -> list[tuple[str, str]]:
     ]
 
 
-def _trend(report: "SwimReport") -> list[tuple[str, str]]:
-    """That the interval does not hold, where it does not."""
+def _trend_rows(report: "SwimReport") -> list[tuple[str, str]]:
+    """Return a warning row if the speed has a trend, as its interval is then invalid."""
     if report.speed_trend is None:
         return []
     how = "speeding up" if report.speed_trend > 0.0 else "slowing down"
@@ -157,5 +162,5 @@ def _trend(report: "SwimReport") -> list[tuple[str, str]]:
     return [("", f"still {how} by {share}: a longer --settle is needed")]
 
 
-def _or_none(value: float | None, form: str) -> str:
+def _format_or_dash(value: float | None, form: str) -> str:
     return "–" if value is None else form.format(value)

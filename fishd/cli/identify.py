@@ -1,4 +1,4 @@
-"""The verb that identifies a fish from its forces."""
+"""The verb `fishctl identify`, which identifies a fish from its forces."""
 
 import shlex
 from copy import deepcopy
@@ -27,14 +27,14 @@ from fishd.recording.folder import find
 if TYPE_CHECKING:
     from fishd.lab.identification import Identification
 
-SECONDS = 180.0
+DEFAULT_EXPERIMENT_S = 180.0
 
 
 @click.command()
 @click.argument("runs", nargs=-1, metavar="[RUN]...")
-@click.option("--experiment", is_flag=True, help="First let a fish swim what tells most about it.")
+@click.option("--experiment", is_flag=True, help="First swim an experiment for the identification.")
 @for_option(
-    f"With --experiment: how long it takes [s]. [default: {SECONDS:g}]",
+    f"With --experiment: its duration [s]. [default: {DEFAULT_EXPERIMENT_S:g}]",
     kind=FiniteRange(min=30.0, max=3600.0),
 )
 @keep_option
@@ -42,15 +42,15 @@ SECONDS = 180.0
 @click.option(
     "--fit",
     metavar="NAME,...",
-    help="What to fit; the rest is as in the configuration. [default: omega0, xi, quadratic_drag, "
-    "coupling, servo_speed, servo_lag, thrust_coefficient, lateral_inertia_ratio, lateral_drag, "
-    "servo_delay, backlash, rotation; and where the forces show it lateral_quadratic_drag, "
-    "cable_slack, servo_dead_zone, servo_reaction]",
+    help="Parameters to fit; the others keep their configured values. [default: omega0, xi, "
+    "quadratic_drag, coupling, servo_speed, servo_lag, thrust_coefficient, lateral_inertia_ratio, "
+    "lateral_drag, servo_delay, backlash, rotation; and if the forces show them "
+    "lateral_quadratic_drag, cable_slack, servo_dead_zone, servo_reaction]",
 )
 @click.option(
     "--fix",
     metavar="NAME,...",
-    help="What not to fit, as it is known: lateral_inertia_ratio where K_y = K, or coupling where "
+    help="Known parameters, which are not fitted: lateral_inertia_ratio if K_y = K, or coupling if "
     "λ was measured.",
 )
 @click.option(
@@ -78,11 +78,11 @@ def identify(
 ) -> int:
     """Identify a fish and its rig from F_x, F_y and φ_c, with 95 % intervals.
 
-    RUN is a path, a name in the folder of recordings, or 'latest'. Several are fitted together, as
-    one fish. Or let --experiment swim one now. --config is the configuration that a fit begins
-    with.
+    RUN is a path, a name in the folder of recordings, or 'latest'. Several recordings are fitted
+    together, as one fish. --experiment swims and fits a new one instead. The fit starts from the
+    configuration of --config.
 
-    --to writes what `fishd --config` and `fishctl simulate --config` read.
+    --to writes a file for `fishd --config` and `fishctl simulate --config`.
     """
     if experiment == bool(runs):
         raise click.UsageError("name recordings to identify, or use --experiment: one of the two")
@@ -98,46 +98,50 @@ def identify(
 
     from fishd.lab import identification as lab
 
-    names = None if fit is None else _names(fit)
-    known = _names(fix or "")
+    names = None if fit is None else _parse_names(fit)
+    known = _parse_names(fix or "")
     lab.check(lab.DEFAULT if names is None else names, known)  # before minutes of swimming
     if experiment:
         try:
-            config, tables = _swum(fish, seconds or SECONDS, folder, as_json)
+            config, tables = _swim_experiment(
+                fish, seconds or DEFAULT_EXPERIMENT_S, folder, as_json
+            )
         except KeyboardInterrupt:
-            where = f"; what it swam is in {folder}" if folder else ""
-            echo(f"fishctl: interrupted, so nothing is fitted{where}", err=True)
+            where = f"; the recording is in {folder}" if folder else ""
+            echo(f"fishctl: interrupted before the fit{where}", err=True)
             return INTERRUPTED
         origin = f"an experiment with {fish}"
     else:
         config, tables = load(fish.file, fish.overrides), [find(run) for run in runs]
         check_tethered(config.robot, "identify")
         origin = ", ".join(path.name for path in tables)
-    found = lab.identify(tables, start=config.plant, rig=config.simulation, fit=names, fix=known)
+    identification = lab.identify(
+        tables, start=config.plant, rig=config.simulation, fit=names, fix=known
+    )
     if as_json:
-        print_json(found.to_builtins() | {"origin": origin})
+        print_json(identification.to_builtins() | {"origin": origin})
     else:
-        _print(found)
+        _print_result(identification)
         echo(f"from {origin}")
-    for remark in found.remarks:
+    for remark in identification.remarks:
         echo(f"fishctl: careful: {remark}", err=True)
     if target:
-        _write(target, found.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
+        _write_config(target, identification.to_yaml(f"{origin} on {datetime.now():%Y-%m-%d}"))
     if picture:
         from fishd.lab.identification.figure import draw
 
-        draw(found, picture)
+        draw(identification, picture)
     return 0
 
 
-def _names(listed: str) -> tuple[str, ...]:
+def _parse_names(listed: str) -> tuple[str, ...]:
     return tuple(filter(None, listed.replace(" ", "").split(",")))
 
 
-def _swum(
+def _swim_experiment(
     fish: ChosenFish, seconds: float, folder: Path | None, as_json: bool
 ) -> tuple[Config, list[Any]]:
-    """Return the configuration that a fit begins with, and the ticks of an experiment."""
+    """Swim an experiment; return the start configuration of the fit, and the ticks."""
     from fishd.lab.identification import experiment
 
     with interrupted_once(), fish.session() as session:
@@ -158,7 +162,7 @@ def _swum(
             return config, [experiment(session, seconds)]
 
 
-def _write(target: Path, text: str) -> None:
+def _write_config(target: Path, text: str) -> None:
     try:
         files.write_atomically(target, text)
     except OSError as error:
@@ -168,26 +172,37 @@ def _write(target: Path, text: str) -> None:
     )
 
 
-def _print(found: "Identification") -> None:
+def _print_result(identification: "Identification") -> None:
     from fishd.lab.identification.formatting import format_estimate, format_if_ratio_holds
 
-    echo(found.headline)
+    echo(identification.headline)
     echo()
-    ratio = found["lateral_inertia_ratio"].value
-    shown = [each for each in (*found.estimates, *found.products) if each.fitted]
+    ratio = identification["lateral_inertia_ratio"].value
+    fitted = [
+        estimate
+        for estimate in (*identification.estimates, *identification.products)
+        if estimate.fitted
+    ]
     rows = [("", "value", "95 % interval", "unit", f"if K_y/K = {ratio:g}")]
-    rows += [(*format_estimate(each), format_if_ratio_holds(each)) for each in shown]
+    rows += [(*format_estimate(estimate), format_if_ratio_holds(estimate)) for estimate in fitted]
     columns = 5 if any(row[4] for row in rows[1:]) else 4
     widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    for name, value, interval, unit, narrow in rows:
+    for name, value, interval, unit, if_ratio_holds in rows:
         line = f"{name:<{widths[0]}}  {value:>{widths[1]}}  {interval:<{widths[2]}}"
-        line += f"  {unit:<{widths[3]}}" + (f"  {narrow}" if columns == 5 else "")
+        line += f"  {unit:<{widths[3]}}" + (f"  {if_ratio_holds}" if columns == 5 else "")
         echo(line.rstrip())
     echo()
     if columns == 5:
-        echo("forces do not tell K_y/K: --fix lateral_inertia_ratio takes it as known")
-    for channel, symbol in zip(found.channels, ("F_x", "F_y"), strict=True):
+        echo(
+            "the forces do not determine K_y/K: --fix lateral_inertia_ratio keeps the configured "
+            "value"
+        )
+    for channel, symbol in zip(identification.channels, ("F_x", "F_y"), strict=True):
         rest = f"noise {channel.noise * 1e3:.2f} mN, drift ±{0.5 * channel.drift * 1e3:.1f} mN"
         echo(f"{symbol}: {channel.explained:.3%} of it explained; {rest}")
-    parts = "" if found.passages == 1 else f", in {found.passages} parts without a gap"
-    echo(f"fitted to {found.seconds:.0f} s of swimming{parts}")
+    parts = (
+        ""
+        if identification.passages == 1
+        else f", in {identification.passages} parts without a gap"
+    )
+    echo(f"fitted to {identification.seconds:.0f} s of swimming{parts}")

@@ -1,4 +1,4 @@
-"""The verb that finds a controller's thrust with its interval, on a live or a simulated fish."""
+"""The verb `fishctl measure`, which measures a controller's thrust on a live or simulated fish."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def measure_options(function: Any) -> Any:
-    """The options of this verb."""
+    """Add the options of this verb."""
     for option in (
         json_option,
         plot_option("raw force, fitted drift and corrected thrust"),
@@ -29,7 +29,7 @@ def measure_options(function: Any) -> Any:
             type=FiniteRange(0.0, 600.0),
             default=1.5,
             show_default=True,
-            help="How long the fin takes to swim steadily, and to come to rest [s].",
+            help="Time until the fin swims steadily, and until it is at rest [s].",
         ),
         for_option("Length of the whole measurement, rests included [s].", default=60.0),
     ):
@@ -39,11 +39,11 @@ def measure_options(function: Any) -> Any:
 
 @click.group(cls=ControllerGroup, options=measure_options, remote=True)
 def measure() -> None:
-    """Find a controller's thrust, with its 95 % interval.
+    """Measure a controller's thrust, with its 95 % interval.
 
-    The fish swims and rests in turn, about 6 s and 3 s, which separates the thrust from a
+    The fish alternately swims for about 6 s and rests for 3 s. This separates the thrust from a
     drift of the force sensor; only whole beats count. The fish must be at rest before, and is at
-    rest afterwards. A running fishd shows its thrust by this measurement from then on.
+    rest afterwards. A running fishd then uses this measurement to show its thrust.
     """
 
 
@@ -59,7 +59,7 @@ def _measure(
     as_json: bool,
 ) -> int:
     from fishd.lab import drawing
-    from fishd.lab.measurement import measure as run
+    from fishd.lab.measurement import measure as run_measurement
     from fishd.lab.measurement import summary
     from fishd.lab.session import LiveSession
 
@@ -76,65 +76,83 @@ def _measure(
         ):
             fish.announce(as_json)
             session.progress = bar.at
-            found = run(session, name, parameters, seconds, settle)
-            result = summary(found, session.tick)
+            measured = run_measurement(session, name, parameters, seconds, settle)
+            result = summary(measured, session.tick)
             if experiment:
                 experiment.write_struct("result.json", result)
-            if isinstance(session, LiveSession) and found.thrust > found.error and not found.remark:
-                session.fish.calibrate_thrust(found.thrust / found.power, found.error / found.power)
+            if (
+                isinstance(session, LiveSession)
+                and measured.thrust > measured.error
+                and not measured.remark
+            ):
+                session.fish.calibrate_thrust(
+                    measured.thrust / measured.power, measured.error / measured.power
+                )
     except KeyboardInterrupt:
         echo("fishctl: interrupted: the fish rests, nothing is measured", err=True)
         return INTERRUPTED
     if as_json:
         print_json(result)
     else:
-        echo(_line(found))
-    for line in _careful(found):
+        echo(_format_result(measured))
+    for line in _find_warnings(measured):
         echo(f"fishctl: {line}", err=True)
     if picture:
         from fishd.lab.measurement_figure import draw
 
-        draw(found, session.tick, picture)
+        draw(measured, session.tick, picture)
     return 0
 
 
-def _line(found: "Measured") -> str:
+def _format_result(measured: "Measured") -> str:
     from fishd.lab import error_budget
     from fishd.lab.disturbances import spell
 
-    what = format_controller(found.controller, dict(found.parameters))
+    command = format_controller(measured.controller, dict(measured.parameters))
     thrust = error_budget.spelled(
-        found.thrust, found.error, found.calibration_ci95, found.total_ci95, found.unit
+        measured.thrust,
+        measured.error,
+        measured.calibration_ci95,
+        measured.total_ci95,
+        measured.unit,
     )
-    line = f"{what}: thrust {thrust} at {found.frequency:.3f} Hz, from {found.swims} swims"
-    words = spell(found.disturbances, found.unit)
+    line = f"{command}: thrust {thrust} at {measured.frequency:.3f} Hz, from {measured.swims} swims"
+    disturbances = spell(measured.disturbances, measured.unit)
     return (
         line
-        + _power(found)
-        + (f"; accounted for: {words}" if words else "")
-        + (f"; careful: {found.remark}" if found.remark else "")
+        + _format_power(measured)
+        + (f"; accounted for: {disturbances}" if disturbances else "")
+        + (f"; careful: {measured.remark}" if measured.remark else "")
     )
 
 
-def _careful(found: "Measured") -> "Iterator[str]":
-    """Yield what the interval does not cover, or covers only by a guess."""
+def _find_warnings(measured: "Measured") -> "Iterator[str]":
+    """Yield warnings about errors that the interval does not cover, or covers only by a guess."""
     from fishd.lab.error_budget import rotation_remark, unknown_calibration
 
-    if line := unknown_calibration(found.calibration_ci95, found.unit):
+    if line := unknown_calibration(measured.calibration_ci95, measured.unit):
         yield line
-    if line := rotation_remark(found.rotation):
+    if line := rotation_remark(measured.rotation):
         yield line
 
 
-def _power(found: "Measured") -> str:
-    """What the servo took, where that is known, and what a watt of it gave."""
+def _format_power(measured: "Measured") -> str:
+    """Return the power of the servo and the thrust per watt; empty if the power is unknown."""
     from fishd.lab import error_budget
     from fishd.lab.statistics import per_watt
 
-    gave, error = per_watt(found.thrust, found.error, found.watts, found.watts_error)
-    if gave is None or error is None or not found.watts:
+    thrust_per_watt, error = per_watt(
+        measured.thrust, measured.error, measured.watts, measured.watts_error
+    )
+    if thrust_per_watt is None or error is None or not measured.watts:
         return ""
-    _, total = per_watt(found.thrust, found.total_ci95, found.watts, found.watts_error)
-    part = None if found.calibration_ci95 is None else found.calibration_ci95 / found.watts
-    budget = error_budget.spelled(gave, error, part, total, f"{found.unit} per W")
-    return f"; {power_words(found.watts)}, {budget}"
+    _, total_ci95 = per_watt(
+        measured.thrust, measured.total_ci95, measured.watts, measured.watts_error
+    )
+    calibration_ci95 = (
+        None if measured.calibration_ci95 is None else measured.calibration_ci95 / measured.watts
+    )
+    budget = error_budget.spelled(
+        thrust_per_watt, error, calibration_ci95, total_ci95, f"{measured.unit} per W"
+    )
+    return f"; {power_words(measured.watts)}, {budget}"

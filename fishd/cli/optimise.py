@@ -1,4 +1,4 @@
-"""The verb that searches the best parameters of a controller."""
+"""The verb `fishctl optimise`, which searches the best parameters of a controller."""
 
 import math
 import time
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 def optimise_options(function: Any) -> Any:
-    """The options of the verb itself."""
+    """Add the options of the verb itself."""
     for option in (
         json_option,
         plot_option("the candidates and what is expected"),
@@ -51,7 +51,7 @@ def optimise_options(function: Any) -> Any:
             "--at-least",
             type=FiniteRange(min=0.0, min_open=True),
             metavar="MN",
-            help="A thrust [mN]: find the parameters that give it for the least power.",
+            help="Thrust to reach [mN]: find the parameters that give it at the least power.",
         ),
         click.option(
             "--objective",
@@ -65,7 +65,7 @@ def optimise_options(function: Any) -> Any:
             type=FiniteRange(0.0, 1.0),
             default=0.01,
             show_default=True,
-            help="Stop once another trial is expected to gain less than this share of the thrust.",
+            help="Stop once the expected gain of another trial is less than this fraction.",
         ),
         click.option(
             "--budget",
@@ -80,7 +80,7 @@ def optimise_options(function: Any) -> Any:
             multiple=True,
             required=True,
             metavar="NAME[=LOW:HIGH]",
-            help="A parameter to search, within its bounds or between these. Repeatable.",
+            help="Parameter to search, within its bounds or from LOW to HIGH. Repeatable.",
         ),
     ):
         function = option(function)
@@ -89,11 +89,11 @@ def optimise_options(function: Any) -> Any:
 
 @click.group(cls=ControllerGroup, options=optimise_options, remote=True, resumable=True)
 def optimise() -> None:
-    """Search the parameters with which a controller thrusts most, in a minute of swimming.
+    """Search the parameters of a controller that give the most thrust, in a minute of swimming.
 
-    The fish swims with a candidate, rests, and swims with the next, which a Gaussian process
-    chooses from all that was measured, each with its error. Other parameters may be given, too.
-    With --resume an interrupted search goes on, and may have a larger --budget.
+    The fish swims with a candidate, rests, and swims with the next. A Gaussian process chooses it
+    from all measurements and their errors. The other parameters of the controller may be set, too.
+    --resume continues an interrupted search; --budget may then be larger.
     """
 
 
@@ -121,10 +121,10 @@ def _optimise(
     if picture:
         drawing.check(picture)
     if objective and at_least:
-        raise click.UsageError("--objective and --at-least: each is an aim of its own, give one")
+        raise click.UsageError("--objective and --at-least exclude each other: give one of them")
     aim = Aim(objective or "thrust", at_least * 1e-3 if at_least else None)
     with fish.session() as session:
-        ranges = [_range(text, name, parameters, session) for text in dict.fromkeys(over)]
+        ranges = [_parse_range(text, name, parameters, session) for text in dict.fromkeys(over)]
         search = aim.make_search(ranges, seed)
         _check_ends(name, parameters, ranges, session)
         if budget < (least := 2.0 * REST + trial_durations(parameters)[1]):
@@ -134,7 +134,7 @@ def _optimise(
         settings = {
             "controller": name,
             "parameters": parameters,
-            "over": {each.name: [each.low, each.high] for each in ranges},
+            "over": {searched.name: [searched.low, searched.high] for searched in ranges},
             "seed": seed,
             "objective": aim.objective,
             "target": aim.target,
@@ -149,21 +149,21 @@ def _optimise(
 def _check_ends(
     name: str, parameters: dict[str, Any], ranges: "list[Range]", session: "Session"
 ) -> None:
-    """Raise `ParameterError` where the ends of the ranges are not possible for the fish."""
+    """Raise `ParameterError` if the fish does not allow the ends of the ranges."""
     from fishd.lab.sweep import grid
     from fishd.lab.sweep.grid import Point
 
     for end in ("low", "high"):
-        given = {**parameters, **{each.name: getattr(each, end) for each in ranges}}
+        candidate = {**parameters, **{searched.name: getattr(searched, end) for searched in ranges}}
         if session.source == "simulation":
-            registry.check(name, given, session.read_config().limits)
+            registry.check(name, candidate, session.read_config().limits)
         else:
-            grid.check_remote([Point(name, given)], Limits(session.amplitude, session.tick))
+            grid.check_remote([Point(name, candidate)], Limits(session.amplitude, session.tick))
 
 
 @dataclass
 class _Optimisation:
-    """One search, as the command line wants it."""
+    """A search from the command line."""
 
     controller: str
     fixed: dict[str, Any]
@@ -180,8 +180,10 @@ class _Optimisation:
     def __post_init__(self) -> None:
         from fishd.lab.optimise.trials import read_trials
 
-        self.units = units_of(_fields().values())
-        self.trials = read_trials(self.experiment, (each.name for each in self.search.ranges))
+        self.units = units_of(_controller_fields().values())
+        self.trials = read_trials(
+            self.experiment, (searched.name for searched in self.search.ranges)
+        )
         for trial in self.trials:
             self.aim.observe(self.search, trial)
 
@@ -193,7 +195,7 @@ class _Optimisation:
         waited = self._measure(ending)
         if not self.trials:
             if ending.is_interrupted:
-                return ending.interrupted("no candidate is measured yet")
+                return ending.interrupted("before the first candidate was measured")
             raise ParameterError(
                 f"a budget of {self.budget:g} s is too short for the first candidate"
             )
@@ -204,20 +206,20 @@ class _Optimisation:
             if self.as_json:
                 print_json(optimum)
             else:
-                _print(optimum, unit, self.units)
+                _print_optimum(optimum, unit, self.units)
                 echo(f"table: {folder / 'rows.csv'}")
-            shown = self._drawn_search()
+            shown = self._search_to_draw()
             paths = [picture] if picture else [folder / "thrust.png", folder / "thrust.svg"]
-            draw(paths, shown, proposal, self.units, _label(self.aim, unit))
+            draw(paths, shown, proposal, self.units, _axis_label(self.aim, unit))
             if not self.as_json:
                 echo(f"picture: {', '.join(map(str, paths))}")
         if ending.is_interrupted:
             return ending.interrupted(f"{format_count(len(self.trials), 'candidate')} are kept")
         if not self._is_done(proposal):
             echo(
-                f"fishctl: the budget of {self.budget:g} s is used: another candidate is expected "
-                f"to give {proposal.improvement:.1%} more, not {self.until:.1%} as requested; a "
-                f"larger one: {self.experiment.resume_command} --budget SECONDS",
+                f"fishctl: the budget of {self.budget:g} s is used up: another candidate is "
+                f"expected to give {proposal.improvement:.1%} more, and --until is {self.until:.1%}. "
+                f"To continue: {self.experiment.resume_command} --budget SECONDS",
                 err=True,
             )
             return 1
@@ -227,9 +229,9 @@ class _Optimisation:
         return self.search.is_warm and proposal.improvement <= self.until
 
     def _measure(self, ending: Ending) -> float:
-        """Measure candidates until it is done, after those that are there.
+        """Measure candidates until the search is done; those in the table are kept.
 
-        Returns how long the fish waited for the next candidate [s].
+        Return the time that the fish waited for the choice of candidates [s].
         """
         from fishd.lab.optimise.trials import measure_trials, write_trial
 
@@ -237,8 +239,8 @@ class _Optimisation:
         last = self.trials[-1] if self.trials else None
         before = session.used = last.passed if last else 0.0
         if last:
-            there = format_count(len(self.trials), "candidate")
-            echo(f"{experiment.path}: {there} there already", err=self.as_json)
+            count = format_count(len(self.trials), "candidate")
+            echo(f"{experiment.path}: {count} measured already", err=self.as_json)
             if self._is_done(search.propose()):
                 return 0.0
         begin = time.monotonic()
@@ -257,7 +259,7 @@ class _Optimisation:
                 self.trials.append(trial)
                 proposal = search.propose()
                 best = proposal if search.is_warm else None
-                line = _line(search.trials, trial, best, session.unit, self.units)
+                line = _format_trial(search.trials, trial, best, session.unit, self.units)
                 show.done(line, trial.passed)
                 if self._is_done(proposal):
                     break
@@ -265,10 +267,10 @@ class _Optimisation:
         return max(0.0, time.monotonic() - begin - passed)
 
     def _judge(self, proposal: "Proposal", waited: float) -> "Optimum":
-        """Return what the search found, with the truth of a simulated fish."""
+        """Return the result of the search, with the true values of a simulated fish."""
         from fishd.lab.simulation import simulate
 
-        optimum = _optimum_of(
+        optimum = _make_optimum(
             self.controller, self.trials, self.search, proposal, self.aim,
             self.session.calibration,
         )  # fmt: skip
@@ -284,8 +286,8 @@ class _Optimisation:
             true_power=truth.mean_power,
         )
 
-    def _drawn_search(self) -> "Search":
-        """Return the search of the quantity that is drawn."""
+    def _search_to_draw(self) -> "Search":
+        """Return the search over the quantity that is drawn."""
         from fishd.lab.optimise.least_power import LeastPower
 
         if not isinstance(self.search, LeastPower):
@@ -295,212 +297,219 @@ class _Optimisation:
         )
 
 
-def _label(aim: "Aim", unit: str) -> str:
-    """Of the picture's axis."""
+def _axis_label(aim: "Aim", unit: str) -> str:
+    """Return the label of the vertical axis."""
     if aim.target is not None:
         return "power (mW)"
     return f"thrust (m{unit})" if aim.objective == "thrust" else f"thrust per watt (m{unit}/W)"
 
 
-def _fields() -> dict[str, Field]:
-    """The parameters of the controller of this command line."""
+def _controller_fields() -> dict[str, Field]:
+    """Return the parameters of the controller of this command line, by name."""
     types = (param.type for param in click.get_current_context().command.params)
     return {kind.field.name: kind.field for kind in types if isinstance(kind, ParameterType)}
 
 
-def _range(text: str, controller: str, given: dict[str, Any], session: "Session") -> "Range":
-    """`frequency`, or `frequency=1:3`; raises `UsageError`."""
+def _parse_range(text: str, controller: str, given: dict[str, Any], session: "Session") -> "Range":
+    """Return the range for `frequency` or `frequency=1:3`; raises `UsageError`."""
     from fishd.lab.optimise.search import Range
     from fishd.lab.optimise.trials import check_bounds, default_range, restrict_to_whole_ticks
 
     name, equals, ends = text.partition("=")
-    known = _fields()
+    known = _controller_fields()
     if name not in known or known[name].kind != "number":
-        numbers = [each for each, field in known.items() if field.kind == "number"]
+        numbers = [other_name for other_name, field in known.items() if field.kind == "number"]
         hint = nearest(name, numbers, listed="it has") if numbers else "it has none"
         raise click.UsageError(f"--over {text}: {controller} has no such number; {hint}")
     if name in given:
-        raise click.UsageError(f"--over {text}: --{name} is given, too")
+        raise click.UsageError(f"--over {text}: --{name} is given, too: leave out one of them")
     if not equals:
-        found = default_range(known[name], session)
-        if found is None:
+        searched = default_range(known[name], session)
+        if searched is None:
             raise click.UsageError(
-                f"--over {name}: it has no bounds on both sides: write --over {name}=LOW:HIGH"
+                f"--over {name}: it is not bounded on both sides: write --over {name}=LOW:HIGH"
             )
-        return restrict_to_whole_ticks(found, session.tick) if name == "frequency" else found
+        return restrict_to_whole_ticks(searched, session.tick) if name == "frequency" else searched
     try:
         low, high = (float(end) for end in ends.split(":"))
     except ValueError:
         raise click.UsageError(
             f"--over {text}: write NAME=LOW:HIGH, such as frequency=0.5:4"
         ) from None
-    found = Range(name, low, high)
-    found.check()
-    check_bounds(found, known[name], session)
-    return restrict_to_whole_ticks(found, session.tick) if name == "frequency" else found
+    searched = Range(name, low, high)
+    searched.check()
+    check_bounds(searched, known[name], session)
+    return restrict_to_whole_ticks(searched, session.tick) if name == "frequency" else searched
 
 
 class Optimum(Struct, frozen=True):
-    """What a search found, as a program reads it."""
+    """Result of a search; the fields are those of the JSON output."""
 
     controller: str
     parameters: dict[str, float]
     low: dict[str, float]
-    """The 95 % interval of each."""
+    """Lower end of the 95 % interval of each parameter."""
     high: dict[str, float]
+    """Upper end of that interval."""
     thrust: float
-    """[N]"""
+    """Predicted thrust [N]."""
     error: float
-    """Half of its 95 % interval [N]."""
+    """Half-width of the 95 % confidence interval of `thrust` [N]."""
     improvement: float
-    """Expected of another trial, as a share of what is searched."""
+    """Expected improvement by another trial, as a fraction of the objective."""
     trials: int
     ticks_swum: int
     seconds: float
-    """In the tank, rest included [s]."""
+    """Tank time, rests included [s]."""
     objective: str = "thrust"
     target: float | None = None
-    """The thrust that was to be reached [N]."""
+    """Thrust to reach [N]; null without --at-least."""
     power: float | None = None
-    """Electrical power of the servo [W]; null where it is not known."""
+    """Electrical power of the servo [W]; null if unknown."""
     power_error: float | None = None
-    """Half of its 95 % interval [W]."""
+    """Half-width of the 95 % confidence interval of `power` [W]."""
     thrust_per_watt: float | None = None
-    """[N/W]"""
+    """Thrust per watt of the servo [N/W]."""
     thrust_per_watt_error: float | None = None
-    """Half of its 95 % interval [N/W]."""
+    """Half-width of the 95 % confidence interval of `thrust_per_watt` [N/W]."""
     calibration_ci95: float | None = None
-    """Half-width of the 95 % interval that the calibration leaves to the thrust [N].
+    """Half-width of the 95 % interval of the thrust due to the calibration [N].
 
-    null where its uncertainty is unknown.
+    null if the uncertainty of the calibration is unknown.
     """
     total_ci95: float | None = None
     """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
     thrust_per_watt_calibration_ci95: float | None = None
-    """As `calibration_ci95`, of the thrust for each watt [N/W]."""
+    """Half-width of the 95 % interval of `thrust_per_watt` due to the calibration [N/W]."""
     thrust_per_watt_total_ci95: float | None = None
-    """As `total_ci95`, of the thrust for each watt [N/W]."""
+    """Half-width of the whole 95 % interval of `thrust_per_watt` [N/W]."""
     rotation: float = 0.0
-    """Rotation of the sensor's axes that is left after calibration; 0 where none is seen [rad]."""
+    """Remaining rotation of the sensor's axes after calibration; 0 if none is visible [rad]."""
     thinking: float | None = None
-    """How long the fish of a robot waited besides while candidates were chosen, this time [s]."""
+    """Additional time that a real fish waited for the choice of candidates, this run [s]."""
     true_thrust: float | None = None
-    """There, of a simulated fish [N]."""
+    """True thrust of a simulated fish at the best parameters [N]."""
     relative_thrust: float | None = None
-    """That over the thrust of the best square wave."""
+    """`true_thrust` divided by the thrust of the best square wave."""
     true_power: float | None = None
-    """There, of a simulated servo [W]."""
+    """True power of a simulated servo at the best parameters [W]."""
 
 
-def _line(
+def _format_trial(
     number: int, trial: "Trial", best: "Proposal | None", unit: str, units: dict[str, str]
 ) -> str:
-    """A line on a trial.
+    """Return a line about a trial.
 
-    best: what seems so, once there is enough to say it
-    unit: of the force; units: of the parameters
+    best: the best candidate, or None while too little was measured
+    unit: unit of the force; units: units of the parameters
     """
     thrust = text.format_measured(trial.thrust, trial.error, unit)
-    measured = f"{number}: {_spelled(trial.parameters, units)}: {thrust}"
+    measured = f"{number}: {_format_parameters(trial.parameters, units)}: {thrust}"
     if math.isfinite(trial.power):
         measured += f" for {power_words(trial.power)}"
     if best is None:
         return measured
     more = f"another may give {best.improvement:.1%} more"
-    return f"{measured}; best so far {_spelled(best.parameters, units)}, {more}"
+    return f"{measured}; best so far {_format_parameters(best.parameters, units)}, {more}"
 
 
-def _spelled(parameters: dict[str, float], units: dict[str, str]) -> str:
+def _format_parameters(parameters: dict[str, float], units: dict[str, str]) -> str:
     return format_values({name: float(f"{value:.4g}") for name, value in parameters.items()}, units)
 
 
-def _optimum_of(
+def _make_optimum(
     name: str,
-    measured: "Sequence[Trial]",
+    trials: "Sequence[Trial]",
     search: "Search | LeastPower",
-    found: "Proposal",
+    proposal: "Proposal",
     aim: "Aim",
     calibration: "ForceCalibration",
 ) -> Optimum:
-    """What a search found; measured: all that it knows of; calibration: of the force sensor"""
+    """Return the result of a search; calibration: that of the force sensor."""
     from fishd.lab.error_budget import budget
     from fishd.lab.statistics import per_watt
 
-    last = measured[-1]
-    force = [(each.parameters, each.thrust, each.error) for each in measured]
-    thrust, error = search.with_observations(force).predict(found.parameters)
+    last_trial = trials[-1]
+    thrusts = [(trial.parameters, trial.thrust, trial.error) for trial in trials]
+    thrust, error = search.with_observations(thrusts).predict(proposal.parameters)
     power = power_error = None
-    if all(math.isfinite(each.power) for each in measured):
-        taken = [(each.parameters, each.power, each.power_error) for each in measured]
-        power, power_error = search.with_observations(taken).predict(found.parameters)
+    if all(math.isfinite(trial.power) for trial in trials):
+        powers = [(trial.parameters, trial.power, trial.power_error) for trial in trials]
+        power, power_error = search.with_observations(powers).predict(proposal.parameters)
     gives, gives_error = per_watt(thrust, error, power, power_error)
     if aim.objective == "thrust-per-watt" and aim.target is None:
-        gives, gives_error = found.value, found.error
-    rotations = [each.rotation for each in measured if each.rotation]
+        gives, gives_error = proposal.value, proposal.error
+    rotations = [trial.rotation for trial in trials if trial.rotation]
     rotation = sum(rotations) / len(rotations) if rotations else 0.0
-    whole = budget(calibration, thrust, error, rotation=rotation)
-    whole_per_watt = (
+    error_parts = budget(calibration, thrust, error, rotation=rotation)
+    per_watt_parts = (
         None if gives is None else budget(calibration, gives, gives_error, rotation=rotation)
     )
     return Optimum(
         controller=name,
-        parameters=found.parameters,
-        low=found.low,
-        high=found.high,
+        parameters=proposal.parameters,
+        low=proposal.low,
+        high=proposal.high,
         thrust=thrust,
         error=error,
-        improvement=found.improvement,
-        trials=len(measured),
+        improvement=proposal.improvement,
+        trials=len(trials),
         objective=aim.objective if aim.target is None else "least-power",
         target=aim.target,
         power=power,
         power_error=power_error,
         thrust_per_watt=gives,
         thrust_per_watt_error=gives_error,
-        calibration_ci95=whole.calibration_ci95,
-        total_ci95=whole.total_ci95,
+        calibration_ci95=error_parts.calibration_ci95,
+        total_ci95=error_parts.total_ci95,
         rotation=rotation,
-        thrust_per_watt_calibration_ci95=whole_per_watt and whole_per_watt.calibration_ci95,
-        thrust_per_watt_total_ci95=whole_per_watt and whole_per_watt.total_ci95,
-        ticks_swum=last.swum,
-        seconds=last.passed,
+        thrust_per_watt_calibration_ci95=per_watt_parts and per_watt_parts.calibration_ci95,
+        thrust_per_watt_total_ci95=per_watt_parts and per_watt_parts.total_ci95,
+        ticks_swum=last_trial.swum,
+        seconds=last_trial.passed,
     )
 
 
-def _print(found: Optimum, unit: str, units: dict[str, str]) -> None:
-    """Show what was found; units: of the parameters, unit: of the force."""
+def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
+    """Print the result; unit: unit of the force, units: units of the parameters."""
     from fishd.lab import error_budget
 
-    for name, value in found.parameters.items():
+    for name, value in optimum.parameters.items():
         symbol = "" if units[name] in ("", "1") else f" {units[name]}"
-        interval = f"[{found.low[name]:.4g}, {found.high[name]:.4g}]"
-        echo(f"best {name} of {found.controller}: {value:.4g}{symbol} {interval}")
+        interval = f"[{optimum.low[name]:.4g}, {optimum.high[name]:.4g}]"
+        echo(f"best {name} of {optimum.controller}: {value:.4g}{symbol} {interval}")
     thrust = error_budget.spelled(
-        found.thrust, found.error, found.calibration_ci95, found.total_ci95, unit
+        optimum.thrust, optimum.error, optimum.calibration_ci95, optimum.total_ci95, unit
     )
     echo(f"thrust there: {thrust}")
-    if found.power is not None and found.power_error is not None:
+    if optimum.power is not None and optimum.power_error is not None:
         gives = error_budget.spelled(
-            found.thrust_per_watt or 0.0,
-            found.thrust_per_watt_error or 0.0,
-            found.thrust_per_watt_calibration_ci95,
-            found.thrust_per_watt_total_ci95,
+            optimum.thrust_per_watt or 0.0,
+            optimum.thrust_per_watt_error or 0.0,
+            optimum.thrust_per_watt_calibration_ci95,
+            optimum.thrust_per_watt_total_ci95,
             f"{unit} per W",
         )
-        echo(f"power there: {found.power * 1e3:.0f} ± {found.power_error * 1e3:.0f} mW, {gives}")
-    unknown = error_budget.unknown_calibration(found.calibration_ci95, unit)
-    for line in filter(None, (unknown, error_budget.rotation_remark(found.rotation))):
-        echo(f"fishctl: {line}", err=True)
-    if found.target is not None and found.thrust < found.target:
-        echo(f"fishctl: no parameters are known that give {found.target * 1e3:g} m{unit}", err=True)
-    if found.true_thrust is not None:
-        taking = "" if found.true_power is None else f" for {power_words(found.true_power)}"
         echo(
-            f"true thrust there: {found.true_thrust * 1e3:.2f} mN{taking}, "
-            f"{found.relative_thrust:.1%} of the best square wave"
+            f"power there: {optimum.power * 1e3:.0f} ± {optimum.power_error * 1e3:.0f} mW, {gives}"
         )
-    thinking = "" if found.thinking is None else f"; {found.thinking:.0f} s of thinking besides"
+    unknown = error_budget.unknown_calibration(optimum.calibration_ci95, unit)
+    for line in filter(None, (unknown, error_budget.rotation_remark(optimum.rotation))):
+        echo(f"fishctl: {line}", err=True)
+    if optimum.target is not None and optimum.thrust < optimum.target:
+        echo(
+            f"fishctl: no parameters are known that give {optimum.target * 1e3:g} m{unit}", err=True
+        )
+    if optimum.true_thrust is not None:
+        power_text = "" if optimum.true_power is None else f" for {power_words(optimum.true_power)}"
+        echo(
+            f"true thrust there: {optimum.true_thrust * 1e3:.2f} mN{power_text}, "
+            f"{optimum.relative_thrust:.1%} of the best square wave"
+        )
+    waiting = (
+        "" if optimum.thinking is None else f"; {optimum.thinking:.0f} s of waiting for candidates"
+    )
     echo(
-        f"{format_count(found.trials, 'candidate')}, {found.ticks_swum} ticks of swimming, "
-        f"{found.seconds:.0f} s with the rests{thinking}"
+        f"{format_count(optimum.trials, 'candidate')}, {optimum.ticks_swum} ticks of swimming, "
+        f"{optimum.seconds:.0f} s including rests{waiting}"
     )

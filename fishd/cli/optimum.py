@@ -1,4 +1,4 @@
-"""The verb that asks the equations for the best command of a fish."""
+"""The verb `fishctl optimum`, which computes the best command of a fish from its equations."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,19 +14,19 @@ from fishd.virtual.plant.parameters import PlantParameters, of_the_paper
 if TYPE_CHECKING:
     from fishd.lab.optimum import Optima, OptimalControl
 
-_LARGEST = 1.57
-"""As for amplitude_limit [rad]."""
-_LEFT_OUT = ("model", "quadratic_drag", "cable_slack", "backlash", "servo_dead_zone")
-"""What the closed forms and the optimal control do not know."""
+_MAX_AMPLITUDE = 1.57
+"""Largest amplitude, as for amplitude_limit [rad]."""
+_IGNORED_PARAMETERS = ("model", "quadratic_drag", "cable_slack", "backlash", "servo_dead_zone")
+"""Parameters that the closed forms and the optimal control ignore."""
 
 
-def _checked(
+def _check_amplitudes(
     ctx: click.Context, param: click.Parameter, values: tuple[float, ...]
 ) -> tuple[float, ...]:
     for value in values:
-        if not 0.0 < value <= _LARGEST:  # NaN is not
+        if not 0.0 < value <= _MAX_AMPLITUDE:  # NaN is not
             raise click.BadParameter(
-                f"{value:g} is not valid: a number in (0, {_LARGEST}] is needed"
+                f"{value:g} is not valid: a number in (0, {_MAX_AMPLITUDE}] is needed"
             )
     return values
 
@@ -37,7 +37,7 @@ def _checked(
     "amplitudes",
     multiple=True,
     type=float,
-    callback=_checked,
+    callback=_check_amplitudes,
     help="Φ [rad]; default: amplitude_limit. Repeatable.",
 )
 @click.option("--control", is_flag=True, help="Find the best command of any shape, too.")
@@ -57,12 +57,11 @@ def optimum(
     overrides: tuple[str, ...],
     as_json: bool,
 ) -> None:
-    """Show the command that thrusts most, by the equations of the simulated fish.
+    """Show the command of the largest thrust, by the equations of the simulated fish.
 
-    Shown are the square wave of the best frequency, and the limits of a servo that is fast (the
-    wheel follows at once) and slow (it always turns at full speed); Φ_s separates the two. With
-    --control, optimal control finds the best periodic command within ±Φ without being told its
-    shape: some seconds.
+    Prints the square wave of the best frequency, and its limits for a fast servo (the wheel
+    follows at once) and a slow one (the wheel always turns at full speed); Φ_s separates the two.
+    --control computes the best periodic command of any shape within ±Φ, which takes some seconds.
     """
     from fishd.lab import drawing
     from fishd.lab import optimum as lab
@@ -70,73 +69,75 @@ def optimum(
     config = load(file, overrides)
     check_tethered(config.robot, "optimum")
     plant = config.plant
-    chosen = amplitudes or (config.amplitude_limit,)
-    if control and len(chosen) > 1:
+    angles = amplitudes or (config.amplitude_limit,)
+    if control and len(angles) > 1:
         raise click.UsageError("--control takes one --amplitude at a time")
     if picture and not control:
         raise click.UsageError("--plot draws what --control finds: give both")
     if picture:
         drawing.check(picture)
-    best = lab.best_square_waves(plant, chosen)
-    fast, slow = lab.fast_servo(plant, chosen), lab.slow_servo(plant, chosen)
+    best = lab.best_square_waves(plant, angles)
+    fast, slow = lab.fast_servo(plant, angles), lab.slow_servo(plant, angles)
     limit = lab.saturation_amplitude(plant)
-    found = lab.optimal_control(plant, chosen[0]) if control else None
-    for k, amplitude in enumerate(chosen):
+    best_control = lab.optimal_control(plant, angles[0]) if control else None
+    for k, amplitude in enumerate(angles):
         warn_of_fin(best.fin_amplitude[k], f" at ±{amplitude:g} rad")
     if as_json:
         sets = {"best_square": best, "fast_servo": fast, "slow_servo": slow}
         print_json(
-            {name: _plain(vars(each)) for name, each in sets.items()}
+            {name: _to_plain(vars(optima)) for name, optima in sets.items()}
             | {"saturation_amplitude": limit}
-            | ({"optimal_control": _plain(vars(found))} if found else {})
+            | ({"optimal_control": _to_plain(vars(best_control))} if best_control else {})
         )
     else:
-        for k, amplitude in enumerate(chosen):
+        for k, amplitude in enumerate(angles):
             echo_rows(
                 [
                     ("amplitude", f"±{amplitude:g} rad, {amplitude / limit:.2f} of Φ_s = Ω/ω₀"),
-                    ("best square", _row(best, k)),
-                    ("fast servo", _row(fast, k)),
-                    ("slow servo", _row(slow, k)),
+                    ("best square", _format_optimum(best, k)),
+                    ("fast servo", _format_optimum(fast, k)),
+                    ("slow servo", _format_optimum(slow, k)),
                 ]
             )
-        if found:
-            echo_rows(_control_rows(found))
-        _say_what_is_left_out(plant, control)
-    if found and picture:
+        if best_control:
+            echo_rows(_control_rows(best_control))
+        _print_ignored(plant, control)
+    if best_control and picture:
         from fishd.lab.optimum.figure import draw
 
-        draw(found, picture)
+        draw(best_control, picture)
 
 
-def _row(optima: "Optima", k: int) -> str:
+def _format_optimum(optima: "Optima", k: int) -> str:
     return (
         f"{1e3 * optima.thrust[k]:.3f} mN at {optima.frequency[k]:.3f} Hz, "
         f"fin ±{optima.fin_amplitude[k]:.4f} rad"
     )
 
 
-def _control_rows(found: "OptimalControl") -> list[tuple[str, str]]:
+def _control_rows(control: "OptimalControl") -> list[tuple[str, str]]:
     return [
-        ("control", f"{1e3 * found.thrust:.3f} mN at {found.frequency:.3f} Hz"),
-        ("", f"{found.ratio:.2%} of the best square wave"),
-        ("", f"|φ_c| = Φ in {found.full:.1%} of the time"),
-        ("", f"on the side of the costate in {found.agreement:.1%} of the time"),
+        ("control", f"{1e3 * control.thrust:.3f} mN at {control.frequency:.3f} Hz"),
+        ("", f"{control.ratio:.2%} of the best square wave"),
+        ("", f"|φ_c| = Φ in {control.full:.1%} of the time"),
+        ("", f"on the side of the costate in {control.agreement:.1%} of the time"),
     ]
 
 
-def _say_what_is_left_out(plant: PlantParameters, control: bool) -> None:
+def _print_ignored(plant: PlantParameters, control: bool) -> None:
     ideal = of_the_paper(plant)
     left_out = [
-        f"plant.{name}" for name in _LEFT_OUT if getattr(plant, name) != getattr(ideal, name)
+        f"plant.{name}"
+        for name in _IGNORED_PARAMETERS
+        if getattr(plant, name) != getattr(ideal, name)
     ]
     if left_out:
-        who = "the limits and the optimal control leave" if control else "the limits leave"
-        echo(f"fishctl: {who} out {', '.join(left_out)}", err=True)
+        subject = "the limits and the optimal control leave" if control else "the limits leave"
+        echo(f"fishctl: {subject} out {', '.join(left_out)}", err=True)
 
 
-def _plain(value: Any) -> Any:
-    """Without numpy."""
+def _to_plain(value: Any) -> Any:
+    """Return the value with arrays and numpy numbers as plain data."""
     if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
+        return {name: _to_plain(part) for name, part in value.items()}
     return value.tolist() if hasattr(value, "tolist") else value

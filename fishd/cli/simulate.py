@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import fish_options
-from fishd.cli.free_swim_options import SETTLE, SwimmerOptions, swimmer_options
+from fishd.cli.free_swim_options import DEFAULT_SETTLE_S, SwimmerOptions, swimmer_options
 from fishd.cli.options import ControllerGroup, for_option, json_option
 from fishd.cli.output import (
     echo,
@@ -82,7 +82,7 @@ def _simulate(
     config = load(file, overrides)
     is_swimmer = config.robot == "swimmer"
     if settle is None:
-        settle = SETTLE if is_swimmer else 10.0
+        settle = DEFAULT_SETTLE_S if free else 10.0
     with ExitStack() as stack:
         writer, on_start = None, _do_nothing
         if not is_swimmer:

@@ -1,4 +1,4 @@
-"""The verb that measures thrust, or speed, over a grid of parameters, and proposes the best."""
+"""The verb `fishctl sweep`, which measures thrust or speed over a grid of parameters."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,34 +25,38 @@ if TYPE_CHECKING:
     from fishd.lab.sweep.grid import Point
     from fishd.lab.sweep.results import PointResult, Quantity
 
-SECONDS = 30.0
+DEFAULT_POINT_S = 30.0
 
 
 def sweep_options(function: Any) -> Any:
-    """The options of the verb itself."""
+    """Add the options of the verb itself."""
     for option in (
         json_option,
         plot_option("the curves"),
         fish_choice,
         folder_options,
         click.option(
-            "--cluster", metavar="ADDRESS", help="In simulation: Dask scheduler that swims them."
+            "--cluster",
+            metavar="ADDRESS",
+            help="In simulation: address of the Dask scheduler to use.",
         ),
         click.option(
-            "--jobs", type=click.IntRange(min=1), help="In simulation: processes. [default: cores]"
+            "--jobs",
+            type=click.IntRange(min=1),
+            help="In simulation: number of processes. [default: number of cores]",
         ),
-        for_option(f"Live: swimming and resting at each point [s]. [default: {SECONDS:g}]"),
+        for_option(f"Live: swimming and resting at each point [s]. [default: {DEFAULT_POINT_S:g}]"),
         click.option(
             "--periods",
             type=click.IntRange(min=2),
-            help="In simulation: tail beats judged at each point; of a swimmer, at least. "
-            "[default: 20; of a swimmer 10]",
+            help="In simulation: measured tail beats of each point; for a swimmer, the "
+            "smallest number. [default: 20; for a swimmer 10]",
         ),
         click.option(
             "--settle",
             type=FiniteRange(min=0.0),
-            help="In simulation: time before they are judged [s]. [default: 10; of a swimmer 4, or "
-            "until its speed is steady]",
+            help="In simulation: time before the measured beats [s]. [default: 10; for a swimmer "
+            "4, or until its speed is steady]",
         ),
         click.option(
             "--vary",
@@ -68,13 +72,14 @@ def sweep_options(function: Any) -> Any:
 
 @click.group(cls=ControllerGroup, options=sweep_options, remote=True, several=True, resumable=True)
 def sweep() -> None:
-    """Measure thrust over a grid of parameters: table, recordings, picture, and the best.
+    """Measure thrust over a grid of parameters; write a table, recordings and a picture.
 
-    Of a fish that swims freely (robot: swimmer), the speed.
+    For a fish that swims freely (robot: swimmer), measure its speed.
 
-    CONTROLLER is one, or several as square,sine,triangle. Each parameter takes a value, a list
-    as 1,1.5,2, or a range as 0.4:4:0.2 (low:high:step); all combinations are measured. With
-    --resume an interrupted sweep goes on, and its grid may grow.
+    CONTROLLER is a controller, or several, such as square,sine,triangle. A parameter takes a
+    value, a list such as 1,1.5,2, or a range such as 0.4:4:0.2 (low:high:step). All combinations
+    are measured, and the best point is printed. --resume continues an interrupted sweep; its grid
+    may then be larger.
     """
 
 
@@ -107,14 +112,16 @@ def _sweep(
     names = [info.name for info in infos]
     takes = {info.name: [field.name for field in info.parameters] for info in infos}
     units = {field.name: field.unit for info in infos for field in info.parameters}
-    points = grid.make_points(names, parameters, takes, dict(_varied(text) for text in vary))
+    points = grid.make_points(
+        names, parameters, takes, dict(_parse_variation(text) for text in vary)
+    )
     task = _Sweep(points, units, place, fish, picture, as_json)
     if fish.on == "live":
-        return task.measure(SECONDS if seconds is None else seconds)
+        return task.measure(DEFAULT_POINT_S if seconds is None else seconds)
     return task.swim({"settle": settle, "periods": periods}, {"jobs": jobs, "cluster": cluster})
 
 
-def _varied(text: str) -> tuple[str, list[Any]]:
+def _parse_variation(text: str) -> tuple[str, list[Any]]:
     from fishd.lab.sweep.grid import expand_values, parse_value
 
     key, equals, values = text.partition("=")
@@ -125,52 +132,54 @@ def _varied(text: str) -> tuple[str, list[Any]]:
 
 @dataclass
 class _Sweep:
-    """One sweep, as the command line wants it."""
+    """A sweep from the command line."""
 
     points: "list[Point]"
     units: dict[str, str]
-    """Units of the parameters."""
+    """Units of the parameters, by name."""
     place: Place
     fish: ChosenFish
     picture: Path | None
     as_json: bool
     finished: int = 0
 
-    def swim(self, given: dict[str, Any], crew: dict[str, Any]) -> int:
-        """Swim simulated fish; given: lengths, crew: who computes."""
+    def swim(self, given: dict[str, Any], workers: dict[str, Any]) -> int:
+        """Swim simulated fish; given: durations, workers: processes or cluster."""
         from fishd.lab.sweep.grid import Lengths
         from fishd.lab.sweep.measuring import swim_all
 
-        pairs = self._fish_of_points()
+        pairs = self._configure_points()
         config = self.fish.load()
         lengths = Lengths.of(config, **given)
         settings = {"lengths": msgspec.to_builtins(lengths)}
         with self.place.open(self.fish, msgspec.to_builtins(config), settings) as experiment:
-            folder = self._folder(experiment)
+            folder = self._open_folder(experiment)
             ending = Ending(experiment)
             with show_progress(len(pairs), "points", err=self.as_json) as show:
                 show.at(self.finished)
 
                 def done(point: "Point", result: "PointResult") -> None:
-                    show.done(self._line(folder, point, result), self.finished)
+                    show.done(self._finish_point(folder, point, result), self.finished)
 
-                ending.is_interrupted = not swim_all(folder, pairs, lengths, done, **crew)
+                ending.is_interrupted = not swim_all(folder, pairs, lengths, done, **workers)
             folder.sort(self.points)
             return self._conclude(folder, ending, "the mean over beats")
 
     def measure(self, seconds: float) -> int:
-        """Measure a live fish for so long at each point [s]."""
+        """Measure a live fish; seconds: duration of each point [s]."""
         from fishd.lab.measurement import plan
         from fishd.lab.sweep import grid
         from fishd.lab.sweep.measuring import measure_all
 
         for point in self.points:
-            plan(seconds, point.parameters)  # which says that it is too short, before it moves
+            plan(
+                seconds, point.parameters
+            )  # raises an error for too short a time before the fish moves
         settings = {"lengths": {"seconds": seconds}}
         with self.fish.session() as session:
             grid.check_remote(self.points, Limits(session.amplitude, session.tick))
             with self.place.open(self.fish, session.config, settings, session.unit) as experiment:
-                folder = self._folder(experiment)
+                folder = self._open_folder(experiment)
                 ending = Ending(experiment)
                 session.used = self.finished * seconds
                 with (
@@ -181,25 +190,25 @@ class _Sweep:
                     session.progress = show.at
 
                     def done(point: "Point", result: "PointResult") -> None:
-                        show.done(self._line(folder, point, result), session.used)
+                        show.done(self._finish_point(folder, point, result), session.used)
 
                     measure_all(folder, self.points, session, seconds, done)
                 folder.sort(self.points)
                 return self._conclude(folder, ending, "the measurement")
 
-    def _fish_of_points(self) -> "list[tuple[Point, Config]]":
-        """Return each point with the configuration of its fish, once all of them are possible."""
+    def _configure_points(self) -> "list[tuple[Point, Config]]":
+        """Return each point with the configuration of its fish, after checking all points."""
         from fishd.lab.sweep import grid
 
         fish: dict[tuple[tuple[str, Any], ...], Config] = {}
         for point in self.points:
             changed = tuple(point.keys.items())
             if changed not in fish:
-                fish[changed] = self._fish_of(point)
+                fish[changed] = self._configure_fish(point)
             grid.check(point, replace(fish[changed].limits, virtual=True))
         return [(point, fish[tuple(point.keys.items())]) for point in self.points]
 
-    def _fish_of(self, point: "Point") -> Config:
+    def _configure_fish(self, point: "Point") -> Config:
         pairs = [f"{key}={value}" for key, value in point.keys.items()]
         try:
             return self.fish.load(pairs)
@@ -209,32 +218,32 @@ class _Sweep:
                 message = message.replace(f"--set {pair}", f"--vary {pair}")
             raise ConfigError(message) from None
 
-    def _folder(self, experiment: "Experiment") -> "SweepFolder":
-        """Open the table, and print what is there already."""
+    def _open_folder(self, experiment: "Experiment") -> "SweepFolder":
+        """Open the table, and print how many points it already has."""
         from fishd.lab.sweep.folder import SweepFolder
 
         columns = dict.fromkeys(name for point in self.points for name in point.columns())
         folder = SweepFolder(experiment, list(columns))
         self.finished = sum(folder.key(point) in folder.results for point in self.points)
-        there = f", {self.finished} of them there already" if self.finished else ""
+        there = f", {self.finished} of them measured already" if self.finished else ""
         self.fish.announce(self.as_json)
         echo(f"{folder.path}: {format_count(len(self.points), 'point')}{there}", err=self.as_json)
         return folder
 
-    def _line(self, folder: "SweepFolder", point: "Point", result: "PointResult") -> str:
-        """Return a line on a point that is done."""
+    def _finish_point(self, folder: "SweepFolder", point: "Point", result: "PointResult") -> str:
+        """Return a line about a finished point."""
         self.finished += 1
-        return f"{point.label()}: {_figures(result, folder.quantity)}"
+        return f"{point.label()}: {_format_result(result, folder.quantity)}"
 
     def _conclude(self, folder: "SweepFolder", ending: Ending, error_of: str) -> int:
-        """Print what is best, and draw what there is; return the exit status."""
+        """Print the best points, and draw the curves; return the exit status."""
         from fishd.lab.sweep import curves, figure
 
         points, quantity = self.points, folder.quantity
-        drawn = curves.make_curves(folder, points)
+        all_curves = curves.make_curves(folder, points)
         bests = [
             (curve, replace(best, whole_ticks=curves.find_best_of_whole_ticks(folder, curve)))
-            for curve in drawn
+            for curve in all_curves
             if (best := curves.find_best(curve))
         ]
         if self.as_json:
@@ -242,15 +251,15 @@ class _Sweep:
         else:
             for curve, best in bests:
                 unit = self.units.get(best.over, "")
-                echo(f"{curve.label}: {_proposal(best, unit, quantity.unit)}")
+                echo(f"{curve.label}: {_format_best(best, unit, quantity.unit)}")
                 if best.whole_ticks:
-                    whole = _measured(best.whole_ticks, quantity.unit)
+                    whole = _format_whole_ticks(best.whole_ticks, quantity.unit)
                     echo(f"{curve.label}, of whole ticks: {whole}")
             echo(f"table: {folder.path / 'rows.csv'}")
-        if any(curve.peak for curve in drawn):
+        if any(curve.peak for curve in all_curves):
             stem = folder.path / quantity.name
             paths = [self.picture] if self.picture else [Path(f"{stem}.png"), Path(f"{stem}.svg")]
-            figure.draw(paths, drawn, self.units, error_of=error_of, quantity=quantity)
+            figure.draw(paths, all_curves, self.units, error_of=error_of, quantity=quantity)
             if not self.as_json:
                 echo(f"picture: {', '.join(map(str, paths))}")
         fins = [
@@ -259,15 +268,15 @@ class _Sweep:
             if (result := folder.results.get(folder.key(point)))
         ]
         if fins:
-            widest, where = max(fins)
-            warn_of_fin(widest, f" at {where}")
+            largest, label = max(fins)
+            warn_of_fin(largest, f" at {label}")
         if ending.is_interrupted:
             done = sum(folder.key(point) in folder.results for point in points)
             return ending.interrupted(f"{done} of {format_count(len(points), 'point')} are kept")
         return 1 if any(folder.results[folder.key(point)].trouble for point in points) else 0
 
 
-def _figures(result: "PointResult", quantity: "Quantity") -> str:
+def _format_result(result: "PointResult", quantity: "Quantity") -> str:
     if result.value is None:
         return f"no {quantity.name}: {result.trouble}"
     beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""
@@ -275,9 +284,9 @@ def _figures(result: "PointResult", quantity: "Quantity") -> str:
     return f"{text.format_measured(result.value, result.error, quantity.unit)}{beats}{steady}"
 
 
-def _proposal(best: "Best", unit: str, of: str) -> str:
+def _format_best(best: "Best", unit: str, unit_of_value: str) -> str:
     symbol = "" if unit in ("", "1") else f" {unit}"
-    value = text.format_measured(best.value, best.error, of)
+    value = text.format_measured(best.value, best.error, unit_of_value)
     if best.x is None:
         return value
     if best.at_edge:
@@ -291,9 +300,9 @@ def _proposal(best: "Best", unit: str, of: str) -> str:
     return f"best {best.over} {best.x:.4g}{symbol} {interval}: {value}"
 
 
-def _measured(found: "WholeTicks", force_unit: str) -> str:
-    thrust = text.format_measured(found.thrust, found.error, force_unit)
-    best = f"best measured at {found.frequency:.4g} Hz: {thrust}"
-    if found.nearer is None:
+def _format_whole_ticks(whole_ticks: "WholeTicks", force_unit: str) -> str:
+    thrust = text.format_measured(whole_ticks.thrust, whole_ticks.error, force_unit)
+    best = f"best measured at {whole_ticks.frequency:.4g} Hz: {thrust}"
+    if whole_ticks.nearer is None:
         return best
-    return f"{best}; {found.nearer:.6g} Hz is nearer the best, and not in the grid"
+    return f"{best}; {whole_ticks.nearer:.6g} Hz is nearer the best, and not in the grid"

@@ -24,11 +24,11 @@ def test_a_search_that_is_interrupted_rests_the_fish_and_goes_on(
     done = table.read_text().count("\n") - 1
     candidates = "1 candidate" if done == 1 else f"{done} candidates"
     assert f"{candidates}, " in out
-    assert "s of thinking besides" in out
+    assert "s of waiting for candidates" in out
     assert err.endswith(f"resume with: fishctl optimise --resume {folder}\n")
     again = fishctl("optimise", "--resume", str(folder), "--budget", "12")
     assert again.returncode == 1
-    assert f"{folder}: {candidates} there already" in again.stdout
+    assert f"{folder}: {candidates} measured already" in again.stdout
     assert "the budget of 12 s is used" in again.stderr
 
 

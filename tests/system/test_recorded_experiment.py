@@ -48,9 +48,7 @@ def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
     status, out, err = swims.end(signal.SIGTERM)
     assert status == 130
     assert out == f"fish: the fish of fishd at {daemon.endpoint}\n"
-    assert err.endswith(
-        f"fishctl: interrupted, so nothing is fitted; what it swam is in {folder}\n"
-    )
+    assert err.endswith(f"fishctl: interrupted before the fit; the recording is in {folder}\n")
     assert daemon.status().mode == "idle"
     run = open_run(path)
     assert run.reason == "ended by Interrupted"

@@ -16,5 +16,6 @@ VERBS = {
 def swimmer() -> None:
     """Draw a fish that swims freely: its wake, its midlines.
 
-    'fishctl simulate' swims it, and writes what these read; 'fishctl sweep' finds its speed.
+    'fishctl simulate' swims it and writes the files that these verbs read; 'fishctl sweep'
+    measures its speed.
     """

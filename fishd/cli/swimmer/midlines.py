@@ -1,4 +1,4 @@
-"""The verb that draws how the body of a free swimmer moves."""
+"""The verb `fishctl swimmer midlines`, which draws the motion of the body in a tail beat."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from fishd.recording.folder import check_new
     type=FiniteRange(min=0.0),
     default=4.0,
     show_default=True,
-    help="Beats before are left out [s].",
+    help="Time before the first beat to use [s].",
 )
 @picture_options
 @json_option
@@ -30,7 +30,7 @@ def midlines(
 ) -> None:
     """Draw the midlines of a tail beat relative to the mean, and the amplitude along the body.
 
-    SWIM is what 'fishctl simulate ... --save FILE.npz' has written. The picture is named after it:
+    SWIM is a file of 'fishctl simulate ... --save FILE.npz'. The picture is named after it:
     FILE-midlines.png.
     """
     path = target / f"{file.stem}-midlines.{form}"

@@ -1,4 +1,4 @@
-"""The verb that draws the water around a free swimmer."""
+"""The verb `fishctl swimmer wake`, which draws the water around a free swimmer."""
 
 from pathlib import Path
 
@@ -22,14 +22,16 @@ from fishd.virtual.swimmer import checkpoint
     multiple=True,
     default=("vorticity", "speed"),
     show_default=True,
-    help="What to draw. Repeatable.",
+    help="Quantity to draw. Repeatable.",
 )
-@click.option("--whole", is_flag=True, help="The whole tank, not only the fish and its near wake.")
+@click.option(
+    "--whole", is_flag=True, help="Draw the whole tank, not only the fish and its near wake."
+)
 @click.option(
     "--limit",
     type=FiniteRange(min=0.0, min_open=True),
-    help="Where the colours end, in the unit of the field. [default: alike for all pictures of "
-    "such a fish]",
+    help="Value at which the colours end, in the unit of the field. [default: the same for all "
+    "pictures of such a fish]",
 )
 @picture_options
 @json_option
@@ -45,12 +47,14 @@ def wake(
 ) -> None:
     """Draw vorticity and speed of the water, and the body in it.
 
-    CHECKPOINT is what 'fishctl simulate ... --checkpoint FILE' has written. The pictures are named
-    after it: FILE-vorticity.png.
+    CHECKPOINT is a file of 'fishctl simulate ... --checkpoint FILE'. The pictures are named after
+    it: FILE-vorticity.png.
     """
     fields = tuple(dict.fromkeys(fields))
     if limit is not None and len(fields) > 1:
-        raise click.UsageError("--limit is of one field, and there are several: --field is needed")
+        raise click.UsageError(
+            "--limit applies to one field, and there are several: give one --field"
+        )
     paths = {field: target / f"{file.stem}-{field}.{form}" for field in fields}
     check_new(paths.values(), replace=force)
     fish = restore_fish(checkpoint.load(file))

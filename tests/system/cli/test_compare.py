@@ -117,4 +117,4 @@ def test_it_is_said_that_another_controller_took_over_from_a_policy(tmp_path: Pa
     shaking = str(write(tmp_path))
     done = run(shaking, "--seconds", "20")
     assert done.returncode == 0
-    assert f"fishctl: {shaking}: another took over: ppo gave up: " in done.stderr
+    assert f"fishctl: {shaking}: another controller took over: ppo gave up: " in done.stderr

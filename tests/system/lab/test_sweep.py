@@ -298,7 +298,7 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     assert "sine plant.xi=1.2: best frequency" in first.stdout
     second = fishctl("sweep", "--resume", str(folder), "--frequency", "1.2:2:0.2", "--json")
     assert second.returncode == 0
-    assert "20 points, 16 of them there already" in second.stderr
+    assert "20 points, 16 of them measured already" in second.stderr
     best = msgspec.json.decode(second.stdout)
     assert [(each["controller"], each["keys"]) for each in best] == [
         (name, {"plant.xi": xi}) for xi in (0.9, 1.2) for name in ("square", "sine")

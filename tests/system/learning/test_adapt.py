@@ -11,7 +11,7 @@ import pytest
 from rigs.processes import fishctl
 from rigs.virtual_daemon import VirtualDaemon
 
-from fishd.cli.adapt import command_of
+from fishd.cli.adapt import format_command
 from fishd.cli.experiment_options import ChosenFish
 from fishd.client import Fish
 from fishd.config import Config, load
@@ -380,11 +380,11 @@ def test_the_last_line_says_what_to_type() -> None:
         contender("square", 1.0, 0.1), controller="square", parameters={"frequency": 5.0 / 3.0}
     )
     live = ChosenFish("live", None, (), None)
-    assert command_of(one, live) == "fishctl set-controller square --frequency 1.66667"
-    there = command_of(one, live._replace(endpoint="ipc:///run/a"))
+    assert format_command(one, live) == "fishctl set-controller square --frequency 1.66667"
+    there = format_command(one, live._replace(endpoint="ipc:///run/a"))
     assert there.endswith(" --endpoint ipc:///run/a")
     keys = ("plant.xi=0.9", "tick=0.05")
-    assert command_of(one, ChosenFish("simulation", Path("a fish.yaml"), keys, None)) == (
+    assert format_command(one, ChosenFish("simulation", Path("a fish.yaml"), keys, None)) == (
         "fishctl simulate square --frequency 1.66667 --config 'a fish.yaml' --set plant.xi=0.9 "
         "--set tick=0.05"
     )

@@ -133,7 +133,7 @@ def test_an_experiment_is_resumed_by_its_own_verb_with_its_own_options(tmp_path:
     refused = one_line(fishctl("optimise", "--resume", str(folder), "--amplitude", "0.2"))
     assert "parameters.amplitude = 0.3, now it is 0.2" in refused
     done = fishctl("optimise", "--resume", str(folder))
-    assert f"{folder}: 1 candidate there already" in done.stdout
+    assert f"{folder}: 1 candidate measured already" in done.stdout
     assert done.stdout.startswith("fish: the default simulated fish, changed by --set\n")
 
 

@@ -97,10 +97,10 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert all(each.from_start and each.equal == each.ticks for each in again)
     assert (folder / "thrust.svg").stat().st_size > 10_000
     again = f"optimise --resume {folder} --budget"
-    assert f"a larger one: fishctl {again} SECONDS" in done.stderr
+    assert f"To continue: fishctl {again} SECONDS" in done.stderr
     there = (folder / "rows.csv").read_text()
     more = fishctl(*again.split(), "40")
-    assert f"{folder}: 3 candidates there already" in more.stdout
+    assert f"{folder}: 3 candidates measured already" in more.stdout
     assert (folder / "rows.csv").read_text().startswith(there)
     assert len(read(folder / "search-2.mcap")) > 100
     refused = one_line(fishctl(*words, "--resume", str(folder), "--amplitude", "0.3"))

@@ -118,7 +118,7 @@ def test_two_aims_are_one_too_many() -> None:
         *("optimise", "square", "--over", "frequency", "--on", "simulation"),
         *("--objective", "thrust", "--at-least", "15"),
     )
-    assert "each is an aim of its own, give one" in one_line(done)
+    assert "exclude each other: give one of them" in one_line(done)
 
 
 def test_a_comparison_tells_what_each_watt_gave_simulated_and_measured() -> None:

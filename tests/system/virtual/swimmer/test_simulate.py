@@ -217,7 +217,7 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
         (("--checkpoint", "no-such/kept"), "no-such/kept: there is no folder to put it into"),
         (("--seconds", "2", "--settle", "3"), "nothing is left to judge"),
         (("--checkpoint", "/dev/null"), "/dev/null: is a device; a regular file is needed"),
-        (("--checkpoint", "kept.npz", "--save", "kept.npz"), "--save need a file each"),
+        (("--checkpoint", "kept.npz", "--save", "kept.npz"), "--save need different files"),
     ],
 )
 def test_what_cannot_be_done_is_said_before_it_swims(
