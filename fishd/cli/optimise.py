@@ -218,7 +218,7 @@ class _Optimisation:
         if not self._is_done(proposal):
             echo(
                 f"fishctl: the budget of {self.budget:g} s is used up: another candidate is "
-                f"expected to give {proposal.improvement:.1%} more, and --until is {self.until:.1%}. "
+                f"expected to give {proposal.improvement:.1%} more, --until is {self.until:.1%}. "
                 f"To continue: {self.experiment.resume_command} --budget SECONDS",
                 err=True,
             )
