@@ -82,7 +82,7 @@ def _simulate(
     config = load(file, overrides)
     is_swimmer = config.robot == "swimmer"
     if settle is None:
-        settle = DEFAULT_SETTLE_S if free else 10.0
+        settle = DEFAULT_SETTLE_S if is_swimmer else 10.0
     with ExitStack() as stack:
         writer, on_start = None, _do_nothing
         if not is_swimmer:
