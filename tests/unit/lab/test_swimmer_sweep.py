@@ -63,7 +63,7 @@ def test_a_speed_that_still_rises_is_not_steady_and_one_that_only_scatters_is() 
 def test_a_fish_whose_speed_still_changes_is_judged_by_the_later_half_and_that_is_said(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(free_swimming, "LONGEST", 2.0)
+    monkeypatch.setattr(free_swimming, "MAX_SWIM_S", 2.0)
     found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
     assert found
     assert (found.trouble, found.settled, found.seconds) == ("", None, 2.0)
@@ -150,7 +150,7 @@ def _no_worker_stays() -> Any:
 def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(free_swimming, "LONGEST", 2.0)
+    monkeypatch.setattr(free_swimming, "MAX_SWIM_S", 2.0)
     folder = tmp_path / "run"
     fast = ["--settle", "0.5", "--periods", "2", "--jobs", "1", "--folder", str(folder)]
     done = fishctl("sweep", "sine", "--frequency", "5", *OPTIONS, *fast)
