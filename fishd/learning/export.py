@@ -22,10 +22,10 @@ from fishd.core.camera_frames import Stack
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.files import write_atomically
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.evaluation import Evaluation, in_simulation
+from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
 from fishd.learning.env.perception import Perception
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
-from fishd.learning.eyes.making import babble
+from fishd.learning.eyes.making import random_angles
 from fishd.learning.picture_networks import PictureExtractor, network_nodes
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs
@@ -113,7 +113,7 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     )
     card = replace(card, provenance=past)
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
-    found = in_simulation(env.config, decide, EvaluationSettings())
+    found = evaluate_in_simulation(env.config, decide, EvaluationSettings())
     _write(path, _completed(card, found), policy, env.perception)
     return path
 
@@ -187,7 +187,7 @@ def _evaluated(
     decide = DeterministicPolicy(policy, perception, card.amplitude)
     settings = msgspec.convert(card.provenance.settings, TrainingSettings)
     camera = _camera(checkpoint.parent, card)
-    return in_simulation(config, decide, settings.evaluation, camera)
+    return evaluate_in_simulation(config, decide, settings.evaluation, camera)
 
 
 def _camera(run: Path, card: Card) -> Camera | None:
@@ -247,7 +247,7 @@ def _stacks(card: Card) -> list[Stack]:
     config = replace(Config(), tick=card.tick, amplitude_limit=card.amplitude)
     link = SimulatedLink(config, camera=Camera(SimulatedCameraSettings(), card.pictures))
     link.reset()
-    for angle in babble(0, _STACKS, card.amplitude).tolist():
+    for angle in random_angles(0, _STACKS, card.amplitude).tolist():
         link.step(angle)
         if (stack := link.look()) is not None:
             found.append(stack)

@@ -22,7 +22,7 @@ from torch.nn.functional import softplus
 
 from fishd.config import Config
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.simulated_link import SimulatedLink, drawn
+from fishd.learning.env.simulated_link import SimulatedLink, draw_fish
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.settings import ImitationSettings, Randomisation, TrainingSettings
 from fishd.virtual.plant.optimum import square_wave
@@ -113,7 +113,7 @@ class Imitation:
         share = min(1.0, float(draw.uniform()) / NEARER)
         is_clean = self._settings.clean_rigs > 0.0 and draw.uniform() < self._settings.clean_rigs
         spread = narrowed(self._spread, share, float(draw.uniform()) if is_clean else 1.0)
-        fish = drawn(config, spread, int(draw.integers(2**31)))
+        fish = draw_fish(config, spread, int(draw.integers(2**31)))
         env = SwimEnv(SimulatedLink(fish), config, self._environment)
         seen, _ = env.reset(seed=int(draw.integers(2**31)))
         learner = DeterministicPolicy(self._policy, env.perception, env.link.amplitude)

@@ -259,7 +259,7 @@ class DeterministicPolicy:
 
     def __init__(self, policy: ActorCriticPolicy, perception: Perception, amplitude: float) -> None:
         """amplitude: Φ [rad]"""
-        self._perception = perception.anew()
+        self._perception = perception.with_new_history()
         self._amplitude = amplitude
         self._latest = self._blind = 0.0
         self._mean = MeanAction(policy)

@@ -21,12 +21,12 @@ SPREAD = 30.0
 
 def babbled(settings: TrainingSettings) -> tuple[Card, ActorCriticPolicy, Perception]:
     """What a training has after its babble."""
-    config, eye = Config(), making.make(settings)
+    config, eye = Config(), making.make_eye(settings)
     assert eye
     link = SimulatedLink(config, camera=Camera(DEFAULT, eye.stack))
     link.reset()
     frames, angles = [], []
-    for angle in making.babble(settings.seed, 200, config.amplitude_limit).tolist():
+    for angle in making.random_angles(settings.seed, 200, config.amplitude_limit).tolist():
         link.step(angle)
         if (stack := link.look()) is not None:
             frames.append(stack[0])

@@ -78,7 +78,7 @@ def test_a_camera_that_dies_ends_the_training_with_the_fish_at_rest(
 
         def kill_camera() -> None:
             rig.camera.process.send_signal(signal.SIGKILL)
-            monkeypatch.setattr(fishd_link, "GIVE_UP", 2.0)
+            monkeypatch.setattr(fishd_link, "FRAMES_TIMEOUT_S", 2.0)
 
         done = while_it_trains(
             lambda: begun.exists() and rows(begun),

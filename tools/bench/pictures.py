@@ -25,7 +25,7 @@ from fishd.config import Config
 from fishd.lab.compare.contestants import best_on_grid
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
-from fishd.learning.eyes.making import make
+from fishd.learning.eyes.making import make_eye
 from fishd.learning.settings import TrainingSettings
 from fishd.virtual.plant.optimum import best_square_wave
 
@@ -142,7 +142,7 @@ def speed(options: Namespace) -> str:
 
 def rate(settings: TrainingSettings, camera: SimulatedCameraSettings, config: Config) -> float:
     """Steps a second."""
-    eye = make(settings)
+    eye = make_eye(settings)
     assert eye
     link = SimulatedLink(config, camera=Camera(camera, settings.camera.stack))
     env = SwimEnv(link, config, settings.seen, eye)

@@ -172,7 +172,7 @@ def _prepare_job(
     """
     from fishd.lab.experiment import default_folder
     from fishd.learning import settings as training
-    from fishd.learning.env.fishd_link import config_of, other_plant
+    from fishd.learning.env.fishd_link import config_of, plant_differences
     from fishd.learning.run_folder import checkpoints, runs
     from fishd.learning.train.jobs import Job
 
@@ -192,7 +192,7 @@ def _prepare_job(
         is_adopted = running_config and not file
         config = adopt(running_config, overrides) if is_adopted else load(file, overrides)
     # The plant scales the inputs, and that of fishd is most likely right.
-    if running_config and (difference := other_plant(config, plant)):
+    if running_config and (difference := plant_differences(config, plant)):
         echo(
             "fishctl: careful: scales and relative thrust are made for another plant than "
             f"that of the fishd that runs: {difference}",

@@ -30,34 +30,34 @@ from fishd.core.signals import Observation
 from fishd.learning.env.link import Link, LinkLost
 from fishd.learning.env.perception import Perception
 from fishd.learning.eyes.base import Eye
-from fishd.learning.eyes.making import babble
+from fishd.learning.eyes.making import random_angles
 from fishd.learning.settings import EnvironmentSettings
 from fishd.virtual.plant.optimum import best_square_wave
 
 
 def best_thrust(config: Config) -> float:
-    """Mean thrust of the best square wave of the configured fish [N]."""
+    """Return the mean thrust of the best square wave of the configured fish [N]."""
     return float(best_square_wave(config.plant, config.amplitude_limit).thrust)
 
 
 def thrust_scale(config: Config, settings: EnvironmentSettings) -> float:
-    """The thrust that is rewarded with `reward_scale` [N]."""
+    """Return the thrust that is rewarded with `reward_scale` [N]."""
     return settings.thrust_scale or best_thrust(config)
 
 
 def force_scale(config: Config) -> float:
-    """K λ ω₀² Φ [N]: the reaction to a fin that is held at λΦ and let go (Fu et al., F_y)."""
+    """Return K λ ω₀² Φ [N], the reaction to a fin released from λΦ (Fu et al., F_y)."""
     plant = config.plant
     return plant.thrust_coefficient * plant.coupling * plant.omega0**2 * config.amplitude_limit
 
 
 def features(config: Config, settings: EnvironmentSettings) -> tuple[Feature, ...]:
-    """The inputs of the network, each with the value that it sees as 1 for the configured fish.
+    """Return the features of the observation, each with the value that the network receives as 1.
 
-    The scales come from the physics, not from running averages: nothing drifts during training, and
-    a policy file carries a few numbers that a person can check.
+    The scales come from the physics of the configured fish, not from running averages: they do not
+    drift during training, and a policy file contains a few numbers that the user can check.
 
-    Raises `ConfigError` for a fin velocity that no policy would know.
+    Raises `ConfigError` for a fin velocity in a unit that policies do not use.
     """
     if config.estimator.kind != "lateral_force" and "fin_velocity" in settings.observation:
         raise ConfigError(
@@ -81,42 +81,44 @@ def features(config: Config, settings: EnvironmentSettings) -> tuple[Feature, ..
 
 Vector = NDArray[np.float32]
 
-_FARTHEST = 1e6
+_OBSERVATION_BOUND = 1e6
 """Bound of the observation space: finite, as tools expect, and never reached."""
-SHORTEST_PAUSE, LONGEST_PAUSE = 10.0, 120.0
-"""Bounds of a pause whose length is not given; the first one is the longest [s]."""
-FIRST_FRAMES = 5.0
-"""How long a camera may take to show a whole stack, in real and in virtual time [s]."""
-_ALLOWANCE = 4.0
-"""Such a pause may last so many times the longest one so far."""
+MIN_PAUSE_S, MAX_PAUSE_S = 10.0, 120.0
+"""Bounds of the permitted length of a pause whose length is not given; the first pause may take the
+longer time [s]."""
+FIRST_FRAMES_TIMEOUT_S = 5.0
+"""Longest time until a camera shows a whole stack, in real and in virtual time [s]."""
+_PAUSE_RATIO = 4.0
+"""Ratio of the permitted length of such a pause to the longest pause before it."""
 
 
 def spaces(features: int) -> tuple[gymnasium.Space[Vector], gymnasium.Space[Vector]]:
-    """Observation and action space of an agent that sees so many features."""
-    seen: Any = gymnasium.spaces.Box(-_FARTHEST, _FARTHEST, (features,), np.float32)
-    done: Any = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
-    return seen, done
+    """Return observation and action space; features: number of inputs of the agent."""
+    observation: Any = gymnasium.spaces.Box(
+        -_OBSERVATION_BOUND, _OBSERVATION_BOUND, (features,), np.float32
+    )
+    action: Any = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+    return observation, action
 
 
 class SwimEnv(gymnasium.Env[Vector, Vector]):
-    """One fish that swims for thrust.
+    """The environment of one fish that swims for thrust.
 
-    `info` of each step holds `thrust` and `lateral_force` (mean F_x and F_y in the tick that
-    followed [N]), `lost` (ticks in which another angle than the action was applied), `blind` (1
-    where the camera did not show that tick) and `paused` (how long the fish has waited at neutral
-    since the previous step [s], mostly 0). A step with `lost` or `blind` ends its episode: it is
-    truncated.
+    `info` of each step contains `thrust` and `lateral_force` (mean F_x and F_y in the tick that
+    followed [N]), `lost` (number of ticks with another angle than the action), `blind` (1 if the
+    camera did not show that tick) and `paused` (time at neutral since the previous step [s], mostly
+    0). A step with `lost` or `blind` truncates its episode.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own way)
+    metadata = {"render_modes": []}  # noqa: RUF012 (as Gymnasium defines it)
 
     def __init__(
         self, link: Link, config: Config, settings: EnvironmentSettings, eye: Eye | None = None
     ) -> None:
         """
-        link: to the fish
-        config: the fish that the scales are made for
-        eye: what makes numbers of pictures, where the agent sees any; fit it before the first step
+        link: link to the fish
+        config: configuration that the scales are computed from
+        eye: eye of an agent that sees pictures; to be fitted before the first step
 
         Raises `ConfigError` where the fish has another tick or Φ than `config`, or swims freely.
         """
@@ -130,12 +132,12 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         window = Window(settings.history, settings.history * config.tick)
         self.perception = Perception(self.features, eye, window)
         self.reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
-        """By which F_x is rewarded [1/N]."""
+        """Reward per thrust [1/N]."""
         self._price, self._cost = settings.power_price, 0.0  # N/W, N
         shortest = config.limits.dwell if settings.dwell else 0.0
         self._dwell = Dwell(shortest, link.tick, link.amplitude)
-        self._limited = 0.0
-        """The time of the latest observation after a tick with the shortest dwell [s]."""
+        self._dwell_time = 0.0
+        """Time of the latest observation after a tick with the shortest dwell [s]."""
         self._held_cost = settings.held_cost * settings.reward_scale
         self.observation_space, self.action_space = spaces(self.perception.inputs)
         self.best_thrust = best_thrust(config)
@@ -143,30 +145,29 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._steps = 0
         self._begun = self._closed = False
         self.latest: Observation
-        """The latest observation, once an episode has begun."""
+        """Latest observation; unset before the first episode."""
         self.stack: Stack | None = None
-        """The frames of this tick; None where the camera has not shown them."""
+        """Frames of the latest tick; None where the camera has not shown them."""
         self._shown: Stack | None = None
-        """The latest frames, of whichever tick."""
+        """Latest frames of any tick."""
         self.tank_time = 0.0
-        """How long the agent has controlled a fish, pauses included [s]."""
+        """Time that the agent has controlled a fish, pauses included [s]."""
         self.lost = 0
-        """Ticks in which another angle than the agent's was applied."""
+        """Number of ticks with another angle than that of the agent."""
         self.blind = 0
-        """Ticks that the camera has not shown."""
+        """Number of ticks that the camera has not shown."""
         self._paused = 0.0
         self._pause_began = 0.0
         self._longest_pause: float | None = None
-        """In real time [s]."""
+        """Longest pause until now, in real time [s]; None before the first one."""
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Vector, dict[str, Any]]:
-        """Begin an episode: up to `longest_start` ticks at a random angle come first.
+        """Begin an episode with up to `longest_start` ticks at a random angle.
 
-        With a seed, or with a randomisation, a simulated fish begins anew, at rest. Any other one
-        swims on from where it is; control of it is re-acquired where it was lost. Raises
-        `LinkLost`.
+        With a seed, or with a randomisation, a simulated fish starts again at rest. Any other fish
+        swims on from its state; control of it is re-acquired if it was lost. Raises `LinkLost`.
         """
         self._check_open()
         super().reset(seed=seed)
@@ -174,7 +175,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.latest = self.link.reset(int(draw.integers(2**31)), new=seed is not None)
         self.perception.forget()
         if self.settings.own_fish and self.link.config:
-            self._suit(self.link.config)
+            self._adapt_to(self.link.config)
         self._begun = True
         self._steps = 0
         self._await_frames()
@@ -185,8 +186,8 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._dwell.activate(self.latest.instruction_angle)
         return self._seen(), self._info(lost)
 
-    def _suit(self, fish: Config) -> None:
-        """Reward the thrust of this fish by its own best, and hold reversals back as it needs."""
+    def _adapt_to(self, fish: Config) -> None:
+        """Use the scale of the thrust, and the shortest dwell, of the fish that swims now."""
         self.reward_per_newton = self.settings.reward_scale / thrust_scale(fish, self.settings)
         shortest = fish.limits.dwell if self.settings.dwell else 0.0
         self._dwell = Dwell(shortest, self.link.tick, self.link.amplitude)
@@ -200,7 +201,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._check_open()
         if not self._begun:
             raise ResetNeeded("no episode has begun: call reset before step")
-        lost = self.swim(_share(action) * self.link.amplitude)
+        lost = self.swim(_read_action(action) * self.link.amplitude)
         self._steps += 1
         reward = self.reward_per_newton * (self.latest.fx - self._cost)
         reward -= self._held_cost * self._dwell.held
@@ -210,16 +211,16 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         return self._seen(), reward, False, truncated, info
 
     def swim(self, angle: float) -> int:
-        """Swim one tick at an angle [rad], or at that of before where it would reverse too soon.
+        """Swim one tick at an angle [rad], or at the previous one if it would reverse too soon.
 
-        Gives the number of ticks lost. Raises `LinkLost`.
+        Returns the number of ticks lost. Raises `LinkLost`.
         """
         lost = self.advance(self._dwell.apply(angle, self.link.tick))
-        self._limited = self.latest.time
+        self._dwell_time = self.latest.time
         return lost
 
     def advance(self, angle: float) -> int:
-        """Swim one tick at an angle [rad], outside of any episode; the number of ticks lost.
+        """Swim one tick at an angle [rad], outside of any episode; return the number of ticks lost.
 
         Raises `LinkLost`, and `ConfigError` where power has a price, but is not known.
         """
@@ -240,50 +241,50 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         return lost
 
     def babble(self, seed: int, ticks: int, stop: Callable[[], bool] = lambda: False) -> bool:
-        """Move at random, outside of any episode, and let the eye find out what it sees of that.
+        """Move at random, outside of any episode, and fit the eye to the pictures of that.
 
-        ticks: for how long
-        stop: called after each of them; True ends it
+        ticks: length of the motion
+        stop: called before each tick; True ends the motion
 
-        False where it was stopped; else the fish is in a pause afterwards. Raises `LinkLost`, and
-        `NoMotion` where the tail is not to be seen.
+        Returns False where it was stopped; else the fish is in a pause afterwards. Raises
+        `LinkLost`, and `NoMotion` where the tail is not visible.
         """
         assert self.eye
         assert self._shown
         frames, angles = [], []
-        for angle in babble(seed, ticks, self.link.amplitude).tolist():
+        for angle in random_angles(seed, ticks, self.link.amplitude).tolist():
             if stop():
                 return False
             self.advance(angle)
             frames.append(self._shown[0])
-            angles.append(self.latest.instruction_angle)  # of a lost tick, another one
-        self.pause()  # to find it out takes longer than fishd waits
+            angles.append(self.latest.instruction_angle)  # in a lost tick, not that of the babble
+        self.pause()  # the fit takes longer than fishd waits
         self.eye.fit(np.stack(frames), np.array(angles))
         return True
 
     def pause(self, seconds: float | None = None) -> None:
-        """Let the fish wait at neutral while the agent learns.
+        """Hold the fish at neutral while the agent learns.
 
-        seconds: at most; None: a multiple of the longest pause so far
+        seconds: longest time [s]; None: a multiple of the longest pause until now
         """
         if seconds is None:
-            seconds = LONGEST_PAUSE
+            seconds = MAX_PAUSE_S
             if self._longest_pause is not None:
-                seconds = min(seconds, max(SHORTEST_PAUSE, _ALLOWANCE * self._longest_pause))
+                seconds = min(seconds, max(MIN_PAUSE_S, _PAUSE_RATIO * self._longest_pause))
         self._pause_began = time.monotonic()
         self.link.pause(seconds)
 
     def resume(self) -> Vector:
-        """End the pause; the observation that the next action answers.
+        """End the pause; return the observation that the next action answers.
 
-        The one before the pause must not be answered: the fish has come to rest meanwhile.
+        The observation before the pause must not be answered, since the fish is at rest now.
         """
         before = self.latest.time
         took = time.monotonic() - self._pause_began
         self._longest_pause = max(took, self._longest_pause or 0.0)
         self.latest = self.link.resume()
         self._await_frames()
-        if self.latest.time > self._limited:
+        if self.latest.time > self._dwell_time:
             self._dwell.activate(self.latest.instruction_angle)
         waited = self.latest.time - before
         self._paused += waited
@@ -296,7 +297,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.link.close()
 
     def _look(self) -> bool:
-        """Take the stack of this tick; False if the camera has not shown it."""
+        """Store the stack of this tick; return False if the camera has not shown it."""
         self.stack = self.link.look()
         self._shown = self.stack or self._shown
         return self.stack is not None
@@ -305,15 +306,18 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         """Stay at neutral until the camera shows a whole stack; raises `LinkLost`."""
         if self.eye is None or self._look():
             return
-        begun, began = self.latest.time, time.monotonic()
-        while min(self.latest.time - begun, time.monotonic() - began) < FIRST_FRAMES:
+        virtual_start, real_start = self.latest.time, time.monotonic()
+        while (
+            min(self.latest.time - virtual_start, time.monotonic() - real_start)
+            < FIRST_FRAMES_TIMEOUT_S
+        ):
             self.latest = self.link.step(0.0).observation
             if self._look():
                 return
         raise LinkLost(
-            f"the camera has shown no whole stack of frames for {FIRST_FRAMES:g} s: they come too "
-            "seldom or too late for camera.stack; give that a larger delay or oldest, or the "
-            "camera a higher rate"
+            f"the camera has shown no whole stack of frames for {FIRST_FRAMES_TIMEOUT_S:g} s: they "
+            "come too seldom or too late for camera.stack; give that a larger delay or oldest, or "
+            "the camera a higher rate"
         )
 
     def _seen(self) -> Vector:
@@ -335,7 +339,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
 
 
 def _check_agreement(link: Link, config: Config) -> None:
-    """Raise `ConfigError` where the fish has another tick or Φ than the scales are made for."""
+    """Raise `ConfigError` where the fish has another tick or Φ than the scales are computed from."""
     for key, here, there, unit in (
         ("tick", config.tick, link.tick, "s"),
         ("amplitude_limit", config.amplitude_limit, link.amplitude, "rad"),
@@ -348,8 +352,8 @@ def _check_agreement(link: Link, config: Config) -> None:
             )
 
 
-def _share(action: Vector) -> float:
-    """The one number of an action, clipped to [-1, 1]; raises ValueError."""
+def _read_action(action: Vector) -> float:
+    """Return the number of an action, clipped to [-1, 1]; raises ValueError."""
     values = np.asarray(action, dtype=np.float64)
     if values.shape != (1,):
         raise ValueError(f"an action of shape {values.shape} is not valid: (1,) is needed, φ_c/Φ")

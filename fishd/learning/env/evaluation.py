@@ -1,4 +1,4 @@
-"""Evaluations without exploration, of a simulated fish; those in a tank are made of `swims`."""
+"""Evaluations without exploration on a simulated fish; `swims` has those in a tank."""
 
 import itertools
 from collections.abc import Callable
@@ -18,57 +18,57 @@ from fishd.lab.simulation import Report, VirtualRun
 from fishd.learning.env.simulated_link import (
     Camera,
     FunctionController,
-    at_edge,
-    drawn,
+    draw_edge_fish,
+    draw_fish,
 )
 from fishd.learning.settings import EvaluationSettings, TrainingSettings
 
-STALLED = 0.05
-"""A policy whose mean |φ_c| is below this share of Φ does not swim."""
-CHATTER = 0.9
-"""Nor does one that reverses in more than this share of the ticks: the fin does not follow."""
+MIN_FULLNESS = 0.05
+"""Smallest mean |φ_c|/Φ of a policy that swims."""
+MAX_REVERSAL_SHARE = 0.9
+"""Largest share of ticks with a reversal of a policy that swims: the fin cannot follow more."""
 
-SHAKE = 1.0
-"""How long a fish is shaken [s]."""
+SHAKE_TIME_S = 1.0
+"""Time of rapid reversals at the start of a swim [s]."""
 
 Decide = Callable[[Observation, Stack | None], float]
-"""A policy: observation, and frames where it sees any, in; instruction angle out [rad]."""
+"""A policy: returns the instruction angle [rad] for an observation and frames, if it sees any."""
 
 
 class Evaluation(Struct, frozen=True, kw_only=True):
-    """How a policy swam without exploration; a row of evaluations.csv."""
+    """The result of a policy without exploration; a row of evaluations.csv."""
 
     steps: int = 0
-    """Control steps that the training had learned from."""
+    """Number of control steps that the training had learned from."""
     policy: int = 0
-    """Control steps that the policy had learned from which swam: in a tank, it may be older."""
+    """Number of control steps that this policy had learned from; in a tank, it may be older."""
     tank_time: float = 0.0
-    """Time in the tank until then [s]."""
+    """Time in the tank until the evaluation [s]."""
     swam: float | None = None
-    """How long this policy has swum in the tank in all its evaluations [s]; None in simulation."""
+    """Time that this policy has swum in all its evaluations [s]; None in simulation."""
     thrust: float
-    """Mean thrust: the true one of a simulated fish, the mean of all swims in a tank [N].
+    """Mean thrust [N]: the true one of a simulated fish, the mean of all swims in a tank.
 
-    In a tank it is 0 where the policy stalled.
+    In a tank it is 0 if the policy stalled.
     """
     error: float | None = None
-    """Half of the 95 % interval of a measured thrust [N]; a true one needs none."""
+    """Half-width of the 95 % interval of a measured thrust [N]; None for a true one."""
     relative_thrust: float
-    """Thrust over that of the configured fish's best square wave."""
+    """Thrust relative to the best square wave of the configured fish."""
     frequency: float
-    """Tail beats per second; 0 where the tail does not beat [Hz]."""
+    """Tail-beat frequency; 0 where the tail does not beat [Hz]."""
     fullness: float
     """Mean |φ_c|/Φ."""
     stalled: bool
-    """It does not swim: it holds still, or nearly so, or reverses in nearly every tick."""
+    """Whether the policy does not swim: it hardly moves, or reverses in nearly every tick."""
     worst: float | None = None
-    """Lowest relative thrust on this and on other fish, where others were tried."""
+    """Lowest relative thrust on this and on other fish; None if others were not tried."""
     best: bool = False
-    """It swims, and is the best so far."""
+    """Whether the policy swims, and is the best until now."""
 
     @property
     def merit(self) -> float:
-        """The figure that the best policy is chosen by."""
+        """Figure by which the best policy is chosen."""
         return self.relative_thrust if self.worst is None else self.worst
 
 
@@ -79,113 +79,123 @@ def judge(
     settle: float,
     camera: Camera | None = None,
 ) -> Report:
-    """Let a policy swim the simulated fish of `config`, from rest, as a controller does.
+    """Return the report of a swim of a policy, from rest, on the simulated fish of `config`.
 
-    seconds, settle: as for `fishd.lab.simulation.simulate` [s]
-    camera: what it sees the fish with, if it sees any
+    seconds, settle: lengths as for `fishd.lab.simulation.simulate` [s]
+    camera: camera of a policy that sees pictures
 
-    Raises `ParameterError` where the lengths do not fit one another.
+    Raises `ParameterError` where the lengths do not agree.
     """
     config = replace(config, robot="simulated", start=Start())
     sights: list[SimulatedSight] = []
 
-    def begun(run: VirtualRun) -> None:
+    def attach_camera(run: VirtualRun) -> None:
         if camera and run.loop.robot.truth:
-            sights.append(camera.on(run.loop.robot.truth, config.tick))
+            sights.append(camera.make_sight(run.loop.robot.truth, config.tick))
 
-    def decided(seen: Observation) -> float:
-        return decide(seen, sights[0].look(seen.time) if sights else None)
+    def decide_with_frames(observation: Observation) -> float:
+        return decide(observation, sights[0].look(observation.time) if sights else None)
 
-    controller = FunctionController(config, decided)
-    return simulation.judge(config, "policy", controller, seconds, settle, None, begun)
+    controller = FunctionController(config, decide_with_frames)
+    return simulation.judge(config, "policy", controller, seconds, settle, None, attach_camera)
 
 
-def in_simulation(
+def evaluate_in_simulation(
     config: Config, decide: Decide, settings: EvaluationSettings, camera: Camera | None = None
 ) -> Evaluation:
-    """Evaluate on a new fish as configured, not a randomised one, and with other noise."""
+    """Return the evaluation on the configured fish, not a randomised one, with other noise."""
     noise = replace(config.simulation, seed=config.simulation.seed + 1)
     if camera:
         light = replace(camera.settings, seed=camera.settings.seed + 1)
         camera = replace(camera, settings=light)
-    found = judge(
+    report = judge(
         replace(config, simulation=noise), decide, settings.seconds, settings.settle, camera
     )
     return Evaluation(
-        thrust=float(found.mean_thrust),
-        relative_thrust=float(found.relative_thrust),
-        frequency=float(found.frequency),
-        fullness=float(found.fullness),
-        stalled=is_stalled(found.frequency, found.fullness, config.tick),
+        thrust=float(report.mean_thrust),
+        relative_thrust=float(report.relative_thrust),
+        frequency=float(report.frequency),
+        fullness=float(report.fullness),
+        stalled=is_stalled(report.frequency, report.fullness, config.tick),
     )
 
 
-def worst_of_others(
+def worst_on_others(
     config: Config, decide: Decide, settings: TrainingSettings, camera: Camera | None = None
 ) -> float:
-    """Lowest relative thrust on fish of the randomisation, each over its own optimum.
+    """Return the lowest relative thrust on fish of the randomisation, each over its own optimum.
 
-    At the edges each begins with rapid reversals, which some policies never leave. In the range
-    they swim as `ppo` does, with the shortest dwell; who insists on less counts as worth nothing.
+    At the edges each swim begins with rapid reversals, which some policies never leave. In the
+    range policies swim as in `ppo`, with the shortest dwell; the relative thrust of a policy that
+    continues to reverse faster is 0.
     """
-    swim = _at_edge if settings.evaluation.others_from == "edges" else _in_range
+    swim = _swim_at_edge if settings.evaluation.others_from == "edges" else _swim_in_range
     seeds = range(settings.evaluation.others)
     return min(swim(config, decide, settings, camera, seed) for seed in seeds)
 
 
-def _at_edge(
+def _swim_at_edge(
     config: Config,
     decide: Decide,
     settings: TrainingSettings,
     camera: Camera | None,
     seed: int,
 ) -> float:
-    fish, found = at_edge(config, settings.randomisation, seed), settings.evaluation
-    return judge(fish, _shaken(decide, config), found.seconds, found.settle, camera).relative_thrust
+    fish, lengths = draw_edge_fish(config, settings.randomisation, seed), settings.evaluation
+    return judge(
+        fish, _shake_first(decide, config), lengths.seconds, lengths.settle, camera
+    ).relative_thrust
 
 
-def _in_range(
+def _swim_in_range(
     config: Config,
     decide: Decide,
     settings: TrainingSettings,
     camera: Camera | None,
     seed: int,
 ) -> float:
-    fish, found = drawn(config, settings.randomisation, seed), settings.evaluation
+    fish, lengths = draw_fish(config, settings.randomisation, seed), settings.evaluation
     limits = fish.limits
     limit = DwellLimit(limits.dwell, limits, fish.amplitude_limit)
 
-    def limited(observation: Observation, stack: Stack | None) -> float:
+    def decide_limited(observation: Observation, stack: Stack | None) -> float:
         return limit.apply(decide(observation, stack), observation.dt)
 
-    report = judge(fish, limited, found.seconds, found.settle, camera)
+    report = judge(fish, decide_limited, lengths.seconds, lengths.settle, camera)
     return 0.0 if report.fallback else report.relative_thrust
 
 
 def beat_frequency(shares: NDArray[np.float64], tick: float) -> float:
-    """Tail beats per second, from a command's changes of side; 0 for less than a beat [Hz].
+    """Return the tail-beat frequency from the reversals of a command; 0 for less than a beat [Hz].
 
-    shares: φ_c/Φ of successive ticks; what is too small to swim with is on neither side
-    tick: [s]
+    shares: φ_c/Φ of successive ticks; values below `MIN_FULLNESS` are on neither side
+    tick: period of the loop [s]
     """
-    sides = np.sign(shares[np.abs(shares) >= STALLED])
+    sides = np.sign(shares[np.abs(shares) >= MIN_FULLNESS])
     reversals = int(np.count_nonzero(np.diff(sides)))
     return reversals / (2.0 * len(shares) * tick) if reversals > 1 else 0.0
 
 
 def is_stalled(frequency: float, fullness: float, tick: float) -> bool:
-    """Does a policy that beats so often [Hz] and so fully not swim? tick: period of the loop [s]"""
-    return frequency == 0.0 or fullness < STALLED or 2.0 * frequency * tick > CHATTER
+    """Return whether a policy does not swim.
+
+    frequency: tail-beat frequency [Hz]
+    fullness: mean |φ_c|/Φ
+    tick: period of the loop [s]
+    """
+    return (
+        frequency == 0.0 or fullness < MIN_FULLNESS or 2.0 * frequency * tick > MAX_REVERSAL_SHARE
+    )
 
 
-def _shaken(decide: Decide, config: Config) -> Decide:
-    """Reverse in every tick at first, and decide only then."""
+def _shake_first(decide: Decide, config: Config) -> Decide:
+    """Return a policy that reverses in every tick for `SHAKE_TIME_S`, then decides as given."""
     ticks = itertools.count()
 
-    def decided(observation: Observation, stack: Stack | None) -> float:
+    def decide_later(observation: Observation, stack: Stack | None) -> float:
         tick = next(ticks)
-        if tick * config.tick < SHAKE:
+        if tick * config.tick < SHAKE_TIME_S:
             return config.amplitude_limit * (-1.0) ** tick
         return decide(observation, stack)
 
-    return decided
+    return decide_later

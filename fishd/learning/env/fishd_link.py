@@ -1,4 +1,4 @@
-"""The link to a running fishd, on the robot or with a simulated fish: its controller `remote`."""
+"""The link to a running fishd, real or simulated, by its controller `remote`."""
 
 import contextlib
 import time
@@ -18,22 +18,22 @@ from fishd.core.errors import FishError, LeaseLost, NoDaemon, PolicyError, Refus
 from fishd.core.signals import Observation, Reason, Status
 from fishd.learning.env.link import LinkLost, StepResult
 
-PATIENCE = 10.0
-"""How long the fish may take to begin, or to go on [s]."""
-GIVE_UP = 5.0
-"""After so long without frames the camera counts as lost [s]; one that is restarted is back."""
-SILENCE = 1.0
-"""After so long without an observation, fishd is asked for its status [s]."""
+OBSERVATION_TIMEOUT_S = 10.0
+"""Time without an observation after which control counts as lost [s]."""
+FRAMES_TIMEOUT_S = 5.0
+"""Time without frames after which the camera counts as lost [s]; a restart takes less."""
+STATUS_INTERVAL_S = 1.0
+"""Time without an observation after which the status of fishd is requested [s]."""
 
 
 def config_of(endpoint: str | None) -> dict[str, Any]:
-    """The configuration of a running fishd, for `adopt`; raises `FishError`."""
+    """Return the configuration of a running fishd, for `adopt`; raises `FishError`."""
     with Fish(endpoint) as fish:
         return fish.config()
 
 
-def other_plant(config: Config, theirs: dict[str, Any]) -> str:
-    """How the plant of a configuration differs from that of fishd; empty where it does not."""
+def plant_differences(config: Config, theirs: dict[str, Any]) -> str:
+    """Return the differences of the plant of a configuration from that of fishd; empty if none."""
     ours: dict[str, Any] = msgspec.to_builtins(config.plant)
     return ", ".join(
         f"plant.{key} is {value!r} here, {theirs.get(key)!r} there"
@@ -43,14 +43,14 @@ def other_plant(config: Config, theirs: dict[str, Any]) -> str:
 
 
 class FishdLink:
-    """Makes `remote` the active controller of a fishd, and is its agent.
+    """The link to a fishd: makes `remote` its active controller, and is the agent of it.
 
     With `lockstep: true` and `start.controller: remote` fishd waits for its agent from its first
-    tick on: then all numbers are those of a `SimulatedLink`, bit by bit.
+    tick on; then all results equal those of a `SimulatedLink`, bit by bit.
     """
 
     config: Config | None
-    """None: which fish swims is not known."""
+    """None: the parameters of the fish are not known."""
 
     def __init__(
         self,
@@ -65,15 +65,15 @@ class FishdLink:
     ) -> None:
         """
         endpoint: control socket of the fishd; None looks for that of this machine
-        experiment: what the lease of the fish is called, as `fishctl status` shows it
-        take: take the fish from an experiment that holds it
-        address: where that fishd can reach this program, as for `Agent`; None: where fishd waits
-            for an agent already, else any free port of this machine
-        deadline: how long a tick waits for an action [s]; None for fishd's default
-        stack: which frames of a camera are wanted; None: none
-        camera: where that camera takes requests; None: as for `CameraClient`
+        experiment: name of the lease, as `fishctl status` shows it
+        take: whether to take the fish from an experiment that holds it
+        address: address at which fishd reaches this program, as for `Agent`; None: the address at
+            which fishd waits for an agent, else any free port of this machine
+        deadline: time that a tick waits for an action [s]; None for the default of fishd
+        stack: frames of the camera that an observation needs; None without a camera
+        camera: request address of the camera; None: as for `CameraClient`
 
-        Raises `NoDaemon` when no fishd answers, `Refused` while it is in mode fault or estop or
+        Raises `NoDaemon` when no fishd answers, `Refused` while fishd is in mode fault or estop or
         another experiment holds the fish, `CameraLost` when no camera answers, `PolicyError` where
         its frames do not suit `stack`, and `FishError` when the address cannot be bound.
         """
@@ -83,12 +83,12 @@ class FishdLink:
         try:
             status = self._fish.status()
             if status.reason:
-                raise Refused(status.mode, _fault(status.mode, status.reason))
+                raise Refused(status.mode, _format_fault(status.mode, status.reason))
             if stack:
                 self._sight = LiveSight(camera, self._fish, stack)
                 self._sight.await_frames()
             self._take_lease(take)
-            self._agent = _agent(address, status)
+            self._agent = _make_agent(address, status)
         except BaseException:
             self._lease.close()
             self._close_sight()
@@ -96,89 +96,89 @@ class FishdLink:
             raise
         self._deadline = deadline
         self._begun = self._paused = self._closed = False
-        self._known = status
+        self._acquired = status
         """Status of fishd when control was acquired."""
-        self._seen = time.monotonic()
-        """When the camera last showed a whole stack [s, monotonic]."""
-        self._taken = 0.0
-        """When the latest observation came [s, monotonic]."""
+        self._stack_time = time.monotonic()
+        """Time of the latest whole stack of frames [s, monotonic]."""
+        self._received = 0.0
+        """Time at which the latest observation arrived [s, monotonic]."""
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
         self.config = None
 
     def reset(self, seed: int = 0, new: bool = False) -> Observation:
-        """The observation that the next action answers; the fish swims on from where it is.
+        """Return the observation that the next action answers; the fish swims on from its state.
 
-        Makes `remote` the active controller where fishd does not wait for this agent already; only
-        the first time is it taken from another controller. Raises `LinkLost`; once fishd is idle,
-        another reset begins anew.
+        Makes `remote` the active controller, unless fishd waits for this agent already. Another
+        controller is replaced only the first time. Raises `LinkLost`; once fishd is idle, another
+        reset acquires control again.
         """
         self._check_open()
-        self._seen = time.monotonic()
+        self._stack_time = time.monotonic()
         if self._paused and self._agent.active:
             return self.resume()
         if self._begun and self._is_fresh():
-            return self._asked()
+            return self._pending()
         self._paused = False
         try:
             status = self._fish.status()
             if not self._is_ours(status):
                 if self._begun and status.mode == "running":
-                    raise LinkLost(f"{self._lost(status)}; 'fishctl stop' frees the fish")
+                    raise LinkLost(f"{self._lost_error(status)}; 'fishctl stop' frees the fish")
                 self._take_lease()
                 self._fish.set_controller(
                     "remote", agent=self._agent.address, deadline=self._deadline
                 )
                 self._agent.active = False
-            elif self._agent.latest and (self._agent.poll(SILENCE) or self._agent.active):
-                self._begun, self._known, self._taken = True, status, time.monotonic()
-                return self._agent.latest  # for which fishd still waits, in lockstep
+            elif self._agent.latest and (self._agent.poll(STATUS_INTERVAL_S) or self._agent.active):
+                self._begun, self._acquired, self._received = True, status, time.monotonic()
+                return self._agent.latest  # in lockstep, fishd still waits for its answer
         except (NoDaemon, Refused) as error:
             raise LinkLost(str(error)) from None
-        self._begun, self._known = True, status
-        return self._next(begun=False)
+        self._begun, self._acquired = True, status
+        return self._await_next(begun=False)
 
     def step(self, angle: float) -> StepResult:
-        """Answer the latest observation, and wait for the next one; raises `LinkLost`."""
-        asked = self._asked()
+        """Answer the latest observation, and return the next one; raises `LinkLost`."""
+        observed = self._pending()
         self._agent.act(angle)
-        found = self._next()
-        # A tick of a pause is not counted as lost there, but no action was applied in it either.
-        applied = found.answered == asked.seq
-        return StepResult(found, max(self._agent.lost, 0 if applied else 1))
+        following = self._await_next()
+        # The agent does not count a tick of a pause as lost, but its action was not applied.
+        applied = following.answered == observed.seq
+        return StepResult(following, max(self._agent.lost, 0 if applied else 1))
 
     def look(self) -> Stack | None:
-        """What the camera shows; in lockstep, once it has come so far.
+        """Return the frames for the latest observation; in lockstep, wait for them.
 
-        After `GIVE_UP` without, it raises `LinkLost`, with the fish at neutral.
+        After `FRAMES_TIMEOUT_S` without frames, raise `LinkLost`, with the fish at neutral.
         """
         if self._sight is None:
             return None
         try:
-            stack = self._sight.look(self._asked().time)
+            stack = self._sight.look(self._pending().time)
         except (CameraLost, PolicyError) as error:
             raise LinkLost(str(error)) from None
         now = time.monotonic()
         if stack is not None:
-            self._seen = now
-        elif now - self._seen > GIVE_UP:
-            self.pause(PATIENCE)  # to find out why takes longer than fishd waits
+            self._stack_time = now
+        elif now - self._stack_time > FRAMES_TIMEOUT_S:
+            self.pause(OBSERVATION_TIMEOUT_S)  # to find the cause takes longer than fishd waits
             raise LinkLost(str(self._sight.lost()))
         return stack
 
     def pause(self, seconds: float) -> None:
-        """Let the fish wait at neutral, or stand still in lockstep, for `seconds` at most."""
-        self._asked()
+        """Hold the fish at neutral for `seconds` at most; in lockstep, its time stands still."""
+        self._pending()
         self._agent.pause(min(seconds, 3600.0))
         self._paused = True
 
     def resume(self) -> Observation:
-        """End the pause; an observation from after it. Raises `LinkLost`."""
-        self._seen = time.monotonic()
+        """End the pause, and return the next observation. Raises `LinkLost`."""
+        self._stack_time = time.monotonic()
         self._paused = False
-        self._asked()
+        self._pending()
         self._agent.resume()
-        return self._next()
+        return self._await_next()
 
     def close(self) -> None:
         """Leave the fish at neutral, where this agent still controls it; may be called twice."""
@@ -188,7 +188,9 @@ class FishdLink:
         if self._begun:
             with contextlib.suppress(FishError):
                 if self._agent.active and self._agent.latest:
-                    self._agent.pause(PATIENCE)  # what follows may take longer than fishd waits
+                    self._agent.pause(
+                        OBSERVATION_TIMEOUT_S
+                    )  # the rest may take longer than fishd waits
                 if self._is_ours(self._fish.status()):
                     self._fish.stop()
         self._lease.close()
@@ -214,62 +216,62 @@ class FishdLink:
         if self._closed:
             raise LinkLost("this link to fishd is closed; make another one")
 
-    def _asked(self) -> Observed:
-        """The observation to be answered, while this agent controls the fish."""
+    def _pending(self) -> Observed:
+        """Return the observation to be answered; raises `LinkLost`."""
         self._check_open()
         if self._agent.latest is None or not self._agent.active:
-            raise self._lost()
+            raise self._lost_error()
         return self._agent.latest
 
     def _is_fresh(self) -> bool:
-        """Does fishd still wait for the answer to the latest observation, as far as is known?"""
+        """Return whether fishd probably still waits for the answer to the latest observation."""
         if self._agent.poll():
-            self._taken = time.monotonic()
-        return self._agent.active and time.monotonic() - self._taken < SILENCE
+            self._received = time.monotonic()
+        return self._agent.active and time.monotonic() - self._received < STATUS_INTERVAL_S
 
-    def _next(self, *, begun: bool = True) -> Observed:
-        """The next observation, of the same session if one had begun."""
+    def _await_next(self, *, begun: bool = True) -> Observed:
+        """Return the next observation; begun: whether it must be of the same session."""
         before = self._agent.latest
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + OBSERVATION_TIMEOUT_S
         while time.monotonic() < deadline:
-            found = self._agent.poll(SILENCE)
-            if found:
-                self._taken = time.monotonic()
-            if found and begun and before and found.session != before.session:
+            observed = self._agent.poll(STATUS_INTERVAL_S)
+            if observed:
+                self._received = time.monotonic()
+            if observed and begun and before and observed.session != before.session:
                 raise LinkLost(
                     "fishd has begun a new session with this agent: perhaps it was restarted"
                 )
-            if found:
-                return found
+            if observed:
+                return observed
             if begun and not self._agent.active:
                 break
-            self._check()
-        raise self._lost()
+            self._check_agent()
+        raise self._lost_error()
 
-    def _check(self) -> None:
-        """Raises `LinkLost` where fishd says that this agent is not the one of its `remote`."""
+    def _check_agent(self) -> None:
+        """Raise `LinkLost` unless this is the agent of the controller `remote` of fishd."""
         try:
             status = self._fish.status()
         except NoDaemon as error:
             self._agent.active = False
             raise LinkLost(str(error)) from None
         if not self._is_ours(status):
-            raise self._lost(status)
+            raise self._lost_error(status)
 
     def _is_ours(self, status: Status) -> bool:
-        """Is this the agent that fishd asks, or waits for?"""
+        """Return whether fishd uses, or waits for, this agent."""
         return _waits_for_an_agent(status) and (
             (self._agent.active and not self._is_another(status))
             or status.parameters["agent"] == self._agent.address
         )
 
     def _is_another(self, status: Status) -> bool:
-        """Is that another fishd than the one whose fish was controlled?"""
-        known = self._known
-        return status.pid != known.pid or status.uptime < known.uptime
+        """Return whether the status is that of another fishd than the one that was controlled."""
+        acquired = self._acquired
+        return status.pid != acquired.pid or status.uptime < acquired.uptime
 
-    def _lost(self, status: Status | None = None) -> LinkLost:
-        """Why control was lost, in fishd's own words where it says so."""
+    def _lost_error(self, status: Status | None = None) -> LinkLost:
+        """Return the error of a lost control, with the reason that fishd gives if it gives one."""
         self._agent.active = False
         try:
             status = status or self._fish.status()
@@ -277,14 +279,14 @@ class FishdLink:
             return LinkLost(str(error))
         if self._is_another(status):
             return LinkLost(
-                f"fishd was restarted: it is process {status.pid} now, and was {self._known.pid}"
+                f"fishd was restarted: it is process {status.pid} now, and was {self._acquired.pid}"
             )
         if status.reason:
-            return LinkLost(_fault(status.mode, status.reason))
+            return LinkLost(_format_fault(status.mode, status.reason))
         if self._is_ours(status):
             return LinkLost(
                 f"fishd at {self._fish.endpoint} has sent no observation to {self._agent.address} "
-                f"within {PATIENCE:g} s"
+                f"within {OBSERVATION_TIMEOUT_S:g} s"
             )
         if _waits_for_an_agent(status):
             return LinkLost(f"another agent has taken command: {status.parameters['agent']}")
@@ -292,10 +294,10 @@ class FishdLink:
             return LinkLost(f"another controller has taken command: {status.controller}")
         if status.lease_expired:
             return LinkLost(status.lease_expired.message)
-        return LinkLost("fishd was told to stop")
+        return LinkLost("fishd received a request to stop")
 
 
-def _fault(mode: str, reason: Reason) -> str:
+def _format_fault(mode: str, reason: Reason) -> str:
     return (
         f"fishd is in mode {mode}: {reason.message}; when that is mended, leave it with 'fishctl "
         "clear-fault'"
@@ -306,10 +308,10 @@ def _waits_for_an_agent(status: Status) -> bool:
     return status.mode == "running" and status.controller == "remote"
 
 
-def _agent(address: str | None, status: Status) -> Agent:
+def _make_agent(address: str | None, status: Status) -> Agent:
     if address is not None:
         return Agent(address)
     if _waits_for_an_agent(status):
-        with contextlib.suppress(FishError):  # another agent is there, or that is another machine
+        with contextlib.suppress(FishError):  # the address is in use, or on another machine
             return Agent(status.parameters["agent"])
     return Agent()

@@ -12,36 +12,36 @@ from fishd.core.signals import Observation
 
 
 class LinkLost(FishdError, ConnectionError):
-    """The fish is gone, or the agent no longer controls it; the message says why."""
+    """Error of an agent that no longer controls the fish; the message says why."""
 
 
 class StepResult(NamedTuple):
-    """What came of one step."""
+    """The result of one step."""
 
     observation: Observation
     lost: int = 0
-    """Ticks since the previous observation in which another angle than the action was applied."""
+    """Number of ticks since the previous observation with another angle than the action."""
     power: float | None = None
-    """Mean electrical power of the servo since then [W]; None where it is not known."""
+    """Mean electrical power of the servo since the previous observation [W]; None if unknown."""
 
 
 class Link(Protocol):
-    """One fish, and the agent that controls it."""
+    """A connection of the agent to the fish that it controls."""
 
     tick: float
     """Period of the loop [s]."""
     amplitude: float
-    """Φ [rad]"""
+    """Amplitude limit Φ [rad]."""
 
     @property
     def config(self) -> Config | None:
-        """The fish that swims now, where that is known."""
+        """Configuration of the fish that swims now; None if unknown."""
 
     def reset(self, seed: int = 0, new: bool = False) -> Observation:
-        """Acquire control, if it is not held yet; the observation that the next action answers.
+        """Acquire control if necessary; return the observation that the next action answers.
 
-        seed: of the noise and of the parameters, where a new fish begins
-        new: begin with a new fish at rest, where that is possible; a real one swims on
+        seed: seed of the noise and of the parameters of a new fish
+        new: start a new fish at rest, if it is simulated; a real fish swims on
 
         Raises `LinkLost`.
         """
@@ -50,19 +50,21 @@ class Link(Protocol):
         """Apply an instruction angle [rad] for one tick; raises `LinkLost`."""
 
     def look(self) -> Stack | None:
-        """The frames for the latest observation.
+        """Return the frames for the latest observation; to be called once a tick.
 
-        None if the camera has not shown them yet, and without a camera; to be asked once a tick.
+        None without a camera, and if the camera has not delivered them yet.
         """
 
     def pause(self, seconds: float) -> None:
-        """Stay at neutral while the agent learns, for `seconds` at most; raises `LinkLost`.
+        """Hold the fish at neutral while the agent learns, for `seconds` at most.
 
-        Virtual time stands still instead.
+        Raises `LinkLost`.
+
+        In simulation, virtual time stands still instead.
         """
 
     def resume(self) -> Observation:
-        """End the pause; the observation that the next action answers. Raises `LinkLost`."""
+        """End the pause; return the observation that the next action answers. Raises `LinkLost`."""
 
     def close(self) -> None:
         """Leave the fish at neutral; may be called twice."""

@@ -1,4 +1,4 @@
-"""The environments as `gymnasium.make` knows them."""
+"""The registration of the environments with `gymnasium.make`."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,15 +12,15 @@ if TYPE_CHECKING:
 
 
 def register() -> None:
-    """Register both with Gymnasium if it is installed: comparing controllers works without it."""
+    """Register both environments with Gymnasium, if it is installed: comparisons do not need it."""
     try:
         import gymnasium
     except ModuleNotFoundError:
         return
-    here = __name__
-    gymnasium.register("fishd/Swim-v0", entry_point=f"{here}:swim")
+    module = __name__
+    gymnasium.register("fishd/Swim-v0", entry_point=f"{module}:swim")
     gymnasium.register(
-        "fishd/SwimOnDaemon-v0", entry_point=f"{here}:swim_on_daemon", nondeterministic=True
+        "fishd/SwimOnDaemon-v0", entry_point=f"{module}:swim_on_daemon", nondeterministic=True
     )
 
 
@@ -30,23 +30,24 @@ def swim(
     overrides: Iterable[str] = (),
     camera: str | Path | None = None,
 ) -> "SwimEnv":
-    """A simulated fish in this process, on the virtual clock.
+    """Return the environment of a simulated fish in this process, on the virtual clock.
 
-    config, overrides: as for fishd, a YAML file and `KEY=VALUE`s; by default the default fish
+    config, overrides: configuration as for fishd, a YAML file and `KEY=VALUE`s; by default the
+        default fish
     settings: YAML file of a training, of which `see`, `environment`, `camera` and `randomisation`
-        count; an eye that has to learn to see babbles first
-    camera: YAML file of the simulated camera, where the settings say `see: camera` or `both`
+        are used; an eye that must be fitted is fitted to a babble first
+    camera: YAML file of the simulated camera, for settings with `see: camera` or `both`
 
     Raises `ConfigError`.
     """
     from fishd.camera import settings as cameras
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.env.simulated_link import Camera, SimulatedLink
-    from fishd.learning.eyes.making import make
+    from fishd.learning.eyes.making import make_eye
 
     fish = load(config, overrides)
     chosen = training.load(settings)
-    eye = make(chosen)
+    eye = make_eye(chosen)
     sight = Camera(cameras.simulated(camera), chosen.camera.stack) if eye else None
     metered = bool(chosen.seen.power_price)
     link = SimulatedLink(fish, chosen.randomisation, sight, metered=metered)
@@ -67,26 +68,25 @@ def swim_on_daemon(
     experiment: str = "environment",
     take: bool = False,
 ) -> "SwimEnv":
-    """The fish of a running fishd, whose lease this process holds until the environment is closed.
+    """Return the environment of the fish of a running fishd; it holds the lease until it is closed.
 
-    endpoint: control socket of the daemon; None looks for the one on this machine
-    config, overrides: the configuration that the scales are made for; without a file, that of the
-        daemon
-    agent: where the daemon can reach this process, as for `Agent`; None: any free port of this
-        machine
-    camera: where its camera takes requests, where the settings say `see: camera` or `both`
-    experiment: what the lease is called, as `fishctl status` shows it
-    take: take the fish from an experiment that holds it
+    endpoint: control socket of fishd; None looks for the fishd of this machine
+    config, overrides: configuration that the scales are computed from; by default that of fishd
+    agent: address at which fishd reaches this process, as for `Agent`; None: any free port of
+        this machine
+    camera: request address of the camera, for settings with `see: camera` or `both`
+    experiment: name of the lease, as `fishctl status` shows it
+    take: whether to take the fish from an experiment that holds it
 
-    Raises `ConfigError`, also where tick or Φ are not the daemon's, and `FishError`.
+    Raises `ConfigError`, also where tick or Φ differ from those of fishd, and `FishError`.
     """
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.env.fishd_link import FishdLink, config_of
-    from fishd.learning.eyes.making import make
+    from fishd.learning.eyes.making import make_eye
 
     chosen = training.load(settings)
     fish = load(config, overrides) if config else adopt(config_of(endpoint), overrides)
-    eye = make(chosen)
+    eye = make_eye(chosen)
     stack = chosen.camera.stack if eye else None
     link = FishdLink(endpoint, experiment, take, address=agent, stack=stack, camera=camera)
     try:

@@ -1,4 +1,4 @@
-"""A simulated fish in this process, on the virtual clock: the robot's own loop, far faster."""
+"""The link to a simulated fish in this process, with the loop of the robot in virtual time."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -19,46 +19,50 @@ from fishd.core.signals import Observation, Truth
 from fishd.learning.env.link import LinkLost, StepResult
 from fishd.learning.settings import Randomisation
 
-_VARIED = ("omega0", "xi", "servo_speed", "coupling")
-_VARIED_TOO = ("servo_lag", "thrust_coefficient", "lateral_drag")
-"""Parameters of the plant that a randomisation has a share for."""
-_ADDED = ("servo_delay", "servo_dead_zone", "backlash")
-"""Those that become larger by up to the randomisation."""
+_FIRST_VARIED = ("omega0", "xi", "servo_speed", "coupling")
+_LATER_VARIED = ("servo_lag", "thrust_coefficient", "lateral_drag")
+"""Parameters of the plant that a randomisation has a share for, in the order of the draws: the
+later ones are drawn after the noise and the offset."""
+_INCREASED = ("servo_delay", "servo_dead_zone", "backlash")
+"""Parameters of the plant that a randomisation increases by up to its value."""
 
 
-def drawn(config: Config, spread: Randomisation, seed: int) -> Config:
-    """A fish and a rig from anywhere in the range, to train on for a fish that is not known."""
-    draw = np.random.default_rng(seed)
+def draw_fish(config: Config, spread: Randomisation, seed: int) -> Config:
+    """Return a random fish and rig of the range, to train on for a fish that is not known."""
+    random = np.random.default_rng(seed)
     if spread.fish:
-        config = replace(config, plant=spread.fish[int(draw.integers(len(spread.fish)))])
-    return _varied(config, spread, lambda: draw.uniform(-1.0, 1.0), int(draw.integers(2**31)))
+        config = replace(config, plant=spread.fish[int(random.integers(len(spread.fish)))])
+    return _vary(config, spread, lambda: random.uniform(-1.0, 1.0), int(random.integers(2**31)))
 
 
-def at_edge(config: Config, spread: Randomisation, seed: int) -> Config:
-    """A fish and a rig with every varied parameter at one end of its range, to evaluate on.
+def draw_edge_fish(config: Config, spread: Randomisation, seed: int) -> Config:
+    """Return a fish and rig with every varied parameter at one end of its range, to evaluate on.
 
-    Of a list of fish it is the one of this number, from the beginning again after the last.
+    A list of fish is indexed by the seed, modulo its length.
     """
-    draw = np.random.default_rng(seed)
+    random = np.random.default_rng(seed)
     if spread.fish:
         config = replace(config, plant=spread.fish[seed % len(spread.fish)])
-    return _varied(config, spread, lambda: float(draw.choice((-1.0, 1.0))), config.simulation.seed)
+    return _vary(config, spread, lambda: float(random.choice((-1.0, 1.0))), config.simulation.seed)
 
 
-def _varied(
+def _vary(
     config: Config, spread: Randomisation, place: Callable[[], float], noise_seed: int
 ) -> Config:
-    """place: draws for one parameter its place in the range, from -1 to 1"""
+    """Return a varied configuration.
 
-    def varied(value: float, share: float) -> float:
+    place: draws the place of a parameter in its range, from -1 to 1
+    """
+
+    def vary(value: float, share: float) -> float:
         return value * math.exp(place() * math.log1p(share))
 
     plant, rig = config.plant, config.simulation
-    changed = {name: varied(getattr(plant, name), getattr(spread, name)) for name in _VARIED}
-    noise = varied(rig.noise, spread.noise)
+    changed = {name: vary(getattr(plant, name), getattr(spread, name)) for name in _FIRST_VARIED}
+    noise = vary(rig.noise, spread.noise)
     offset_y = rig.offset_y + spread.offset * place()
-    changed |= {name: varied(getattr(plant, name), getattr(spread, name)) for name in _VARIED_TOO}
-    for name in _ADDED:
+    changed |= {name: vary(getattr(plant, name), getattr(spread, name)) for name in _LATER_VARIED}
+    for name in _INCREASED:
         changed[name] = getattr(plant, name) + 0.5 * (1.0 + place()) * getattr(spread, name)
     changed["servo_reaction"] = plant.servo_reaction + spread.servo_reaction * place()
     rotation = rig.rotation + spread.rotation * place()
@@ -74,35 +78,35 @@ class _NoParameters(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FunctionController(Controller[_NoParameters]):
-    """Any function as a controller."""
+    """A controller that calls a function."""
 
     Parameters = _NoParameters
 
     def __init__(self, config: Config, decide: Callable[[Observation], float]) -> None:
-        """decide: observation in, instruction angle out [rad]; called once a tick"""
+        """decide: returns the instruction angle for an observation [rad]; called once a tick"""
         super().__init__(_NoParameters(), config.limits)
         self._decide = decide
 
     def update(self, observation: Observation) -> float:
-        """What the function returns [rad]."""
+        """Return the angle that the function returns [rad]."""
         return self._decide(observation)
 
 
 class Camera(Struct, frozen=True):
-    """A simulated camera, and which of its frames an agent is shown."""
+    """A simulated camera, and the stack of its frames that an agent receives."""
 
     settings: SimulatedCameraSettings
     stack: StackSettings
 
-    def on(self, truth: Callable[[], Truth], tick: float) -> SimulatedSight:
-        """Look at a fish that is at rest; tick: period of the loop [s]"""
+    def make_sight(self, truth: Callable[[], Truth], tick: float) -> SimulatedSight:
+        """Return the sight of a fish that is at rest; tick: period of the loop [s]."""
         return SimulatedSight(self.settings, self.stack, tick, truth)
 
 
 class SimulatedLink:
     """The link to a `ControlLoop` on a `SimulatedFish` in the same process.
 
-    Each turn of the loop is split: the agent decides between its two halves, while virtual time
+    Each tick of the loop is split: the agent decides between its two halves, while virtual time
     stands still.
     """
 
@@ -116,9 +120,9 @@ class SimulatedLink:
     ) -> None:
         """
         config: fish, rig, tick and limits; its robot and start are ignored
-        randomisation: how much the fish and rig of each episode vary; by default not at all
-        camera: what looks at the fish, if anything does
-        metered: False where the power of the servo has no reader, which is quicker
+        randomisation: ranges of the fish and rig of each episode; by default they do not vary
+        camera: camera that sees the fish; None: it is not seen
+        metered: whether to compute the power of the servo; False is faster
 
         Raises `ConfigError` for a fish that swims freely.
         """
@@ -126,7 +130,7 @@ class SimulatedLink:
         self.tick = config.tick
         self.amplitude = config.amplitude_limit
         self.config = replace(config, robot="simulated", start=Start())
-        """The fish that swims now, as drawn."""
+        """Configuration of the fish that swims now, as drawn."""
         self._nominal = self.config
         self._randomisation = randomisation or Randomisation()
         self._varies = self._randomisation != Randomisation()
@@ -139,15 +143,15 @@ class SimulatedLink:
         self._turn: Turn | None = None
 
     def reset(self, seed: int = 0, new: bool = False) -> Observation:
-        """A fish at rest where it is to be new, is randomised or is the first; else it swims on."""
+        """Start a new fish at rest if requested, randomised or the first; else let it swim on."""
         if self._turn is None or new or self._varies:
             config = self._nominal
-            self.config = drawn(config, self._randomisation, seed) if self._varies else config
+            self.config = draw_fish(config, self._randomisation, seed) if self._varies else config
             self._begin()
         return self.resume()
 
     def step(self, angle: float) -> StepResult:
-        """Act, and observe what comes of it one tick later."""
+        """Apply an angle [rad], and return the result one tick later."""
         assert self._turn
         self._angle = angle
         self._loop.act(self._turn)
@@ -158,19 +162,19 @@ class SimulatedLink:
         return StepResult(self._turn.observation, power=self._turn.power)
 
     def look(self) -> Stack | None:
-        """What the simulated camera shows."""
+        """Return the frames of the simulated camera; None without a camera."""
         return self._sight.look(self.resume().time) if self._sight else None
 
     def pause(self, seconds: float) -> None:
-        """Nothing: virtual time stands still while the agent learns."""
+        """Do nothing: virtual time stands still while the agent learns."""
 
     def resume(self) -> Observation:
-        """The latest observation."""
+        """Return the latest observation."""
         assert self._turn
         return self._turn.observation
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing: this link holds no resources."""
 
     def _begin(self) -> None:
         config, clock = self.config, VirtualClock()
@@ -180,5 +184,5 @@ class SimulatedLink:
         self._loop.set_controller("agent", FunctionController(config, lambda _: self._angle))
         self._slots = virtual_slots(clock, config.tick)
         if self._camera:
-            self._sight = self._camera.on(fish.truth, config.tick)
+            self._sight = self._camera.make_sight(fish.truth, config.tick)
         self._turn = self._loop.observe(next(self._slots))

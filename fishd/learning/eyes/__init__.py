@@ -1,1 +1,1 @@
-"""Eyes: what turns pictures of the tail into the numbers that a policy's network is given."""
+"""Eyes, which convert pictures of the tail to inputs of the network of a policy."""

@@ -1,4 +1,4 @@
-"""What every eye does: it is fitted to the babble once, then sees stack after stack."""
+"""The base class of eyes: an eye is fitted to the babble once, then converts stacks of frames."""
 
 from abc import ABC, abstractmethod
 from collections import deque
@@ -14,66 +14,66 @@ Array = NDArray[np.float32]
 
 
 Nodes = tuple[list[Any], dict[str, NDArray[Any]]]
-"""Operators of ONNX in the order in which they run, and their constants by name."""
+"""Operators of ONNX in their order of execution, and their constants by name."""
 
 
 class Eye(ABC):
-    """Turns a stack of frames into numbers, by constants that learning does not change.
+    """A conversion of stacks of frames to numbers, with constants that learning does not change.
 
-    They are found once, from the babble: frames of a tail that is driven at random. A policy file
-    carries them in its network.
+    The constants are fitted once, to the babble: frames of a tail that is driven at random. The
+    network of a policy file contains them.
     """
 
     shape: tuple[int, int, int] | None = None
-    """Channels, height and width of what it gives, where that is a picture whose mirror image is
-    that of the mirrored fish; None for numbers that change sign instead."""
+    """Channels, height and width of the output, if that is a picture whose mirror image is that of
+    a mirrored fish; None for numbers that change sign instead."""
     outputs: int
-    """How many numbers it gives."""
+    """Number of outputs."""
     network: Literal["cnn", "nature"] = "cnn"
-    """Which network looks at that picture."""
+    """Network that receives the output picture."""
     shapes: Mapping[str, tuple[int, ...]]
-    """Of its constants, by name."""
+    """Shapes of the constants, by name."""
 
     def __init__(self, stack: StackSettings) -> None:
         self.stack = stack
         self.constants: dict[str, Array] = {}
-        """What the babble taught it, by name; empty until it is fitted."""
+        """Constants by name; empty until the eye is fitted."""
         self._latest: deque[tuple[Pixels, Array]] = deque(maxlen=2 * stack.frames)
-        """Frames that were seen, and what came of each: most are in several stacks."""
+        """Latest frames with their codes, a cache, since a frame is in several stacks."""
 
     @abstractmethod
     def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
-        """Find the constants.
+        """Fit the constants.
 
-        frames: the newest of each tick of the babble, shape (ticks, size, size)
-        angles: instruction angle that was applied until each of these ticks, shape (ticks,) [rad]
+        frames: newest frame of each tick of the babble, shape (ticks, size, size)
+        angles: instruction angle applied until each of these ticks, shape (ticks,) [rad]
 
-        Raises `fishd.camera.axis.NoMotion` where the tail is not to be seen.
+        Raises `fishd.camera.axis.NoMotion` where the tail is not visible.
         """
 
     def see(self, stack: Stack) -> Array:
-        """What it gives, shape (outputs,)."""
-        return self.joined([self._seen(frame) for frame in stack]).ravel()
+        """Return the outputs for a stack, shape (outputs,)."""
+        return self.combine([self._encode_cached(frame) for frame in stack]).ravel()
 
     @abstractmethod
-    def glimpse(self, frame: Pixels) -> Array:
-        """What is made of a single frame, shape (size, size)."""
+    def encode_frame(self, frame: Pixels) -> Array:
+        """Return the code of a single frame; frame: shape (size, size)."""
 
     @abstractmethod
-    def joined(self, glimpses: list[Array]) -> Array:
-        """What it gives for a stack, from what was made of each of its frames."""
+    def combine(self, codes: list[Array]) -> Array:
+        """Return the outputs for a stack from the codes of its frames."""
 
-    def _seen(self, frame: Pixels) -> Array:
-        for known, glimpse in self._latest:
+    def _encode_cached(self, frame: Pixels) -> Array:
+        for known, code in self._latest:
             if known is frame:
-                return glimpse
-        glimpse = self.glimpse(frame)
-        self._latest.append((frame, glimpse))
-        return glimpse
+                return code
+        code = self.encode_frame(frame)
+        self._latest.append((frame, code))
+        return code
 
     @abstractmethod
     def nodes(self, pictures: str, out: str) -> Nodes:
-        """The same as operators of ONNX, and their constants.
+        """Return `see` as operators of ONNX, and their constants.
 
         pictures: name of the stack, float32 of shape (1, frames, size, size)
         out: name of the result, shape (1, outputs), or (1, *shape) for a picture
@@ -81,29 +81,29 @@ class Eye(ABC):
 
     @property
     def is_fitted(self) -> bool:
-        """Has it seen a babble, if it needs one?"""
+        """Whether the eye has all its constants."""
         return set(self.constants) == set(self.shapes)
 
     def restore(self, constants: Mapping[str, Array]) -> None:
-        """Take over constants that were kept; raises ValueError where they are not those."""
-        found = {name: array.shape for name, array in constants.items()}
-        if found != self.shapes:
-            raise ValueError(f"constants of shapes {found}; {dict(self.shapes)} are needed")
+        """Set the constants from a file; raises ValueError where their names or shapes differ."""
+        shapes = {name: array.shape for name, array in constants.items()}
+        if shapes != self.shapes:
+            raise ValueError(f"constants of shapes {shapes}; {dict(self.shapes)} are needed")
         if not all(np.isfinite(array).all() for array in constants.values()):
             raise ValueError("constants that are not finite numbers")
         self.constants = dict(constants)
 
 
-def lit(pictures: NDArray[Any]) -> Array:
-    """Frames over their mean grey level, which takes off how bright the light is."""
+def normalise(pictures: NDArray[Any]) -> Array:
+    """Return frames divided by their mean grey level, which removes the brightness of the light."""
     size = pictures.shape[-1] * pictures.shape[-2]
     sums = pictures.sum(axis=(-2, -1), dtype=np.uint32, keepdims=True)
-    found: Array = pictures * (np.float32(size) / np.maximum(sums, size).astype(np.float32))
-    return found
+    normalised: Array = pictures * (np.float32(size) / np.maximum(sums, size).astype(np.float32))
+    return normalised
 
 
-def lit_nodes(pictures: str, out: str, size: int) -> Nodes:
-    """`lit` as operators of ONNX, on float32 of shape (1, frames, size, size)."""
+def normalise_nodes(pictures: str, out: str, size: int) -> Nodes:
+    """Return `normalise` as operators of ONNX, on float32 of shape (1, frames, size, size)."""
     from onnx import helper
 
     sums, bright, factor, area, plane = (

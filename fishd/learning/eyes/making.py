@@ -1,4 +1,4 @@
-"""Makes the eye that a training asks for, and the babble that it is fitted to."""
+"""The eye of a training, and the babble that it is fitted to."""
 
 import math
 
@@ -10,12 +10,12 @@ from fishd.learning.eyes.modes import ModesEye
 from fishd.learning.eyes.pictures import CnnEye, NatureEye
 from fishd.learning.settings import TrainingSettings
 
-_LONGEST = 6
-"""An angle of the babble is held for up to so many ticks."""
+_MAX_HOLD_TICKS = 6
+"""Largest number of ticks for which an angle of the babble is held."""
 
 
-def make(settings: TrainingSettings) -> Eye | None:
-    """The eye of a training, not yet fitted; None where only forces are seen."""
+def make_eye(settings: TrainingSettings) -> Eye | None:
+    """Return the eye of a training, not yet fitted; None where the agent sees only forces."""
     camera = settings.camera
     if settings.see == "force":
         return None
@@ -26,16 +26,16 @@ def make(settings: TrainingSettings) -> Eye | None:
     return NatureEye(camera.stack)
 
 
-def babble(seed: int, ticks: int, amplitude: float) -> NDArray[np.float64]:
-    """Instruction angles that have nothing to do with what is seen, shape (ticks,) [rad].
+def random_angles(seed: int, ticks: int, amplitude: float) -> NDArray[np.float64]:
+    """Return random instruction angles, independent of the pictures, shape (ticks,) [rad].
 
     The second half is the first one mirrored, so that the mean picture favours no side.
 
-    ticks: how many
-    amplitude: the largest [rad]
+    ticks: number of angles
+    amplitude: largest angle [rad]
     """
     random = np.random.default_rng([seed, 1])
     half = math.ceil(ticks / 2)
     levels = random.uniform(-amplitude, amplitude, half)
-    angles = np.repeat(levels, random.integers(1, _LONGEST + 1, half))[:half]
+    angles = np.repeat(levels, random.integers(1, _MAX_HOLD_TICKS + 1, half))[:half]
     return np.concatenate((angles, -angles))[:ticks]

@@ -1,4 +1,4 @@
-"""The eyes that leave seeing to a network: `cnn` prepares the picture, `nature` does not."""
+"""The eyes that pass pictures to a network: `cnn` preprocesses them, `nature` does not."""
 
 from itertools import pairwise
 
@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 from fishd.camera.axis import find_motion
 from fishd.core.camera_frames import Pixels, StackSettings
-from fishd.learning.eyes.base import Array, Eye, Nodes, lit, lit_nodes
+from fishd.learning.eyes.base import Array, Eye, Nodes, normalise, normalise_nodes
 
 SHRINK = 4
-"""The eye `cnn` averages over squares of so many pixels' side."""
+"""Side of the squares of pixels that the eye `cnn` averages over [px]."""
 
 
 class CnnEye(Eye):
-    """The newest frame and the differences between frames, shrunk, about the axis."""
+    """An eye that returns the newest frame and differences of frames, shrunk, about the axis."""
 
     def __init__(self, stack: StackSettings, align: bool) -> None:
         super().__init__(stack)
@@ -30,15 +30,15 @@ class CnnEye(Eye):
         }
 
     def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
-        """Find axis, mean picture and contrast; see the base class."""
+        """Fit axis, mean picture and contrast; see the base class."""
         size = self.stack.size
         shift = 0.0
         if self._align:
             motion = find_motion(frames)
             column = round(motion.centre)
             shift = float(motion.axis.rows(size, size)[column]) - 0.5 * (size - 1)
-        rows, columns = _shrinking(size, shift), _shrinking(size, 0.0).T.copy()
-        shrunk = np.stack([rows @ frame @ columns for frame in lit(frames)])
+        rows, columns = _shrink_matrix(size, shift), _shrink_matrix(size, 0.0).T.copy()
+        shrunk = np.stack([rows @ frame @ columns for frame in normalise(frames)])
         mean = shrunk.mean(axis=0)
         self.constants = {
             "rows": rows,
@@ -47,23 +47,23 @@ class CnnEye(Eye):
             "scale": np.array([1.0 / (shrunk - mean).std()], np.float32),
         }
 
-    def glimpse(self, frame: Pixels) -> Array:
-        """Deviation from the mean picture, over its deviation in the babble."""
-        found = self.constants
-        small = found["rows"] @ lit(frame) @ found["columns"]
-        return np.asarray((small - found["mean"]) * found["scale"], np.float32)
+    def encode_frame(self, frame: Pixels) -> Array:
+        """Return the difference to the mean picture, over its standard deviation in the babble."""
+        constants = self.constants
+        small = constants["rows"] @ normalise(frame) @ constants["columns"]
+        return np.asarray((small - constants["mean"]) * constants["scale"], np.float32)
 
-    def joined(self, glimpses: list[Array]) -> Array:
-        """The newest, then the differences to older ones."""
-        newest, *_ = glimpses
-        pairs = pairwise(glimpses)
+    def combine(self, codes: list[Array]) -> Array:
+        """Return the newest code, then the differences between successive ones."""
+        newest, *_ = codes
+        pairs = pairwise(codes)
         return np.stack([newest, *(newer - older for newer, older in pairs)])
 
     def nodes(self, pictures: str, out: str) -> Nodes:
-        """See the base class."""
+        """Return `see` as operators of ONNX; see the base class."""
         from onnx import helper
 
-        nodes, constants = lit_nodes(pictures, "lit", self.stack.size)
+        nodes, constants = normalise_nodes(pictures, "lit", self.stack.size)
         last = self.stack.frames - 1
         constants |= {**self.constants, "channel": np.array([1])}
         constants |= {f"at_{k}": np.array([k]) for k in {0, 1, last, last + 1}}
@@ -73,7 +73,7 @@ class CnnEye(Eye):
             helper.make_node("Sub", ["small", "mean"], ["deviation"]),
             helper.make_node("Mul", ["deviation", "scale"], ["glimpses" if last else out]),
         ]
-        if last:  # the newest, then each less the one after it
+        if last:  # the newest, then the differences between successive codes
             end = f"at_{last + 1}"
             nodes += [
                 helper.make_node("Slice", ["glimpses", "at_0", "at_1", "channel"], ["newest"]),
@@ -86,7 +86,7 @@ class CnnEye(Eye):
 
 
 class NatureEye(Eye):
-    """The frames as they are, from 0 to 1, as in the paper."""
+    """An eye that returns the frames unchanged, scaled to 0 to 1, as in the paper."""
 
     network = "nature"
 
@@ -97,28 +97,28 @@ class NatureEye(Eye):
         self.shapes = {}
 
     def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
-        """There is nothing to find."""
+        """Do nothing: this eye has no constants."""
 
-    def glimpse(self, frame: Pixels) -> Array:
-        """Grey levels over 255."""
+    def encode_frame(self, frame: Pixels) -> Array:
+        """Return the grey levels divided by 255."""
         return frame.astype(np.float32) * np.float32(1.0 / 255.0)
 
-    def joined(self, glimpses: list[Array]) -> Array:
-        """See the base class."""
-        return np.stack(glimpses)
+    def combine(self, codes: list[Array]) -> Array:
+        """Return the codes as channels."""
+        return np.stack(codes)
 
     def nodes(self, pictures: str, out: str) -> Nodes:
-        """See the base class."""
+        """Return `see` as operators of ONNX; see the base class."""
         from onnx import helper
 
         node = helper.make_node("Mul", [pictures, "white"], [out])
         return [node], {"white": np.array(1.0 / 255.0, np.float32)}
 
 
-def _shrinking(size: int, shift: float) -> Array:
-    """Weights, shape (size // SHRINK, size), that average rows about a shifted middle.
+def _shrink_matrix(size: int, shift: float) -> Array:
+    """Return weights that average rows about a shifted middle, shape (size // SHRINK, size).
 
-    shift: of the middle [px]; rows beyond the picture are those of its edge
+    shift: shift of the middle [px]; the row at the edge stands for rows beyond it
     """
     small = size // SHRINK
     weights = np.zeros((small, size), np.float32)

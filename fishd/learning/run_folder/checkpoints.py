@@ -218,7 +218,7 @@ def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
 
     card = read_card(checkpoint)
     settings = msgspec.convert(card.provenance.settings, TrainingSettings)
-    eye = eyes.make(settings)
+    eye = eyes.make_eye(settings)
     if eye:
         load_eye(eye, checkpoint)
     with _readable(checkpoint / MODEL) as parameters:

@@ -21,7 +21,7 @@ class Job(Struct, frozen=True, kw_only=True):
     """The job of a training: settings, fish and run folder."""
 
     config: Config
-    """Configuration of the fish; on a robot, of the fish that the scales are made for."""
+    """Configuration of the fish; on a robot, that which the scales are computed from."""
     settings: TrainingSettings
     folder: Path
     """The run folder: a new one, or that of the run to resume."""

@@ -97,7 +97,7 @@ class Training:
     def __init__(self, job: Job, link: Link, display: Display, stop: Callable[[], bool]) -> None:
         """Create or open the run folder; nothing moves yet. Raises as `train` does."""
         self._job, self._display, self._stop = job, display, stop
-        self._eye = eyes.make(job.settings)
+        self._eye = eyes.make_eye(job.settings)
         self._env = SwimEnv(link, job.config, job.settings.seen, self._eye)
         self._vec_env = DummyVecEnv([lambda: self._env])
         self._model = make_learner(job.settings, self._vec_env, self._eye)
@@ -262,9 +262,11 @@ class Training:
         job, env = self._job, self._env
         policy = DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
         camera, steps = job.simulated_camera, self._recorder.steps
-        found = evaluation.in_simulation(job.config, policy, job.settings.evaluation, camera)
+        found = evaluation.evaluate_in_simulation(
+            job.config, policy, job.settings.evaluation, camera
+        )
         if job.settings.evaluation.others:
-            others = evaluation.worst_of_others(job.config, policy, job.settings, camera)
+            others = evaluation.worst_on_others(job.config, policy, job.settings, camera)
             found = replace(found, worst=min(others, found.relative_thrust))
         return replace(found, steps=steps, policy=steps, tank_time=env.tank_time)
 

@@ -36,7 +36,7 @@ from fishd.learning.adapt.state import (
     Tried,
 )
 from fishd.learning.adapt.verdict import judge
-from fishd.learning.env.simulated_link import at_edge, drawn
+from fishd.learning.env.simulated_link import draw_edge_fish, draw_fish
 from fishd.learning.settings import Randomisation
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import square_wave
@@ -90,8 +90,8 @@ def test_a_cloud_has_the_errors_of_the_fit_and_how_they_go_together() -> None:
 def test_each_episode_of_a_training_swims_a_fish_of_the_cloud() -> None:
     fish = cloud(found(), count=5)
     spread = Randomisation(fish=fish)
-    assert {drawn(Config(), spread, seed).plant for seed in range(60)} == set(fish)
-    assert [at_edge(Config(), spread, seed).plant for seed in range(5)] == list(fish)
+    assert {draw_fish(Config(), spread, seed).plant for seed in range(60)} == set(fish)
+    assert [draw_edge_fish(Config(), spread, seed).plant for seed in range(5)] == list(fish)
 
 
 CONTROLLERS = {"policy": "ppo", "swing": "swing", "square": "square"}

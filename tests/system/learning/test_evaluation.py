@@ -13,8 +13,8 @@ from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
 from fishd.lab.compare.contestants import best_on_grid
 from fishd.lab.simulation import simulate
-from fishd.learning.env.evaluation import in_simulation, judge, worst_of_others
-from fishd.learning.env.simulated_link import at_edge, drawn
+from fishd.learning.env.evaluation import evaluate_in_simulation, judge, worst_on_others
+from fishd.learning.env.simulated_link import draw_edge_fish, draw_fish
 from fishd.learning.settings import (
     EvaluationSettings,
     Randomisation,
@@ -92,9 +92,9 @@ def test_no_square_wave_of_whole_ticks_beats_the_best_on_the_grid(amplitude: flo
 def test_a_policy_is_worth_what_it_does_on_the_worst_of_other_fish() -> None:
     weak = Randomisation(coupling=0.5)
     settings = TrainingSettings(randomisation=weak, evaluation=EvaluationSettings(others=6))
-    others = [at_edge(CONFIG, weak, seed) for seed in range(6)]
+    others = [draw_edge_fish(CONFIG, weak, seed) for seed in range(6)]
     own = [judge(fish, square_of_six_ticks, 20.0, 5.0).relative_thrust for fish in others]
-    worst = worst_of_others(CONFIG, square_of_six_ticks, settings)
+    worst = worst_on_others(CONFIG, square_of_six_ticks, settings)
     assert worst == pytest.approx(min(own), abs=1e-3)
 
 
@@ -108,17 +108,19 @@ def test_a_policy_that_stays_in_rapid_reversals_once_it_is_there_is_worth_nothin
     assert judge(CONFIG, stuck, 20.0, 5.0).relative_thrust > 0.95
     found.clear()
     settings = TrainingSettings(evaluation=EvaluationSettings(others=1))
-    assert worst_of_others(CONFIG, stuck, settings) < 0.05
+    assert worst_on_others(CONFIG, stuck, settings) < 0.05
 
 
 def test_fish_at_the_edge_have_every_parameter_at_an_end_of_its_range() -> None:
     spread = Randomisation(omega0=0.2, xi=0.2, servo_speed=0.2, coupling=0.2, offset=0.01)
-    fish = [at_edge(CONFIG, spread, seed) for seed in range(40)]
+    fish = [draw_edge_fish(CONFIG, spread, seed) for seed in range(40)]
     for name in ("omega0", "xi", "servo_speed", "coupling"):
         shares = {getattr(one.plant, name) / getattr(CONFIG.plant, name) for one in fish}
         assert sorted(shares) == pytest.approx([1 / 1.2, 1.2])
     assert sorted({one.simulation.offset_y for one in fish}) == pytest.approx([-0.005, 0.015])
-    within = [drawn(CONFIG, spread, seed).plant.omega0 / CONFIG.plant.omega0 for seed in range(40)]
+    within = [
+        draw_fish(CONFIG, spread, seed).plant.omega0 / CONFIG.plant.omega0 for seed in range(40)
+    ]
     assert len(set(within)) == 40
     assert 1 / 1.2 < min(within) < 0.95 < 1.05 < max(within) < 1.2
 
@@ -153,4 +155,4 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
 def test_a_policy_that_does_not_swim_is_told_from_one_that_does(
     decide: Callable[[Observation], float], stalls: bool
 ) -> None:
-    assert in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).stalled is stalls
+    assert evaluate_in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).stalled is stalls

@@ -21,7 +21,7 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.link import StepResult
 from fishd.learning.env.simulated_link import SimulatedLink
-from fishd.learning.env.swims import REST, Swims
+from fishd.learning.env.swims import REST_TIME_S, Swims
 from fishd.learning.ppo import make_learner
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.settings import EnvironmentSettings, PpoSettings, TrainingSettings
@@ -68,7 +68,7 @@ def test_whatever_the_sensor_drifts_a_short_swim_tells_the_thrust(drift: str) ->
     true = square_wave(env.config.plant, 0.42, 1 / 0.6).thrust
     assert [swim.thrust for swim in found] == pytest.approx([true] * 3, rel=0.04)
     assert [swim.frequency for swim in found] == pytest.approx([1 / 0.6] * 3)
-    assert env.tank_time == pytest.approx(3 * 3.5 + 4 * REST, abs=0.6)  # and the start
+    assert env.tank_time == pytest.approx(3 * 3.5 + 4 * REST_TIME_S, abs=0.6)  # and the start
 
 
 @pytest.mark.parametrize(
@@ -182,7 +182,7 @@ def test_a_policy_that_stalls_costs_little_and_never_swims_again(
     before = tank.env.tank_time
     (row,) = tank.evaluate(still)
     assert (row.stalled, row.best, row.error, row.thrust) == (True, False, None, 0.0)
-    assert tank.env.tank_time - before == pytest.approx(2 * REST + 1.5)
+    assert tank.env.tank_time - before == pytest.approx(2 * REST_TIME_S + 1.5)
     tank.evaluate(square(6))
     tank.evaluate(square(6))
     assert 0 not in tank.asked
@@ -277,7 +277,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     ]
     assert [row["swam"] for row in table] == ["3.5", "3.5", "7.0", "1.5", "7.0"]
     assert 0.0 < float(table[2]["error"]) < float(table[0]["error"])
-    monkeypatch.delattr(exporting, "in_simulation")  # its figures are those of the tank
+    monkeypatch.delattr(exporting, "evaluate_in_simulation")  # its figures are those of the tank
     exported = exporting.export(outcome.best, tmp_path / "best.onnx")
     assert exported.evaluation == best
     assert exported.card.provenance.relative_thrust == best.relative_thrust

@@ -26,7 +26,7 @@ from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.export import export, export_model
-from fishd.learning.eyes.making import babble
+from fishd.learning.eyes.making import random_angles
 from fishd.learning.look import look
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.settings import (
@@ -86,7 +86,7 @@ def test_where_frames_are_missing_the_file_swims_as_the_policy_is_evaluated(
     link = SimulatedLink(config, camera=Camera(DEFAULT, settings.camera.stack))
     seen = link.reset()
     blind = {12, 15, 16, 19, *range(22, 30)}
-    for tick, angle in enumerate(babble(1, 40, card.amplitude).tolist()):
+    for tick, angle in enumerate(random_angles(1, 40, card.amplitude).tolist()):
         stack = None if tick in blind else link.look()
         assert pilot.angle(seen, stack) == pytest.approx(decide(seen, stack), abs=1e-4)
         seen = link.step(angle).observation

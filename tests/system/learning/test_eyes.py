@@ -17,7 +17,7 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.link import StepResult
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.eyes.base import Eye
-from fishd.learning.eyes.making import babble, make
+from fishd.learning.eyes.making import make_eye, random_angles
 from fishd.learning.settings import EnvironmentSettings, TrainingSettings, VisionSettings
 
 CONFIG = Config()
@@ -27,7 +27,7 @@ TICKS = 256
 
 def eye_of(kind: str, **settings: object) -> Eye:
     camera = VisionSettings(eye=kind, **settings)
-    eye = make(TrainingSettings(see="camera", camera=camera))
+    eye = make_eye(TrainingSettings(see="camera", camera=camera))
     assert eye
     return eye
 
@@ -37,7 +37,7 @@ def swum(
 ) -> tuple[list[Stack], NDArray[np.float64], NDArray[np.float64]]:
     """Stacks and fin angles of a fish that babbles, and what it was told."""
     if angles is None:
-        angles = babble(0, TICKS, CONFIG.amplitude_limit)
+        angles = random_angles(0, TICKS, CONFIG.amplitude_limit)
     eye = eye_of("nature")
     link = SimulatedLink(CONFIG, camera=Camera(rig, StackSettings()))
     env = SwimEnv(
@@ -94,7 +94,7 @@ def mirrored(stack: Stack) -> Stack:
 @pytest.mark.parametrize("rig", [DEFAULT, WEB])
 def test_modes_tell_the_fin_angle_whatever_the_light(rig: SimulatedCameraSettings) -> None:
     eye = fitted("modes", rig)
-    told = babble(1, 300, CONFIG.amplitude_limit)
+    told = random_angles(1, 300, CONFIG.amplitude_limit)
     stacks, fins, _ = swum(replace(rig, seed=7, light_drift=0.2), told)
     seen = np.stack([eye.see(stack) for stack in stacks])[:, :4]
     fit = np.linalg.lstsq(seen, fins, rcond=None)[0]
@@ -162,7 +162,7 @@ def test_constants_of_another_kind_of_eye_are_refused(
 
 
 def test_the_babble_is_the_same_for_the_same_seed_and_within_the_limit() -> None:
-    one, other = (babble(3, 501, 0.42) for _ in range(2))
+    one, other = (random_angles(3, 501, 0.42) for _ in range(2))
     assert np.array_equal(one, other)
     assert 0.3 < np.abs(one).max() <= 0.42
-    assert not np.array_equal(one, babble(4, 501, 0.42))
+    assert not np.array_equal(one, random_angles(4, 501, 0.42))

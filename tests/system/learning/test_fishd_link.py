@@ -184,7 +184,7 @@ def test_a_reset_in_control_swims_on_without_a_lost_tick(env: SwimEnv, fish: Fis
 def test_a_stop_ends_it_and_a_reset_reacquires_control(env: SwimEnv, fish: Fish) -> None:
     fish.stop()
     stopped = fish.status().seq
-    with losing("fishd was told to stop"):
+    with losing("fishd received a request to stop"):
         swim_on(env)
     env.reset()
     assert fish.status().mode == "running"

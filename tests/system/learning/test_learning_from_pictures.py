@@ -21,7 +21,7 @@ from fishd.learning.env import environment
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.eyes.base import Eye
-from fishd.learning.eyes.making import make
+from fishd.learning.eyes.making import make_eye
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import (
@@ -221,7 +221,7 @@ def test_another_camera_is_looked_at_anew_with_the_networks_of_the_first(
 
 def job_eye(kind: str) -> Eye | None:
     stack = StackSettings(frames=1)
-    return make(TrainingSettings(see="camera", camera=VisionSettings(eye=kind, stack=stack)))
+    return make_eye(TrainingSettings(see="camera", camera=VisionSettings(eye=kind, stack=stack)))
 
 
 def test_gymnasium_makes_an_environment_that_sees(tmp_path: Path) -> None:

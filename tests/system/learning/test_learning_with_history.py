@@ -12,8 +12,8 @@ from fishd.controllers.policy.file import read
 from fishd.core.signals import Observation
 from fishd.lab.simulation import simulate
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.evaluation import in_simulation, worst_of_others
-from fishd.learning.env.simulated_link import SimulatedLink, drawn
+from fishd.learning.env.evaluation import evaluate_in_simulation, worst_on_others
+from fishd.learning.env.simulated_link import SimulatedLink, draw_fish
 from fishd.learning.export import export
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import (
@@ -88,7 +88,7 @@ def test_a_training_begins_only_with_a_policy_of_the_same_history(tmp_path: Path
 
 
 def test_the_rigs_of_a_randomisation_are_anywhere_in_its_range() -> None:
-    fish = [drawn(CONFIG, HARSH, seed) for seed in range(40)]
+    fish = [draw_fish(CONFIG, HARSH, seed) for seed in range(40)]
     for name, most in (("servo_delay", 0.08), ("servo_dead_zone", 0.05), ("backlash", 0.1)):
         values = [getattr(one.plant, name) for one in fish]
         assert 0.0 < min(values) < 0.2 * most < 0.8 * most < max(values) < most
@@ -101,8 +101,8 @@ def test_the_rigs_of_a_randomisation_are_anywhere_in_its_range() -> None:
 
 def test_the_fish_of_a_training_are_those_of_before_where_nothing_new_varies() -> None:
     spread = Randomisation(omega0=0.2, offset=0.01)
-    before = drawn(CONFIG, spread, 3)
-    after = drawn(CONFIG, replace(spread, backlash=0.1), 3)
+    before = draw_fish(CONFIG, spread, 3)
+    after = draw_fish(CONFIG, replace(spread, backlash=0.1), 3)
     assert after.plant == replace(before.plant, backlash=after.plant.backlash)
     assert after.simulation == before.simulation
 
@@ -128,9 +128,9 @@ def test_who_leans_on_the_shortest_dwell_is_worth_nothing_among_fish_of_the_rang
 
     chosen = EvaluationSettings(seconds=8.0, settle=3.0, others=3, others_from="range")
     settings = TrainingSettings(randomisation=Randomisation(backlash=0.1), evaluation=chosen)
-    assert in_simulation(CONFIG, six_ticks, chosen).relative_thrust > 0.9
-    assert worst_of_others(CONFIG, six_ticks, settings) > 0.7
-    assert worst_of_others(CONFIG, every_tick, settings) == 0.0
+    assert evaluate_in_simulation(CONFIG, six_ticks, chosen).relative_thrust > 0.9
+    assert worst_on_others(CONFIG, six_ticks, settings) > 0.7
+    assert worst_on_others(CONFIG, every_tick, settings) == 0.0
 
 
 def test_a_training_on_harsh_fish_records_its_worst(tmp_path: Path) -> None:
