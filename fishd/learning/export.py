@@ -35,8 +35,8 @@ from fishd.learning.settings import EvaluationSettings, TrainingSettings
 TOLERANCE = 1e-4
 """Largest difference between the outputs of the file and of the trained policy, as a share of Φ:
 pixels and large weights are summed, in an order that differs between libraries."""
-_PROBES = 1000
-_STACKS = 100
+_PROBE_INPUTS = 1000
+_PROBE_STACKS = 100
 """Number of stacks of noise, and of stacks of a moving tail."""
 
 
@@ -63,16 +63,16 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
     torch.set_num_threads(1)  # for single pictures, more threads are slower
     card = checkpoints.read_card(checkpoint)
     policy, perception = checkpoints.load_policy(checkpoint)
-    found = _evaluated(checkpoint, card, policy, perception)
-    if found.stalled and not force:
+    evaluation = _evaluate(checkpoint, card, policy, perception)
+    if evaluation.stalled and not force:
         raise PolicyError(
             f"{checkpoint}: this policy stalls when it swims without exploration: "
-            f"{found.frequency:.2f} Hz, |φ_c| {found.fullness:.0%} of Φ; train longer, choose "
-            "another checkpoint, or export it all the same with --force"
+            f"{evaluation.frequency:.2f} Hz, |φ_c| {evaluation.fullness:.0%} of Φ; train longer, "
+            "choose another checkpoint, or export it nevertheless with --force"
         )
-    card = _completed(card, found, note)
+    card = _complete_card(card, evaluation, note)
     size = _write(target, card, policy, perception)
-    return Exported(target, checkpoint, card, found, size)
+    return Exported(target, checkpoint, card, evaluation, size)
 
 
 def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Path:
@@ -113,14 +113,14 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     )
     card = replace(card, provenance=past)
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
-    found = evaluate_in_simulation(env.config, decide, EvaluationSettings())
-    _write(path, _completed(card, found), policy, env.perception)
+    evaluation = evaluate_in_simulation(env.config, decide, EvaluationSettings())
+    _write(path, _complete_card(card, evaluation), policy, env.perception)
     return path
 
 
 def _write(target: Path, card: Card, policy: ActorCriticPolicy, perception: Perception) -> int:
     """Write the file atomically; return its size [bytes]. Raises `PolicyError`."""
-    sight = _sight(policy, perception)
+    sight = _make_sight(policy, perception)
     content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
     _verify(PolicyFile(target, content, card), policy, perception)
     if not target.name or (target.exists() and not target.is_file()):
@@ -133,7 +133,7 @@ def _write(target: Path, card: Card, policy: ActorCriticPolicy, perception: Perc
     return len(content)
 
 
-def _sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | None:
+def _make_sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | None:
     """Return the graph from frames to the inputs of the first layer; None without frames."""
     from onnx import TensorProto, helper
 
@@ -169,15 +169,15 @@ def _sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | None:
     return Sight(nodes, constants, "given", width + perception.numbers, mirrored)
 
 
-def _evaluated(
+def _evaluate(
     checkpoint: Path, card: Card, policy: ActorCriticPolicy, perception: Perception
 ) -> Evaluation:
     """Return the evaluation of the policy on the robot, else on its simulated fish."""
     state = checkpoints.read_state(checkpoint)
     if state.on == "live":
-        for found in (state.best, state.latest):
-            if found and found.policy == state.steps:
-                return found
+        for evaluation in (state.best, state.latest):
+            if evaluation and evaluation.policy == state.steps:
+                return evaluation
     try:  # with the imperfections of its rig, where the run folder still exists
         config, _ = runs.read(checkpoint.parent)
     except FishdError:
@@ -201,7 +201,7 @@ def _camera(run: Path, card: Card) -> Camera | None:
     return Camera(seen, card.pictures)
 
 
-def _completed(card: Card, evaluation: Evaluation, note: str = "") -> Card:
+def _complete_card(card: Card, evaluation: Evaluation, note: str = "") -> Card:
     """Return the card with the figures of an evaluation, and the note."""
     past = replace(
         card.provenance,
@@ -216,10 +216,10 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
     """Compare the file, run as on the robot, with the policy; raises `PolicyError`."""
     network = Network(file)
     random = np.random.default_rng(0)
-    stacks = _stacks(file.card)
-    number = len(stacks) or _PROBES
+    stacks = _probe_stacks(file.card)
+    number = len(stacks) or _PROBE_INPUTS
     rows = random.normal(0.0, 1.5, (number, file.card.numbers)).astype(np.float32)
-    given, found = [], []
+    given, outputs = [], []
     for index, row in enumerate(rows):
         network.row[:] = row
         seen = row
@@ -227,9 +227,9 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
             network.frames[:] = stacks[index]
             seen = np.concatenate((perception.eye.see(stacks[index]), row))
         given.append(seen)
-        found.append(network.run())
-    wanted, _ = policy.predict(np.array(given), deterministic=True)
-    worst = float(np.abs(np.array(found) - wanted[:, 0]).max())
+        outputs.append(network.run())
+    expected, _ = policy.predict(np.array(given), deterministic=True)
+    worst = float(np.abs(np.array(outputs) - expected[:, 0]).max())
     if not worst <= TOLERANCE:
         raise PolicyError(
             f"with this onnxruntime, the outputs of the file differ from those of the policy, by "
@@ -237,18 +237,18 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
         )
 
 
-def _stacks(card: Card) -> list[Stack]:
+def _probe_stacks(card: Card) -> list[Stack]:
     """Return stacks of noise, and of a simulated fish that moves at random, if any are seen."""
     if card.pictures is None:
         return []
     random = np.random.default_rng(1)
-    noise = random.integers(0, 256, (_STACKS, *card.pictures.shape), np.uint8)
-    found = [tuple(stack) for stack in noise]
+    noise = random.integers(0, 256, (_PROBE_STACKS, *card.pictures.shape), np.uint8)
+    stacks = [tuple(stack) for stack in noise]
     config = replace(Config(), tick=card.tick, amplitude_limit=card.amplitude)
     link = SimulatedLink(config, camera=Camera(SimulatedCameraSettings(), card.pictures))
     link.reset()
-    for angle in random_angles(0, _STACKS, card.amplitude).tolist():
+    for angle in random_angles(0, _PROBE_STACKS, card.amplitude).tolist():
         link.step(angle)
         if (stack := link.look()) is not None:
-            found.append(stack)
-    return found
+            stacks.append(stack)
+    return stacks

@@ -28,19 +28,19 @@ from fishd.learning.settings import ImitationSettings, Randomisation, TrainingSe
 from fishd.virtual.plant.optimum import square_wave
 from fishd.virtual.plant.parameters import PlantParameters
 
-LONGEST_HALF = 1.2
+MAX_HALF_BEAT_S = 1.2
 """Longest half beat that is compared [s]."""
-AT_RANDOM = 3
+RANDOM_START_RATIO = 3
 """Smallest ratio of all ticks of a fish to its initial ticks, which are swum by random waves."""
-NEARER = 0.3
+NARROWED_SHARE = 0.3
 """Share of the fish that are from a part of the randomisation; the others are from all of it."""
 RIG_RANGES = ("servo_delay", "servo_dead_zone", "backlash", "servo_reaction")
 """Names of the ranges of a randomisation that are smaller for a clean rig."""
-LEAST_WEIGHT = 0.02
+MIN_WEIGHT = 0.02
 """Weight of a tick in which both sides are equally good, as a share of the best thrust."""
 
 
-class Labelled(NamedTuple):
+class LabelledTicks(NamedTuple):
     """Ticks, labelled with the right side of each."""
 
     seen: NDArray[np.float32]
@@ -51,7 +51,7 @@ class Labelled(NamedTuple):
     """Cost of the choice of the other side, shape (ticks,)."""
 
 
-def narrowed(spread: Randomisation, share: float, rig_share: float = 1.0) -> Randomisation:
+def narrow(spread: Randomisation, share: float, rig_share: float = 1.0) -> Randomisation:
     """Return a randomisation with narrower ranges.
 
     share: factor on each range, from 0 to 1
@@ -69,7 +69,7 @@ def half_beats(config: Config) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=64)  # a fish of a list is drawn again and again
 def _half_beats(plant: PlantParameters, amplitude: float, tick: float) -> NDArray[np.float64]:
-    ticks = range(1, math.ceil(LONGEST_HALF / tick) + 1)
+    ticks = range(1, math.ceil(MAX_HALF_BEAT_S / tick) + 1)
     thrusts = [square_wave(plant, amplitude, 0.5 / (n * tick)).thrust for n in ticks]
     return np.array([0.0, *thrusts]) / max(thrusts)
 
@@ -90,7 +90,7 @@ class Imitation:
         self._spread = settings.randomisation
         self._policy = policy
         self._draw = np.random.default_rng([settings.seed, 1])
-        self._rounds: list[Labelled] = []
+        self._rounds: list[LabelledTicks] = []
 
     def round(self, stop: Callable[[], bool] = lambda: False) -> float | None:
         """Swim with new fish, and learn from them and from all previous fish.
@@ -103,22 +103,22 @@ class Imitation:
         for _ in range(self._settings.fish):
             if stop():
                 return None
-            fish.append(self._swum())
-        self._rounds.append(_joined(fish))
-        return self._fit(_joined(self._rounds))
+            fish.append(self._swim_fish())
+        self._rounds.append(_join(fish))
+        return self._fit(_join(self._rounds))
 
-    def _swum(self) -> Labelled:
+    def _swim_fish(self) -> LabelledTicks:
         """Swim one fish: first random half beats, then, after the first round, the learner."""
         config, draw, ticks = self._config, self._draw, self._settings.ticks
-        share = min(1.0, float(draw.uniform()) / NEARER)
+        share = min(1.0, float(draw.uniform()) / NARROWED_SHARE)
         is_clean = self._settings.clean_rigs > 0.0 and draw.uniform() < self._settings.clean_rigs
-        spread = narrowed(self._spread, share, float(draw.uniform()) if is_clean else 1.0)
+        spread = narrow(self._spread, share, float(draw.uniform()) if is_clean else 1.0)
         fish = draw_fish(config, spread, int(draw.integers(2**31)))
         env = SwimEnv(SimulatedLink(fish), config, self._environment)
         seen, _ = env.reset(seed=int(draw.integers(2**31)))
         learner = DeterministicPolicy(self._policy, env.perception, env.link.amplitude)
         relative_thrust = half_beats(fish)
-        at_random = int(draw.integers(ticks // AT_RANDOM + 1)) if self._rounds else ticks
+        at_random = int(draw.integers(ticks // RANDOM_START_RATIO + 1)) if self._rounds else ticks
         longest = 2 * int(relative_thrust.argmax())
         half = int(draw.integers(2, longest + 2))
         rows, sides, weights = [], [], []
@@ -134,11 +134,11 @@ class Imitation:
                 share = -side if elapsed >= half else side
                 half = half if elapsed < half else int(draw.integers(2, longest + 2))
             seen = env.step(np.full(1, share, np.float32))[0]
-        return Labelled(np.array(rows), *np.array((sides, weights), np.float32))
+        return LabelledTicks(np.array(rows), *np.array((sides, weights), np.float32))
 
-    def _fit(self, given: Labelled) -> float:
+    def _fit(self, given: LabelledTicks) -> float:
         settings, policy = self._settings, self._policy
-        seen, sides, weights = (torch.from_numpy(each) for each in given)
+        seen, sides, weights = (torch.from_numpy(array) for array in given)
         weights = weights / weights.mean()
         optimiser = torch.optim.Adam(policy.parameters(), settings.learning_rate)
         batches = math.ceil(len(seen) / settings.batch_size)
@@ -163,9 +163,9 @@ def advice(relative_thrust: NDArray[np.float64], elapsed: int) -> tuple[float, f
     elapsed: ticks since the last reversal
     """
     now = min(elapsed, len(relative_thrust) - 2)
-    cost = abs(float(relative_thrust[now] - relative_thrust[now + 1])) + LEAST_WEIGHT
+    cost = abs(float(relative_thrust[now] - relative_thrust[now + 1])) + MIN_WEIGHT
     return (-1.0 if now >= relative_thrust.argmax() else 1.0), cost
 
 
-def _joined(parts: list[Labelled]) -> Labelled:
-    return Labelled(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+def _join(parts: list[LabelledTicks]) -> LabelledTicks:
+    return LabelledTicks(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))

@@ -27,7 +27,7 @@ from fishd.lab.drawing import BLUE, drawn
 from fishd.learning.env.evaluation import judge
 from fishd.learning.env.simulated_link import Camera
 
-SECONDS, SETTLE = 15.0, 5.0
+SWIM_S, SETTLE_S = 15.0, 5.0
 """Length of the swim, and of its beginning that is left out [s]."""
 STACKS = 40
 """Number of evenly spread ticks of the swim in which parts are hidden."""
@@ -38,7 +38,7 @@ Floats = NDArray[np.float64]
 Seen = tuple[Observation, Stack]
 
 
-class Looked(NamedTuple):
+class Sensitivity(NamedTuple):
     """The sensitivity of a policy to the parts of its pictures."""
 
     mean: Floats
@@ -64,12 +64,12 @@ def look(
     policy: str,
     config: Config,
     camera: SimulatedCameraSettings,
-    seconds: float = SECONDS,
-) -> Looked:
+    seconds: float = SWIM_S,
+) -> Sensitivity:
     """Let a policy swim a simulated fish, and compute its sensitivity to parts of the pictures.
 
     policy: name or path
-    seconds: length of the swim, of which the first `SETTLE` are left out
+    seconds: length of the swim, of which the first `SETTLE_S` are left out
 
     Raises `PolicyError` for a policy that sees no pictures, does not fit, or does not react to
     them, `NoMotion` where it does not swim, and `ParameterError` for too short a swim.
@@ -77,17 +77,17 @@ def look(
     file = opening.read(policy, config.limits)
     if file.card.pictures is None:
         raise PolicyError(f"{file.path}: it sees no pictures, so it looks at nothing")
-    seen = _swum(policy, config, Camera(camera, file.card.pictures), seconds)
+    seen = _record_swim(policy, config, Camera(camera, file.card.pictures), seconds)
     frames = np.stack([stack[0] for _, stack in seen])
     mean = frames.mean(axis=0)
     chosen = [seen[k] for k in np.linspace(0, len(seen) - 1, STACKS).astype(int)]
-    sensitivity = _sensitivity(_uncut(file), chosen, mean, file.card)
+    sensitivity = _compute_sensitivity(_load_unclipped(file), chosen, mean, file.card)
     if not sensitivity.any():
         raise PolicyError(f"{file.path}: nothing in the pictures moves it")
-    return Looked(mean, sensitivity, find_motion(frames).energy > 0.0)
+    return Sensitivity(mean, sensitivity, find_motion(frames).energy > 0.0)
 
 
-def _swum(policy: str, config: Config, camera: Camera, seconds: float) -> list[Seen]:
+def _record_swim(policy: str, config: Config, camera: Camera, seconds: float) -> list[Seen]:
     """Return the observations and stacks of a swim, tick by tick."""
     pilot = Pilot(policy, config.limits)
     seen: list[Seen] = []
@@ -95,15 +95,15 @@ def _swum(policy: str, config: Config, camera: Camera, seconds: float) -> list[S
 
     def decide(observation: Observation, stack: Stack | None) -> float:
         first.append(observation.time)
-        if stack is not None and observation.time >= first[0] + SETTLE:
+        if stack is not None and observation.time >= first[0] + SETTLE_S:
             seen.append((observation, stack))
         return pilot.angle(observation, stack)
 
-    judge(config, decide, seconds, SETTLE, camera)
+    judge(config, decide, seconds, SETTLE_S, camera)
     return seen
 
 
-def _uncut(file: PolicyFile) -> Network:
+def _load_unclipped(file: PolicyFile) -> Network:
     """Return the network without the cut to ±1, which would hide changes of the action."""
     import onnx
     from onnx import helper
@@ -115,8 +115,8 @@ def _uncut(file: PolicyFile) -> Network:
     return Network(file._replace(content=model.SerializeToString()))
 
 
-def _sensitivity(network: Network, seen: list[Seen], mean: Floats, card: Card) -> Floats:
-    """Return `Looked.sensitivity`: each pixel has the mean of the patches that hide it."""
+def _compute_sensitivity(network: Network, seen: list[Seen], mean: Floats, card: Card) -> Floats:
+    """Return `Sensitivity.sensitivity`: each pixel has the mean of the patches that hide it."""
     size = len(mean)
     patch = max(2, size // PATCH)
     begins = np.unique(np.linspace(0, size - patch, 2 * PATCH - 1).round().astype(int))
@@ -140,31 +140,31 @@ def _sensitivity(network: Network, seen: list[Seen], mean: Floats, card: Card) -
         for j, left in enumerate(begins):
             total[top : top + patch, left : left + patch] += changes[i, j]
             count[top : top + patch, left : left + patch] += 1.0
-    found: Floats = total / count
-    return found
+    sensitivity: Floats = total / count
+    return sensitivity
 
 
-def draw(path: str | os.PathLike[str], found: Looked, title: str) -> None:
+def draw(path: str | os.PathLike[str], result: Sensitivity, title: str) -> None:
     """Draw a heat map of the sensitivity over the mean picture; a line bounds the moving tail.
 
     Raises as `fishd.lab.drawing.check` does.
     """
-    strongest = float(found.sensitivity.max())
+    strongest = float(result.sensitivity.max())
     with drawn(Path(path), (4.4, 3.8)) as figure:
         axis = figure.subplots()
-        axis.imshow(found.mean, cmap="gray", vmin=0.0, vmax=255.0)
+        axis.imshow(result.mean, cmap="gray", vmin=0.0, vmax=255.0)
         heat = axis.imshow(
-            found.sensitivity,
+            result.sensitivity,
             cmap="inferno",
             vmin=0.0,
             vmax=strongest,
-            alpha=0.75 * found.sensitivity / strongest,
+            alpha=0.75 * result.sensitivity / strongest,
         )
-        axis.contour(found.moves, levels=[0.5], colors=BLUE, linewidths=1.0)
+        axis.contour(result.moves, levels=[0.5], colors=BLUE, linewidths=1.0)
         axis.set_title(title)
         axis.set_xlabel(
-            f"{found.share:.0%} of the sensitivity where the tail moves\n"
-            f"(blue line), {found.area:.0%} of the picture"
+            f"{result.share:.0%} of the sensitivity where the tail moves\n"
+            f"(blue line), {result.area:.0%} of the picture"
         )
         axis.set_xticks([])
         axis.set_yticks([])

@@ -133,7 +133,7 @@ def make_learner(settings: TrainingSettings, env: VecEnv, eye: Eye | None = None
     """Return a new PPO with an untrained policy; seed torch, numpy and the environment."""
     ppo = settings.ppo
     return PPO(
-        _kind(ppo, eye),
+        _policy_class(ppo, eye),
         env,
         learning_rate=ppo.learning_rate,
         n_steps=ppo.n_steps,
@@ -147,7 +147,7 @@ def make_learner(settings: TrainingSettings, env: VecEnv, eye: Eye | None = None
         max_grad_norm=ppo.max_grad_norm,
         target_kl=ppo.target_kl,
         rollout_buffer_class=Rollout,
-        policy_kwargs=_shape(ppo, eye),
+        policy_kwargs=_policy_arguments(ppo, eye),
         seed=settings.seed,
         device="cpu",
     )
@@ -159,30 +159,32 @@ def make_policy(ppo: PpoSettings, numbers: int, eye: Eye | None = None) -> Actor
     numbers: number of inputs beside the outputs of the eye
     """
     observation, action = spaces(numbers + (eye.outputs if eye else 0))
-    return _kind(ppo, eye)(observation, action, lambda _: ppo.learning_rate, **_shape(ppo, eye))
+    return _policy_class(ppo, eye)(
+        observation, action, lambda _: ppo.learning_rate, **_policy_arguments(ppo, eye)
+    )
 
 
-def _kind(ppo: PpoSettings, eye: Eye | None) -> type[ActorCriticPolicy]:
+def _policy_class(ppo: PpoSettings, eye: Eye | None) -> type[ActorCriticPolicy]:
     if not ppo.symmetric:
         return ActorCriticPolicy
     return SymmetricPicturePolicy if eye and eye.shape else SymmetricPolicy
 
 
-def _shape(ppo: PpoSettings, eye: Eye | None) -> dict[str, Any]:
-    found = {
+def _policy_arguments(ppo: PpoSettings, eye: Eye | None) -> dict[str, Any]:
+    arguments = {
         "net_arch": {"pi": list(ppo.hidden), "vf": list(ppo.hidden)},
         "activation_fn": _ACTIVATIONS[ppo.activation],
         "log_std_init": ppo.log_std_init,
         "optimizer_class": Adam,
     }
     if eye and eye.shape:
-        found["features_extractor_class"] = PictureExtractor
-        found["features_extractor_kwargs"] = {
+        arguments["features_extractor_class"] = PictureExtractor
+        arguments["features_extractor_kwargs"] = {
             "shape": eye.shape,
             "kind": eye.network,
             "mirrored": ppo.symmetric,
         }
-    return found
+    return arguments
 
 
 def learning_rate(ppo: PpoSettings, steps: int) -> float:

@@ -14,7 +14,7 @@ from fishd.core.errors import ConfigError
 from fishd.core.schema import Problem, convert, note, unit, without_empty_sections
 from fishd.virtual.plant.parameters import PlantParameters
 
-SMALLEST = {"modes": 16, "cnn": 68, "nature": 36}
+MIN_FRAME_SIZES_PX = {"modes": 16, "cnn": 68, "nature": 36}
 """Smallest size of a frame that all convolutions of the network can process, by eye [px]."""
 Share = Annotated[float, Meta(ge=0, le=9)]
 
@@ -24,21 +24,21 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     observation: Annotated[
         tuple[FeatureName, ...],
-        note("What the agent sees, in order; forces only where `see` permits them."),
+        note("Inputs of the agent, in order; forces only where `see` permits them."),
     ] = ("fy", "instruction_angle", "previous_angle", "fin_velocity", "side_time")
     history: Annotated[
         int,
         unit(
             "ticks",
-            "It sees them of the latest so many ticks, newest first: what a servo's delay or play "
-            "does to a fish does not show in one.",
+            "Number of latest ticks that the inputs are from, newest first: one tick does not show "
+            "the effects of the delay or play of a servo.",
             ge=1,
             le=LONGEST_HISTORY,
         ),
     ] = 1
     force_scale: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
-        unit("N", "F_y that the network sees as 1; null: K λ ω₀² Φ of the configured plant."),
+        unit("N", "F_y that the network receives as 1; null: K λ ω₀² Φ of the configured plant."),
     ] = None
     thrust_scale: Annotated[
         Annotated[float, Meta(ge=1e-9, le=1e9)] | None,
@@ -47,8 +47,8 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
     own_fish: Annotated[
         bool,
         note(
-            "Where fish are randomised, thrust_scale: null is the best square wave's thrust of "
-            "each, so that a weak one counts as much, and chatter.dwell: auto is that of each."
+            "Where fish are randomised, thrust_scale: null and chatter.dwell: auto are those of "
+            "each fish, so that a weak fish counts as much as a strong one."
         ),
     ] = False
     reward_scale: Annotated[float, note("Reward for thrust_scale.", gt=0, le=1000)] = 0.3
@@ -56,8 +56,8 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
         float,
         unit(
             "N/W",
-            "Thrust that a watt of the servo must give at the least: the reward is of F_x less "
-            "this times the power. In simulation only: agents of a fishd are not told the power.",
+            "Smallest thrust that justifies a watt of the servo: the reward is for F_x less this "
+            "times the power. Only in simulation: fishd does not send the power to agents.",
             ge=0,
             le=1000,
         ),
@@ -66,17 +66,20 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
     longest_start: Annotated[
         int,
         unit(
-            "ticks", "An episode begins after up to so many ticks at a random angle.", ge=0, le=1000
+            "ticks",
+            "Largest number of ticks at a random angle before an episode.",
+            ge=0,
+            le=1000,
         ),
     ] = 10
     dwell: Annotated[
-        bool, note("Reversals that ppo would hold back (chatter.dwell) are held back here, too.")
+        bool, note("Whether reversals that ppo would delay (chatter.dwell) are delayed here, too.")
     ] = True
     held_cost: Annotated[
         float,
         note(
-            "Share of reward_scale that a tick costs in which one is held back, so that policies "
-            "do not lean on it.",
+            "Share of reward_scale that each tick of such a delay costs, so that policies avoid "
+            "it.",
             ge=0,
             le=10,
         ),
@@ -89,9 +92,9 @@ class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     eye: Annotated[
         Literal["modes", "cnn", "nature"],
         note(
-            "`modes`: patterns that follow the command; `cnn`: a small network that is shown "
-            "differences of frames about the axis; `nature`: a large one with the frames as they "
-            "are, as in the paper."
+            "`modes`: patterns that follow the command; `cnn`: a small network for differences of "
+            "frames about the axis; `nature`: a large network for unchanged frames, as in the "
+            "paper."
         ),
     ] = "modes"
     stack: StackSettings = StackSettings()
@@ -99,17 +102,18 @@ class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         int,
         unit(
             "ticks",
-            "Before it learns, the fish moves at random: `modes` and `cnn` need that.",
+            "Length of the random motion before learning, which `modes` and `cnn` need.",
             ge=64,
             le=10_000,
         ),
     ] = 256
     align: Annotated[
-        bool, note("`modes` and `cnn` look for the axis in the babble; false: the middle row.")
+        bool,
+        note("Whether `modes` and `cnn` detect the axis in the babble; false: the middle row."),
     ] = True
-    modes: Annotated[int, note("Patterns that the eye `modes` keeps.", ge=1, le=16)] = 4
+    modes: Annotated[int, note("Number of patterns of the eye `modes`.", ge=1, le=16)] = 4
     memory: Annotated[
-        int, unit("ticks", "Commands that `modes` explains a frame by.", ge=2, le=64)
+        int, unit("ticks", "Number of commands that `modes` explains a frame by.", ge=2, le=64)
     ] = 8
 
 
@@ -131,13 +135,13 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     thrust_coefficient: Share = 0.0
     lateral_drag: Share = 0.0
     servo_delay: Annotated[
-        float, unit("s", "Uniform, from the configured one to so much more.", ge=0, le=0.4)
+        float, unit("s", "Uniform, from the configured value to this much more.", ge=0, le=0.4)
     ] = 0.0
     servo_dead_zone: Annotated[
-        float, unit("rad", "Uniform, from the configured one to so much more.", ge=0, le=0.5)
+        float, unit("rad", "Uniform, from the configured value to this much more.", ge=0, le=0.5)
     ] = 0.0
     backlash: Annotated[
-        float, unit("rad", "Uniform, from the configured one to so much more.", ge=0, le=0.5)
+        float, unit("rad", "Uniform, from the configured value to this much more.", ge=0, le=0.5)
     ] = 0.0
     servo_reaction: Annotated[
         float, unit("N s^2/rad", "Uniform in ±this about the configured one.", ge=0, le=0.05)
@@ -160,14 +164,15 @@ class ImitationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     rounds: Annotated[
         int,
         note(
-            "In each it swims other fish of the randomisation, more of them like the configured "
-            "one, and learns when the best square wave of each would reverse; 0 for none. In "
-            "simulation only: of a real fish that is not known.",
+            "Number of rounds; 0 for none. In each, the policy swims other fish of the "
+            "randomisation, more of them like the configured one, and learns when the best "
+            "square wave of each would reverse. Only in simulation: that wave of a real fish is "
+            "unknown.",
             ge=0,
             le=100,
         ),
     ] = 0
-    fish: Annotated[int, note("Fish of a round.", ge=1, le=100_000)] = 500
+    fish: Annotated[int, note("Number of fish in a round.", ge=1, le=100_000)] = 500
     clean_rigs: Annotated[
         float,
         note(
@@ -177,29 +182,29 @@ class ImitationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             le=1,
         ),
     ] = 0.0
-    ticks: Annotated[int, unit("ticks", "For which each is swum.", ge=8, le=100_000)] = 120
+    ticks: Annotated[int, unit("ticks", "Length of the swim of each fish.", ge=8, le=100_000)] = 120
     epochs: Annotated[
-        int, note("Passes, after each round, over the ticks of all rounds so far.", ge=1, le=1000)
+        int, note("Passes over the ticks of all previous rounds, after each round.", ge=1, le=1000)
     ] = 12
     batch_size: Annotated[int, note("Size of a minibatch.", ge=2, le=1_000_000)] = 1024
     learning_rate: Annotated[
-        float, note("At first; it falls to 0 as a cosine does, in each round.", gt=0, le=1)
+        float, note("Initial rate; it falls to 0 as a cosine in each round.", gt=0, le=1)
     ] = 3e-3
 
 
 class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Hyper-parameters of PPO, with their names in stable-baselines3."""
 
-    n_steps: Annotated[int, note("Steps between two updates.", ge=2, le=1_000_000)] = 64
+    n_steps: Annotated[int, note("Number of steps between two updates.", ge=2, le=1_000_000)] = 64
     batch_size: Annotated[int, note("Size of a minibatch.", ge=2, le=1_000_000)] = 64
     n_epochs: Annotated[int, note("Passes over the steps of an update.", ge=1, le=1000)] = 20
     gamma: Annotated[float, note("Discount factor.", ge=0, le=1)] = 0.95
     gae_lambda: Annotated[float, note("Bias against variance of the advantages.", ge=0, le=1)] = (
         0.95
     )
-    learning_rate: Annotated[float, note("At the first step.", gt=0, le=1)] = 3e-3
+    learning_rate: Annotated[float, note("Rate at the first step.", gt=0, le=1)] = 3e-3
     final_learning_rate: Annotated[
-        float, note("From `decay_steps` on; linear until then.", gt=0, le=1)
+        float, note("Rate from `decay_steps` on; linear until then.", gt=0, le=1)
     ] = 3e-4
     decay_steps: Annotated[int, Meta(ge=1)] = 10_000
     clip_range: Annotated[float, Meta(gt=0, le=1)] = 0.2
@@ -213,17 +218,17 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     clean_rewards: Annotated[
         bool,
         note(
-            "Learn without what a sensor adds to F_x: its drifting offset, spikes, and the share "
-            "of F_y that it has where it is turned. Where each episode swims another fish, it does "
-            "not apply."
+            "Whether to remove the errors of the sensor from F_x: its drifting offset, spikes, and "
+            "the share of F_y in F_x of a rotated sensor. Without effect where each episode has "
+            "another fish."
         ),
     ] = True
     symmetric: Annotated[
-        bool, note("Build into the networks that left and right are alike; not with F_x seen.")
+        bool, note("Whether the networks are symmetric in left and right; not possible with fx.")
     ] = True
     hidden: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=1024)], ...],
-        note("Sizes of the hidden layers, of policy and value each.", min_length=1),
+        note("Sizes of the hidden layers, for each of policy and value.", min_length=1),
     ] = (64, 64)
     activation: Literal["tanh", "relu"] = "tanh"
 
@@ -231,7 +236,7 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The deterministic evaluations during training."""
 
-    every: Annotated[int, note("An evaluation after so many updates; 0 for none.", ge=0)] = 2
+    every: Annotated[int, note("Number of updates between two evaluations; 0 for none.", ge=0)] = 2
     patience: Annotated[
         Annotated[int, Meta(ge=1)] | None,
         unit(
@@ -241,16 +246,16 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
             "best square wave; null: it ends after `steps`.",
         ),
     ] = 8
-    seconds: Annotated[float, unit("s", "Its length.", ge=1, le=3600)] = 20.0
+    seconds: Annotated[float, unit("s", "Length of an evaluation.", ge=1, le=3600)] = 20.0
     settle: Annotated[
-        float, unit("s", "Time at its beginning that is not judged.", ge=0, le=3600)
+        float, unit("s", "Time at its beginning that is not evaluated.", ge=0, le=3600)
     ] = 5.0
     on_robot: Annotated[
         float,
         unit(
             "s",
-            "Its length in a tank at most: policies that may be the best swim for some seconds "
-            "each, between rests.",
+            "Largest length of an evaluation in a tank: policies that may be the best swim for "
+            "some seconds each, between rests.",
             ge=8,
             le=3600,
         ),
@@ -258,8 +263,8 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     others: Annotated[
         int,
         note(
-            "In simulation, so many other fish are tried too, of the randomisation and shaken "
-            "first; the policy counts as the best that does best on its worst fish.",
+            "Number of other fish of the randomisation in each evaluation, only in simulation; "
+            "the best policy is the one that is best on its worst fish.",
             ge=0,
             le=100,
         ),
@@ -267,8 +272,9 @@ class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     others_from: Annotated[
         Literal["edges", "range"],
         note(
-            "Where in the randomisation these are: every parameter at one end of its range, or "
-            "anywhere in it, as the fish of the episodes."
+            "Place of these fish in the randomisation. edges: every parameter at one end of its "
+            "range, and each swim begins with rapid reversals. range: anywhere in it, as for the "
+            "fish of the episodes."
         ),
     ] = "edges"
 
@@ -278,15 +284,11 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     steps: Annotated[
         int,
-        note(
-            "Control steps that PPO learns from, at most; 0 after an imitation that is all.", ge=0
-        ),
+        note("Largest number of control steps of PPO; 0 for imitation alone.", ge=0),
     ] = 8000
-    seed: Annotated[int, note("Of networks, exploration and start.", ge=0, le=2**32 - 1)] = 0
-    checkpoint_every: Annotated[int, note("Steps between checkpoints.", ge=1)] = 5000
-    see: Annotated[Literal["force", "camera", "both"], note("What the agent sees of the fish.")] = (
-        "force"
-    )
+    seed: Annotated[int, note("Seed of networks, exploration and start.", ge=0, le=2**32 - 1)] = 0
+    checkpoint_every: Annotated[int, note("Number of steps between checkpoints.", ge=1)] = 5000
+    see: Annotated[Literal["force", "camera", "both"], note("Senses of the agent.")] = "force"
     environment: EnvironmentSettings = EnvironmentSettings()
     camera: VisionSettings = VisionSettings()
     randomisation: Randomisation = Randomisation()
@@ -370,10 +372,11 @@ def _check(settings: TrainingSettings) -> None:
             "an empty list is not valid with see: force; the agent would see nothing",
         )
     eye, size = settings.camera.eye, settings.camera.stack.size
-    if settings.see != "force" and size < SMALLEST[eye]:
+    if settings.see != "force" and size < MIN_FRAME_SIZES_PX[eye]:
         raise Problem(
             ("camera", "stack", "size"),
-            f"{size} px is not valid with the eye {eye}: {SMALLEST[eye]} px or more are needed",
+            f"{size} px is not valid with the eye {eye}: {MIN_FRAME_SIZES_PX[eye]} px or more are "
+            "needed",
         )
     babbles = settings.see != "force" and settings.camera.eye != "nature"
     if babbles and settings.steps <= settings.camera.babble:

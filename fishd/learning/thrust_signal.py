@@ -10,15 +10,15 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-MEMORY = 4096
+MEMORY_TICKS = 4096
 """Number of latest ticks from which the share of F_y is estimated."""
-ORDINARY = 3.0
+ORDINARY_THRUSTS = 3.0
 """Largest ordinary distance of a tick's thrust from the median, in best mean thrusts; square waves
 of simulated fish reach two."""
-OUTLIER = 4.5
+ORDINARY_DEVIATIONS = 4.5
 """Distance from the median below which a thrust is ordinary, too, in medians of the distance."""
 _PASSES = 4
-_HUBER = 1.5
+_HUBER_MEDIANS = 1.5
 
 
 Forces = NDArray[np.float64]
@@ -29,8 +29,8 @@ class ThrustSignal:
 
     def __init__(self, best: float) -> None:
         """best: mean thrust of the best square wave [N]"""
-        self._ordinary = ORDINARY * best
-        self._past: deque[tuple[float, float]] = deque(maxlen=MEMORY)
+        self._ordinary = ORDINARY_THRUSTS * best
+        self._past: deque[tuple[float, float]] = deque(maxlen=MEMORY_TICKS)
 
     def of(self, fx: Forces, fy: Forces) -> Forces:
         """Return the thrust of each tick of a rollout, up to a constant [N], shape (ticks,).
@@ -44,22 +44,22 @@ class ThrustSignal:
             return fx
         self._past.extend(zip(fx.tolist(), fy.tolist(), strict=True))
         thrust = fx - slope(*np.array(self._past).T) * (fy - fy.mean())
-        off = thrust - np.median(thrust)
-        most = max(self._ordinary, OUTLIER * float(np.median(np.abs(off))))
-        ordinary: Forces = np.where(np.abs(off) < most, off, 0.0)
+        deviations = thrust - np.median(thrust)
+        limit = max(self._ordinary, ORDINARY_DEVIATIONS * float(np.median(np.abs(deviations))))
+        ordinary: Forces = np.where(np.abs(deviations) < limit, deviations, 0.0)
         return ordinary - float(ordinary.mean())
 
 
 def slope(fx: Forces, fy: Forces) -> float:
     """Return the slope of the line through the points (fy, fx), robust to outliers (Huber)."""
     x, y = fy - np.median(fy), fx - np.median(fx)
-    weights, found = np.ones_like(x), 0.0
+    weights, coefficient = np.ones_like(x), 0.0
     for _ in range(_PASSES):
         squares = float(weights @ (x * x))
         if squares <= 0.0:
             return 0.0
-        found = float(weights @ (x * y)) / squares
-        off = np.abs(y - found * x)
-        spread = _HUBER * float(np.median(off))
-        weights = np.minimum(1.0, spread / np.maximum(off, 1e-30)) if spread else weights
-    return found
+        coefficient = float(weights @ (x * y)) / squares
+        deviations = np.abs(y - coefficient * x)
+        spread = _HUBER_MEDIANS * float(np.median(deviations))
+        weights = np.minimum(1.0, spread / np.maximum(deviations, 1e-30)) if spread else weights
+    return coefficient

@@ -241,7 +241,7 @@ def _train(job: "Job", as_json: bool) -> int:
 
 def print_outcome(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
     """Print how a training ended; return the exit status."""
-    from fishd.learning.train.progress import NOT_COUNTED, described, minutes
+    from fishd.learning.train.progress import NOT_COUNTED, describe_evaluation, minutes
 
     resume_command = f"fishctl learn ppo --resume {outcome.folder}"
     for option, address in (
@@ -276,7 +276,7 @@ def print_outcome(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
         err=as_json,
     )
     if evaluation := outcome.best_evaluation:
-        echo(f"best: {described(evaluation).strip()}", err=as_json)
+        echo(f"best: {describe_evaluation(evaluation).strip()}", err=as_json)
         relative_error = evaluation.error / evaluation.thrust if evaluation.error else 0.0
         if evaluation.relative_thrust * (1.0 - relative_error) > MAX_RELATIVE_THRUST:
             echo(
@@ -334,10 +334,10 @@ def _train_seeds(
 
 
 def _print_seed(seed: int, outcome: "Outcome", err: bool) -> None:
-    from fishd.learning.train.progress import described
+    from fishd.learning.train.progress import describe_evaluation
 
     latest = outcome.latest_evaluation
-    swims = f": {described(latest).strip()}" if latest else ""
+    swims = f": {describe_evaluation(latest).strip()}" if latest else ""
     is_finished = outcome.ended == "finished"
     ended = "" if is_finished else f" {outcome.ended}"
     why = f" ({outcome.message})" if outcome.message else ""

@@ -15,7 +15,7 @@ from fishd.lab.measurement import REST, measure
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import simulate
 from fishd.learning.adapt import steps as do
-from fishd.learning.adapt.practice import TRIES, practise, simulated
+from fishd.learning.adapt.practice import MAX_TRAININGS, practise, simulated
 from fishd.learning.adapt.state import (
     FISH,
     POLICY,
@@ -52,7 +52,7 @@ class Adaptation:
         """
         session: entered by the caller; the plant and the rig of its configuration are not used
         tank_time: time for all steps that need the fish, rests included [s]; at least
-            `steps.LEAST`
+            `steps.MIN_TANK_TIME_S`
         steps: number of steps of the training
         """
         self._session = session
@@ -85,15 +85,15 @@ class Adaptation:
         if state.trained is None:
             self._practise(state)
         if state.verdict is None:
-            self._contest(state)
+            self._compare(state)
             state.verdict = judge(state.contenders, self._model(state))
-            self._keep()
+            self._save()
         return state
 
     def _excite(self, state: State) -> None:
         seconds = do.BUDGET["excitation"] * self._tank_time
         path = self._run.experiment.recording("excitation")
-        with self._in_tank("excitation", "excitation"), self._session.recorded(path, _NOTE):
+        with self._count_tank_time("excitation", "excitation"), self._session.recorded(path, _NOTE):
             experiment(self._session, seconds)
         state.excitation = path.name
         self._done(f"excitation: {seconds:.0f} s of it are in {path.name}")
@@ -102,37 +102,42 @@ class Adaptation:
         assert state.excitation
         self._show.at(self._session.used, "fitting a fish to it; the fish rests")
         path = self._run.path / state.excitation
-        found, state.fitted = do.fit(path, self._session.amplitude, self._seed)
-        self._run.experiment.write(FISH, found.to_yaml("fishctl adapt"))
-        explained = " and ".join(f"{channel.explained:.1%}" for channel in found.channels)
+        identification, state.fitted = do.fit(path, self._session.amplitude, self._seed)
+        self._run.experiment.write(FISH, identification.to_yaml("fishctl adapt"))
+        explained = " and ".join(f"{channel.explained:.1%}" for channel in identification.channels)
         unused = "" if state.fitted.model.error is not None else ": too little to be used"
         self._done(f"fit: it explains {explained} of F_x and F_y{unused}")
-        for remark in found.remarks:
+        for remark in identification.remarks:
             self._show.warn(f"fishctl: careful: {remark}")
 
     def _settle_swing(self, state: State) -> None:
         seconds = do.BUDGET["swing"] * self._tank_time - REST
         path = self._run.experiment.recording("swing")
-        with self._in_tank("swing", "swing --C auto"), self._session.recorded(path, _NOTE):
+        with self._count_tank_time("swing", "swing --C auto"), self._session.recorded(path, _NOTE):
             state.swing = do.settle_swing(self._session, seconds)
-        found = state.swing
-        lead = f", {found.lead * 1e3:.0f} ms ahead" if found.lead else ""
-        unsure = "" if found.settled else "; its search was not over"
-        self._done(f"swing --C auto: C = {found.C:g}{lead}{unsure}")
+        rung = state.swing
+        lead = f", {rung.lead * 1e3:.0f} ms ahead" if rung.lead else ""
+        unsure = "" if rung.settled else "; its search was not over"
+        self._done(f"swing --C auto: C = {rung.C:g}{lead}{unsure}")
 
     def _search(self, state: State) -> None:
         assert state.fitted
         search = do.square_waves(state.fitted, self._session, self._seed)
-        budget = max(do.BUDGET["search"] * self._tank_time, do.least_search(self._session, search))
+        budget = max(
+            do.BUDGET["search"] * self._tank_time, do.min_search_time(self._session, search)
+        )
 
-        def keep(trial: Tried) -> None:
+        def add_trial(trial: Tried) -> None:
             state.trials.append(trial)
             state.tank_time = self._session.used
-            self._keep()
+            self._save()
 
         path = self._run.experiment.recording("search")
-        with self._in_tank("search", "searching square waves"), self._session.recorded(path, _NOTE):
-            do.search_square_waves(self._session, search, budget, tuple(state.trials), keep)
+        with (
+            self._count_tank_time("search", "searching square waves"),
+            self._session.recorded(path, _NOTE),
+        ):
+            do.search_square_waves(self._session, search, budget, tuple(state.trials), add_trial)
         state.square, used = do.best_of(search, state.trials, state.fitted, self._session.amplitude)
         state.disagrees = not used and state.fitted.model.error is not None
         tried = f"{len(state.trials)} square waves tried"
@@ -153,65 +158,65 @@ class Adaptation:
             return
 
         def progress(done: int) -> None:
-            again, step = divmod(done - 1, self._steps)
-            more = f", once more ({again + 1} of {TRIES})" if again else ""
+            repetition, step = divmod(done - 1, self._steps)
+            more = f" (training {repetition + 1} of {MAX_TRAININGS})" if repetition else ""
             doing = f"training, {step + 1} of {self._steps} steps{more}; the fish rests"
             self._show.at(self._session.used, doing)
 
-        state.trained = found = practise(
+        state.trained = trained = practise(
             self._config, state.fitted, self._run.path, self._steps, self._seed, progress
         )
-        if found.refused:
-            self._keep()
-            self._show.warn(f"fishctl: careful: no policy takes part: {found.refused}")
+        if trained.refused:
+            self._save()
+            self._show.warn(f"fishctl: careful: no policy takes part: {trained.refused}")
             return
-        worst = "" if found.worst is None else f", {found.worst:.1%} on the worst tried"
+        worst = "" if trained.worst is None else f", {trained.worst:.1%} on the worst tried"
         cloud = f"{len(state.fitted.cloud)} fish of the fit's errors"
-        self._done(f"training on {cloud}: {found.relative_thrust:.1%} in simulation{worst}")
+        self._done(f"training on {cloud}: {trained.relative_thrust:.1%} in simulation{worst}")
 
     def gaits(self, state: State) -> list[Gait]:
         """Return the gaits that take part in the comparison."""
         assert state.swing
         assert state.square
         swing = {"C": state.swing.C} | ({"lead": state.swing.lead} if state.swing.lead else {})
-        found = [
+        gaits = [
             Gait("swing", "swing", swing),
             Gait(SQUARE, "square", {"frequency": state.square}),
         ]
         if state.trained and not state.trained.refused:
             policy = str((self._run.path / POLICY).absolute())
-            found.insert(0, Gait("policy", "ppo", {"policy": policy}))
-        return found
+            gaits.insert(0, Gait("policy", "ppo", {"policy": policy}))
+        return gaits
 
-    def _contest(self, state: State) -> None:
-        known = {one.name for one in state.contenders} | set(state.left_out)
+    def _compare(self, state: State) -> None:
+        known = {contender.name for contender in state.contenders} | set(state.left_out)
         todo = [gait for gait in self.gaits(state) if gait.name not in known]
         left = self._tank_time - self._session.used
-        needed = sum(do.least_measurement(gait.parameters) for gait in todo)
+        needed = sum(do.min_measurement_time(gait.parameters) for gait in todo)
         if left < needed:
             raise FishdError(
                 f"{max(0.0, left):.0f} s are left of the tank time, and the comparison needs "
                 f"{needed:.0f} s: a larger --budget is needed"
             )
         for index, gait in enumerate(todo):
-            rest = sum(do.least_measurement(other.parameters) for other in todo[index + 1 :])
+            rest = sum(do.min_measurement_time(other.parameters) for other in todo[index + 1 :])
             left = self._tank_time - self._session.used
             seconds = min(left / (len(todo) - index), left - rest)
-            self._measure(state, gait, max(seconds, do.least_measurement(gait.parameters)))
+            self._measure(state, gait, max(seconds, do.min_measurement_time(gait.parameters)))
 
     def _measure(self, state: State, gait: Gait, seconds: float) -> None:
         path = self._run.experiment.recording(f"measured-{gait.name}")
         try:
             with (
-                self._in_tank("comparison", f"measuring {gait.name}"),
+                self._count_tank_time("comparison", f"measuring {gait.name}"),
                 self._session.recorded(path, _NOTE),
             ):
-                found = measure(self._session, gait.controller, gait.parameters, seconds)
+                measurement = measure(self._session, gait.controller, gait.parameters, seconds)
         except FishdError as error:
             if not concerns_one_controller(error) or gait.name == SQUARE:
                 raise
             state.left_out[gait.name] = str(error)
-            self._keep()
+            self._save()
             self._show.warn(f"fishctl: {gait.name}: left out: {error}")
             return
         state.contenders.append(
@@ -219,25 +224,29 @@ class Adaptation:
                 name=gait.name,
                 controller=gait.controller,
                 parameters=gait.parameters,
-                thrust=found.thrust,
-                error=found.error,
-                calibration_ci95=found.calibration_ci95,
-                total_ci95=found.total_ci95,
-                frequency=found.frequency,
+                thrust=measurement.thrust,
+                error=measurement.error,
+                calibration_ci95=measurement.calibration_ci95,
+                total_ci95=measurement.total_ci95,
+                frequency=measurement.frequency,
                 seconds=seconds,
-                remark=found.remark,
-                expected=self._expected(state, gait),
-                **_truth(self._config, self._session, gait),
+                remark=measurement.remark,
+                expected=self._simulate_thrusts(state, gait),
+                **_true_thrusts(self._config, self._session, gait),
             )
         )
         measured = error_budget.spelled(
-            found.thrust, found.error, found.calibration_ci95, found.total_ci95, found.unit
+            measurement.thrust,
+            measurement.error,
+            measurement.calibration_ci95,
+            measurement.total_ci95,
+            measurement.unit,
         )
-        self._done(f"{gait.name}: {measured} at {found.frequency:.3f} Hz")
-        if found.remark:
-            self._show.warn(f"fishctl: {gait.name}: {found.remark}")
+        self._done(f"{gait.name}: {measured} at {measurement.frequency:.3f} Hz")
+        if measurement.remark:
+            self._show.warn(f"fishctl: {gait.name}: {measurement.remark}")
 
-    def _expected(self, state: State, gait: Gait) -> list[float]:
+    def _simulate_thrusts(self, state: State, gait: Gait) -> list[float]:
         """Return the thrusts of a gait on the first fish of the cloud [N]; empty if unused."""
         assert state.fitted
         if state.fitted.model.error is None:
@@ -245,11 +254,11 @@ class Adaptation:
         identified = simulated(self._config, state.fitted)
         return [
             simulate(replace(identified, plant=plant), gait.controller, gait.parameters).mean_thrust
-            for plant in state.fitted.cloud[:_CLOUD]
+            for plant in state.fitted.cloud[:_SIMULATED_FISH]
         ]
 
     @contextmanager
-    def _in_tank(self, step: str, doing: str) -> Iterator[None]:
+    def _count_tank_time(self, step: str, doing: str) -> Iterator[None]:
         """Add the time in the tank of a step to the state, also if the step fails."""
         state, begun = self._run.state, self._session.used
         self._doing = doing
@@ -259,22 +268,22 @@ class Adaptation:
             spent = self._session.used - begun
             state.spent[step] = state.spent.get(step, 0.0) + spent
             state.tank_time = self._session.used
-            self._keep()
+            self._save()
 
-    def _keep(self) -> None:
-        self._run.keep()
+    def _save(self) -> None:
+        self._run.save()
 
     def _done(self, line: str) -> None:
-        self._keep()
+        self._save()
         self._show.done(line, self._session.used)
 
 
 _NOTE = "fishctl adapt"
-_CLOUD = 8
+_SIMULATED_FISH = 8
 """Number of fish of the cloud on which a gait is simulated."""
 
 
-def _truth(config: Config, session: Session, gait: Gait) -> dict[str, float]:
+def _true_thrusts(config: Config, session: Session, gait: Gait) -> dict[str, float]:
     """Return the true thrusts of a gait, known only of a simulated fish; else nothing."""
     if session.source != "simulation":
         return {}

@@ -9,11 +9,13 @@ from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC
 from fishd.lab.identification.result import OF_THE_RIG
 from fishd.virtual.plant.parameters import PlantParameters
 
-FISH = 32
+CLOUD_SIZE = 32
 """Number of fish in the cloud."""
 
 
-def cloud(found: Identification, seed: int = 0, count: int = FISH) -> tuple[PlantParameters, ...]:
+def cloud(
+    identification: Identification, seed: int = 0, count: int = CLOUD_SIZE
+) -> tuple[PlantParameters, ...]:
     """Return fish that agree with the data; the first is the identified one itself.
 
     They are drawn from the joint normal distribution of the errors, of logarithms for parameters
@@ -21,22 +23,22 @@ def cloud(found: Identification, seed: int = 0, count: int = FISH) -> tuple[Plan
     K_y/K is that of the identified fish: no force depends on it as long as the parameters that it
     scales change with it.
     """
-    centre = [_centre(found, name) for name in found.names]
+    centre = [_mean_of_draws(identification, name) for name in identification.names]
     draws = np.random.default_rng(seed).multivariate_normal(
-        centre, found.covariance, count - 1, method="eigh", check_valid="ignore"
+        centre, identification.covariance, count - 1, method="eigh", check_valid="ignore"
     )
-    fitted = identified(found)
-    return (fitted, *(_fish(fitted, found.names, z.tolist()) for z in draws))
+    fitted = identified(identification)
+    return (fitted, *(_fish(fitted, identification.names, z.tolist()) for z in draws))
 
 
-def identified(found: Identification) -> PlantParameters:
+def identified(identification: Identification) -> PlantParameters:
     """Return the identified fish."""
-    return msgspec.convert(found.plant, PlantParameters)
+    return msgspec.convert(identification.plant, PlantParameters)
 
 
-def _centre(found: Identification, name: str) -> float:
+def _mean_of_draws(identification: Identification, name: str) -> float:
     """Return the mean of a fitted parameter, or of its logarithm if that is fitted."""
-    value = found[name].value
+    value = identification[name].value
     return float(np.log(value)) if name in LOGARITHMIC else value
 
 

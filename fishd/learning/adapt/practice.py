@@ -25,16 +25,16 @@ from fishd.virtual.plant.optimum import best_square_wave
 
 EPISODE = 128
 """Steps per episode; each episode swims one fish of the cloud."""
-NOISE = 0.3
+MAX_NOISE = 0.3
 """Largest noise of a tick in the training, as a share of the best thrust; more would hide the
 reward."""
-GOOD, TRIES = 0.97, 3
+GOOD_MERIT, MAX_TRAININGS = 0.97, 3
 """Merit with which a policy is good enough, as a share of the best square wave on its worst fish;
 and the largest number of trainings."""
 IMITATION_ROUNDS, IMITATION_FISH = 2, 64
 """Rounds of imitation before PPO, and draws from the cloud in each round. PPO alone may stay at a
 wave that is one tick too short or too long."""
-EVERY, OTHERS = 5, 3
+EVALUATION_INTERVAL, OTHER_FISH = 5, 3
 """Updates per evaluation, and number of fish of the cloud evaluated beside the identified one."""
 
 
@@ -48,14 +48,14 @@ def settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
         randomisation=Randomisation(fish=fitted.cloud, offset=min(10.0, fitted.offset)),
         imitation=ImitationSettings(rounds=IMITATION_ROUNDS, fish=IMITATION_FISH),
         ppo=PpoSettings(decay_steps=max(1, steps)),
-        evaluation=EvaluationSettings(every=EVERY, others=OTHERS, patience=None),
+        evaluation=EvaluationSettings(every=EVALUATION_INTERVAL, others=OTHER_FISH, patience=None),
     )
 
 
 def simulated(config: Config, fitted: Fitted) -> Config:
     """Return the configuration of the identified fish on its rig, with the real fish's loop."""
     best = best_square_wave(fitted.plant, config.amplitude_limit).thrust
-    rig = replace(fitted.rig, noise=min(fitted.rig.noise, NOISE * best))
+    rig = replace(fitted.rig, noise=min(fitted.rig.noise, MAX_NOISE * best))
     return replace(config, robot="simulated", plant=fitted.plant, simulation=rig, start=Start())
 
 
@@ -69,8 +69,8 @@ def practise(
 ) -> Trained:
     """Train, and write the policy that did best on its worst fish into the folder.
 
-    Where its merit is less than `GOOD`, the training is repeated with the next seed. There are at
-    most `TRIES` trainings, and the best of all policies is taken.
+    Where its merit is less than `GOOD_MERIT`, the training is repeated with the next seed. There
+    are at most `MAX_TRAININGS` trainings, and the best of all policies is taken.
 
     config: tick, Φ and limits of the fish; its plant and rig are not used
     folder: folder of the adaptation; an interrupted training in it is restarted
@@ -79,7 +79,7 @@ def practise(
     best: Outcome | None = None
     display = _Steps(progress)
     message = "in no evaluation did it swim"
-    for index in range(TRIES):
+    for index in range(MAX_TRAININGS):
         place = folder / (TRAINING if index == 0 else f"{TRAINING}-{index + 1}")
         if place.exists():
             shutil.rmtree(place)
@@ -88,7 +88,7 @@ def practise(
         message = outcome.message or message
         if outcome.best and (best is None or _merit(outcome) > _merit(best)):
             best = outcome
-        if best and _merit(best) >= GOOD:
+        if best and _merit(best) >= GOOD_MERIT:
             break
     if best is None or best.best is None or best.best_evaluation is None:
         return Trained(steps=display.steps, refused=f"nothing came of the training: {message}")
@@ -96,12 +96,12 @@ def practise(
         export(best.best, folder / POLICY, note="of fishctl adapt")
     except PolicyError as error:
         return Trained(steps=display.steps, refused=str(error))
-    found = best.best_evaluation
+    evaluation = best.best_evaluation
     return Trained(
         steps=display.steps,
         folder=best.folder.name,
-        relative_thrust=found.relative_thrust,
-        worst=found.worst,
+        relative_thrust=evaluation.relative_thrust,
+        worst=evaluation.worst,
     )
 
 

@@ -61,11 +61,11 @@ def _draw_fit(axis: Any, fitted: Fitted) -> None:
     one that is withheld has no bar.
     """
     shown = []
-    for name, each in fitted.found["estimates"].items():
-        low, high = each.get("if_ratio_holds") or (each["low"], each["high"])
-        if each.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio":
+    for name, estimate in fitted.found["estimates"].items():
+        low, high = estimate.get("if_ratio_holds") or (estimate["low"], estimate["high"])
+        if estimate.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio":
             width = math.nan if low is None or high is None else high - low
-            shown.append((name, 50.0 * width / abs(each["value"])))
+            shown.append((name, 50.0 * width / abs(estimate["value"])))
     places = np.arange(len(shown))[::-1]
     axis.barh(places, [width for _, width in shown], color=BLUE, height=0.6)
     axis.set_yticks(places, [name for name, _ in shown])
@@ -119,18 +119,19 @@ def _draw_training(axis: Any, folder: Path) -> None:
 
 def _draw_contest(axis: Any, state: State) -> None:
     """Draw the thrusts measured on the fish."""
-    for place, one in enumerate(state.contenders):
+    for place, contender in enumerate(state.contenders):
         axis.errorbar(
-            1e3 * one.thrust, -place, xerr=1e3 * one.error, fmt="o", capsize=3,
-            color=_COLOURS[one.name],
+            1e3 * contender.thrust, -place, xerr=1e3 * contender.error, fmt="o", capsize=3,
+            color=_COLOURS[contender.name],
         )  # fmt: skip
-        if one.true_thrust is not None:
-            axis.plot(1e3 * one.true_thrust, -place, "x", color=BLACK, zorder=3)
+        if contender.true_thrust is not None:
+            axis.plot(1e3 * contender.true_thrust, -place, "x", color=BLACK, zorder=3)
     axis.set_yticks(
-        [-place for place in range(len(state.contenders))], [one.name for one in state.contenders]
+        [-place for place in range(len(state.contenders))],
+        [contender.name for contender in state.contenders],
     )
     axis.set_ylim(0.5 - len(state.contenders), 0.5)
-    known = any(one.true_thrust is not None for one in state.contenders)
+    known = any(contender.true_thrust is not None for contender in state.contenders)
     axis.set_xlabel("thrust, measured, 95 % (mN)" + ("; ×: true" if known else ""))
     axis.set_title("in the tank")
 
@@ -144,7 +145,11 @@ def page(state: State, picture: bytes, again: str) -> str:
     remarks += [f"{NAMES[name]} was left out: {why}" for name, why in state.left_out.items()]
     if line := error_budget.unknown_calibration(state.contenders[0].calibration_ci95, "N"):
         remarks.append(line)
-    remarks += [f"{NAMES[one.name]}: {one.remark}" for one in state.contenders if one.remark]
+    remarks += [
+        f"{NAMES[contender.name]}: {contender.remark}"
+        for contender in state.contenders
+        if contender.remark
+    ]
     if state.trained and state.trained.refused:
         remarks.append(f"no policy took part: {state.trained.refused}")
     minutes = " + ".join(f"{seconds:.0f} s {step}" for step, seconds in state.spent.items())
@@ -161,7 +166,7 @@ def page(state: State, picture: bytes, again: str) -> str:
         _table(*_contenders(state)),
         "<p>Relative thrust is the share of that of the best square wave that the search has "
         "found; the intervals hold together in 95 % of cases. The error of the force sensor's "
-        "calibration is the same fraction of all thrusts, so it is no part of a share.</p>",
+        "calibration is the same fraction of all thrusts, so it does not affect a share.</p>",
         "<h2>The fish</h2>",
         _table(("", "value", "95 % interval", "unit"), _estimates(state.fitted)),
         *([f"<h2>Careful</h2><ul>{''.join(map(_item, remarks))}</ul>"] if remarks else []),
@@ -181,22 +186,28 @@ def _item(words: str) -> str:
 def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Return the head and the rows of the table of measured gaits."""
     assert state.verdict
-    known = any(one.true_thrust is not None for one in state.contenders)
+    known = any(contender.true_thrust is not None for contender in state.contenders)
     head = ("gait", "thrust", "Hz", "relative thrust", *(("true thrust",) if known else ()))
     rows = []
-    for one in state.contenders:
-        share = state.verdict.others.get(one.name)
+    for contender in state.contenders:
+        share = state.verdict.others.get(contender.name)
         relative_thrust = "100 %"
         if share:
             relative_thrust = format_ratio(share)
         row = [
-            NAMES[one.name] + _role(one.name, state.verdict),
-            error_budget.spelled(one.thrust, one.error, one.calibration_ci95, one.total_ci95, "N"),
-            f"{one.frequency:.3f}",
+            NAMES[contender.name] + _role(contender.name, state.verdict),
+            error_budget.spelled(
+                contender.thrust,
+                contender.error,
+                contender.calibration_ci95,
+                contender.total_ci95,
+                "N",
+            ),
+            f"{contender.frequency:.3f}",
             relative_thrust,
         ]
         if known:
-            true = one.true_thrust
+            true = contender.true_thrust
             row.append("" if true is None else f"{1e3 * true:.2f} mN")
         rows.append(tuple(row))
     return head, rows
@@ -214,14 +225,14 @@ def _role(name: str, verdict: Verdict) -> str:
 def _estimates(fitted: Fitted) -> list[tuple[str, ...]]:
     """Return the rows of the fitted parameters, as `fishctl identify` prints them."""
     rows = []
-    for name, each in fitted.found["estimates"].items():
-        if each.get("fitted", True):
+    for name, values in fitted.found["estimates"].items():
+        if values.get("fitted", True):
             # JSON has no infinity: null stands for an end that the data do not determine.
-            low = -math.inf if each["low"] is None else each["low"]
-            high = math.inf if each["high"] is None else each["high"]
-            narrow = each.get("if_ratio_holds")
+            low = -math.inf if values["low"] is None else values["low"]
+            high = math.inf if values["high"] is None else values["high"]
+            narrow = values.get("if_ratio_holds")
             narrow = (narrow[0], narrow[1]) if narrow else None
-            estimate = Estimate(name, each["value"], low, high, if_ratio_holds=narrow)
+            estimate = Estimate(name, values["value"], low, high, if_ratio_holds=narrow)
             *row, unit = format_estimate(estimate)
             rows.append((*row, unit or "–"))
     return rows

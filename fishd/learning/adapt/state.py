@@ -163,6 +163,6 @@ class AdaptFolder:
         self.experiment = experiment
         self.state = experiment.read_struct(STATE, State) or State()
 
-    def keep(self) -> None:
+    def save(self) -> None:
         """Write the state; raises `FishdError`."""
         self.experiment.write_struct(STATE, self.state)

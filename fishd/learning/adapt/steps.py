@@ -35,15 +35,15 @@ from fishd.virtual.plant.optimum import best_square_wave, square_wave
 
 FITTED = (*DEFAULT, "lateral_quadratic_drag", "servo_dead_zone", "servo_reaction")
 """Fitted parameters: all that a fit can find except slack, which backlash represents."""
-LEAST_EXPLAINED = 0.1
+MIN_EXPLAINED = 0.1
 """Smallest explained share of a force; below it the force is mostly noise: the fit is rejected."""
-AROUND = 2.0
+SEARCH_RATIO = 2.0
 """Factor of the search range of square waves, below and above the best of the identified fish."""
-SLOWEST, FASTEST = 0.3, 8.0
+MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ = 0.3, 8.0
 """Bounds of the search of square waves, whatever the fit [Hz]."""
 BUDGET = {"excitation": 0.2, "swing": 0.14, "search": 0.2}
 """Shares of the tank time; the comparison uses the remainder."""
-LEAST = 150.0
+MIN_TANK_TIME_S = 150.0
 """Shortest tank time [s]: its excitation takes 30 s, the shortest that a fit accepts."""
 
 
@@ -51,30 +51,30 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
     """Fit a fish to a recorded excitation, without prior knowledge; return it and its cloud.
 
     amplitude: Φ [rad]
-    Raises `Unidentifiable`, also where the fit explains less than `LEAST_EXPLAINED` of a force.
+    Raises `Unidentifiable`, also where the fit explains less than `MIN_EXPLAINED` of a force.
     """
-    found = identify([recording], fit=FITTED)
-    for channel, symbol in zip(found.channels, ("F_x", "F_y"), strict=True):
-        if not channel.explained >= LEAST_EXPLAINED:
+    identification = identify([recording], fit=FITTED)
+    for channel, symbol in zip(identification.channels, ("F_x", "F_y"), strict=True):
+        if not channel.explained >= MIN_EXPLAINED:
             raise Unidentifiable(
-                f"the best fit explains {max(0.0, channel.explained):.0%} of {symbol} only: its "
-                "forces are mostly noise, or have nothing to do with what it is told to do; see "
+                f"the best fit explains {max(0.0, channel.explained):.0%} of {symbol} only: the "
+                "forces are mostly noise, or do not follow the commands; see "
                 "fishctl plot and fishctl identify with --plot"
             )
-    plant = identified(found)
-    model = model_of(found)
+    plant = identified(identification)
+    model = model_of(identification)
     if not best_square_wave(plant, amplitude).thrust > 0.0:
         model = replace(model, error=None)
-    offset, drift = found["offset_y"], found.channels[1].drift
+    offset, drift = identification["offset_y"], identification.channels[1].drift
     fitted = Fitted(
         plant=plant,
-        rig=msgspec.convert(found.simulation, SimulationSettings),
+        rig=msgspec.convert(identification.simulation, SimulationSettings),
         offset=max(offset.high - offset.value, 0.5 * drift),
-        cloud=cloud(found, seed),
+        cloud=cloud(identification, seed),
         model=model,
-        found=found.to_builtins(),
+        found=identification.to_builtins(),
     )
-    return found, fitted
+    return identification, fitted
 
 
 def settle_swing(session: Session, seconds: float) -> Rung:
@@ -83,9 +83,11 @@ def settle_swing(session: Session, seconds: float) -> Rung:
     session.rest(REST)
     end = ticks[len(ticks) // 2 :]
     shown = [tick.quantities for tick in end if tick.quantities]
-    watching = [each for each in shown if not each["searching"]]
+    watching = [quantities for quantities in shown if not quantities["searching"]]
     # If the search is not over, the rung between the trials is the most frequent one.
-    rungs = Counter((each["criterion"], each["lead"]) for each in watching or shown)
+    rungs = Counter(
+        (quantities["criterion"], quantities["lead"]) for quantities in watching or shown
+    )
     (criterion, lead), _ = rungs.most_common(1)[0]
     return Rung(criterion, lead, bool(watching))
 
@@ -95,11 +97,11 @@ def square_waves(fitted: Fitted, session: Session, seed: int) -> Search:
 
     Where the fish explains too little, all frequencies are searched.
     """
-    low, high = SLOWEST, FASTEST
+    low, high = MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ
     if fitted.model.error is not None:
         best = best_square_wave(fitted.plant, session.amplitude).frequency
-        best = min(FASTEST / AROUND, max(SLOWEST * AROUND, best))
-        low, high = best / AROUND, best * AROUND
+        best = min(MAX_FREQUENCY_HZ / SEARCH_RATIO, max(MIN_FREQUENCY_HZ * SEARCH_RATIO, best))
+        low, high = best / SEARCH_RATIO, best * SEARCH_RATIO
     high = min(high, 0.5 / session.tick)
     return Search([restrict_to_whole_ticks(Range("frequency", low, high), session.tick)], seed)
 
@@ -109,22 +111,27 @@ def search_square_waves(
     search: Search,
     budget: float,
     before: Sequence[Tried],
-    keep: Callable[[Tried], None],
+    add_trial: Callable[[Tried], None],
 ) -> None:
     """Try square waves until the budget is used [s].
 
-    before: square waves tried already; keep: called with each new one
+    before: square waves tried already; add_trial: called with each new one
     """
     last = None
-    for one in before:
-        nobody = math.nan, math.nan  # the electrical power is unknown
+    for tried in before:
+        power = math.nan, math.nan  # the electrical power is unknown
         last = Trial(
-            {"frequency": one.frequency}, one.thrust, one.error, *nobody, one.swum, one.passed
+            {"frequency": tried.frequency},
+            tried.thrust,
+            tried.error,
+            *power,
+            tried.swum,
+            tried.passed,
         )
         search.observe(last.parameters, last.thrust, last.error)
-    for each in measure_trials(session, "square", {}, search, budget, last):
-        frequency = each.parameters["frequency"]
-        keep(Tried(frequency, each.thrust, each.error, each.swum, each.passed))
+    for trial in measure_trials(session, "square", {}, search, budget, last):
+        frequency = trial.parameters["frequency"]
+        add_trial(Tried(frequency, trial.thrust, trial.error, trial.swum, trial.passed))
 
 
 def best_of(
@@ -146,20 +153,20 @@ def best_of(
         )
         spread = deviations(curves, fitted.model.error, correlation_of_waves(frequencies))
         places = [int(np.argmin(np.abs(np.subtract(frequencies, t.frequency)))) for t in tried]
-        measured = np.array([each.thrust for each in tried])
-        ci95 = np.array([each.error for each in tried])
+        measured = np.array([trial.thrust for trial in tried])
+        ci95 = np.array([trial.error for trial in tried])
         if not is_rejected(curves[0], spread, places, measured, ci95):
             thrusts, _ = combine(curves[0], spread, places, measured, ci95)
             return frequencies[int(np.argmax(thrusts))], True
     return search.propose().parameters["frequency"], False
 
 
-def least_search(session: Session, search: Search) -> float:
+def min_search_time(session: Session, search: Search) -> float:
     """Return the time of a search that tries the slowest wave once [s]."""
     return 2.0 * REST + trial_durations({"frequency": search.ranges[0].values[0]})[1] + session.tick
 
 
-def least_measurement(parameters: Mapping[str, Any]) -> float:
+def min_measurement_time(parameters: Mapping[str, Any]) -> float:
     """Return the shortest time in which a gait can be measured, rests included [s]."""
     frequency = float(parameters.get("frequency", 0.0))
     swim = max(SWIM, 1.5 + 3.0 / frequency) if frequency else SWIM

@@ -42,11 +42,13 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
     contenders: measured gaits; one is named `square`
     Raises `FishdError` where the thrust of the square wave is too small to compare with.
     """
-    square = next(one for one in contenders if one.name == SQUARE)
-    others = [one for one in contenders if one is not square]
-    shares = {one.name: _relative_thrust(one, square, len(others)) for one in others}
-    ranking = rank([_candidate(one) for one in contenders])
-    names = [each.name for each in ranking.undecided]
+    square = next(contender for contender in contenders if contender.name == SQUARE)
+    others = [contender for contender in contenders if contender is not square]
+    shares = {
+        contender.name: _relative_thrust(contender, square, len(others)) for contender in others
+    }
+    ranking = rank([_candidate(contender) for contender in contenders])
+    names = [candidate.name for candidate in ranking.undecided]
     if ranking.is_decided:
         chosen, claim = names[0], _format_win(names[0], shares)
     else:
@@ -71,20 +73,22 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
     )
 
 
-def _candidate(one: Contender) -> Candidate:
-    return Candidate(one.name, one.thrust, one.error, complexity(one.controller))
+def _candidate(contender: Contender) -> Candidate:
+    return Candidate(
+        contender.name, contender.thrust, contender.error, complexity(contender.controller)
+    )
 
 
 def _relative_thrust(
-    one: Contender, square: Contender, comparisons: int
+    contender: Contender, square: Contender, comparisons: int
 ) -> tuple[float, float, float]:
     """Return a relative thrust with its interval; raises `FishdError`."""
-    widths = [half_width(_candidate(each), comparisons) for each in (one, square)]
-    share = ratio(one.thrust, widths[0], square.thrust, widths[1])
+    widths = [half_width(_candidate(gait), comparisons) for gait in (contender, square)]
+    share = ratio(contender.thrust, widths[0], square.thrust, widths[1])
     if share is None:
         raise FishdError(
             f"the best square wave found thrusts {1e3 * square.thrust:.2f} ± "
-            f"{1e3 * square.error:.2f} mN: too little to be told from nothing, so no relative "
+            f"{1e3 * square.error:.2f} mN: too little to differ clearly from zero, so no relative "
             "thrust is known"
         )
     return share
@@ -92,12 +96,12 @@ def _relative_thrust(
 
 def _not_excluded_by(contenders: Sequence[Contender], names: list[str], model: Model) -> list[str]:
     """Return the undecided gaits that the identified fish does not exclude, in their order."""
-    expected = np.array([one.expected for one in contenders]).T
+    expected = np.array([contender.expected for contender in contenders]).T
     if model.error is None or model.is_rejected or not expected.size or expected[0].min() <= 0.0:
         return names
     places = range(len(contenders))
-    measured = np.array([one.thrust for one in contenders])
-    ci95 = np.array([one.error for one in contenders])
+    measured = np.array([contender.thrust for contender in contenders])
+    ci95 = np.array([contender.error for contender in contenders])
     spread = deviations(expected, model.error)
     if is_rejected(expected[0], spread, places, measured, ci95):
         return names

@@ -339,7 +339,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
 
 
 def _check_agreement(link: Link, config: Config) -> None:
-    """Raise `ConfigError` where the fish has another tick or Φ than the scales are computed from."""
+    """Raise `ConfigError` where the fish has another tick or Φ than the configuration."""
     for key, here, there, unit in (
         ("tick", config.tick, link.tick, "s"),
         ("amplitude_limit", config.amplitude_limit, link.amplitude, "rad"),

@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 
 MODEL, CARD, STATE, EYE = "model.zip", "card.json", "state.json", "eye.msgpack"
 
-LARGEST_MODEL = 256 * 2**20
+MAX_MODEL_BYTES = 256 * 2**20
 """Largest size of the file of networks and optimiser [bytes]."""
-LARGEST_EYE = 16 * 2**20
+MAX_EYE_BYTES = 16 * 2**20
 """Largest size of the file of an eye's constants [bytes]."""
-LARGEST_TEXT = 2**20
+MAX_TEXT_BYTES = 2**20
 """Largest size of the file of a card, or of a state [bytes]."""
 
 _NAME = re.compile(r"(step|best)-(\d+)", re.ASCII)
@@ -119,25 +119,26 @@ def save(
 def all_in(folder: Path) -> list[Path]:
     """Return the checkpoints of a run by steps; a `best` is before a `step` of the same steps."""
     named = [(_NAME.fullmatch(path.name), path) for path in folder.glob("*-*")]
-    found = [(int(name[2]), name[1] == "step", path) for name, path in named if name]
-    return [path for _, _, path in sorted(found)]
+    checkpoints = [(int(name[2]), name[1] == "step", path) for name, path in named if name]
+    return [path for _, _, path in sorted(checkpoints)]
 
 
 def newest(folder: Path) -> Path:
     """Return the checkpoint with most steps of a run folder; raises `CheckpointError`."""
-    found = all_in(folder)
-    if not found:
+    checkpoints = all_in(folder)
+    if not checkpoints:
         raise CheckpointError(
-            f"{folder}: there is no checkpoint in it: the training ended before the first one, or "
+            f"{folder}: it contains no checkpoint: the training ended before the first one, or "
             "there was none; name another folder, or train into a new one"
         )
-    return found[-1]
+    return checkpoints[-1]
 
 
 def best(folder: Path) -> Path | None:
     """Return the checkpoint that swam best; None where no policy of the run has swum."""
-    found = [path for path in all_in(folder) if path.name.startswith("best")]
-    return max(found, key=_written, default=None)  # after a kill, the previous best may remain
+    checkpoints = [path for path in all_in(folder) if path.name.startswith("best")]
+    # After a kill, the previous best may remain.
+    return max(checkpoints, key=_write_time, default=None)
 
 
 def find(path: Path, *, latest: bool = False) -> Path:
@@ -158,7 +159,7 @@ def find(path: Path, *, latest: bool = False) -> Path:
 
 def refuse_several(folder: Path) -> None:
     """Raise `CheckpointError` for a folder that contains the run folders of several seeds."""
-    seeds = sorted(folder.glob("seed-*"), key=lambda one: (len(one.name), one.name))
+    seeds = sorted(folder.glob("seed-*"), key=lambda path: (len(path.name), path.name))
     if seeds:
         raise CheckpointError(
             f"{folder} holds several trainings, {seeds[0].name} to {seeds[-1].name}; name one of "
@@ -184,7 +185,7 @@ def sweep(folder: Path) -> None:
 def read_card(checkpoint: Path) -> Card:
     """Read the card of a checkpoint; raises `CheckpointError`."""
     try:
-        return decode(_text(checkpoint / CARD))
+        return decode(_read_text(checkpoint / CARD))
     except PolicyError as error:
         raise CheckpointError(f"{checkpoint / CARD}: {error}") from None
 
@@ -192,15 +193,15 @@ def read_card(checkpoint: Path) -> Card:
 def read_state(checkpoint: Path) -> State:
     """Read the state of a checkpoint; raises `CheckpointError`."""
     try:
-        return msgspec.json.decode(_text(checkpoint / STATE), type=State)
+        return msgspec.json.decode(_read_text(checkpoint / STATE), type=State)
     except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{checkpoint / STATE}: {_brief(error)}; {_ADVICE}") from None
+        raise CheckpointError(f"{checkpoint / STATE}: {_format_error(error)}; {_ADVICE}") from None
 
 
 def load_parameters(model: "PPO", checkpoint: Path, *, optimiser: bool = True) -> None:
     """Load networks, and optimiser, into a model of the same shape; raises `CheckpointError`."""
     fresh = model.get_parameters()["policy.optimizer"]
-    with _readable(checkpoint / MODEL) as parameters:
+    with _open_model(checkpoint / MODEL) as parameters:
         model.set_parameters(parameters, exact_match=True, device="cpu")
     if not optimiser:
         model.policy.optimizer.load_state_dict(fresh)
@@ -208,7 +209,7 @@ def load_parameters(model: "PPO", checkpoint: Path, *, optimiser: bool = True) -
 
 def read_parameters(checkpoint: Path) -> dict[str, Any]:
     """Read the parameters of networks and optimiser; raises `CheckpointError`."""
-    with _readable(checkpoint / MODEL) as parameters:
+    with _open_model(checkpoint / MODEL) as parameters:
         return parameters
 
 
@@ -221,7 +222,7 @@ def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
     eye = eyes.make_eye(settings)
     if eye:
         load_eye(eye, checkpoint)
-    with _readable(checkpoint / MODEL) as parameters:
+    with _open_model(checkpoint / MODEL) as parameters:
         policy = make_policy(settings.ppo, card.numbers, eye)
         policy.load_state_dict(parameters["policy"])
     policy.set_training_mode(False)
@@ -234,46 +235,50 @@ def load_eye(eye: Eye, checkpoint: Path) -> None:
     if not path.exists():
         return
     try:
-        content = files.read(path, LARGEST_EYE, "the constants of an eye")
-        found = msgspec.msgpack.decode(content, type=dict[str, Constant])
+        content = files.read(path, MAX_EYE_BYTES, "the constants of an eye")
+        constants = msgspec.msgpack.decode(content, type=dict[str, Constant])
         eye.restore(
             {
-                name: np.frombuffer(one.values, np.float32).reshape(one.shape)
-                for name, one in found.items()
+                name: np.frombuffer(constant.values, np.float32).reshape(constant.shape)
+                for name, constant in constants.items()
             }
         )
     except files.FileProblem as problem:
         raise CheckpointError(f"{path}: {problem}; {_ADVICE}") from None
     except (ValueError, OverflowError, RecursionError) as error:
-        raise CheckpointError(f"{path}: cannot be read: {_brief(error)}; {_ADVICE}") from None
+        raise CheckpointError(
+            f"{path}: cannot be read: {_format_error(error)}; {_ADVICE}"
+        ) from None
 
 
 @contextmanager
-def _readable(path: Path) -> Iterator[dict[str, Any]]:
+def _open_model(path: Path) -> Iterator[dict[str, Any]]:
     """Yield the tensors of a model's file; raises `CheckpointError`, also if their use fails."""
     try:
-        yield _tensors(path)
+        yield _read_tensors(path)
     except files.FileProblem as problem:
         raise CheckpointError(f"{path}: {problem}; {_ADVICE}") from None
     except (RuntimeError, ValueError, KeyError) as error:
-        raise CheckpointError(f"{path}: cannot be read: {_brief(error)}; {_ADVICE}") from None
+        raise CheckpointError(
+            f"{path}: cannot be read: {_format_error(error)}; {_ADVICE}"
+        ) from None
 
 
-def _tensors(path: Path) -> dict[str, Any]:
+def _read_tensors(path: Path) -> dict[str, Any]:
     from stable_baselines3.common.save_util import load_from_zip_file
 
-    content = files.read(path, LARGEST_MODEL, "a checkpoint")
+    content = files.read(path, MAX_MODEL_BYTES, "a checkpoint")
     try:
         with ZipFile(io.BytesIO(content)) as archive:
-            if sum(part.file_size for part in archive.infolist()) > LARGEST_MODEL:
+            if sum(part.file_size for part in archive.infolist()) > MAX_MODEL_BYTES:
                 raise ValueError("it unpacks to far more than a checkpoint needs")
-        found = load_from_zip_file(io.BytesIO(content), load_data=False, device="cpu")
-        return cast(dict[str, Any], found[1])
+        parts = load_from_zip_file(io.BytesIO(content), load_data=False, device="cpu")
+        return cast(dict[str, Any], parts[1])
     except Exception as error:  # a damaged archive raises many kinds of exceptions
-        raise ValueError(_brief(error.__cause__ or error)) from None
+        raise ValueError(_format_error(error.__cause__ or error)) from None
 
 
-def _brief(error: BaseException) -> str:
+def _format_error(error: BaseException) -> str:
     if isinstance(error, KeyError):
         return f"{error} is missing"
     return " ".join(str(error).split())[:200] or type(error).__name__
@@ -287,15 +292,15 @@ def _discard(checkpoint: Path) -> None:
     shutil.rmtree(old)
 
 
-def _written(checkpoint: Path) -> float:
+def _write_time(checkpoint: Path) -> float:
     try:
         return (checkpoint / STATE).stat().st_mtime
     except OSError:
         return 0.0
 
 
-def _text(path: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
-        return files.read_text(path, LARGEST_TEXT, "a checkpoint")
+        return files.read_text(path, MAX_TEXT_BYTES, "a checkpoint")
     except files.FileProblem as problem:
         raise CheckpointError(f"{path}: {problem}; {_ADVICE}") from None

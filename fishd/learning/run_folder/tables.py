@@ -96,7 +96,10 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
 def best_so_far(evaluations: Iterable[Evaluation]) -> list[float]:
     """Return the relative thrust of the best policy until each evaluation, stalled excluded."""
     best = 0.0
-    return [best := one.relative_thrust if one.best else best for one in evaluations]
+    return [
+        best := evaluation.relative_thrust if evaluation.best else best
+        for evaluation in evaluations
+    ]
 
 
 def write_summary(path: Path, folders: Sequence[Path]) -> None:
@@ -108,7 +111,9 @@ def write_summary(path: Path, folders: Sequence[Path]) -> None:
     for folder in folders:
         evaluations = read_evaluations(folder)
         shares = zip(evaluations, best_so_far(evaluations), strict=True)
-        runs.append({one.steps: (one.relative_thrust, best) for one, best in shares})
+        runs.append(
+            {evaluation.steps: (evaluation.relative_thrust, best) for evaluation, best in shares}
+        )
     lines: list[Sequence[Any]] = [SUMMARY]
     latest: dict[int, tuple[float, float]] = {}
     for steps in sorted(set().union(*runs)):

@@ -4,7 +4,7 @@ Each swim gives one thrust, with an error of unknown size. The policy of the nex
 in LUCB (Kalyanakrishnan et al., "PAC subset selection in stochastic multi-armed bandits", ICML
 2012): of the policy with the highest mean, and of the one with the highest upper bound among the
 others, the one that has swum less often. The search ends when no other policy may be better by more
-than `NEAR`.
+than `EQUAL_SHARE`.
 """
 
 import math
@@ -15,12 +15,12 @@ from msgspec import Struct
 from fishd.core.calibration import Z95
 from fishd.learning.env.swims import Swim
 
-NEAR = 0.01
+EQUAL_SHARE = 0.01
 """Difference of thrust below which policies are equally good, as a share of the best square
 wave's."""
-MOST = 8
+MAX_CANDIDATES = 8
 """Largest number of candidates."""
-FIRST_ERROR, FIRST_DEGREES = 0.03, 3
+PRIOR_ERROR, PRIOR_DEGREES = 0.03, 3
 """Prior standard deviation of a swim, as a share of the best square wave's thrust, and its weight
 as a number of comparisons of swims of the same policy."""
 
@@ -55,38 +55,44 @@ class Candidates:
 
     def __init__(self, best_thrust: float) -> None:
         """best_thrust: thrust of the best square wave [N]"""
-        self.those: list[Candidate] = []
-        self._near = NEAR * best_thrust
-        self._squares = FIRST_DEGREES * (FIRST_ERROR * best_thrust) ** 2
-        self._degrees = FIRST_DEGREES
+        self.remaining: list[Candidate] = []
+        self._equal = EQUAL_SHARE * best_thrust
+        self._squares = PRIOR_DEGREES * (PRIOR_ERROR * best_thrust) ** 2
+        self._degrees = PRIOR_DEGREES
 
-    def add(self, one: Candidate) -> None:
+    def add(self, candidate: Candidate) -> None:
         """Add a candidate, which may have swum before."""
-        self.those.append(one)
+        self.remaining.append(candidate)
 
-    def count(self, one: Candidate, swim: Swim) -> None:
+    def count(self, candidate: Candidate, swim: Swim) -> None:
         """Add a swim to the figures of a candidate; remove the candidate if it stalls."""
-        one.frequency, one.fullness, one.stalled = swim.frequency, swim.fullness, swim.stalled
-        one.swam += swim.seconds
-        if one.stalled:
-            self.those.remove(one)
+        candidate.frequency, candidate.fullness, candidate.stalled = (
+            swim.frequency,
+            swim.fullness,
+            swim.stalled,
+        )
+        candidate.swam += swim.seconds
+        if candidate.stalled:
+            self.remaining.remove(candidate)
         elif swim.thrust is not None:
-            if one.swims:
-                self._squares += (swim.thrust - one.thrust) ** 2 * one.swims / (one.swims + 1)
+            if candidate.swims:
+                self._squares += (
+                    (swim.thrust - candidate.thrust) ** 2 * candidate.swims / (candidate.swims + 1)
+                )
                 self._degrees += 1
-            one.swims += 1
-            one.thrust += (swim.thrust - one.thrust) / one.swims
+            candidate.swims += 1
+            candidate.thrust += (swim.thrust - candidate.thrust) / candidate.swims
 
-    def error(self, one: Candidate) -> float:
+    def error(self, candidate: Candidate) -> float:
         """Return the half-width of the 95 % interval of its thrust, infinite before a swim [N].
 
         The errors of all swims are assumed to have the same standard deviation, which is estimated
         from all policies that have swum more than once.
         """
-        if not one.swims:
+        if not candidate.swims:
             return math.inf
         variance = self._squares / (self._degrees - 2)  # as that of Student's t distribution
-        return Z95 * math.sqrt(variance / one.swims)
+        return Z95 * math.sqrt(variance / candidate.swims)
 
     @property
     def best(self) -> Candidate | None:
@@ -95,32 +101,36 @@ class Candidates:
 
     def next(self) -> Candidate | None:
         """Return the candidate of the next swim; None where the best is known well enough."""
-        for one in reversed(self.those):
-            if not one.swims:
-                return one
-        first = max(self.those, key=lambda one: one.thrust, default=None)
-        others = [one for one in self.those if one is not first]
+        for candidate in reversed(self.remaining):
+            if not candidate.swims:
+                return candidate
+        first = max(self.remaining, key=lambda candidate: candidate.thrust, default=None)
+        others = [candidate for candidate in self.remaining if candidate is not first]
         if first is None or not others:
             return None
         rival = max(others, key=self._upper)
-        if self._upper(rival) <= self._lower(first) + self._near:
+        if self._upper(rival) <= self._lower(first) + self._equal:
             return None
-        return min(first, rival, key=lambda one: one.swims)
+        return min(first, rival, key=lambda candidate: candidate.swims)
 
-    def weed(self) -> None:
-        """Remove candidates that can no longer be the best, and the least likely beyond `MOST`."""
-        least = max(map(self._lower, self._measured), default=-math.inf)
-        likely = sorted(self.those, key=self._upper, reverse=True)
-        kept = [one for one in likely if self._upper(one) >= least][:MOST]
+    def remove_unlikely(self) -> None:
+        """Remove candidates that can no longer be the best; keep at most `MAX_CANDIDATES`."""
+        bound = max(map(self._lower, self._measured), default=-math.inf)
+        likely = sorted(self.remaining, key=self._upper, reverse=True)
+        kept = [candidate for candidate in likely if self._upper(candidate) >= bound][
+            :MAX_CANDIDATES
+        ]
         best = self.best
-        self.those = [one for one in self.those if one in kept or one is best]
+        self.remaining = [
+            candidate for candidate in self.remaining if candidate in kept or candidate is best
+        ]
 
     @property
     def _measured(self) -> list[Candidate]:
-        return [one for one in self.those if one.swims]
+        return [candidate for candidate in self.remaining if candidate.swims]
 
-    def _lower(self, one: Candidate) -> float:
-        return one.thrust - self.error(one)
+    def _lower(self, candidate: Candidate) -> float:
+        return candidate.thrust - self.error(candidate)
 
-    def _upper(self, one: Candidate) -> float:
-        return one.thrust + self.error(one)
+    def _upper(self, candidate: Candidate) -> float:
+        return candidate.thrust + self.error(candidate)

@@ -71,7 +71,7 @@ class ShownDisplay(Display):
         merit = round(evaluation.merit, 3)
         better = evaluation.best and (evaluation.error is not None or merit > self._best)
         self._best = merit if better else self._best
-        line = described(evaluation) + (", the best so far" if better else "")
+        line = describe_evaluation(evaluation) + (", the best so far" if better else "")
         self._show.done(line, self._steps)
 
 
@@ -80,7 +80,7 @@ def imitation(number: int, rounds: int, right: float) -> str:
     return f"imitation {number} of {rounds}: {right:.1%} right"
 
 
-def described(evaluation: "Evaluation") -> str:
+def describe_evaluation(evaluation: "Evaluation") -> str:
     """Format an evaluation in one line."""
     when = f"{evaluation.steps:7d} steps, {minutes(evaluation.tank_time):>8} in the tank"
     if evaluation.swam is None:

@@ -23,9 +23,9 @@ from fishd.learning.run_folder.tables import EVALUATIONS, PROGRESS, Table
 from fishd.learning.train.candidates import Candidate
 from fishd.learning.train.jobs import Job
 
-GOOD_ENOUGH = 0.97
+MIN_FINAL_MERIT = 0.97
 """Smallest merit with which a training may end before its last step."""
-IMPROVEMENT = 0.001
+MIN_IMPROVEMENT = 0.001
 """Smallest rise of the merit that counts as a better policy."""
 
 
@@ -62,9 +62,9 @@ class RunRecorder:
         self.latest: Evaluation | None = None
         self.best: Evaluation | None = None
         self.unimproved = 0
-        """Number of evaluations in simulation since the best merit rose by `IMPROVEMENT`."""
+        """Number of evaluations in simulation since the best merit rose by `MIN_IMPROVEMENT`."""
         self._plateau = 0.0
-        """Merit of the best policy after its latest rise by `IMPROVEMENT`."""
+        """Merit of the best policy after its latest rise by `MIN_IMPROVEMENT`."""
         self.imitated = False
         """Whether imitation is finished, in this run or in the one that it began with."""
         self.checkpoint: Path | None = None
@@ -105,7 +105,7 @@ class RunRecorder:
         """Write one row of evaluations.csv; return the evaluation with `best` set."""
         is_best = self.best is None or evaluation.merit >= self.best.merit
         self.unimproved += 1
-        if evaluation.merit >= self._plateau + IMPROVEMENT:
+        if evaluation.merit >= self._plateau + MIN_IMPROVEMENT:
             self._plateau, self.unimproved = evaluation.merit, 0
         return self.add_measured(replace(evaluation, best=is_best and not evaluation.stalled))
 
@@ -115,7 +115,7 @@ class RunRecorder:
         patience, latest, best = self._job.settings.evaluation.patience, self.latest, self.best
         if patience is None or latest is None or best is None or self.unimproved < patience:
             return False
-        return best.merit >= GOOD_ENOUGH and latest.merit > best.merit - IMPROVEMENT
+        return best.merit >= MIN_FINAL_MERIT and latest.merit > best.merit - MIN_IMPROVEMENT
 
     def add_measured(self, evaluation: Evaluation) -> Evaluation:
         """Write one row of evaluations.csv, with `best` as given; return the evaluation."""
@@ -126,12 +126,12 @@ class RunRecorder:
             self.best = evaluation
         return evaluation
 
-    def save(self, *, due: bool = True, anew: bool = False) -> None:
+    def save(self, *, due: bool = True, policy_changed: bool = False) -> None:
         """Write a `best` checkpoint if another policy is now the best, and a `step` one if due.
 
         due: write a `step` checkpoint unless the newest one is of this step, and also a `best`
             one if only the figures of the best policy have changed
-        anew: write it even then, because the policy has changed without a step
+        policy_changed: write it even then, because the policy has changed without a step
 
         Call it after the rows of the tables are written: a resume drops rows that are newer than
         the checkpoint, but cannot add missing ones.
@@ -141,10 +141,16 @@ class RunRecorder:
             best and best.policy != kept.policy and best.merit != kept.merit
         )
         if best and best != kept and (due or is_better):
-            with _wearing(self._model, self.winner.parameters) if self.winner else nullcontext():
+            with (
+                _with_parameters(self._model, self.winner.parameters)
+                if self.winner
+                else nullcontext()
+            ):
                 self._save("best")
             self._kept = best
-        if anew or (due and (self.checkpoint is None or self.checkpoint.name != f"step-{name}")):
+        if policy_changed or (
+            due and (self.checkpoint is None or self.checkpoint.name != f"step-{name}")
+        ):
             self.checkpoint = self._save("step")
 
     def close(self) -> None:
@@ -161,13 +167,13 @@ class RunRecorder:
             raise ConfigError(f"{folder} is being trained in, by process {taken.pid}") from None
 
     def _save(self, kind: Literal["step", "best"]) -> Path:
-        one = self.winner if kind == "best" else None
+        candidate = self.winner if kind == "best" else None
         state = State(
             on=self._job.on,
-            steps=one.steps if one else self.steps,
-            updates=one.updates if one else self._model._n_updates,
+            steps=candidate.steps if candidate else self.steps,
+            updates=candidate.updates if candidate else self._model._n_updates,
             tank_time=self._env.tank_time,
-            rollouts=one.rollouts if one else self.rollouts,
+            rollouts=candidate.rollouts if candidate else self.rollouts,
             latest=self.latest,
             best=self.best,
             imitated=self.imitated,
@@ -182,13 +188,13 @@ class RunRecorder:
 
     def _begin_with(self, parent: Path) -> None:
         """Load the networks of another run; raises `CheckpointError`."""
-        past = self._checked_card(parent).provenance
+        past = self._check_card(parent).provenance
         checkpoints.load_parameters(self._model, parent, optimiser=False)
         name = f"{parent.resolve().parent.name}/{parent.name}"
         self._note = f"began with {name}, {past.steps} steps in {past.on}"
         self.imitated = True
 
-    def _checked_card(self, checkpoint: Path) -> Card:
+    def _check_card(self, checkpoint: Path) -> Card:
         """Return the card of a checkpoint.
 
         Raises `CheckpointError` where its inputs, actions or networks differ from those of this
@@ -232,7 +238,7 @@ class RunRecorder:
                 f"{job.folder} was trained on {state.on}; to go on with its networks on another "
                 f"fish, begin a new run: --on {job.on} --from {job.folder}"
             )
-        card = self._checked_card(self.checkpoint)
+        card = self._check_card(self.checkpoint)
         if state.is_finished(job.settings.steps):
             raise ConfigError(
                 f"{job.folder} is finished, with {state.steps} steps; to train it for longer, give "
@@ -244,11 +250,11 @@ class RunRecorder:
         self.steps = model.num_timesteps = state.steps
         self.rollouts, model._n_updates = state.rollouts, state.updates
         self.latest, self.imitated = state.latest, state.imitated
-        self._take_best(state)
+        self._restore_best(state)
         self._env.tank_time = state.tank_time
         runs.write_settings(job.folder, job.settings)
 
-    def _take_best(self, state: State) -> None:
+    def _restore_best(self, state: State) -> None:
         """Restore the best policy; one from a tank stays a candidate, with its previous swims.
 
         After a kill, the checkpoint of the best may be newer than the one that is resumed.
@@ -280,7 +286,7 @@ class RunRecorder:
 
 
 @contextmanager
-def _wearing(model: PPO, parameters: dict[str, Any]) -> Iterator[None]:
+def _with_parameters(model: PPO, parameters: dict[str, Any]) -> Iterator[None]:
     """Give a model other networks and another optimiser state; restore its own at the end."""
     own: Any = copy.deepcopy(model.get_parameters())
     model.set_parameters(parameters, device="cpu")

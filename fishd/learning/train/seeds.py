@@ -54,30 +54,30 @@ def train_seeds(
     from fishd.learning.run_folder.tables import write_summary
 
     folder = job.folder.absolute()
-    waiting = [_job_of(job, folder, index) for index in range(seeds)]
+    waiting = [_make_job(job, folder, index) for index in range(seeds)]
     outcomes: dict[int, Outcome] = {}
 
-    def keep(index: int, outcome: Outcome) -> None:
+    def add_outcome(index: int, outcome: Outcome) -> None:
         outcomes[index] = outcome
         ended(waiting[index].settings.seed, outcome)
 
     check_free(folder)  # before workers remove the file that stops them
     with workers(folder / STOP, jobs, cluster) as crew, on_signal(crew.ask_to_stop):
         mark_folder(folder, "learn ppo", job.on)
-        tasks = [_Task(each, crew.stop) for each in waiting]
+        tasks = [_Task(seed_job, crew.stop) for seed_job in waiting]
         try:
-            for index, found in crew.run(_train_remotely if cluster else _train_here, tasks):
-                if found[1]:
-                    unpack(found[1], waiting[index].folder)
-                keep(index, found[0])
+            for index, result in crew.run(_train_remotely if cluster else _train_here, tasks):
+                if result[1]:
+                    unpack(result[1], waiting[index].folder)
+                add_outcome(index, result[0])
         except Killed as killed:
             for index in killed.left:
-                keep(index, _failed(waiting[index], "its process was killed"))
+                add_outcome(index, _make_failure(waiting[index], "its process was killed"))
     write_summary(folder / "seeds.csv", [job.folder for job in waiting])
     return [outcomes[index] for index in range(seeds)]
 
 
-def _job_of(job: Job, folder: Path, index: int) -> Job:
+def _make_job(job: Job, folder: Path, index: int) -> Job:
     rig = job.config.simulation
     return replace(
         job,
@@ -117,7 +117,7 @@ def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
 
     try:
         if checkpoints.all_in(job.folder):
-            finished = _finished(job)
+            finished = _read_finished(job)
             if finished:
                 return finished
             job = replace(job, resume=True, parent=None)
@@ -126,10 +126,10 @@ def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
         return train(job, stop=stop)
     except Exception as error:
         text = str(error) if isinstance(error, FishdError) else f"{type(error).__name__}: {error}"
-        return _failed(job, text)
+        return _make_failure(job, text)
 
 
-def _finished(job: Job) -> Outcome | None:
+def _read_finished(job: Job) -> Outcome | None:
     """Return the outcome of a finished seed whose process was killed; None if not finished."""
     from fishd.learning.run_folder import checkpoints
 
@@ -150,7 +150,7 @@ def _finished(job: Job) -> Outcome | None:
     )
 
 
-def _failed(job: Job, message: str) -> Outcome:
+def _make_failure(job: Job, message: str) -> Outcome:
     return Outcome(folder=job.folder, ended="failed", message=message)
 
 

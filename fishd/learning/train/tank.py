@@ -56,11 +56,13 @@ class TankEvaluations:
         self._env.resume()
         swims = Swims(self._env, self._stop)
         try:
-            while (one := self._candidates.next()) and (not self._swum or swims.fits(seconds)):
-                policy.load_state_dict(one.parameters["policy"])
-                found = swims.swim(self._policy())
-                self._swum.append(one)
-                self._candidates.count(one, found)
+            while (candidate := self._candidates.next()) and (
+                not self._swum or swims.fits(seconds)
+            ):
+                policy.load_state_dict(candidate.parameters["policy"])
+                swim = swims.swim(self._policy())
+                self._swum.append(candidate)
+                self._candidates.count(candidate, swim)
         except Stopped:
             pass
         finally:
@@ -74,30 +76,34 @@ class TankEvaluations:
         steps: number of steps that the training has learned from
         """
         best = self._candidates.best
-        told = {one.steps: one for one in self._swum if one.stalled or one.swims}
+        reported = {
+            candidate.steps: candidate
+            for candidate in self._swum
+            if candidate.stalled or candidate.swims
+        }
         if best and best is not self.best:
-            told[best.steps] = best
-        rows = [self._row(one, steps, one is best) for one in told.values()]
+            reported[best.steps] = best
+        rows = [self._row(candidate, steps, candidate is best) for candidate in reported.values()]
         self.best = best or self.best
-        self._candidates.weed()
+        self._candidates.remove_unlikely()
         return rows
 
     def _policy(self) -> DeterministicPolicy:
         env = self._env
         return DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
 
-    def _row(self, one: Candidate, steps: int, best: bool) -> Evaluation:
-        thrust = 0.0 if one.stalled else one.thrust
+    def _row(self, candidate: Candidate, steps: int, best: bool) -> Evaluation:
+        thrust = 0.0 if candidate.stalled else candidate.thrust
         return Evaluation(
             steps=steps,
-            policy=one.steps,
+            policy=candidate.steps,
             tank_time=self._env.tank_time,
-            swam=one.swam,
+            swam=candidate.swam,
             thrust=thrust,
-            error=None if one.stalled else self._candidates.error(one),
+            error=None if candidate.stalled else self._candidates.error(candidate),
             relative_thrust=thrust / self._env.best_thrust,
-            frequency=one.frequency,
-            fullness=one.fullness,
-            stalled=one.stalled,
+            frequency=candidate.frequency,
+            fullness=candidate.fullness,
+            stalled=candidate.stalled,
             best=best,
         )

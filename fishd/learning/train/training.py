@@ -85,7 +85,7 @@ def train(
             raise
         raise CheckpointError(
             f"{error.filename or job.folder}: cannot be written: {error.strerror}; when that is "
-            f"mended, {_advice(job)}"
+            f"mended, {_format_advice(job)}"
         ) from error
     finally:
         link.close()
@@ -102,7 +102,7 @@ class Training:
         self._vec_env = DummyVecEnv([lambda: self._env])
         self._model = make_learner(job.settings, self._vec_env, self._eye)
         if job.cleans_rewards:
-            _clean(cast(Rollout, self._model.rollout_buffer), self._env)
+            _enable_cleaning(cast(Rollout, self._model.rollout_buffer), self._env)
         self._rollouts = Rollouts(self._model, self._env, display, stop)
         self._recorder = RunRecorder(job, self._env, self._model)
         self._tank = TankEvaluations(self._model, self._env, self._recorder.winner, stop)
@@ -205,7 +205,7 @@ class Training:
         self._recorder.imitated = True
         if self._job.settings.evaluation.every:
             self._evaluate()
-        self._recorder.save(anew=True)
+        self._recorder.save(policy_changed=True)
         return "finished"
 
     def _update(self) -> tuple[Ended, str]:
@@ -254,30 +254,30 @@ class Training:
             tank.add(recorder.steps, recorder.rollouts)
             tank.swim(self._job.settings.evaluation.on_robot)
         finally:
-            for found in tank.results(recorder.steps):
-                self._display.evaluated(recorder.add_measured(found))
+            for result in tank.results(recorder.steps):
+                self._display.evaluated(recorder.add_measured(result))
             recorder.winner = tank.best
 
     def _in_simulation(self) -> Evaluation:
         job, env = self._job, self._env
         policy = DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
         camera, steps = job.simulated_camera, self._recorder.steps
-        found = evaluation.evaluate_in_simulation(
+        result = evaluation.evaluate_in_simulation(
             job.config, policy, job.settings.evaluation, camera
         )
         if job.settings.evaluation.others:
             others = evaluation.worst_on_others(job.config, policy, job.settings, camera)
-            found = replace(found, worst=min(others, found.relative_thrust))
-        return replace(found, steps=steps, policy=steps, tank_time=env.tank_time)
+            result = replace(result, worst=min(others, result.relative_thrust))
+        return replace(result, steps=steps, policy=steps, tank_time=env.tank_time)
 
 
-def _clean(rollout: Rollout, env: SwimEnv) -> None:
+def _enable_cleaning(rollout: Rollout, env: SwimEnv) -> None:
     """Let the rollout remove the errors of the sensor from the measured forces."""
     rollout.signal = ThrustSignal(env.best_thrust)
     rollout.reward_per_newton = env.reward_per_newton
 
 
-def _advice(job: Job) -> str:
+def _format_advice(job: Job) -> str:
     """Return advice for the user after the run folder could not be written."""
     folder = shlex.quote(str(job.folder))
     if checkpoints.all_in(job.folder):

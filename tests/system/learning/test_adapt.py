@@ -168,7 +168,7 @@ def test_intervals_of_two_are_wider_than_that_of_one() -> None:
 
 
 def test_a_square_wave_that_hardly_thrusts_is_no_measure() -> None:
-    with pytest.raises(FishdError, match="too little to be told from nothing"):
+    with pytest.raises(FishdError, match="too little to differ clearly from zero"):
         judge([contender("swing", 1e-4, 2e-4), contender("square", 1e-4, 2e-4)], GOOD)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fishd.learning.env.swims import Swim
-from fishd.learning.train.candidates import MOST, Candidate, Candidates
+from fishd.learning.train.candidates import MAX_CANDIDATES, Candidate, Candidates
 
 BEST = 0.025
 
@@ -51,8 +51,8 @@ def test_where_it_is_clear_no_time_is_spent_on_the_rest() -> None:
     for steps in (64, 128):
         candidates.add(policy(steps))
     assert swim(candidates, 10, lambda one: {64: 0.5, 128: 0.9}[one.steps]) == 2
-    candidates.weed()
-    assert [one.steps for one in candidates.those] == [128]
+    candidates.remove_unlikely()
+    assert [one.steps for one in candidates.remaining] == [128]
 
 
 def test_a_lucky_swim_does_not_stay_the_best() -> None:
@@ -109,9 +109,9 @@ def test_no_more_are_kept_than_can_be_told_apart() -> None:
         candidates.add(policy(steps))
         swim(candidates, 2, lambda _: 0.98)
         best = candidates.best
-        candidates.weed()
+        candidates.remove_unlikely()
         assert candidates.best is best
-        assert len(candidates.those) <= MOST + 1
+        assert len(candidates.remaining) <= MAX_CANDIDATES + 1
 
 
 @pytest.mark.parametrize("off", [0.005, 0.015, 0.03])
@@ -130,7 +130,7 @@ def test_intervals_hold_the_truth_and_the_best_is_hardly_below_the_true_best(off
         for newest in those:
             candidates.add(newest)
             swim(candidates, 2, measured)
-            candidates.weed()
+            candidates.remove_unlikely()
         for one in those:
             held.append(abs(one.thrust / BEST - truth[one.steps]) < candidates.error(one) / BEST)
         best = candidates.best

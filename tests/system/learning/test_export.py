@@ -74,7 +74,7 @@ def test_a_policy_that_stalls_is_refused_and_leaves_no_file(
 ) -> None:
     assert stalled.checkpoint
     target = tmp_path / "policy.onnx"
-    with pytest.raises(PolicyError, match=r"this policy stalls .* all the same with --force"):
+    with pytest.raises(PolicyError, match=r"this policy stalls .* nevertheless with --force"):
         export(stalled.checkpoint, target)
     assert list(tmp_path.iterdir()) == []
     assert export(stalled.checkpoint, target, force=True).evaluation.stalled
@@ -174,7 +174,7 @@ def test_a_model_that_sees_more_than_a_policy_file_can_say_is_refused(tmp_path: 
         ("nowhere", "no such folder; the run folder of a training is needed"),
         ("model.zip", "not a folder; the run folder of a training is needed"),
         ("several", "holds several trainings, seed-0 to seed-10; name one of them"),
-        ("empty", "there is no checkpoint in it"),
+        ("empty", "it contains no checkpoint"),
     ],
 )
 def test_what_is_no_run_is_told_apart(tmp_path: Path, name: str, message: str) -> None:

@@ -15,7 +15,7 @@ from fishd.controllers.policy.file import read
 from fishd.core.errors import ConfigError
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.export import export
-from fishd.learning.imitation import advice, half_beats, narrowed
+from fishd.learning.imitation import advice, half_beats, narrow
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.settings import (
     EnvironmentSettings,
@@ -58,10 +58,10 @@ def test_half_beats_are_compared_by_their_thrust() -> None:
 
 def test_a_clean_rig_keeps_the_fish_and_has_less_delay_and_play() -> None:
     spread = Randomisation(omega0=0.6, noise=1.0, servo_delay=0.08, backlash=0.1)
-    clean = narrowed(spread, 0.5, 0.25)
+    clean = narrow(spread, 0.5, 0.25)
     assert (clean.omega0, clean.noise) == (0.3, 0.5)
     assert (clean.servo_delay, clean.backlash) == pytest.approx((0.01, 0.0125))
-    assert narrowed(spread, 1.0) == spread
+    assert narrow(spread, 1.0) == spread
 
 
 def test_it_is_right_to_stay_until_the_best_half_beat_is_over() -> None:

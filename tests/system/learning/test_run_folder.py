@@ -325,7 +325,7 @@ def test_a_disk_that_is_full_before_the_first_checkpoint_advises_to_start_again(
         enlarge("50m")
         with pytest.raises(ConfigError, match="the folder is not empty"):
             train(job)
-        with pytest.raises(CheckpointError, match="there is no checkpoint in it: the"):
+        with pytest.raises(CheckpointError, match="it contains no checkpoint: the"):
             train(replace(job, resume=True))
         shutil.rmtree(job.folder)
         assert train(job).ended == "finished"

@@ -264,7 +264,7 @@ def test_a_run_that_has_all_its_steps_or_no_checkpoint_says_so(copied: Job, tmp_
     job = copied
     with pytest.raises(ConfigError, match="is finished, with 128 steps; to train it for longer"):
         train(replace(job, resume=True))
-    with pytest.raises(CheckpointError, match="there is no checkpoint in it"):
+    with pytest.raises(CheckpointError, match="it contains no checkpoint"):
         train(replace(job, resume=True, folder=tmp_path))
 
 
