@@ -59,7 +59,7 @@ CASES = [
 
 def network_of(settings: TrainingSettings) -> tuple[Network, Any]:
     card, policy, perception = babbled(settings)
-    sight = exporting._sight(policy, perception)
+    sight = exporting._make_sight(policy, perception)
     content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
     exporting._verify(PolicyFile(Path("eye.onnx"), content, card), policy, perception)
     return Network(PolicyFile(Path("eye.onnx"), content, card)), perception
@@ -101,7 +101,7 @@ def test_a_mirrored_picture_gets_the_mirrored_action(eye: str) -> None:
     if perception.eye and eye == "cnn":  # and whose mean picture has noise of its own
         mean = perception.eye.constants["mean"]
         perception.eye.constants["mean"] = 0.5 * (mean + mean[::-1])
-    sight = exporting._sight(policy, perception)
+    sight = exporting._make_sight(policy, perception)
     content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
     network = Network(PolicyFile(Path("eye.onnx"), content, card))
     random = np.random.default_rng(2)
@@ -122,7 +122,7 @@ def test_a_file_that_would_see_something_else_is_never_put_in_place(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     card, policy, perception = babbled(settings_of("cnn"))
-    whole = exporting._sight
+    whole = exporting._make_sight
 
     def careless(*arguments: Any) -> Any:
         sight = whole(*arguments)
@@ -131,7 +131,7 @@ def test_a_file_that_would_see_something_else_is_never_put_in_place(
         constants["mean"] = 0.0 * constants["mean"]
         return sight._replace(constants=constants)
 
-    monkeypatch.setattr(exporting, "_sight", careless)
+    monkeypatch.setattr(exporting, "_make_sight", careless)
     with pytest.raises(PolicyError, match="outputs of the file differ from those of the policy"):
         exporting._write(tmp_path / "eye.onnx", card, policy, perception)
     assert list(tmp_path.iterdir()) == []
