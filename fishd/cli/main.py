@@ -31,12 +31,12 @@ VERBS = {
         "policies": Verb("policies", "policies", "List the named policies, or show one."),
     },
     "Experiment": {
-        "measure": Verb("measure", "measure", "Find a controller's thrust, with its interval."),
+        "measure": Verb("measure", "measure", "Measure a controller's thrust, with its interval."),
         "compare": Verb("compare", "compare", "Compare controllers and policies on one fish."),
         "sweep": Verb("sweep", "sweep", "Measure thrust over a grid of parameters."),
         "optimise": Verb("optimise", "optimise", "Find the best parameters of a controller."),
         "identify": Verb("identify", "identify", "Fit a fish to its forces, with intervals."),
-        "optimum": Verb("optimum", "optimum", "Show the command that thrusts most."),
+        "optimum": Verb("optimum", "optimum", "Show the command with the largest thrust."),
     },
     "Record": {
         "record": Verb("recording.record", "record", "Record a running fish into a file."),
@@ -44,11 +44,11 @@ VERBS = {
         "plot": Verb("recording.plot", "plot", "Draw a recording, as a picture and a page."),
         "export": Verb("recording.export", "export", "Write a recording as CSV or Parquet."),
         "replay": Verb("recording.replay", "replay", "Publish a recording, as if it were live."),
-        "rerun": Verb("recording.rerun", "rerun", "Let a controller choose again, offline."),
-        "recover": Verb("recording.recover", "recover", "Finish a recording that was cut off."),
+        "rerun": Verb("recording.rerun", "rerun", "Run a controller again on a recording."),
+        "recover": Verb("recording.recover", "recover", "Repair a recording that was cut off."),
     },
     "Camera": {
-        "camera": Verb("camera", "camera", "Look through the camera, set it up, record it."),
+        "camera": Verb("camera", "camera", "Show the picture of the camera, set it up, record it."),
     },
     "Calibrate": {
         "tare": Verb("calibrate", "tare", "Set the force zero to the present force."),
@@ -59,10 +59,10 @@ VERBS = {
         "swimmer": Verb("swimmer", "swimmer", "Draw a fish that swims freely, and its wake."),
         "adapt": Verb("adapt", "adapt", "Find a new fish's best gait: fit, train, measure."),
         "learn": Verb("learn", "learn", "Train policies, and write them to files."),
-        "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and break it."),
+        "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and inject faults."),
     },
     "Check and configure": {
-        "doctor": Verb("doctor", "doctor", "Check this machine, and say how to mend it."),
+        "doctor": Verb("doctor", "doctor", "Check this machine, and print remedies."),
         "config": Verb("config", "config", "Check and show the configuration, print its schema."),
         "completion": Verb("completion", "completion", "Print the completion script of a shell."),
     },

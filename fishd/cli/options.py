@@ -334,7 +334,7 @@ class ControllerGroup(click.Group):
         return [info.name for info in registry.describe_all()]
 
     def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        """Complete the name of a controller, and import only controllers whose name matches."""
+        """Complete the name of a controller, and import only the matching controllers."""
         from fishd.controllers import registry
 
         known = registry.describe_all(incomplete)

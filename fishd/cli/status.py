@@ -79,7 +79,7 @@ def _criterion(status: Status) -> list[tuple[str, str]]:
     quantities = status.quantities
     if status.parameters.get("C") != "auto" or "criterion" not in quantities:
         return []
-    when = "on trial, or the best so far" if quantities.get("searching") else "chosen"
+    when = "on trial, or the best yet" if quantities.get("searching") else "chosen"
     return [("C auto", format_criterion(quantities, when))]
 
 

@@ -1,4 +1,4 @@
-"""Verbs that run a virtual Raspberry Pi and break it."""
+"""Verbs that run a virtual Raspberry Pi and inject faults."""
 
 import contextlib
 import os
@@ -52,7 +52,7 @@ def _connect(config: Config) -> Iterator[RemotePi]:
 
 @click.group()
 def virtual_pi() -> None:
-    """Run a virtual Raspberry Pi with sensor, servo and fish, and break it.
+    """Run a virtual Raspberry Pi with sensor, servo and fish, and inject faults.
 
     fishd drives it with robot: virtual-pi, through the same drivers as on the robot.
     """

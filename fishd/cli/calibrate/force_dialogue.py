@@ -36,7 +36,7 @@ PLAN = (
 MIN_RESTLESS_RATIO = 3.0
 """Smallest ratio of the standard deviations of a moving load and of the quietest load."""
 _QUIET_STD_V = 5e-5
-"""Standard deviation below which every load counts as still [V]."""
+"""Lower limit of the quietest standard deviation in this comparison [V]."""
 _NOT_STILL = "it was not still, compared with other loads"
 
 Force = tuple[float, float]

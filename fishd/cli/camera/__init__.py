@@ -22,7 +22,7 @@ VERBS = {
 
 @click.group(cls=Verbs, verbs=VERBS)
 def camera() -> None:
-    """Look through the camera above the tail, set it up, and record its frames.
+    """Show the picture of the camera above the tail, set it up, and record its frames.
 
-    They talk to a running fishd-camera.
+    These verbs talk to a running fishd-camera.
     """

@@ -28,7 +28,7 @@ _COLOURS = {"ok": "green", "warning": "yellow", "FAIL": "red", "skipped": "brigh
 def doctor(
     file: Path | None, overrides: tuple[str, ...], endpoint: str | None, as_json: bool
 ) -> int:
-    """Check everything that fishd needs with this configuration, and say how to mend it.
+    """Check everything that fishd needs with this configuration, and print remedies.
 
     Only what concerns the configured robot is checked. Nothing moves and nothing is changed; a
     running fishd is asked and not disturbed. Exit status 1 when a check failed, 78 when the

@@ -1,4 +1,4 @@
-"""A virtual Pi, a fishd on it, and somebody who talks to fishctl."""
+"""A virtual Pi, a fishd on it, and dialogues with fishctl."""
 
 import shutil
 import tempfile
@@ -19,21 +19,21 @@ Shared = tuple[Bench, Daemon]
 
 @pytest.fixture(autouse=True)
 def _patient_doctor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A fishd that answers does so, however busy the machine is."""
+    """Give fishd a long time to answer, so that a busy machine fails no test."""
     for module in (base, service):
         monkeypatch.setattr(module, "ANSWER_TIMEOUT_S", 10.0)
 
 
 @pytest.fixture
 def hurried_doctor(_patient_doctor: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It gives up soon, where nothing answers and that is the point."""
+    """Give fishd a short time to answer, for tests in which nothing answers."""
     for module in (base, service):
         monkeypatch.setattr(module, "ANSWER_TIMEOUT_S", 0.5)
 
 
 @pytest.fixture
 def root() -> Iterator[Path]:
-    """A tree of files that every user may enter."""
+    """Folder that every user may enter, for a tree of files."""
     folder = Path(tempfile.mkdtemp())
     folder.chmod(0o755)
     yield folder
@@ -42,7 +42,7 @@ def root() -> Iterator[Path]:
 
 @pytest.fixture
 def examine(root: Path) -> Examine:
-    """Make one check of `fishctl doctor` on the tree, for robot pi."""
+    """Function that runs one check of `fishctl doctor` on the tree, for robot pi."""
     return examiner(root)
 
 
@@ -54,9 +54,9 @@ def process() -> Iterator[Any]:
 
 @pytest.fixture
 def pi(process: Any, tmp_path: Path) -> Iterator[Bench]:
-    """A virtual Pi on which no fishd runs yet."""
-    with bench(process, tmp_path) as found:
-        yield found
+    """Virtual Pi without a fishd."""
+    with bench(process, tmp_path) as rig:
+        yield rig
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def shared(process: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[S
 
 @pytest.fixture
 def daemon(shared: Shared) -> Daemon:
-    """One for all tests of a module, on `rig`, as after its start whatever was done before."""
+    """The fishd of all tests of a module, on `rig`, reset to its state after the start."""
     rig, daemon = shared
     rig.renew(daemon)
     return daemon
@@ -75,7 +75,7 @@ def daemon(shared: Shared) -> Daemon:
 
 @pytest.fixture
 def rig(shared: Shared) -> Bench:
-    """The virtual Pi of `daemon`."""
+    """Virtual Pi of `daemon`."""
     return shared[0]
 
 

@@ -26,25 +26,25 @@ PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
 
 
 def measure(dialogue: Dialogue, rig: Bench, fx: float, fy: float, size: str | None = None) -> None:
-    """Hang a load when it is asked for, and let it be measured.
+    """Hang a load when the dialogue asks for it, and let it be measured.
 
-    Once more where the sensor gave nothing, as while the machine stalls; then it is asked again.
+    Repeat while the sensor gave nothing, as on a stalled machine: the dialogue asks again.
     """
     deadline = time.monotonic() + PATIENCE
-    found = NOTHING
-    while NOTHING in found:
+    output = NOTHING
+    while NOTHING in output:
         assert time.monotonic() < deadline, dialogue.text
         if size is not None:
             dialogue.answer("load [", size)
         dialogue.expect("Enter when it is still")
         rig.pi.load(fx, fy)
         dialogue.answer(":")
-        found = dialogue.expect("\n")
+        output = dialogue.expect("\n")
     dialogue.answer("r to measure it again:")
 
 
 def measure_again(dialogue: Dialogue, rig: Bench, x: float, y: float, size: str = "") -> None:
-    """Hang the second load along each axis, to either side."""
+    """Hang the second load along each axis, in both directions."""
     for load in ((x, 0.0), (-x, 0.0), (0.0, y), (0.0, -y)):
         measure(dialogue, rig, *load, size)
 
@@ -72,9 +72,9 @@ def test_guided_loads_make_true_forces_of_voltages_and_say_how_well_they_are_kno
     assert "over 10 loads" in fit
     assert float(re.search(r"residual ([\d.]+) mN", fit)[1]) < 2.0  # type: ignore[index]
     assert float(re.search(r"condition number ([\d.]+)", fit)[1]) < 3.0  # type: ignore[index]
-    known = re.search(r"known to ± ([\d.]+)%: scatter .* ± ([\d.]+)%, .* ± 1.00%", fit)
-    assert known
-    total, scatter = map(float, known.groups())
+    match = re.search(r"known to ± ([\d.]+)%: scatter .* ± ([\d.]+)%, .* ± 1.00%", fit)
+    assert match
+    total, scatter = map(float, match.groups())
     assert total == pytest.approx((scatter**2 + 1.0) ** 0.5, abs=0.02)
     used = calibrations(daemon).force
     assert used.thrust_ci95(1.0) == pytest.approx(total / 100.0, abs=1e-4)
@@ -105,7 +105,7 @@ def test_a_doubtful_load_is_pointed_out_and_measured_again_and_none_is_lost(
     dialogue.answer("load [N]", "")
     rig.pi.load(2.0, 0.0)  # clipped
     dialogue.answer(still)
-    assert "not to be believed" in dialogue.answer(again, "r")
+    assert "warning: suspect: " in dialogue.answer(again, "r")
     dialogue.answer("load [N]", "")
     rig.pi.load(0.2, 0.0)
     rig.pi.inject("unplugged")
@@ -151,7 +151,7 @@ def test_loads_that_make_no_fit_can_be_measured_again_and_none_is_lost(
     assert forces(daemon) == pytest.approx((0.1, -0.1), abs=3e-3)
 
 
-def test_a_load_beyond_what_the_sensor_is_believed_is_refused_where_it_is_typed(
+def test_a_load_beyond_the_force_limit_is_refused_where_it_is_typed(
     talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.2")
@@ -167,9 +167,7 @@ def test_a_load_beyond_what_the_sensor_is_believed_is_refused_where_it_is_typed(
 
 
 @pytest.mark.parametrize("how", ["ctrl-c", "end of input", "no"])
-def test_whoever_does_not_say_yes_changes_nothing(
-    talk: Talk, rig: Bench, daemon: Daemon, how: str
-) -> None:
+def test_without_a_yes_nothing_changes(talk: Talk, rig: Bench, daemon: Daemon, how: str) -> None:
     before = calibrations(daemon)
     measured = rig.folder / "measured.csv"
     measured.write_text("fx_N,fy_N,vx_V,vy_V\n" + "".join(f"{x},{y},{x},{y}\n" for x, y in PLAN))
@@ -186,7 +184,7 @@ def test_whoever_does_not_say_yes_changes_nothing(
     assert rig.files("force") == []
 
 
-def test_a_plan_of_ones_own_is_gone_through_load_by_load(
+def test_a_plan_from_a_file_is_measured_load_by_load(
     talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     plan = rig.folder / "plan.csv"
@@ -200,10 +198,10 @@ def test_a_plan_of_ones_own_is_gone_through_load_by_load(
     dialogue.answer("Another load")
     assert dialogue.finish() == 0
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        found = fish.calibrations().force
+        calibration = fish.calibrations().force
     determinant = 1 - CROSSTALK**2
-    assert found.xx == pytest.approx(1 / SENSITIVITY_X / determinant, rel=0.02)
-    assert found.yy == pytest.approx(1 / SENSITIVITY_Y / determinant, rel=0.02)
+    assert calibration.xx == pytest.approx(1 / SENSITIVITY_X / determinant, rel=0.02)
+    assert calibration.yy == pytest.approx(1 / SENSITIVITY_Y / determinant, rel=0.02)
 
 
 def test_loads_outlive_a_fishd_that_does_not_answer_or_refuses_what_they_make(
@@ -237,7 +235,7 @@ def test_loads_outlive_a_fishd_that_does_not_answer_or_refuses_what_they_make(
     assert len(rig.files("force")) == 1
 
 
-def test_a_full_disk_costs_no_load_and_is_told(
+def test_a_full_disk_costs_no_load_and_is_reported(
     talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path
 ) -> None:
     record = tmp_path / "folder" / "loads.csv"

@@ -45,15 +45,15 @@ def test_the_servo_is_calibrated_by_small_steps_and_saved_after_a_yes(
     assert dialogue.finish() == 0
     assert dialogue.text.endswith(f"saved in {rig.files('servo')[-1]}\n")
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        found = fish.calibrations()
-        assert (found.servo.trim, found.servo.direction) == (30.0, -1)
-        assert (found.servo.lowest, found.servo.highest) == (-1.2, 0.1)
+        calibrations = fish.calibrations()
+        assert (calibrations.servo.trim, calibrations.servo.direction) == (30.0, -1)
+        assert (calibrations.servo.lowest, calibrations.servo.highest) == (-1.2, 0.1)
         assert fish.status().mode == "idle"
     rig.wait_for_pulse(1529, 1531)
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGHUP, signal.SIGTERM, None])
-def test_an_interrupted_servo_calibration_leaves_neutral_and_what_was_in_force(
+def test_an_interrupted_servo_calibration_leaves_neutral_and_the_previous_calibration(
     talk: Talk, rig: Bench, daemon: Daemon, how: int | None
 ) -> None:
     before = calibrations(daemon)
@@ -91,13 +91,13 @@ def test_a_calibration_whose_fishctl_is_killed_is_taken_back_by_fishd(
     assert calibrations(daemon) == before
 
 
-def test_an_operator_may_take_time_and_nobody_else_moves_the_fish_meanwhile(
+def test_an_operator_may_take_time_and_no_other_program_moves_the_fish_meanwhile(
     talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
     dialogue = talk(daemon, "calibrate", "servo")
     dialogue.answer("trim +0 µs> ", "++")
     dialogue.expect("trim +25 µs> ")
-    time.sleep(LEASE + 2.0)  # which is not renewed but by fishctl
+    time.sleep(LEASE + 2.0)  # only fishctl renews the lease
     assert "\ncalibrating the servo, by a client\n" in daemon.fishctl("status").stdout
     swim, second = daemon.fishctl("set-controller", "swing"), daemon.fishctl("calibrate", "servo")
     assert re.fullmatch(
@@ -129,30 +129,32 @@ def test_where_pulses_end_before_the_amplitude_the_limit_is_there_and_saved_afte
             dialogue.answer("lowest +0.00 rad> ", "keep")
             dialogue.answer("Save it?", answer)
             assert dialogue.finish() == status
-        found = calibrations(daemon).servo
-    assert (found.trim, found.highest, found.lowest) == (10.0, 0.0166, -1.2)
+        calibration = calibrations(daemon).servo
+    assert (calibration.trim, calibration.highest, calibration.lowest) == (10.0, 0.0166, -1.2)
 
 
-def test_a_lease_that_ends_while_fishctl_is_stopped_is_told_at_the_prompt(
+def test_a_lease_that_ends_while_fishctl_is_stopped_is_reported_at_the_prompt(
     talk: Talk, rig: Bench, daemon: Daemon
 ) -> None:
-    dialogue = a_trim_of_25(talk, rig, daemon)
+    dialogue = begin_trim_of_25(talk, rig, daemon)
     dialogue.process.send_signal(signal.SIGSTOP)
     rig.wait_for_pulse(1499, 1501)
-    says_that_its_lease_has_ended(dialogue)
+    check_end_of_lease(dialogue)
 
 
-def test_a_lease_that_ends_as_fishd_is_restarted_is_told_at_the_prompt(
+def test_a_lease_that_ends_as_fishd_is_restarted_is_reported_at_the_prompt(
     talk: Talk, pi: Bench
 ) -> None:
     with pi.daemon() as first:
-        dialogue = a_trim_of_25(talk, pi, first)
-        dialogue.process.send_signal(signal.SIGSTOP)  # so that it asks the second one first
+        dialogue = begin_trim_of_25(talk, pi, first)
+        dialogue.process.send_signal(
+            signal.SIGSTOP
+        )  # so that its first request goes to the second fishd
     with pi.daemon():
-        says_that_its_lease_has_ended(dialogue)
+        check_end_of_lease(dialogue)
 
 
-def a_trim_of_25(talk: Talk, rig: Bench, daemon: Daemon) -> Dialogue:
+def begin_trim_of_25(talk: Talk, rig: Bench, daemon: Daemon) -> Dialogue:
     dialogue = talk(daemon, "calibrate", "servo")
     dialogue.answer("trim +0 µs> ", "++")
     dialogue.expect("trim +25 µs> ")
@@ -160,11 +162,11 @@ def a_trim_of_25(talk: Talk, rig: Bench, daemon: Daemon) -> Dialogue:
     return dialogue
 
 
-def says_that_its_lease_has_ended(stopped: Dialogue) -> None:
+def check_end_of_lease(stopped: Dialogue) -> None:
     stopped.process.send_signal(signal.SIGCONT)
-    said = stopped.expect("[no-lease]\n")
-    assert "the servo is at neutral; its calibration is as before\n" in said
-    assert re.search(r"\nfishctl: this program no longer holds the fish[^\n]+\n$", said)
+    output = stopped.expect("[no-lease]\n")
+    assert "the servo is at neutral; its calibration is as before\n" in output
+    assert re.search(r"\nfishctl: this program no longer holds the fish[^\n]+\n$", output)
     assert stopped.process.wait(PATIENCE) == 1
 
 
@@ -219,8 +221,8 @@ def test_the_servo_is_not_calibrated_while_the_fish_swims_or_after_a_fault(
     assert re.fullmatch(r"fishctl: fishd is in estop: a test; [^\n]+\n", stopped.stderr)
 
 
-class Lagging(VirtualDaemon):
-    """Its telemetry lags: who subscribes hears some ticks from before first."""
+class LaggingDaemon(VirtualDaemon):
+    """Daemon with delayed telemetry: a new subscriber first receives some earlier ticks."""
 
     def ticks(self) -> Iterator[Tick]:
         yield from self._kept.ticks[-5:]
@@ -231,7 +233,7 @@ def test_a_tick_from_before_a_request_is_not_taken_for_a_tail_that_stands_still(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(servo, "MOVE_INTERVAL_S", 0.0)
-    daemon = Lagging()
+    daemon = LaggingDaemon()
     for _ in range(10):
         daemon.run.tick()
     tail = servo.Tail(cast(Fish, daemon), ServoCalibration())

@@ -45,7 +45,7 @@ CAMERA = (
 
 @pytest.fixture(scope="module")
 def daemon_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    # A lease that outlasts a program which is held up for 3 s.
+    # The lease outlasts a program that is stopped for 3 s.
     with running(tmp_path_factory.mktemp("fishd"), "--set", "control.lease=10") as daemon:
         yield daemon
 
@@ -62,7 +62,7 @@ def camera(
 
 @pytest.fixture
 def daemon(daemon_of_all: Daemon, camera: CameraProcess) -> Daemon:
-    """At rest."""
+    """The fishd, at rest."""
     return daemon_of_all.at_rest()
 
 
@@ -79,44 +79,44 @@ def _addresses(daemon: Daemon, camera: CameraProcess, monkeypatch: pytest.Monkey
     monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
 
 
-def said(*words: str | Path) -> str:
-    """What a verb says that succeeds."""
+def output_of(*words: str | Path) -> str:
+    """Return the output of a verb that succeeds."""
     done = fishctl("camera", *map(str, words))
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def as_json(*words: str) -> Any:
-    return json.loads(said(*words, "--json"))
+def json_of(*words: str) -> Any:
+    return json.loads(output_of(*words, "--json"))
 
 
 def width_of(picture: Path) -> int:
-    found = cv2.imread(str(picture))
-    assert found is not None
-    return found.shape[1]
+    image = cv2.imread(str(picture))
+    assert image is not None
+    return image.shape[1]
 
 
-def in_terminal(
+def run_in_terminal(
     columns: int, *words: str, until: Callable[[str], bool] | None = None, **env: str
 ) -> str:
-    """What a verb draws on a terminal.
+    """Return what a verb draws on a terminal.
 
-    until: press Ctrl-C once this is true of what was drawn so far
+    until: condition of the drawn text on which Ctrl-C is pressed
     """
     pid, terminal = pty.fork()
     if pid == 0:
         screen = {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": "30"}
         environment = os.environ | screen | env
         os.execve(FISHCTL, ["fishctl", "camera", *words], environment)
-    drawn, begun = b"", time.monotonic()
-    while time.monotonic() - begun < PATIENCE:
+    drawn, start = b"", time.monotonic()
+    while time.monotonic() - start < PATIENCE:
         if until and until(drawn.decode(errors="replace")):
             os.write(terminal, b"\x03")
             until = None
         if select.select([terminal], [], [], 0.1)[0]:
             try:
                 drawn += os.read(terminal, 65536)
-            except OSError:  # it has ended
+            except OSError:  # the verb has ended
                 break
     os.close(terminal)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
@@ -124,7 +124,7 @@ def in_terminal(
 
 
 def test_status_says_how_the_camera_is(camera: CameraProcess, daemon: Daemon) -> None:
-    shown = said("status")
+    shown = output_of("status")
     assert re.search(
         rf"^camera +a simulated camera above the fish at {daemon.endpoint}$", shown, re.M
     )
@@ -132,7 +132,7 @@ def test_status_says_how_the_camera_is(camera: CameraProcess, daemon: Daemon) ->
     assert re.search(r"^rate +(29|30|31)\.\d frames a second$", shown, re.M)
     assert re.search(r"^age +\d+\.\d ms when available, exposed for 10\.0 ms$", shown, re.M)
     assert re.search(rf"^process +fishd-camera .*, pid {camera.process.pid}, up 0:", shown, re.M)
-    assert as_json("status")["session"] == camera.status().session
+    assert json_of("status")["session"] == camera.status().session
 
 
 def test_without_a_camera_a_verb_says_so_in_one_line(tmp_path: Path) -> None:
@@ -147,13 +147,13 @@ def test_without_a_camera_a_verb_says_so_in_one_line(tmp_path: Path) -> None:
 
 
 def test_a_view_without_a_terminal_is_a_line() -> None:
-    line = said("view")
+    line = output_of("view")
     assert re.fullmatch(r"frame \d+, (29|30|31)\.\d a second, \d+ ms old when it came\n", line)
 
 
 def test_a_view_in_a_terminal_is_a_picture_that_fits_its_width() -> None:
     for columns in (40, 100):
-        lines = re.sub(r"\x1b\[[0-9;]*m", "", in_terminal(columns, "view")).splitlines()
+        lines = re.sub(r"\x1b\[[0-9;]*m", "", run_in_terminal(columns, "view")).splitlines()
         rows = [line for line in lines if line.startswith("▀")]
         assert 10 < len(rows) <= 28
         assert max(map(len, rows)) <= columns
@@ -162,7 +162,7 @@ def test_a_view_in_a_terminal_is_a_picture_that_fits_its_width() -> None:
 
 
 def test_a_view_that_follows_draws_again_until_it_is_interrupted(swimming: Daemon) -> None:
-    drawn = in_terminal(
+    drawn = run_in_terminal(
         100, "view", "--follow", until=lambda drawn: len(set(FRAME.findall(drawn))) > 5
     )
     assert len(set(FRAME.findall(drawn))) > 5
@@ -172,24 +172,24 @@ def test_a_view_that_follows_draws_again_until_it_is_interrupted(swimming: Daemo
 def test_ctrl_c_at_the_moment_when_a_view_takes_the_screen_gives_it_back(
     camera: CameraProcess, tmp_path: Path
 ) -> None:
-    drawn = in_terminal(100, "view", "--follow", **signal_as_drawing_begins(tmp_path, "SIGINT"))
+    drawn = run_in_terminal(100, "view", "--follow", **signal_as_drawing_begins(tmp_path, "SIGINT"))
     assert drawn.count(ENTER_SCREEN) == drawn.count(LEAVE_SCREEN) == 1
     assert "Traceback" not in drawn
 
 
-def test_a_view_is_written_with_the_axis_once_that_is_looked_for(
+def test_a_view_is_written_with_the_axis_once_it_was_searched(
     swimming: Daemon, tmp_path: Path
 ) -> None:
-    line = said("view", "--axis", "--plot", tmp_path / "a.png")
+    line = output_of("view", "--axis", "--plot", tmp_path / "a.png")
     offset = re.search(r"axis ([+-][\d.]+) px", line)
     assert offset
     assert float(offset[1]) == pytest.approx(OFF, abs=1.0)
     assert width_of(tmp_path / "a.png") == 84 * 7
-    said("view", "--whole", "--plot", tmp_path / "whole.png")
+    output_of("view", "--whole", "--plot", tmp_path / "whole.png")
     assert width_of(tmp_path / "whole.png") >= 84
 
 
-def test_no_axis_is_found_while_the_fish_rests(daemon: Daemon) -> None:
+def test_no_axis_is_detected_while_the_fish_rests(daemon: Daemon) -> None:
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         ticks = fish.ticks()
         wait_until(lambda: abs(float(next(ticks).alpha)) < 1e-4)  # type: ignore[arg-type]
@@ -233,15 +233,15 @@ def test_a_fish_that_swims_without_moving_has_no_axis(daemon: Daemon) -> None:
 
 
 def test_alignment_finds_the_axis_within_a_pixel(swimming: Daemon, tmp_path: Path) -> None:
-    found = as_json("align", "--for", "8", "--plot", str(tmp_path / "motion.png"))
-    assert found["offset"] == pytest.approx(OFF, abs=1.0)
-    assert found["tilt"] == pytest.approx(TILT, abs=0.02)
-    assert not found["good"]
-    assert found["settings"]["simulated.off_axis"] == pytest.approx(0.0, abs=1.0)
+    alignment = json_of("align", "--for", "8", "--plot", str(tmp_path / "motion.png"))
+    assert alignment["offset"] == pytest.approx(OFF, abs=1.0)
+    assert alignment["tilt"] == pytest.approx(TILT, abs=0.02)
+    assert not alignment["good"]
+    assert alignment["settings"]["simulated.off_axis"] == pytest.approx(0.0, abs=1.0)
     assert width_of(tmp_path / "motion.png") == 84 * 7
 
 
-def test_alignment_lets_the_fish_swim_where_it_is_told_to_and_rest_afterwards(
+def test_alignment_lets_the_fish_swim_with_swim_and_rest_afterwards(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     done = fishctl("camera", "align", "--swim", "--for", "5")
@@ -289,18 +289,18 @@ def test_ctrl_c_stops_the_fish(daemon: Daemon) -> None:
 
 @pytest.mark.realtime
 def test_the_latency_of_the_whole_path_is_measured_within_milliseconds(daemon: Daemon) -> None:
-    found = as_json("latency", "--for", "30")
-    assert found["stamps"] == pytest.approx(0.0, abs=3e-3)
-    assert found["arrival"] >= LATENCY - 1e-3
-    assert found["delay"] == pytest.approx(found["arrival"], abs=3e-3)
-    assert found["error"] < 4e-3
-    assert found["latest"] < 0.1
-    assert found["stack_delay"] == 0.0
-    assert found["advice"][-1] == "young enough for learning: nothing to set in a training"
+    latency = json_of("latency", "--for", "30")
+    assert latency["stamps"] == pytest.approx(0.0, abs=3e-3)
+    assert latency["arrival"] >= LATENCY - 1e-3
+    assert latency["delay"] == pytest.approx(latency["arrival"], abs=3e-3)
+    assert latency["error"] < 4e-3
+    assert latency["latest"] < 0.1
+    assert latency["stack_delay"] == 0.0
+    assert latency["advice"][-1] == "young enough for learning: nothing to set in a training"
     assert daemon.status().mode == "idle"
 
 
-def test_a_fishd_that_is_in_lockstep_is_not_let_swim(tmp_path: Path) -> None:
+def test_a_fishd_in_lockstep_does_not_swim(tmp_path: Path) -> None:
     with (
         running(tmp_path, "--set", "lockstep=true") as daemon,
         running_camera(tmp_path, f"simulated.fishd={daemon.endpoint}") as camera,
@@ -337,9 +337,9 @@ def test_the_page_shows_the_view_live_with_the_axis_in_a_true_browser(swimming: 
 
 
 def test_a_page_whose_port_is_taken_is_refused(swimming: Daemon) -> None:
-    with socket.socket() as somebody:
-        somebody.bind(("127.0.0.1", 0))
-        port = somebody.getsockname()[1]
+    with socket.socket() as occupant:
+        occupant.bind(("127.0.0.1", 0))
+        port = occupant.getsockname()[1]
         line = one_line(fishctl("camera", "page", "--port", str(port)))
     assert line == (
         f"fishctl: cannot serve a page at 127.0.0.1:{port}: Address already in use; "
@@ -361,6 +361,6 @@ KEEP_RED_ROW = """() => {
     window.redRow = rows.reduce((sum, row) => sum + row, 0) / rows.length / canvas.height;
   };
 }"""
-"""Keeps how far down the axis is in the middle column, as a share of the height, once it is drawn.
+"""Script that stores the height of the axis in the middle column, as a fraction, once it is drawn.
 
-Facts are told before the picture that they belong to is drawn."""
+Facts arrive before the picture that they belong to is drawn."""

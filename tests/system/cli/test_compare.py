@@ -43,7 +43,7 @@ def test_the_command_prints_json_with_every_run() -> None:
     assert {"relative_thrust", "thrust", "frequency", "fullness", "squareness"} <= set(first)
 
 
-def test_one_that_is_refused_does_not_keep_the_others_from_swimming() -> None:
+def test_a_refused_contestant_does_not_keep_the_others_from_swimming() -> None:
     other = ("--set", "amplitude_limit=0.31", "--seconds", "15", "--settle", "5")
     done = run("swing", "default-fish", *other, "--json")
     assert [standing["contestant"] for standing in json.loads(done.stdout)] == ["swing"]
@@ -53,7 +53,7 @@ def test_one_that_is_refused_does_not_keep_the_others_from_swimming() -> None:
     assert run("default-fish", *other).stderr.startswith("fishctl: ppo: policy: ")
 
 
-def test_of_one_that_gives_up_later_it_is_said_that_its_runs_before_stand_in_the_table(
+def test_earlier_runs_of_a_controller_that_gives_up_stand_in_the_table(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     swum: list[str] = []
@@ -79,13 +79,13 @@ def test_of_one_that_gives_up_later_it_is_said_that_its_runs_before_stand_in_the
     assert "Verdict: swing wins: it thrusts " in done.stdout
 
 
-def test_a_misspelt_path_of_a_policy_is_told_before_anything_swims() -> None:
+def test_a_misspelt_path_of_a_policy_is_reported_before_anything_swims() -> None:
     done = run("swing", "runs/frist.onnx", "--seconds", "15", "--settle", "5")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "fishctl: ppo: policy: runs/frist.onnx: no such file\n"
-    done = run("~nobody-here.onnx", "--seconds", "15", "--settle", "5")
+    done = run("~no-such-user.onnx", "--seconds", "15", "--settle", "5")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "fishctl: ppo: policy: ~nobody-here.onnx: no such file\n"
+    assert done.stderr == "fishctl: ppo: policy: ~no-such-user.onnx: no such file\n"
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_a_wrong_command_is_one_line(arguments: list[str], message: str, status:
 
 
 @pytest.mark.slow
-def test_policies_without_the_packages_that_they_need_are_said_to_be_left_out(
+def test_policies_without_their_packages_are_reported_as_left_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
@@ -113,7 +113,7 @@ def test_policies_without_the_packages_that_they_need_are_said_to_be_left_out(
     assert all(line == line.rstrip() for line in done.stdout.splitlines())
 
 
-def test_it_is_said_that_another_controller_took_over_from_a_policy(tmp_path: Path) -> None:
+def test_a_takeover_from_a_policy_is_reported(tmp_path: Path) -> None:
     shaking = str(write(tmp_path))
     done = run(shaking, "--seconds", "20")
     assert done.returncode == 0

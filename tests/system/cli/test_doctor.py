@@ -13,8 +13,8 @@ from rigs.processes import fishctl
 from fishd.core.calibration import ForceCalibration
 from fishd.hardware.calibration_files import CalibrationFolder
 
-WELL = ("ok", "warning")
-"""Levels of what is timed: a busy machine may give fewer samples than a healthy bus."""
+GOOD_LEVELS = ("ok", "warning")
+"""Levels of timed checks: a busy machine may give fewer samples than a healthy bus."""
 
 
 def test_on_a_simulated_robot_only_what_it_needs_is_checked(tmp_path: Path) -> None:
@@ -45,14 +45,14 @@ def test_a_healthy_virtual_pi_is_all_well_with_and_without_a_daemon(pi: Bench) -
     status, alone = doctor(pi.folder, *pi.settings, *free_telemetry())
     assert status == 0
     assert alone["adc"][0] == "ok"
-    assert alone["force"][0] in WELL
-    assert alone["pigpiod"][0] in WELL
+    assert alone["force"][0] in GOOD_LEVELS
+    assert alone["pigpiod"][0] in GOOD_LEVELS
     assert "not clipped, not frozen" in alone["force"][1]
     with pi.daemon() as daemon:
         status, asked = doctor(pi.folder, *pi.settings, *free_telemetry())
         assert status == 0
         assert asked["adc"][0] == "skipped"
-        assert asked["force"][0] in WELL
+        assert asked["force"][0] in GOOD_LEVELS
         assert "the newest" in asked["force"][1]
         assert str(daemon.process.pid) in asked["daemon"][1]
         assert asked["control"] == ("ok", f"{daemon.endpoint} is served by the running fishd")
@@ -97,9 +97,9 @@ def test_a_fault_of_the_hardware_fails_the_check_that_is_about_it(
     assert complaint in message
     sound = {"adc", "force", "pigpiod"} - {check}
     if fault.startswith("pigpiod"):
-        assert all(findings[name][0] in WELL for name in sound)
+        assert all(findings[name][0] in GOOD_LEVELS for name in sound)
     else:
-        assert findings["pigpiod"][0] in WELL
+        assert findings["pigpiod"][0] in GOOD_LEVELS
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_a_chip_that_is_not_as_fishd_left_it_is_pointed_out(
 
 
 def test_without_a_virtual_pi_the_sensor_fails_in_one_line(tmp_path: Path) -> None:
-    settings = ("--set", "robot=virtual-pi", "--set", f"virtual_pi.socket={tmp_path}/nobody")
+    settings = ("--set", "robot=virtual-pi", "--set", f"virtual_pi.socket={tmp_path}/nothing")
     status, findings = doctor(tmp_path, *settings, *free_telemetry())
     assert status == 1
     assert "no virtual Pi is running" in findings["adc"][1]
@@ -137,10 +137,10 @@ def test_a_daemon_in_fault_fails_with_its_reason(pi: Bench) -> None:
     assert "sensor-stale" in findings["daemon"][1]
 
 
-def test_what_a_fishd_of_another_robot_measures_is_not_taken_for_this_ones(pi: Bench) -> None:
+def test_measurements_of_a_fishd_of_another_robot_are_not_used(pi: Bench) -> None:
     with pi.daemon() as daemon:
-        own = ("--set", "robot=pi", "--set", f"state_folder={pi.folder}/of-pi")
-        _, findings = doctor(pi.folder, *own)
+        settings = ("--set", "robot=pi", "--set", f"state_folder={pi.folder}/of-pi")
+        _, findings = doctor(pi.folder, *settings)
     another = f"the fishd at {daemon.endpoint} drives another robot, virtual-pi; name this one's"
     assert findings["adc"] == findings["force"] == ("skipped", f"{another} with --endpoint")
     assert findings["daemon"][0] == "warning"
@@ -174,7 +174,7 @@ def test_missing_privileges_are_warnings(tmp_path: Path) -> None:
 
 
 def install(folder: Path, name: str, version: str) -> dict[str, str]:
-    """What makes a package of that name seem installed; its files are not there."""
+    """Return the environment in which a package seems installed; only its metadata exists."""
     info = folder / f"{name.replace('-', '_')}-{version}.dist-info"
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")

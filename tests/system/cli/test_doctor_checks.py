@@ -66,7 +66,7 @@ BACKUP = {"state/pi/force-backup.yaml": f"{{{MATRIX}}}\n"}
 BROKEN = {"state/pi/force-2026-02-02T000000.000000Z.yaml": "xx: a lot\n"}
 
 CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
-    ("model", "warning", "no Raspberry Pi", {}, []),
+    ("model", "warning", "not a Raspberry Pi", {}, []),
     ("model", "ok", "Raspberry Pi 4 Model B Rev 1.5", PI_4 | {CHIP: "brcm,bcm2711\0"}, []),
     ("model", "FAIL", "too slow", ZERO_W, []),
     ("model", "ok", "Zero 2 W", ZERO_2, []),
@@ -93,7 +93,7 @@ CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
     ("power", "warning", "the Pi is throttled", {FLAGS: "4\n"}, []),
     ("power", "warning", "too hot", {FLAGS: "8\n"}, []),
     ("power", "warning", "has been under-voltage and throttled", {FLAGS: "50000\n"}, []),
-    ("power", "skipped", "does not tell", {}, []),
+    ("power", "skipped", "does not report", {}, []),
     ("power", "ok", "no under-voltage", MONITOR | {ALARM: "0\n"}, []),
     ("power", "FAIL", "under-voltage", MONITOR | {ALARM: "1\n"}, []),
     ("governor", "skipped", "", {}, []),
@@ -141,7 +141,7 @@ CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
     CASES,
     ids=[f"{check}: {level} {words[:30]}" for check, level, words, *_ in CASES],
 )
-def test_a_check_says_what_it_finds_on_a_pi(
+def test_a_check_reports_the_state_of_a_pi(
     root: Path,
     examine: Examine,
     check: str,
@@ -152,11 +152,11 @@ def test_a_check_says_what_it_finds_on_a_pi(
 ) -> None:
     for path, content in files.items():
         put(root, path, content)
-    found, message, mend = examine(check, *settings)
-    assert (found, words in f"{message}; {mend}") == (level, True), message
+    actual_level, message, mend = examine(check, *settings)
+    assert (actual_level, words in f"{message}; {mend}") == (level, True), message
 
 
-def as_root() -> None:
+def skip_unless_root() -> None:
     if os.geteuid() != 0:
         pytest.skip("needs root: a file gets another owner or group")
 
@@ -172,7 +172,7 @@ def as_root() -> None:
 def test_the_i2c_bus_must_be_accessible_to_this_user(
     root: Path, examine: Examine, group: str, mode: int, remedy: str
 ) -> None:
-    as_root()
+    skip_unless_root()
     device = put(root, "dev/i2c-1")
     shutil.chown(device, group=group)
     device.chmod(mode)
@@ -185,10 +185,10 @@ def test_the_i2c_bus_must_be_accessible_to_this_user(
     ("owner", "remedy"),
     [(0, "sudo -u fishd fishctl doctor"), (1, "sudo -u daemon fishctl doctor"), (65534, "chmod")],
 )
-def test_a_state_folder_of_another_user_is_not_taken_away_from_him(
+def test_a_state_folder_of_another_user_keeps_its_owner(
     root: Path, examine: Examine, owner: int, remedy: str
 ) -> None:
-    as_root()
+    skip_unless_root()
     folder = root / "state" / "pi"
     folder.mkdir(parents=True)
     os.chown(folder, owner, owner)
@@ -204,17 +204,17 @@ def test_a_state_folder_of_another_user_is_not_taken_away_from_him(
 def test_a_read_only_file_system_is_not_taken_for_a_permission(root: Path) -> None:
     (root / "state").mkdir()
     mount = 'mount -t tmpfs -o ro none "$0" && exec "$@"'
-    apart = ["unshare", *([] if os.geteuid() == 0 else ["-r"]), "-m", "sh", "-c", mount]
-    if call(*apart, str(root / "state"), "true").returncode:
-        pytest.skip("needs a file system of its own")
+    command = ["unshare", *([] if os.geteuid() == 0 else ["-r"]), "-m", "sh", "-c", mount]
+    if call(*command, str(root / "state"), "true").returncode:
+        pytest.skip("needs permission to mount a file system")
     settings = ("--set", "robot=pi", "--set", f"state_folder={root}/state", *free_telemetry())
-    _, found = doctor(root, *settings, under=(*apart, str(root / "state")))
-    level, message = found["state folder"]
+    _, findings = doctor(root, *settings, under=(*command, str(root / "state")))
+    level, message = findings["state folder"]
     assert level == "FAIL"
     assert f"{root}/state is on a read-only file system" in message
 
 
-def test_why_nobody_can_see_who_uses_pins_is_told(root: Path, examine: Examine) -> None:
+def test_the_reason_for_unknown_users_of_pins_is_reported(root: Path, examine: Examine) -> None:
     only_root = "only root can see who uses GPIO pins: sudo fishctl doctor"
     if os.geteuid() == 0:
         (root / "sys/kernel/debug").mkdir(parents=True)
@@ -243,10 +243,10 @@ def test_the_pwm_channel_must_be_there_and_silent(root: Path, examine: Examine) 
     assert duty.read_text() == "1500000\n"
 
 
-def test_a_button_that_nothing_can_read_is_not_passed_over(
+def test_a_button_that_nothing_can_read_is_reported(
     examine: Examine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The installation goes on without its package, and nobody may take that for a working one."""
+    """An installation without the package works, but doctor must report it."""
     monkeypatch.setattr("fishd.hardware.header._PROVIDERS", ())
     assert examine("gpio package") == ("", "", "")
     level, message, mend = examine("gpio package", "panel.estop_gpio=17")
@@ -263,7 +263,7 @@ def test_a_button_that_nothing_can_read_is_not_passed_over(
         (99, "or allow 'rtprio 99' in"),
     ],
 )
-def test_whoever_may_not_be_in_real_time_is_told_which_limit_suffices(
+def test_without_real_time_permission_the_sufficient_limit_is_named(
     examine: Examine, monkeypatch: pytest.MonkeyPatch, priority: int, words: str
 ) -> None:
     monkeypatch.setattr(timing, "_TRIAL", "raise SystemExit(1)")

@@ -1,4 +1,4 @@
-"""`fishctl estop`: the pulses end by whichever way there is, and it says which."""
+"""`fishctl estop`: the pulses end by any way that works, and the verb names it."""
 
 import json
 import os
@@ -63,8 +63,8 @@ def test_pulses_that_cannot_be_ended_are_no_success(pi: Bench) -> None:
         swim(pi, daemon)
         daemon.kill()
         pi.pi.inject("pigpiod-frozen")
-        said = one_line(daemon.fishctl("estop"))
-    assert "the servo was not released and may still have pulses: cut its power" in said
+        line = one_line(daemon.fishctl("estop"))
+    assert "the servo was not released and may still have pulses: cut its power" in line
 
 
 def test_a_simulated_fish_that_hangs_has_no_pulses(tmp_path: Path) -> None:
@@ -80,13 +80,13 @@ def test_a_simulated_fish_that_hangs_has_no_pulses(tmp_path: Path) -> None:
     )
 
 
-def test_without_a_fishd_and_without_a_servo_it_says_that_it_did_nothing(tmp_path: Path) -> None:
-    said = one_line(fishctl("--endpoint", f"ipc://{tmp_path}/control", "estop"))
-    assert "nothing was released" in said
-    assert "fishctl estop --config FILE" in said
+def test_without_a_fishd_and_without_a_servo_it_reports_that_it_did_nothing(tmp_path: Path) -> None:
+    line = one_line(fishctl("--endpoint", f"ipc://{tmp_path}/control", "estop"))
+    assert "nothing was released" in line
+    assert "fishctl estop --config FILE" in line
 
 
-def test_a_configuration_names_the_servo_of_a_fishd_that_has_left_nothing(pi: Bench) -> None:
+def test_a_configuration_names_the_servo_of_a_fishd_without_a_recipe(pi: Bench) -> None:
     file = pi.folder / "fish.yaml"
     file.write_text(
         f"robot: virtual-pi\nstate_folder: {pi.folder}/state\n"

@@ -32,13 +32,13 @@ try:
 finally:
     print("loaded:", *[name for name in {HEAVY} if name in sys.modules], file=sys.stderr)
 """
-CPU = 0.15
-"""Of this machine, with the start of Python [s]."""
+MAX_CPU_S = 0.15
+"""Largest CPU time of a release, with the start of Python [s]."""
 
 
 @pytest.fixture(autouse=True)
 def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The runtime folder of the service, for fishd and for what systemd runs after it."""
+    """Runtime folder of the service, for fishd and the command that systemd runs after it."""
     folder = tmp_path / "runtime"
     folder.mkdir()
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(folder))
@@ -47,44 +47,44 @@ def runtime(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def file(pi: Bench) -> Path:
-    """A configuration file for the virtual Pi."""
+    """Configuration file for the virtual Pi."""
     return file_for(pi)
 
 
-Left = tuple[Bench, Path, Path]
-"""A virtual Pi, the configuration file of the fishd that was killed on it, and its recipe."""
+Remains = tuple[Bench, Path, Path]
+"""Virtual Pi, configuration file of the fishd that was killed on it, and its recipe."""
 
 
 @pytest.fixture(scope="module")
-def left_by_one(process: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Left]:
+def remains_of_module(process: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Remains]:
     folder = tmp_path_factory.mktemp("killed")
     with bench(process, folder) as pi:
         file = file_for(pi)
         with pytest.MonkeyPatch.context() as environment:
             environment.setenv("RUNTIME_DIRECTORY", str(folder))
-            kill_one(pi, file)
+            run_and_kill_fishd(pi, file)
             recipe = Path(release_recipe._path(str(file)))
         yield pi, file, recipe
 
 
 @pytest.fixture
-def left(left_by_one: Left, runtime: Path) -> Iterator[Left]:
-    """What a fishd that was killed has left, and as it has left it."""
-    pi, file, recipe = left_by_one
+def remains(remains_of_module: Remains, runtime: Path) -> Iterator[Remains]:
+    """State that a killed fishd has left: virtual Pi, configuration file and recipe."""
+    pi, file, recipe = remains_of_module
     yield pi, file, Path(shutil.copy2(recipe, runtime))
     pi.pi.clear()
 
 
 @pytest.fixture
-def killed(left: Left) -> Iterator[Left]:
-    """The same, while another program keeps its pulses where they were."""
-    with pulses_of_another(left[0]):
-        yield left
+def killed(remains: Remains) -> Iterator[Remains]:
+    """The same state, while another program keeps the pulses on."""
+    with foreign_pulses(remains[0]):
+        yield remains
 
 
 @contextmanager
-def changed(file: Path) -> Iterator[None]:
-    """Meanwhile the file is another; then it is as before for `release_recipe`, too."""
+def changed_file(file: Path) -> Iterator[None]:
+    """Change the file; restore it afterwards, with its times, which `release_recipe` compares."""
     text, status = file.read_text(), file.stat()
     file.write_text(f"{text}# changed\n")
     try:
@@ -101,10 +101,10 @@ def file_for(pi: Bench) -> Path:
 
 
 @contextmanager
-def pulses_of_another(pi: Bench) -> Iterator[None]:
+def foreign_pulses(pi: Bench) -> Iterator[None]:
     client = pigpio.pi("127.0.0.1", pi.pi.port(), show_errors=False)
     try:
-        for script in range(32):  # the countdown would end those pulses, too
+        for script in range(32):  # the countdown would also end these pulses
             with suppress(pigpio.error):
                 client.delete_script(script)
         client.set_servo_pulsewidth(18, 1750)
@@ -114,7 +114,7 @@ def pulses_of_another(pi: Bench) -> Iterator[None]:
         dispose(client)
 
 
-def kill_one(pi: Bench, file: Path, calibration: ServoCalibration | None = None) -> None:
+def run_and_kill_fishd(pi: Bench, file: Path, calibration: ServoCalibration | None = None) -> None:
     with pi.daemon("--config", str(file)) as daemon:
         if calibration:
             with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
@@ -126,12 +126,12 @@ def release(*words: str, **env: str) -> subprocess.CompletedProcess[str]:
     return call(sys.executable, "-c", SOURCE, *words, env=os.environ | env)
 
 
-def said(ended: subprocess.CompletedProcess[str]) -> list[str]:
-    """The lines on standard error but that of the modules."""
+def error_lines(ended: subprocess.CompletedProcess[str]) -> list[str]:
+    """Return the lines on standard error, without that of the modules."""
     return [line for line in ended.stderr.splitlines() if not line.startswith("loaded:")]
 
 
-def test_it_ends_pulses_at_neutral_and_costs_next_to_nothing(killed: Left) -> None:
+def test_it_ends_pulses_at_neutral_and_costs_little_time(killed: Remains) -> None:
     pi, file, _ = killed
     ended = release("--config", str(file), SERVICE_RESULT="signal")
     assert ended.returncode == 0
@@ -139,11 +139,11 @@ def test_it_ends_pulses_at_neutral_and_costs_next_to_nothing(killed: Left) -> No
     assert ended.stdout == ("the service ended with 'signal': pulses were on: neutral, then off\n")
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
     assert release("--config", str(file)).stdout == "there were no pulses\n"
-    assert min(cpu_of_a_release(file) for _ in range(5)) < CPU
+    assert min(cpu_of_a_release(file) for _ in range(5)) < MAX_CPU_S
 
 
 def cpu_of_a_release(file: Path) -> float:
-    """CPU time of one, with the start of Python [s]."""
+    """Return the CPU time of a release, with the start of Python [s]."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     call(sys.executable, "-m", "fishd.cli.fishd_release", "--config", str(file), check=True)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -151,21 +151,21 @@ def cpu_of_a_release(file: Path) -> float:
 
 
 def test_neutral_is_that_of_a_calibration_made_while_it_ran(pi: Bench, file: Path) -> None:
-    kill_one(pi, file, ServoCalibration(trim=-40.0))
-    with pulses_of_another(pi):
+    run_and_kill_fishd(pi, file, ServoCalibration(trim=-40.0))
+    with foreign_pulses(pi):
         ended = release("--config", str(file))
     assert (ended.returncode, ended.stderr) == (0, "loaded:\n")
     assert pi.pi.widths()[-2:] == [1460, 0]
 
 
-def test_without_a_sound_recipe_it_does_what_fishctl_does(left: Left) -> None:
-    pi, file, path = left
+def test_without_a_sound_recipe_it_does_what_fishctl_does(remains: Remains) -> None:
+    pi, file, path = remains
     sound = path.read_text()
 
     def check() -> None:
-        with pulses_of_another(pi):
+        with foreign_pulses(pi):
             ended = release("--config", str(file))
-        assert (ended.returncode, said(ended)) == (0, [])
+        assert (ended.returncode, error_lines(ended)) == (0, [])
         assert ended.stdout == "pulses were on: neutral, then off\n"
         assert "click" in ended.stderr
 
@@ -181,31 +181,33 @@ def test_without_a_sound_recipe_it_does_what_fishctl_does(left: Left) -> None:
     check()
 
 
-def test_a_file_that_has_changed_since_counts_too(killed: Left) -> None:
+def test_a_file_that_has_changed_since_counts_too(killed: Remains) -> None:
     _, file, _ = killed
-    with changed(file):
+    with changed_file(file):
         ended = release("--config", str(file))
-    assert (ended.returncode, said(ended)) == (0, [])
+    assert (ended.returncode, error_lines(ended)) == (0, [])
     assert ended.stdout == "pulses were on: neutral, then off\nthere were no pulses\n"
 
 
 def test_a_simulated_fish_leaves_the_recipe_of_a_robot_alone_unless_the_file_has_changed(
-    left: Left, runtime: Path
+    remains: Remains, runtime: Path
 ) -> None:
-    pi, file, recipe = left
+    pi, file, recipe = remains
     simulated = ("--config", str(file), "--set", "robot=simulated")
     with pi.daemon(*simulated):
         assert recipe.exists()
-    with changed(file), pi.daemon(*simulated):
+    with changed_file(file), pi.daemon(*simulated):
         assert not recipe.exists()
 
 
-def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(killed: Left) -> None:
+def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(
+    killed: Remains,
+) -> None:
     pi, file, _ = killed
     pi.pi.inject("pigpiod-gone")
     ended = release("--config", str(file))
     assert (ended.returncode, ended.stdout) == (1, "")
-    (line,) = said(ended)
+    (line,) = error_lines(ended)
     assert re.fullmatch(
         r"fishctl: pigpiod at 127.0.0.1:\d+: Connection refused; the servo was not released .*",
         line,
@@ -213,17 +215,17 @@ def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(killed: Le
 
 
 @pytest.mark.parametrize("words", [(), ("--config", "/nowhere/fishd.yaml"), ("--steam",)])
-def test_whatever_else_is_asked_fishctl_answers(words: tuple[str, ...]) -> None:
+def test_fishctl_handles_all_other_arguments(words: tuple[str, ...]) -> None:
     quick, slow = release(*words), fishctl("release", *words)
     assert slow.returncode != 0
     assert (quick.returncode, quick.stdout) == (slow.returncode, slow.stdout)
-    assert said(quick) == slow.stderr.splitlines()
+    assert error_lines(quick) == slow.stderr.splitlines()
 
 
-def powered(folder: Path, *, enabled: int = 1, recipe: bool = True) -> tuple[Path, Path]:
-    """A channel of the kernel's PWM with pulses, and the configuration file of its servo.
+def powered_channel(folder: Path, *, enabled: int = 1, recipe: bool = True) -> tuple[Path, Path]:
+    """Return a PWM channel of the kernel with pulses, and the configuration file of its servo.
 
-    recipe: a fishd has left one for `fishd-release`
+    recipe: whether a fishd has left a recipe for `fishd-release`
     """
     channel = folder / "pwm" / "pwmchip3" / "pwm2"
     channel.mkdir(parents=True)
@@ -242,7 +244,7 @@ def powered(folder: Path, *, enabled: int = 1, recipe: bool = True) -> tuple[Pat
 
 
 def duty_and_enable(channel: Path) -> tuple[int, int]:
-    """Empty where a write is under way: -1."""
+    """Return the duty cycle and enable flag of a channel; -1 for a file that is being written."""
     duty, on = ((channel / name).read_text().split() for name in ("duty_cycle", "enable"))
     return int(duty[0]) if duty else -1, int(on[0]) if on else -1
 
@@ -250,9 +252,9 @@ def duty_and_enable(channel: Path) -> tuple[int, int]:
 @pytest.mark.parametrize("recipe", [True, False])
 @pytest.mark.parametrize("enabled", [1, 0])
 def test_the_kernels_pwm_is_released_too(tmp_path: Path, enabled: int, recipe: bool) -> None:
-    channel, file = powered(tmp_path, enabled=enabled, recipe=recipe)
+    channel, file = powered_channel(tmp_path, enabled=enabled, recipe=recipe)
     ended = release("--config", str(file))
-    assert (ended.returncode, said(ended)) == (0, [])
+    assert (ended.returncode, error_lines(ended)) == (0, [])
     assert ("click" in ended.stderr) != recipe
     assert ended.stdout.startswith("pulses were on" if enabled else "there were no pulses")
     assert duty_and_enable(channel) == ((0, 0) if enabled else (1_800_000, 0))
@@ -263,15 +265,15 @@ def test_the_kernels_pwm_is_released_too(tmp_path: Path, enabled: int, recipe: b
 def test_a_lost_session_or_ctrl_c_at_neutral_does_not_leave_the_servo_powered(
     tmp_path: Path, number: int, program: str
 ) -> None:
-    channel, file = powered(tmp_path)
+    channel, file = powered_channel(tmp_path)
     words = program.split()
     words[0] = str(Path(sys.executable).with_name(words[0]))
     process = Process(*words, "--config", str(file))
-    wait_until(lambda: duty_and_enable(channel)[0] not in (-1, 1_800_000) or over(process))
+    wait_until(lambda: duty_and_enable(channel)[0] not in (-1, 1_800_000) or has_ended(process))
     code, out, errors = process.end(number)
     assert (code, out, errors) == (0, "pulses were on: neutral, then off\n", "")
     assert duty_and_enable(channel) == (0, 0)
 
 
-def over(process: Process) -> bool:
+def has_ended(process: Process) -> bool:
     return process.process.poll() is not None

@@ -1,4 +1,4 @@
-"""One fishd for one robot: a second one is refused, whoever runs it, until the first has ended."""
+"""One fishd for one robot: a second one of any user is refused until the first has ended."""
 
 import fcntl
 import os
@@ -30,7 +30,7 @@ PI = [
 
 @pytest.fixture
 def folders() -> Iterator[tuple[Path, Path]]:
-    """Two folders that every user may write to; and no lock files stay behind."""
+    """Two folders that every user may write to; lock files are removed afterwards."""
     parent = Path(tempfile.mkdtemp())
     for folder in (parent, parent / "one", parent / "other"):
         folder.mkdir(exist_ok=True)
@@ -42,13 +42,13 @@ def folders() -> Iterator[tuple[Path, Path]]:
             lock.unlink()
 
 
-def as_nobody() -> tuple[str, ...]:
-    """What starts a fishd of another user, who can start Python once more from it."""
+def command_as_nobody() -> tuple[str, ...]:
+    """Return the command that starts a fishd as user 65534, if that user can start Python."""
     version = "python{}.{}".format(*sys.version_info)
     for python in (sys.executable, f"/usr/bin/{version}", f"/usr/local/bin/{version}"):
         under = (*NOBODY, "env", f"PYTHONPATH={os.pathsep.join(sys.path[1:])}", python)
-        again = "import subprocess, sys; sys.exit(subprocess.call([sys.executable, '--version']))"
-        for arguments in (["-c", again], [FISHD, "--version"]):
+        child = "import subprocess, sys; sys.exit(subprocess.call([sys.executable, '--version']))"
+        for arguments in (["-c", child], [FISHD, "--version"]):
             if subprocess.run([*under, *arguments], capture_output=True, check=False).returncode:
                 break
         else:
@@ -56,8 +56,8 @@ def as_nobody() -> tuple[str, ...]:
     pytest.skip("another user cannot start this fishd: its folder, or Python's, is private")
 
 
-def refusal(folder: Path, *arguments: str, **command: tuple[str, ...]) -> str:
-    """What a fishd that does not start says."""
+def failed_start(folder: Path, *arguments: str, **command: tuple[str, ...]) -> str:
+    """Return the message of a fishd that does not start."""
     status, _, err = Daemon(folder, *arguments, **command).finish()
     assert status == 1
     assert err.count("\n") == 1
@@ -68,17 +68,17 @@ def pi_settings(folder: Path) -> list[str]:
     return [*PI, "--set", f"state_folder={folder}"]
 
 
-def test_a_second_fishd_on_the_same_bus_is_refused_and_told_the_pid(
+def test_a_second_fishd_on_the_same_bus_is_refused_with_the_pid_of_the_first(
     folders: tuple[Path, Path],
 ) -> None:
     one, other = folders
     with running(one, *pi_settings(one)) as first:
-        said = refusal(other, *pi_settings(other))
-        assert f"another fishd (pid {first.process.pid}) drives /dev/i2c-{BUS}; " in said
-        assert "force_sensor.bus" in said
+        message = failed_start(other, *pi_settings(other))
+        assert f"another fishd (pid {first.process.pid}) drives /dev/i2c-{BUS}; " in message
+        assert "force_sensor.bus" in message
         elsewhere = [*pi_settings(other), "--set", f"force_sensor.bus={BUS + ANOTHER}"]
-        said = refusal(other, *elsewhere)
-        assert f"another fishd (pid {first.process.pid}) drives the servo on GPIO 18" in said
+        message = failed_start(other, *elsewhere)
+        assert f"another fishd (pid {first.process.pid}) drives the servo on GPIO 18" in message
         assert first.fishctl("status").returncode == 0
     (ownership.lock_folder() / f"fishd-i2c-{BUS + ANOTHER}.lock").unlink()
 
@@ -96,7 +96,7 @@ main()
 
 @pytest.fixture
 def locks(tmp_path: Path) -> Iterator[Path]:
-    """A folder of lock files as `make install-pi` makes it, for the group of user nobody."""
+    """Folder of lock files as made by `make install-pi`, with the group of user 65534."""
     if os.geteuid() != 0:
         pytest.skip("needs root: one fishd runs as another user")
     parent = Path(tempfile.mkdtemp())
@@ -112,31 +112,31 @@ def locks(tmp_path: Path) -> Iterator[Path]:
 def test_the_fishd_of_another_user_counts_and_what_it_leaves_behind_does_not(
     folders: tuple[Path, Path], locks: Path
 ) -> None:
-    nobody = as_nobody()
+    nobody = command_as_nobody()
     start = ("-c", IN_FOLDER.format(folder=str(locks)))
-    mine = (sys.executable, "-P", *start)
+    own_start = (sys.executable, "-P", *start)
     one, other = folders
     private = ("sh", "-c", 'umask 077; exec "$@"', "sh", *nobody)
     with running(one, *pi_settings(one), under=private, start=start) as killed:
-        assert f"drives /dev/i2c-{BUS}" in refusal(other, *pi_settings(other), start=mine)
+        assert f"drives /dev/i2c-{BUS}" in failed_start(other, *pi_settings(other), start=own_start)
         assert {lock.stat().st_mode & 0o777 for lock in locks.iterdir()} == {0o660}
         killed.kill()
-    with running(other, *pi_settings(other), start=mine) as first:  # by lock files of the other
-        said = refusal(one, *pi_settings(one), under=nobody, start=start)
-        assert f"(pid {first.process.pid})" in said
+    with running(other, *pi_settings(other), start=own_start) as first:  # same lock files
+        message = failed_start(one, *pi_settings(one), under=nobody, start=start)
+        assert f"(pid {first.process.pid})" in message
 
 
 def test_a_user_who_may_not_know_the_locks_does_not_start_and_cannot_take_one(
     folders: tuple[Path, Path], locks: Path
 ) -> None:
     one, other = folders
-    outsider = [word.replace("regid=65534", "regid=65533") for word in as_nobody()]
+    outsider = [word.replace("regid=65534", "regid=65533") for word in command_as_nobody()]
     start = ("-c", IN_FOLDER.format(folder=str(locks)))
-    mine = (sys.executable, "-P", *start)
-    said = refusal(one, *pi_settings(one), under=tuple(outsider), start=start)
-    assert "Permission denied, so whether another fishd drives " in said
-    assert f"join the group of {locks} ('sudo usermod -aG fishd USER')" in said
-    with running(other, *pi_settings(other), start=mine):
+    own_start = (sys.executable, "-P", *start)
+    message = failed_start(one, *pi_settings(one), under=tuple(outsider), start=start)
+    assert "Permission denied, so whether another fishd drives " in message
+    assert f"join the group of {locks} ('sudo usermod -aG fishd USER')" in message
+    with running(other, *pi_settings(other), start=own_start):
         (lock, *_) = sorted(locks.iterdir())
         take = ("-c", "import os, sys; os.open(sys.argv[1], os.O_RDONLY)", str(lock))
         attempt = subprocess.run([*outsider, *take], capture_output=True, text=True, check=False)
@@ -158,7 +158,7 @@ def test_a_folder_of_lock_files_that_another_user_made_is_not_used(
         pass
 
 
-def test_the_kernel_tells_who_holds_a_lock_whatever_is_written_into_it(tmp_path: Path) -> None:
+def test_the_kernel_names_the_holder_of_a_lock_whatever_is_written_into_it(tmp_path: Path) -> None:
     part = ownership.Part(tmp_path / "fishd-bus", "/dev/i2c-7", "force_sensor.bus")
     with ownership.claim_parts([part]):
         lock_path(part.path).write_text("1\n")
@@ -174,10 +174,10 @@ def test_one_virtual_pi_takes_one_fishd_by_any_name_of_its_socket_even_one_that_
     other_name = ["--set", f"virtual_pi.socket={tmp_path}/link"]
     with pi.daemon() as first:
         taken = f"another fishd (pid {first.process.pid}) drives the virtual Pi on "
-        assert taken in refusal(tmp_path / "second", *pi.settings, *other_name)
+        assert taken in failed_start(tmp_path / "second", *pi.settings, *other_name)
         first.process.send_signal(signal.SIGSTOP)
         try:
-            assert taken in refusal(tmp_path / "second", *pi.settings)
+            assert taken in failed_start(tmp_path / "second", *pi.settings)
         finally:
             first.process.send_signal(signal.SIGCONT)
     with running(tmp_path / "second", *pi.settings):  # free again
@@ -189,12 +189,12 @@ def test_doctor_leaves_the_bus_of_a_fishd_at_another_endpoint_alone(
 ) -> None:
     (tmp_path / "elsewhere").mkdir()
     with running(tmp_path / "elsewhere", *pi.settings) as daemon:
-        _, found = doctor(pi.folder, *pi.settings, *free_telemetry())
+        _, findings = doctor(pi.folder, *pi.settings, *free_telemetry())
     for name in ("adc", "force"):
-        assert found[name][0] == "skipped"
-        assert f"(pid {daemon.process.pid})" in found[name][1]
-        assert "--endpoint" in found[name][1]
-    level, message = found["daemon"]
+        assert findings[name][0] == "skipped"
+        assert f"(pid {daemon.process.pid})" in findings[name][1]
+        assert "--endpoint" in findings[name][1]
+    level, message = findings["daemon"]
     assert level == "warning"
     assert (
         f"no fishd at ipc://{pi.folder}/control, but a fishd (pid {daemon.process.pid})" in message
@@ -210,7 +210,7 @@ def test_without_a_place_for_lock_files_fishd_says_so_and_starts(
     assert ownership.owner([part]) == ""
 
 
-def test_a_link_that_somebody_put_there_is_not_followed(tmp_path: Path) -> None:
+def test_a_symbolic_link_is_not_followed(tmp_path: Path) -> None:
     victim = tmp_path / "victim"
     victim.write_text("precious")
     (tmp_path / "bus.lock").symlink_to(victim)
@@ -219,7 +219,7 @@ def test_a_link_that_somebody_put_there_is_not_followed(tmp_path: Path) -> None:
     assert victim.read_text() == "precious"
 
 
-def test_whoever_only_asks_who_the_owner_is_keeps_no_fishd_from_starting(
+def test_a_program_that_only_asks_for_the_owner_keeps_no_fishd_from_starting(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     part = ownership.Part(tmp_path / "fishd-part", "a part", "a.key")
@@ -227,11 +227,11 @@ def test_whoever_only_asks_who_the_owner_is_keeps_no_fishd_from_starting(
 
     def sleep(seconds: float) -> None:
         slept.append(seconds)
-        if sum(slept) > 0.5:  # it was held up meanwhile
-            asks.close()
+        if sum(slept) > 0.5:  # the claim has waited by then
+            reader.close()
 
     monkeypatch.setattr("time.sleep", sleep)
-    with lock_path(part.path).open("w") as asks:
-        fcntl.flock(asks, fcntl.LOCK_SH)
+    with lock_path(part.path).open("w") as reader:
+        fcntl.flock(reader, fcntl.LOCK_SH)
         with ownership.claim_parts([part]):
-            assert asks.closed
+            assert reader.closed

@@ -14,7 +14,7 @@ PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
 
 
 @pytest.mark.parametrize("volts", ["", ",0,0"])
-def test_a_load_beyond_what_the_sensor_is_believed_is_refused_in_a_file(
+def test_a_load_beyond_the_force_limit_is_refused_in_a_file(
     rig: Bench, daemon: Daemon, volts: str
 ) -> None:
     loads = rig.folder / "loads.csv"
@@ -46,27 +46,27 @@ def test_what_was_measured_earlier_cannot_be_recorded(tmp_path: Path) -> None:
     assert not record.exists()
 
 
-def test_where_the_loads_are_to_be_recorded_is_looked_at_before_the_first_one(
+def test_the_file_for_recorded_loads_is_checked_before_the_first_load(
     rig: Bench, daemon: Daemon, tmp_path: Path
 ) -> None:
     record = tmp_path / "loads.csv"
     record.write_text("precious\n")
-    asked = ("calibrate", "force", "--record")
-    ended = daemon.fishctl(*asked, str(record))
+    words = ("calibrate", "force", "--record")
+    ended = daemon.fishctl(*words, str(record))
     assert one_line(ended) == f"fishctl: {record}: is there already; --force replaces it\n"
     assert record.read_text() == "precious\n"
-    ended = daemon.fishctl(*asked, str(tmp_path / "none" / "loads.csv"), "--force")
+    ended = daemon.fishctl(*words, str(tmp_path / "none" / "loads.csv"), "--force")
     assert one_line(ended).endswith("none/loads.csv: there is no folder to put it into\n")
 
 
-def test_loads_of_a_file_that_are_refused_for_now_are_said_to_be_there_still(
+def test_a_refusal_for_now_names_the_file_that_still_holds_the_loads(
     rig: Bench, daemon: Daemon
 ) -> None:
     measured = rig.folder / "measured.csv"
     measured.write_text("fx_N,fy_N,vx_V,vy_V\n" + "".join(f"{x},{y},{x},{y}\n" for x, y in PLAN))
-    asked = ("calibrate", "force", "--yes", "--loads", str(measured))
+    words = ("calibrate", "force", "--yes", "--loads", str(measured))
     assert daemon.fishctl("set-controller", "swing").returncode == 0
-    ended = daemon.fishctl(*asked)
+    ended = daemon.fishctl(*words)
     assert ended.returncode == 1
     assert re.fullmatch(
         rf"fishctl: [^\n]+ 'fishctl stop'; then run this again: the loads are in {measured} "
@@ -74,7 +74,7 @@ def test_loads_of_a_file_that_are_refused_for_now_are_said_to_be_there_still(
         ended.stderr,
     )
     daemon.at_rest()
-    assert daemon.fishctl(*asked).returncode == 0
+    assert daemon.fishctl(*words).returncode == 0
 
 
 def test_loads_of_a_file_that_make_no_fit_are_refused_even_with_yes(
@@ -101,10 +101,10 @@ def test_loads_measured_earlier_are_fitted_without_a_question(rig: Bench, daemon
     ended = daemon.fishctl("calibrate", "force", "--loads", str(measured), "--yes")
     assert (ended.returncode, ended.stderr) == (0, "")
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        found = fish.calibrations().force
-    assert (found.xx, found.xy, found.x0) == pytest.approx((0.5, 0.0, -0.15))
-    assert (found.yx, found.yy, found.y0) == pytest.approx((0.0, 1 / 1.5, 0.2 / 1.5))
-    assert (found.loads, found.residual) == (5, pytest.approx(0.0, abs=1e-12))
+        fit = fish.calibrations().force
+    assert (fit.xx, fit.xy, fit.x0) == pytest.approx((0.5, 0.0, -0.15))
+    assert (fit.yx, fit.yy, fit.y0) == pytest.approx((0.0, 1 / 1.5, 0.2 / 1.5))
+    assert (fit.loads, fit.residual) == (5, pytest.approx(0.0, abs=1e-12))
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,7 @@ def test_loads_measured_earlier_are_fitted_without_a_question(rig: Bench, daemon
         (None, r"no such file"),
     ],
 )
-def test_a_file_of_loads_that_is_no_good_is_refused_in_one_line(
+def test_a_wrong_file_of_loads_is_refused_in_one_line(
     tmp_path: Path, text: str | None, complaint: str
 ) -> None:
     path = tmp_path / "loads.csv"

@@ -1,4 +1,4 @@
-"""Where a driver's library is not installed, each program says so in one line."""
+"""Each program reports a missing library of a driver in one line."""
 
 import json
 import os
@@ -15,8 +15,8 @@ MODULES = ("pigpio", "adafruit_extended_bus", "adafruit_ads1x15", "Adafruit_Pure
 ONE_LINE = r"[^\n]*the package %s is missing; install fishd\[pi\]\n"
 
 
-def without(folder: Path, *modules: str) -> dict[str, str]:
-    """The environment of a Python that cannot import these."""
+def environment_without(folder: Path, *modules: str) -> dict[str, str]:
+    """Return the environment of a Python that cannot import these modules."""
     blocked = "".join(f"sys.modules[{name!r}] = None\n" for name in modules)
     (folder / "sitecustomize.py").write_text(f"import sys\n{blocked}")
     return os.environ | {"PYTHONPATH": str(folder)}
@@ -24,8 +24,8 @@ def without(folder: Path, *modules: str) -> dict[str, str]:
 
 @pytest.fixture
 def env(tmp_path: Path) -> dict[str, str]:
-    """Without the drivers."""
-    return without(tmp_path, *MODULES)
+    """Environment without the libraries of drivers."""
+    return environment_without(tmp_path, *MODULES)
 
 
 def test_fishd_on_a_virtual_pi_names_the_package(pi: Bench, env: dict[str, str]) -> None:
@@ -44,16 +44,16 @@ def test_fishd_on_a_virtual_pi_names_the_package(pi: Bench, env: dict[str, str])
 def test_fishd_on_a_pi_does_not_start_without_what_it_needs(
     tmp_path: Path, modules: list[str], settings: list[str], complaint: str
 ) -> None:
-    env = without(tmp_path, *modules)
+    env = environment_without(tmp_path, *modules)
     with (tmp_path / "sitecustomize.py").open("a") as file:  # another fishd may hold these pins
         file.write(
             "from pathlib import Path\n"
             "from fishd.hardware import ownership\n"
             f"ownership.FOLDER = Path({str(tmp_path)!r})\n"
         )
-    pi = sets("robot=pi", "force_sensor.bus=255", *settings)  # no machine has that
-    own = [*sets(f"state_folder={tmp_path}"), *addresses(tmp_path)]
-    ended = call(FISHD, *pi, *own, env=env)
+    pi = sets("robot=pi", "force_sensor.bus=255", *settings)  # no machine has this bus
+    paths = [*sets(f"state_folder={tmp_path}"), *addresses(tmp_path)]
+    ended = call(FISHD, *pi, *paths, env=env)
     assert (tmp_path / "fishd-i2c-255.lock").exists()
     assert ended.returncode == 1
     assert re.fullmatch(complaint, ended.stderr)
@@ -74,11 +74,11 @@ def test_a_simulation_of_the_virtual_pi_names_the_package(env: dict[str, str]) -
 def test_no_check_of_doctor_breaks_off(pi: Bench, env: dict[str, str]) -> None:
     ended = call(FISHCTL, "doctor", "--json", *pi.settings, *addresses(pi.folder), env=env)
     assert (ended.returncode, ended.stderr) == (1, "")
-    found = {line["check"]: line for line in json.loads(ended.stdout)}
+    findings = {line["check"]: line for line in json.loads(ended.stdout)}
     for name in ("adc", "force", "pigpiod"):
-        assert found[name]["level"] == "FAIL"
-        assert found[name]["message"].endswith(" is missing; install fishd[pi]")
-        assert found[name]["mend"].endswith("-m pip install 'fishd[pi]'")
+        assert findings[name]["level"] == "FAIL"
+        assert findings[name]["message"].endswith(" is missing; install fishd[pi]")
+        assert findings[name]["mend"].endswith("-m pip install 'fishd[pi]'")
     assert "ModuleNotFoundError" not in ended.stdout
     assert "broke off" not in ended.stdout
 
@@ -95,13 +95,13 @@ def test_a_package_that_is_there_but_broken_is_not_called_missing() -> None:
 def test_training_without_the_extra_names_it_in_one_line(
     tmp_path: Path, missing: list[str]
 ) -> None:
-    env = without(tmp_path, *missing)
-    found = call(FISHCTL, "learn", "ppo", "--folder", tmp_path / "run", env=env)
-    assert found.returncode == 1
+    env = environment_without(tmp_path, *missing)
+    done = call(FISHCTL, "learn", "ppo", "--folder", tmp_path / "run", env=env)
+    assert done.returncode == 1
     assert re.fullmatch(
         r"fishctl: \w+ is not installed; where the sources of fishd are: pip install [^\n]+ "
         r"--editable '.\[learn\]'\n",
-        found.stderr,
+        done.stderr,
     )
     assert not (tmp_path / "run").exists()
     shown = call(FISHCTL, "learn", "ppo", "--help", env=env)
@@ -110,9 +110,9 @@ def test_training_without_the_extra_names_it_in_one_line(
 
 @pytest.mark.parametrize("module", ["onnx", "onnxruntime"])
 def test_an_agent_names_the_extra_that_policies_need(tmp_path: Path, module: str) -> None:
-    found = call(FISHCTL, "agent", "default-fish", env=without(tmp_path, module))
-    assert (found.returncode, found.stdout) == (1, "")
-    assert found.stderr == (
+    done = call(FISHCTL, "agent", "default-fish", env=environment_without(tmp_path, module))
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == (
         f"fishctl: {module} is not installed; where the sources of fishd are: pip install "
         "--constraint tools/constraints.txt --editable '.[policy]'\n"
     )
@@ -122,9 +122,7 @@ def test_an_agent_names_the_extra_that_policies_need(tmp_path: Path, module: str
 def test_a_verb_about_a_camera_names_the_extra_that_it_needs(
     tmp_path: Path, module: str, verb: tuple[str, ...]
 ) -> None:
-    found = call(FISHCTL, "camera", *verb, env=without(tmp_path, module))
+    done = call(FISHCTL, "camera", *verb, env=environment_without(tmp_path, module))
     extra = "camera" if module == "aiohttp" else "record"
-    assert (found.returncode, found.stdout) == (1, "")
-    assert re.fullmatch(
-        rf"fishctl: {module} is not installed; [^\n]*'.\[{extra}\]'\n", found.stderr
-    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(rf"fishctl: {module} is not installed; [^\n]*'.\[{extra}\]'\n", done.stderr)

@@ -1,4 +1,4 @@
-"""The bar of an experiment is for a person: the output is clean for a program."""
+"""The bar of an experiment goes to standard error: programs can read the output."""
 
 import os
 import pty
@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-SHOWS = """
+PROGRAM = """
 from fishd.cli.progress import show_progress
 from fishd.cli.output import print_json
 with show_progress(2.0, "s", err={err}) as show:
@@ -17,25 +17,25 @@ print_json([1])
 """
 
 
-def shown_on_a_terminal(err: bool) -> tuple[str, str]:
-    """What goes into a pipe, and what a terminal shows that is standard error only."""
-    ours, theirs = pty.openpty()
-    command = [sys.executable, "-c", SHOWS.format(err=err)]
-    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=theirs, text=True, check=True)
-    os.close(theirs)
-    seen = b""
+def run_on_terminal(err: bool) -> tuple[str, str]:
+    """Return the output in a pipe, and the standard error on a terminal."""
+    reading_end, terminal = pty.openpty()
+    command = [sys.executable, "-c", PROGRAM.format(err=err)]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=terminal, text=True, check=True)
+    os.close(terminal)
+    shown = b""
     try:
-        while chunk := os.read(ours, 4096):
-            seen += chunk
-    except OSError:  # nobody writes there any more
+        while chunk := os.read(reading_end, 4096):
+            shown += chunk
+    except OSError:  # no process writes there any more
         pass
-    os.close(ours)
-    return done.stdout, seen.decode()
+    os.close(reading_end)
+    return done.stdout, shown.decode()
 
 
 @pytest.mark.parametrize("err", [True, False])
-def test_the_bar_is_on_standard_error_and_lines_where_they_are_wanted(err: bool) -> None:
-    out, seen = shown_on_a_terminal(err)
-    assert "2 of 2 s" in seen
-    assert ("one is done" in seen) == err
+def test_the_bar_is_on_standard_error_and_the_lines_on_either_stream(err: bool) -> None:
+    out, shown = run_on_terminal(err)
+    assert "2 of 2 s" in shown
+    assert ("one is done" in shown) == err
     assert out == ("" if err else "one is done\n") + "[\n  1\n]\n"

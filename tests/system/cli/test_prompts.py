@@ -1,4 +1,4 @@
-"""What a signal does to a prompt, whenever it comes."""
+"""A signal ends a prompt, whenever it comes."""
 
 import random
 import select
@@ -9,7 +9,7 @@ import time
 
 from rigs.processes import PATIENCE
 
-PROMPTS = """
+PROGRAM = """
 import signal, threading, time
 from fishd.cli.prompts import input_interrupted
 
@@ -30,25 +30,25 @@ while True:
     except KeyboardInterrupt:
         print("interrupted", flush=True)
 """
-"""Asks again and again, beside a thread that takes the interpreter's lock as the lease's does."""
+"""Program that prompts repeatedly; like the lease, a thread takes the interpreter's lock."""
 
 
 def test_a_signal_at_any_instant_after_a_prompt_interrupts_it() -> None:
     instants = random.Random(11)
-    asking = subprocess.Popen(
-        [sys.executable, "-c", PROMPTS], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    process = subprocess.Popen(
+        [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
-    assert asking.stdout
+    assert process.stdout
     try:
         for _ in range(100):
-            assert asking.stdout.read(1) == b"?"
+            assert process.stdout.read(1) == b"?"
             instant = time.perf_counter() + instants.uniform(0.0, 1e-4)
             while time.perf_counter() < instant:
                 pass  # a sleep is longer than the time between the prompt and the wait for input
-            asking.send_signal(signal.SIGTERM)
-            heard, _, _ = select.select([asking.stdout], [], [], PATIENCE)
-            assert heard, "it waits for input"
-            assert asking.stdout.readline() == b"interrupted\n"
+            process.send_signal(signal.SIGTERM)
+            readable, _, _ = select.select([process.stdout], [], [], PATIENCE)
+            assert readable, "it waits for input"
+            assert process.stdout.readline() == b"interrupted\n"
     finally:
-        asking.kill()
-        asking.communicate()
+        process.kill()
+        process.communicate()

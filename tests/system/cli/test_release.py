@@ -1,4 +1,4 @@
-"""`fishctl release` without a daemon: on pigpiod, on the kernel's PWM, where nothing is to do."""
+"""`fishctl release` without a daemon: on pigpiod, on the kernel's PWM, and with nothing to do."""
 
 import datetime
 import os
@@ -21,7 +21,7 @@ from fishd.hardware.calibration_files import CalibrationFolder
 
 @pytest.fixture
 def other_program(pi: Bench) -> Iterator[pigpio.pi]:
-    """Something that has left pulses on."""
+    """Client of a program that has left pulses on."""
     client = pigpio.pi("127.0.0.1", pi.pi.port(), show_errors=False)
     client.set_servo_pulsewidth(18, 1750)
     pi.wait_for_pulse(1750, 1750)
@@ -70,10 +70,10 @@ def test_an_output_that_takes_nothing_is_no_failure_of_the_release(
 ) -> None:
     command = ["sh", "-c", '"$@" >/dev/full', "sh", FISHCTL, "release", *pi.settings]
     ended = call(*command, env=os.environ | {"FISHD_CONFIG": ""})
-    said = (
+    message = (
         "pulses were on: neutral, then off; the output cannot be written: No space left on device"
     )
-    assert (ended.returncode, ended.stderr) == (0, f"fishctl: {said}\n")
+    assert (ended.returncode, ended.stderr) == (0, f"fishctl: {message}\n")
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
 
 
@@ -162,7 +162,7 @@ def test_a_calibration_that_cannot_be_read_does_not_keep_the_servo_energised(
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
 
 
-@pytest.mark.parametrize("folder", ["~nobody-here/fish", '"/var/\\0fish"', "3"])
+@pytest.mark.parametrize("folder", ["~no-user/fish", '"/var/\\0fish"', "3"])
 def test_a_state_folder_that_cannot_be_does_not_keep_the_servo_energised(
     pi: Bench, other_program: pigpio.pi, folder: str
 ) -> None:
@@ -176,7 +176,7 @@ def test_a_state_folder_that_cannot_be_does_not_keep_the_servo_energised(
 
 
 def test_a_state_folder_that_cannot_be_hides_no_other_fault() -> None:
-    ended = release("--set", "robot=pi", "--set", "state_folder=~nobody-here", "--set", "tick=soon")
+    ended = release("--set", "robot=pi", "--set", "state_folder=~no-user", "--set", "tick=soon")
     assert (ended.returncode, ended.stdout) == (78, "")
     assert re.fullmatch(r"fishctl: [^\n]*tick: 'soon' is not valid[^\n]*\n", ended.stderr)
 

@@ -1,4 +1,4 @@
-"""A reversed F_y as an operator meets it: in status, in doctor, and in calibrate force."""
+"""Reports of a reversed F_y: in status, in doctor, and in calibrate force."""
 
 import time
 from collections.abc import Callable
@@ -17,12 +17,12 @@ LINE = (
     "so controllers are shown it with the other sign"
 )
 
-REST, FIRST_PUSH = 50, 40
-"""More than what the sign of F_y takes to be judged [ticks]."""
+REST_TICKS, PUSH_TICKS = 50, 40
+"""Durations of rest and first push that suffice to judge the sign of F_y [ticks]."""
 
 
-def loads(folder: Path, sign: int) -> str:
-    """A file of loads that were measured, with +y and -y interchanged for sign -1."""
+def loads_file(folder: Path, sign: int) -> str:
+    """Write a file of measured loads, with +y and -y interchanged for sign -1; return its path."""
     forces = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
     rows = "".join(f"{x},{y},{x},{sign * y}\n" for x, y in forces)
     file = folder / f"loads{sign}.csv"
@@ -31,28 +31,28 @@ def loads(folder: Path, sign: int) -> str:
 
 
 def swim_until_judged(fish: Fish) -> None:
-    """Set off from rest, once more where a stall of the machine took the first push."""
+    """Set off from rest; repeat if a stall of the machine hid the first push."""
     deadline = time.monotonic() + PATIENCE
     while fish.status().fy_reversed is None:
         assert time.monotonic() < deadline
         wait_until(lambda: fish.status().phi_c == 0.0)
-        wait_for_ticks(fish, REST, lambda: False)
+        wait_for_ticks(fish, REST_TICKS, lambda: False)
         fish.set_controller("square", frequency=1.0)
-        wait_for_ticks(fish, FIRST_PUSH, lambda: fish.status().fy_reversed is not None)
+        wait_for_ticks(fish, PUSH_TICKS, lambda: fish.status().fy_reversed is not None)
         fish.stop()
 
 
 def wait_for_ticks(fish: Fish, ticks: int, earlier: Callable[[], bool]) -> None:
-    """Wait for so many ticks, or until the other is true."""
+    """Wait until a number of ticks has passed, or `earlier` returns true."""
     seq = fish.status().seq
     wait_until(lambda: fish.status().seq > seq + ticks or earlier())
 
 
 @pytest.fixture
 def interchanged(rig: Bench, daemon: Daemon) -> Daemon:
-    """A fishd that was calibrated with +y and -y interchanged, and has swum since."""
+    """The fishd, calibrated with +y and -y interchanged, after a swim."""
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        fish.calibrate_force(ForceCalibration(yy=-1.0, loads=5))
+        fish.calibrate_force(ForceCalibration(yy=-1.0, loads_file=5))
         assert fish.status().fy_reversed is None
         swim_until_judged(fish)
     return daemon
@@ -69,11 +69,15 @@ def test_status_doctor_and_calibrate_force_say_it_and_the_right_calibration_ends
     assert level == "warning"
     assert LINE in message
 
-    again = interchanged.fishctl("calibrate", "force", "--loads", loads(rig.folder, -1), "--yes")
-    assert "F_y is reversed, as was seen when the tail last set off, and this calibration" in (
-        again.stderr
+    still_reversed = interchanged.fishctl(
+        "calibrate", "force", "--loads", loads_file(rig.folder, -1), "--yes"
     )
-    right = interchanged.fishctl("calibrate", "force", "--loads", loads(rig.folder, 1), "--yes")
+    assert "F_y is reversed, as was seen when the tail last set off, and this calibration" in (
+        still_reversed.stderr
+    )
+    right = interchanged.fishctl(
+        "calibrate", "force", "--loads", loads_file(rig.folder, 1), "--yes"
+    )
     assert right.stderr == ""
     assert LINE not in interchanged.fishctl("status").stdout
 
@@ -85,5 +89,5 @@ def test_a_calibration_that_would_turn_a_right_force_round_is_doubted(
         swim_until_judged(fish)
         assert fish.status().fy_reversed is False
         wait_until(lambda: fish.status().phi_c == 0.0)
-    ended = daemon.fishctl("calibrate", "force", "--loads", loads(rig.folder, -1), "--yes")
+    ended = daemon.fishctl("calibrate", "force", "--loads", loads_file(rig.folder, -1), "--yes")
     assert "turns F_y round, which was right when the tail last set off" in ended.stderr

@@ -52,7 +52,7 @@ def test_a_calibration_file_that_cuts_the_range_is_one_line_of_degraded(pi: Benc
     assert err.count(line) == 1
 
 
-def test_config_check_tells_of_a_range_that_is_chosen(tmp_path: Path) -> None:
+def test_config_check_reports_a_reduced_range(tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("robot: pi\nservo: {lowest: -0.25}\n")
     ended = fishctl("config", "check", str(file))
@@ -93,7 +93,7 @@ def test_pulses_that_end_before_the_amplitude_are_refused(
 @pytest.mark.parametrize(
     "remedy", ["amplitude_limit=0.333", "servo.highest=0.333", "servo.trim=-52"]
 )
-def test_each_remedy_for_pulses_that_end_too_early_is_one(remedy: str) -> None:
+def test_each_remedy_for_pulses_that_end_too_early_works(remedy: str) -> None:
     config = load(None, ["servo.centre=2300", remedy])
     wanted = min(config.amplitude_limit, config.servo.highest)
     assert pulses.reach(config.servo)[1] >= wanted - pulses.ANGLE_TOLERANCE_RAD

@@ -1,4 +1,4 @@
-"""`fishctl tare`, and what none of the verbs about calibrations can do, on a real fishd."""
+"""`fishctl tare`, and requests that all verbs about calibrations refuse, on a real fishd."""
 
 import math
 import re
@@ -12,7 +12,7 @@ from rigs.operator_rig import Bench, fishctl_alone, forces
 from rigs.processes import FISHCTL, Daemon, Process, running
 
 
-def test_a_tare_calls_the_present_force_zero_and_says_what_it_did(
+def test_a_tare_sets_the_zero_to_the_present_force_and_reports_it(
     rig: Bench, daemon: Daemon
 ) -> None:
     before = forces(daemon)
@@ -46,7 +46,7 @@ def test_a_tare_that_is_given_up_while_it_measures_changes_nothing(
     tare = Process(FISHCTL, "--endpoint", daemon.endpoint, "tare", "--seconds", str(seconds))
     time.sleep(1.5)  # it measures
     assert tare.end(how)[0] != 0
-    forces(daemon, seconds)  # begun later and as long: its measurement would have ended
+    forces(daemon, seconds)  # starts later and takes as long: the tare would have ended
     assert math.hypot(*forces(daemon)) > 0.3
     assert rig.files("force") == []
 
@@ -58,7 +58,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
         yield daemon
 
 
-def test_a_simulated_fish_can_be_tared_for_as_long_as_it_lives(simulated: Daemon) -> None:
+def test_a_tare_of_a_simulated_fish_lasts_until_it_ends(simulated: Daemon) -> None:
     assert forces(simulated)[0] == pytest.approx(0.02, abs=2e-3)
     ended = simulated.fishctl("tare")
     assert ended.stdout.splitlines()[-1] == "in use, until this fish ends"

@@ -39,7 +39,7 @@ def daemon_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 @pytest.fixture
 def daemon(daemon_of_all: Daemon) -> Daemon:
-    """It swims, as from its start, whatever the test before has done with it."""
+    """The fishd, swimming, reset to its state after the start."""
     with Fish(daemon_of_all.at_rest().endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("swing")
         wait_until(lambda: fish.status().phi_c != 0.0)
@@ -47,7 +47,7 @@ def daemon(daemon_of_all: Daemon) -> Daemon:
 
 
 class Terminal:
-    """`fishctl watch` under a terminal, and all that it wrote there."""
+    """Terminal in which `fishctl watch` runs, with all of its output."""
 
     def __init__(self, daemon: Daemon, *options: str, **env: str) -> None:
         self._master, self._slave = pty.openpty()
@@ -69,7 +69,7 @@ class Terminal:
         fcntl.ioctl(self._slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
 
     def wait_for(self, pattern: str, meanwhile: Callable[[], object] = lambda: None) -> None:
-        """Read until `pattern` turns up in what is new; meanwhile: done again and again."""
+        """Read until `pattern` appears in new output; meanwhile: called repeatedly."""
         deadline = time.monotonic() + PATIENCE
         start = len(self.text)
         while not re.search(pattern, self.text[start:]):
@@ -82,7 +82,7 @@ class Terminal:
         self._process.send_signal(number)
 
     def finish(self) -> int:
-        """Wait for the end; returns the exit status."""
+        """Wait for the end; return the exit status."""
         deadline = time.monotonic() + PATIENCE
         while self._process.poll() is None:
             assert time.monotonic() < deadline, self.text
@@ -103,7 +103,7 @@ class Terminal:
 
     @property
     def restored(self) -> bool:
-        """True when the screen of before is shown again, with its cursor."""
+        """Whether the previous screen is restored, with its cursor."""
         return self.text.rfind(LEAVE_SCREEN) > self.text.rfind(ENTER_SCREEN) and self.text.rfind(
             SHOW_CURSOR
         ) > self.text.rfind(HIDE_CURSOR)
@@ -141,8 +141,8 @@ def test_without_a_terminal_it_prints_a_plain_line_every_second(daemon: Daemon) 
     assert (ended.returncode, ended.stderr) == (0, "")
     lines = ended.stdout.splitlines()
     assert 1 <= len(lines) <= 3
-    line = r"\d\d:\d\d:\d\d  \S+  running swing .* ticks"
-    assert all(re.match(line, each) for each in lines)
+    pattern = r"\d\d:\d\d:\d\d  \S+  running swing .* ticks"
+    assert all(re.match(pattern, line) for line in lines)
     assert re.search(r" ticks  top_speed \S+  reversal_speed \S+  since_reversal \S+ s$", lines[-1])
 
 
@@ -153,7 +153,7 @@ def test_it_draws_until_a_signal_and_leaves_the_terminal_as_it_was(
     terminal = Terminal(daemon)
     terminal.wait_for("RUNNING")
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        # Events have a subscription of their own, which may begin after the first tick is drawn.
+        # Events have a separate subscription, which may begin after the first tick is drawn.
         terminal.wait_for(
             "mark: a weight on the sensor", meanwhile=lambda: fish.mark("a weight on the sensor")
         )
@@ -206,7 +206,7 @@ def test_it_follows_the_terminal_through_any_size_without_colour_if_asked(daemon
 
 
 def tick(seq: int, t: float | None = None, **fields: Any) -> Tick:
-    """The tick of a loop of 50 ms, with a wave on both forces."""
+    """Return a tick of a loop of 50 ms, with a wave on both forces."""
     numbers = {name: 0.0 for name in Tick.__struct_fields__ if name not in ("alpha", "phi")}
     wave = {"fx": 0.02 + 0.02 * math.sin(0.5 * seq), "fy": 0.2 * math.sin(0.25 * seq)}
     what = {"seq": seq, "mode": "running", "controller": "swing", "servo_on": True, "missed": 0}
@@ -224,56 +224,56 @@ def status(**fields: Any) -> Status:
     )
 
 
-def shown(view: View, width: int = 80, height: int = 24) -> list[str]:
+def render(view: View, width: int = 80, height: int = 24) -> list[str]:
     console = Console(file=io.StringIO(), width=width, height=height)
     lines = console.render_lines(Screen(view))
     return ["".join(segment.text for segment in line).rstrip() for line in lines]
 
 
 def still_trace(screen: list[str]) -> str:
-    """The row of zero of the last trace, in which nothing moves."""
+    """Return the row of zero of the last trace, which is constant."""
     return [row for row in screen if " 0\u2524" in row][-1]
 
 
 def view_of(ticks: Iterable[Tick], **fields: Any) -> View:
     view = View(status(**fields))
-    for each in ticks:
-        view.add(each)
+    for one_tick in ticks:
+        view.add(one_tick)
     return view
 
 
 def test_lost_ticks_are_counted_and_leave_a_gap_in_the_traces() -> None:
-    whole = shown(view_of(map(tick, range(1, 101))))
-    holed = shown(view_of(tick(seq) for seq in range(1, 101) if not 40 <= seq < 60))
-    assert whole[2].split()[-1] == "0"
+    complete = render(view_of(map(tick, range(1, 101))))
+    holed = render(view_of(tick(seq) for seq in range(1, 101) if not 40 <= seq < 60))
+    assert complete[2].split()[-1] == "0"
     assert holed[2].split()[-1] == "20"
     gap = re.compile("[\u2801-\u28ff][ \u2800]{8,}[\u2801-\u28ff]")
     assert gap.search(still_trace(holed))
-    assert not gap.search(still_trace(whole))
+    assert not gap.search(still_trace(complete))
 
 
 def test_it_shows_which_experiment_holds_the_fish() -> None:
     holder = LeaseHolder(name="sweep", host="lab", pid=7, age=65.2)
     held = "held by sweep (pid 7 on lab), for 65 s"
-    assert held in shown(view_of(map(tick, range(1, 101)), lease=holder))
-    assert held not in shown(view_of(map(tick, range(1, 101))))
+    assert held in render(view_of(map(tick, range(1, 101)), lease=holder))
+    assert held not in render(view_of(map(tick, range(1, 101))))
 
 
 def test_a_daemon_that_was_restarted_is_not_a_loss() -> None:
     after = [tick(seq, t=60.0 + 0.05 * seq) for seq in range(1, 50)]
-    assert shown(view_of([*map(tick, range(1000, 1050)), *after]))[2].split()[-1] == "0"
+    assert render(view_of([*map(tick, range(1000, 1050)), *after]))[2].split()[-1] == "0"
 
 
-def test_late_and_busy_are_the_worst_of_what_is_shown() -> None:
+def test_late_and_busy_are_the_worst_of_the_ticks_shown() -> None:
     early = tick(1, lateness_us=9999.0)
     bad = tick(150, lateness_us=777.0, busy_us=888.0)
-    late = shown(view_of([early, *map(tick, range(2, 150)), bad, *map(tick, range(151, 200))]))
+    late = render(view_of([early, *map(tick, range(2, 150)), bad, *map(tick, range(151, 200))]))
     assert "777 µs" in late[2]
     assert "888 µs" in late[2]
 
 
-def test_in_slow_motion_where_no_tick_is_late_there_is_no_word_of_it() -> None:
-    screen = shown(view_of(map(tick, range(1, 50)), robot="swimmer"))
+def test_in_slow_motion_the_timing_is_not_shown() -> None:
+    screen = render(view_of(map(tick, range(1, 50)), robot="swimmer"))
     assert "tail beat" in screen[1]
     assert not re.search("late|busy|missed", screen[1])
 
@@ -282,28 +282,28 @@ def test_a_fault_is_explained_in_full_however_narrow_the_screen() -> None:
     message = "no force sample for 0.15 s: is the sensor's cable plugged in at both of its ends?"
     reason = Reason("sensor-stale", message)
     faulty = view_of([tick(1, mode="fault", servo_on=False)], mode="fault", reason=reason)
-    screen = shown(faulty, width=30, height=24)
+    screen = render(faulty, width=30, height=24)
     assert screen[0].startswith(" FAULT ")
     assert message in " ".join(screen)
-    assert "no pulses" in shown(faulty)[0]
+    assert "no pulses" in render(faulty)[0]
 
 
 def test_a_lost_sensor_or_servo_and_a_controller_that_took_over_are_shown() -> None:
     why = Reason("chatter", "ppo gave up: in 30 of the last 40 ticks it wanted to reverse too soon")
-    screen = shown(view_of([tick(1)], sensor_lost=True, servo_lost=True, fallback=why), width=120)
+    screen = render(view_of([tick(1)], sensor_lost=True, servo_lost=True, fallback=why), width=120)
     assert screen[0].startswith(" RUNNING ")
     assert "servo not reached" in screen[0]
     assert screen[1] == f"took over: chatter: {why.message}"
     assert "– mN" in screen[3]
 
 
-def test_what_the_controller_shows_is_on_the_screen_with_its_unit() -> None:
-    own = {"top_speed": 2.3144, "since_reversal": 0.15}
-    screen = shown(view_of([tick(1, quantities=own)], quantity_units={"since_reversal": "s"}))
+def test_quantities_of_the_controller_are_on_the_screen_with_their_units() -> None:
+    values = {"top_speed": 2.3144, "since_reversal": 0.15}
+    screen = render(view_of([tick(1, quantities=values)], quantity_units={"since_reversal": "s"}))
     assert screen[3].split() == ["top_speed", "2.31", "since_reversal", "0.15", "s"]
 
 
-def test_the_status_is_asked_for_again_every_second_and_when_mode_or_controller_change() -> None:
+def test_the_status_is_requested_every_second_and_when_mode_or_controller_change() -> None:
     assert not view_of([tick(1, t=100.5)], t=100.0).outdated
     assert view_of([tick(1, t=101.0)], t=100.0).outdated
     assert view_of([tick(1, t=100.5, mode="estop")], t=100.0).outdated
@@ -314,7 +314,7 @@ def test_any_size_of_screen_is_filled_and_never_overflows() -> None:
     view = view_of(map(tick, range(1, 101)), reason=Reason("servo-link", "the cable is off"))
     for width in (1, 10, 27, 28, 60, 250):
         for height in (1, 2, 3, 5, 9, 15, 60):
-            screen = shown(view, width, height)
+            screen = render(view, width, height)
             assert len(screen) == height
             assert max(map(len, screen)) <= width
 
@@ -322,4 +322,4 @@ def test_any_size_of_screen_is_filled_and_never_overflows() -> None:
 @pytest.mark.parametrize("period", [0.002, 0.05, 0.2])
 def test_traces_are_whole_lines_at_any_period_of_the_loop(period: float) -> None:
     ticks = (tick(seq, t=period * seq) for seq in range(1, round(6.0 / period)))
-    assert re.search("[\u2801-\u28ff]{60}", still_trace(shown(view_of(ticks, tick=period))))
+    assert re.search("[\u2801-\u28ff]{60}", still_trace(render(view_of(ticks, tick=period))))

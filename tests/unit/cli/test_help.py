@@ -1,4 +1,4 @@
-"""What `fishctl --help` and its groups show, and what a misspelled verb gets."""
+"""Help of `fishctl` and its groups, and hints for misspelled verbs."""
 
 import json
 import re
@@ -19,22 +19,22 @@ def groups(command: click.Command, path: tuple[str, ...] = ()) -> Iterator[tuple
         yield path
         context = click.Context(command)
         for name in command.list_commands(context):
-            found = command.get_command(context, name)
-            assert found
-            yield from groups(found, (*path, name))
+            subcommand = command.get_command(context, name)
+            assert subcommand
+            yield from groups(subcommand, (*path, name))
 
 
-ALL = list(groups(fishctl))
+ALL_GROUPS = list(groups(fishctl))
 
 
-@pytest.mark.parametrize("path", ALL, ids=lambda path: " ".join(("fishctl", *path)))
+@pytest.mark.parametrize("path", ALL_GROUPS, ids=lambda path: " ".join(("fishctl", *path)))
 def test_no_summary_is_cut(path: tuple[str, ...]) -> None:
     shown = CliRunner().invoke(fishctl, [*path, "--help"], terminal_width=80)
     assert shown.exit_code == 0
     assert "..." not in shown.stdout.replace("[ARGS]...", "")
 
 
-def test_verbs_stand_below_headings_that_say_what_one_wants() -> None:
+def test_verbs_stand_below_headings_of_their_purpose() -> None:
     lines = CliRunner().invoke(fishctl, ["--help"]).stdout.splitlines()
     headings = [line for line in lines if line.endswith(":") and not line.startswith(" ")]
     assert headings == [
@@ -61,23 +61,25 @@ def test_a_misspelled_verb_gets_the_nearest(words: list[str], meant: str) -> Non
     assert f"'{meant}'" in done.stderr
 
 
-def numbers(command: click.Command, name: str = "fishctl") -> Iterator[tuple[str, click.Parameter]]:
-    """The options for a number within bounds, of all verbs."""
+def numeric_options(
+    command: click.Command, name: str = "fishctl"
+) -> Iterator[tuple[str, click.Parameter]]:
+    """Yield the options for a number within bounds, of all verbs."""
     if isinstance(command, click.Group):
         context = click.Context(command)
-        for each in command.list_commands(context):
-            found = command.get_command(context, each)
-            assert found
-            yield from numbers(found, f"{name} {each}")
+        for verb in command.list_commands(context):
+            subcommand = command.get_command(context, verb)
+            assert subcommand
+            yield from numeric_options(subcommand, f"{name} {verb}")
     for parameter in command.params:
         if isinstance(parameter.type, click.FloatRange):
             yield name, parameter
 
 
-def test_no_option_takes_for_a_number_within_bounds_what_is_none() -> None:
-    found = list(numbers(fishctl))
-    assert len(found) > 20
-    for name, parameter in found:
+def test_no_option_with_bounds_accepts_nan() -> None:
+    bounded_options = list(numeric_options(fishctl))
+    assert len(bounded_options) > 20
+    for name, parameter in bounded_options:
         with pytest.raises(click.BadParameter, match="a finite number is needed"):
             print(name, parameter.name, parameter.type.convert("nan", parameter, None))
 
@@ -94,7 +96,7 @@ WITHOUT_JSON = {
     *("virtual-pi clear", "virtual-pi inject", "virtual-pi press", "virtual-pi run"),
     "virtual-pi unpress",
 }
-"""Verbs that print no result: dialogues, pictures in the terminal, scripts, nothing at all."""
+"""Verbs that print no result: dialogues, pictures in the terminal, scripts, or nothing."""
 EXPERIMENTS = ("measure", "compare", "sweep", "optimise", "identify", "adapt", "learn ppo")
 
 
@@ -104,9 +106,9 @@ def test_all_verbs_have_one_vocabulary() -> None:
         WITHOUT_JSON
     )
     for verb, command in known.items():
-        own = options(command)
-        assert ("--for" in own) == ("--seconds" in own), verb
-        assert not own & {"--tank-time", "--out", "--output", "--figure"}, verb
+        own_options = options(command)
+        assert ("--for" in own_options) == ("--seconds" in own_options), verb
+        assert not own_options & {"--tank-time", "--out", "--output", "--figure"}, verb
         for parameter in command.params:
             if "--seed" in parameter.opts:
                 assert isinstance(parameter, click.Option)
@@ -121,7 +123,7 @@ def test_all_verbs_have_one_vocabulary() -> None:
 
 
 @pytest.mark.parametrize("word", ["help", "list", "start", "run", "swim"])
-def test_a_word_of_other_programs_gets_verbs_that_there_are(word: str) -> None:
+def test_a_hint_for_a_word_of_other_programs_names_existing_verbs(word: str) -> None:
     done = CliRunner().invoke(fishctl, [word])
     assert done.exit_code == 2
     for verb in re.findall(r"'([a-z-]+)'", done.stderr.partition(": did you mean")[2]):
@@ -148,7 +150,7 @@ def test_parameters_stand_behind_a_controller_or_are_options(words: tuple[str, .
     assert json.loads(done.stdout)["parameters"] == {"frequency": 1.7, "amplitude": 0.3}
 
 
-def test_the_fish_is_live_where_a_fishd_runs_and_nothing_describes_another(
+def test_the_fish_is_live_if_a_fishd_runs_and_no_option_describes_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     choose = experiment_options.default_on

@@ -30,7 +30,7 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     assert load(fish).plant.omega0 == pytest.approx(11.0, rel=0.01)
     assert picture.read_bytes()[:4] == b"\x89PNG"
 
-    again = invoke(
+    second = invoke(
         str(record),
         "--fit",
         "omega0, xi, coupling",
@@ -40,10 +40,10 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
         "plant.omega0=11",
         "--json",
     )
-    assert again.exit_code == 0
-    told = json.loads(again.stdout)
-    assert told["origin"] == "identify.mcap"
-    estimates = told["estimates"]
+    assert second.exit_code == 0
+    result = json.loads(second.stdout)
+    assert result["origin"] == "identify.mcap"
+    estimates = result["estimates"]
     assert estimates["omega0"]["low"] < 11.0 < estimates["omega0"]["high"]
     assert not estimates["coupling"]["fitted"]
 
@@ -52,7 +52,7 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     assert "exists already; --force overwrites it, --to names another" in str(refused.exception)
 
 
-def test_a_folder_that_cannot_be_made_is_told_before_the_fish_swims(
+def test_a_folder_that_cannot_be_made_is_reported_before_the_fish_swims(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     swum: list[object] = []
@@ -72,10 +72,12 @@ def test_a_run_is_a_name_in_the_folder_of_recordings_or_the_latest(
     known = ("--fit", "omega0", "--set", "simulation.rotation=0.1")
     swim = ("--experiment", "--for", "30", "--folder", str(folder), *known)
     assert invoke(*swim).exit_code == 0
-    told = [invoke(run, *known) for run in ("identify", "identify.mcap", "latest")]
-    assert told[0].stdout.endswith("\nfrom identify.mcap\n")
-    assert {each.stdout for each in told} == {told[0].stdout}
-    assert {each.stderr for each in told} == {""}  # the fish is explained, as its sensor is turned
+    results = [invoke(run, *known) for run in ("identify", "identify.mcap", "latest")]
+    assert results[0].stdout.endswith("\nfrom identify.mcap\n")
+    assert {result.stdout for result in results} == {results[0].stdout}
+    assert {result.stderr for result in results} == {
+        ""
+    }  # no warning: the model includes the turned sensor
     assert "the folder is not empty" in str(invoke(*swim).exception)
 
 
@@ -97,10 +99,10 @@ def test_it_says_which_fish_swam(
     assert done.stdout.endswith(f"\nfrom an experiment with {fish}\n")
 
 
-def test_a_drift_is_told_to_either_side() -> None:
+def test_a_drift_is_reported_in_both_directions() -> None:
     drifting = ("--set", "simulation.drift=0.01")
     done = invoke("--experiment", "--for", "70", "--fit", "omega0", *drifting)
-    shown = [float(each) for each in re.findall(r"drift ±(\S+) mN", done.stdout)]
+    shown = [float(drift) for drift in re.findall(r"drift ±(\S+) mN", done.stdout)]
     assert shown == [pytest.approx(10.0, abs=0.5)] * 2
 
 

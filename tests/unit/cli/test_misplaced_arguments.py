@@ -1,4 +1,4 @@
-"""An argument that belongs elsewhere: the verb says where."""
+"""An argument that belongs elsewhere: the message names the place."""
 
 import socket
 from pathlib import Path
@@ -11,7 +11,9 @@ from rigs.processes import fishctl, one_line
 
 @pytest.mark.parametrize("override", ["camera.eye=cnn", "ppo.n_steps=64", "see=camera"])
 @pytest.mark.parametrize("verb", [("learn", "ppo"), ("compare", "swing")])
-def test_a_setting_of_a_training_is_sent_to_its_file(verb: tuple[str, ...], override: str) -> None:
+def test_for_a_setting_of_a_training_the_message_names_its_file(
+    verb: tuple[str, ...], override: str
+) -> None:
     done = fishctl(*verb, "--set", override)
     name = override.partition("=")[0].partition(".")[0]
     assert done.returncode == 78
@@ -76,9 +78,9 @@ def test_a_true_camera_cannot_see_a_simulated_fish(eye: str) -> None:
 
 @pytest.mark.parametrize("verb", ["status", "view", "align", "page"])
 def test_a_file_in_place_of_the_address_of_a_camera_is_refused(verb: str) -> None:
-    with socket.socket() as somebody:  # also where a page is shown already
-        somebody.bind(("127.0.0.1", 0))
-        port = ("--port", str(somebody.getsockname()[1])) if verb == "page" else ()
+    with socket.socket() as occupant:  # also while a page is served already
+        occupant.bind(("127.0.0.1", 0))
+        port = ("--port", str(occupant.getsockname()[1])) if verb == "page" else ()
         line = one_line(fishctl("camera", verb, "--camera", "config/web.yaml", *port))
     assert line == (
         "fishctl: 'config/web.yaml' is a file, for 'fishd-camera --config' and for simulated "

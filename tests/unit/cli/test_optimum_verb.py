@@ -1,4 +1,4 @@
-"""`fishctl optimum`: what it says of the configured fish, and what it refuses."""
+"""`fishctl optimum`: output for the configured fish, and refusals."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,8 @@ from click.testing import CliRunner, Result
 from fishd.cli.main import fishctl
 from fishd.core.errors import FishdError
 
-QUICK = ("--set", "plant.servo_speed=1000", "--set", "plant.servo_lag=0.001")
-"""A servo for which the best command is found soon."""
+QUICK_SERVO = ("--set", "plant.servo_speed=1000", "--set", "plant.servo_lag=0.001")
+"""Options for a servo whose best command is computed fast."""
 
 
 def invoke(*arguments: str) -> Result:
@@ -29,9 +29,9 @@ def test_it_shows_the_best_square_wave_and_the_limits_of_the_configured_fish() -
 
 
 @pytest.mark.slow
-def test_optimal_control_is_told_and_drawn(tmp_path: Path) -> None:
+def test_optimal_control_is_printed_and_drawn(tmp_path: Path) -> None:
     picture = tmp_path / "best.svg"
-    done = invoke("--control", "--plot", str(picture), *QUICK)
+    done = invoke("--control", "--plot", str(picture), *QUICK_SERVO)
     assert done.exit_code == 0
     assert "|φ_c| = Φ in 100.0% of the time" in done.output
     assert picture.read_text(encoding="utf-8").startswith("<?xml")
@@ -59,7 +59,7 @@ def test_without_control_there_is_nothing_to_draw(tmp_path: Path) -> None:
     assert "give both" in done.output
 
 
-def test_what_the_limits_leave_out_is_said() -> None:
+def test_ignored_parameters_are_reported() -> None:
     done = invoke("--set", "plant.backlash=0.02")
     assert "the limits leave out plant.backlash" in done.stderr
 

@@ -17,8 +17,8 @@ from fishd.core.errors import NoDaemon, PolicyError
 
 
 @pytest.fixture(autouse=True)
-def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """No daemon is running; the folder is the only one with policies."""
+def policy_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Folder that is the only one with policies, while no daemon runs."""
     folder = tmp_path / "policies"
     monkeypatch.delenv("FISHD_ENDPOINT", raising=False)
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
@@ -32,10 +32,12 @@ def invoke(*arguments: str) -> Result:
     return CliRunner().invoke(fishctl, arguments)
 
 
-def test_without_a_daemon_the_policies_of_this_machine_are_listed(nobody: Path) -> None:
-    write(nobody, FLIP, "flip")
-    write(nobody, b"PK", "torch")
-    write(nobody, to_onnx(linear(1.0), "tanh", card(tick=0.02, amplitude=0.8)), "wide")
+def test_without_a_daemon_the_policies_of_this_machine_are_listed(
+    policy_folder: Path,
+) -> None:
+    write(policy_folder, FLIP, "flip")
+    write(policy_folder, b"PK", "torch")
+    write(policy_folder, to_onnx(linear(1.0), "tanh", card(tick=0.02, amplitude=0.8)), "wide")
     done = invoke("policies")
     assert done.exit_code == 0
     assert "fishctl: no fishd is running; these are the policies of this machine" in done.stderr
@@ -44,37 +46,37 @@ def test_without_a_daemon_the_policies_of_this_machine_are_listed(nobody: Path) 
     assert head.split() == heads.split()
     assert rows[0].split() == [
         *("flip", "forces", "0.42", "50", "ms", "simulation", "8000", "98.7%", "2026-11-21"),
-        str(nobody),
+        str(policy_folder),
     ]
-    assert rows[1].split() == ["torch", *["–"] * 7, str(nobody)]
+    assert rows[1].split() == ["torch", *["–"] * 7, str(policy_folder)]
     assert rows[2].startswith("    not here: this is a zip archive as torch writes")
     assert rows[3].startswith("wide   forces  0.8")
     assert len(rows) == 4
 
 
-def test_where_there_are_none_it_says_where_they_belong(nobody: Path) -> None:
+def test_without_policies_it_names_their_folder(policy_folder: Path) -> None:
     done = invoke("policies")
     assert (done.exit_code, done.stdout) == (0, "")
-    assert done.stderr.endswith(f"no policies here; put .onnx files into {nobody}\n")
+    assert done.stderr.endswith(f"no policies here; put .onnx files into {policy_folder}\n")
 
 
 def test_an_endpoint_that_is_named_must_answer(tmp_path: Path) -> None:
-    done = invoke("--endpoint", f"ipc://{tmp_path}/nobody", "policies")
+    done = invoke("--endpoint", f"ipc://{tmp_path}/nothing", "policies")
     assert isinstance(done.exception, NoDaemon)
-    done = invoke("policies", "--endpoint", f"ipc://{tmp_path}/nobody", "show", "flip")
+    done = invoke("policies", "--endpoint", f"ipc://{tmp_path}/nothing", "show", "flip")
     assert isinstance(done.exception, NoDaemon)
 
 
-def test_the_whole_card_of_a_name_or_a_file_is_shown(nobody: Path, tmp_path: Path) -> None:
+def test_the_whole_card_of_a_name_or_a_file_is_shown(policy_folder: Path, tmp_path: Path) -> None:
     for policy in ("flip", str(write(tmp_path, FLIP, "copy"))):
-        write(nobody, FLIP, "flip")
+        write(policy_folder, FLIP, "flip")
         shown = invoke("policies", "show", policy).stdout
         for line in ("tick: 0.05", "amplitude: 0.42", "  algorithm: by hand", "      n_steps: 128"):
             assert f"\n{line}\n" in shown
 
 
-def test_what_is_no_policy_cannot_be_shown_and_says_why(nobody: Path) -> None:
-    path = write(nobody, b"\x80\x04", "torch")
+def test_a_file_without_a_policy_is_refused_with_the_reason(policy_folder: Path) -> None:
+    path = write(policy_folder, b"\x80\x04", "torch")
     done = invoke("policies", "show", "torch")
     assert isinstance(done.exception, PolicyError)
     assert str(done.exception).startswith(f"{path}: this is a pickle")
@@ -82,12 +84,12 @@ def test_what_is_no_policy_cannot_be_shown_and_says_why(nobody: Path) -> None:
     assert str(done.exception).startswith("no policy is named 'touch'; did you mean 'torch'? Th")
 
 
-def test_a_strangers_file_says_nothing_to_the_terminal_and_keeps_the_table_narrow(
-    nobody: Path,
+def test_control_characters_of_a_file_do_not_reach_the_terminal(
+    policy_folder: Path,
 ) -> None:
-    past = replace(PROVENANCE, on="\x1b[2Jrobot" + "x" * 10_000, note="\x1b]0;title\x07")
-    evil = replace(card(), provenance=replace(past, steps=10**50))
-    write(nobody, to_onnx(linear(1.0), "tanh", evil), "evil")
+    provenance = replace(PROVENANCE, on="\x1b[2Jrobot" + "x" * 10_000, note="\x1b]0;title\x07")
+    hostile_card = replace(card(), provenance=replace(provenance, steps=10**50))
+    write(policy_folder, to_onnx(linear(1.0), "tanh", hostile_card), "evil")
     for done in (
         invoke("policies"),
         invoke("policies", "show", "evil"),
@@ -96,14 +98,14 @@ def test_a_strangers_file_says_nothing_to_the_terminal_and_keeps_the_table_narro
         assert done.exit_code == 0
         assert "robot" in done.stdout
         assert "\x1b" not in done.stdout
-    assert max(map(len, invoke("policies").stdout.splitlines())) < 200 + len(str(nobody))
+    assert max(map(len, invoke("policies").stdout.splitlines())) < 200 + len(str(policy_folder))
 
 
 def test_a_policy_can_be_simulated_by_name_and_by_a_relative_path(
-    nobody: Path, monkeypatch: pytest.MonkeyPatch
+    policy_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = write(nobody, FLIP, "flip")
-    monkeypatch.chdir(nobody)
+    path = write(policy_folder, FLIP, "flip")
+    monkeypatch.chdir(policy_folder)
     for given, shown in (
         ("flip", "flip until 1.95 s, then swing;"),
         ("flip.onnx", f"{path} until"),
@@ -113,10 +115,10 @@ def test_a_policy_can_be_simulated_by_name_and_by_a_relative_path(
 
 
 def test_the_option_for_a_policy_explains_itself_and_completes_names_and_files(
-    nobody: Path,
+    policy_folder: Path,
 ) -> None:
     for name in ("flip", "flop", "swim"):
-        write(nobody, FLIP, name)
+        write(policy_folder, FLIP, name)
     shown = invoke("set-controller", "ppo", "--help").stdout
     assert "--policy NAME|FILE" in shown
     assert "required" in shown
@@ -125,14 +127,14 @@ def test_the_option_for_a_policy_explains_itself_and_completes_names_and_files(
     ppo = verb.get_command(click.Context(verb), "ppo")
     assert ppo
     option = next(param for param in ppo.params if "--policy" in param.opts)
-    found = option.shell_complete(click.Context(ppo), "fl")
-    assert [(item.value, item.type) for item in found] == [
+    items = option.shell_complete(click.Context(ppo), "fl")
+    assert [(item.value, item.type) for item in items] == [
         ("fl", "file"), ("flip", "plain"), ("flop", "plain")
     ]  # fmt: skip
 
 
 @pytest.mark.slow
-def test_fishctl_that_only_asks_loads_no_numbers() -> None:
+def test_a_plain_request_of_fishctl_loads_no_numpy() -> None:
     program = (
         "import sys; from fishd.controllers import registry; from fishd.client import Fish; "
         "registry.describe('ppo'); print([m for m in ('numpy', 'onnx', 'onnxruntime') "

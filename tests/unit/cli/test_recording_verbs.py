@@ -1,4 +1,4 @@
-"""What the verbs about recordings refuse and say."""
+"""Refusals and output of the verbs about recordings."""
 
 import json
 import re
