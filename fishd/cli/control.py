@@ -26,7 +26,7 @@ def list_from_daemon(
     look: Callable[[], list[T]],
     noun: str,
 ) -> list[T]:
-    """Return the list that the daemon gives, or that of this machine if none runs or was named.
+    """Return the list that the daemon gives, or that of this machine if no daemon runs.
 
     ask: gets the list from the daemon; look: gets it without one; noun: plural noun of its items
     """

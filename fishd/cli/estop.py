@@ -69,7 +69,7 @@ def _to_builtins(state: State) -> dict[str, Any]:
 
 
 def _end_pulses(no_answer: NoDaemon, path: Path | None, file: Path | None) -> str:
-    """End the pulses without the daemon; return what was result, in words."""
+    """End the pulses without the daemon; return what was done, in words."""
     recipe = release_recipe.read(str(path)) if path and not file else None
     if recipe is None:
         from fishd.cli.release import release_by_config

@@ -59,7 +59,9 @@ VERBS = {
         "swimmer": Verb("swimmer", "swimmer", "Draw a fish that swims freely, and its wake."),
         "adapt": Verb("adapt", "adapt", "Find a new fish's best gait: fit, train, measure."),
         "learn": Verb("learn", "learn", "Train policies, and write them to files."),
-        "virtual-pi": Verb("virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and inject faults."),
+        "virtual-pi": Verb(
+            "virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and inject faults."
+        ),
     },
     "Check and configure": {
         "doctor": Verb("doctor", "doctor", "Check this machine, and print remedies."),

@@ -1,4 +1,4 @@
-"""CSV files of loads for `fishctl calibrate force`: read as a plan or a measurement, written."""
+"""CSV files of loads for `fishctl calibrate force`: reading of plans and measurements, and writing."""
 
 import csv
 import io
@@ -39,7 +39,7 @@ def explain_excess(fx: float, fy: float, limit: float) -> str:
 
 
 def check_limit(steps: Sequence[Step], limit: float) -> None:
-    """Raise `click.ClickException` for the first load that is `explain_excess` the limit [N]."""
+    """Raise `click.ClickException` for the first load beyond the limit [N]."""
     for step in steps:
         if problem := explain_excess(step.fx, step.fy, limit):
             hint = "; are these grams? Then name the columns fx_g,fy_g" if step.unit == "N" else ""

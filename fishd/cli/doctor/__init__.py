@@ -30,7 +30,7 @@ def doctor(
 ) -> int:
     """Check everything that fishd needs with this configuration, and print remedies.
 
-    Only what concerns the configured robot is checked. Nothing moves and nothing is changed; a
+    Only what the configured robot needs is checked. Nothing moves and nothing is changed; a
     running fishd is asked and not disturbed. Exit status 1 when a check failed, 78 when the
     configuration is wrong.
     """

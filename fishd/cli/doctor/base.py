@@ -74,7 +74,7 @@ def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
 
 
 def is_unused(endpoint: str) -> bool:
-    """Return whether certainly no process listens there.
+    """Return whether certainly no process listens at an endpoint.
 
     Raises PermissionError if this user cannot find out.
     """

@@ -1,4 +1,4 @@
-"""The verb that finishes a recording that was cut off."""
+"""The verb that repairs a recording that was cut off."""
 
 from pathlib import Path
 
@@ -18,10 +18,10 @@ from fishd.recording.recover import recover as finish
 @folder_option
 @json_option
 def recover(file: str, folder: Path | None, as_json: bool) -> None:
-    """Finish a recording that was cut off, by a kill, a full disk or a power cut, or is damaged.
+    """Repair a recording that was cut off by a kill, a full disk or a power cut, or is damaged.
 
     FILE is a path, a name in the folder of recordings, or 'latest'. NAME.mcap.part becomes
-    NAME.mcap; a file of another name stays as it is, and NAME-recovered.mcap is written beside it.
+    NAME.mcap; a file of another name stays unchanged, and NAME-recovered.mcap is written beside it.
     """
     path = find(file, folder)
     damaged = open_run(path)

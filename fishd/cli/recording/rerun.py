@@ -1,4 +1,4 @@
-"""The verb that lets a controller choose again on what was recorded."""
+"""The verb that runs a controller again on a recording."""
 
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ def rerun(
     folder: Path | None,
     as_json: bool,
 ) -> int:
-    """Let a controller choose again in each recorded tick, and compare its commands.
+    """Run a controller again on each recorded tick, and compare its commands.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. The controller sees the recorded
     forces and angles. The controller that swam gives the same commands to the last bit, from each
