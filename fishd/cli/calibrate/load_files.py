@@ -1,4 +1,4 @@
-"""CSV files of loads for `fishctl calibrate force`: reading of plans and measurements, and writing."""
+"""CSV files of loads for `fishctl calibrate force`: plans and measurements."""
 
 import csv
 import io
