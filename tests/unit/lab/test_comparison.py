@@ -1,4 +1,4 @@
-"""Policies and controllers on the same fish: their figures, and a picture."""
+"""Comparison of policies and controllers on the same fish: results and picture."""
 
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,12 @@ CONFIG = load(None, ["simulation.offset_y=0.005"])
 FIGURES = "install the extra 'lab'"
 
 
-def swum(*texts: str, runs: int = 1) -> list[comparison.Standing]:
+def compare_texts(*texts: str, runs: int = 1) -> list[comparison.Standing]:
     return compare(CONFIG, [parse(text) for text in texts], 20.0, 5.0, runs)[0]
 
 
 def test_square_beats_sine_beats_triangle_and_each_is_as_square_as_it_is() -> None:
-    standings = swum(*(f"{name}:frequency=1.7" for name in ("square", "sine", "triangle")))
+    standings = compare_texts(*(f"{name}:frequency=1.7" for name in ("square", "sine", "triangle")))
     relative_thrusts = [standing.relative_thrust for standing in standings]
     assert relative_thrusts == sorted(relative_thrusts, reverse=True)
     assert [standing.squareness for standing in standings] == pytest.approx(
@@ -115,9 +115,9 @@ def test_what_is_no_controller_is_taken_for_a_policy() -> None:
 def test_nobody_swims_before_everybody_is_known_to_be_able_to(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(comparison, "judge", lambda *_: pytest.fail("somebody swam"))
+    monkeypatch.setattr(comparison, "judge", lambda *_: pytest.fail("a contestant swam"))
     with pytest.raises(ParameterError, match="frequency"):
-        swum("swing", "square:frequency=99")
+        compare_texts("swing", "square:frequency=99")
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_nobody_swims_before_everybody_is_known_to_be_able_to(
 )
 def test_a_contestant_that_is_spelled_wrong_is_refused_in_one_line(text: str) -> None:
     with pytest.raises((ParameterError, UnknownController)) as caught:
-        swum(text)
+        compare_texts(text)
     assert "\n" not in str(caught.value)
     assert "swing" in str(caught.value)
 

@@ -1,4 +1,4 @@
-"""Gains and rotation of the force sensor are part of a thrust's interval, or named beside it."""
+"""Errors of gain and rotation of the force sensor in the interval of a thrust."""
 
 import math
 
@@ -24,13 +24,13 @@ KNOWN = ForceCalibration(
 """Calibration of a sensor of 1 N/V: its gain is off by 2 %, with an interval of ± 3 %."""
 
 
-def measured(*overrides: str, calibration: ForceCalibration | None = None) -> Measured:
+def measure_swing(*overrides: str, calibration: ForceCalibration | None = None) -> Measured:
     with VirtualSession(load(None, overrides), calibration) as rig:
         return measure(rig, "swing", {}, 30.0)
 
 
 def test_a_gain_error_is_within_the_total_interval_and_its_part_is_named() -> None:
-    measurement, truth = measured(calibration=KNOWN), simulate(load(), "swing", {}).mean_thrust
+    measurement, truth = measure_swing(calibration=KNOWN), simulate(load(), "swing", {}).mean_thrust
     assert measurement.calibration_ci95 == pytest.approx(
         0.03 * measurement.thrust / (1.0 + GAIN_ERROR)
     )
@@ -46,7 +46,7 @@ def test_a_gain_error_is_within_the_total_interval_and_its_part_is_named() -> No
 
 
 def test_the_sensor_of_a_simulated_fish_is_exact() -> None:
-    measurement = measured()
+    measurement = measure_swing()
     assert (measurement.calibration_ci95, measurement.total_ci95, measurement.rotation) == (
         0.0,
         measurement.error,
@@ -57,7 +57,7 @@ def test_the_sensor_of_a_simulated_fish_is_exact() -> None:
 @pytest.mark.parametrize("angle", [0.05, -0.17])
 def test_a_rotation_that_no_load_has_shown_is_seen_in_the_swim_and_covered(angle: float) -> None:
     quiet = ("simulation.noise=1e-5", f"simulation.rotation={angle}")
-    measurement, truth = measured(*quiet), simulate(load(), "swing", {}).mean_thrust
+    measurement, truth = measure_swing(*quiet), simulate(load(), "swing", {}).mean_thrust
     assert measurement.rotation == pytest.approx(angle, abs=0.003)
     assert measurement.total_ci95
     assert truth - measurement.thrust == pytest.approx((1.0 - math.cos(angle)) * truth, rel=0.1)
@@ -68,12 +68,12 @@ def test_a_rotation_that_no_load_has_shown_is_seen_in_the_swim_and_covered(angle
 @pytest.mark.parametrize("seed", [700, 703])
 def test_delay_backlash_and_drift_turn_no_sensor_and_hide_no_rotation(seed: int) -> None:
     fish = harsh(seed).overrides
-    assert measured(*fish, "simulation.rotation=0").rotation == 0.0
-    assert measured(*fish, "simulation.rotation=0.1").rotation == pytest.approx(0.1, abs=0.005)
+    assert measure_swing(*fish, "simulation.rotation=0").rotation == 0.0
+    assert measure_swing(*fish, "simulation.rotation=0.1").rotation == pytest.approx(0.1, abs=0.005)
 
 
 def test_a_hum_and_a_fin_at_rest_turn_no_sensor() -> None:
-    assert measured("simulation.noise=0.02", "simulation.drift=5e-3").rotation == 0.0
+    assert measure_swing("simulation.noise=0.02", "simulation.drift=5e-3").rotation == 0.0
     with VirtualSession(load()) as rig:
         assert measure(rig, "hold", {}, 30.0).rotation == 0.0
 

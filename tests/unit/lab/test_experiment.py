@@ -1,4 +1,4 @@
-"""The folder of an experiment: begun once, resumed with the same, used by one process."""
+"""Folder of an experiment: created once, resumed with equal settings, used by one process."""
 
 import json
 import os
@@ -54,11 +54,15 @@ def test_it_is_resumed_with_the_same_only(
     tmp_path: Path, changes: dict[str, Any], named: str
 ) -> None:
     begin(tmp_path)
-    given = {"kind": "sweep", "on": "live", "settings": HEADER.settings, "config": HEADER.config}
+    header = {"kind": "sweep", "on": "live", "settings": HEADER.settings, "config": HEADER.config}
     with pytest.raises(ConfigError, match=named):
-        resume(tmp_path, Header(**(given | changes)))
-    begun = {"version": "0", "command": ["--json"], "config": {"plant": {"xi": 1.2}, "name": "x"}}
-    assert resume(tmp_path, Header(**(given | begun)))  # which are no matter
+        resume(tmp_path, Header(**(header | changes)))
+    other_version = {
+        "version": "0",
+        "command": ["--json"],
+        "config": {"plant": {"xi": 1.2}, "name": "x"},
+    }
+    assert resume(tmp_path, Header(**(header | other_version)))  # these may differ
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Identification: a fish from its forces, with what can and cannot be told of it."""
+"""Identification of a fish from its forces, and the limits of what forces determine."""
 
 import math
 from dataclasses import replace
@@ -28,7 +28,7 @@ from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish
 
 TICK = 0.05
-REAL = (
+RIG_OVERRIDES = (
     "simulation.offset_x=0.02",
     "simulation.offset_y=0.02",
     "simulation.drift=0.005",
@@ -37,83 +37,91 @@ REAL = (
     "plant.servo_delay=0.04",
     "plant.backlash=0.02",
 )
-FISH = load(None, REAL).plant
+FISH = load(None, RIG_OVERRIDES).plant
 NEARLY_KNOWN = ("omega0", "servo_delay", "rotation")
 
 
-def swum(*overrides: str, seconds: float = 90.0) -> pd.DataFrame:
+def swim_experiment(*overrides: str, seconds: float = 90.0) -> pd.DataFrame:
     with VirtualSession(load(None, overrides)) as rig:
         return experiment(rig, seconds)
 
 
 @pytest.fixture(scope="module")
 def table() -> pd.DataFrame:
-    """Without what no robot knows, and what an estimator makes of it."""
-    return swum(*REAL).drop(columns=["alpha", "alpha_rate", "phi", "fin_velocity"])
+    """Ticks of an experiment, without the columns that a real robot does not have."""
+    return swim_experiment(*RIG_OVERRIDES).drop(
+        columns=["alpha", "alpha_rate", "phi", "fin_velocity"]
+    )
 
 
 @pytest.fixture(scope="module")
-def found(table: pd.DataFrame) -> Identification:
+def identification(table: pd.DataFrame) -> Identification:
     return identify(table)
 
 
 @pytest.mark.slow
 def test_it_finds_the_fish_and_the_rig_from_forces_and_commands_alone(
-    found: Identification,
+    identification: Identification,
 ) -> None:
-    config = load(None, REAL)
+    config = load(None, RIG_OVERRIDES)
     truth = asdict(config.plant) | asdict(config.simulation)
     for name in ("omega0", "xi", "coupling", "servo_speed", "servo_lag", "thrust_coefficient",
                  "lateral_drag", "rotation"):  # fmt: skip
-        assert found[name].value == pytest.approx(truth[name], rel=0.01), name
-        assert found[name].low < found[name].value < found[name].high
-    assert found["servo_delay"].value == pytest.approx(0.04, abs=5e-4)
-    assert found["backlash"].value == pytest.approx(0.02, abs=1e-3)
-    assert found.remarks == ()
-    assert found.failed_assumptions == ()
-    assert found.headline.startswith("identified: the model explains 9")
+        assert identification[name].value == pytest.approx(truth[name], rel=0.01), name
+        assert identification[name].low < identification[name].value < identification[name].high
+    assert identification["servo_delay"].value == pytest.approx(0.04, abs=5e-4)
+    assert identification["backlash"].value == pytest.approx(0.02, abs=1e-3)
+    assert identification.remarks == ()
+    assert identification.failed_assumptions == ()
+    assert identification.headline.startswith("identified: the model explains 9")
 
 
 @pytest.mark.slow
 def test_forces_tell_products_and_the_intervals_of_factors_allow_for_any_ratio(
-    found: Identification,
+    identification: Identification,
 ) -> None:
     truth = asdict(FISH)
     scale = truth["coupling"]
     products = [truth["thrust_coefficient"] * scale, truth["thrust_coefficient"],
                 truth["lateral_drag"]]  # fmt: skip
-    for product, value in zip(found.products, products, strict=True):
+    for product, value in zip(identification.products, products, strict=True):
         assert product.value == pytest.approx(scale * value, rel=0.01)
         assert product.high < 1.02 * product.low
     for name, factor in (("coupling", 2.0), ("thrust_coefficient", 4.0), ("lateral_drag", 2.0)):
-        low, high = found[name].known
-        assert (found[name].low, found[name].high) == pytest.approx((low / factor, high * factor))
+        low, high = identification[name].known
+        assert (identification[name].low, identification[name].high) == pytest.approx(
+            (low / factor, high * factor)
+        )
         assert high < 1.03 * low
 
 
 @pytest.mark.slow
 def test_quadratic_drag_and_another_lateral_inertia_are_found() -> None:
-    other = ("plant.quadratic_drag=0.8", "plant.lateral_quadratic_drag=0.003",
+    changes = ("plant.quadratic_drag=0.8", "plant.lateral_quadratic_drag=0.003",
              "plant.lateral_inertia_ratio=0.7")  # fmt: skip
-    table = swum(*REAL, *other, seconds=60.0)
-    truth = asdict(load(None, (*REAL, *other)).plant)
-    found, known = identify(table), identify(table, fix=("coupling",))
-    for each in (*found.estimates, *known.estimates):
-        if each.fitted and each.name in truth:
-            width = 0.5 * (each.high - each.low)
-            assert each.low - width <= truth[each.name] <= each.high + width, each.name
-    assert found.failed_assumptions == known.failed_assumptions == ()
-    assert found["quadratic_drag"].value > 0.4
-    assert found["lateral_inertia_ratio"].value == 1.0  # as configured: no force tells it
-    assert known["lateral_inertia_ratio"].value == pytest.approx(0.7, rel=0.02)
+    table = swim_experiment(*RIG_OVERRIDES, *changes, seconds=60.0)
+    truth = asdict(load(None, (*RIG_OVERRIDES, *changes)).plant)
+    identification, with_coupling = identify(table), identify(table, fix=("coupling",))
+    for estimate in (*identification.estimates, *with_coupling.estimates):
+        if estimate.fitted and estimate.name in truth:
+            width = 0.5 * (estimate.high - estimate.low)
+            assert estimate.low - width <= truth[estimate.name] <= estimate.high + width, (
+                estimate.name
+            )
+    assert identification.failed_assumptions == with_coupling.failed_assumptions == ()
+    assert identification["quadratic_drag"].value > 0.4
+    assert (
+        identification["lateral_inertia_ratio"].value == 1.0
+    )  # as configured: forces do not determine it
+    assert with_coupling["lateral_inertia_ratio"].value == pytest.approx(0.7, rel=0.02)
 
 
 @pytest.mark.slow
 def test_what_the_forces_show_is_fitted_too_unless_that_is_fixed() -> None:
-    table = swum(*REAL, "plant.servo_reaction=-0.0003", seconds=45.0)
-    found = identify(table, start=FISH)
-    assert found.failed_assumptions == ()
-    assert found["servo_reaction"].value == pytest.approx(-0.0003, rel=0.05)
+    table = swim_experiment(*RIG_OVERRIDES, "plant.servo_reaction=-0.0003", seconds=45.0)
+    identification = identify(table, start=FISH)
+    assert identification.failed_assumptions == ()
+    assert identification["servo_reaction"].value == pytest.approx(-0.0003, rel=0.05)
     fixed = identify(table, start=FISH, fit=(*NEARLY_KNOWN, "xi", "servo_lag"))
     assert fixed.failed_assumptions[0] == "servo_reaction = 0"
     assert fixed.headline.startswith("careful: the model lacks something")
@@ -124,52 +132,64 @@ def test_what_the_forces_show_is_fitted_too_unless_that_is_fixed() -> None:
 def test_a_fish_of_another_kind_is_not_identified_and_the_first_line_says_so(
     table: pd.DataFrame,
 ) -> None:
-    # Each force moves against the other of twice the frequency: no fish of the model does that.
+    # The forces have components that no fish of the model can have.
     chance = np.random.default_rng(0)
     strange = table.assign(
         fx=table["fx"] + 0.05 * np.sign(table["phi_c"]).shift(3, fill_value=0.0),
         fy=table["fy"] * (1.0 + 0.5 * np.tanh(20.0 * table["fy"])) + 1e-3 * chance.normal(),
     )
-    found = identify(strange, start=FISH, fit=NEARLY_KNOWN)
-    assert not found.identified
-    assert found.headline.startswith("not identified: the model explains ")
-    assert {"white residual of fx", "white residual of fy"} <= set(found.failed_assumptions)
-    assert min(channel.explained_out_of_sample for channel in found.channels) < 0.9
-    assert (found["omega0"].low, found["omega0"].high) == (0.0, math.inf)
-    assert found.to_builtins()["estimates"]["omega0"]["high"] is None
-    assert found.covariance[0, 0] > 0.0
-    assert "# not identified" in found.to_yaml()
+    identification = identify(strange, start=FISH, fit=NEARLY_KNOWN)
+    assert not identification.identified
+    assert identification.headline.startswith("not identified: the model explains ")
+    assert {"white residual of fx", "white residual of fy"} <= set(
+        identification.failed_assumptions
+    )
+    assert min(channel.explained_out_of_sample for channel in identification.channels) < 0.9
+    assert (identification["omega0"].low, identification["omega0"].high) == (0.0, math.inf)
+    assert identification.to_builtins()["estimates"]["omega0"]["high"] is None
+    assert identification.covariance[0, 0] > 0.0
+    assert "# not identified" in identification.to_yaml()
 
 
 @pytest.mark.slow
 def test_delay_and_backlash_are_known_to_10_percent_at_best_where_they_are() -> None:
-    with VirtualSession(load(None, [*REAL, "simulation.noise=0.01"])) as rig:
+    with VirtualSession(load(None, [*RIG_OVERRIDES, "simulation.noise=0.01"])) as rig:
         ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
-    found = identify(frame(ticks), start=FISH, fit=("servo_delay", "backlash", "rotation"))
-    remark = next(each for each in found.remarks if each.startswith("known to 10 % at best"))
+    identification = identify(frame(ticks), start=FISH, fit=("servo_delay", "backlash", "rotation"))
+    remark = next(
+        each for each in identification.remarks if each.startswith("known to 10 % at best")
+    )
     assert "servo_delay" in remark
     assert "backlash" in remark
 
 
 @pytest.mark.slow
-def test_offsets_are_those_of_the_sensor_and_the_drift_is_told_apart(found: Identification) -> None:
+def test_offsets_are_those_of_the_sensor_and_the_drift_is_told_apart(
+    identification: Identification,
+) -> None:
     # One period and a half of a drift of 5 mN: its mean is within 2 π of a third.
-    assert abs(found["offset_y"].value - 0.02) < 5e-3 / 2
-    assert all(channel.drift == pytest.approx(0.010, rel=0.1) for channel in found.channels)
-    assert all(channel.noise == pytest.approx(1e-3, rel=0.05) for channel in found.channels)
+    assert abs(identification["offset_y"].value - 0.02) < 5e-3 / 2
+    assert all(
+        channel.drift == pytest.approx(0.010, rel=0.1) for channel in identification.channels
+    )
+    assert all(
+        channel.noise == pytest.approx(1e-3, rel=0.05) for channel in identification.channels
+    )
 
 
 @pytest.mark.slow
-def test_what_it_writes_is_a_configuration(found: Identification, tmp_path: Path) -> None:
+def test_what_it_writes_is_a_configuration(identification: Identification, tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
-    file.write_text(found.to_yaml("a test"), encoding="utf-8")
+    file.write_text(identification.to_yaml("a test"), encoding="utf-8")
     config = load(file)
     written = asdict(config.plant) | asdict(config.simulation)
-    assert set(found.plant) == set(asdict(config.plant)) - {"model"}  # that of the paper
-    ratio = found["thrust_coefficient"].value / found["lateral_drag"].value
+    assert set(identification.plant) == set(asdict(config.plant)) - {"model"}  # that of the paper
+    ratio = identification["thrust_coefficient"].value / identification["lateral_drag"].value
     assert config.estimator.leak == pytest.approx(ratio, rel=1e-3)
-    for each in found.estimates:
-        assert abs(written[each.name] - each.value) <= 0.01 * (each.high - each.low), each.name
+    for estimate in identification.estimates:
+        assert abs(written[estimate.name] - estimate.value) <= 0.01 * (
+            estimate.high - estimate.low
+        ), estimate.name
 
 
 @pytest.mark.slow
@@ -177,10 +197,12 @@ def test_what_it_writes_is_a_configuration(found: Identification, tmp_path: Path
 def test_the_interval_of_an_offset_knows_that_the_drift_has_a_mean(
     seed: int, seconds: float
 ) -> None:
-    table = swum(*REAL, f"simulation.seed={seed}", seconds=seconds)
-    found = identify(table, start=FISH, rig=load(None, REAL).simulation, fit=["coupling"])
+    table = swim_experiment(*RIG_OVERRIDES, f"simulation.seed={seed}", seconds=seconds)
+    identification = identify(
+        table, start=FISH, rig=load(None, RIG_OVERRIDES).simulation, fit=["coupling"]
+    )
     for name in ("offset_x", "offset_y"):
-        assert found[name].low < 0.02 < found[name].high, name
+        assert identification[name].low < 0.02 < identification[name].high, name
 
 
 @pytest.mark.parametrize("seconds", [5.0, math.nan, math.inf])
@@ -196,21 +218,25 @@ def test_an_experiment_takes_half_a_minute_or_more_and_ends(seconds: float) -> N
 def test_the_configuration_has_no_digits_that_the_interval_does_not_know(
     table: pd.DataFrame, tmp_path: Path
 ) -> None:
-    found = identify(table, start=FISH, fit=["coupling"])
-    others = tuple(each for each in found.estimates if each.name != "servo_delay")
-    found = replace(found, estimates=(Estimate("servo_delay", 3.9e-14, 0.0, 4e-5), *others))
+    identification = identify(table, start=FISH, fit=["coupling"])
+    others = tuple(
+        estimate for estimate in identification.estimates if estimate.name != "servo_delay"
+    )
+    identification = replace(
+        identification, estimates=(Estimate("servo_delay", 3.9e-14, 0.0, 4e-5), *others)
+    )
     file = tmp_path / "fish.yaml"
-    file.write_text(found.to_yaml(), encoding="utf-8")
+    file.write_text(identification.to_yaml(), encoding="utf-8")
     assert "servo_delay: 0  # 0 to 4e-05 s" in file.read_text(encoding="utf-8")
 
 
 def test_gaps_and_skipped_slots_cost_only_what_is_missing(table: pd.DataFrame) -> None:
     lost = table.drop(index=range(700, 720)).drop(index=range(1200, 1201))
-    found = identify(lost, start=FISH, fit=NEARLY_KNOWN)
-    assert found.passages == 3
-    assert found["omega0"].value == pytest.approx(11.0, rel=0.01)
-    assert found["servo_delay"].value == pytest.approx(0.04, abs=1e-3)
-    assert all(channel.white for channel in found.channels)
+    identification = identify(lost, start=FISH, fit=NEARLY_KNOWN)
+    assert identification.passages == 3
+    assert identification["omega0"].value == pytest.approx(11.0, rel=0.01)
+    assert identification["servo_delay"].value == pytest.approx(0.04, abs=1e-3)
+    assert all(channel.white for channel in identification.channels)
 
 
 def test_a_force_that_is_not_to_be_believed_is_left_out(table: pd.DataFrame) -> None:
@@ -218,74 +244,80 @@ def test_a_force_that_is_not_to_be_believed_is_left_out(table: pd.DataFrame) -> 
     doubted = clipped.index % 400 == 399
     clipped.loc[doubted, "fy"] += 50.0
     clipped["suspect"] = np.where(doubted, "a sample is clipped", None)
-    found = passages([clipped])
-    assert len(found) == 5
-    assert sum(each.duration for each in found) == pytest.approx(90.0, abs=1.0)
-    assert max(float(abs(each.forces).max()) for each in found) < 10.0
+    parts = passages([clipped])
+    assert len(parts) == 5
+    assert sum(part.duration for part in parts) == pytest.approx(90.0, abs=1.0)
+    assert max(float(abs(part.forces).max()) for part in parts) < 10.0
 
 
 def test_slots_that_were_skipped_are_part_of_a_longer_window() -> None:
-    rig = Rig(*REAL)
+    rig = Rig(*RIG_OVERRIDES)
     rig.start("excitation")
     for _ in range(30):
         rig.run(1, missed=3)
         rig.run(29)
-    found = identify(frame(rig.recorder.ticks), start=FISH, fit=NEARLY_KNOWN)
-    assert found.passages == 1
-    assert found.seconds == pytest.approx(30 * 33 * TICK, abs=0.2)
-    assert found["omega0"].value == pytest.approx(11.0, rel=0.01)
-    assert found["servo_delay"].value == pytest.approx(0.04, abs=1e-3)
+    identification = identify(frame(rig.recorder.ticks), start=FISH, fit=NEARLY_KNOWN)
+    assert identification.passages == 1
+    assert identification.seconds == pytest.approx(30 * 33 * TICK, abs=0.2)
+    assert identification["omega0"].value == pytest.approx(11.0, rel=0.01)
+    assert identification["servo_delay"].value == pytest.approx(0.04, abs=1e-3)
 
 
 def test_what_is_not_fitted_is_as_the_configuration_says(table: pd.DataFrame) -> None:
-    config = load(None, (*REAL, "plant.servo_reaction=1e-7", "plant.quadratic_drag=1e-3"))
-    found = identify(table, start=config.plant, rig=config.simulation, fit=["omega0", "xi"])
-    assert found["rotation"].value == config.simulation.rotation
-    assert not found["rotation"].fitted
-    assert found["omega0"].low < 11.0 < found["omega0"].high
-    assert all(channel.white for channel in found.channels)
-    assert found.plant["servo_reaction"] == 1e-7
-    assert found.plant["quadratic_drag"] == 1e-3
+    config = load(None, (*RIG_OVERRIDES, "plant.servo_reaction=1e-7", "plant.quadratic_drag=1e-3"))
+    identification = identify(
+        table, start=config.plant, rig=config.simulation, fit=["omega0", "xi"]
+    )
+    assert identification["rotation"].value == config.simulation.rotation
+    assert not identification["rotation"].fitted
+    assert identification["omega0"].low < 11.0 < identification["omega0"].high
+    assert all(channel.white for channel in identification.channels)
+    assert identification.plant["servo_reaction"] == 1e-7
+    assert identification.plant["quadratic_drag"] == 1e-3
 
 
 @pytest.mark.slow
 def test_the_reaction_of_the_servo_is_found_where_it_is_asked_for() -> None:
     change = ("plant.servo_reaction=-0.002", "plant.servo_dead_zone=0.02")
-    with VirtualSession(load(None, (*REAL, *change))) as rig:
+    with VirtualSession(load(None, (*RIG_OVERRIDES, *change))) as rig:
         table = experiment(rig, 60.0)
-    found = identify(table, fit=(*DEFAULT, "servo_reaction", "servo_dead_zone"))
-    assert all(channel.white for channel in found.channels)
-    assert found["servo_reaction"].value == pytest.approx(-0.002, rel=0.02)
-    assert found["servo_dead_zone"].value == pytest.approx(0.02, abs=1e-3)
-    assert found["omega0"].value == pytest.approx(11.0, rel=0.01)
+    identification = identify(table, fit=(*DEFAULT, "servo_reaction", "servo_dead_zone"))
+    assert all(channel.white for channel in identification.channels)
+    assert identification["servo_reaction"].value == pytest.approx(-0.002, rel=0.02)
+    assert identification["servo_dead_zone"].value == pytest.approx(0.02, abs=1e-3)
+    assert identification["omega0"].value == pytest.approx(11.0, rel=0.01)
 
 
-def width(found: Identification) -> float:
-    return found["omega0"].high - found["omega0"].low
+def interval_width(identification: Identification) -> float:
+    return identification["omega0"].high - identification["omega0"].low
 
 
 def test_several_runs_are_one_fish(table: pd.DataFrame) -> None:
     halves = [table.iloc[:900], table.iloc[900:]]
-    both, one = (identify(runs, start=FISH, fit=NEARLY_KNOWN) for runs in (halves, halves[1]))
+    both, second_half = (
+        identify(runs, start=FISH, fit=NEARLY_KNOWN) for runs in (halves, halves[1])
+    )
     assert both.passages == 2
-    assert width(both) < 0.8 * width(one)
+    assert interval_width(both) < 0.8 * interval_width(second_half)
 
 
 @pytest.mark.slow
 def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
-    table = swum("plant.xi=0.3", seconds=68.0)
+    table = swim_experiment("plant.xi=0.3", seconds=68.0)
     short, long = table.iloc[:160], table.iloc[160:]
-    found, of_long = (identify(runs, fit=("xi",)) for runs in ([short, long], long))
-    assert (found.passages, found.seconds) == (1, of_long.seconds)
-    assert found["xi"].value == pytest.approx(of_long["xi"].value)
+    identification, of_long = (identify(runs, fit=("xi",)) for runs in ([short, long], long))
+    assert (identification.passages, identification.seconds) == (1, of_long.seconds)
+    assert identification["xi"].value == pytest.approx(of_long["xi"].value)
 
 
 @pytest.mark.slow
 def test_data_that_cannot_tell_say_so() -> None:
     with VirtualSession(load(None, ["simulation.noise=0.003"])) as rig:
         ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
-    found = identify(frame(ticks), fit=("xi", "coupling", "thrust_coefficient", "lateral_drag"))
-    assert any("known to 10 % at best" in remark for remark in found.remarks)
+    identification = identify(
+        frame(ticks), fit=("xi", "coupling", "thrust_coefficient", "lateral_drag")
+    )
+    assert any("known to 10 % at best" in remark for remark in identification.remarks)
 
 
 @pytest.mark.parametrize(
@@ -335,7 +367,7 @@ def test_the_response_is_that_of_the_simulated_fish(plant: PlantParameters) -> N
     fx = plant.thrust_coefficient * scale * scale * a
     fy = plant.lateral_inertia * scale * b + drag * scale * c + plant.servo_reaction * d
     fy = fy + plant.lateral_quadratic_drag * scale * scale * e
-    # Far below the noise of 1 mN; play is lost and found between two points of the grid.
+    # Far below the noise of 1 mN; the backlash is taken up between two points of the grid.
     assert fx == pytest.approx([w.sampled_thrust for w in windows], abs=2e-5)
     assert fy == pytest.approx([w.sampled_lateral_force for w in windows], abs=1e-4)
     rms = math.sqrt(np.mean((fy - [w.sampled_lateral_force for w in windows]) ** 2))

@@ -1,4 +1,4 @@
-"""Contestants on a fish that can only be measured, here one in virtual time."""
+"""Comparison on a fish whose thrust can only be measured, here in virtual time."""
 
 import math
 from collections.abc import Mapping
@@ -24,35 +24,35 @@ def test_a_drifting_sensor_ranks_by_the_true_thrust_which_lies_in_each_interval(
         live = LiveComparison(rig, names)
         live.swim(30.0)
     true, _ = compare(DRIFTS, names)
-    for found, known in zip(live.standings(), true, strict=True):
-        assert found.contestant == known.contestant
-        assert found.error is not None
-        assert abs(found.thrust - known.thrust) < found.error < 2e-3
-        assert found.squareness == pytest.approx(known.squareness, abs=0.01)
-        assert found.frequency == pytest.approx(known.frequency, abs=0.03)
+    for measured, truth in zip(live.standings(), true, strict=True):
+        assert measured.contestant == truth.contestant
+        assert measured.error is not None
+        assert abs(measured.thrust - truth.thrust) < measured.error < 2e-3
+        assert measured.squareness == pytest.approx(truth.squareness, abs=0.01)
+        assert measured.frequency == pytest.approx(truth.frequency, abs=0.03)
 
 
 def test_several_runs_come_in_turn() -> None:
-    told: list[str] = []
-    passed: list[float] = []
+    order: list[str] = []
+    progress: list[float] = []
 
-    class Listening(VirtualSession):
+    class RecordingOrder(VirtualSession):
         def swim(
             self, controller: str, parameters: Mapping[str, Any], seconds: float
         ) -> list[Tick]:
-            if told[-1:] != [controller]:
-                told.append(controller)
+            if order[-1:] != [controller]:
+                order.append(controller)
             return super().swim(controller, parameters, seconds)
 
-    with Listening(DRIFTS) as rig:
+    with RecordingOrder(DRIFTS) as rig:
         live = LiveComparison(rig, ["swing", "sine"])
-        rig.progress = passed.append
+        rig.progress = progress.append
         live.swim(25.0, runs=2)
-        both = live.standings()[0]
-    assert told == ["swing", "sine", "swing", "sine"]
-    assert len(both.thrusts) == 2
-    assert passed == sorted(passed)
-    assert passed[-1] == pytest.approx(100.0, rel=0.02)
+        standing = live.standings()[0]
+    assert order == ["swing", "sine", "swing", "sine"]
+    assert len(standing.thrusts) == 2
+    assert progress == sorted(progress)
+    assert progress[-1] == pytest.approx(100.0, rel=0.02)
 
 
 @pytest.mark.parametrize(
@@ -68,15 +68,15 @@ def test_the_error_of_several_runs_is_what_they_are_known_to_or_how_they_differ(
     monkeypatch: pytest.MonkeyPatch, thrusts: list[float], expected: float
 ) -> None:
     with VirtualSession(DRIFTS) as rig:
-        one = measure(rig, "swing", {}, 21.0)
-        runs = [one._replace(thrust=thrust, error=0.3e-3) for thrust in thrusts]
+        measurement = measure(rig, "swing", {}, 21.0)
+        runs = [measurement._replace(thrust=thrust, error=0.3e-3) for thrust in thrusts]
         monkeypatch.setattr("fishd.lab.compare.live.measure", lambda *_: runs.pop(0))
         live = LiveComparison(rig, ["swing"])
         live.swim(21.0, runs=len(runs))
-    (found,) = live.standings()
-    assert found.thrusts == thrusts
-    assert found.thrust == pytest.approx(20e-3)
-    assert found.error == pytest.approx(expected, rel=1e-6)
+    (standing,) = live.standings()
+    assert standing.thrusts == thrusts
+    assert standing.thrust == pytest.approx(20e-3)
+    assert standing.error == pytest.approx(expected, rel=1e-6)
 
 
 def test_who_cannot_swim_or_gives_up_is_left_out_and_the_others_go_on(tmp_path: Path) -> None:
@@ -85,14 +85,14 @@ def test_who_cannot_swim_or_gives_up_is_left_out_and_the_others_go_on(tmp_path: 
         live = LiveComparison(rig, ["swing:C=7", shaking, "swing"])
         live.swim(25.0, runs=2)
     assert [standing.contestant for standing in live.standings()] == ["swing"]
-    (one, refusal, _), (other, gave_up, _) = live.left_out
-    assert (one.label, other.label) == ("swing:C=7", shaking)
+    (refused, refusal, _), (failed, failure, _) = live.left_out
+    assert (refused.label, failed.label) == ("swing:C=7", shaking)
     assert "number in [0, 1]" in str(refusal)
-    assert "ppo gave up" in str(gave_up)
+    assert "ppo gave up" in str(failure)
 
 
 class Disturbing(VirtualSession):
-    """Somebody stops the fish in the second measurement."""
+    """Session in which another client stops the fish during the second measurement."""
 
     swims = 0
 

@@ -1,4 +1,4 @@
-"""The fish of a running fishd, here one in virtual time: who stops it, and what may be lost."""
+"""Sessions with the fish of a running fishd, here in virtual time: stops and lost ticks."""
 
 import math
 from typing import Any, cast
@@ -20,8 +20,8 @@ def rig_of(daemon: VirtualDaemon) -> LiveSession:
     return LiveSession(cast(Fish, daemon))
 
 
-class Late(VirtualDaemon):
-    """Its answers to `set_controller` are not heard: it swims at once, or once it has loaded."""
+class LostAnswer(VirtualDaemon):
+    """Daemon whose answers to `set_controller` are lost; it swims at once or after loading."""
 
     def __init__(self, ended_by: type[BaseException], loads: bool) -> None:
         super().__init__()
@@ -46,7 +46,7 @@ class Late(VirtualDaemon):
 def test_a_controller_whose_start_was_not_heard_of_is_stopped(
     ended_by: type[BaseException], loads: bool
 ) -> None:
-    daemon = Late(ended_by, loads)
+    daemon = LostAnswer(ended_by, loads)
     with pytest.raises(ended_by), rig_of(daemon) as rig:
         rig.swim("swing", {}, 1.0)
     assert daemon.loading is None
@@ -100,7 +100,7 @@ def test_a_restart_of_fishd_is_told_at_once_whenever_it_happens() -> None:
 
 
 class Restarting(VirtualDaemon):
-    """It is restarted after a tick; the new one is ahead by some ticks when it is heard."""
+    """Daemon that restarts after a tick; the first ticks of the new process are lost."""
 
     def __init__(self, at: int, then_ahead: int) -> None:
         super().__init__()
@@ -117,13 +117,13 @@ class Restarting(VirtualDaemon):
 
 def test_a_few_ticks_may_be_lost_but_not_many() -> None:
     with rig_of(VirtualDaemon()) as rig:
-        whole = measure(rig, "swing", {}, 21.0)
+        complete = measure(rig, "swing", {}, 21.0)
     daemon = VirtualDaemon()
     daemon.lost = {100, 101, 200, 399}
     with rig_of(daemon) as rig:
-        found = measure(rig, "swing", {}, 21.0)
-        assert len(found.ticks) == pytest.approx(420 - 4, abs=2)
-        assert found.thrust == pytest.approx(whole.thrust, abs=0.05e-3)
+        incomplete = measure(rig, "swing", {}, 21.0)
+        assert len(incomplete.ticks) == pytest.approx(420 - 4, abs=2)
+        assert incomplete.thrust == pytest.approx(complete.thrust, abs=0.05e-3)
 
     daemon = VirtualDaemon()
     daemon.lost = set(range(100, 110))
@@ -147,7 +147,7 @@ def test_a_swim_of_which_nothing_came_is_told() -> None:
 
 
 class Calibrated(VirtualDaemon):
-    """A fishd whose robot has a force sensor that loads have calibrated."""
+    """Daemon whose robot has a calibrated force sensor."""
 
     def status(self) -> VirtualStatus:
         status = super().status()

@@ -1,4 +1,4 @@
-"""Thrust is told apart from whatever the force sensor drifts, with an interval that holds."""
+"""Thrust is separated from any drift of the force sensor, with an interval that holds."""
 
 from collections.abc import Callable
 from functools import cache
@@ -36,11 +36,11 @@ DRIFTS = {
 
 @cache
 def truth() -> float:
-    """The fish's own thrust with `swing`, whatever its turned sensor would show [N]."""
+    """Return the true thrust of the fish with `swing`, independent of its turned sensor [N]."""
     return simulate(RIG, "swing", {}).mean_thrust
 
 
-def measured(config: Config, seconds: float = 30.0, controller: str = "swing") -> Measured:
+def measure_swim(config: Config, seconds: float = 30.0, controller: str = "swing") -> Measured:
     with VirtualSession(config) as rig:
         return measure(rig, controller, {}, seconds)
 
@@ -51,28 +51,28 @@ def test_the_interval_holds_the_true_thrust_whatever_the_drift(name: str) -> Non
     misses = 0
     for seed in range(8):
         config = replace(RIG, simulation=replace(RIG.simulation, seed=seed, **DRIFTS[name]))
-        found = measured(config)
-        assert found.thrust == pytest.approx(truth(), abs=1.5e-3)
-        assert found.total_ci95
-        misses += abs(found.thrust - truth()) > found.total_ci95
-    assert misses <= 2  # of 8, where one in twenty is meant
+        measurement = measure_swim(config)
+        assert measurement.thrust == pytest.approx(truth(), abs=1.5e-3)
+        assert measurement.total_ci95
+        misses += abs(measurement.thrust - truth()) > measurement.total_ci95
+    assert misses <= 2  # of 8; one in twenty is expected
 
 
 def test_a_drift_that_the_plain_average_falls_for_is_taken_off() -> None:
     config = replace(RIG, simulation=replace(RIG.simulation, drift_rate=1e-3))
-    found = measured(config)
-    plain = np.mean([tick.fx for tick in found.ticks if tick.mode == "running"])
-    assert plain > found.thrust + 10e-3
-    assert found.thrust == pytest.approx(measured(RIG).thrust, abs=0.2e-3)
-    assert found.drift[-1] - found.drift[0] == pytest.approx(
-        1e-3 * (found.blocks.time[-1] - found.blocks.time[0]), rel=0.05
+    measurement = measure_swim(config)
+    plain = np.mean([tick.fx for tick in measurement.ticks if tick.mode == "running"])
+    assert plain > measurement.thrust + 10e-3
+    assert measurement.thrust == pytest.approx(measure_swim(RIG).thrust, abs=0.2e-3)
+    assert measurement.drift[-1] - measurement.drift[0] == pytest.approx(
+        1e-3 * (measurement.blocks.time[-1] - measurement.blocks.time[0]), rel=0.05
     )
 
 
 def test_a_fish_that_holds_still_has_no_thrust() -> None:
-    found = measured(RIG, controller="hold")
-    assert abs(found.thrust) < max(found.error, 0.3e-3)
-    assert found.frequency == 0.0
+    measurement = measure_swim(RIG, controller="hold")
+    assert abs(measurement.thrust) < max(measurement.error, 0.3e-3)
+    assert measurement.frequency == 0.0
 
 
 @pytest.mark.parametrize(("seconds", "frequency"), [(30.0, 1.7), (60.0, 0.4), (21.0, 3.0)])
@@ -87,9 +87,9 @@ def test_a_plan_takes_its_time_and_begins_and_ends_at_rest(
 
 def test_swims_and_rests_differ_in_length_so_that_no_drift_keeps_time_with_them() -> None:
     lengths = [length for _, length in plan(60.0, {})]
-    for same in (lengths[::2], lengths[1::2]):
-        assert max(same) > 1.5 * min(same)
-        assert len({round(length, 2) for length in same}) == len(same)
+    for group in (lengths[::2], lengths[1::2]):
+        assert max(group) > 1.5 * min(group)
+        assert len({round(length, 2) for length in group}) == len(group)
 
 
 @pytest.mark.parametrize("seconds", [10.0, float("nan"), float("inf"), -1.0, 1e9])
@@ -101,30 +101,30 @@ def test_a_length_that_is_not_possible_is_told_with_what_is_needed(seconds: floa
 def test_a_fault_in_the_middle_ends_the_measurement_and_says_which() -> None:
     with VirtualSession(RIG) as rig:
         rig.rest(1.0)
-        rig._run.loop.estop("somebody fell in")
-        with pytest.raises(Disturbed, match=r"told to rest, but it is in mode estop \(somebody"):
+        rig._run.loop.estop("emergency stop")
+        with pytest.raises(Disturbed, match=r"told to rest, but it is in mode estop \(emergency"):
             rig.rest(1.0)
 
 
 def test_a_force_that_is_not_to_be_believed_spoils_no_measurement() -> None:
-    found = measured(RIG)
+    measurement = measure_swim(RIG)
     ticks = [
         replace(tick, fx=tick.fx + 5.0, suspect="clipped") if tick.seq % 97 == 0 else tick
-        for tick in found.ticks
+        for tick in measurement.ticks
     ]
     again = evaluate(samples_of(ticks), RIG.tick)
-    assert again.thrust == pytest.approx(found.thrust, abs=found.error)
-    assert again.error < 3.0 * found.error
+    assert again.thrust == pytest.approx(measurement.thrust, abs=measurement.error)
+    assert again.error < 3.0 * measurement.error
 
 
 @cache
-def undisturbed(seconds: float) -> Measured:
-    return measured(replace(RIG, simulation=replace(RIG.simulation, seed=77)), seconds)
+def measure_undisturbed(seconds: float) -> Measured:
+    return measure_swim(replace(RIG, simulation=replace(RIG.simulation, seed=77)), seconds)
 
 
-def disturbed(seconds: float, force: Callable[[float, bool], float]) -> Measured:
-    """A measurement with a force added to F_x, at a time since its start, swimming or not."""
-    ticks = undisturbed(seconds).ticks
+def measure_disturbed(seconds: float, force: Callable[[float, bool], float]) -> Measured:
+    """Return a measurement to whose F_x a force of time and swimming is added."""
+    ticks = measure_undisturbed(seconds).ticks
     return evaluate(
         samples_of(
             replace(
@@ -139,22 +139,30 @@ def disturbed(seconds: float, force: Callable[[float, bool], float]) -> Measured
 
 @pytest.mark.parametrize("at", [8.0, 13.5, 14.3, 22.0])  # in swims, before one, in a rest
 def test_a_step_of_the_zero_is_found_and_accounted_for(at: float) -> None:
-    clean, found = undisturbed(30.0), disturbed(30.0, lambda time, _: 5e-3 * (time > at))
-    (step,) = [each for each in found.disturbances if each.kind == "step"]
+    clean, measurement = (
+        measure_undisturbed(30.0),
+        measure_disturbed(30.0, lambda time, _: 5e-3 * (time > at)),
+    )
+    (step,) = [
+        disturbance for disturbance in measurement.disturbances if disturbance.kind == "step"
+    ]
     assert step.size == pytest.approx(5e-3, abs=1e-3)
     assert step.time == pytest.approx(at, abs=1.5)
-    assert abs(found.thrust - clean.thrust) < found.error < 2.0 * clean.error
-    assert found.drift[-1] - found.drift[0] == pytest.approx(5e-3, abs=1e-3)
-    assert "the zero stepped by +" in spell(found.disturbances, "N")
+    assert abs(measurement.thrust - clean.thrust) < measurement.error < 2.0 * clean.error
+    assert measurement.drift[-1] - measurement.drift[0] == pytest.approx(5e-3, abs=1e-3)
+    assert "the zero stepped by +" in spell(measurement.disturbances, "N")
 
 
 @pytest.mark.parametrize("at", [6.0, 11.0])  # in a swim, in a rest
 def test_a_tick_far_off_is_found_and_hardly_moves_the_thrust(at: float) -> None:
-    clean, found = undisturbed(30.0), disturbed(30.0, lambda time, _: 0.1 * (abs(time - at) < 0.02))
-    (outlier,) = found.disturbances
+    clean, measurement = (
+        measure_undisturbed(30.0),
+        measure_disturbed(30.0, lambda time, _: 0.1 * (abs(time - at) < 0.02)),
+    )
+    (outlier,) = measurement.disturbances
     assert outlier.kind == "outlier"
     assert outlier.time == pytest.approx(at, abs=0.6)
-    assert abs(found.thrust - clean.thrust) < found.error < 1.3 * clean.error
+    assert abs(measurement.thrust - clean.thrust) < measurement.error < 1.3 * clean.error
 
 
 def test_a_zero_that_follows_swimming_is_named_and_not_taken_for_thrust() -> None:
@@ -165,30 +173,32 @@ def test_a_zero_that_follows_swimming_is_named_and_not_taken_for_thrust() -> Non
         level += (swims - level) * RIG.tick / 10.0
         return 4e-3 * level
 
-    found = disturbed(60.0, follow)
-    (response,) = found.disturbances
+    measurement = measure_disturbed(60.0, follow)
+    (response,) = measurement.disturbances
     assert response.kind == "response"
     assert response.size == pytest.approx(4e-3, rel=0.3)
-    assert abs(found.thrust - truth()) < found.error < 0.5e-3
+    assert abs(measurement.thrust - truth()) < measurement.error < 0.5e-3
 
 
 def test_nothing_is_named_where_the_zero_holds_still() -> None:
-    assert not undisturbed(30.0).disturbances
-    assert not undisturbed(60.0).disturbances
-    assert not undisturbed(60.0).remark
+    assert not measure_undisturbed(30.0).disturbances
+    assert not measure_undisturbed(60.0).disturbances
+    assert not measure_undisturbed(60.0).remark
 
 
 def test_a_zero_with_more_disturbances_than_are_searched_for_is_a_remark(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("fishd.lab.disturbances.MAX_DISTURBANCES", 1)
-    assert "disturbed too often" in disturbed(30.0, lambda time, _: 5e-3 * (time > 8.0)).remark
+    assert (
+        "disturbed too often" in measure_disturbed(30.0, lambda time, _: 5e-3 * (time > 8.0)).remark
+    )
 
 
-def candidate(generator: np.random.Generator, half_beat: int) -> list[Sample]:
-    """A swim of 2 s between rests, whose beats differ five times as much as pieces of a rest.
+def make_candidate(generator: np.random.Generator, half_beat: int) -> list[Sample]:
+    """Return a swim of 2 s between rests, whose beats scatter five times as much as rests.
 
-    half_beat: [ticks]
+    half_beat: length of a half beat [ticks]
     """
     rests, swims = generator.normal(0.0, 1e-3, (2, 55)), generator.normal(0.0, 5e-3, 40)
     fx = [*rests[0], *(swims + 0.02), *rests[1]]
@@ -209,14 +219,14 @@ def test_where_a_swim_has_one_beat_those_of_others_say_how_sure_its_thrust_and_p
     alike: list[Step] = []
     thrust_missed = power_missed = 0
     for _ in range(60):
-        alike += evaluate(candidate(generator, 4), 0.05, 0.75, alike=alike).steps
-        found = evaluate(candidate(generator, 6), 0.05, 0.75, alike=alike)
-        assert not found.steps  # of one beat
-        assert found.watts is not None
-        assert found.watts_error is not None
-        thrust_missed += abs(found.thrust - 0.02) > found.error
-        power_missed += abs(found.watts - 0.5) > found.watts_error
-    assert thrust_missed <= 9  # of 60, where three are meant
+        alike += evaluate(make_candidate(generator, 4), 0.05, 0.75, alike=alike).steps
+        evaluation = evaluate(make_candidate(generator, 6), 0.05, 0.75, alike=alike)
+        assert not evaluation.steps  # of one beat
+        assert evaluation.watts is not None
+        assert evaluation.watts_error is not None
+        thrust_missed += abs(evaluation.thrust - 0.02) > evaluation.error
+        power_missed += abs(evaluation.watts - 0.5) > evaluation.watts_error
+    assert thrust_missed <= 9  # of 60; three are expected
     assert power_missed <= 9
 
 
@@ -230,14 +240,14 @@ def test_swimming_alone_cannot_be_told_from_a_drift() -> None:
 @pytest.mark.slow
 def test_a_fin_that_takes_its_time_is_told_and_measured_right_with_more_of_it() -> None:
     slow = replace(RIG, plant=replace(RIG.plant, xi=0.05))
-    found = measured(slow, 60.0)
-    assert "the fin was not steady: its power changed by +" in found.remark
+    measurement = measure_swim(slow, 60.0)
+    assert "the fin was not steady: its power changed by +" in measurement.remark
     with VirtualSession(slow) as rig:
-        found = measure(rig, "swing", {}, 240.0, settle=14.0)
+        measurement = measure(rig, "swing", {}, 240.0, settle=14.0)
     truth = simulate(slow, "swing", {}, 200.0, 60.0).mean_thrust
-    assert found.remark == ""
-    assert found.total_ci95
-    assert abs(found.thrust - truth) < found.total_ci95 < 0.02 * truth
+    assert measurement.remark == ""
+    assert measurement.total_ci95
+    assert abs(measurement.thrust - truth) < measurement.total_ci95 < 0.02 * truth
 
 
 def test_a_beat_that_is_longer_than_a_swim_is_told() -> None:
@@ -248,8 +258,8 @@ def test_a_beat_that_is_longer_than_a_swim_is_told() -> None:
 
 @pytest.mark.slow
 def test_a_long_measurement_is_the_same_and_no_slower_to_judge() -> None:
-    found = measured(replace(RIG, simulation=replace(RIG.simulation, drift=5e-3)), 600.0)
-    assert len(found.blocks.time) <= MOST_BLOCKS + 2 * found.swims + 1
-    assert found.total_ci95
-    assert abs(found.thrust - truth()) < 2.0 * found.total_ci95
-    assert 2.0 * found.error < 0.2e-3
+    measurement = measure_swim(replace(RIG, simulation=replace(RIG.simulation, drift=5e-3)), 600.0)
+    assert len(measurement.blocks.time) <= MOST_BLOCKS + 2 * measurement.swims + 1
+    assert measurement.total_ci95
+    assert abs(measurement.thrust - truth()) < 2.0 * measurement.total_ci95
+    assert 2.0 * measurement.error < 0.2e-3

@@ -1,6 +1,4 @@
-"""The lab's optima: limits that the whole equations reach, and a command that is not told to be
-square, but is.
-"""
+"""Optima of a fish: limits of the full equations, and an optimal command that is a square wave."""
 
 import numpy as np
 import pytest
@@ -22,18 +20,18 @@ DEFAULT = PlantParameters()
 
 def test_a_quick_servo_reaches_the_fast_limit_at_every_amplitude() -> None:
     quick = replace(DEFAULT, servo_speed=1e4, servo_lag=1e-4)
-    whole, limit = best_square_waves(quick, [0.05, 0.4]), fast_servo(DEFAULT, [0.05, 0.4])
-    assert whole.thrust == pytest.approx(limit.thrust, rel=1e-4)
-    assert whole.frequency == pytest.approx(limit.frequency, rel=1e-3)
-    assert whole.fin_amplitude == pytest.approx(limit.fin_amplitude, rel=1e-3)
+    full, limit = best_square_waves(quick, [0.05, 0.4]), fast_servo(DEFAULT, [0.05, 0.4])
+    assert full.thrust == pytest.approx(limit.thrust, rel=1e-4)
+    assert full.frequency == pytest.approx(limit.frequency, rel=1e-3)
+    assert full.fin_amplitude == pytest.approx(limit.fin_amplitude, rel=1e-3)
 
 
 def test_a_large_amplitude_reaches_the_slow_limit() -> None:
     amplitude = [300.0 * saturation_amplitude(DEFAULT)]
-    whole, limit = best_square_waves(DEFAULT, amplitude), slow_servo(DEFAULT, amplitude)
-    assert whole.thrust == pytest.approx(limit.thrust, rel=5e-3)
-    assert whole.frequency == pytest.approx(limit.frequency, rel=2e-2)
-    assert whole.fin_amplitude == pytest.approx(limit.fin_amplitude, rel=1e-2)
+    full, limit = best_square_waves(DEFAULT, amplitude), slow_servo(DEFAULT, amplitude)
+    assert full.thrust == pytest.approx(limit.thrust, rel=5e-3)
+    assert full.frequency == pytest.approx(limit.frequency, rel=2e-2)
+    assert full.fin_amplitude == pytest.approx(limit.fin_amplitude, rel=1e-2)
 
 
 def test_an_amplitude_that_is_not_positive_is_refused() -> None:
@@ -41,21 +39,21 @@ def test_an_amplitude_that_is_not_positive_is_refused() -> None:
         best_square_waves(DEFAULT, [0.1, 0.0])
 
 
-def is_bang_bang(found: OptimalControl) -> bool:
+def is_bang_bang(control: OptimalControl) -> bool:
     return (
-        found.full >= 0.98
-        and found.agreement >= 0.98
-        and found.ratio == pytest.approx(1.0, abs=0.005)
-        and found.frequency == pytest.approx(found.best_square.frequency, rel=0.01)
+        control.full >= 0.98
+        and control.agreement >= 0.98
+        and control.ratio == pytest.approx(1.0, abs=0.005)
+        and control.frequency == pytest.approx(control.best_square.frequency, rel=0.01)
     )
 
 
 def test_the_best_command_of_any_shape_is_a_square_wave() -> None:
-    found = optimal_control(DEFAULT, 0.42)
-    assert is_bang_bang(found)
-    assert found.command[0] == pytest.approx(0.42)
-    assert found.force.mean() == pytest.approx(found.thrust)
-    assert np.all(found.time[1:] > found.time[:-1])
+    control = optimal_control(DEFAULT, 0.42)
+    assert is_bang_bang(control)
+    assert control.command[0] == pytest.approx(0.42)
+    assert control.force.mean() == pytest.approx(control.thrust)
+    assert np.all(control.time[1:] > control.time[:-1])
 
 
 @pytest.mark.slow

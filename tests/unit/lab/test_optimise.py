@@ -1,4 +1,4 @@
-"""The search of the best parameters: few ticks of swimming, honest about what it does not know."""
+"""Search of the best parameters: few ticks of swimming, and intervals that hold."""
 
 import os
 import signal
@@ -26,7 +26,7 @@ from fishd.recording import open_run, read
 from fishd.virtual.plant.base import TrueWindow
 
 BEST = 25.736e-3
-"""Of the default fish, by a square wave of whole ticks, at 1.667 Hz [N]."""
+"""Best thrust of the default fish by a square wave of whole ticks, at 1.667 Hz [N]."""
 
 
 @pytest.mark.slow
@@ -34,10 +34,10 @@ def test_a_few_noisy_measurements_find_a_maximum_and_say_how_well() -> None:
     generator = np.random.default_rng(3)
     search = Search([Range("frequency", 0.5, 5.0), Range("amplitude", 0.1, 0.4)], seed=1)
     for _ in range(11):
-        found = search.suggest()
-        thrust = 0.02 * np.exp(-4.0 * np.log(found["frequency"] / 1.7) ** 2)
-        thrust *= 1.0 - 20.0 * (found["amplitude"] - 0.3) ** 2
-        search.observe(found, thrust + generator.normal(0.0, 0.3e-3), 0.6e-3)
+        candidate = search.suggest()
+        thrust = 0.02 * np.exp(-4.0 * np.log(candidate["frequency"] / 1.7) ** 2)
+        thrust *= 1.0 - 20.0 * (candidate["amplitude"] - 0.3) ** 2
+        search.observe(candidate, thrust + generator.normal(0.0, 0.3e-3), 0.6e-3)
     best = search.propose()
     assert best.parameters == pytest.approx({"frequency": 1.7, "amplitude": 0.3}, rel=0.15)
     for name, truth in (("frequency", 1.7), ("amplitude", 0.3)):
@@ -51,13 +51,13 @@ def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> N
     assert search.ranges[0].values == pytest.approx(possible)
     tried = set()
     for _ in range(8):
-        found = search.suggest()["frequency"]
-        tried.add(found)
-        thrust = 0.0257 - 0.02 * (found - 1.74) ** 2  # whose top is at none of them
-        search.observe({"frequency": found}, thrust, 0.8e-3)
+        frequency = search.suggest()["frequency"]
+        tried.add(frequency)
+        thrust = 0.0257 - 0.02 * (frequency - 1.74) ** 2  # its maximum is at none of them
+        search.observe({"frequency": frequency}, thrust, 0.8e-3)
         best = search.propose()
-        for each in (best.parameters, best.low, best.high):
-            assert each["frequency"] in search.ranges[0].values
+        for parameters in (best.parameters, best.low, best.high):
+            assert parameters["frequency"] in search.ranges[0].values
     assert best.parameters["frequency"] in tried
     assert best.parameters["frequency"] == pytest.approx(10 / 6)
     assert len(tried) > 3
@@ -70,13 +70,13 @@ def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
     swum = 0
     with VirtualSession(config) as rig:
         for trial in measure_trials(rig, "square", {}, search, 300.0):
-            swum, found = trial.swum, search.propose()
-            if search.is_warm and found.improvement < 0.01:
+            swum, proposal = trial.swum, search.propose()
+            if search.is_warm and proposal.improvement < 0.01:
                 break
     assert swum <= 360
-    truth = simulate(config, "square", found.parameters).mean_thrust
+    truth = simulate(config, "square", proposal.parameters).mean_thrust
     assert truth >= 0.97 * BEST
-    assert found.value == pytest.approx(truth, abs=2.0 * found.error)
+    assert proposal.value == pytest.approx(truth, abs=2.0 * proposal.error)
 
 
 @pytest.mark.slow
@@ -94,14 +94,14 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert len(run.ticks) == round(passed / 0.05)
     again = rerun(run).stretches
     assert len(again) == len(rows) - 1
-    assert all(each.from_start and each.equal == each.ticks for each in again)
+    assert all(stretch.from_start and stretch.equal == stretch.ticks for stretch in again)
     assert (folder / "thrust.svg").stat().st_size > 10_000
     again = f"optimise --resume {folder} --budget"
     assert f"To continue: fishctl {again} SECONDS" in done.stderr
-    there = (folder / "rows.csv").read_text()
+    table = (folder / "rows.csv").read_text()
     more = fishctl(*again.split(), "40")
     assert f"{folder}: 3 candidates measured already" in more.stdout
-    assert (folder / "rows.csv").read_text().startswith(there)
+    assert (folder / "rows.csv").read_text().startswith(table)
     assert len(read(folder / "search-2.mcap")) > 100
     refused = one_line(fishctl(*words, "--resume", str(folder), "--amplitude", "0.3"))
     assert "began with parameters.amplitude = None, now it is 0.3" in refused
@@ -132,9 +132,9 @@ def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
         left = int(generator.integers(1, 300)) if stops < 8 else 0
         done = fishctl(*words)
         words = ["optimise", "--resume", str(folder)]
-        now = table.read_text()
-        assert now.startswith(kept)
-        kept = now
+        content = table.read_text()
+        assert content.startswith(kept)
+        kept = content
         if done.returncode == 0:
             break
         stops += 1
@@ -144,7 +144,7 @@ def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
     assert stops == 8
     assert "best frequency of square: 1.667 Hz" in done.stdout
     rows = [row.split(",") for row in kept.splitlines()[1:]]
-    seconds = sum(len(read(each)) for each in folder.glob("search*.mcap")) * 0.05
+    seconds = sum(len(read(path)) for path in folder.glob("search*.mcap")) * 0.05
     swims = sum(float(b[3]) - float(a[3]) for a, b in pairwise([[0.0] * 5, *rows])) * 0.05
     assert seconds > swims + 2.75 * len(rows)
 
@@ -178,6 +178,6 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
 )
 def test_what_cannot_be_searched_is_one_line(tmp_path: Path, words: list[str], named: str) -> None:
     folder = tmp_path / "run"
-    found = fishctl("optimise", "square", *words, "--folder", str(folder))
-    assert named in one_line(found)
+    done = fishctl("optimise", "square", *words, "--folder", str(folder))
+    assert named in one_line(done)
     assert not folder.exists()

@@ -1,4 +1,4 @@
-"""Experiments that ask what a thrust costs: thrust for each watt, a thrust at the least power."""
+"""Experiments on the power of a thrust: thrust per watt, and a thrust at the least power."""
 
 import json
 import math
@@ -29,22 +29,24 @@ RANGE = Range("frequency", 0.5, 5.0)
 
 def test_a_measurement_tells_power_and_thrust_per_watt_with_their_intervals() -> None:
     with VirtualSession(DRIFTING) as rig:
-        found = summary(measure(rig, "swing", {}, 40.0), rig.tick)
+        report = summary(measure(rig, "swing", {}, 40.0), rig.tick)
     truth = simulate(DRIFTING, "swing", {})
-    assert found.power == pytest.approx(truth.mean_power, rel=0.01)
-    assert found.thrust_per_watt == pytest.approx(found.thrust / found.power)
-    assert found.thrust_per_watt_error is not None
-    gave = truth.mean_thrust / truth.mean_power
-    assert found.thrust_per_watt == pytest.approx(gave, abs=2.0 * found.thrust_per_watt_error)
+    assert report.power == pytest.approx(truth.mean_power, rel=0.01)
+    assert report.thrust_per_watt == pytest.approx(report.thrust / report.power)
+    assert report.thrust_per_watt_error is not None
+    true_thrust_per_watt = truth.mean_thrust / truth.mean_power
+    assert report.thrust_per_watt == pytest.approx(
+        true_thrust_per_watt, abs=2.0 * report.thrust_per_watt_error
+    )
 
 
 @pytest.mark.slow
 def test_without_a_power_meter_a_measurement_tells_the_thrust_alone() -> None:
     config = load("config/virtual-pi.yaml", ["power_meter=null"])
     with VirtualSession(config) as rig:
-        found = summary(measure(rig, "square", {"frequency": 2.0}, 25.0), rig.tick)
-    assert found.thrust > 0.0
-    assert (found.power, found.power_error, found.thrust_per_watt) == (None, None, None)
+        report = summary(measure(rig, "square", {"frequency": 2.0}, 25.0), rig.tick)
+    assert report.thrust > 0.0
+    assert (report.power, report.power_error, report.thrust_per_watt) == (None, None, None)
 
 
 def test_the_error_of_a_ratio_is_that_of_both() -> None:
@@ -64,11 +66,11 @@ def test_the_search_of_the_least_power_ends_where_the_thrust_is_just_reached() -
         thrust = 0.025 * math.exp(-(math.log(frequency / 1.7) ** 2) / 0.5)
         measured = thrust + generator.normal(0.0, 0.3e-3)
         search.observe(candidate, (measured, 0.6e-3), (0.1 + 0.3 * frequency, 1e-3))
-    found = search.propose()
-    least = 1.7 * math.exp(-math.sqrt(0.5 * math.log(0.025 / 0.015)))  # where it is 15 mN
-    assert found.parameters["frequency"] == pytest.approx(least, rel=0.1)
-    assert found.low["frequency"] <= least <= found.high["frequency"]
-    assert found.value == pytest.approx(0.1 + 0.3 * least, rel=0.1)
+    proposal = search.propose()
+    slowest = 1.7 * math.exp(-math.sqrt(0.5 * math.log(0.025 / 0.015)))  # where it is 15 mN
+    assert proposal.parameters["frequency"] == pytest.approx(slowest, rel=0.1)
+    assert proposal.low["frequency"] <= slowest <= proposal.high["frequency"]
+    assert proposal.value == pytest.approx(0.1 + 0.3 * slowest, rel=0.1)
 
 
 def test_a_thrust_that_nothing_reaches_leads_to_the_most_there_is() -> None:
@@ -87,30 +89,32 @@ def test_without_a_power_meter_there_is_no_search_of_a_power(aim: Aim) -> None:
         aim.observe(aim.make_search([RANGE], 0), trial)
 
 
-def _searched(tmp_path: Path, *words: str) -> dict[str, Any]:
+def _run_optimise(tmp_path: Path, *words: str) -> dict[str, Any]:
     done = fishctl(
         *("optimise", "square", "--over", "frequency=0.6:2", "--on", "simulation"),
         *("--folder", f"{tmp_path}/run", "--json", *words),
     )
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    optimum: dict[str, Any] = json.loads(done.stdout)
+    return optimum
 
 
 @pytest.mark.slow
 def test_optimise_finds_the_frequency_that_gives_most_for_each_watt(tmp_path: Path) -> None:
-    found = _searched(tmp_path, "--objective", "thrust-per-watt")
+    optimum = _run_optimise(tmp_path, "--objective", "thrust-per-watt")
     swims = [simulate(load(None), "square", {"frequency": 0.5 / (0.05 * n)}) for n in range(5, 10)]
     best = max(swim.mean_thrust / swim.mean_power for swim in swims)
-    assert found["true_thrust"] / found["true_power"] > 0.97 * best
-    assert found["thrust_per_watt"] == pytest.approx(best, abs=2 * found["thrust_per_watt_error"])
+    assert optimum["true_thrust"] / optimum["true_power"] > 0.97 * best
+    assert optimum["thrust_per_watt"] == pytest.approx(
+        best, abs=2 * optimum["thrust_per_watt_error"]
+    )
 
 
 @pytest.mark.slow
 def test_optimise_finds_the_slowest_beat_that_gives_a_thrust(tmp_path: Path) -> None:
-    found = _searched(tmp_path, "--at-least", "15")
-    assert (found["objective"], found["target"]) == ("least-power", 0.015)
-    assert found["parameters"] == {"frequency": pytest.approx(1.0)}
-    assert found["true_thrust"] > 0.015
+    optimum = _run_optimise(tmp_path, "--at-least", "15")
+    assert (optimum["objective"], optimum["target"]) == ("least-power", 0.015)
+    assert optimum["parameters"] == {"frequency": pytest.approx(1.0)}
+    assert optimum["true_thrust"] > 0.015
 
 
 def test_two_aims_are_one_too_many() -> None:

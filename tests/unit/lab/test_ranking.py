@@ -1,4 +1,4 @@
-"""Which gaits may be the best one, and which of them is chosen."""
+"""Ranking of gaits: those that may be the best, and the chosen one."""
 
 import math
 
@@ -19,15 +19,15 @@ def test_where_intervals_overlap_the_simplest_gait_is_chosen_not_the_largest_mea
             Candidate("sine", 17.0, 0.3, WAVE),
         ]
     )
-    assert [each.name for each in ranking.undecided] == ["square", "swing", "policy"]
+    assert [candidate.name for candidate in ranking.undecided] == ["square", "swing", "policy"]
     assert (ranking.chosen.name, ranking.reason) == ("square", "it is the simplest")
     assert not ranking.is_decided
 
 
 def test_a_gait_is_excluded_by_any_other_not_by_the_largest_mean_alone() -> None:
     vague, sharp, low = ("vague", 26.0, 3.0), ("sharp", 25.0, 0.2), ("low", 23.5, 0.2)
-    ranking = rank([Candidate(*each, WAVE) for each in (vague, sharp, low)])
-    assert [each.name for each in ranking.undecided] == ["vague", "sharp"]
+    ranking = rank([Candidate(*candidate, WAVE) for candidate in (vague, sharp, low)])
+    assert [candidate.name for candidate in ranking.undecided] == ["vague", "sharp"]
 
 
 def test_thrusts_without_an_error_count_as_equal_up_to_rounding_alone() -> None:
@@ -55,8 +55,10 @@ def test_the_best_gait_is_left_out_in_no_more_than_five_percent_of_cases(freedom
         else:
             runs = generator.normal(true, sigma, (3, 4))
             means, ci95 = runs.mean(axis=0), 4.303 * runs.std(axis=0, ddof=1) / math.sqrt(3.0)
-        found = [Candidate(str(k), float(means[k]), float(ci95[k]), 0, freedom) for k in range(4)]
-        lost += "0" not in {each.name for each in rank(found).undecided}
+        candidates = [
+            Candidate(str(k), float(means[k]), float(ci95[k]), 0, freedom) for k in range(4)
+        ]
+        lost += "0" not in {candidate.name for candidate in rank(candidates).undecided}
     assert lost <= 50
 
 

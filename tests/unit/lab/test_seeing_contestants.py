@@ -59,12 +59,12 @@ def test_named_policies_that_see_swim_where_none_is_named(
 ) -> None:
     write(tmp_path, velocity_follower(), "eye")
     monkeypatch.setenv("FISHD_POLICIES", str(tmp_path))
-    assert "eye" in [one.label for one in default_contestants(Config())]
+    assert "eye" in [contestant.label for contestant in default_contestants(Config())]
 
 
 @pytest.mark.slow
 def test_it_swims_on_a_virtual_pi_in_virtual_time_too(tmp_path: Path, eye: str) -> None:
     config = load(None, ["robot=virtual-pi", f"state_folder={tmp_path}"])
-    found = compare(config, [eye], seconds=10.0, settle=5.0)[0][0]
-    assert found.relative_thrust
-    assert found.relative_thrust > 0.3
+    standing = compare(config, [eye], seconds=10.0, settle=5.0)[0][0]
+    assert standing.relative_thrust
+    assert standing.relative_thrust > 0.3

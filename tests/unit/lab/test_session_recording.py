@@ -1,4 +1,4 @@
-"""What a rig does is recorded while it does it, with all that a rerun and a reader need."""
+"""Recordings of a rig, written while it swims, with everything that a rerun needs."""
 
 import re
 from pathlib import Path
@@ -26,15 +26,17 @@ def test_every_swim_of_a_rig_is_rerun_to_the_last_bit(tmp_path: Path) -> None:
     run = open_run(path)
     assert [run.about[key] for key in ("source", "note")] == ["simulation", "two swims"]
     assert [event.kind for event in run.events].count("controller") == 2
-    found = rerun(run)
-    assert [each.recorded for each in found.stretches] == ["swing", "square"]
-    assert [each.parameters.get("C") for each in found.stretches] == [0.4, None]
-    assert all(each.from_start and each.equal == each.ticks for each in found.stretches)
-    assert found.estimates.equal == found.estimates.ticks == len(run.ticks) == 360
+    result = rerun(run)
+    assert [stretch.recorded for stretch in result.stretches] == ["swing", "square"]
+    assert [stretch.parameters.get("C") for stretch in result.stretches] == [0.4, None]
+    assert all(
+        stretch.from_start and stretch.equal == stretch.ticks for stretch in result.stretches
+    )
+    assert result.estimates.equal == result.estimates.ticks == len(run.ticks) == 360
 
 
-class Full:
-    """A disk that is full after some ticks."""
+class FullDisk:
+    """Listener that fails as a full disk does, after some ticks."""
 
     def __init__(self, room: int) -> None:
         self._room = room
@@ -45,12 +47,12 @@ class Full:
             raise RecordingError("no room")
 
     def event(self, _: Event) -> None:
-        """There is room for it."""
+        """Accept the event."""
 
 
 def test_a_recording_that_fails_ends_a_swim_and_is_no_fault_of_the_fish() -> None:
     with VirtualSession(Config()) as rig:
-        rig.listener = Full(50)
+        rig.listener = FullDisk(50)
         with pytest.raises(RecordingError, match="no room"):
             rig.swim("swing", {}, 10.0)
 

@@ -1,4 +1,4 @@
-"""Contestants on many fish, and the verb that shows them: `fishctl learn evaluate`."""
+"""Survey of contestants on many fish, and its verb `fishctl learn evaluate`."""
 
 import json
 from pathlib import Path
@@ -19,12 +19,12 @@ BRIEF = ("--seconds", "8", "--settle", "3")
 
 def test_each_fish_is_swum_as_by_itself() -> None:
     fish = (OtherFish("slow", ("plant.omega0=8",)), harsh(7))
-    configs = [(one, load(None, one.overrides)) for one in fish]
+    configs = [(other_fish, load(None, other_fish.overrides)) for other_fish in fish]
     swing, square = survey(configs, [parse("swing:C=0.5"), parse("square:frequency=1.7")], 8.0, 3.0)
-    assert [swum.fish for swum in square.fish] == ["slow", "harsh 7"]
-    for (_, config), swum in zip(configs, swing.fish, strict=True):
+    assert [result.fish for result in square.fish] == ["slow", "harsh 7"]
+    for (_, config), result in zip(configs, swing.fish, strict=True):
         alone = simulate(config, "swing", {"C": 0.5}, 8.0, 3.0)
-        assert (swum.relative_thrust, swum.thrust) == (alone.relative_thrust, alone.mean_thrust)
+        assert (result.relative_thrust, result.thrust) == (alone.relative_thrust, alone.mean_thrust)
     assert swing.worst.relative_thrust <= swing.median
 
 
@@ -42,7 +42,7 @@ def test_it_tells_who_shook_the_servo_and_who_lost_command(tmp_path: Path) -> No
 
 def test_the_harsh_fish_are_twenty_and_always_the_same() -> None:
     fish = harsh_fish()
-    assert len({one.overrides for one in fish}) == 20
+    assert len({other_fish.overrides for other_fish in fish}) == 20
     assert fish == harsh_fish()
     assert 8.0 <= load(None, fish[3].overrides).plant.omega0 <= 18.0
 

@@ -1,4 +1,4 @@
-"""What a sweep measures, and where its curves have their best."""
+"""Points of a sweep, and the maxima of its curves."""
 
 import csv
 
@@ -43,10 +43,10 @@ def test_what_is_no_range_says_what_is_needed(text: str) -> None:
 def test_a_grid_has_every_combination_and_each_controller_only_its_own_parameters() -> None:
     takes = {"square": ["frequency", "amplitude"], "swing": ["C", "amplitude"]}
     values = {"frequency": [1.0, 2.0], "C": [0.6], "amplitude": [0.3]}
-    found = make_points(["square", "swing"], values, takes, {"plant.xi": ["0.6", "1.2"]})
-    assert len(found) == 6
-    assert found[-1] == Point("swing", {"C": 0.6, "amplitude": 0.3}, {"plant.xi": "1.2"})
-    assert find_axis(found) == "parameters.frequency"
+    grid = make_points(["square", "swing"], values, takes, {"plant.xi": ["0.6", "1.2"]})
+    assert len(grid) == 6
+    assert grid[-1] == Point("swing", {"C": 0.6, "amplitude": 0.3}, {"plant.xi": "1.2"})
+    assert find_axis(grid) == "parameters.frequency"
     with pytest.raises(ParameterError, match=r"^square has no parameter 'phase'$"):
         make_points(["square"], {"phase": [0.1]}, takes)
     with pytest.raises(ParameterError, match=r"^none of square, swing has a parameter 'phase'$"):
@@ -60,25 +60,25 @@ def test_the_best_of_a_noisy_curve_is_within_its_interval_as_often_as_it_says() 
     for _ in range(300):
         truth = generator.uniform(1.5, 1.9)
         y = 25e-3 - 20e-3 * (x - truth) ** 2 + generator.normal(0.0, 0.3e-3, len(x))
-        found = find_peak(x.tolist(), y.tolist(), [0.6e-3] * len(x))
-        assert found.x_low is not None
-        assert found.x_high is not None
-        hits += found.x_low <= truth <= found.x_high
+        peak = find_peak(x.tolist(), y.tolist(), [0.6e-3] * len(x))
+        assert peak.x_low is not None
+        assert peak.x_high is not None
+        hits += peak.x_low <= truth <= peak.x_high
     assert 0.92 <= hits / 300 <= 0.99
 
 
 @pytest.mark.parametrize(("waveform", "frequency"), [("square", 1.709), ("sine", 1.752)])
 def test_the_best_is_that_of_the_curve_and_not_of_the_grid(waveform: str, frequency: float) -> None:
     with (ROOT / "tests/reference/thrust_vs_frequency.csv").open(encoding="utf-8") as file:
-        own = [row for row in csv.DictReader(file) if row["waveform"] == waveform]
-    x = [float(row["frequency_Hz"]) for row in own]
-    found = find_peak(x, [float(row["mean_thrust_mN"]) for row in own], [None] * len(x))
-    assert found.x == pytest.approx(frequency, abs=0.02)
-    assert found.x_low is not None
-    assert found.x_high is not None
-    assert found.x_low <= frequency <= found.x_high
+        rows = [row for row in csv.DictReader(file) if row["waveform"] == waveform]
+    x = [float(row["frequency_Hz"]) for row in rows]
+    peak = find_peak(x, [float(row["mean_thrust_mN"]) for row in rows], [None] * len(x))
+    assert peak.x == pytest.approx(frequency, abs=0.02)
+    assert peak.x_low is not None
+    assert peak.x_high is not None
+    assert peak.x_low <= frequency <= peak.x_high
 
 
 def test_a_best_at_the_edge_is_told_and_has_no_interval() -> None:
-    found = find_peak([1.0, 1.2, 1.4], [1.0, 2.0, 3.0], [0.1, 0.1, 0.1])
-    assert (found.x, found.at_edge, found.x_low) == (1.4, True, None)
+    peak = find_peak([1.0, 1.2, 1.4], [1.0, 2.0, 3.0], [0.1, 0.1, 0.1])
+    assert (peak.x, peak.at_edge, peak.x_low) == (1.4, True, None)

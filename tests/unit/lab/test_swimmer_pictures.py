@@ -1,4 +1,4 @@
-"""Pictures of a free swimmer: where things are in them, and that a film shows what swam."""
+"""Pictures of a free swimmer: positions in them, and films that show the swim."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +19,7 @@ COARSE = SwimmerSettings(numerics=Numerics(cell=2e-3, step=2e-3))
 
 @pytest.fixture(scope="module")
 def fish() -> Fish:
-    """After a second of a square wave of 2.5 Hz."""
+    """Fish after a second of a square wave of 2.5 Hz."""
     swimmer = Fish(COARSE)
     for step in range(500):
         swimmer.step(1.0 if step % 200 < 100 else -1.0)
@@ -46,8 +46,8 @@ def test_between_the_nodes_of_a_stretched_grid_a_view_is_linear(fish: Fish) -> N
     fish.flow.p[:] = 3.0 * grid.xc[:, None] + 2.0 * grid.yc[None]
     shown = view.take_view(fish, "pressure", view.window_around(COARSE), 50)
     fish.flow.p[:] = before
-    middles = shown.window.left - fish.travelled + 0.3 * (np.arange(50) + 0.5) / 50
-    assert shown.values.mean(axis=0) == pytest.approx(3e3 * middles)
+    midpoints = shown.window.left - fish.travelled + 0.3 * (np.arange(50) + 0.5) / 50
+    assert shown.values.mean(axis=0) == pytest.approx(3e3 * midpoints)
 
 
 def test_the_colours_end_at_a_round_value_of_the_size_that_occurs(fish: Fish) -> None:
@@ -129,8 +129,8 @@ def test_a_film_of_another_kind_is_refused_before_anything_swims(tmp_path: Path)
         Film(tmp_path / "none" / "wake.webp", COARSE)
 
 
-def swum(beats: float, frequency: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
-    """A stiff front body and a tail that beats by ±0.1 L, obliquely across the laboratory."""
+def make_midlines(beats: float, frequency: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return midlines of a stiff body whose tail beats by ±0.1 L, obliquely to the axes."""
     time = np.arange(0.0, beats / frequency, 0.005)
     along = np.linspace(0.0, 0.1, 41)
     across = 0.01 * (along / 0.1) ** 2 * np.sin(2.0 * np.pi * frequency * time)[:, None]
@@ -140,23 +140,23 @@ def swum(beats: float, frequency: float = 2.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_midlines_are_relative_to_the_mean_motion_wherever_the_fish_goes() -> None:
-    found = compute_envelope(*swum(5.5))
-    assert found.periods == pytest.approx([0.5] * 4, rel=1e-3)
-    assert found.amplitudes[:, -1] == pytest.approx(0.1, rel=5e-3)
-    assert found.amplitudes[:, 20] == pytest.approx(0.025, rel=5e-3)
-    assert found.amplitudes[:, 0] == pytest.approx(0.0, abs=5e-4)
-    assert found.midlines[:, 0, 0] == pytest.approx(0.0, abs=0.01)
-    assert found.midlines[:, -1, 0] == pytest.approx(1.0, abs=0.02)
+    envelope = compute_envelope(*make_midlines(5.5))
+    assert envelope.periods == pytest.approx([0.5] * 4, rel=1e-3)
+    assert envelope.amplitudes[:, -1] == pytest.approx(0.1, rel=5e-3)
+    assert envelope.amplitudes[:, 20] == pytest.approx(0.025, rel=5e-3)
+    assert envelope.amplitudes[:, 0] == pytest.approx(0.0, abs=5e-4)
+    assert envelope.midlines[:, 0, 0] == pytest.approx(0.0, abs=0.01)
+    assert envelope.midlines[:, -1, 0] == pytest.approx(1.0, abs=0.02)
 
 
 def test_a_tail_that_does_not_beat_has_no_midlines_of_a_beat() -> None:
     with pytest.raises(FishdError, match="does not complete a beat"):
-        compute_envelope(*swum(0.7))
+        compute_envelope(*make_midlines(0.7))
 
 
 def test_a_picture_of_midlines_is_written(tmp_path: Path) -> None:
     midline_figure.draw_midlines(
-        compute_envelope(*swum(3.5)), "a sine of 2 Hz", tmp_path / "midlines.png"
+        compute_envelope(*make_midlines(3.5)), "a sine of 2 Hz", tmp_path / "midlines.png"
     )
     with Image.open(tmp_path / "midlines.png") as picture:
         assert picture.width == 1440

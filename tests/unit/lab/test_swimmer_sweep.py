@@ -1,4 +1,4 @@
-"""Sweeps of a free swimmer: a speed is averaged once it is steady, and said to be one."""
+"""Sweeps of a free swimmer, whose speed is averaged once it is steady."""
 
 import csv
 from pathlib import Path
@@ -23,7 +23,7 @@ from fishd.lab.sweep.results import SpeedResult
 WAVE = Point("square", {"frequency": 3.0})
 
 
-class Dropped:
+class NullPublisher:
     def tick(self, tick: Tick) -> None:
         pass
 
@@ -37,7 +37,7 @@ def config() -> Config:
 
 
 def beats(speeds: np.ndarray, period: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
-    """When beats of these speeds begin, and where the fish is then."""
+    """Return the begin times of beats of these speeds, and the positions of the fish then."""
     return (
         period * np.arange(len(speeds) + 1),
         -np.concatenate([[0.0], np.cumsum(period * speeds)]),
@@ -64,13 +64,13 @@ def test_a_fish_whose_speed_still_changes_is_judged_by_the_later_half_and_that_i
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(free_swimming, "MAX_SWIM_S", 2.0)
-    found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
-    assert found
-    assert (found.trouble, found.settled, found.seconds) == ("", None, 2.0)
-    assert found.beats == 2
-    assert found.beat_frequency == pytest.approx(3.0, rel=0.03)
-    assert found.speed is not None
-    assert 0.01 < found.speed < 0.1
+    result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
+    assert result
+    assert (result.trouble, result.settled, result.seconds) == ("", None, 2.0)
+    assert result.beats == 2
+    assert result.beat_frequency == pytest.approx(3.0, rel=0.03)
+    assert result.speed is not None
+    assert 0.01 < result.speed < 0.1
 
 
 def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
@@ -78,30 +78,30 @@ def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
 ) -> None:
     monkeypatch.setattr("fishd.lab.sweep.free_swimming.MIN_MEASURED_S", 0.5)
     monkeypatch.setattr("fishd.lab.sweep.free_swimming.STEADY_FRACTION", 0.5)
-    found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
-    assert found
-    assert found.settled is not None
-    assert 0.3 < found.settled < 1.0
-    assert found.beats == 2
-    assert found.seconds == pytest.approx(found.settled + 2.0 / 3.0, abs=0.05)
+    result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
+    assert result
+    assert result.settled is not None
+    assert 0.3 < result.settled < 1.0
+    assert result.beats == 2
+    assert result.seconds == pytest.approx(result.settled + 2.0 / 3.0, abs=0.05)
 
 
 def test_a_fish_that_is_lost_is_a_point_without_a_speed(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fishd.virtual.swimmer.fish.UNSTABLE", 1e-6)
-    found = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), Dropped())
-    assert found
-    assert found.speed is None
-    assert "the swimmer cannot go on at 0.04" in found.trouble
+    result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
+    assert result
+    assert result.speed is None
+    assert "the swimmer cannot go on at 0.04" in result.trouble
 
 
 def test_a_swim_is_stopped_before_its_end(config: Config) -> None:
     lengths = Lengths(settle=0.1, periods=2)
-    assert swim_freely(WAVE, config, lengths, Dropped(), stop=lambda: True) is None
+    assert swim_freely(WAVE, config, lengths, NullPublisher(), stop=lambda: True) is None
 
 
-def opened(path: Path, config: Config) -> SweepFolder:
+def open_folder(path: Path, config: Config) -> SweepFolder:
     header = Header(kind="sweep", on="simulation", config=msgspec.to_builtins(config))
     with open_experiment(path, header, resume=(path / "experiment.json").exists()) as experiment:
         return SweepFolder(experiment, ["controller", "parameters.frequency", "parameters.C"])
@@ -110,31 +110,31 @@ def opened(path: Path, config: Config) -> SweepFolder:
 def test_a_table_of_speeds_is_gone_on_with_and_swing_is_drawn_among_the_waves(
     tmp_path: Path, config: Config
 ) -> None:
-    folder = opened(tmp_path, config)
-    found = [Point("square", {"frequency": value}) for value in (1.0, 2.0, 3.0, 4.0, 5.0)]
-    found += [Point("swing", {"C": value}) for value in (0.0, 0.6)]
+    folder = open_folder(tmp_path, config)
+    points = [Point("square", {"frequency": value}) for value in (1.0, 2.0, 3.0, 4.0, 5.0)]
+    points += [Point("swing", {"C": value}) for value in (0.0, 0.6)]
     speeds = (0.02, 0.05, 0.07, 0.06, 0.03, 0.06, 0.07)
-    for point, speed in zip(found, speeds, strict=True):
+    for point, speed in zip(points, speeds, strict=True):
         result = SpeedResult(speed=speed, error=1e-3, beat_frequency=2.9, settled=4.0, beats=10)
         folder.add_result(point, result, b"a recording")
-    assert opened(tmp_path, config).results == folder.results
-    drawn = make_curves(folder, found)
-    told = find_best(drawn[0])
-    assert told
-    shown = best_to_builtins(told, folder.quantity)
-    assert shown["speed"] == pytest.approx(0.07, abs=4e-3)
-    assert "thrust" not in shown
+    assert open_folder(tmp_path, config).results == folder.results
+    curves = make_curves(folder, points)
+    best = find_best(curves[0])
+    assert best
+    fields = best_to_builtins(best, folder.quantity)
+    assert fields["speed"] == pytest.approx(0.07, abs=4e-3)
+    assert "thrust" not in fields
     picture = tmp_path / "speed.svg"
     figure.draw(
         [picture],
-        drawn,
+        curves,
         {"frequency": "Hz"},
         error_of="it",
         quantity=folder.quantity,
     )
     text = picture.read_text()
-    assert all(words in text for words in ("speed (mm/s)", "swing C=0.6", "frequency (Hz)"))
-    assert "<!-- C -->" not in text  # no panel of its own
+    assert all(label in text for label in ("speed (mm/s)", "swing C=0.6", "frequency (Hz)"))
+    assert "<!-- C -->" not in text  # swing has no separate panel
 
 
 @pytest.fixture

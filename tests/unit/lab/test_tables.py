@@ -1,4 +1,4 @@
-"""Tables of experiments, which people open in spreadsheets and fishd reads again."""
+"""Tables of experiments, which are safe in spreadsheets and readable by fishd."""
 
 from pathlib import Path
 
