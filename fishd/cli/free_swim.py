@@ -15,7 +15,7 @@ from fishd.core.process.interruption import on_signal
 
 if TYPE_CHECKING:
     from fishd.config import Config
-    from fishd.lab.simulation.free_swim import SwimReport, Swum
+    from fishd.lab.simulation.free_swim import SwimReport, SwimResult
     from fishd.virtual.swimmer.robot import Swimmer
 
 
@@ -26,7 +26,7 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
     Raises `FishdError` and OSError.
     """
     try:
-        from fishd.lab.simulation.free_swim import Keeping
+        from fishd.lab.simulation.free_swim import CheckpointSettings
         from fishd.lab.simulation.free_swim import swim as run
         from fishd.virtual.swimmer import checkpoint, track
         from fishd.virtual.swimmer.midlines import Midlines
@@ -38,7 +38,11 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
     if options.save:
         track.check_name(options.save)
     options.check()
-    keeping = Keeping(options.checkpoint, options.checkpoint_every) if options.checkpoint else None
+    keeping = (
+        CheckpointSettings(options.checkpoint, options.checkpoint_every)
+        if options.checkpoint
+        else None
+    )
     resume = checkpoint.load(options.resume) if options.resume else None
     interrupted = threading.Event()
     midlines = Midlines()
@@ -112,7 +116,7 @@ def _open_film(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[
         yield lambda fish: film.add_frame(fish.fish)
 
 
-def _describe_checkpoint(swum: "Swum", options: SwimmerOptions) -> str:
+def _describe_checkpoint(swum: "SwimResult", options: SwimmerOptions) -> str:
     """Return a clause about the checkpoint from which the run can be resumed."""
     if swum.kept is not None:
         return f"its last checkpoint is of {swum.kept:.2f} s: --resume {options.checkpoint}"

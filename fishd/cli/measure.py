@@ -14,7 +14,7 @@ from fishd.core.console import INTERRUPTED, power_words
 from fishd.core.process.interruption import interrupted_once
 
 if TYPE_CHECKING:
-    from fishd.lab.measurement import Measured
+    from fishd.lab.measurement import ThrustMeasurement
 
 
 def measure_options(function: Any) -> Any:
@@ -60,7 +60,7 @@ def _measure(
 ) -> int:
     from fishd.lab import drawing
     from fishd.lab.measurement import measure as run_measurement
-    from fishd.lab.measurement import summary
+    from fishd.lab.measurement import summarise
     from fishd.lab.session import LiveSession
 
     if picture:
@@ -77,7 +77,7 @@ def _measure(
             fish.announce(as_json)
             session.progress = bar.at
             measured = run_measurement(session, name, parameters, seconds, settle)
-            result = summary(measured, session.tick)
+            result = summarise(measured, session.tick)
             if experiment:
                 experiment.write_struct("result.json", result)
             if (
@@ -104,12 +104,12 @@ def _measure(
     return 0
 
 
-def _format_result(measured: "Measured") -> str:
+def _format_result(measured: "ThrustMeasurement") -> str:
     from fishd.lab import error_budget
     from fishd.lab.disturbances import spell
 
     command = format_controller(measured.controller, dict(measured.parameters))
-    thrust = error_budget.spelled(
+    thrust = error_budget.format_with_budget(
         measured.thrust,
         measured.error,
         measured.calibration_ci95,
@@ -126,7 +126,7 @@ def _format_result(measured: "Measured") -> str:
     )
 
 
-def _find_warnings(measured: "Measured") -> "Iterator[str]":
+def _find_warnings(measured: "ThrustMeasurement") -> "Iterator[str]":
     """Yield warnings about errors that the interval does not cover, or covers only by a guess."""
     from fishd.lab.error_budget import rotation_remark, unknown_calibration
 
@@ -136,7 +136,7 @@ def _find_warnings(measured: "Measured") -> "Iterator[str]":
         yield line
 
 
-def _format_power(measured: "Measured") -> str:
+def _format_power(measured: "ThrustMeasurement") -> str:
     """Return the power of the servo and the thrust per watt; empty if the power is unknown."""
     from fishd.lab import error_budget
     from fishd.lab.statistics import per_watt
@@ -152,7 +152,7 @@ def _format_power(measured: "Measured") -> str:
     calibration_ci95 = (
         None if measured.calibration_ci95 is None else measured.calibration_ci95 / measured.watts
     )
-    budget = error_budget.spelled(
+    budget = error_budget.format_with_budget(
         thrust_per_watt, error, calibration_ci95, total_ci95, f"{measured.unit} per W"
     )
     return f"; {power_words(measured.watts)}, {budget}"

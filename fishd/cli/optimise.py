@@ -113,7 +113,7 @@ def _optimise(
     as_json: bool,
 ) -> int:
     from fishd.lab import drawing
-    from fishd.lab.measurement import REST
+    from fishd.lab.measurement import MEAN_REST_S
     from fishd.lab.optimise.aim import Aim
     from fishd.lab.optimise.trials import trial_durations
 
@@ -127,7 +127,7 @@ def _optimise(
         ranges = [_parse_range(text, name, parameters, session) for text in dict.fromkeys(over)]
         search = aim.make_search(ranges, seed)
         _check_ends(name, parameters, ranges, session)
-        if budget < (least := 2.0 * REST + trial_durations(parameters)[1]):
+        if budget < (least := 2.0 * MEAN_REST_S + trial_durations(parameters)[1]):
             raise ParameterError(
                 f"a budget of {budget:g} s is too short: one candidate takes {least:.3g} s"
             )
@@ -478,12 +478,12 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
         symbol = "" if units[name] in ("", "1") else f" {units[name]}"
         interval = f"[{optimum.low[name]:.4g}, {optimum.high[name]:.4g}]"
         echo(f"best {name} of {optimum.controller}: {value:.4g}{symbol} {interval}")
-    thrust = error_budget.spelled(
+    thrust = error_budget.format_with_budget(
         optimum.thrust, optimum.error, optimum.calibration_ci95, optimum.total_ci95, unit
     )
     echo(f"thrust there: {thrust}")
     if optimum.power is not None and optimum.power_error is not None:
-        gives = error_budget.spelled(
+        gives = error_budget.format_with_budget(
             optimum.thrust_per_watt or 0.0,
             optimum.thrust_per_watt_error or 0.0,
             optimum.thrust_per_watt_calibration_ci95,

@@ -1,9 +1,9 @@
-"""Steps of the zero, blocks that are far off, and a zero that follows swimming.
+"""Search for steps of the zero, outlying blocks, and a zero that follows swimming.
 
 `fishd.lab.drift` averages over kinds of drift. Each of these disturbances is a regressor beside
 them, with a Gaussian prior of its size and a prior probability. Every quantity below is one array
 for all drifts (axis 0); adding a disturbance is a rank-one update of each, so that all candidates
-(axis 1) can be judged at once.
+(axis 1) can be evaluated at once.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,21 +19,21 @@ from fishd.core import text
 Array = NDArray[np.float64]
 
 RESPONSE_TIMES_S = (3.0, 6.0, 12.0, 24.0, 48.0)
-"""Time constants that are tried for a zero that follows swimming [s]."""
+"""Time constants of a zero that follows swimming, as candidates [s]."""
 RESPONSE_ODDS = 3.0
-"""Prior odds of a zero that follows swimming, of all time constants together."""
+"""Prior odds of a zero that follows swimming, for all time constants together."""
 STEP_ODDS_PER_SECOND = 1 / 60
 """Prior odds of a step of the zero between two blocks, for each second between their middles."""
 OUTLIER_ODDS = 0.01
-"""Prior odds of a block that is far off."""
+"""Prior odds that a block is an outlier."""
 NAMED_ODDS = 10.0
-"""Disturbances of smaller odds count in the average, but are not named."""
-SIZE = 15.0
+"""Smallest posterior odds of a disturbance that is reported; others count in the average only."""
+PRIOR_SIZE = 15.0
 """Prior standard deviation of the size of a disturbance, over the standard deviation of a block."""
 MAX_DISTURBANCES = 12
 """Largest number of disturbances in one fit."""
 MIN_BLOCKS, BLOCKS_PER_DISTURBANCE = 11, 3
-"""Numbers of blocks that are needed beside disturbances, and for each: one swim has too few."""
+"""Smallest number of blocks beside the disturbances, and per disturbance; one swim has too few."""
 
 
 class Kind(IntEnum):
@@ -45,56 +45,58 @@ class Kind(IntEnum):
 
 
 class Disturbance(Struct, frozen=True):
-    """A disturbance of the zero that a fit found and accounted for."""
+    """A disturbance of the zero that a fit contains."""
 
     kind: str
     """`step`, `outlier` (of one block), or `response` (of the zero to swimming)."""
     size: float
-    """Change of the force [N]; for a response that of endless swimming."""
+    """Change of the force [N]; for a response, its limit in endless swimming."""
     time: float | None = None
     """Time since the first tick [s]; null for a response."""
     time_constant: float | None = None
-    """Time constant of a response [s]; null for the others."""
+    """Time constant of a response [s]; null for a step or an outlier."""
 
 
 def spell(disturbances: Sequence[Disturbance], unit: str) -> str:
-    """Return these disturbances in words, forces in thousandths of their unit; empty for none."""
+    """Return a description of disturbances, forces in thousandths of their unit; else empty."""
     unit = f"m{text.quoted(unit)}"
-    words = []
-    steps = [each for each in disturbances if each.kind == "step"]
+    clauses = []
+    steps = [disturbance for disturbance in disturbances if disturbance.kind == "step"]
     if len(steps) == 1:
-        words.append(
+        clauses.append(
             f"the zero stepped by {1e3 * steps[0].size:+.1f} {unit} at {steps[0].time:.1f} s"
         )
     elif steps:
-        largest = max(abs(each.size) for each in steps)
-        words.append(f"the zero stepped {len(steps)} times, by up to {1e3 * largest:.1f} {unit}")
-    outliers = [abs(each.size) for each in disturbances if each.kind == "outlier"]
+        largest = max(abs(disturbance.size) for disturbance in steps)
+        clauses.append(f"the zero stepped {len(steps)} times, by up to {1e3 * largest:.1f} {unit}")
+    outliers = [
+        abs(disturbance.size) for disturbance in disturbances if disturbance.kind == "outlier"
+    ]
     if outliers:
-        many = (
+        count = (
             "1 beat or piece of a rest"
             if len(outliers) == 1
             else f"{len(outliers)} beats or pieces of a rest"
         )
-        words.append(f"{many} far off, by up to {1e3 * max(outliers):.1f} {unit}")
-    words += [
-        f"the zero follows swimming, by {1e3 * each.size:+.1f} {unit} "
-        f"with a time constant of about {each.time_constant:g} s"
-        for each in disturbances
-        if each.kind == "response"
+        clauses.append(f"{count} far off, by up to {1e3 * max(outliers):.1f} {unit}")
+    clauses += [
+        f"the zero follows swimming, by {1e3 * disturbance.size:+.1f} {unit} "
+        f"with a time constant of about {disturbance.time_constant:g} s"
+        for disturbance in disturbances
+        if disturbance.kind == "response"
     ]
-    return ", ".join(words)
+    return ", ".join(clauses)
 
 
 class Candidates(NamedTuple):
-    """All disturbances that a fit may have, c of them."""
+    """All disturbances that a fit may contain; their number is c."""
 
     columns: Array
-    """The force that each adds, for a size of 1; n×c."""
+    """Force that each candidate adds for a size of 1; n×c."""
     kinds: Array
-    """Kind of each."""
+    """Kind of each candidate."""
     log_odds: Array
-    """Logarithm of the prior odds of each."""
+    """Logarithm of the prior odds of each candidate."""
 
 
 def candidates(time: Array, responses: Array) -> Candidates:
@@ -115,40 +117,40 @@ def candidates(time: Array, responses: Array) -> Candidates:
 
 
 class _State(NamedTuple):
-    """The fit with a set of disturbances, for m drifts, and what each of c candidates would do."""
+    """The fit with a set of disturbances for m drifts, and the effect of each of c candidates."""
 
     chosen: tuple[int, ...]
     pull: Array
-    """Product of each candidate with the weighed residuals; m×c."""
+    """Product of each candidate with the weighted residuals; m×c."""
     weight: Array
     """Sum of the weights of each candidate beside all other regressors; m×c."""
     share: Array
     """Coefficient of swimming in a regression of each candidate; m×c."""
     left: Array
-    """Weighed sum of the squared residuals [N²]; m."""
+    """Weighted sum of the squared residuals [N²]; m."""
     evidence: Array
-    """Logarithm of the probability but for the part of the residuals; m."""
+    """Logarithm of the probability without the factor of the residuals; m."""
     force: Array
     """Force that swimming adds [N]; m."""
     unsure: Array
-    """Variance of that over that of a block; m."""
+    """Variance of `force` over that of a block; m."""
     used: tuple[tuple[Array, Array], ...]
-    """Products with all candidates, and own weight, of each chosen one."""
+    """Products with all candidates, and the weight, of each chosen candidate."""
 
 
 class Mixture(NamedTuple):
-    """Fits, one for each drift or for each drift and candidate."""
+    """A set of fits, one for each drift or for each drift and candidate."""
 
     likely: Array
     """Logarithm of the probability."""
     force: Array
-    """[N]"""
+    """Force that swimming adds [N]."""
     variance: Array
-    """[N²]"""
+    """Variance of `force` [N²]."""
 
 
 class Search:
-    """Search for the set of disturbances, and the average over sets near it."""
+    """The search for a set of disturbances, and the average over the sets near it."""
 
     def __init__(
         self,
@@ -162,12 +164,12 @@ class Search:
         """Prepare the fit without a disturbance.
 
         precision: m×n×n, inverse covariance of the forces over the variance of a block, with
-            what a level and a trend explain projected out
-        evidence: logarithm of the probability of each drift, but for the part of the residuals; m
+            level and trend projected out
+        evidence: logarithm of the probability of each drift without the factor of the residuals; m
         force: mean force in each block [N]; n
         swims: 1 where the fish swam, else 0; n
-        variance: that of a block, as neighbours differ; counts as much as one degree of freedom
-            [N²]
+        variance: variance of a block, from the differences of neighbours, which counts as one
+            degree of freedom [N²]
         """
         self._precision = precision
         self._force, self._swims, self._known = force, swims, known
@@ -196,7 +198,7 @@ class Search:
     def _weights(self) -> Array:
         """Return the quadratic form of each candidate with the precision; m×c.
 
-        That of a step is the sum over the rows and columns after it.
+        For a step, this is the sum over the rows and columns after it.
         """
         precision, n = self._precision, len(self._force)
         diagonal = np.diagonal(precision, axis1=1, axis2=2)
@@ -207,20 +209,20 @@ class Search:
         return np.concatenate((steps, diagonal, forms), axis=1)
 
     def _column(self, candidate: int) -> Array:
-        """Return the products of a candidate with all others, swimming projected out; m×c."""
+        """Return the products of a candidate with all candidates, swimming projected out; m×c."""
         if candidate not in self._columns:
             columns = self._known.columns
-            found = self._precision @ columns[:, candidate] @ columns
+            products = self._precision @ columns[:, candidate] @ columns
             share = self._crossed[:, candidate] / self._information
-            self._columns[candidate] = found - self._crossed * share[:, np.newaxis]
+            self._columns[candidate] = products - self._crossed * share[:, np.newaxis]
         return self._columns[candidate]
 
     def _added(self, state: _State, candidate: int) -> _State:
         """Return the fit with one more disturbance."""
         column = self._column(candidate)
-        for other, weight in state.used:
-            column = column - other * (other[:, candidate] / weight)[:, np.newaxis]
-        weight = np.maximum(state.weight[:, candidate], 0.0) + SIZE**-2
+        for used, weight in state.used:
+            column = column - used * (used[:, candidate] / weight)[:, np.newaxis]
+        weight = np.maximum(state.weight[:, candidate], 0.0) + PRIOR_SIZE**-2
         size, share = state.pull[:, candidate] / weight, state.share[:, candidate]
         return _State(
             chosen=(*state.chosen, candidate),
@@ -229,7 +231,7 @@ class Search:
             share=state.share - column * (share / weight)[:, np.newaxis],
             left=np.maximum(state.left - state.pull[:, candidate] * size, self._variance),
             evidence=state.evidence
-            - 0.5 * np.log(weight * SIZE**2)
+            - 0.5 * np.log(weight * PRIOR_SIZE**2)
             + self._known.log_odds[candidate],
             force=state.force - share * size,
             unsure=state.unsure + share**2 / weight,
@@ -251,14 +253,14 @@ class Search:
     def _additions(self, state: _State, barred: Sequence[int] = ()) -> Mixture:
         """Return the fits with one more disturbance, one for each drift and candidate.
 
-        barred: candidates that do not count; those of `state` and a second response never do
+        barred: candidates that are excluded, beside those of `state` and a second response
         """
         kinds = self._known.kinds
-        weight = np.maximum(state.weight, 0.0) + SIZE**-2
+        weight = np.maximum(state.weight, 0.0) + PRIOR_SIZE**-2
         left = np.maximum(state.left[:, np.newaxis] - state.pull**2 / weight, self._variance)
         likely = (
             state.evidence[:, np.newaxis]
-            - 0.5 * np.log(weight * SIZE**2)
+            - 0.5 * np.log(weight * PRIOR_SIZE**2)
             + self._known.log_odds
             - 0.5 * self._degrees * np.log(left)
         )
@@ -274,14 +276,14 @@ class Search:
         )
 
     def find(self) -> tuple[int, ...]:
-        """Return the set of candidates to which no change of one makes a more probable one."""
+        """Return a set of candidates that no change of a single candidate makes more probable."""
         chosen: tuple[int, ...] = ()
         best = _log_sum(self._mixture(self._empty).likely)
         while True:
             sets = list(self._extended(chosen))
             if not sets or max(sets)[0] <= best:
                 for candidate in chosen:
-                    fewer = tuple(each for each in chosen if each != candidate)
+                    fewer = tuple(index for index in chosen if index != candidate)
                     sets.append((_log_sum(self._mixture(self._state(fewer)).likely), fewer))
                     sets += self._extended(fewer)
             if not sets or max(sets)[0] <= best + 1e-6:
@@ -289,7 +291,7 @@ class Search:
             best, chosen = max(sets)
 
     def _extended(self, chosen: tuple[int, ...]) -> Iterator[tuple[float, tuple[int, ...]]]:
-        """Yield the most probable set with one more candidate, with its probability's logarithm."""
+        """Yield the most probable set with one more candidate, after its log-probability."""
         if len(chosen) < self._limit:
             likely = self._additions(self._state(chosen)).likely
             candidate = int(likely.max(axis=0).argmax())
@@ -297,26 +299,26 @@ class Search:
             yield sums, (*chosen, candidate)
 
     def odds(self, chosen: Sequence[int], candidate: int) -> float:
-        """Return how much more probable this set is with one of its disturbances than without."""
-        fewer = [each for each in chosen if each != candidate]
-        both = (_log_sum(self._mixture(self._state(each)).likely) for each in (chosen, fewer))
+        """Return the ratio of the probability of a set to that without one of its disturbances."""
+        fewer = [item for item in chosen if item != candidate]
+        both = (_log_sum(self._mixture(self._state(item)).likely) for item in (chosen, fewer))
         return float(np.exp(min(700.0, next(both) - next(both))))
 
     def is_full(self, chosen: Sequence[int]) -> bool:
-        """Return whether no more disturbances than these can be told apart."""
+        """Return whether a set has the largest possible number of disturbances."""
         return len(chosen) >= self._limit > 0
 
     def average(self, chosen: Sequence[int]) -> tuple[float, float]:
-        """Return force [N] and variance [N²], over these disturbances and all sets one away."""
+        """Return mean force [N] and variance [N²] over this set and all sets that differ by one."""
         full = self._state(chosen)
         parts = [self._mixture(full)]
         if len(chosen) < self._limit:
             parts.append(self._additions(full))
         for candidate in chosen:
-            fewer = self._state([each for each in chosen if each != candidate])
+            fewer = self._state([item for item in chosen if item != candidate])
             parts += [self._mixture(fewer), self._additions(fewer, [candidate])]
         likely, force, variance = (
-            np.concatenate([each.ravel() for each in arrays]) for arrays in zip(*parts, strict=True)
+            np.concatenate([item.ravel() for item in arrays]) for arrays in zip(*parts, strict=True)
         )
         weight = np.exp(likely - likely.max())
         weight /= weight.sum()
@@ -335,7 +337,7 @@ class Search:
         weight /= weight.sum()
         columns = np.column_stack((self._swims, known.columns[:, index]))
         crossed = self._precision @ columns
-        ridge = np.diag([0.0, *[SIZE**-2] * len(index)])
+        ridge = np.diag([0.0, *[PRIOR_SIZE**-2] * len(index)])
         sizes = np.linalg.solve(
             columns.T @ crossed + ridge, (self._pulled @ columns)[..., np.newaxis]
         )

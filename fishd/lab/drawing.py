@@ -1,4 +1,4 @@
-"""How the laboratory draws: one style, without a display, and the same file for the same data."""
+"""Figures in one style, without a display; equal data give equal files."""
 
 import os
 from collections.abc import Iterator
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DOTS_PER_INCH = 200
-LONGEST_LABEL = 120
-"""Text from outside that a figure shows [characters]."""
+MAX_LABEL_CHARS = 120
+"""Length of the longest label in a figure that comes from user input [characters]."""
 FORMATS = (".pdf", ".png", ".svg")
 _MISSING = "a figure needs matplotlib, which is not installed: pip install 'fishd[lab]'"
 BLACK, BLUE, ORANGE, GREEN, PURPLE = "#1a1a1a", "#0072b2", "#d55e00", "#009e73", "#aa4499"
-"""Colours that stay apart in grey and for the colour-blind (Okabe and Ito), darkest first."""
+"""Colours that differ in grey and for the colour-blind (Okabe and Ito), darkest first."""
 YELLOW = "#e69f00"
-"""Beside ORANGE, for the second of a pair."""
+"""Colour of the second curve of a pair whose first one is ORANGE."""
 GREY = "0.55"
-"""Of what a curve is compared with."""
+"""Grey level of a reference curve."""
 _STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.spines.top": False,
@@ -38,7 +38,7 @@ _STYLE: dict[Any, Any] = {
     "lines.markersize": 4.5,
     "legend.frameon": False,
     "legend.fontsize": 8,
-    "svg.hashsalt": "fishd",  # else the names within an .svg differ from run to run
+    "svg.hashsalt": "fishd",  # else the identifiers within an .svg differ from run to run
 }
 
 
@@ -62,20 +62,22 @@ def check(path: str | os.PathLike[str]) -> None:
             "is needed"
         )
     if not file.parent.is_dir():
-        raise FishdError(f"{file}: the figure cannot be written: there is no folder {file.parent}")
+        raise FishdError(
+            f"{file}: the figure cannot be written: the folder {file.parent} does not exist"
+        )
 
 
 def plain(words: str) -> str:
-    """Return a line of text from outside that matplotlib does not read as mathematics."""
-    return text.line(words, LONGEST_LABEL).replace("$", r"\$")
+    """Return user input as a line of text in which matplotlib finds no mathematics."""
+    return text.line(words, MAX_LABEL_CHARS).replace("$", r"\$")
 
 
 @contextmanager
-def drawn(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator["Figure"]:
-    """A figure to draw on, of `size` (width and height, inch); it is written on leaving.
+def open_figure(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator["Figure"]:
+    """Provide a figure of `size` (width and height, inch), and write it to a file at the end.
 
-    path: the suffix chooses the format, one of `FORMATS`; no file holds a date
-    Raises as `check` does, and `FishdError` where writing fails.
+    path: its suffix chooses the format, one of `FORMATS`; no file contains a date
+    Raises the errors of `check`, and `FishdError` where writing fails.
     """
     check(path)
     from matplotlib import rc_context

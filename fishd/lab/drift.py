@@ -3,13 +3,13 @@
 The force is measured in blocks, while the fish swims and while it rests. What swimming adds is
 fitted by generalised least squares beside a level, a trend, and a drift of unknown kind and
 strength: a random walk, and a smooth Gaussian process, which together follow most that sensors do.
-Kinds and strengths are not chosen but averaged over, each weighed by its restricted likelihood
+The result is an average over kinds and strengths, each weighted by its restricted likelihood
 (REML; Patterson & Thompson, Biometrika 58 (1971) 545; Gaussian processes: Rasmussen & Williams,
 Gaussian Processes for Machine Learning, 2006, section 2.7).
 
-What no such drift describes is searched for (`fishd.lab.disturbances`): a step of the zero, a block
-that is far off, and a zero that follows swimming. The result is averaged over the set of
-disturbances that was found and all sets that differ from it by one disturbance.
+`fishd.lab.disturbances` searches for what no such drift describes: a step of the zero, a block
+that is an outlier, and a zero that follows swimming. The result is averaged over the best set of
+disturbances and all sets that differ from it by one disturbance.
 """
 
 import math
@@ -24,57 +24,57 @@ from fishd.lab.statistics import Z95
 
 Array = NDArray[np.float64]
 
-WALKS = (0.0, 0.03, 0.5, 8.0)
-"""Variances of the random walk after a second, over that of a block, that are tried."""
-TIMES = (2.5, 3.5, 5.0, 7.0, 10.0, 14.0, 20.0, 40.0)
-"""Correlation times of the smooth drift that are tried [s]."""
-STRENGTHS = tuple(10.0**exponent for exponent in (-0.5, 0.75, 2.0, 3.25, 4.5))
-"""Variances of the smooth drift, over that of a block, that are tried."""
-LEAST_NOISE = 1e-3
-"""Smallest variance of a block over that of an average one, for the covariances to be inverted."""
-LEAST_BLOCKS = 6
-"""Fewer say nothing about a drift."""
+WALK_VARIANCES = (0.0, 0.03, 0.5, 8.0)
+"""Variances of the random walk after one second, over that of a block."""
+CORRELATION_TIMES_S = (2.5, 3.5, 5.0, 7.0, 10.0, 14.0, 20.0, 40.0)
+"""Correlation times of the smooth drift [s]."""
+DRIFT_VARIANCES = tuple(10.0**exponent for exponent in (-0.5, 0.75, 2.0, 3.25, 4.5))
+"""Variances of the smooth drift, over that of a block."""
+MIN_NOISE = 1e-3
+"""Smallest variance of a block over the mean one, so that covariances can be inverted."""
+MIN_FIT_BLOCKS = 6
+"""Smallest number of blocks in a fit."""
 MAX_BLOCKS_AT_ONCE = 150
-"""More blocks are fitted in parts, because time and memory grow faster than their number."""
+"""Largest number of blocks in one fit; more are fitted in parts, to limit time and memory."""
 
 
 class Blocks(NamedTuple):
     """Means of the force over short times, one after the other; arrays of n."""
 
     time: Array
-    """The middle of each [s]."""
+    """Time of the middle of each block [s]."""
     force: Array
-    """Mean force in it [N]."""
+    """Mean force of each block [N]."""
     variance: Array
-    """Variance of that without drift, as neighbours differ [N²]."""
+    """Variance of `force` without drift, from the differences of neighbours [N²]."""
     swims: NDArray[np.bool_]
-    """Did the fish swim? It rested where not."""
+    """True for a block of a swim, False for a block of a rest."""
     responses: Array
     """First-order responses to swimming, for the last k of `RESPONSE_TIMES_S`; n×k."""
 
 
 class Fit(NamedTuple):
-    """What swimming adds to the force, and the drift below it."""
+    """The force that swimming adds, and the drift below it."""
 
     force: float
-    """[N]"""
+    """Force that swimming adds [N]."""
     error: float
-    """Half of the 95 % interval [N]."""
+    """Half-width of the 95 % confidence interval of `force` [N]."""
     drift: Array
-    """The force without swimming, block by block [N]."""
+    """Force that each block would have without swimming [N]."""
     disturbances: Sequence[Disturbance] = ()
-    """What was found beside a drift, and accounted for."""
+    """Disturbances that the fit contains beside a drift."""
     is_disturbed: bool = False
-    """Were there as many disturbances as can be told apart, or more?"""
+    """True where there are as many disturbances as a fit may have, or more."""
 
 
 def fit(blocks: Blocks) -> Fit:
-    """What swimming adds to the force, with an interval that knows what the drift may have done.
+    """Return the force that swimming adds, with an interval that allows for drift.
 
-    Raises ValueError for fewer than `LEAST_BLOCKS` blocks, or without both swimming and rest.
+    Raises ValueError for fewer than `MIN_FIT_BLOCKS` blocks, or without both swimming and rest.
     """
     n, swims = len(blocks.time), blocks.swims
-    if n < LEAST_BLOCKS or swims.all() or not swims.any():
+    if n < MIN_FIT_BLOCKS or swims.all() or not swims.any():
         raise ValueError("blocks of swimming and of rest are needed, six at least")
     parts = math.ceil(n / MAX_BLOCKS_AT_ONCE)
     pieces = (np.array_split(array, parts) for array in blocks)
@@ -93,26 +93,26 @@ def fit(blocks: Blocks) -> Fit:
 
 def _fit(blocks: Blocks) -> Fit:
     time, force, variance, swims, responses = blocks
-    noise = np.maximum(variance / variance.mean(), LEAST_NOISE)
+    noise = np.maximum(variance / variance.mean(), MIN_NOISE)
     precision, evidence = _precisions(time - time[0], noise)
-    known = candidates(time, responses)
+    all_candidates = candidates(time, responses)
     swimming = swims.astype(np.float64)
-    search = Search(precision, evidence, force, swimming, known, float(variance.mean()))
+    search = Search(precision, evidence, force, swimming, all_candidates, float(variance.mean()))
     chosen = search.find()
     mean, spread = search.average(chosen)
     sizes, drift = search.explain(chosen, noise)
-    found = [
+    named = [
         _disturbance(candidate, size, time, responses.shape[1])
         for candidate, size in zip(chosen, sizes.tolist(), strict=True)
         if search.odds(chosen, candidate) >= NAMED_ODDS
     ]
-    return Fit(mean, Z95 * spread**0.5, drift, found, search.is_full(chosen))
+    return Fit(mean, Z95 * spread**0.5, drift, named, search.is_full(chosen))
 
 
 def _disturbance(candidate: int, size: float, time: Array, responses: int) -> Disturbance:
-    """Return what a candidate is; they are in the order of `candidates`.
+    """Return the disturbance that a candidate stands for, by its index in `candidates`.
 
-    responses: how many of them are responses
+    responses: number of candidates that are responses
     """
     n = len(time)
     if candidate < n - 1:
@@ -126,18 +126,18 @@ def _disturbance(candidate: int, size: float, time: Array, responses: int) -> Di
 def _precisions(seconds: Array, noise: Array) -> tuple[Array, Array]:
     """Return the inverse covariance of each drift beside a level and a trend, and its evidence.
 
-    Each drift counts as much as any other before the forces are seen: a kind that is added here
-    with n strengths counts n times.
+    All drifts have the same prior probability: a kind that is added with n strengths counts n
+    times.
 
-    seconds: middles of the blocks; noise: their variances, over that of an average one
+    seconds: times of the middles of the blocks; noise: their variances, over the mean one
     """
-    walk = np.multiply.outer(WALKS, np.minimum.outer(seconds, seconds)) + np.diag(noise)
+    walk = np.multiply.outer(WALK_VARIANCES, np.minimum.outer(seconds, seconds)) + np.diag(noise)
     gap = np.subtract.outer(seconds, seconds)
     covariances = np.concatenate(
         [
             walk + strength * np.exp(-0.5 * (gap / time) ** 2)
-            for time in TIMES
-            for strength in STRENGTHS
+            for time in CORRELATION_TIMES_S
+            for strength in DRIFT_VARIANCES
         ]
     )
     base = np.column_stack((np.ones(len(seconds)), seconds - seconds.mean()))

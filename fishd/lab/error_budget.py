@@ -21,18 +21,18 @@ from fishd.core.signals import Tick
 from fishd.lab.statistics import Z95
 
 MIN_ROTATION_RAD = 0.01
-"""A smaller rotation hides less than 0.005 % of a thrust and is not counted."""
+"""Smallest rotation that counts; a smaller one hides less than 0.005 % of a thrust."""
 MIN_ELONGATION = 4.0
-"""Ratio of the variances along the axes of the force, below which its direction is not known."""
+"""Smallest ratio of the variances along the principal axes that defines their direction."""
 
 
 class Budget(NamedTuple):
-    """Half-widths of 95 % intervals of a thrust, in its unit."""
+    """Half-widths of the 95 % intervals of a thrust, in its unit."""
 
     calibration_ci95: float | None
-    """Part of the calibration, gains and rotation; None where its uncertainty is unknown."""
+    """Half-width from gains and rotation; None where the calibration's uncertainty is unknown."""
     total_ci95: float | None
-    """Statistics and calibration together; None where one of them is unknown."""
+    """Half-width from statistics and calibration; None where one of them is unknown."""
 
 
 def budget(
@@ -44,23 +44,24 @@ def budget(
 ) -> Budget:
     """Return the error budget of a thrust [N].
 
-    Random errors are added as squares. What a rotation hides is not random: it is added whole.
+    Random errors are added in quadrature; the effect of a rotation is systematic and is added
+    linearly.
 
-    statistical_ci95: None where it is unknown [N]
-    lateral: the mean F_y that swimming adds [N]
-    rotation: of the sensor's axes, as `visible_rotation` finds it [rad]
+    statistical_ci95: half-width of the statistical interval; None where unknown [N]
+    lateral: mean F_y that swimming adds [N]
+    rotation: rotation of the sensor's axes, from `visible_rotation` [rad]
     """
     gain = calibration.thrust_ci95(thrust, lateral)
     if gain is None:
         return Budget(None, None)
     lost = (math.cos(rotation) - 1.0) * thrust
-    # A drift of F_y is in `lateral`: it must not make up for what the rotation hides.
+    # `lateral` contains the drift of F_y, which must not cancel the effect of the rotation.
     hidden = max(abs(lost), abs(lost + math.sin(rotation) * lateral))
     whole = None if statistical_ci95 is None else math.hypot(statistical_ci95, gain) + hidden
     return Budget(gain + hidden, whole)
 
 
-def spelled(
+def format_with_budget(
     value: float,
     statistical_ci95: float,
     calibration_ci95: float | None,
@@ -69,7 +70,7 @@ def spelled(
 ) -> str:
     """Return a force, or a force for each watt, with its error budget, in thousandths of its unit.
 
-    Where the calibration's part is unknown, the statistical error stands alone, and that is said.
+    Where the part of the calibration is unknown, the text gives the statistical error and says so.
     """
     if calibration_ci95 is None or total_ci95 is None:
         total_ci95 = statistical_ci95
@@ -83,7 +84,7 @@ def spelled(
 
 
 def unknown_calibration(calibration_ci95: float | None, unit: str) -> str:
-    """Return a line on a calibration whose uncertainty is unknown; empty where it is known."""
+    """Return a remark on a calibration of unknown uncertainty; empty where it is known."""
     if calibration_ci95 is not None:
         return ""
     if unit != "N":
@@ -98,7 +99,7 @@ def unknown_calibration(calibration_ci95: float | None, unit: str) -> str:
 
 
 def rotation_remark(rotation: float) -> str:
-    """Return a line on a rotation that no load has shown; empty where none is seen."""
+    """Return a remark on a rotation of the sensor; empty where there is none."""
     if not rotation:
         return ""
     hidden = 1.0 - math.cos(rotation)
@@ -109,20 +110,20 @@ def rotation_remark(rotation: float) -> str:
 
 
 def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLE_TIME_S) -> float:
-    """Return by what angle F_x and F_y are turned into each other while the fish swims [rad].
+    """Return the angle by which F_x and F_y are rotated into each other while the fish swims [rad].
 
     Over whole beats of a symmetric gait the true F_x, at even harmonics, and the true F_y, at odd
-    ones, are not correlated. 0 where the angle is below `MIN_ROTATION_RAD`, or its interval has 0
-    in it.
+    ones, are not correlated. 0 where the angle is below `MIN_ROTATION_RAD`, or its interval
+    contains 0.
 
     settles: time until a swim is steady [s]
     """
     steady = _steady_swims(ticks, settles)
     swims = [np.array([(tick.fx, tick.fy) for tick in swim]) for swim in steady]
-    apart = [swim - swim.mean(axis=0) for swim in swims]
-    if not apart:
+    deviations = [swim - swim.mean(axis=0) for swim in swims]
+    if not deviations:
         return 0.0
-    forces = np.concatenate(apart)
+    forces = np.concatenate(deviations)
     (xx, xy), (_, yy) = forces.T @ forces
     least, most = np.linalg.eigvalsh(forces.T @ forces)
     if most < MIN_ELONGATION * least:
@@ -134,7 +135,7 @@ def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLE_TIME_S)
 
 
 def lateral_force(ticks: Iterable[Tick]) -> float:
-    """Return what swimming adds to the mean of F_y [N]; 0 without a whole beat and a rest."""
+    """Return the mean F_y that swimming adds [N]; 0 without a whole beat and a rest."""
     ticks = list(ticks)
     swimming = [tick.fy for swim in _steady_swims(ticks, SWIM_SETTLE_TIME_S) for tick in swim]
     rests = _settled_phases(ticks, SWIM_SETTLE_TIME_S, swims=False)
@@ -145,18 +146,18 @@ def lateral_force(ticks: Iterable[Tick]) -> float:
 
 
 def _steady_swims(ticks: Iterable[Tick], settles: float) -> list[list[Tick]]:
-    """Return the whole beats of each swim once it is steady."""
+    """Return the ticks of the whole beats of each steady swim."""
     beats = []
     for swim in _settled_phases(ticks, settles, swims=True):
         ups = upward_reversals(tick.phi_c for tick in swim)
         if len(ups) > 1:
-            # A force is that of the window before its tick, an angle that of the one after it.
+            # The force of a tick is the mean over the period before it; its angle applies after it.
             beats.append(swim[ups[0] + 1 : ups[-1] + 1])
     return beats
 
 
 def _settled_phases(ticks: Iterable[Tick], settles: float, *, swims: bool) -> Iterator[list[Tick]]:
-    """Yield each swim, or each rest, once it has settled, without forces not to be trusted."""
+    """Yield the ticks of each settled swim or rest, without suspect forces."""
     for running, group in groupby(ticks, lambda tick: tick.mode == "running"):
         phase = list(group)
         start = phase[0].t + settles

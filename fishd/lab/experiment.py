@@ -1,7 +1,7 @@
-"""The folder of an experiment: a header, a table of rows, recordings, and what it can resume.
+"""The folder of an experiment: a header, a table of rows, recordings, and state for resuming.
 
-sweep, optimise and adapt keep all that they measure in such a folder; a training marks its folder
-with the same header. Each file is written atomically, each row at once.
+sweep, optimise and adapt write all results into such a folder; a training marks its folder with
+the same header. Files are written atomically, and each row as soon as it is known.
 """
 
 import shlex
@@ -26,9 +26,9 @@ from fishd.recording.part_file import PART, SUFFIX
 
 HEADER, ROWS = "experiment.json", "rows.csv"
 MAX_TABLE_BYTES = 256 * 2**20
-"""Size of the longest table [bytes]: 2.6 kB for each of the points that a sweep may have."""
-IRRELEVANT = ("control", "name", "panel", "realtime", "start", "state_folder", "telemetry")
-"""Sections and keys of a configuration that have no part in the thrust."""
+"""Size of the largest table [bytes]: 2.6 kB for each of the points that a sweep may have."""
+IRRELEVANT_KEYS = ("control", "name", "panel", "realtime", "start", "state_folder", "telemetry")
+"""Sections and keys of a configuration that do not affect the thrust."""
 _NOT_COMPARED = ("began", "command", "version")
 
 On = Literal["live", "simulation"]
@@ -36,20 +36,20 @@ T = TypeVar("T", bound=Struct)
 
 
 class Progress(Protocol):
-    """What a person sees of an experiment, as `fishd.cli.progress.Lines` is."""
+    """Display of an experiment's progress, implemented by `fishd.cli.progress.Lines`."""
 
     def done(self, line: str, amount: float) -> None:
-        """Show what was done; amount: how much of the total is done by now."""
+        """Show a finished step; amount: amount of the total that is finished by now."""
 
-    def at(self, amount: float, found: str = "") -> None:
-        """Show how much of the total is done by now, and what was found so far."""
+    def at(self, amount: float, result: str = "") -> None:
+        """Show the amount of the total that is finished by now, and a preliminary result."""
 
     def warn(self, line: str) -> None:
-        """Show a line on standard error."""
+        """Show a warning on standard error."""
 
 
 class Header(Struct, frozen=True, kw_only=True):
-    """What all rows of an experiment have in common; a folder is resumed only with the same."""
+    """The facts that all rows of an experiment share; only an equal header resumes a folder."""
 
     kind: str
     """Verb of the experiment, such as `sweep`."""
@@ -57,17 +57,17 @@ class Header(Struct, frozen=True, kw_only=True):
     config: dict[str, Any] = {}
     """Configuration of the fish, as plain data."""
     settings: dict[str, Any] = {}
-    """What else the rows depend on."""
+    """Further settings on which the rows depend."""
     force_unit: str = "N"
     command: list[str] = []
-    """Arguments of the verb, with which `--resume` begins."""
+    """Arguments of the verb, which `--resume` starts from."""
     began: str = ""
     """Local time of the start, in ISO 8601."""
     version: str = __version__
 
 
 class Experiment:
-    """A folder in which an experiment is kept as it is measured; see `open_experiment`."""
+    """A folder with the results of an experiment, written row by row; see `open_experiment`."""
 
     def __init__(self, path: Path, header: Header) -> None:
         self.path = path
@@ -76,13 +76,13 @@ class Experiment:
 
     @property
     def resume_command(self) -> str:
-        """Return the command line that resumes it."""
+        """Return the command line that resumes the experiment."""
         return shlex.join(["fishctl", *self.header.kind.split(), "--resume", str(self.path)])
 
     def read_rows(self, columns: Sequence[str]) -> list[dict[str, str]]:
-        """Return the rows that are there; a last row that a kill has cut off is dropped.
+        """Return the rows of the table, without a last row that is incomplete after a kill.
 
-        columns: those of each row, in their order; the table is made where there is none
+        columns: columns of the table in order; a missing table is created
         Raises `ConfigError` where the table has other columns, and `FishdError`.
         """
         path, expected = self.path / ROWS, list(columns)
@@ -93,42 +93,44 @@ class Experiment:
             except (FileProblem, ValueError) as problem:
                 raise ConfigError(f"{path}: {problem or 'it is empty'}; {_OTHER_FOLDER}") from None
             if head != expected:
-                raise ConfigError(f"{path}: {_difference(head, expected)}; {_OTHER_FOLDER}")
+                raise ConfigError(
+                    f"{path}: {_describe_difference(head, expected)}; {_OTHER_FOLDER}"
+                )
             rows = [row for row in rows if len(row) == len(head)]
             whole = tables.lines([head, *rows])
             if path.read_bytes() != whole.encode():
                 self.write(ROWS, whole)
-        with self._writing():
+        with self._os_errors_as_fishd_errors():
             self._table = Table(path, expected)
         return [dict(zip(expected, row, strict=True)) for row in rows]
 
     def add_row(self, row: Mapping[str, Any]) -> None:
         """Add a row to the table, numbers in full precision; raises `FishdError`."""
-        with self._writing():
+        with self._os_errors_as_fishd_errors():
             self._table.add(row)
 
     def write_rows(self, rows: Sequence[Mapping[str, str]]) -> None:
         """Replace the rows of the table; raises `FishdError`."""
         columns = self._table.columns
         self.write(
-            ROWS, tables.lines([columns, *([row[each] for each in columns] for row in rows)])
+            ROWS, tables.lines([columns, *([row[column] for column in columns] for row in rows)])
         )
 
     def make_folder(self, name: str) -> Path:
         """Return a folder within that of the experiment; raises `FishdError`."""
-        with self._writing():
+        with self._os_errors_as_fishd_errors():
             (self.path / name).mkdir(exist_ok=True)
         return self.path / name
 
     def write(self, name: str, content: str | bytes) -> None:
         """Write a file of the folder; raises `FishdError`."""
-        with self._writing():
+        with self._os_errors_as_fishd_errors():
             write_atomically(self.path / name, content)
 
     def read_struct(self, name: str, kind: type[T]) -> T | None:
-        """Return what `write_struct` has written; None where it has not.
+        """Return a struct that `write_struct` wrote; None where the file does not exist.
 
-        Raises `ConfigError` where it is something else.
+        Raises `ConfigError` where the file holds something else.
         """
         path = self.path / name
         return _read_struct(path, kind) if path.exists() else None
@@ -138,7 +140,7 @@ class Experiment:
         self.write(name, _as_json(value))
 
     def recording(self, stem: str) -> Path:
-        """Return a free name for a recording; one that was broken off keeps its own."""
+        """Return an unused path for a recording; an incomplete recording keeps its name."""
         number, path = 1, self.path / f"{stem}{SUFFIX}"
         while path.exists() or path.with_name(path.name + PART).exists():
             number += 1
@@ -146,8 +148,8 @@ class Experiment:
         return path
 
     @contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Turn an OSError into `FishdError`."""
+    def _os_errors_as_fishd_errors(self) -> Iterator[None]:
+        """Raise `FishdError` in place of an OSError."""
         try:
             yield
         except OSError as error:
@@ -158,16 +160,17 @@ class Experiment:
 
 
 def default_folder(kind: str) -> Path:
-    """Return a new name in the folder of all runs, from date and time."""
+    """Return a path in the folder of all runs, with date and time in its name."""
     return runs_folder() / f"{kind.split()[-1]}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
 @contextmanager
 def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iterator[Experiment]:
-    """Begin an experiment in a new folder, or resume one; no other process uses it meanwhile.
+    """Start an experiment in a new folder, or resume one; lock the folder while this lasts.
 
-    resume: an experiment with the same header must be there
-    Raises `ConfigError` where the folder is in use, of another experiment, or cannot be made.
+    resume: resume an experiment, whose header must be equal
+    Raises `ConfigError` where the folder is in use, belongs to another experiment, or cannot be
+    created.
     """
     if resume:
         _check_same(path, read_header(path), header)
@@ -177,7 +180,7 @@ def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iter
             experiment = Experiment(path, header)
             if not resume:
                 check_free(path)
-                experiment.write_struct(HEADER, _dated(header))
+                experiment.write_struct(HEADER, _with_start_time(header))
             yield experiment
     except Taken as taken:
         raise ConfigError(f"{path}: another experiment uses it, process {taken.pid}") from None
@@ -186,13 +189,13 @@ def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iter
 
 
 def mark_folder(path: Path, kind: str, on: On) -> None:
-    """Make a new folder with a header, of an experiment that keeps the rest in files of its own.
+    """Create a folder with a header, for an experiment that writes its other files itself.
 
-    Raises `ConfigError` where it is not empty, or cannot be made, and OSError.
+    Raises `ConfigError` where the folder is not empty or cannot be created, and OSError.
     """
     check_free(path)
     _make_folder(path)
-    write_atomically(path / HEADER, _as_json(_dated(Header(kind=kind, on=on))))
+    write_atomically(path / HEADER, _as_json(_with_start_time(Header(kind=kind, on=on))))
 
 
 def _make_folder(path: Path) -> None:
@@ -202,18 +205,18 @@ def _make_folder(path: Path) -> None:
         raise ConfigError(f"{path}: cannot be made a folder: {error.strerror}") from None
 
 
-def _dated(header: Header) -> Header:
-    """Return a header that begins now."""
+def _with_start_time(header: Header) -> Header:
+    """Return the header with the current time as its start."""
     began = datetime.now().astimezone().isoformat(timespec="seconds")
     return msgspec.structs.replace(header, began=began)
 
 
 def check_free(path: Path) -> None:
-    """Raise `ConfigError` where a folder is there and not empty."""
+    """Raise `ConfigError` where a folder exists and is not empty."""
     try:
-        if path.exists() and any(not each.name.endswith(".lock") for each in path.iterdir()):
-            how = f"--resume {path} goes on with it, " if (path / HEADER).exists() else ""
-            raise ConfigError(f"{path}: the folder is not empty; {how}--folder names another")
+        if path.exists() and any(not file.name.endswith(".lock") for file in path.iterdir()):
+            hint = f"--resume {path} goes on with it, " if (path / HEADER).exists() else ""
+            raise ConfigError(f"{path}: the folder is not empty; {hint}--folder names another")
     except OSError as error:
         raise ConfigError(f"{path}: cannot be made a folder: {error.strerror}") from None
 
@@ -227,7 +230,7 @@ def read_header(path: Path) -> Header:
 
 
 def list_experiments(root: Path) -> Iterator[tuple[Path, Header | ConfigError]]:
-    """Yield the experiments of a folder with their headers, or what is wrong with one."""
+    """Yield the experiments of a folder, each with its header or the error of reading it."""
     folders = sorted(root.glob(f"*/{HEADER}"), key=lambda path: path.stat().st_mtime)
     for path in folders:
         try:
@@ -237,7 +240,7 @@ def list_experiments(root: Path) -> Iterator[tuple[Path, Header | ConfigError]]:
 
 
 def count_rows(path: Path) -> int | None:
-    """Return how many rows an experiment has; None where it keeps no table."""
+    """Return the number of rows of an experiment; None where it has no table."""
     try:
         return max(0, len(tables.read(path / ROWS, MAX_TABLE_BYTES)) - 1)
     except FileProblem:
@@ -247,8 +250,8 @@ def count_rows(path: Path) -> int | None:
 _OTHER_FOLDER = "--folder names a new folder"
 
 
-def _difference(head: Sequence[str], columns: Sequence[str]) -> str:
-    """Return why a table with another head is not resumed."""
+def _describe_difference(head: Sequence[str], columns: Sequence[str]) -> str:
+    """Return the difference between the columns of a table and the expected ones."""
     for which, names, others in (("no", columns, head), ("a", head, columns)):
         if missing := [name for name in names if name not in others]:
             return f"the table has {which} column {missing[0]}"
@@ -256,8 +259,8 @@ def _difference(head: Sequence[str], columns: Sequence[str]) -> str:
 
 
 def _check_same(path: Path, before: Header, header: Header) -> None:
-    """Raise `ConfigError` where an experiment with another header began in the folder."""
-    old, new = (_relevant(each) for each in (before, header))
+    """Raise `ConfigError` where the experiment in the folder has another header."""
+    old, new = (_relevant_values(each) for each in (before, header))
     for key in dict.fromkeys([*old, *new]):
         known = (key in old and key in new) or not key.startswith("config.")
         if known and old.get(key) != new.get(key):
@@ -273,21 +276,21 @@ def _check_same(path: Path, before: Header, header: Header) -> None:
         )
 
 
-def _relevant(header: Header) -> dict[str, Any]:
-    """Return what the rows depend on, by dotted keys."""
+def _relevant_values(header: Header) -> dict[str, Any]:
+    """Return the values on which the rows depend, by dotted keys."""
     return {
         key: value
-        for key, value in _leaves(msgspec.to_builtins(header)).items()
+        for key, value in _flatten(msgspec.to_builtins(header)).items()
         if key.partition(".")[0] not in _NOT_COMPARED
-        and key.removeprefix("config.").partition(".")[0] not in IRRELEVANT
+        and key.removeprefix("config.").partition(".")[0] not in IRRELEVANT_KEYS
     }
 
 
-def _leaves(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     leaves: dict[str, Any] = {}
     for key, value in data.items():
         if isinstance(value, Mapping):
-            leaves |= _leaves(value, f"{prefix}{key}.")
+            leaves |= _flatten(value, f"{prefix}{key}.")
         else:
             leaves[prefix + key] = value
     return leaves

@@ -14,35 +14,37 @@ from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 from fishd.lab import error_budget
 from fishd.lab.disturbances import RESPONSE_TIMES_S, Disturbance
-from fishd.lab.drift import LEAST_BLOCKS, Array, Blocks, fit
+from fishd.lab.drift import MIN_FIT_BLOCKS, Array, Blocks, fit
 from fishd.lab.session import Session, refuse_lost
 from fishd.lab.statistics import Z95, per_watt
 
-SWIM, REST = 6.0, 2.75
-"""How long the fish swims and rests in turn, on average [s]."""
-SHORT_SWIM, SHORT_REST = 4.5, 2.25
-"""The shortest of these [s]."""
+MEAN_SWIM_S, MEAN_REST_S = 6.0, 2.75
+"""Mean length of a swim and of a rest [s]."""
+MIN_SWIM_S, MIN_REST_S = 4.5, 2.25
+"""Length of the shortest swim and of the shortest rest [s]."""
 GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
-"""Multiples of the golden ratio, less their whole part, are spread evenly and never recur."""
-UNSTEADY, RESTLESS = 0.05, 0.01
-"""The power of the fin may change by this share in a swim, and be this share of it at rest."""
-LONGEST = 3600.0
-"""The longest measurement [s]."""
-LONGER = "measure again with a longer --settle"
-DISTURBED = "the zero of F_x was disturbed too often for the interval to be trusted; measure again"
-"""What is said of a measurement that may be wrong."""
-MOST_BLOCKS = 200
-"""Beats and pieces of a rest are taken together until there are no more blocks than this."""
-FEW_STEPS = 3
-"""From fewer beat to beat nobody knows how beats differ."""
-UNUSUAL = 20.0
-"""Squares of differences beyond so many times their median do not count: 3 standard deviations."""
-SHORT_BEAT = 0.4
-"""Beats are taken together until they last so long [s]."""
+"""Number whose multiples, taken modulo 1, are spread evenly and never repeat."""
+MAX_POWER_CHANGE, MAX_REST_POWER = 0.05, 0.01
+"""Largest change of the fin's power within a swim, and largest power at rest, as fractions."""
+MAX_MEASUREMENT_S = 3600.0
+"""Length of the longest measurement [s]."""
+SETTLE_REMEDY = "measure again with a longer --settle"
+DISTURBED_REMARK = (
+    "the zero of F_x was disturbed too often for the interval to be trusted; measure again"
+)
+"""Remark on a measurement with as many disturbances as a fit can have."""
+MAX_BLOCKS = 200
+"""Largest number of blocks; with more of them, neighbouring blocks are merged."""
+MIN_STEPS = 3
+"""Smallest number of steps from beat to beat that gives the variance of a beat."""
+MAX_SQUARE_OVER_MEDIAN = 20.0
+"""Largest squared step that counts, over the median square: about 3 standard deviations."""
+MIN_BLOCK_S = 0.4
+"""Length of the shortest block of a swim; shorter beats are merged [s]."""
 
 
 class Sample(NamedTuple):
-    """What a measurement needs to know of a tick."""
+    """The quantities of a tick that a measurement uses."""
 
     seq: int
     """Number of the tick."""
@@ -52,67 +54,67 @@ class Sample(NamedTuple):
     phi_c: float
     """Instruction angle from this tick on [rad]."""
     swims: bool
-    """Is the fish told to swim?"""
+    """True while a controller swims the fish."""
     watts: float = math.nan
-    """Mean electrical power of the servo since the tick before [W]; NaN where it is not known."""
+    """Mean electrical power of the servo since the tick before [W]; NaN where unknown."""
 
 
-class Measured(NamedTuple):
-    """What a controller does on a rig, and what it was found from."""
+class ThrustMeasurement(NamedTuple):
+    """The thrust of a controller on a rig, with the data that it was computed from."""
 
     controller: str
     parameters: Mapping[str, Any]
     thrust: float
-    """[N]"""
+    """Mean thrust while the fish swims [N]."""
     error: float
-    """Half of its 95 % interval [N]."""
+    """Half-width of the 95 % confidence interval of `thrust`, statistical only [N]."""
     frequency: float
     """Tail beats per second; 0 where the tail does not beat [Hz]."""
     power: float
-    """Mean square of `fin_velocity` while it swims, in the square of that quantity's unit."""
+    """Mean square of `fin_velocity` while the fish swims, in the square of that quantity's unit."""
     swims: int
-    """How often it swam."""
+    """Number of swims."""
     blocks: Blocks
-    """The force in blocks; of time since the first tick."""
+    """Means of the force in blocks, with times since the first tick."""
     drift: Array
-    """The force without swimming, block by block [N]."""
+    """Force that each block would have without swimming [N]."""
     ticks: Sequence[Tick]
     """Every tick, in order."""
     unit: str
-    """Of all forces: `N`; that of the sensor where it is not calibrated."""
+    """Unit of all forces: `N`, or that of the sensor where it is not calibrated."""
     remark: str
-    """Why the thrust may be wrong by more than its error; empty where nothing speaks for that."""
+    """Reason why the thrust may be wrong by more than its error; empty where there is none."""
     watts: float | None = None
-    """Electrical power of the servo while it swims [W]; None where it is not known."""
+    """Electrical power of the servo while the fish swims [W]; None where unknown."""
     watts_error: float | None = None
-    """Half of its 95 % interval, by how beats differ [W]."""
+    """Half-width of the 95 % confidence interval of `watts`, from the spread of beats [W]."""
     steps: Sequence["Step"] = ()
-    """How each beat differed from the one before it."""
+    """Differences between neighbouring beats."""
     calibration_ci95: float | None = 0.0
-    """Half-width of the 95 % interval that the calibration of the sensor leaves to the thrust [N].
+    """Half-width of the 95 % interval of the thrust that the calibration alone causes [N].
 
-    None where its uncertainty is unknown.
+    None where the uncertainty of the calibration is unknown.
     """
     total_ci95: float | None = None
-    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
+    """Half-width of the 95 % interval from `error` and `calibration_ci95` together [N]."""
     rotation: float = 0.0
-    """Rotation of the sensor's axes that is left after calibration; 0 where none is seen [rad]."""
+    """Rotation of the sensor's axes that remains after calibration; 0 where none is seen [rad]."""
     lateral: float = 0.0
     """Mean F_y that swimming adds [N]."""
     disturbances: Sequence[Disturbance] = ()
-    """Disturbances of the zero that the fit found and accounted for."""
+    """Disturbances of the zero that the fit contains."""
 
 
 class Step(NamedTuple):
-    """How two neighbouring beats of a swim, or pieces of a rest, differ.
+    """Squared differences between two neighbouring beats of a swim, or pieces of a rest.
 
-    Squares of the differences; their means are the variances of the mean of a second.
+    Their means over many steps are the variances of the mean over one second.
     """
 
     force: float
-    """[N² s]"""
+    """Squared difference of the force [N² s]."""
     watts: float
-    """[W² s]"""
+    """Squared difference of the power [W² s]."""
 
 
 def measure(
@@ -121,28 +123,32 @@ def measure(
     parameters: Mapping[str, Any],
     seconds: float = 60.0,
     settle: float = SWIM_SETTLE_TIME_S,
-) -> Measured:
-    """Swim and rest a controller in turn for `seconds`, and return its thrust.
+) -> ThrustMeasurement:
+    """Swim a controller and rest in turn for `seconds`, and return its thrust.
 
     The rests separate the drift of the sensor: see `fishd.lab.drift`.
-    settle: how long the fin takes until it swims steadily, or hangs still as before [s]
+    settle: time the fin needs to swim steadily, or to hang still again [s]
 
-    Raises `ParameterError` for a time that is too short, `Disturbed` (also where many ticks were
-    lost on their way), and what `Session.swim` raises.
+    Raises `ParameterError` for a time that is too short, `Disturbed` (also where too many ticks
+    were lost on the way from fishd), and the errors of `Session.swim`.
     """
     ticks: list[Tick] = []
     phases = plan(seconds, parameters, settle)
     for swims, length in phases:
         ticks += session.swim(controller, parameters, length) if swims else session.rest(length)
     refuse_lost(ticks, (length for _, length in phases), session.tick)
-    samples = samples_of(ticks)
-    found = evaluate(samples, session.tick, settle, _still(settle))
-    if not found.frequency and len({each.phi_c for each in samples if each.swims}) > 1:
-        raise ParameterError("no whole beat is left of a swim; a longer --settle lengthens swims")
+    samples = to_samples(ticks)
+    measurement = evaluate(samples, session.tick, settle, _rest_settle_time(settle))
+    if not measurement.frequency and len({sample.phi_c for sample in samples if sample.swims}) > 1:
+        raise ParameterError(
+            "no whole beat is left of a swim; lengthen the swims with a longer --settle"
+        )
     rotation = error_budget.visible_rotation(ticks)
     lateral = error_budget.lateral_force(ticks)
-    budget = error_budget.budget(session.calibration, found.thrust, found.error, lateral, rotation)
-    return found._replace(
+    budget = error_budget.budget(
+        session.calibration, measurement.thrust, measurement.error, lateral, rotation
+    )
+    return measurement._replace(
         controller=controller,
         parameters=dict(parameters),
         ticks=ticks,
@@ -153,112 +159,119 @@ def measure(
     )
 
 
-def samples_of(ticks: Iterable[Tick]) -> list[Sample]:
-    """What a measurement needs to know of these.
+def to_samples(ticks: Iterable[Tick]) -> list[Sample]:
+    """Return the samples of a measurement from its ticks.
 
-    One whose force is not to be believed counts as lost, and with it its beat.
+    A tick whose force is suspect counts as lost, and with it its beat.
     """
     return [
         Sample(
-            each.seq,
-            each.fx,
-            each.fin_velocity,
-            each.phi_c,
-            each.mode == "running",
-            math.nan if each.power is UNSET else each.power,
+            tick.seq,
+            tick.fx,
+            tick.fin_velocity,
+            tick.phi_c,
+            tick.mode == "running",
+            math.nan if tick.power is UNSET else tick.power,
         )
-        for each in ticks
-        if each.suspect is UNSET
+        for tick in ticks
+        if tick.suspect is UNSET
     ]
 
 
 class Summary(Struct, frozen=True):
-    """A measurement without what it was found from."""
+    """A measurement without the data that it was computed from."""
 
     controller: str
     parameters: dict[str, Any]
     thrust: float
-    """[N]"""
+    """Mean thrust while the fish swims [N]."""
     error: float
-    """Half of its 95 % interval [N]."""
+    """Half-width of the 95 % confidence interval of `thrust`, statistical only [N]."""
     frequency: float
-    """[Hz]"""
+    """Frequency of the tail beat [Hz]."""
     factor: float
     """Thrust over the mean square of `fin_velocity`."""
     swims: int
     seconds: float
-    """How long it took, rests included [s]."""
+    """Length of the measurement, rests included [s]."""
     force_unit: str
     remark: str
     power: float | None = None
-    """Electrical power of the servo while it swims [W]; null where it is not known."""
+    """Electrical power of the servo while the fish swims [W]; null where unknown."""
     power_error: float | None = None
-    """Half of its 95 % interval [W]."""
+    """Half-width of the 95 % confidence interval of `power` [W]."""
     thrust_per_watt: float | None = None
-    """[N/W]"""
+    """Thrust over electrical power [N/W]."""
     thrust_per_watt_error: float | None = None
-    """Half of its 95 % interval [N/W]."""
+    """Half-width of the 95 % confidence interval of `thrust_per_watt`, statistical only [N/W]."""
     calibration_ci95: float | None = None
-    """Half-width of the 95 % interval that the calibration leaves to the thrust [N].
+    """Half-width of the 95 % interval of the thrust that the calibration alone causes [N].
 
-    null where its uncertainty is unknown.
+    null where the uncertainty of the calibration is unknown.
     """
     total_ci95: float | None = None
-    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
+    """Half-width of the 95 % interval from `error` and `calibration_ci95` together [N]."""
     rotation: float = 0.0
-    """Rotation of the sensor's axes that is left after calibration; 0 where none is seen [rad]."""
+    """Rotation of the sensor's axes that remains after calibration; 0 where none is seen [rad]."""
     thrust_per_watt_total_ci95: float | None = None
-    """As `total_ci95`, of the thrust for each watt [N/W]."""
+    """Half-width of the 95 % interval of `thrust_per_watt`, calibration included [N/W]."""
     disturbances: Sequence[Disturbance] = ()
-    """Disturbances of the zero that the fit found and accounted for."""
+    """Disturbances of the zero that the fit contains."""
 
 
-def summary(found: Measured, tick: float) -> Summary:
-    """What fits in a line, or in JSON; tick: period of the loop [s]."""
-    ratio, ratio_error = per_watt(found.thrust, found.error, found.watts, found.watts_error)
+def summarise(measurement: ThrustMeasurement, tick: float) -> Summary:
+    """Return the summary of a measurement, for output as text or JSON.
+
+    tick: period of the loop [s]
+    """
+    ratio, ratio_error = per_watt(
+        measurement.thrust, measurement.error, measurement.watts, measurement.watts_error
+    )
     return Summary(
-        found.controller,
-        dict(found.parameters),
-        found.thrust,
-        found.error,
-        found.frequency,
-        found.thrust / found.power if found.power else 0.0,
-        found.swims,
-        len(found.ticks) * tick,
-        found.unit,
-        found.remark,
-        found.watts,
-        found.watts_error,
+        measurement.controller,
+        dict(measurement.parameters),
+        measurement.thrust,
+        measurement.error,
+        measurement.frequency,
+        measurement.thrust / measurement.power if measurement.power else 0.0,
+        measurement.swims,
+        len(measurement.ticks) * tick,
+        measurement.unit,
+        measurement.remark,
+        measurement.watts,
+        measurement.watts_error,
         ratio,
         ratio_error,
-        found.calibration_ci95,
-        found.total_ci95,
-        found.rotation,
-        per_watt(found.thrust, found.total_ci95, found.watts, found.watts_error)[1],
-        list(found.disturbances),
+        measurement.calibration_ci95,
+        measurement.total_ci95,
+        measurement.rotation,
+        per_watt(
+            measurement.thrust, measurement.total_ci95, measurement.watts, measurement.watts_error
+        )[1],
+        list(measurement.disturbances),
     )
 
 
 def plan(
     seconds: float, parameters: Mapping[str, Any], settle: float = SWIM_SETTLE_TIME_S
 ) -> list[tuple[bool, float]]:
-    """When to swim (True) and to rest, and for how long each [s]; `seconds` in all.
+    """Return swims (True) and rests (False) in order, with the length of each [s].
 
-    A slow beat makes a swim longer, a long time to settle both.
-    Raises `ParameterError` where two swims do not fit.
+    The lengths add up to `seconds`. A slow beat lengthens swims; a long settling time lengthens
+    both. Raises `ParameterError` where two swims do not fit.
     """
     frequency = parameters.get("frequency")
     slow = 3.0 / frequency if isinstance(frequency, int | float) and frequency > 0.0 else 0.0
-    swim = settle + max(SWIM - SWIM_SETTLE_TIME_S, slow)
-    rest = _still(settle) + REST - REST_SETTLE_TIME_S
-    if not 2 * swim + 3 * rest <= seconds <= LONGEST:  # NaN is not
+    swim = settle + max(MEAN_SWIM_S - SWIM_SETTLE_TIME_S, slow)
+    rest = _rest_settle_time(settle) + MEAN_REST_S - REST_SETTLE_TIME_S
+    if not 2 * swim + 3 * rest <= seconds <= MAX_MEASUREMENT_S:  # NaN is not
         raise ParameterError(
             f"a measurement of {seconds:g} s is not possible: two swims of {swim:.3g} s between "
-            f"three rests of {rest:.3g} s need {2 * swim + 3 * rest:.4g} s, and {LONGEST:g} s are "
-            "the most"
+            f"three rests of {rest:.3g} s need {2 * swim + 3 * rest:.4g} s, and the limit is "
+            f"{MAX_MEASUREMENT_S:g} s"
         )
     count = math.floor((seconds - rest) / (swim + rest) + 1e-9)
-    least = rest - REST + SHORT_REST, settle + max(SHORT_SWIM - SWIM_SETTLE_TIME_S, slow)
+    least = rest - MEAN_REST_S + MIN_REST_S, settle + max(MIN_SWIM_S - SWIM_SETTLE_TIME_S, slow)
     shares = [((GOLDEN_RATIO * (index + 1) / 2) % 1.0) ** 2 for index in range(2 * count + 1)]
     spare = (seconds - count * sum(least) - least[False]) / sum(shares)
     return [
@@ -266,8 +279,11 @@ def plan(
     ]
 
 
-def _still(settle: float) -> float:
-    """When the fin of a fish that takes so long to swim steadily hangs still [s]."""
+def _rest_settle_time(settle: float) -> float:
+    """Return the time after which the fin hangs still in a rest [s].
+
+    settle: time until a swim is steady [s]
+    """
     return REST_SETTLE_TIME_S + max(0.0, settle - SWIM_SETTLE_TIME_S)
 
 
@@ -277,72 +293,81 @@ def evaluate(
     settles: float = SWIM_SETTLE_TIME_S,
     stills: float = REST_SETTLE_TIME_S,
     alike: Sequence[Step] = (),
-) -> Measured:
-    """The thrust of a fish that swam and rested in turn; names no controller, and has no ticks.
+) -> ThrustMeasurement:
+    """Return the thrust of a fish that swam and rested in turn, without controller and ticks.
 
-    A tail that does not beat is judged by pieces of its swims, as of its rests.
+    Where the tail does not beat, swims are cut into pieces, as rests are.
 
     tick: period of the loop [s]
-    settles, stills: when a swim is steady, and a rest is still [s]
-    alike: how beats of other swims on this rig differed; counts where there are few beats here
-    Raises `ParameterError` where there is too little to tell it from a drift.
+    settles, stills: time until a swim is steady, and until a rest is still [s]
+    alike: steps between beats of other swims on this rig, used where there are few beats here
+    Raises `ParameterError` where the samples are too few to separate thrust from drift.
     """
     first = samples[0].seq
-    phases = list(_phases(samples))
+    phases = list(_split_phases(samples))
     kept = [
-        list(_blocks(phase, tick, first, settles if phase[0].swims else stills)) for phase in phases
+        list(_cut_blocks(phase, tick, first, settles if phase[0].swims else stills))
+        for phase in phases
     ]
-    found = [block for blocks in _together(kept) for block in blocks]
-    swimming = [block for block in found if block.swims]
-    if len(found) < LEAST_BLOCKS or len({block.swims for block in found}) < 2:
+    merged_blocks = [block for blocks in _merge_blocks(kept) for block in blocks]
+    swimming = [block for block in merged_blocks if block.swims]
+    if len(merged_blocks) < MIN_FIT_BLOCKS or len({block.swims for block in merged_blocks}) < 2:
         raise ParameterError(
             f"too little is left of {len(samples) * tick:.3g} s to measure a thrust: whole beats "
             "between rests are needed"
         )
-    time, force = np.array([(block.time, block.force) for block in found]).T
-    swims = np.array([block.swims for block in found])
-    lasts = np.array([block.lasts for block in found])
-    apart = [block for blocks in kept for block in blocks]
-    steps, still = list(_steps(apart, True)), list(_steps(apart, False))
-    known = steps if len(steps) >= FEW_STEPS else [*steps, *alike]
-    beats, rests = _spread(known if len(known) >= FEW_STEPS else [*known, *still]), _spread(still)
-    spread = np.where(swims, beats.force, rests.force)
+    time, force = np.array([(block.time, block.force) for block in merged_blocks]).T
+    swims = np.array([block.swims for block in merged_blocks])
+    lasts = np.array([block.lasts for block in merged_blocks])
+    single_blocks = [block for blocks in kept for block in blocks]
+    own_steps, rest_steps = (
+        list(_iter_steps(single_blocks, True)),
+        list(_iter_steps(single_blocks, False)),
+    )
+    swim_steps = own_steps if len(own_steps) >= MIN_STEPS else [*own_steps, *alike]
+    swim_spread, rest_spread = (
+        _mean_step(swim_steps if len(swim_steps) >= MIN_STEPS else [*swim_steps, *rest_steps]),
+        _mean_step(rest_steps),
+    )
+    spread = np.where(swims, swim_spread.force, rest_spread.force)
     blocks = Blocks(
-        time, force, spread / lasts, swims, _responses(phases, time, tick, first, settles)
+        time, force, spread / lasts, swims, _response_columns(phases, time, tick, first, settles)
     )
     result = fit(blocks)
-    lasting = sum(block.lasts for block in swimming)
-    return Measured(
+    swimming_time = sum(block.lasts for block in swimming)
+    return ThrustMeasurement(
         controller="",
         parameters={},
         thrust=result.force,
         error=result.error,
-        frequency=sum(block.beats for block in swimming) / lasting,
-        power=sum(block.power * block.lasts for block in swimming) / lasting,
+        frequency=sum(block.beats for block in swimming) / swimming_time,
+        power=sum(block.power * block.lasts for block in swimming) / swimming_time,
         swims=sum(phase[0].swims for phase in phases),
         blocks=blocks,
         drift=result.drift,
         ticks=[],
         unit="N",
-        remark=_remark(kept) or (DISTURBED if result.is_disturbed else ""),
-        steps=steps,
+        remark=_find_remark(kept) or (DISTURBED_REMARK if result.is_disturbed else ""),
+        steps=own_steps,
         disturbances=result.disturbances,
-        **_watts(swimming, beats.watts),
+        **_mean_power(swimming, swim_spread.watts),
     )
 
 
-def _responses(
+def _response_columns(
     phases: Sequence[Sequence[Sample]], time: Array, tick: float, first: int, settles: float
 ) -> Array:
-    """Return first-order responses to swimming, which begin at 0, at these times; n×k.
+    """Return first-order responses to swimming at these times, n×k; all are 0 at first.
 
-    There is one for each of `RESPONSE_TIMES_S` that is twice as long as a swim takes to settle:
-    faster ones cannot be told from thrust. With a single swim, none can.
+    The columns are for the time constants in `RESPONSE_TIMES_S` of at least twice the settling
+    time: faster responses cannot be separated from thrust. With a single swim, none can.
 
-    first: index that time is counted from
+    first: index of the tick at time 0
     """
     several = sum(phase[0].swims for phase in phases) > 1
-    constants = np.array([each for each in RESPONSE_TIMES_S if several and each >= 2.0 * settles])
+    constants = np.array(
+        [constant for constant in RESPONSE_TIMES_S if several and constant >= 2.0 * settles]
+    )
     begins = [(phase[0].seq - first) * tick for phase in phases]
     responses, level = np.empty((len(time), len(constants))), np.zeros(len(constants))
     for phase, begin, end in zip(phases, begins, [*begins[1:], math.inf], strict=True):
@@ -354,39 +379,40 @@ def _responses(
     return responses
 
 
-def block_of(phase: Sequence[Sample], tick: float, settles: float) -> "Block | None":
-    """The whole beats of one swim, or the pieces of one rest, once it has settled, in one block.
+def average_phase(phase: Sequence[Sample], tick: float, settles: float) -> "Block | None":
+    """Return the whole beats of a settled swim, or the pieces of a settled rest, as one block.
 
     tick: period of the loop [s]
-    settles: when it has [s]
-    None where nothing is left.
+    settles: time until the swim or the rest has settled [s]
+    Returns None where nothing is left.
     """
-    found = list(_blocks(phase, tick, 0, settles))
-    return _joined(found) if found else None
+    blocks = list(_cut_blocks(phase, tick, 0, settles))
+    return _merge(blocks) if blocks else None
 
 
-def _watts(swimming: Sequence["Block"], spread: float) -> dict[str, float]:
-    """The power of these blocks and its error; nothing where it is not known of each.
+def _mean_power(swimming: Sequence["Block"], spread: float) -> dict[str, float]:
+    """Return the mean power of blocks and its error; empty where it is unknown for any of them.
 
-    spread: variance of the power of a second [W² s]
+    spread: variance of the mean power over one second [W² s]
     """
-    lasting = sum(block.lasts for block in swimming)
-    mean = sum(block.watts * block.lasts for block in swimming) / lasting
+    duration = sum(block.lasts for block in swimming)
+    mean = sum(block.watts * block.lasts for block in swimming) / duration
     if not math.isfinite(mean):
         return {}
-    return {"watts": mean, "watts_error": Z95 * math.sqrt(spread / lasting)}
+    return {"watts": mean, "watts_error": Z95 * math.sqrt(spread / duration)}
 
 
-def _together(kept: Sequence[list["Block"]]) -> list[list["Block"]]:
-    """The same in longer blocks, each within its swim or rest, where there are too many."""
-    each = math.ceil(sum(map(len, kept)) / MOST_BLOCKS)
+def _merge_blocks(kept: Sequence[list["Block"]]) -> list[list["Block"]]:
+    """Merge neighbouring blocks of each swim and rest where there are more than `MAX_BLOCKS`."""
+    count = math.ceil(sum(map(len, kept)) / MAX_BLOCKS)
     return [
-        [_joined(blocks[begin : begin + each]) for begin in range(0, len(blocks), each)]
+        [_merge(blocks[begin : begin + count]) for begin in range(0, len(blocks), count)]
         for blocks in kept
     ]
 
 
-def _joined(blocks: Sequence["Block"]) -> "Block":
+def _merge(blocks: Sequence["Block"]) -> "Block":
+    """Return one block in place of several neighbours, with means weighted by length."""
     if len(blocks) == 1:
         return blocks[0]
     lasts = np.array([block.lasts for block in blocks])
@@ -399,19 +425,21 @@ def _joined(blocks: Sequence["Block"]) -> "Block":
     return Block(time, float(lasts.sum()), force, power, beats, blocks[0].swims, watts)
 
 
-def _remark(kept: Sequence[Sequence["Block"]]) -> str:
-    """What speaks against a measurement, of the blocks of each swim and rest."""
+def _find_remark(kept: Sequence[Sequence["Block"]]) -> str:
+    """Return why a measurement may be wrong, from its blocks by swim and rest; else empty."""
     swims = [blocks for blocks in kept if len(blocks) > 1 and blocks[0].swims]
     rests = [block.power for blocks in kept[1:] for block in blocks if not block.swims]
     begins = sum(block.power for blocks in swims for block in blocks[: len(blocks) // 2])
     ends = sum(block.power for blocks in swims for block in blocks[-(len(blocks) // 2) :])
-    if begins and abs(ends / begins - 1.0) > UNSTEADY:
+    if begins and abs(ends / begins - 1.0) > MAX_POWER_CHANGE:
         change = ends / begins - 1.0
-        return f"the fin was not steady: its power changed by {change:+.0%} in a swim; {LONGER}"
+        return (
+            f"the fin was not steady: its power changed by {change:+.0%} in a swim; {SETTLE_REMEDY}"
+        )
     count = sum(len(blocks) // 2 for blocks in swims)
-    if begins and rests and np.mean(rests) > RESTLESS * begins / count:
+    if begins and rests and np.mean(rests) > MAX_REST_POWER * begins / count:
         share = np.mean(rests) * count / begins
-        return f"the fin did not rest: it had {share:.0%} of its power left; {LONGER}"
+        return f"the fin did not rest: it had {share:.0%} of its power left; {SETTLE_REMEDY}"
     return ""
 
 
@@ -419,79 +447,88 @@ class Block(NamedTuple):
     """Some whole beats of a swim, or a piece of a rest."""
 
     time: float
-    """Of its middle [s]."""
+    """Time of the middle [s]."""
     lasts: float
-    """[s]"""
+    """Length [s]."""
     force: float
-    """Mean F_x in it [N]."""
+    """Mean F_x [N]."""
     power: float
     """Mean square of `fin_velocity`, in the square of that quantity's unit."""
     beats: float
+    """Number of tail beats; 0 where the tail does not beat."""
     swims: bool
-    """Did the fish swim? It rested where not."""
+    """True in a swim, False in a rest."""
     watts: float
-    """Mean electrical power of the servo [W]; NaN where it is not known."""
+    """Mean electrical power of the servo [W]; NaN where unknown."""
 
 
-def _phases(samples: Sequence[Sample]) -> Iterator[list[Sample]]:
-    """Each swim and each rest."""
+def _split_phases(samples: Sequence[Sample]) -> Iterator[list[Sample]]:
+    """Yield the samples of each swim and of each rest."""
     for _, phase in groupby(samples, lambda sample: sample.swims):
         yield list(phase)
 
 
-def _blocks(phase: Sequence[Sample], tick: float, first: int, settles: float) -> Iterator[Block]:
-    """Whole beats of a swim, or pieces of a rest, once it has settled.
+def _cut_blocks(
+    phase: Sequence[Sample], tick: float, first: int, settles: float
+) -> Iterator[Block]:
+    """Yield blocks of whole beats of a settled swim, or of pieces of a settled rest.
 
-    first: index that time is counted from
-    settles: when it has [s]
+    first: index of the tick at time 0
+    settles: time until the swim or the rest has settled [s]
     """
     swims = phase[0].swims
     begin = round(settles / tick)
-    ups = upward_reversals(each.phi_c for each in phase) if swims else []
+    ups = upward_reversals(sample.phi_c for sample in phase) if swims else []
     cuts = [up for up in ups if up >= begin]
-    beating = len(cuts) > 1
-    if not beating:
+    beats_found = len(cuts) > 1
+    if not beats_found:
         cuts = list(range(begin, len(phase), max(1, round(PIECE_S / tick))))
-    begun, beats = 0, 0
+    cut_index, beats = 0, 0
     for index in range(1, len(cuts)):
         beats += 1
-        start, end = cuts[begun], cuts[index]
-        if (end - start) * tick < SHORT_BEAT - 1e-9 * tick:
+        start, end = cuts[cut_index], cuts[index]
+        if (end - start) * tick < MIN_BLOCK_S - 1e-9 * tick:
             continue
-        # A force is that of the window before its tick, an angle that of the one after it.
+        # The force of a tick is the mean over the period before it; its angle applies after it.
         window = phase[start + 1 : end + 1]
-        counted, beats, begun = beats, 0, index
-        if phase[end].seq - phase[start].seq != len(window):  # a tick was lost: no whole beats
+        beat_count, beats, cut_index = beats, 0, index
+        if phase[end].seq - phase[start].seq != len(
+            window
+        ):  # a tick was lost: the beats are not whole
             continue
         yield Block(
             time=(0.5 * (phase[start].seq + phase[end].seq) - first) * tick,
             lasts=len(window) * tick,
-            force=sum(each.fx for each in window) / len(window),
-            power=sum(each.fin_velocity**2 for each in window) / len(window),
-            beats=counted if beating else 0,
+            force=sum(sample.fx for sample in window) / len(window),
+            power=sum(sample.fin_velocity**2 for sample in window) / len(window),
+            beats=beat_count if beats_found else 0,
             swims=swims,
-            watts=sum(each.watts for each in window) / len(window),
+            watts=sum(sample.watts for sample in window) / len(window),
         )
 
 
-def _steps(found: Sequence[Block], swims: bool) -> Iterator[Step]:
-    """Between neighbours, so that hardly any drift is in them."""
-    for one, other in pairwise(found):
-        if one.swims == other.swims == swims and other.time - one.time < 2.0 * one.lasts:
-            share = 1.0 / (1.0 / one.lasts + 1.0 / other.lasts)
+def _iter_steps(blocks: Sequence[Block], swims: bool) -> Iterator[Step]:
+    """Yield the differences between neighbouring blocks, which contain hardly any drift."""
+    for block, successor in pairwise(blocks):
+        if (
+            block.swims == successor.swims == swims
+            and successor.time - block.time < 2.0 * block.lasts
+        ):
+            weight = 1.0 / (1.0 / block.lasts + 1.0 / successor.lasts)
             yield Step(
-                (other.force - one.force) ** 2 * share, (other.watts - one.watts) ** 2 * share
+                (successor.force - block.force) ** 2 * weight,
+                (successor.watts - block.watts) ** 2 * weight,
             )
 
 
-def _spread(steps: Sequence[Step]) -> Step:
-    """Their means without those far off; next to nothing where there are none."""
-    force, watts = (map(_usual_mean, zip(*steps, strict=True))) if steps else (0.0, 0.0)
+def _mean_step(steps: Sequence[Step]) -> Step:
+    """Return the means of steps without outliers; tiny values for an empty list."""
+    force, watts = (map(_mean_without_outliers, zip(*steps, strict=True))) if steps else (0.0, 0.0)
     return Step(max(force, 1e-12), max(watts, 1e-12))
 
 
-def _usual_mean(squares: Sequence[float]) -> float:
-    """Return the mean of these, without those that a disturbance of the force has made."""
-    largest = UNUSUAL * float(np.median(squares))
+def _mean_without_outliers(squares: Sequence[float]) -> float:
+    """Return the mean of these squares, without those that a disturbance has enlarged."""
+    largest = MAX_SQUARE_OVER_MEDIAN * float(np.median(squares))
     usual = [square for square in squares if not square > largest]  # NaN stays
     return sum(usual) / len(usual)

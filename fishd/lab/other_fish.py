@@ -1,6 +1,6 @@
-"""Fish that differ from the model as those of real rigs do: one by one, and in all of it at once.
+"""Simulated fish that differ from the model as real rigs do, in one respect or in all of them.
 
-What is to swim a fish that nobody has measured should do well on all of them.
+A controller for an unidentified fish should swim all of them well.
 """
 
 import math
@@ -11,15 +11,17 @@ from typing import NamedTuple
 from fishd.virtual.plant.parameters import PlantParameters
 
 FIRST_SEED = 300
-"""Of the harsh fish; nothing in fishd was trained or chosen with these."""
-HARSH_FISH = 20
+"""Seed of the first harsh fish; nothing in fishd was trained or selected with these fish."""
+HARSH_FISH_COUNT = 20
+"""Number of harsh fish."""
 
 
 class OtherFish(NamedTuple):
-    """A fish, by the keys in which it differs from the configured one."""
+    """A simulated fish, described by its differences from the configured one."""
 
     name: str
     overrides: tuple[str, ...]
+    """Changes of the configuration, as KEY=VALUE."""
 
 
 _MODEL = PlantParameters()
@@ -37,11 +39,11 @@ CHANGES = (
         for times in (3, 10)
     ),
 )
-"""What a real rig does, one at a time."""
+"""Fish with one imperfection of real rigs each."""
 
 
 def harsh(seed: int) -> OtherFish:
-    """A fish and a rig with all of it, in random sizes."""
+    """Return a fish and a rig with all imperfections, of random sizes."""
     uniform = random.Random(seed).uniform
     plant = {
         **_random_fish(uniform),
@@ -62,10 +64,10 @@ def harsh(seed: int) -> OtherFish:
 
 
 def mild(seed: int) -> OtherFish:
-    """Return a random fish on a clean rig: it differs from `harsh` in what the rig adds.
+    """Return a random fish on a clean rig: it differs from `harsh` in the rig.
 
-    The fish have the ranges of `harsh`. The servo delay is 20 ms at most; there is no backlash, no
-    dead zone, no servo reaction, no offset, no drift and no rotation, and the noise is the default.
+    The fish have the ranges of `harsh`. The servo delay is 20 ms at most. Backlash, dead zone,
+    servo reaction, offset, drift and rotation are zero, and the noise is the default.
     """
     uniform = random.Random(seed).uniform
     plant = {**_random_fish(uniform), "servo_delay": uniform(0.0, 0.02)}
@@ -73,8 +75,8 @@ def mild(seed: int) -> OtherFish:
 
 
 def harsh_fish() -> tuple[OtherFish, ...]:
-    """The twenty that policies are judged by."""
-    return tuple(harsh(FIRST_SEED + k) for k in range(HARSH_FISH))
+    """Return the twenty harsh fish on which policies are evaluated."""
+    return tuple(harsh(FIRST_SEED + k) for k in range(HARSH_FISH_COUNT))
 
 
 def _random_fish(uniform: Callable[[float, float], float]) -> dict[str, float]:

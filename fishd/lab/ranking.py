@@ -1,8 +1,8 @@
-"""Which of several gaits is the best one, as far as their intervals tell; for compare and adapt.
+"""Ranking of gaits by thrust with confidence intervals, for compare and adapt.
 
-A gait is excluded where another one thrusts more than it by more than the interval of their
+A gait is excluded where the thrust of another one is larger by more than the half-width of their
 difference. The intervals of all pairs hold together in 95 % of cases (Bonferroni), whichever gait
-is the best one. What is left is undecided, and the simplest gait is chosen from it.
+is the best one. The remaining gaits are undecided, and the simplest of them is chosen.
 """
 
 import math
@@ -12,92 +12,93 @@ from typing import NamedTuple
 from fishd.lab.statistics import quantile, student95
 
 LEVEL = 0.05
-"""Probability with which one of the intervals that belong together may fail."""
+"""Probability that any of the simultaneous intervals fails."""
 EXACT_TOLERANCE = 1e-4
-"""Relative difference up to which two thrusts without an error count as equal."""
+"""Largest relative difference of two exact thrusts that count as equal."""
 _OPEN_LOOP = frozenset(("hold", "square", "sine", "triangle", "excitation"))
 
 
 class Candidate(NamedTuple):
-    """A gait, and what was measured of it."""
+    """A gait with its measured thrust."""
 
     name: str
     thrust: float
-    """[N]"""
+    """Mean thrust [N]."""
     ci95: float
-    """Half-width of its 95 % confidence interval, without calibration; 0 for an exact one [N]."""
+    """Half-width of the 95 % interval of `thrust`, without calibration; 0 for an exact one [N]."""
     complexity: int
-    """The smaller, the simpler: see `complexity`."""
+    """Complexity of the controller: see `complexity`."""
     freedom: float = math.inf
-    """Degrees of freedom of that interval, by Student's t."""
+    """Degrees of freedom of the interval, for Student's t."""
 
 
 class Ranking(NamedTuple):
-    """The gaits that may be the best one, and which of them is chosen."""
+    """The gaits that may be the best one, and the choice among them."""
 
     undecided: tuple[Candidate, ...]
-    """Those that none of the others excludes, simplest first; of equally simple ones, the one that
-    thrusts most."""
+    """Gaits that no other one excludes, the simplest first, then by decreasing thrust."""
 
     @property
     def is_decided(self) -> bool:
-        """Return True where the measurement alone says which one is the best."""
+        """True where only one gait is not excluded."""
         return len(self.undecided) == 1
 
     @property
     def chosen(self) -> Candidate:
-        """The simplest one."""
+        """The simplest of the undecided gaits."""
         return self.undecided[0]
 
     @property
     def reason(self) -> str:
-        """Why that one is chosen, as a clause."""
-        alike = [each for each in self.undecided if each.complexity == self.chosen.complexity]
-        if len(alike) == 1:
+        """Reason for the choice, as a clause."""
+        simplest = [gait for gait in self.undecided if gait.complexity == self.chosen.complexity]
+        if len(simplest) == 1:
             return "it is the simplest"
-        if len(alike) < len(self.undecided):
+        if len(simplest) < len(self.undecided):
             return "it thrusts most of the simplest ones"
         return "all are equally simple, and it thrusts most"
 
 
 def complexity(controller: str) -> int:
-    """Return 0 for a given wave, 1 for a law that looks at the forces, 2 for a policy."""
+    """Return 0 for a given wave, 1 for a law with force feedback, 2 for a policy."""
     if controller in _OPEN_LOOP:
         return 0
     return 2 if controller == "ppo" else 1
 
 
 def rank(candidates: Sequence[Candidate]) -> Ranking:
-    """Return which of these may be the best one."""
+    """Return the ranking of gaits."""
     pairs = len(candidates) * (len(candidates) - 1) // 2
-    widths = [half_width(each, pairs) for each in candidates]
+    widths = [half_width(candidate, pairs) for candidate in candidates]
 
     def apart(i: int, j: int) -> float:
         scale = max(abs(candidates[i].thrust), abs(candidates[j].thrust))
         return max(math.hypot(widths[i], widths[j]), EXACT_TOLERANCE * scale)
 
-    left = not_excluded([each.thrust for each in candidates], apart)
-    return Ranking(in_order(candidates[k] for k in left))
+    indices = not_excluded([candidate.thrust for candidate in candidates], apart)
+    return Ranking(sort_by_simplicity(candidates[k] for k in indices))
 
 
-def in_order(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
-    """Return them simplest first; of equally simple ones, the one that thrusts most first."""
-    return tuple(sorted(candidates, key=lambda each: (each.complexity, -each.thrust)))
+def sort_by_simplicity(candidates: Iterable[Candidate]) -> tuple[Candidate, ...]:
+    """Return the gaits, the simplest first, then by decreasing thrust."""
+    return tuple(
+        sorted(candidates, key=lambda candidate: (candidate.complexity, -candidate.thrust))
+    )
 
 
 def not_excluded(values: Sequence[float], apart: Callable[[int, int], float]) -> list[int]:
-    """Return which values no other one exceeds by more than the interval of their difference.
+    """Return the indices of values that no other one exceeds by more than a half-width.
 
-    apart: half-width of the interval of the difference of two of them
+    apart: function that returns the half-width of the difference of the values of two indices
     """
     places = range(len(values))
     return [i for i in places if all(values[j] - values[i] <= apart(i, j) for j in places)]
 
 
 def half_width(candidate: Candidate, comparisons: int) -> float:
-    """Return the half-width that holds in so many comparisons together, in 95 % of cases [N].
+    """Return the half-width for a number of simultaneous comparisons, at 95 % [N].
 
-    The square root of the sum of squares of two such is a half-width of a difference, also for
+    The root of the sum of squares of two of them is the half-width of the difference, also for
     Student's t (Banerjee, "Approximate confidence interval for linear functions of means of k
     populations", Sankhyā 22 (1960) 357).
     """
@@ -105,7 +106,7 @@ def half_width(candidate: Candidate, comparisons: int) -> float:
 
 
 def widening(comparisons: int, freedom: float = math.inf) -> float:
-    """Return how much wider an interval is that holds in so many comparisons together."""
+    """Return the factor by which simultaneous comparisons widen an interval."""
     return quantile(1.0 - 0.5 * LEVEL / max(1, comparisons), freedom) / student95(freedom)
 
 
@@ -115,7 +116,7 @@ def ratio(
     """Return a ratio of two thrusts with its interval, by Fieller's theorem; None if unbounded.
 
     (Fieller, "Some problems in interval estimation", J. R. Stat. Soc. B 16 (1954) 175.)
-    width, reference_width: half-widths of independent intervals of the wanted level [N]
+    width, reference_width: half-widths of independent intervals of the same level [N]
     """
     if not reference > reference_width:
         return None

@@ -1,9 +1,9 @@
-"""Lets the estimator and a controller decide again, on what was recorded, and compares.
+"""Rerun of the estimator and a controller on a recording, compared with the original run.
 
-The controller sees what it would have seen: the forces of each tick, and the angles that were
-truly applied. So each of its commands answers the recorded past, not its own. It gives the very
-same bits from every start of a controller that is in the recording; one that had begun before,
-or before ticks that are missing, has a past that nobody knows.
+The controller sees the forces of each tick and the angles that were truly applied, so each of its
+commands answers the recorded past, not its own. From a start of a controller that is in the
+recording, the rerun gives the same bits as the original. The past of a controller that started
+earlier, or before ticks that are missing, is unknown.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -28,45 +28,46 @@ from fishd.recording.summary import Tally
 T = TypeVar("T")
 Messages = Iterable[Event | Status | Tick]
 ESTIMATES = ("fy_rate", "fin_velocity", "frequency")
-"""What the estimator adds to a measurement, and ticks tell; their thrust is that of the filter."""
+"""Estimates that ticks contain; their thrust is that of the live filter, not the estimator's."""
 
 
 class Stretch(Struct):
-    """Ticks without a gap in which one controller swam, and how those of the rerun compare."""
+    """Ticks without a gap in which one controller swam, and their comparison with the rerun."""
 
     recorded: str
-    """The controller that swam."""
+    """Name of the controller that swam."""
     parameters: dict[str, Any]
-    """Those at its start."""
+    """Parameters of the recorded controller at the start of the stretch."""
     controller: str
-    """The one that chose again."""
+    """Name of the controller of the rerun."""
     t: float
-    """Time of the first tick that is compared [s, unix]."""
+    """Time of the first compared tick [s, unix]."""
     seq: int
-    """Its number."""
+    """Number of the first compared tick."""
     from_start: bool
-    """Is the start of the controller in the recording? Only then is all its past known."""
+    """True where the recording contains the start of the controller, so that its past is known."""
     ticks: int = 0
+    """Number of compared ticks."""
     equal: int = 0
-    """Ticks in which the angle is the same to the last bit."""
+    """Number of ticks in which the angle is the same to the last bit."""
     largest: float = 0.0
-    """The largest difference of the angle [rad]."""
+    """Largest difference of the angle [rad]."""
     differs_last: int | None = None
-    """Number of the last tick in which it differs."""
+    """Number of the last tick in which the angle differs."""
 
 
 class Estimates(Struct):
-    """How what the estimator says again compares with what it said."""
+    """Comparison of the estimates of the rerun with the recorded ones."""
 
     from_start: bool = True
-    """Did the recording begin with fishd, without a gap? Only then is all its past known."""
+    """True where the recording starts with fishd and has no gap, so that the past is known."""
     ticks: int = 0
     equal: int = 0
-    """Ticks in which all are the same to the last bit."""
+    """Number of ticks in which all estimates are the same to the last bit."""
 
 
 class Rerun(Struct):
-    """The result: one stretch after the other."""
+    """Result of a rerun: stretches in order, and the comparison of the estimates."""
 
     stretches: list[Stretch]
     estimates: Estimates
@@ -78,31 +79,30 @@ def rerun(
     parameters: Mapping[str, Any] | None = None,
     overrides: Iterable[str] = (),
 ) -> Rerun:
-    """Let a controller choose again in every tick in which one swam.
+    """Rerun a controller in every tick of a recording in which a controller swam.
 
-    name: of the controller; None for the one that swam, whichever it was
-    parameters: of it; the others are those that were recorded where it is the one that swam, and
-        else their defaults
-    overrides: KEY=VALUE of the configuration. Where the estimator is another one by them, the
-        controller sees its new estimates; else those that were recorded, which are exact from the
-        first tick on.
+    name: name of the controller; None for the recorded one of each stretch
+    parameters: its parameters; the others are the recorded ones for the recorded controller, and
+        the defaults for another one
+    overrides: KEY=VALUE of the configuration. Where they change the estimator, the controller
+        sees the new estimates; else the recorded ones, which are exact from the first tick on.
 
-    Raises `RecordingError`, and what the controller raises for its parameters.
+    Raises `RecordingError`, and the errors of the controller for its parameters.
     """
     if "remote" in (name, *run.summary.swimming):
         raise RecordingError(
-            f"{run.path}: remote asks a program for its commands, which cannot be asked again"
+            f"{run.path}: 'remote' has no rerun: its commands came from another program"
         )
-    again = _Rerun(run, name, dict(parameters or {}), tuple(overrides))
+    comparison = _Rerun(run, name, dict(parameters or {}), tuple(overrides))
     messages = list(run.messages())
     tally = Tally()
     for index, message in enumerate(messages):
         tally.add(message)
         if isinstance(message, Event):
-            again.event(message)
+            comparison.event(message)
         elif isinstance(message, Tick):
-            again.tick(message, tally.restarts, islice(messages, index, None))
-    return Rerun(again.stretches, again.estimates)
+            comparison.tick(message, tally.restarts, islice(messages, index, None))
+    return Rerun(comparison.stretches, comparison.estimates)
 
 
 class _Rerun:
@@ -114,20 +114,20 @@ class _Rerun:
         self.stretches: list[Stretch] = []
         self.estimates = Estimates()
         self._number = -1
-        """Of the fishd whose ticks are compared."""
+        """Number of the fishd whose ticks are compared."""
         self._last: Tick | None = None
-        self._believed = Measurement(0.0, 0.0, 0.0, 0)
-        """As of the loop."""
+        self._trusted = Measurement(0.0, 0.0, 0.0, 0)
+        """Last trusted measurement, as the control loop keeps it."""
         self._before = 0.0
-        """The angle before that of the last tick [rad]."""
+        """Angle before that of the last tick [rad]."""
         self._started: tuple[str, dict[str, Any]] | None = None
-        """A controller that takes over in the next tick, and its parameters."""
+        """Controller that starts in the next tick, and its parameters."""
         self._retunes: list[dict[str, Any]] = []
-        """Changes of its parameters that came before that tick."""
+        """Changes of its parameters before that tick."""
         self._swims: Controller[Any] | None = None
 
     def event(self, event: Event) -> None:
-        """Take note of what changes from the next tick on."""
+        """Store a change that applies from the next tick on."""
         if event.kind in ("controller", "fallback"):
             self._started = (
                 self._read_data(event, "controller", str),
@@ -151,16 +151,16 @@ class _Rerun:
             self._estimator.forget_zero()
 
     def _read_data(self, event: Event, name: str, kind: type[T]) -> T:
-        """What the data of an event say; raises `RecordingError` where they do not."""
+        """Return a field of the data of an event; raises `RecordingError` where it is missing."""
         value = event.data.get(name)
         if not isinstance(value, kind):
             raise RecordingError(
-                f"{self._run.path}: an event '{text.quoted(event.kind)}' does not say its {name}"
+                f"{self._run.path}: an event '{text.quoted(event.kind)}' has no {name}"
             )
         return value
 
     def tick(self, tick: Tick, number: int, upcoming: Messages) -> None:
-        """Choose again in one tick; number: of its fishd, as the recorder has counted."""
+        """Rerun one tick; number: number of its fishd in the recording."""
         last = self._last
         if number != self._number:
             self._begin_fishd(tick, number)
@@ -172,7 +172,7 @@ class _Rerun:
         whole = last is not None or tick.seq == 1
         applied = last.phi_c if last else 0.0
         dt = (1 + tick.missed - (last.missed if last else 0)) * self._config.tick
-        if not whole:  # how long ago the tick before was, and its angle, are not known
+        if not whole:  # time and angle of the tick before are unknown
             applied, dt = tick.phi_c, self._config.tick
         seen = self._observe(tick, applied, dt)
         if tick.mode != "running":
@@ -185,12 +185,12 @@ class _Rerun:
         self._number = number
         self._swims = None
         self._before = 0.0
-        self._believed = Measurement(0.0, 0.0, 0.0, 0)
+        self._trusted = Measurement(0.0, 0.0, 0.0, 0)
         recorded = self._run.config_of(self._number)
         self._config: Config = adopt(self._run.settings_of(self._number), self._overrides)
-        modelled = self._config.estimator.kind == "observer"
+        uses_plant = self._config.estimator.kind == "observer"
         self._estimates_again = self._config.estimator != recorded.estimator or (
-            modelled and self._config.plant != recorded.plant
+            uses_plant and self._config.plant != recorded.plant
         )
         self._estimator = build_estimator(self._config)
         self.estimates.from_start &= tick.seq == 1
@@ -198,20 +198,20 @@ class _Rerun:
         self._guard = Guard(
             config.amplitude_limit, config.tick, config.slew_limit, config.fade_time
         )
-        about = next(
-            (each for each in self._run.daemons if each.get("number") == str(self._number)), {}
+        description = next(
+            (daemon for daemon in self._run.daemons if daemon.get("number") == str(self._number)),
+            {},
         )
-        if "lowest" in about:
+        if "lowest" in description:
             try:
-                self._guard.restrict(float(about["lowest"]), float(about["highest"]))
+                self._guard.restrict(float(description["lowest"]), float(description["highest"]))
             except (KeyError, ValueError):
                 raise RecordingError(
-                    f"{self._run.path}: the angles that fishd {self._number} permits are not "
-                    "numbers"
+                    f"{self._run.path}: the angle limits of fishd {self._number} are not numbers"
                 ) from None
 
     def _observe(self, tick: Tick, applied: float, dt: float) -> Observation:
-        """What the controller sees in this tick."""
+        """Return the observation of the controller in this tick."""
         measurement = Measurement(
             tick.t - 1e-3 * tick.age_ms,
             tick.fx,
@@ -220,27 +220,27 @@ class _Rerun:
             fin_velocity=tick.fin_velocity,
         )
         if tick.suspect is UNSET:
-            self._believed = replace(measurement, samples=0)
+            self._trusted = replace(measurement, samples=0)
         else:
-            measurement = self._believed
+            measurement = self._trusted
         corrected = tick.fy_corrected is True
         if corrected is not self._estimator.fy_corrected:
             self._estimator.reverse_fy()
-        again = self._estimator.update(measurement, applied, tick.t, dt)
+        estimated = self._estimator.update(measurement, applied, tick.t, dt)
         recorded = {name: getattr(tick, name) for name in ESTIMATES}
         if corrected:
             recorded["fy_rate"] = -tick.fy_rate
         self.estimates.ticks += 1
         self.estimates.equal += all(
-            getattr(again, name) == value for name, value in recorded.items()
+            getattr(estimated, name) == value for name, value in recorded.items()
         )
         if self._estimates_again:
-            return again
+            return estimated
         return replace(
-            again,
+            estimated,
             previous_angle=self._before,
-            thrust_factor=_known(tick.thrust_factor),
-            thrust_factor_error=_known(tick.thrust_factor_error),
+            thrust_factor=_none_if_unset(tick.thrust_factor),
+            thrust_factor_error=_none_if_unset(tick.thrust_factor_error),
             **recorded,
         )
 
@@ -257,7 +257,7 @@ class _Rerun:
             if not known:
                 started = tick.controller, self._parameters_of(tick, upcoming)
             assert started
-            # At its first tick fishd begins as it is configured to; nobody hears it say so.
+            # fishd starts a configured controller in tick 1, before a recorder receives events.
             self._begin(tick, *started, from_start=known or tick.seq == 1)
             for values in self._retunes:
                 self._retune(values)
@@ -276,7 +276,7 @@ class _Rerun:
             stretch.differs_last = tick.seq
 
     def _call(self, tick: Tick, method: Callable[[Observation], T], seen: Observation) -> T:
-        """Call a method of the controller; raises `RecordingError` where that fails."""
+        """Call a method of the controller; raises `RecordingError` where it fails."""
         try:
             return contained(method, seen)
         except Exception as error:
@@ -302,7 +302,7 @@ class _Rerun:
         )
 
     def _retune(self, parameters: dict[str, Any]) -> None:
-        """Change parameters as was recorded; another controller than the recorded one keeps its."""
+        """Apply a recorded change of parameters where the recorded controller runs again."""
         stretch, swims = self.stretches[-1], self._swims
         if swims is not None and stretch.controller == stretch.recorded:
             values = {**parameters, **self._parameters}
@@ -313,7 +313,7 @@ class _Rerun:
             contained(swims.retune, checked)
 
     def _parameters_of(self, tick: Tick, upcoming: Messages) -> dict[str, Any]:
-        """Those of a controller whose start is not in the recording: as the next status says."""
+        """Return the parameters of a controller without a recorded start, from the next status."""
         for message in upcoming:
             if isinstance(message, Status) and message.controller == tick.controller:
                 return message.parameters
@@ -323,5 +323,5 @@ class _Rerun:
         return dict(start.parameters) if start.controller == tick.controller else {}
 
 
-def _known(value: float | UnsetType) -> float | None:
+def _none_if_unset(value: float | UnsetType) -> float | None:
     return None if value is UNSET else value

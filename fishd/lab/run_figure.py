@@ -1,16 +1,16 @@
-"""A picture of a recording: forces, command, thrust, a controller's own, and a phase portrait."""
+"""Figure of a recording: forces, command, thrust, controller quantities, phase portrait."""
 
 import os
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn, plain
+from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, open_figure, plain
 from fishd.lab.run_traces import (
-    LEAST_ANGLE,
-    LEAST_FORCE,
-    LEAST_QUANTITY,
-    PORTRAIT,
+    MIN_ANGLE_SPAN,
+    MIN_FORCE_SPAN,
+    MIN_QUANTITY_SPAN,
+    PORTRAIT_S,
     Traces,
     limits,
 )
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
 
-MOST_LABELS = 12
-"""With more events than this, they are lines without a text."""
+MAX_LABELLED_EVENTS = 12
+"""Largest number of events that have a text; with more, all events are lines only."""
 COLOURS = {"mark": PURPLE, "fault": ORANGE, "fallback": ORANGE}
 
 
-def picture(traces: Traces, path: str | os.PathLike[str]) -> None:
-    """Write the picture; raises `FishdError` where it cannot be, and `MissingPackage`."""
-    traces = _plain(traces)
+def draw_run(traces: Traces, path: str | os.PathLike[str]) -> None:
+    """Write the figure; raises `FishdError` where this fails, and `MissingPackage`."""
+    traces = _escape_texts(traces)
     panels = 3 + len(traces.quantities)
-    with drawn(path, (10.0, 1.9 + 1.45 * panels)) as figure:
+    with open_figure(path, (10.0, 1.9 + 1.45 * panels)) as figure:
         figure.suptitle(traces.title, x=0.01, ha="left", fontsize=10)
         grid = figure.add_gridspec(1, 2 if traces.portrait else 1)
         if traces.portrait:
@@ -40,7 +40,7 @@ def picture(traces: Traces, path: str | os.PathLike[str]) -> None:
         _thrust(axes[2], traces)
         for axis, (name, values) in zip(axes[3:], traces.quantities.items(), strict=True):
             axis.plot(traces.time, values, color=GREEN, linewidth=0.9)
-            axis.set_ylim(*limits(LEAST_QUANTITY, values))
+            axis.set_ylim(*limits(MIN_QUANTITY_SPAN, values))
             axis.set_ylabel(name.replace(" (", "\n("))
         axes[-1].set_xlabel("time (s)")
         first, last = traces.time.min(), traces.time.max()  # the clock may have been set
@@ -49,15 +49,15 @@ def picture(traces: Traces, path: str | os.PathLike[str]) -> None:
             _events(axis, traces, named=axis is axes[0])
         if traces.portrait:
             right = figure.add_subfigure(grid[1])
-            across = right.add_subplot(right.add_gridspec(panels, 1)[:2])
-            _portrait(across, traces, traces.portrait)
+            portrait_axis = right.add_subplot(right.add_gridspec(panels, 1)[:2])
+            _portrait(portrait_axis, traces, traces.portrait)
 
 
 def _forces(axis: "Axes", traces: Traces) -> None:
     axis.axhline(0.0, color="0.85", linewidth=0.6)
     axis.plot(traces.time, traces.fy, color=ORANGE, linewidth=0.7, label="$F_y$")
     axis.plot(traces.time, traces.fx, color=BLUE, linewidth=0.9, label="$F_x$")
-    axis.set_ylim(*limits(LEAST_FORCE, traces.fx, traces.fy))
+    axis.set_ylim(*limits(MIN_FORCE_SPAN, traces.fx, traces.fy))
     axis.set_ylabel(f"force ({traces.unit})")
     _legend(axis)
 
@@ -76,7 +76,7 @@ def _command(axis: "Axes", traces: Traces) -> None:
     if traces.alpha is not None:
         axis.plot(traces.time, traces.alpha, color=GREEN, linewidth=0.9, label="true fin angle α")
     angles = [traces.phi_c] if traces.alpha is None else [traces.phi_c, traces.alpha]
-    axis.set_ylim(*limits(LEAST_ANGLE, *angles))
+    axis.set_ylim(*limits(MIN_ANGLE_SPAN, *angles))
     axis.set_ylabel("angle (rad)")
     _legend(axis)
 
@@ -87,19 +87,21 @@ def _thrust(axis: "Axes", traces: Traces) -> None:
     low, high = traces.thrust - traces.thrust_error, traces.thrust + traces.thrust_error
     if np.isfinite(traces.thrust_error).any():
         axis.fill_between(traces.time, low, high, color=BLUE, alpha=0.2, linewidth=0, label="95 %")
-    axis.set_ylim(*limits(LEAST_FORCE, traces.thrust, low, high))
+    axis.set_ylim(*limits(MIN_FORCE_SPAN, traces.thrust, low, high))
     axis.set_ylabel(f"thrust ({traces.unit})")
-    other = axis.twinx()
-    beat = other.plot(traces.time, traces.frequency, color=GREY, linewidth=0.8, label="tail beat")
-    other.set_ylabel("tail beat (Hz)", color="0.4")
-    other.set_ylim(0.0, max(1.0, limits(1.0, traces.frequency)[1]))
-    other.spines["right"].set_visible(True)
-    _headroom(other)
+    frequency_axis = axis.twinx()
+    beat = frequency_axis.plot(
+        traces.time, traces.frequency, color=GREY, linewidth=0.8, label="tail beat"
+    )
+    frequency_axis.set_ylabel("tail beat (Hz)", color="0.4")
+    frequency_axis.set_ylim(0.0, max(1.0, limits(1.0, traces.frequency)[1]))
+    frequency_axis.spines["right"].set_visible(True)
+    _headroom(frequency_axis)
     _legend(axis, *beat)
 
 
 def _legend(axis: "Axes", *more: "Artist") -> None:
-    """Above the curves; of `more` than this axis has."""
+    """Draw a legend above the curves, with the handles `more` beside those of the axis."""
     _headroom(axis)
     handles = [*axis.get_legend_handles_labels()[0], *more]
     axis.legend(handles=handles, loc="upper right", ncols=3, borderaxespad=0.1)
@@ -111,7 +113,7 @@ def _headroom(axis: "Axes") -> None:
 
 
 def _events(axis: "Axes", traces: Traces, *, named: bool) -> None:
-    labels = named and len(traces.events) <= MOST_LABELS
+    labels = named and len(traces.events) <= MAX_LABELLED_EVENTS
     first, last = axis.get_xlim()
     where = axis.get_xaxis_transform()
     times = [event.time for event in traces.events]
@@ -131,21 +133,21 @@ def _events(axis: "Axes", traces: Traces, *, named: bool) -> None:
 
 def _portrait(axis: "Axes", traces: Traces, part: slice) -> None:
     if traces.alpha is not None and traces.alpha_rate is not None:
-        across, up = traces.alpha, traces.alpha_rate
+        x, y = traces.alpha, traces.alpha_rate
         axis.set_xlabel("true fin angle α (rad)")
         axis.set_ylabel("its rate (rad/s)")
     else:
-        across, up = traces.fin_velocity, traces.fy
+        x, y = traces.fin_velocity, traces.fy
         axis.set_xlabel("fin velocity, as estimated")
         axis.set_ylabel(f"$F_y$ ({traces.unit})")
     axis.axhline(0.0, color="0.85", linewidth=0.6)
     axis.axvline(0.0, color="0.85", linewidth=0.6)
-    axis.plot(across[part], up[part], color=GREEN, linewidth=0.7, marker=".")
-    axis.set_title(f"phase portrait, last {PORTRAIT:g} s")
+    axis.plot(x[part], y[part], color=GREEN, linewidth=0.7, marker=".")
+    axis.set_title(f"phase portrait, last {PORTRAIT_S:g} s")
 
 
-def _plain(traces: Traces) -> Traces:
-    """Return the traces with all their texts such that matplotlib shows them as they are."""
+def _escape_texts(traces: Traces) -> Traces:
+    """Return the traces with texts in which matplotlib finds no mathematics."""
     return traces._replace(
         title=plain(traces.title),
         unit=plain(traces.unit),

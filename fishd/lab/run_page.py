@@ -14,26 +14,26 @@ from fishd.core.errors import RecordingError
 from fishd.core.files import write_atomically
 from fishd.lab.drawing import BLACK, BLUE, GREEN, ORANGE, PURPLE
 from fishd.lab.run_traces import (
-    LEAST_ANGLE,
-    LEAST_FORCE,
-    LEAST_QUANTITY,
-    PORTRAIT,
+    MIN_ANGLE_SPAN,
+    MIN_FORCE_SPAN,
+    MIN_QUANTITY_SPAN,
+    PORTRAIT_S,
     Traces,
     limits,
 )
 
-_PORTRAIT_HEIGHT = 2
-"""Of the phase portrait, in rows of the others."""
+_PORTRAIT_ROWS = 2
+"""Height of the phase portrait, in heights of the other plots."""
 
 
-def page(traces: Traces, path: str | os.PathLike[str]) -> None:
-    """Write the page; raises `RecordingError` where it cannot be."""
-    traces = _escaped(traces)
+def write_page(traces: Traces, path: str | os.PathLike[str]) -> None:
+    """Write the page; raises `RecordingError` where this fails."""
+    traces = _escape_texts(traces)
     titles = ["forces", "command", "thrust", *traces.quantities]
     heights = [1] * len(titles)
     if traces.portrait:
-        titles.append(f"phase portrait, last {PORTRAIT:g} s of swimming")
-        heights.append(_PORTRAIT_HEIGHT)
+        titles.append(f"phase portrait, last {PORTRAIT_S:g} s of swimming")
+        heights.append(_PORTRAIT_ROWS)
     rows = len(titles)
     figure = make_subplots(
         rows=rows,
@@ -42,14 +42,14 @@ def page(traces: Traces, path: str | os.PathLike[str]) -> None:
         vertical_spacing=0.3 / rows,
         subplot_titles=titles,
     )
-    _lines(figure, traces)
+    _add_lines(figure, traces)
     over_time = len(heights) - bool(traces.portrait)
     if traces.portrait:
-        _portrait(figure, traces, traces.portrait, rows)
+        _add_portrait(figure, traces, traces.portrait, rows)
     for row in range(1, over_time + 1):
         figure.update_xaxes(matches="x", row=row, col=1)
     figure.update_xaxes(title_text="time (s)", row=over_time, col=1)
-    # All at once: plotly takes seconds to add as few as twenty one by one.
+    # All at once: plotly takes seconds to add twenty lines one by one.
     lowest = figure.layout[f"yaxis{over_time}"].domain[0]
     lines = [
         {
@@ -68,7 +68,7 @@ def page(traces: Traces, path: str | os.PathLike[str]) -> None:
         }
         for event in traces.events
     ]
-    words = [
+    labels = [
         {
             "x": event.time,
             "y": 1,
@@ -82,7 +82,7 @@ def page(traces: Traces, path: str | os.PathLike[str]) -> None:
     ]
     figure.update_layout(
         shapes=lines,
-        annotations=[*figure.layout.annotations, *words],
+        annotations=[*figure.layout.annotations, *labels],
         title=traces.title,
         height=190 * (1 + sum(heights)),
         template="plotly_white",
@@ -94,7 +94,7 @@ def page(traces: Traces, path: str | os.PathLike[str]) -> None:
         raise RecordingError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
-def _lines(figure: Figure, traces: Traces) -> None:
+def _add_lines(figure: Figure, traces: Traces) -> None:
     def add(row: int, name: str, values: Any, colour: str, **line: Any) -> None:
         figure.add_trace(
             Scattergl(
@@ -120,28 +120,28 @@ def _lines(figure: Figure, traces: Traces) -> None:
         add(3, f"{'−+'[sign > 0]} 95 %", edge, BLUE, dash="dot")
     for row, (name, values) in enumerate(traces.quantities.items(), start=4):
         add(row, name, values, GREEN)
-        figure.update_yaxes(range=limits(LEAST_QUANTITY, values), row=row, col=1)
+        figure.update_yaxes(range=limits(MIN_QUANTITY_SPAN, values), row=row, col=1)
     error = traces.thrust_error
     angles = [traces.phi_c] if traces.alpha is None else [traces.phi_c, traces.alpha]
     ends = (
-        (traces.unit, limits(LEAST_FORCE, traces.fx, traces.fy)),
-        ("rad", limits(LEAST_ANGLE, *angles)),
-        (traces.unit, limits(LEAST_FORCE, *(traces.thrust + k * error for k in (-1, 0, 1)))),
+        (traces.unit, limits(MIN_FORCE_SPAN, traces.fx, traces.fy)),
+        ("rad", limits(MIN_ANGLE_SPAN, *angles)),
+        (traces.unit, limits(MIN_FORCE_SPAN, *(traces.thrust + k * error for k in (-1, 0, 1)))),
     )
     for row, (unit, span) in enumerate(ends, start=1):
         figure.update_yaxes(title_text=unit, range=span, row=row, col=1)
 
 
-def _portrait(figure: Figure, traces: Traces, chosen: slice, row: int) -> None:
+def _add_portrait(figure: Figure, traces: Traces, chosen: slice, row: int) -> None:
     if traces.alpha is not None and traces.alpha_rate is not None:
-        across, up = traces.alpha, traces.alpha_rate
+        x, y = traces.alpha, traces.alpha_rate
         names = "true fin angle α (rad)", "its rate (rad/s)"
     else:
-        across, up = traces.fin_velocity, traces.fy
+        x, y = traces.fin_velocity, traces.fy
         names = "fin velocity, as estimated", f"F_y ({traces.unit})"
     line = Scattergl(
-        x=across[chosen],
-        y=up[chosen],
+        x=x[chosen],
+        y=y[chosen],
         text=[f"{time:.2f} s" for time in traces.time[chosen]],
         mode="lines+markers",
         marker={"size": 3},
@@ -153,11 +153,13 @@ def _portrait(figure: Figure, traces: Traces, chosen: slice, row: int) -> None:
     figure.update_yaxes(title_text=names[1], row=row, col=1)
 
 
-def _escaped(traces: Traces) -> Traces:
-    """Return the traces with all their texts such that plotly, which knows tags, shows them."""
+def _escape_texts(traces: Traces) -> Traces:
+    """Return the traces with texts in which plotly finds no HTML tags."""
     return traces._replace(
         title=escape(text.line(traces.title), quote=False),
         unit=escape(traces.unit, quote=False),
-        quantities={escape(name, quote=False): it for name, it in traces.quantities.items()},
+        quantities={
+            escape(name, quote=False): values for name, values in traces.quantities.items()
+        },
         events=[event._replace(text=escape(event.text, quote=False)) for event in traces.events],
     )

@@ -1,4 +1,4 @@
-"""What the figures of a recording are drawn from: arrays against time, with a break at each gap."""
+"""Data for the figures of a recording: arrays against time, with a break at each gap."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -17,81 +17,82 @@ from fishd.core.schema import format_values
 from fishd.core.signals import Event, Tick
 from fishd.recording import Run
 
-PORTRAIT = 20.0
-"""The phase portrait is of so much swimming, the latest [s]."""
-LEAST_FORCE, LEAST_ANGLE, LEAST_QUANTITY = 1.0, 0.1, 1e-3
-"""No axis spans less, so that numerical dust does not look like a signal [mN or mV, rad, any]."""
-SHOWN = ("mark", "controller", "parameters", "fallback", "fault", "calibration")
+PORTRAIT_S = 20.0
+"""Length of the phase portrait, at the end of the latest swim [s]."""
+MIN_FORCE_SPAN, MIN_ANGLE_SPAN, MIN_QUANTITY_SPAN = 1.0, 0.1, 1e-3
+"""Shortest spans of axes, so that rounding errors do not look like signals [mN or mV, rad, any]."""
+SHOWN_EVENTS = ("mark", "controller", "parameters", "fallback", "fault", "calibration")
 """Kinds of event that a figure shows."""
 
-LONGEST_TEXT = 48
-"""Of an event [characters]."""
-LONGEST_NAME, LONGEST_UNIT = 24, 8
-"""Of a quantity, and of the forces; longer ones leave a panel no room [characters]."""
+MAX_TEXT_CHARS = 48
+"""Length of the longest text of an event [characters]."""
+MAX_NAME_CHARS, MAX_UNIT_CHARS = 24, 8
+"""Length of the longest name of a quantity and unit of a force; panels are small [characters]."""
 MAX_QUANTITIES = 12
-"""Quantities of controllers in one figure; of more, the first are drawn."""
+"""Largest number of controller quantities in one figure; further ones are left out."""
 MAX_EVENTS = 500
-"""Events in one figure; of more, the first are drawn."""
+"""Largest number of events in one figure; further ones are left out."""
 MAX_VALUE = 1e12
-"""Largest number that is drawn; larger ones are refused [N, rad, s, any]."""
+"""Largest value that can be drawn; larger ones are refused [N, rad, s, any]."""
 
 Array = NDArray[np.float64]
 
 
-class Shown(NamedTuple):
+class EventLabel(NamedTuple):
     """An event in a figure."""
 
     time: float
-    """As `Traces.time` [s]."""
+    """Time since the first tick of the recording [s]."""
     kind: str
     text: str
-    """Which controller, which parameters changed to what, or what a mark says."""
+    """Name of the controller with parameters, changed parameters, or text of a mark."""
 
 
 class Traces(NamedTuple):
-    """A part of a recording; NaN where ticks are missing, and where a quantity is not known."""
+    """A part of a recording; NaN where ticks are missing, and where a quantity is unknown."""
 
     title: str
     unit: str
-    """Of forces: mN, or mV until the sensor is calibrated."""
+    """Unit of forces: mN, or mV until the sensor is calibrated."""
     time: Array
-    """Since the first tick of the recording [s]."""
+    """Time since the first tick of the recording [s]."""
     fx: Array
+    """F_x [`unit`]."""
     fy: Array
-    """[`unit`]"""
+    """F_y [`unit`]."""
     phi_c: Array
-    """[rad]"""
+    """Command φ_c [rad]."""
     thrust: Array
-    """As fishd told it, over whole beats [`unit`]."""
+    """Mean thrust over whole beats, as fishd published it [`unit`]."""
     thrust_error: Array
-    """Half of its 95 % interval; NaN while the zero is not known [`unit`]."""
+    """Half-width of the 95 % interval of `thrust`; NaN while the zero is unknown [`unit`]."""
     frequency: Array
-    """[Hz]"""
+    """Frequency of the tail beat [Hz]."""
     fin_velocity: Array
-    """As estimated; its scale is not known."""
+    """Estimated velocity of the fin, in an unknown unit."""
     alpha: Array | None
     alpha_rate: Array | None
-    """True fin angle and its rate, of a simulated fish [rad, rad/s]."""
+    """True fin angle and its rate [rad, rad/s]; None for a real fish."""
     quantities: dict[str, Array]
-    """The controller's own, by name and unit, as in `since_reversal (s)`."""
+    """Quantities of the controller by name and unit, as in `since_reversal (s)`."""
     portrait: slice | None
-    """The samples of the phase portrait; None where no controller swam."""
-    events: list[Shown]
+    """Samples of the phase portrait; None where no controller swam."""
+    events: list[EventLabel]
 
 
 def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
-    """The part from `begin` to `end` [s]; raises `RecordingError` where nothing is in it."""
+    """Return the part from `begin` to `end` [s]; raises `RecordingError` where it is empty."""
     first = run.ticks[0].t if run.ticks else 0.0
     chosen = [tick for tick in run.ticks if begin <= tick.t - first <= end]
     if not chosen:
         length = f"it is {run.summary.duration:.1f} s long"
-        raise RecordingError(f"{run.path}: there is no tick between these times; {length}")
+        raise RecordingError(f"{run.path}: no tick between these times; {length}")
     rows = _with_breaks(chosen)
 
     def column(name: str, value: Callable[[Tick], object] | None = None) -> Array:
         get = value or attrgetter(name)
-        found = (get(row) if isinstance(row, Tick) else math.nan for row in rows)
-        values = np.array([math.nan if v is UNSET else v for v in found], dtype=float)
+        raw_values = (get(row) if isinstance(row, Tick) else math.nan for row in rows)
+        values = np.array([math.nan if v is UNSET else v for v in raw_values], dtype=float)
         return _checked(run, name, values)
 
     def quantity(name: str) -> Array:
@@ -103,18 +104,18 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
     swims = [index for index, row in enumerate(rows) if isinstance(row, Tick) and _swims(row)]
     units = _units({tick.controller for tick in chosen})
     names = dict.fromkeys(name for tick in chosen for name in _quantities(tick))
-    events = [event for event in _shown(run.events, first) if begin <= event.time <= end]
+    events = [event for event in _label_events(run.events, first) if begin <= event.time <= end]
     _checked(run, "the time of an event", np.array([event.time for event in events]))
     left_out = [
-        f"{len(whole) - most} {what} not drawn"
-        for whole, most, what in (
+        f"{len(items) - maximum} {kind} not drawn"
+        for items, maximum, kind in (
             (names, MAX_QUANTITIES, "quantities"), (events, MAX_EVENTS, "events")
         )
-        if len(whole) > most
+        if len(items) > maximum
     ]  # fmt: skip
     return Traces(
         title="; ".join((_title(run), *left_out)),
-        unit=f"m{text.line(run.summary.force_unit, LONGEST_UNIT)}",
+        unit=f"m{text.line(run.summary.force_unit, MAX_UNIT_CHARS)}",
         time=time,
         fx=1e3 * column("fx"),
         fy=1e3 * column("fy"),
@@ -126,7 +127,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         alpha=column("alpha") if simulated else None,
         alpha_rate=column("alpha_rate") if simulated else None,
         quantities={
-            f"{text.line(name, LONGEST_NAME)} ({units.get(name, '1')})": quantity(name)
+            f"{text.line(name, MAX_NAME_CHARS)} ({units.get(name, '1')})": quantity(name)
             for name in list(names)[:MAX_QUANTITIES]
         },
         portrait=_portrait(time, swims),
@@ -135,7 +136,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
 
 
 def limits(least: float, *curves: Array) -> tuple[float, float]:
-    """Ends of an axis with room for these curves, and of a span that is not less than `least`."""
+    """Return the ends of an axis with a margin around curves, and a span of `least` or more."""
     values = np.concatenate(curves)
     values = values[np.isfinite(values)]
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
@@ -144,7 +145,7 @@ def limits(least: float, *curves: Array) -> tuple[float, float]:
 
 
 def _checked(run: Run, name: str, values: Array) -> Array:
-    """The values; raises `RecordingError` where one of them is too large to be drawn."""
+    """Return the values; raises `RecordingError` where one of them is too large to be drawn."""
     if np.any(np.abs(values) > MAX_VALUE):
         raise RecordingError(
             f"{run.path}: {text.quoted(name)} is {np.nanmax(np.abs(values)):.3g} somewhere, which "
@@ -157,22 +158,24 @@ def _portrait(time: Array, swims: list[int]) -> slice | None:
     if not swims:
         return None
     last = swims[-1]
-    return slice(int(np.searchsorted(time, time[last] - PORTRAIT)), last + 1)
+    return slice(int(np.searchsorted(time, time[last] - PORTRAIT_S)), last + 1)
 
 
 def _units(controllers: Iterable[str]) -> dict[str, str]:
-    """Units of the quantities of these controllers, as far as they are installed here."""
+    """Return the units of controller quantities, by name, for the controllers installed here."""
     units: dict[str, str] = {}
     for name in sorted(controllers):
         with suppress(UnknownController):
-            units |= {each.name: each.unit for each in registry.describe(name).quantities}
+            units |= {
+                quantity.name: quantity.unit for quantity in registry.describe(name).quantities
+            }
     return units
 
 
-def _shown(events: Iterable[Event], first: float) -> Iterator[Shown]:
+def _label_events(events: Iterable[Event], first: float) -> Iterator[EventLabel]:
     before: dict[str, Any] = {}
     for event in events:
-        if event.kind not in SHOWN:
+        if event.kind not in SHOWN_EVENTS:
             continue
         words, parameters = event.kind, event.data.get("parameters")
         if isinstance(parameters, dict):
@@ -190,11 +193,11 @@ def _shown(events: Iterable[Event], first: float) -> Iterator[Shown]:
             words = event.message
         elif event.kind == "fault":
             words = f"fault {event.data.get('code', '')}".strip()
-        yield Shown(event.t - first, event.kind, text.line(words, LONGEST_TEXT))
+        yield EventLabel(event.t - first, event.kind, text.line(words, MAX_TEXT_CHARS))
 
 
 def _with_breaks(ticks: list[Tick]) -> list[Tick | float]:
-    """The ticks, and between two that do not follow one another the time of a break."""
+    """Return the ticks, with the time of a break at each gap between two of them."""
     rows: list[Tick | float] = []
     for before, tick in zip((None, *ticks), ticks, strict=False):
         if before is not None and tick.seq != before.seq + 1:

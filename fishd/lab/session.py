@@ -1,4 +1,4 @@
-"""A session of an experiment on one fish: of a running fishd, or in virtual time."""
+"""A session of an experiment on the fish of a running fishd, or on a simulated fish."""
 
 import os
 import time
@@ -95,20 +95,20 @@ class Session(ABC):
 
     def __init__(self) -> None:
         self.used = 0.0
-        """Tank time so far, that of a swim that was broken off included [s]."""
+        """Tank time used by now, that of interrupted swims included [s]."""
         self.progress: Callable[[float], None] = lambda used: None
         """Function that is called with the tank time, tick by tick [s]."""
         self.listener: Publisher | None = None
         """Receiver of each tick and event, in order; an exception of it ends a swim or a rest."""
-        self._passed = self._planned = 0.0
+        self._elapsed = self._planned = 0.0
 
     def __enter__(self) -> Self:
-        """Nothing moves yet."""
+        """Return the session; nothing moves yet."""
         return self
 
     def read_config(self) -> Config:
         """Return the configuration of its loop."""
-        return adopt(deepcopy(self.config))  # which changes what it is given
+        return adopt(deepcopy(self.config))  # adopt modifies its argument
 
     def check_calibrated(self) -> None:
         """Raise `FishdError` where its forces are not in newtons."""
@@ -124,20 +124,20 @@ class Session(ABC):
 
     @abstractmethod
     def describe(self, writer: "RunWriter") -> None:
-        """Write what the ticks are made with into a recording; raises `RecordingError`."""
+        """Write the source and settings of the ticks to a recording; raises `RecordingError`."""
 
     @abstractmethod
     def _swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
-        """Do what `swim` says."""
+        """Implement `swim`."""
 
     @abstractmethod
     def _rest(self, seconds: float) -> list[Tick]:
-        """Do what `rest` says."""
+        """Implement `rest`."""
 
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         """Swim a controller from its start for `seconds`; return the ticks of that time, in order.
 
-        Raises `Refused` for a controller that is not possible, `Disturbed`, and `NoDaemon`.
+        Raises `Refused` for a controller that fishd rejects, `Disturbed`, and `NoDaemon`.
         """
         with self._timed(seconds):
             return self._swim(controller, parameters, seconds)
@@ -156,9 +156,9 @@ class Session(ABC):
     ) -> "Iterator[RunWriter]":
         """Record every tick and event while this lasts.
 
-        Whatever ends it, what was recorded stays; a recording without a tick does not.
+        The recording is kept after an exception too, unless it has no tick.
 
-        path: of the finished file, note, extra: as for `RunWriter`
+        path: path of the finished file; note, extra: see `RunWriter`
         Raises `RecordingError`, also later where a tick cannot be written, and `NoDaemon`.
         """
         from fishd.recording.writer import RunWriter
@@ -173,20 +173,20 @@ class Session(ABC):
 
     @contextmanager
     def _timed(self, seconds: float) -> Iterator[None]:
-        """Add a swim or a rest to the tank time, as far as it came."""
-        self._passed, self._planned = 0.0, seconds
+        """Add a swim or a rest to the tank time; after an exception, only the part that passed."""
+        self._elapsed, self._planned = 0.0, seconds
         try:
             yield
-            self._passed = seconds
+            self._elapsed = seconds
         finally:
-            self.used += self._passed
-            self._passed = 0.0
+            self.used += self._elapsed
+            self._elapsed = 0.0
 
-    def _hand_on(self, message: Tick | Event) -> None:
+    def _publish(self, message: Tick | Event) -> None:
         """Count a tick, and pass a tick or an event to the listener."""
         if isinstance(message, Tick):
-            self._passed = min(self._planned, self._passed + self.tick)
-            self.progress(self.used + self._passed)
+            self._elapsed = min(self._planned, self._elapsed + self.tick)
+            self.progress(self.used + self._elapsed)
             if self.listener:
                 self.listener.tick(message)
         elif self.listener:
@@ -215,7 +215,7 @@ class VirtualSession(Session):
     """A session on a simulated fish in virtual time."""
 
     def __init__(self, config: Config, calibration: ForceCalibration | None = None) -> None:
-        """calibration: that of its force sensor; by default what was saved, else an exact one"""
+        """calibration: of the force sensor; by default the saved one, else an exact one"""
         super().__init__()
         check_tethered(config.robot, "a measurement of thrust")
         self.name = "simulation"
@@ -223,8 +223,8 @@ class VirtualSession(Session):
         self.amplitude = config.amplitude_limit
         self.source: Source = "simulation"
         self.config = msgspec.to_builtins(config)
-        self._heard = _Heard()
-        self._run = VirtualRun(config, self._heard)
+        self._queue = _MessageQueue()
+        self._run = VirtualRun(config, self._queue)
         robot = self._run.loop.robot
         if calibration and robot.tared:
             robot.tared.recalibrate(calibration)
@@ -233,7 +233,7 @@ class VirtualSession(Session):
         self.unit = robot.force_unit
 
     def describe(self, writer: "RunWriter") -> None:
-        """As `Session.describe`."""
+        """Write the configuration and the robot to a recording."""
         writer.describe(self._run.config, self._run.about())
 
     def __exit__(self, *exception: Any) -> None:
@@ -241,18 +241,18 @@ class VirtualSession(Session):
 
     def _swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         self._run.set_controller(controller, parameters)
-        return self._pass(seconds, controller)
+        return self._collect_ticks(seconds, controller)
 
     def _rest(self, seconds: float) -> list[Tick]:
         self._run.loop.stop()
-        return self._pass(seconds, None)
+        return self._collect_ticks(seconds, None)
 
-    def _pass(self, seconds: float, controller: str | None) -> list[Tick]:
+    def _collect_ticks(self, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
         for _ in range(_count(seconds, self.tick)):
             self._run.tick()
-            for message in self._heard.taken():
-                self._hand_on(message)
+            for message in self._queue.take_all():
+                self._publish(message)
                 if isinstance(message, Tick):
                     ticks.append(message)
             loop = self._run.loop
@@ -263,16 +263,16 @@ class VirtualSession(Session):
 class LiveSession(Session):
     """A session on the fish of a running fishd; while it is entered, it holds the lease.
 
-    A few ticks that are lost on their way are missing in what it returns.
+    Ticks that are lost on the way from fishd are missing in the returned lists.
     """
 
     def __init__(self, fish: Fish, experiment: str = "experiment", take: bool = False) -> None:
         """
-        experiment: what the lease is called, as `fishctl status` shows it
-        take: take the fish from an experiment that has it
+        experiment: name of the lease, which `fishctl status` shows
+        take: take the fish from another experiment
 
         Raises `NoDaemon`, `Refused` while another experiment holds the fish, and `ConfigError`
-        where it swims freely.
+        for a free swimmer.
         """
         super().__init__()
         status = fish.status()
@@ -291,44 +291,46 @@ class LiveSession(Session):
         self._messages = fish.ticks_and_events()
         self._pid = status.pid
         self._latest = 0
-        """Number of the latest tick that came."""
+        """Number of the latest received tick."""
         self._lease = fish.lease(experiment, take=take, idle_limit=IDLE_LIMIT)
         self._held: LeaseRenewal
 
     def describe(self, writer: "RunWriter") -> None:
-        """As `Session.describe`; raises `NoDaemon`, too."""
+        """Write the facts about fishd to a recording; raises also `NoDaemon`."""
         from fishd.recording.recorder import description
 
         description(self.fish).write(writer)
 
     def __enter__(self) -> Self:
-        """Raises `Refused` while another experiment holds the fish."""
+        """Take the lease; raises `Refused` while another experiment holds the fish."""
         self._held = self._lease.__enter__()
         return self
 
     def __exit__(self, *exception: Any) -> None:
-        """Give the fish back, at rest; one that was taken by another request swims on."""
+        """Release the lease, with the fish at rest; leave a fish that another client took."""
         self._lease.__exit__(*exception)
 
     def _swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
-        with _disturbed():
+        with _lease_loss_as_disturbed():
             state = self.fish.set_controller(controller, **parameters)
-            return self._pass(state.seq, seconds, controller)
+            return self._collect_ticks(state.seq, seconds, controller)
 
     def _rest(self, seconds: float) -> list[Tick]:
-        with _disturbed():
-            return self._pass(self.fish.stop().seq, seconds, None)
+        with _lease_loss_as_disturbed():
+            return self._collect_ticks(self.fish.stop().seq, seconds, None)
 
-    def _pass(self, first: int, seconds: float, controller: str | None) -> list[Tick]:
+    def _collect_ticks(self, first: int, seconds: float, controller: str | None) -> list[Tick]:
         ticks: list[Tick] = []
         end = first + _count(seconds, self.tick)
         if first <= self._latest:
             raise _restarted()
         for tick in self._messages:
-            self._hand_on(tick)
+            self._publish(tick)
             if not isinstance(tick, Tick):
                 if ticks and controller and tick.kind in ("parameters", "controller"):
-                    self.fish.renew_lease(self._held.token)  # raises why it has ended
+                    self.fish.renew_lease(
+                        self._held.token
+                    )  # raises the reason if the lease has ended
                     raise Disturbed(
                         f"another client changed what swims: {text.line(tick.message)}: this "
                         "measurement is lost"
@@ -337,10 +339,12 @@ class LiveSession(Session):
             self._check_same_fishd(tick)
             if tick.seq < first:
                 continue
-            if not _as_told(tick, controller):
+            if not _is_as_requested(tick, controller):
                 status = self.fish.status()
                 if not (status.reason or status.fallback):
-                    self.fish.renew_lease(self._held.token)  # raises why it has ended
+                    self.fish.renew_lease(
+                        self._held.token
+                    )  # raises the reason if the lease has ended
                 _check(tick, controller, status.reason, status.fallback)
             if tick.seq < end:
                 ticks.append(tick)
@@ -351,18 +355,18 @@ class LiveSession(Session):
         return ticks
 
     def _check_same_fishd(self, tick: Tick) -> None:
-        """Raise `Disturbed` where this tick is of another fishd than the first one."""
+        """Raise `Disturbed` where fishd was restarted before this tick."""
         before, self._latest = self._latest, tick.seq
         if tick.seq <= before:
             raise _restarted()
-        # One that was restarted soon after its start may have got further meanwhile.
+        # A fishd that restarted soon after its start may have passed that tick number meanwhile.
         if before and tick.seq > before + 1 and self.fish.status().pid != self._pid:
             raise _restarted()
 
 
 @contextmanager
-def _disturbed() -> Iterator[None]:
-    """Turn the loss of the lease into `Disturbed`."""
+def _lease_loss_as_disturbed() -> Iterator[None]:
+    """Raise `Disturbed` in place of `LeaseLost`."""
     try:
         yield
     except LeaseLost as error:
@@ -373,8 +377,8 @@ def _restarted() -> Disturbed:
     return Disturbed("fishd was restarted: this measurement is lost")
 
 
-class _Heard:
-    """Keeps ticks and events in their order until they are taken."""
+class _MessageQueue:
+    """A publisher that stores ticks and events in order until they are taken."""
 
     def __init__(self) -> None:
         self._messages: list[Tick | Event] = []
@@ -385,13 +389,14 @@ class _Heard:
     def event(self, event: Event) -> None:
         self._messages.append(event)
 
-    def taken(self) -> list[Tick | Event]:
-        """All of them, once."""
+    def take_all(self) -> list[Tick | Event]:
+        """Return the stored messages and remove them."""
         messages, self._messages = self._messages, []
         return messages
 
 
-def _as_told(tick: Tick, controller: str | None) -> bool:
+def _is_as_requested(tick: Tick, controller: str | None) -> bool:
+    """Return whether a controller swims; for None, whether the fish rests."""
     if controller is None:
         return tick.mode == "idle"
     return (tick.mode, tick.controller) == ("running", controller)
@@ -400,16 +405,16 @@ def _as_told(tick: Tick, controller: str | None) -> bool:
 def _check(
     tick: Tick, controller: str | None, reason: Reason | None, fallback: Reason | None
 ) -> None:
-    """Raises `Disturbed` where the fish does another thing than it was told to.
+    """Raise `Disturbed` where the fish does not do what the experiment requested.
 
-    reason: why it is in mode fault or estop; fallback: why another controller took over
+    reason: reason of mode fault or estop; fallback: reason why another controller took over
     """
-    if _as_told(tick, controller):
+    if _is_as_requested(tick, controller):
         return
-    told = f"told to let {controller} swim" if controller else "told to rest"
+    request = f"told to let {controller} swim" if controller else "told to rest"
     cause = reason or fallback
     why = f" ({cause.message})" if cause else ""
-    does = f"{tick.controller} swims" if tick.mode == "running" else f"it is in mode {tick.mode}"
+    state = f"{tick.controller} swims" if tick.mode == "running" else f"it is in mode {tick.mode}"
     replaced = controller and fallback and tick.mode == "running"
     kind = Replaced if replaced else Disturbed
-    raise kind(f"the fish was {told}, but {does}{why}: this measurement is lost")
+    raise kind(f"the fish was {request}, but {state}{why}: this measurement is lost")

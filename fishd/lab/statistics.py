@@ -1,18 +1,20 @@
-"""Confidence intervals: normal and Student's t quantiles, of a mean, and of a ratio."""
+"""Confidence intervals of a mean and of a ratio; quantiles of Student's t."""
 
 import math
 from collections.abc import Sequence
 from functools import cache
 from statistics import stdev
 
-from fishd.core.calibration import Z95 as Z95  # half-widths of the daemon use the same one
+from fishd.core.calibration import (
+    Z95 as Z95,
+)  # the daemon computes half-widths with the same quantile
 
 
 @cache
 def student95(freedom: float) -> float:
     """Return the half-width of a 95 % interval, in standard errors, by Student's t.
 
-    freedom: degrees of freedom; infinite for a standard error that is known
+    freedom: degrees of freedom; infinite for a known standard error
     """
     return quantile(0.975, freedom)
 
@@ -33,23 +35,23 @@ def mean_ci95(values: Sequence[float]) -> float | None:
 
 
 def weighted_mean(values: Sequence[float], ci95: Sequence[float]) -> tuple[float, float]:
-    """Return the mean of measurements and its half-width; they count by their inverse squares.
+    """Return the mean of measurements, weighted by inverse squared half-widths, and its half-width.
 
-    Where they differ by more than their half-widths say, that of the mean is by Student's t.
+    Where the values scatter by more than their half-widths, the result uses Student's t.
     """
-    weights = [1.0 / each**2 for each in ci95]
-    mean = sum(w * value for w, value in zip(weights, values, strict=True)) / sum(weights)
+    weights = [1.0 / half_width**2 for half_width in ci95]
+    mean = sum(weight * value for weight, value in zip(weights, values, strict=True)) / sum(weights)
     return mean, max(1.0 / math.sqrt(sum(weights)), mean_ci95(values) or 0.0)
 
 
 def per_watt(
     thrust: float, ci95: float | None, watts: float | None, watts_ci95: float | None
 ) -> tuple[float, float] | tuple[None, None]:
-    """Return the ratio of two means and its half-width [N/W], to the first order of the errors.
+    """Return the ratio of two means and its half-width [N/W], to first order in the errors.
 
-    Both are None where the power or a half-width is not known, or the servo takes no power.
+    Both are None where the power or a half-width is unknown, or the power is zero.
 
-    ci95, watts_ci95: half-width of the 95 % interval of each
+    ci95, watts_ci95: half-widths of the 95 % intervals of thrust and power
     """
     if not watts or watts_ci95 is None or ci95 is None:
         return None, None

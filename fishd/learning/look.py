@@ -23,7 +23,7 @@ from fishd.controllers.policy.runtime import Network
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
-from fishd.lab.drawing import BLUE, drawn
+from fishd.lab.drawing import BLUE, open_figure
 from fishd.learning.env.evaluation import judge
 from fishd.learning.env.simulated_link import Camera
 
@@ -150,7 +150,7 @@ def draw(path: str | os.PathLike[str], result: Sensitivity, title: str) -> None:
     Raises as `fishd.lab.drawing.check` does.
     """
     strongest = float(result.sensitivity.max())
-    with drawn(Path(path), (4.4, 3.8)) as figure:
+    with open_figure(Path(path), (4.4, 3.8)) as figure:
         axis = figure.subplots()
         axis.imshow(result.mean, cmap="gray", vmin=0.0, vmax=255.0)
         heat = axis.imshow(

@@ -39,7 +39,7 @@ SAID = {
     ("rerun", "yaml-with-tags"): "tick: a value that is not of the tag 'bool'",
     ("rerun", "yaml-of-bytes"): "not a text in UTF-8",
     ("rerun", "limits-that-are-no-numbers"): "",
-    ("rerun", "events-that-do-not-say-what"): "an event 'controller' does not say its controller",
+    ("rerun", "events-that-do-not-say-what"): "an event 'controller' has no controller",
     ("rerun", "parameters-that-no-controller-has"): "swing",
     ("plot --png", "numbers-that-no-fish-has"): "is 1e+308 somewhere, which cannot be drawn",
 }

@@ -109,7 +109,9 @@ def one(run: tuple[str, int]) -> Outcome:
     truth |= msgspec.structs.asdict(config.simulation)
     # Nearly three whole periods of the drift: its mean is as good as zero.
     intervals = {
-        each.name: Interval(truth[each.name], each.value, each.low, each.high, *each.known)
+        each.name: Interval(
+            truth[each.name], each.value, each.low, each.high, *each.narrowest_interval
+        )
         for each in found.estimates
         if each.fitted
     }

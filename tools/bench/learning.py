@@ -48,7 +48,7 @@ from fishd.config import Config, load
 from fishd.controllers import registry
 from fishd.lab.compare.contestants import best_on_grid, parse
 from fishd.lab.compare.survey import survey
-from fishd.lab.other_fish import CHANGES, FIRST_SEED, HARSH_FISH, harsh_fish, mild
+from fishd.lab.other_fish import CHANGES, FIRST_SEED, HARSH_FISH_COUNT, harsh_fish, mild
 from fishd.lab.other_fish import harsh as harsh_of_seed
 from fishd.lab.simulation import simulate
 from fishd.learning.env.environment import SwimEnv, best_thrust
@@ -230,7 +230,7 @@ def transfer(options: Namespace) -> str:
 def harsh(options: Namespace) -> str:
     """What `fishctl learn evaluate --fish harsh` shows, and mild fish, for three contestants."""
     changes, random = list(CHANGES), list(harsh_fish())
-    clean = [mild(FIRST_SEED + number) for number in range(HARSH_FISH)]
+    clean = [mild(FIRST_SEED + number) for number in range(HARSH_FISH_COUNT)]
     configs = [(fish, load(None, fish.overrides)) for fish in (*changes, *random, *clean)]
     contestants = [parse(text) for text in (SHIPPED, *SWINGS)]
     found = survey(configs, contestants, SECONDS, SETTLE)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fishd.lab.drawing import drawn
+from fishd.lab.drawing import open_figure
 
 _CURVES = (
     ("#0072b2", "-", 2.6),
@@ -34,7 +34,7 @@ def learning_curves(
     Raises `FishdError` where the file cannot be made, and `MissingPackage`.
     """
     steps_shown = max(seeds[0][0][-1] for seeds in curves.values())
-    with drawn(path, (6.4, 3.8)) as figure:
+    with open_figure(path, (6.4, 3.8)) as figure:
         axis = figure.subplots()
         for (color, style, width), (label, seeds) in zip(cycle(_CURVES), curves.items()):
             steps = np.array(seeds[0][0])

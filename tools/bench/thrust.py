@@ -17,7 +17,7 @@ import numpy as np
 from common.report import Options, Report, table
 from fishd.config import Config, load
 from fishd.lab.measurement import measure as measured
-from fishd.lab.measurement import summary
+from fishd.lab.measurement import summarise
 from fishd.lab.other_fish import OtherFish, harsh
 from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import KeepingPublisher, VirtualRun, simulate
@@ -145,7 +145,7 @@ def by_measurement(
 ) -> tuple[float, float] | None:
     """The factor that a minute of `fishctl measure` finds, and half of its interval."""
     with VirtualSession(load(None, overrides)) as rig:
-        found = summary(measured(rig, controller, parameters, 60.0), rig.tick)
+        found = summarise(measured(rig, controller, parameters, 60.0), rig.tick)
     if not found.thrust > 0.0 or not found.factor > 0.0:
         return None
     return found.factor, found.error / found.thrust * found.factor

@@ -104,7 +104,7 @@ def _swum() -> tuple[list[float], ...]:
 def draw() -> None:
     """Command, fin and thrust; lines from the loop, dots from optimal control."""
     loop, control = read(NAME, source="loop"), read(NAME, source="optimal control")
-    with drawing.drawn(FOLDER / f"{NAME}.svg", (6.0, 4.8)) as drawn:
+    with drawing.open_figure(FOLDER / f"{NAME}.svg", (6.0, 4.8)) as drawn:
         panels = drawn.subplots(3, 1, sharex=True)
         shown = (
             ("command_rad", "command $φ_c$ (rad)", BLACK),

@@ -115,7 +115,7 @@ def draw() -> None:
         ("B", "frequency_Hz", "frequency (Hz)", (0.8, 4)),
         ("C", "fin_amplitude_rad", "fin amplitude (rad)", (0.015, 1)),
     )
-    with drawing.drawn(FOLDER / f"{NAME}.svg", (9.6, 3.6)) as figure:
+    with drawing.open_figure(FOLDER / f"{NAME}.svg", (9.6, 3.6)) as figure:
         for axes, (title, name, label, limits) in zip(figure.subplots(1, 3), panels, strict=True):
             axes.axvline(saturation_amplitude(PLANT), color="0.85", lw=0.8)
             for source, style in curves:

@@ -52,7 +52,7 @@ def compute(jobs: int) -> None:
 def draw() -> None:
     """Lines for the fine tick, points for that of the robot."""
     styles = (("-", "s", BLACK), ((0, (5, 2)), "o", BLUE), ((0, (1, 1)), "^", ORANGE))
-    with drawing.drawn(FOLDER / f"{NAME}.svg", (6.0, 3.8)) as figure:
+    with drawing.open_figure(FOLDER / f"{NAME}.svg", (6.0, 3.8)) as figure:
         axes = figure.subplots()
         for wave, (line, marker, colour) in zip(WAVES, styles, strict=True):
             for tick in TICKS:

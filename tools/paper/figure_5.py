@@ -88,7 +88,7 @@ def draw() -> None:
         "v^osD",
         strict=True,
     )
-    with drawing.drawn(FOLDER / f"{NAME}.svg", (7.2, 4.6)) as figure:
+    with drawing.open_figure(FOLDER / f"{NAME}.svg", (7.2, 4.6)) as figure:
         axes = figure.subplots()
         for criterion, colour, line, marker in styles:
             rows = read(NAME, C=criterion)

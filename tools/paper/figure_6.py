@@ -119,7 +119,7 @@ def _row(case: Case, found: SpeedResult) -> Row:
 
 def draw() -> None:
     """Speeds over frequencies on the left, over the size of the cells on the right."""
-    with drawing.drawn(FOLDER / f"{NAME}.svg", (8.4, 3.9)) as figure:
+    with drawing.open_figure(FOLDER / f"{NAME}.svg", (8.4, 3.9)) as figure:
         left, right = figure.subplots(1, 2, sharey=True, width_ratios=(5, 2))
         styles = zip(WAVES, (BLACK, BLUE, ORANGE), "so^", strict=True)
         colours = {}

@@ -96,7 +96,7 @@ def draw() -> None:
     from matplotlib.patches import Rectangle
 
     median = _map("median")
-    with drawing.drawn(FOLDER / f"{NAME}.svg", (8, 6)) as figure:
+    with drawing.open_figure(FOLDER / f"{NAME}.svg", (8, 6)) as figure:
         axes = figure.subplots()
         axes.spines[:].set_visible(False)
         image = axes.pcolormesh(

@@ -18,7 +18,7 @@ from fishd.config import load
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from fishd.lab.compare.survey import Surveyed, Swum
+    from fishd.lab.compare.survey import ContestantSurvey, FishResult
 
 PIPE_COLUMNS = 1000
 """Width of a table in a file or a pipe, so that nothing is wrapped [columns]."""
@@ -94,7 +94,7 @@ def evaluate(
     return 1 if faults else 0
 
 
-def _table(surveys: "list[Surveyed]", singles: int) -> "Table":
+def _table(surveys: "list[ContestantSurvey]", singles: int) -> "Table":
     """Return a table: a row for each of the first `singles` fish, and figures of all others."""
     from rich.table import Table
 
@@ -120,7 +120,7 @@ def _table(surveys: "list[Surveyed]", singles: int) -> "Table":
             *(f"{min(swum.relative_thrust for swum in row):.1%}" for row in harsh_runs),
         )
 
-    def add_figure(name: str, figure: "Callable[[list[Swum]], str]") -> None:
+    def add_figure(name: str, figure: "Callable[[list[FishResult]], str]") -> None:
         table.add_row(name, *(figure(surveyed.fish) for surveyed in surveys))
 
     add_figure("another took over", lambda row: f"{sum(swum.fallback is not None for swum in row)}")

@@ -8,7 +8,7 @@ import click
 from fishd.cli.options import FiniteRange, json_option
 from fishd.cli.output import print_paths
 from fishd.cli.recording.choice import folder_option, open_recording
-from fishd.lab.run_figure import picture
+from fishd.lab.run_figure import draw_run
 from fishd.lab.run_traces import traces
 from fishd.recording.folder import check_new
 
@@ -54,9 +54,9 @@ def plot(
     paths = {form: target / f"{recorded.name}.{form}" for form in forms}
     check_new(paths.values(), replace=force)
     if "png" in paths:
-        picture(drawn, paths["png"])
+        draw_run(drawn, paths["png"])
     if "html" in paths:
-        from fishd.lab.run_page import page
+        from fishd.lab.run_page import write_page
 
-        page(drawn, paths["html"])
+        write_page(drawn, paths["html"])
     print_paths(paths.values(), as_json)

@@ -1,4 +1,4 @@
-"""Policies and controllers on the same fish: who swims best, and how square is the command?"""
+"""Comparison of policies and controllers on the same simulated fish."""
 
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -28,10 +28,10 @@ from fishd.lab.ranking import (
 from fishd.lab.simulation import KeepingPublisher, Report, VirtualRun, check_whole_beat, judge
 from fishd.lab.statistics import mean_ci95
 
-TRACE = 3.0
-"""How much of the end of a run a picture shows [s]."""
-_BEAT = 2.0
-"""How much more is kept, so that there is an upward reversal to begin with [s]."""
+TRACE_S = 3.0
+"""Length of the end of a run that a figure shows [s]."""
+_MARGIN_S = 2.0
+"""Further length that is stored, so that the figure can start at an upward reversal [s]."""
 
 
 class Trace(NamedTuple):
@@ -40,50 +40,50 @@ class Trace(NamedTuple):
     time: list[float]  # s, 0 at the end
     command: list[float]  # φ_c applied from `time` on, rad
     thrust: list[float]  # F_x as measured, mean over the tick before `time`, N
-    fin: list[float]  # true α at `time`, rad; NaN where nobody knows it
+    fin: list[float]  # true α at `time`, rad; NaN where unknown
 
 
 class Standing(Struct, frozen=True, kw_only=True):
-    """How a contestant did: means over its runs."""
+    """Result of a contestant, as means over its runs."""
 
     contestant: str
     controller: str
     parameters: dict[str, Any]
     thrust: float
-    """[N]"""
+    """Mean thrust [N]."""
     error: float | None
-    """Half of its 95 % interval [N]; None for one run in simulation, which has no error."""
+    """Half-width of the 95 % interval of `thrust` [N]; None for a single run in simulation."""
     frequency: float
-    """[Hz]"""
+    """Frequency of the tail beat [Hz]."""
     fullness: float
     """Mean |φ_c|/Φ."""
     squareness: float
     """Mean |φ_c| over the rms of φ_c: square 1, sine 0.900, triangle 0.866."""
     thrusts: list[float]
-    """Of each run [N]."""
+    """Thrust of each run [N]."""
     relative_thrust: float | None = None
-    """Thrust over that of the best square wave, which is known of a simulated fish only."""
+    """Thrust over that of the best square wave; None for a real fish."""
     faults: list[str] = []
-    """Why runs ended in mode fault, if any did."""
+    """Reasons of runs that ended in mode fault."""
     fallbacks: list[str] = []
-    """Why another controller took over in runs, if one did; the figures are those of both."""
+    """Reasons why the fallback took over in runs; the results include its swimming."""
     runs: list[Report] = []
-    """Of a simulated fish."""
+    """Reports of the runs of a simulated fish; empty for a real fish."""
     power: float | None = None
-    """Electrical power of the servo [W]; None where it is not known."""
+    """Electrical power of the servo [W]; None where unknown."""
     thrust_per_watt: float | None = None
-    """[N/W]"""
+    """Thrust over electrical power [N/W]."""
     thrust_per_watt_error: float | None = None
-    """Half of its 95 % interval [N/W]; None for one run in simulation."""
+    """Half-width of the 95 % interval of `thrust_per_watt` [N/W]; None for one simulated run."""
     calibration_ci95: float | None = None
-    """Half-width of the 95 % interval that the calibration leaves to the thrust [N].
+    """Half-width of the 95 % interval of the thrust that the calibration alone causes [N].
 
-    None in simulation, where the thrust is the true one, and where it is unknown.
+    None in simulation, where the thrust is exact, and where it is unknown.
     """
     total_ci95: float | None = None
-    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
+    """Half-width of the 95 % interval from `error` and `calibration_ci95` together [N]."""
     thrust_per_watt_total_ci95: float | None = None
-    """As `total_ci95`, of the thrust for each watt [N/W]."""
+    """Half-width of the 95 % interval of `thrust_per_watt`, calibration included [N/W]."""
 
 
 def compare(
@@ -95,33 +95,33 @@ def compare(
     progress: Callable[[float], None] = lambda seconds: None,
     camera: SimulatedCameraSettings | None = None,
 ) -> tuple[list[Standing], list[Trace]]:
-    """Let each swim the fish of `config`; standings and last traces, in the order given.
+    """Swim the fish of `config` with each contestant; return standings and traces of last runs.
 
-    contestants: texts are parsed: see `parse`
-    runs: each contestant swims so many times, with noise of seed, seed + 1, ...
-    progress: called with the time that has been swum [s]
-    camera: what shows the fish to policies that see it; by default a good one
+    contestants: contestants, or texts for `parse`
+    runs: number of runs of each contestant, with noise of seed, seed + 1, ...
+    progress: called with the time swum by now [s]
+    camera: settings of the camera for policies that see pictures; by default a good one
 
     Raises `ParameterError` (`PolicyError` for a file that is not a policy for this fish) and
-    `UnknownController`, before anything swims; `ParameterError` also where a run has no whole beat.
+    `UnknownController` before the first run, and `ParameterError` for a run without a whole beat.
     """
-    chosen = [parse(one) if isinstance(one, str) else one for one in contestants]
-    for contestant in chosen:
+    parsed = [parse(item) if isinstance(item, str) else item for item in contestants]
+    for contestant in parsed:
         if error := refusal(config, contestant):
             raise error
-    seen = camera or SimulatedCameraSettings()
-    standings, traces, swum = [], [], count(1)
-    for contestant in chosen:
+    camera_settings = camera or SimulatedCameraSettings()
+    standings, traces, run_count = [], [], count(1)
+    for contestant in parsed:
         reports = []
         for run in range(runs):
             noise = replace(config.simulation, seed=config.simulation.seed + run)
             fish = replace(config, simulation=noise)
-            light = replace(seen, seed=seen.seed + run)
-            end = _End(config.tick)
-            report = swim(fish, contestant, seconds, settle, end, light)
+            camera_of_run = replace(camera_settings, seed=camera_settings.seed + run)
+            end = _LatestTicks(config.tick)
+            report = swim(fish, contestant, seconds, settle, end, camera_of_run)
             check_whole_beat(report, seconds, settle)
             reports.append(report)
-            progress(next(swum) * seconds)
+            progress(next(run_count) * seconds)
         standings.append(_standing(contestant.label, reports))
         traces.append(trace(end.ticks))
     return standings, traces
@@ -135,27 +135,27 @@ def swim(
     publisher: Publisher,
     camera: SimulatedCameraSettings,
 ) -> Report:
-    """Let one swim the fish of `config` once, from rest.
+    """Swim the fish of `config` once with a contestant, from rest; return the report.
 
-    publisher: gets each tick
-    camera: what shows the fish to a policy that sees it
+    publisher: receiver of each tick
+    camera: settings of the camera for a policy that sees pictures
 
-    Raises as `compare` does.
+    Raises the errors of `compare`.
     """
     controller = build(contestant, replace(config.limits, virtual=True), camera)
-    watch = controller.watch if isinstance(controller, SeeingController) else _nothing
+    watch = controller.watch if isinstance(controller, SeeingController) else _do_nothing
     fish = replace(config, start=Start())
     return judge(fish, contestant.controller, controller, seconds, settle, publisher, watch)
 
 
-def _nothing(_: VirtualRun) -> None:
-    """No camera is needed."""
+def _do_nothing(_: VirtualRun) -> None:
+    """Do nothing, as no camera is needed."""
 
 
 def trace(ticks: Sequence[Tick]) -> Trace:
-    """As much of the end of these ticks as a picture needs."""
+    """Return the end of a run as a trace for figures."""
     end = ticks[-1].t
-    shown = [tick for tick in ticks if tick.t >= end - TRACE - _BEAT - 1e-6]
+    shown = [tick for tick in ticks if tick.t >= end - TRACE_S - _MARGIN_S - 1e-6]
     return Trace(
         [tick.t - end for tick in shown],
         [tick.phi_c for tick in shown],
@@ -189,34 +189,34 @@ def _standing(label: str, reports: list[Report]) -> Standing:
 
 
 class Verdict(NamedTuple):
-    """Which contestant thrusts most, as far as that is known."""
+    """The contestants of largest thrust, with regard to the intervals."""
 
     sentence: str
     best: tuple[str, ...]
-    """Those that may be the best one, the chosen one first; empty where no interval is known."""
+    """Labels of those that may be the best, the chosen one first; empty without intervals."""
 
 
 def judge_standings(standings: Sequence[Standing], is_random: bool = True) -> Verdict | None:
-    """Return the verdict on contestants; None where there are not two to compare.
+    """Return the verdict on contestants; None for fewer than two.
 
-    One whose run ended in a fault, or that another controller took over from, is left out of it.
+    Contestants with a run that ended in a fault or in a fallback are left out.
 
-    is_random: whether the forces of a simulated rig depend on the seed, as `is_random` of its
-        settings says; a single run without noise is exact
+    is_random: whether the forces of a simulated rig depend on the seed; a single run without
+        noise is exact
     """
-    fair = [each for each in standings if not each.faults and not each.fallbacks]
+    fair = [item for item in standings if not item.faults and not item.fallbacks]
     if len(fair) < 2:
         return None
-    if any(each.error is None and _depends_on_seed(each, is_random) for each in fair):
+    if any(item.error is None and _depends_on_seed(item, is_random) for item in fair):
         return Verdict("none: a single run with noise has no interval; use --runs 5", ())
-    found = [_candidate(each) for each in fair]
-    ranking = rank(found)
-    names = tuple(each.name for each in ranking.undecided)
+    candidates = [_candidate(item) for item in fair]
+    ranking = rank(candidates)
+    names = tuple(item.name for item in ranking.undecided)
     if not ranking.is_decided:
         return Verdict(format_choice(names, names[0], ranking.reason), names)
-    best, following = sorted(found, key=lambda each: -each.thrust)[:2]
-    pairs = len(found) * (len(found) - 1) // 2
-    widths = [half_width(each, pairs) for each in (best, following)]
+    best, following = sorted(candidates, key=lambda item: -item.thrust)[:2]
+    pairs = len(candidates) * (len(candidates) - 1) // 2
+    widths = [half_width(item, pairs) for item in (best, following)]
     share = ratio(best.thrust, widths[0], following.thrust, widths[1])
     if share is None:
         return Verdict(f"{names[0]} wins: no other one has a thrust above zero", names)
@@ -225,7 +225,7 @@ def judge_standings(standings: Sequence[Standing], is_random: bool = True) -> Ve
 
 
 def _depends_on_seed(standing: Standing, is_random: bool) -> bool:
-    """Return True where another run would differ: a given wave swims the same in any noise."""
+    """Return whether another run would differ; a given wave swims the same for any noise."""
     sees = standing.controller == "ppo" and may_see_pictures(standing.parameters.get("policy"))
     return sees or (is_random and complexity(standing.controller) > 0)
 
@@ -242,15 +242,15 @@ def _candidate(standing: Standing) -> Candidate:
     )
 
 
-class _End(KeepingPublisher):
-    """A publisher that keeps the latest ticks."""
+class _LatestTicks(KeepingPublisher):
+    """A publisher that stores the latest ticks."""
 
     def __init__(self, tick: float) -> None:
         super().__init__()
-        self._most = max(2, round((TRACE + _BEAT) / tick) + 1)
+        self._max_ticks = max(2, round((TRACE_S + _MARGIN_S) / tick) + 1)
 
     def tick(self, tick: Tick) -> None:
-        """Keep it; forget the oldest from time to time."""
+        """Store a tick, and drop the oldest from time to time."""
         super().tick(tick)
-        if len(self.ticks) > 2 * self._most:
-            del self.ticks[: -self._most]
+        if len(self.ticks) > 2 * self._max_ticks:
+            del self.ticks[: -self._max_ticks]

@@ -1,4 +1,4 @@
-"""Who takes part in a comparison: controllers with parameters, and policies."""
+"""The contestants of a comparison: controllers with parameters, and policies."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,12 +17,12 @@ from fishd.core.schema import names_file, nearest
 from fishd.lab.compare.seeing import SeeingController, sees_pictures
 from fishd.virtual.plant.optimum import SteadyState, square_wave
 
-_GRID_HZ = (0.2, 10.0)
-"""Whole-tick square waves are sought between these frequencies."""
+_FREQUENCY_RANGE_HZ = (0.2, 10.0)
+"""Range of the search for the best square wave on the grid of ticks [Hz]."""
 
 
 class Contestant(NamedTuple):
-    """A controller with its parameters, and what people call it."""
+    """A controller with its parameters, and its label in results."""
 
     label: str
     controller: str
@@ -30,22 +30,22 @@ class Contestant(NamedTuple):
 
 
 def parse(text: str) -> Contestant:
-    """`swing:C=0.6`, `square:frequency=1.7,amplitude=0.3`, the name of a policy, a policy file.
+    """Return the contestant for a text, as in `swing:C=0.6` or `square:frequency=2,amplitude=0.3`.
 
-    Raises `ParameterError`.
+    The text may also be the name of a policy or a policy file. Raises `ParameterError`.
     """
     name = text.partition(":")[0]
     if name == "remote":
         raise ParameterError(
-            "remote: its agent is another program, which can swim a fishd but not be compared here"
+            "remote: its agent is another program; compare policies or other controllers"
         )
     if name not in registry.names():
         if not (names_file(text, library.SUFFIX) or text in library.names()):
             if run := library.of_run(Path(text)):
                 raise ParameterError(f"{text} {run}")
-            able = [known for known in registry.names() if known != "remote"]
+            comparable = [controller for controller in registry.names() if controller != "remote"]
             files = [f"{text}{library.SUFFIX}"] if Path(f"{text}{library.SUFFIX}").is_file() else []
-            hint = nearest(name, files or [*able, *library.names()])
+            hint = nearest(name, files or [*comparable, *library.names()])
             raise ParameterError(
                 f"'{name}' is not a controller, named policy or {library.SUFFIX} file; {hint}"
             )
@@ -60,16 +60,16 @@ def parse(text: str) -> Contestant:
 
 
 def absolute(contestant: Contestant) -> Contestant:
-    """The same, whose policy file is found from any folder: that of a fishd may be another."""
+    """Return the contestant with an absolute path of its policy file, for a fishd elsewhere."""
     policy = contestant.parameters.get("policy")
     if not (isinstance(policy, str) and names_file(policy, library.SUFFIX)):
         return contestant
-    found = {**contestant.parameters, "policy": str(files.expanded(policy).absolute())}
-    return contestant._replace(parameters=found)
+    parameters = {**contestant.parameters, "policy": str(files.expanded(policy).absolute())}
+    return contestant._replace(parameters=parameters)
 
 
 def is_missing(contestant: Contestant) -> bool:
-    """Is it a path at which this machine has no file, such as a misspelt one or a run folder?"""
+    """Return whether the policy is a path at which this machine has no file."""
     policy = contestant.parameters.get("policy")
     if not (isinstance(policy, str) and names_file(policy, library.SUFFIX)):
         return False
@@ -77,11 +77,11 @@ def is_missing(contestant: Contestant) -> bool:
 
 
 def best_on_grid(config: Config) -> SteadyState:
-    """The best square wave whose half periods are whole ticks.
+    """Return the best square wave whose half periods are whole ticks.
 
-    No waveform in a loop does better, but for waves that alternate between two half periods.
+    Only waves that alternate between two half periods can be better in a loop.
     """
-    lowest, highest = _GRID_HZ
+    lowest, highest = _FREQUENCY_RANGE_HZ
     fewest = max(1, round(0.5 / highest / config.tick))
     most = max(fewest, round(0.5 / lowest / config.tick))
     waves = (
@@ -92,21 +92,21 @@ def best_on_grid(config: Config) -> SteadyState:
 
 
 def default_contestants(config: Config) -> list[Contestant]:
-    """The best square wave on the grid of ticks, `swing`, and the named policies that fit."""
+    """Return the best square wave on the grid of ticks, `swing`, and the fitting named policies."""
     best = best_on_grid(config).frequency
-    found = [
+    contestants = [
         Contestant(f"square {best:.3f} Hz", "square", {"frequency": best}),
         Contestant("swing", "swing", {}),
     ]
     policies = (Contestant(name, "ppo", {"policy": name}) for name in library.names())
-    found += [policy for policy in policies if not refusal(config, policy)]
-    return found
+    contestants += [policy for policy in policies if not refusal(config, policy)]
+    return contestants
 
 
 def build(
     contestant: Contestant, limits: Limits, camera: SimulatedCameraSettings
 ) -> Controller[Any]:
-    """Its controller; of a policy that sees, one that a camera is to be put above its fish for.
+    """Return the controller; for a policy that sees pictures, one that needs a camera.
 
     Raises `ParameterError`, `PolicyError` and `UnknownController`.
     """
@@ -117,7 +117,7 @@ def build(
 
 
 def refusal(config: Config, contestant: Contestant) -> FishdError | None:
-    """Why one cannot swim the fish of `config`, such as a policy for another amplitude, or None."""
+    """Return the error for a contestant that cannot swim the fish of `config`, else None."""
     limits = replace(config.limits, virtual=True)
     try:
         build(contestant, limits, SimulatedCameraSettings()).close()

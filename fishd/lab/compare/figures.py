@@ -1,4 +1,4 @@
-"""Pictures of a comparison: command, fin, force and result of each contestant."""
+"""Figure of a comparison: command, fin, force and result of each contestant."""
 
 import math
 import os
@@ -9,13 +9,14 @@ import numpy as np
 
 from fishd.core import text
 from fishd.core.beats import upward_reversals
-from fishd.lab.compare.comparison import TRACE, Standing, Trace
-from fishd.lab.drawing import BLACK, BLUE, ORANGE, drawn, plain
+from fishd.lab.compare.comparison import TRACE_S, Standing, Trace
+from fishd.lab.drawing import BLACK, BLUE, ORANGE, open_figure, plain
 
-_SPREAD = "0.2"
+_WHISKER_GREY = "0.2"
 _FORCES = ("$F_x$, drift subtracted", "$F_x$ as measured")
+"""Labels of the force, for a real fish and for a simulated one."""
 _THRUSTS = ("thrust, measured", "true mean $F_x$")
-"""What is drawn of a live fish, and of a simulated one."""
+"""Labels of the mean force, for a real fish and for a simulated one."""
 
 
 def draw(
@@ -25,57 +26,59 @@ def draw(
     amplitude: float,
     unit: str = "N",
 ) -> None:
-    """Command, fin and force at the end of each contestant's run, and a bar of its result.
+    """Draw command, fin and force at the end of each contestant's run, and a bar of its result.
 
-    That is its relative thrust, or, of a fish that could only be measured, its thrust.
-    amplitude: Φ [rad]; unit: of the forces
-    Raises `FishdError` where the file cannot be made, and `MissingPackage`.
+    The bar shows the relative thrust for a simulated fish, and the thrust for a real one.
+    amplitude: Φ [rad]; unit: unit of forces
+    Raises `FishdError` where the file cannot be written, and `MissingPackage`.
     """
     unit = plain(unit)
     rows = len(standings)
     simulated = all(standing.runs for standing in standings)
-    most = max(standing.thrust + (standing.error or 0.0) for standing in standings)
-    with drawn(path, (7.6, 0.7 + 1.25 * rows)) as figure:
+    largest = max(standing.thrust + (standing.error or 0.0) for standing in standings)
+    with open_figure(path, (7.6, 0.7 + 1.25 * rows)) as figure:
         axes = figure.subplots(rows, 3, squeeze=False, width_ratios=(3, 3, 1.8))
         forces = [1e3 * force for trace in traces for force in trace.thrust]
         limits = min(0.0, *forces) - 4.0, 1.15 * max(0.0, *forces) + 1.0
         axes[0][1].set_title("force", fontweight="normal")
         axes[0][2].set_title("relative thrust" if simulated else "thrust", fontweight="normal")
-        for (left, middle, right), standing, trace in zip(axes, standings, traces, strict=True):
+        for (angle_axis, force_axis, bar_axis), standing, trace in zip(
+            axes, standings, traces, strict=True
+        ):
             shown = _from_upward_reversal(trace)
-            left.set_title(plain(standing.contestant))
-            _draw_angles(left, shown, amplitude)
-            _draw_force(middle, standing, shown, limits, unit)
+            angle_axis.set_title(plain(standing.contestant))
+            _draw_angles(angle_axis, shown, amplitude)
+            _draw_force(force_axis, standing, shown, limits, unit)
             if simulated:
-                _draw_relative_thrust(right, standing)
+                _draw_relative_thrust(bar_axis, standing)
             else:
-                _draw_thrust(right, standing, most)
-            _describe(right, standing, unit)
+                _draw_thrust(bar_axis, standing, largest)
+            _describe(bar_axis, standing, unit)
         for axis in axes[:-1].flat:
             axis.tick_params(labelbottom=False)
         for axis in axes[-1][:2]:
             axis.set_xlabel("time (s)")
-        what = "% of the best\nsquare wave" if simulated else f"m{unit}"
-        axes[-1][2].set_xlabel(what)
-        named = [axis.get_legend_handles_labels() for axis in axes[0]]
-        handles, labels = ([one for pair in named for one in pair[k]] for k in (0, 1))
+        label = "% of the best\nsquare wave" if simulated else f"m{unit}"
+        axes[-1][2].set_xlabel(label)
+        legends = [axis.get_legend_handles_labels() for axis in axes[0]]
+        handles, labels = ([item for pair in legends for item in pair[k]] for k in (0, 1))
         figure.legend(handles, labels, loc="outside lower left", ncols=3)
 
 
 def _from_upward_reversal(trace: Trace) -> Trace:
-    """`TRACE` seconds of it, from where the command turns upward: contestants can be compared."""
+    """Return `TRACE_S` seconds from an upward reversal of the command on, for comparison."""
     turns = upward_reversals(trace.command)
-    earliest = trace.time[0] + max(0.0, -trace.time[0] - TRACE)
+    earliest = trace.time[0] + max(0.0, -trace.time[0] - TRACE_S)
     first = next((k for k in turns if trace.time[k] <= earliest + 1e-9), 0)
     begin = trace.time[first]
-    last = max(k for k, time in enumerate(trace.time) if time <= begin + TRACE + 1e-9)
+    last = max(k for k, time in enumerate(trace.time) if time <= begin + TRACE_S + 1e-9)
     chosen = slice(first, last + 1)
     times = [time - begin for time in trace.time[chosen]]
     return Trace(times, trace.command[chosen], trace.thrust[chosen], trace.fin[chosen])
 
 
 def _draw_angles(axis: Any, trace: Trace, amplitude: float) -> None:
-    # Not as a step plot: it would turn to the command after the last time shown.
+    # Not as a step plot, which would show the command after the last time.
     line = {"color": BLACK, "linewidth": 0.9, "label": "command $φ_c$"}
     axis.stairs(trace.command[:-1], trace.time, baseline=None, **line)
     if not any(map(math.isnan, trace.fin)):
@@ -119,10 +122,10 @@ def _draw_thrust(axis: Any, standing: Standing, most: float) -> None:
 def _draw_bar(
     axis: Any, label: str, value: float, below: float, above: float, whisker: str
 ) -> None:
-    """A bar with its number, and with a whisker where that has a name."""
+    """Draw a bar with its value, and with a whisker if `whisker`, its label, is not empty."""
     axis.barh(0.0, value, height=0.45, color="0.75", label=label)
     if whisker:
-        style = {"fmt": "none", "ecolor": _SPREAD, "elinewidth": 0.8, "capsize": 2}
+        style = {"fmt": "none", "ecolor": _WHISKER_GREY, "elinewidth": 0.8, "capsize": 2}
         axis.errorbar(value, 0.0, xerr=[[below], [above]], label=whisker, **style)
     axis.text(0.02, 0.0, f"{value:.1f}", va="center", fontsize=8, transform=_across(axis))
     axis.set_ylim(-1.0, 0.4)
@@ -131,21 +134,21 @@ def _draw_bar(
 
 
 def _describe(axis: Any, standing: Standing, unit: str) -> None:
-    whole = standing.error if standing.total_ci95 is None else standing.total_ci95
-    words = (
-        f"{text.format_measured(standing.thrust, whole, unit)}, {standing.frequency:.2f} Hz\n"
+    half_width = standing.error if standing.total_ci95 is None else standing.total_ci95
+    caption = (
+        f"{text.format_measured(standing.thrust, half_width, unit)}, {standing.frequency:.2f} Hz\n"
         f"$|φ_c|/Φ$ {standing.fullness:.2f}, square {standing.squareness:.2f}"
     )
     style = {"va": "top", "fontsize": 6, "color": "0.35", "transform": _across(axis)}
-    axis.text(0.0, -0.34, words, **style)
+    axis.text(0.0, -0.34, caption, **style)
 
 
 def _across(axis: Any) -> Any:
-    """Places by the share of the width, and by the height as drawn."""
+    """Return the transform with x as a fraction of the width and y in data coordinates."""
     return axis.get_yaxis_transform()
 
 
 def _of_runs(what: str, standing: Standing) -> str:
-    """`what` and of how many runs; nothing where there is only one."""
+    """Return `what` with the number of runs; empty for a single run."""
     runs = len(standing.thrusts)
     return f"{what} of {runs} runs" if runs > 1 else ""

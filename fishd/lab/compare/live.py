@@ -1,4 +1,4 @@
-"""Policies and controllers on a fish that can only be measured: its thrust, and the interval."""
+"""Comparison of policies and controllers on a real fish, by measured thrust with intervals."""
 
 import math
 from collections.abc import Iterable
@@ -12,65 +12,67 @@ from fishd.core.signals import Tick
 from fishd.lab.compare.comparison import Standing, Trace, trace
 from fishd.lab.compare.contestants import Contestant, parse
 from fishd.lab.error_budget import budget
-from fishd.lab.measurement import Measured, measure, plan
+from fishd.lab.measurement import ThrustMeasurement, measure, plan
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.statistics import per_watt, weighted_mean
 
 
 class LiveComparison:
-    """Measures contestants on one fish, one after the other; keeps what was measured."""
+    """A comparison of contestants on one fish, which stores all measurements."""
 
     def __init__(self, session: Session, contestants: Iterable[Contestant | str]) -> None:
-        """contestants: texts are parsed: see `parse`, which raises `ParameterError`"""
-        self.contestants = [parse(one) if isinstance(one, str) else one for one in contestants]
+        """contestants: contestants, or texts for `parse`, which raises `ParameterError`"""
+        self.contestants = [parse(item) if isinstance(item, str) else item for item in contestants]
         self.left_out: list[tuple[Contestant, FishdError, int]] = []
-        """Who could not be measured, or no further, why, and after how many runs."""
+        """Contestants that failed, each with the error and the number of runs before it."""
         self._session = session
-        self._measured: list[list[Measured]] = [[] for _ in self.contestants]
+        self._measured: list[list[ThrustMeasurement]] = [[] for _ in self.contestants]
 
     def swim(self, seconds: float = 60.0, runs: int = 1) -> None:
         """Swim and rest each contestant in turn, for `seconds` in each run.
 
-        With several runs all contestants swim once, then all again, so that what changes slowly
-        affects all of them. One that cannot swim is left out, and the others go on; what it swam
-        before counts.
+        With several runs, all contestants swim once, then all again, so that slow changes affect
+        all of them equally. A contestant that fails is left out of later runs; its earlier runs
+        count.
 
         Raises `ParameterError` for a time that is too short, `Disturbed` and `NoDaemon`.
         """
         for contestant in self.contestants:
             plan(seconds, contestant.parameters)
-        out = set[int]()
-        turns = [index for _ in range(runs) for index in range(len(self.contestants))]
-        for index in turns:
-            if index in out:
+        excluded = set[int]()
+        order = [index for _ in range(runs) for index in range(len(self.contestants))]
+        for index in order:
+            if index in excluded:
                 continue
             contestant = self.contestants[index]
             try:
-                found = measure(
+                measurement = measure(
                     self._session, contestant.controller, contestant.parameters, seconds
                 )
             except FishdError as error:
                 if not concerns_one_controller(error):
                     raise
                 self.left_out.append((contestant, error, len(self._measured[index])))
-                out.add(index)
+                excluded.add(index)
                 continue
-            self._measured[index].append(found)
+            self._measured[index].append(measurement)
 
     def standings(self) -> list[Standing]:
-        """Of all that were measured, in the order given."""
+        """Return the standings of all measured contestants, in the given order."""
         pairs = zip(self.contestants, self._measured, strict=True)
-        return [_standing(one.label, found, self._session) for one, found in pairs if found]
+        return [
+            _standing(contestant.label, runs, self._session) for contestant, runs in pairs if runs
+        ]
 
     def traces(self) -> list[Trace]:
-        """The ends of their last swims, without the drift."""
-        return [_trace(found[-1]) for found in self._measured if found]
+        """Return the ends of their last swims, with the drift subtracted."""
+        return [_trace(runs[-1]) for runs in self._measured if runs]
 
 
-def _standing(label: str, runs: list[Measured], session: Session) -> Standing:
-    """Runs count by the inverse squares of their errors.
+def _standing(label: str, runs: list[ThrustMeasurement], session: Session) -> Standing:
+    """Return the standing of a contestant, with runs weighted by inverse squared errors.
 
-    Where they differ by more than these say, the error is that of their mean by Student's t.
+    Where runs scatter by more than their errors, the error of the mean uses Student's t.
     """
     thrusts = [run.thrust for run in runs]
     weights = [1.0 / run.error**2 for run in runs]
@@ -93,15 +95,19 @@ def _standing(label: str, runs: list[Measured], session: Session) -> Standing:
     return replace(standing, **_budget(runs, weights, standing, session.calibration))
 
 
-def _power(runs: list[Measured]) -> dict[str, float]:
-    """Power and thrust for each watt, as the thrust; nothing where not every run knows it."""
-    found = [
+def _power(runs: list[ThrustMeasurement]) -> dict[str, float]:
+    """Return power and thrust per watt as fields of a standing; empty if unknown for any run."""
+    results = [
         (run.watts, *per_watt(run.thrust, run.error, run.watts, run.watts_error)) for run in runs
     ]
-    known = [(watts, gave, error) for watts, gave, error in found if watts and gave and error]
+    known = [
+        (watts, thrust_per_watt, error)
+        for watts, thrust_per_watt, error in results
+        if watts and thrust_per_watt and error
+    ]
     if len(known) < len(runs):
         return {}
-    mean, ci95 = weighted_mean([each for _, each, _ in known], [error for _, _, error in known])
+    mean, ci95 = weighted_mean([item for _, item, _ in known], [error for _, _, error in known])
     return {
         "power": sum(watts for watts, _, _ in known) / len(known),
         "thrust_per_watt": mean,
@@ -110,41 +116,44 @@ def _power(runs: list[Measured]) -> dict[str, float]:
 
 
 def _budget(
-    runs: list[Measured], weights: list[float], standing: Standing, calibration: ForceCalibration
+    runs: list[ThrustMeasurement],
+    weights: list[float],
+    standing: Standing,
+    calibration: ForceCalibration,
 ) -> dict[str, float | None]:
-    """The part of the calibration: the same error in all runs, so that more of them do not help.
+    """Return the error of the calibration, which is the same in all runs, as fields of a standing.
 
-    weights: by which the runs count
+    weights: weights of the runs
     """
     rotation, lateral = np.average(
         [(run.rotation, run.lateral) for run in runs], axis=0, weights=weights
     ).tolist()
-    whole = budget(calibration, standing.thrust, standing.error, lateral, rotation)
-    found = whole._asdict()
+    total = budget(calibration, standing.thrust, standing.error, lateral, rotation)
+    fields = total._asdict()
     if standing.power and standing.thrust_per_watt is not None:
-        found["thrust_per_watt_total_ci95"] = budget(
+        fields["thrust_per_watt_total_ci95"] = budget(
             calibration,
             standing.thrust_per_watt,
             standing.thrust_per_watt_error,
             lateral / standing.power,
             rotation,
         ).total_ci95
-    return found
+    return fields
 
 
-def _trace(run: Measured) -> Trace:
+def _trace(run: ThrustMeasurement) -> Trace:
     swim = _last_swim(run)
-    begun = run.ticks[0].t
-    drift = np.interp([tick.t - begun for tick in swim], run.blocks.time, run.drift)
+    start = run.ticks[0].t
+    drift = np.interp([tick.t - start for tick in swim], run.blocks.time, run.drift)
     corrected = [replace(t, fx=t.fx - float(d)) for t, d in zip(swim, drift, strict=True)]
     return trace(corrected)
 
 
-def _last_swim(run: Measured) -> list[Tick]:
+def _last_swim(run: ThrustMeasurement) -> list[Tick]:
     swim: list[Tick] = []
-    for each in reversed(run.ticks):
-        if each.mode == "running":
-            swim.append(each)
+    for tick in reversed(run.ticks):
+        if tick.mode == "running":
+            swim.append(tick)
         elif swim:
             break
     return swim[::-1]

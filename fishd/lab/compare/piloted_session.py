@@ -1,4 +1,4 @@
-"""A live fish on which policies that see pictures swim, too: this program is their agent."""
+"""A session on a live fish that also swims policies with pictures, with this program as agent."""
 
 import threading
 from collections.abc import Mapping
@@ -16,16 +16,16 @@ from fishd.core.signals import Tick
 from fishd.lab.compare.seeing import sees_pictures
 from fishd.lab.session import Disturbed, LiveSession
 
-GIVE_UP = 2.0
-"""After so long without frames the camera counts as lost [s]."""
-_REST = 60.0
-"""Longest rest after that, in which fishd expects no answer [s]."""
-_PATIENCE = 0.1
-"""How long an agent waits for an observation before it looks whether it is to end [s]."""
+CAMERA_TIMEOUT_S = 2.0
+"""Time without frames after which the camera counts as lost [s]."""
+_PAUSE_S = 60.0
+"""Longest pause of the agent after that, in which fishd expects no answer [s]."""
+_POLL_TIMEOUT_S = 0.1
+"""Timeout of a wait for an observation, after which the agent checks whether to end [s]."""
 
 
 class PilotedSession(LiveSession):
-    """As `LiveSession`; a policy that sees pictures swims as the agent of fishd's `remote`."""
+    """A `LiveSession` in which a policy that sees pictures is the agent of fishd's `remote`."""
 
     def __init__(
         self,
@@ -37,9 +37,9 @@ class PilotedSession(LiveSession):
         agent: str | None = None,
     ) -> None:
         """
-        experiment, take: as for `LiveSession`
-        camera: where fishd-camera takes requests; None: as for `CameraClient`
-        agent: where fishd reaches this program; None: any free port, for a fishd on this machine
+        experiment, take: see `LiveSession`
+        camera: endpoint of the requests of fishd-camera; None for the default of `CameraClient`
+        agent: address of this program for fishd; None for a free port, for a fishd on this machine
 
         Raises `FishError`.
         """
@@ -55,28 +55,28 @@ class PilotedSession(LiveSession):
         self._stack.close()
 
     def _swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
-        """As `LiveSession.swim`; raises `PolicyError` for a policy that does not suit the camera.
+        """Implement `swim`; raise `PolicyError` for a policy that does not fit the camera.
 
-        Raises `CameraLost` where there is no camera, and `Disturbed` where it is lost.
+        Raises `CameraLost` without a camera, and `Disturbed` where it is lost during the swim.
         """
         policy = parameters.get("policy")
         if controller != "ppo" or not sees_pictures(policy, self._limits):
             return super()._swim(controller, parameters, seconds)
         agent = self._agent_of(str(policy))
         dwell = self._limits.dwell
-        asked = {"agent": agent.address, "dwell": dwell}
+        remote_parameters = {"agent": agent.address, "dwell": dwell}
         try:
-            found = super()._swim("remote", asked, seconds)
+            ticks = super()._swim("remote", remote_parameters, seconds)
         except Disturbed:
             if agent.problem:
                 raise Disturbed(f"{policy}: {agent.problem}") from None
             raise
         if agent.problem:
             raise Disturbed(f"{policy}: {agent.problem}: this measurement is lost")
-        return found
+        return ticks
 
     def _agent_of(self, policy: str) -> "_PilotThread":
-        """The agent that swims a policy; only the latest one is kept."""
+        """Return the agent that swims a policy; close the one of another policy."""
         if policy != self._policy:
             self._stack.close()
             self._policy = ""
@@ -89,15 +89,15 @@ class PilotedSession(LiveSession):
 
 
 class _PilotThread:
-    """Answers each observation that fishd sends with what a policy chooses, in its own thread."""
+    """An agent that answers the observations of fishd with the actions of a policy, in a thread."""
 
     def __init__(
         self, policy: str, limits: Limits, endpoint: str, camera: str | None, address: str | None
     ) -> None:
-        """Raises `PolicyError`, `CameraLost` and `FishError`; answers from then on."""
+        """Start answering; raises `PolicyError`, `CameraLost` and `FishError`."""
         self.problem: FishdError | None = None
-        """Why the fish is kept at neutral, if it is."""
-        # fishd itself holds back reversals that come too soon, as it does for ppo.
+        """Error because of which the fish is kept at neutral; None if there is none."""
+        # fishd itself delays reversals that come too soon, as it does for ppo.
         free = replace(limits, dwell=0.0)
         with ExitStack() as stack:
             self._pilot = Pilot(policy, free)
@@ -116,7 +116,7 @@ class _PilotThread:
         self._thread.start()
 
     def close(self) -> None:
-        """End; fishd must not wait for it any more."""
+        """Stop the thread; fishd must not wait for an answer any more."""
         self._stopping.set()
         self._thread.join()
         self._stack.close()
@@ -124,7 +124,7 @@ class _PilotThread:
     def _run(self) -> None:
         agent = self._agent
         while not self._stopping.is_set():
-            seen = agent.poll(_PATIENCE)
+            seen = agent.poll(_POLL_TIMEOUT_S)
             try:
                 if seen is None:
                     self._sight.listen()
@@ -132,8 +132,8 @@ class _PilotThread:
                     agent.act(0.0)
                 else:
                     agent.act(self._pilot.angle(seen, self._sight.look(seen.time)))
-                    if self._pilot.blind > GIVE_UP:
-                        agent.pause(_REST)  # at neutral: to find out why takes a while
+                    if self._pilot.blind > CAMERA_TIMEOUT_S:
+                        agent.pause(_PAUSE_S)  # at neutral, as the diagnosis takes a while
                         self.problem = self._sight.lost()
             except FishdError as error:
                 self.problem = error

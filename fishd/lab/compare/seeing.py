@@ -1,4 +1,4 @@
-"""Policies that see pictures as contestants: on a simulated fish, with a simulated camera."""
+"""Policies that see pictures, on a simulated fish with a simulated camera."""
 
 from typing import Any
 
@@ -14,9 +14,9 @@ from fishd.lab.simulation import VirtualRun
 
 
 def sees_pictures(policy: Any, limits: Limits) -> bool:
-    """Is it a policy that sees pictures? False for one that does not fit: `ppo` says why.
+    """Return whether a policy sees pictures; False for one that does not fit, which `ppo` rejects.
 
-    policy: name or path
+    policy: name or path of the policy
     """
     try:
         return isinstance(policy, str) and opening.read(policy, limits).card.pictures is not None
@@ -25,9 +25,9 @@ def sees_pictures(policy: Any, limits: Limits) -> bool:
 
 
 def may_see_pictures(policy: Any) -> bool:
-    """Is it a policy that sees pictures, or one that cannot be read here?
+    """Return whether a policy sees pictures or cannot be read here.
 
-    policy: name or path
+    policy: name or path of the policy
     """
     try:
         return isinstance(policy, str) and file.read(library.find(policy)).card.pictures is not None
@@ -36,7 +36,7 @@ def may_see_pictures(policy: Any) -> bool:
 
 
 class SeeingController(Controller[PpoParameters]):
-    """`ppo` for a policy that sees: the simulated fish is shown to it by a simulated camera."""
+    """The controller `ppo` for a policy that sees pictures, with a simulated camera."""
 
     Parameters = PpoParameters
 
@@ -50,13 +50,13 @@ class SeeingController(Controller[PpoParameters]):
         self._sight: SimulatedSight | None = None
 
     def watch(self, run: VirtualRun) -> None:
-        """Put the camera above the fish of a run, before its first tick."""
+        """Connect the simulated camera to the fish of a run, before its first tick."""
         truth, pictures = run.loop.robot.truth, self._pilot.card.pictures
         assert truth
         assert pictures
         self._sight = SimulatedSight(self._camera, pictures, self.limits.tick, truth)
 
     def update(self, observation: Observation) -> float:
-        """The angle that the policy chooses [rad]; raises `ControllerFault`, see `DwellLimit`."""
+        """Return the angle of the policy [rad]; raises `ControllerFault`, see `DwellLimit`."""
         stack = self._sight.look(observation.time) if self._sight else None
         return self._pilot.angle(observation, stack)

@@ -1,4 +1,4 @@
-"""One contestant after the other on many fish: does it carry over to those that differ?"""
+"""Survey of contestants on many simulated fish, to test how well they generalise."""
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
@@ -16,69 +16,69 @@ from fishd.lab.compare.contestants import Contestant, refusal
 from fishd.lab.other_fish import OtherFish
 
 
-class Swum(Struct, frozen=True, kw_only=True):
-    """How a contestant swam a fish."""
+class FishResult(Struct, frozen=True, kw_only=True):
+    """Result of a contestant on one fish."""
 
     fish: str
     overrides: tuple[str, ...]
-    """The keys in which it differs."""
+    """Changes of the configuration, as KEY=VALUE."""
     relative_thrust: float
-    """Thrust over that of this fish's own best square wave."""
+    """Thrust over that of the best square wave on this fish."""
     thrust: float
-    """[N]"""
+    """Mean thrust [N]."""
     frequency: float
-    """[Hz]"""
+    """Frequency of the tail beat [Hz]."""
     shaken: float
-    """Longest stretch of reversals in consecutive ticks [s]."""
+    """Length of the longest series of reversals in consecutive ticks [s]."""
     fallback: str | None
-    """Why another controller took over, if one did; the figures are those of both."""
+    """Reason why the fallback took over; None if not. The results include its swimming."""
     fault: str | None
-    """Why the run ended in mode fault, if it did."""
+    """Reason why the run ended in mode fault; None if it did not."""
 
 
-class Surveyed(Struct, frozen=True, kw_only=True):
-    """A contestant on all fish."""
+class ContestantSurvey(Struct, frozen=True, kw_only=True):
+    """Results of a contestant on all fish."""
 
     contestant: str
     controller: str
     parameters: dict[str, Any]
-    fish: list[Swum]
+    fish: list[FishResult]
 
     @property
     def median(self) -> float:
-        """Of the relative thrusts."""
+        """Median of the relative thrusts."""
         return median(swum.relative_thrust for swum in self.fish)
 
     @property
-    def worst(self) -> Swum:
-        """On the fish that it is worst on."""
+    def worst(self) -> FishResult:
+        """Result on the fish of smallest relative thrust."""
         return min(self.fish, key=lambda swum: swum.relative_thrust)
 
 
 class ReversalTimes:
-    """Publisher that notes when the instruction angle changed its side."""
+    """A publisher that stores the times of reversals of the instruction angle."""
 
     def __init__(self) -> None:
         self.times: list[float] = []
         self._reversals = Reversals()
 
     def tick(self, tick: Tick) -> None:
-        """Note a reversal."""
+        """Store the time of a reversal."""
         if self._reversals.add(tick.phi_c):
             self.times.append(tick.t)
 
     def event(self, event: Event) -> None:
-        """Drop."""
+        """Drop an event."""
 
     def longest(self, apart: float) -> float:
-        """The longest stretch of reversals that follow within less than a time [s]."""
-        longest = begun = 0.0
+        """Return the length of the longest series of reversals less than `apart` apart [s]."""
+        longest = start = 0.0
         for before, now in pairwise(self.times):
-            begun = begun or before
+            start = start or before
             if now - before < apart:
-                longest = max(longest, now - begun)
+                longest = max(longest, now - start)
             else:
-                begun = 0.0
+                start = 0.0
         return longest
 
 
@@ -89,27 +89,27 @@ def survey(
     settle: float,
     progress: Callable[[float], None] = lambda seconds: None,
     camera: SimulatedCameraSettings | None = None,
-) -> list[Surveyed]:
-    """Let each contestant swim each fish once, in virtual time.
+) -> list[ContestantSurvey]:
+    """Swim each fish once with each contestant, in virtual time.
 
-    configs: the fish, and each as a configuration
-    seconds, settle: as for `fishd.lab.simulation.simulate` [s]
-    progress: called with the time that has been swum [s]
-    camera: what shows the fish to policies that see it; by default a good one
+    configs: the fish, each with its configuration
+    seconds, settle: see `fishd.lab.simulation.simulate` [s]
+    progress: called with the time swum by now [s]
+    camera: settings of the camera for policies that see pictures; by default a good one
 
     Raises `ParameterError` (`PolicyError` for a file that is not a policy for these fish) and
-    `UnknownController`, before a contestant swims.
+    `UnknownController` before the first run of a contestant.
     """
-    seen, found, done = camera or SimulatedCameraSettings(), [], 0.0
+    camera_settings, surveys, done = camera or SimulatedCameraSettings(), [], 0.0
     for contestant in contestants:
         if error := refusal(configs[0][1], contestant):
             raise error
         rows = []
         for fish, config in configs:
             reversals = ReversalTimes()
-            report = swim(config, contestant, seconds, settle, reversals, seen)
+            report = swim(config, contestant, seconds, settle, reversals, camera_settings)
             rows.append(
-                Swum(
+                FishResult(
                     fish=fish.name,
                     overrides=fish.overrides,
                     relative_thrust=report.relative_thrust,
@@ -123,5 +123,7 @@ def survey(
             done += seconds
             progress(done)
         label, name, parameters = contestant
-        found.append(Surveyed(contestant=label, controller=name, parameters=parameters, fish=rows))
-    return found
+        surveys.append(
+            ContestantSurvey(contestant=label, controller=name, parameters=parameters, fish=rows)
+        )
+    return surveys

@@ -1,6 +1,6 @@
-"""Identification: a fish and its rig from F_x, F_y and φ_c alone, with intervals.
+"""Identification of a fish and its rig from F_x, F_y and φ_c alone, with intervals.
 
-`identify` fits what was recorded, `experiment` lets a fish swim what tells most about it.
+`identify` fits recordings; `experiment` swims a fish with an informative command.
 """
 
 from fishd.lab.identification.estimation import DEFAULT, check, identify

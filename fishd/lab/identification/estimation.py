@@ -1,8 +1,8 @@
-"""From ticks to a fish: starts and fits, and what of the fish they are for.
+"""Identification of a fish from ticks: the choice of parameters, start values and fits.
 
-K, λ, K_y and K_d cannot be told apart by forces: F_x is K λ² times what the wheel does, F_y is
-K_y λ and K_d λ times it. K and λ are told apart by K_y = K. How far that may be wrong is part of
-their intervals, unless `lateral_inertia_ratio` is left out of `fit`.
+Forces determine only products of K, λ, K_y and K_d: F_x is proportional to K λ², and F_y to K_y λ
+and K_d λ. The assumption K_y = K separates K and λ. Its uncertainty is part of their intervals,
+unless `lateral_inertia_ratio` is not in `fit`.
 """
 
 import os
@@ -25,11 +25,11 @@ from fishd.lab.identification.fit import (
     Problem,
     solve,
 )
-from fishd.lab.identification.passages import SHORTEST, Passage, Unidentifiable, passages
+from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifiable, passages
 from fishd.lab.identification.result import (
     Identification,
 )
-from fishd.lab.identification.summary import CLEAR, SCALED, summarise
+from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, summarise
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -41,23 +41,25 @@ DEFAULT = (
     *("thrust_coefficient", "lateral_inertia_ratio", "lateral_drag"),
     *("servo_delay", "backlash", "rotation"),
 )
-"""What is fitted by default; what is left over may then demand some of `FURTHER`, too."""
+"""Parameters that are fitted by default; residuals may then require some of `FURTHER` too."""
 POSSIBLE = tuple(BOUNDS)
+"""Parameters that can be fitted."""
 
-_LIKELY = 4.0
-"""Smallest fall of the sum of squares, in units of noise², with which something further is fitted
-though what is left over is white: two standard errors."""
-_DEMANDED = 0.05
-"""Smallest share of what is left over that something further must explain to be fitted."""
-_SETTLE = 2.0
-"""How long the beginning of a passage is not judged, since nobody knows what was before [s]."""
-_LONGEST_SETTLE = 20.0
-_FORGOTTEN = 7.0
-"""Time constants of the fin after which its start is forgotten."""
-_ROUGH = 12
-"""Steps of a fit that shows whether it is worth going on."""
+_MIN_FALL = 4.0
+"""Smallest fall of the sum of squares, in units of noise², for which a further parameter is fitted
+although the residual is white: two standard errors."""
+_MIN_SHARE = 0.05
+"""Smallest share of the residual that a further parameter must explain to be fitted."""
+_SETTLE_S = 2.0
+"""Time at the start of a passage that is left out, as the motion before it is unknown [s]."""
+_MAX_SETTLE_S = 20.0
+"""Longest time at the start of a passage that is left out [s]."""
+_SETTLE_TIME_CONSTANTS = 7.0
+"""Time, in time constants of the fin, after which its initial state has no effect."""
+_ROUGH_STEPS = 12
+"""Largest number of steps of a rough fit, which compares start values."""
 _STARTS = tuple(product((1.0, 0.5, 2.0), (0.01, 0.06, 0.12)))
-"""Natural frequency, as a multiple of that of the first fish, and delay [s]."""
+"""Start values: natural frequency, as a multiple of that of the given fish, and delay [s]."""
 
 
 def identify(
@@ -68,52 +70,54 @@ def identify(
     fit: Sequence[str] | None = None,
     fix: Sequence[str] = (),
 ) -> Identification:
-    """Fit a fish and its rig to what some runs of it have measured.
+    """Fit a fish and its rig to recorded runs.
 
     runs: tables of ticks (`fishd.recording.read`, `experiment`), or paths of recordings
-    start: where to begin, and the value of what is not fitted; by default the fish of Fu et al.
-    rig: the same for `rotation`; by default the sensor is not turned
-    fit: what to fit: keys of section `plant` among `POSSIBLE`, and `rotation`; by default `DEFAULT`
-        and what of `FURTHER` the data demand
-    fix: what of that is not fitted. With `lateral_inertia_ratio`, K_y/K is as in `start`, and K, λ
-        and K_d are known so much better; so they are with `coupling`, if λ was measured
+    start: start values, and values of the parameters that are not fitted; by default the fish of
+        Fu et al.
+    rig: the same for `rotation`; by default the sensor is not rotated
+    fit: parameters to fit: keys of section `plant` among `POSSIBLE`, and `rotation`; by default
+        `DEFAULT` and those of `FURTHER` that the data require
+    fix: parameters that are excluded from the fit. With `lateral_inertia_ratio`, K_y/K is as in
+        `start`, and the intervals of K, λ and K_d are much narrower; likewise with `coupling`, if
+        λ was measured
 
-    Raises `Unidentifiable` for runs that hold nothing to fit, `ParameterError` for a name in `fit`
-    that is not possible, and what `fishd.recording.read` raises.
+    Raises `Unidentifiable` for runs without usable data, `ParameterError` for a name that cannot
+    be fitted, and the errors of `fishd.recording.read`.
     """
-    known = msgspec.structs.asdict(start or PlantParameters())
-    known["rotation"] = (rig or SimulationSettings()).rotation
+    given_values = msgspec.structs.asdict(start or PlantParameters())
+    given_values["rotation"] = (rig or SimulationSettings()).rotation
     further = tuple(name for name in FURTHER if fit is None and name not in fix)
-    names = check((*DEFAULT, *filter(known.get, FURTHER)) if fit is None else fit, fix)
-    parts = passages([_table(run) for run in _several(runs)])
-    if not any(one.commands.any() for one in parts):
+    names = check((*DEFAULT, *filter(given_values.get, FURTHER)) if fit is None else fit, fix)
+    parts = passages([_to_frame(run) for run in _to_list(runs)])
+    if not any(part.commands.any() for part in parts):
         raise Unidentifiable("φ_c is zero all the time: a recording of a fish that swims is needed")
-    values = {name: float(known[name]) for name in POSSIBLE}
+    values = {name: float(given_values[name]) for name in POSSIBLE}
     scale_is_free = _scale_is_free(names, values)
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
-    problem, values = _solved(parts, names, values, further)
-    settle = _settling(values)
-    if settle > _SETTLE:
-        longer = [one for one in parts if one.duration > settle + SHORTEST]
-        parts, settle = (longer, settle) if longer else (parts, _SETTLE)
+    problem, values = _solve_from_starts(parts, names, values, further)
+    settle = _settling_time(values)
+    if settle > _SETTLE_S:
+        longer = [part for part in parts if part.duration > settle + MIN_PASSAGE_S]
+        parts, settle = (longer, settle) if longer else (parts, _SETTLE_S)
         problem = Problem(parts, problem.names, settle)
         values = solve(problem, values)
-    return summarise(parts, problem, values, known, scale_is_free)
+    return summarise(parts, problem, values, given_values, scale_is_free)
 
 
 def _scale_is_free(names: Sequence[str], values: dict[str, float]) -> bool:
-    """Return whether K_y/K changes no force: all that goes with it is fitted, or zero."""
+    """Return whether K_y/K affects no force: all parameters that scale with it are free or zero."""
     needed = [name for name in SCALED if name in LOGARITHMIC or values[name]]
     return all(name in names for name in needed)
 
 
-def _several(runs: object) -> list[object]:
+def _to_list(runs: object) -> list[object]:
     is_list = isinstance(runs, Sequence) and not isinstance(runs, str)
     return list(runs) if is_list else [runs]  # type: ignore[call-overload]
 
 
-def _table(run: object) -> "DataFrame":
+def _to_frame(run: object) -> "DataFrame":
     if isinstance(run, str | os.PathLike):
         from fishd.recording import open_run
 
@@ -130,9 +134,9 @@ def _table(run: object) -> "DataFrame":
 
 
 def check(fit: Sequence[str], fix: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the names of what to fit, in order, without those of `fix`.
+    """Return the names of the parameters to fit, in order, without those in `fix`.
 
-    Raises `ParameterError` for one that is not possible, and where nothing is left.
+    Raises `ParameterError` for a name that cannot be fitted, and where no name is left.
     """
     for name in (*fit, *fix):
         if name not in POSSIBLE:
@@ -143,79 +147,81 @@ def check(fit: Sequence[str], fix: Sequence[str] = ()) -> tuple[str, ...]:
     return names
 
 
-def _solved(
+def _solve_from_starts(
     parts: Sequence[Passage],
     names: tuple[str, ...],
     first: dict[str, float],
     further: Sequence[str],
 ) -> tuple[Problem, dict[str, float]]:
-    """Return the best fit of several starts; of one, where it leaves no more than noise.
+    """Return the best fit from several start values, or the first if its residual is white.
 
-    The others are fitted roughly, without quadratic drag, and the best of them to its end.
+    From the others, rough fits are made without quadratic drag; the best of them is completed.
 
-    further: what is fitted, too, where what is left over looks like it
+    further: parameters that are fitted too where the residual resembles their effect
     """
-    starts = [_begun(first, names, *start) for start in _STARTS]
-    problem = Problem(parts, names, _SETTLE)
+    starts = [_start_values(first, names, *start) for start in _STARTS]
+    problem = Problem(parts, names, _SETTLE_S)
     values = solve(problem, starts[0])
-    problem, values = _extended(parts, problem, values, further)
+    problem, values = _add_required(parts, problem, values, further)
     if misfit.all_white(problem, values):
         return problem, values
-    rough = []
-    few = tuple(name for name in names if name not in QUADRATIC) or names
+    rough_fits = []
+    rough_names = tuple(name for name in names if name not in QUADRATIC) or names
     for start in starts[1:]:
-        other = Problem(parts, few, _SETTLE)
-        rough.append((solve(other, start, rounds=1, steps=_ROUGH), other))
-    best, _ = min(rough, key=lambda each: each[1].unexplained)
-    other = Problem(parts, names, _SETTLE)
-    best = solve(other, best)
-    other, best = _extended(parts, other, best, further)
-    return (other, best) if other.unexplained < problem.unexplained else (problem, values)
+        candidate = Problem(parts, rough_names, _SETTLE_S)
+        rough_fits.append((solve(candidate, start, rounds=1, steps=_ROUGH_STEPS), candidate))
+    best, _ = min(rough_fits, key=lambda fit: fit[1].unexplained)
+    candidate = Problem(parts, names, _SETTLE_S)
+    best = solve(candidate, best)
+    candidate, best = _add_required(parts, candidate, best, further)
+    return (candidate, best) if candidate.unexplained < problem.unexplained else (problem, values)
 
 
-def _extended(
+def _add_required(
     parts: Sequence[Passage],
     problem: Problem,
     values: dict[str, float],
     further: Sequence[str],
 ) -> tuple[Problem, dict[str, float]]:
-    """Return the fit with what of `further` the data demand, one after the other.
+    """Return the fit with those of `further` that the data require, added one by one.
 
-    They are fitted at the first sign of them, even if what is left over is white: a little of them
-    makes others wrong before it is seen. Where there is none, they would cost precision.
+    A parameter is added at a small effect already, even if the residual is white: it biases the
+    others before it is significant. One without an effect would only cost precision.
     """
     while True:
         white = misfit.all_white(problem, values)
-        looks_like = misfit.likenesses(problem, values, further)
-        if not looks_like or looks_like[0][1] < (_LIKELY if white else CLEAR):
+        find_missing_parameters = misfit.find_missing_parameters(problem, values, further)
+        if not find_missing_parameters or find_missing_parameters[0][1] < (
+            _MIN_FALL if white else MIN_CLEAR_FALL
+        ):
             break
-        name, _, size = looks_like[0]
-        wider = Problem(parts, check((*problem.names, name)), _SETTLE)
-        begun = {**values, name: float(np.clip(size, *BOUNDS[name]))}
-        begun = solve(wider, begun)
-        if not white and wider.unexplained > problem.unexplained - 0.5 * _DEMANDED:
+        name, _, size = find_missing_parameters[0]
+        wider = Problem(parts, check((*problem.names, name)), _SETTLE_S)
+        wider_values = {**values, name: float(np.clip(size, *BOUNDS[name]))}
+        wider_values = solve(wider, wider_values)
+        if not white and wider.unexplained > problem.unexplained - 0.5 * _MIN_SHARE:
             break
-        problem, values = wider, begun
+        problem, values = wider, wider_values
     return problem, values
 
 
-def _begun(
+def _start_values(
     first: dict[str, float], names: tuple[str, ...], frequency: float, delay: float
 ) -> dict[str, float]:
-    """Where a fit begins; away from zero, where backlash has no slope."""
-    begun = dict(first)
+    """Return start values of a fit; backlash is not zero, where its derivative vanishes."""
+    values = dict(first)
     for name, value in (
         ("omega0", first["omega0"] * frequency),
         ("servo_delay", max(first["servo_delay"], delay)),
         ("backlash", max(first["backlash"], 0.01)),
     ):
         if name in names:
-            begun[name] = value
-    return begun
+            values[name] = value
+    return values
 
 
-def _settling(values: dict[str, float]) -> float:
-    """How long the fin remembers where it was [s]."""
+def _settling_time(values: dict[str, float]) -> float:
+    """Return the time after which the initial state of the fin has no effect [s]."""
     omega0, xi = values["omega0"], values["xi"]
     slowest = 0.5 * omega0 * (xi - np.sqrt(max(0.0, xi * xi - 4.0)))
-    return float(min(_FORGOTTEN / slowest, _LONGEST_SETTLE))
+    return float(min(_SETTLE_TIME_CONSTANTS / slowest, _MAX_SETTLE_S))

@@ -1,4 +1,4 @@
-"""Lets a fish swim what tells most about it."""
+"""Experiment with the command that is most informative for an identification."""
 
 import math
 from typing import TYPE_CHECKING
@@ -10,21 +10,23 @@ from fishd.lab.session import Session
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-REST = 4.0
-"""Rest before it swims [s]: the tail stands still, and its state is known."""
-SHORTEST = 30.0
-"""Less swimming tells too little [s]."""
+REST_S = 4.0
+"""Length of the rest before the swim [s]: the tail stands still, so its state is known."""
+MIN_EXPERIMENT_S = 30.0
+"""Length of the shortest experiment; a shorter one determines too little [s]."""
 
 
 def experiment(session: Session, seconds: float = 180.0) -> "DataFrame":
-    """Rest, then swim `excitation` at the rig's whole amplitude; a row a tick.
+    """Rest, then swim `excitation` at the full amplitude of the rig; return one row per tick.
 
-    seconds: how long all of it takes [s]
-    Raises `ParameterError` for less than `SHORTEST` or for ever, `Disturbed` where somebody else
-    takes the fish, and what the rig raises.
+    seconds: length of the experiment, rest included [s]
+    Raises `ParameterError` for less than `MIN_EXPERIMENT_S` or an infinite time, `Disturbed` where
+    another client takes the fish, and the errors of the session.
     """
-    if not SHORTEST <= seconds < math.inf:
-        raise ParameterError(f"an experiment of {seconds:g} s: {SHORTEST:g} s or more are needed")
-    ticks = session.rest(REST)
-    ticks += session.swim("excitation", {}, seconds - REST)
+    if not MIN_EXPERIMENT_S <= seconds < math.inf:
+        raise ParameterError(
+            f"an experiment of {seconds:g} s: {MIN_EXPERIMENT_S:g} s or more are needed"
+        )
+    ticks = session.rest(REST_S)
+    ticks += session.swim("excitation", {}, seconds - REST_S)
     return frame(ticks)

@@ -1,38 +1,38 @@
-"""The picture of an identification: forces and fit, and what is left over."""
+"""Figure of an identification: forces, fit and residuals."""
 
 import os
 from typing import Any
 
 import numpy as np
 
-from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, drawn
+from fishd.lab.drawing import BLACK, BLUE, GREY, ORANGE, open_figure
 from fishd.lab.identification.result import Fit, Identification
 from fishd.lab.statistics import Z95
 
-_EXTRACT = 6.0
-"""How long forces are shown in detail [s]."""
-_LAGS = 40
-"""How many ticks the correlation of what is left over is shown for."""
+_EXTRACT_S = 6.0
+"""Length of the extract that shows forces in detail [s]."""
+_MAX_LAG = 40
+"""Largest lag of the plotted correlation [ticks]."""
 
 
-def draw(found: Identification, path: str | os.PathLike[str]) -> None:
-    """Draw it into a file; raises `FishdError` where that cannot be written."""
-    with drawn(path, (10.0, 6.5)) as figure:
+def draw(identification: Identification, path: str | os.PathLike[str]) -> None:
+    """Draw an identification into a file; raises `FishdError` where it cannot be written."""
+    with open_figure(path, (10.0, 6.5)) as figure:
         axes = figure.subplots(2, 3, width_ratios=(3.0, 3.0, 1.6))
         for channel, (row, symbol) in enumerate(zip(axes, ("F_x", "F_y"), strict=True)):
-            _draw_forces(row[0], found.fit, channel, symbol)
-            left = 1e3 * (found.fit.measured - found.fit.simulated)[channel]
-            drift = 1e3 * found.fit.drift[channel]
-            _draw_residual(row[1], found, channel, left, drift)
-            _draw_correlation(row[2], left - drift)
+            _draw_forces(row[0], identification.fit, channel, symbol)
+            residual = 1e3 * (identification.fit.measured - identification.fit.simulated)[channel]
+            drift = 1e3 * identification.fit.drift[channel]
+            _draw_residual(row[1], identification, channel, residual, drift)
+            _draw_correlation(row[2], residual - drift)
         handles = [line for axis in axes[1][:2] for line in axis.get_legend_handles_labels()[0]]
         figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
 
 
 def _draw_forces(axis: Any, fit: Fit, channel: int, symbol: str) -> None:
-    """Some seconds in the middle; the fit with the drift of the sensor, as it was measured."""
+    """Plot an extract of measured forces, and of the fit with the drift of the sensor."""
     middle = np.nanmedian(fit.times)
-    shown = np.abs(fit.times - middle) <= 0.5 * _EXTRACT
+    shown = np.abs(fit.times - middle) <= 0.5 * _EXTRACT_S
     times = fit.times[shown]
     simulated = 1e3 * (fit.simulated + fit.drift)[channel, shown]
     style = {"color": BLACK, "markersize": 3.0, "linestyle": "none"}
@@ -43,21 +43,31 @@ def _draw_forces(axis: Any, fit: Fit, channel: int, symbol: str) -> None:
     axis.set_title(f"${symbol}$, mean of each tick")
 
 
-def _draw_residual(axis: Any, found: Identification, channel: int, left: Any, drift: Any) -> None:
-    told = found.channels[channel]
-    axis.plot(found.fit.times, left, color=GREY, linewidth=0.4, label="measured − identified fish")
-    axis.plot(found.fit.times, drift, color=ORANGE, linewidth=1.2, label="offset and drift")
+def _draw_residual(
+    axis: Any, identification: Identification, channel: int, residual: Any, drift: Any
+) -> None:
+    result = identification.channels[channel]
+    axis.plot(
+        identification.fit.times,
+        residual,
+        color=GREY,
+        linewidth=0.4,
+        label="measured − identified fish",
+    )
+    axis.plot(
+        identification.fit.times, drift, color=ORANGE, linewidth=1.2, label="offset and drift"
+    )
     axis.set_ylabel("residual (mN)")
     axis.set_xlabel("time (s)")
-    title = f"{told.explained:.2%} explained, noise {told.noise * 1e3:.2f} mN"
+    title = f"{result.explained:.2%} explained, noise {result.noise * 1e3:.2f} mN"
     axis.set_title(title)
 
 
-def _draw_correlation(axis: Any, left: Any) -> None:
-    """Of what neither fish nor drift explain; between the lines it is as good as none."""
-    known = left[np.isfinite(left)]
+def _draw_correlation(axis: Any, residual: Any) -> None:
+    """Plot the correlation of the residual without drift, with the bounds for white noise."""
+    known = residual[np.isfinite(residual)]
     known = known - known.mean()
-    lags = range(1, min(_LAGS, len(known) - 1) + 1)
+    lags = range(1, min(_MAX_LAG, len(known) - 1) + 1)
     squares = float(known @ known)
     correlations = [float(known[lag:] @ known[:-lag]) / squares for lag in lags]
     axis.vlines(lags, 0.0, correlations, color=BLUE, linewidth=1.5)

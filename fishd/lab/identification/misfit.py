@@ -1,8 +1,8 @@
-"""What a fitted model does not explain: prediction of data left out, and the error that it causes.
+"""Misfit of a fitted model: cross-validation, and the error of the parameters that it causes.
 
-A model that lacks something of a fish errs differently at each frequency and amplitude. So data are
-grouped by these: each group in turn is predicted from a fit of the others, and how much the groups
-disagree on a parameter says how far it may be off.
+The error of an incomplete model depends on frequency and amplitude, so data are grouped by these.
+Each group is predicted from a fit of the others, and the disagreement of the groups on a parameter
+gives its error.
 """
 
 from collections.abc import Sequence
@@ -18,30 +18,30 @@ from fishd.lab.identification.response import Array
 Labels = NDArray[np.int_]
 
 _MIN_GROUPS = 4
-"""Smallest number of groups by frequency and amplitude; else data are grouped by time."""
+"""Smallest number of groups by frequency and amplitude; with fewer, data are grouped by time."""
 _TIME_GROUPS = 8
-"""Number of stretches of time, where data are grouped by time."""
-_SHARE_OF_A_GROUP = 1.0 / 24.0
+"""Number of groups where data are grouped by time."""
+_MIN_GROUP_SHARE = 1.0 / 24.0
 """Smallest share of all windows in a group."""
 LAGS = 20
-"""Ticks that what is left over may be correlated for."""
-_PROBED = 0.01
-"""Size of slack and dead zone whose effect is compared with what is left over [rad]."""
+"""Largest lag at which the correlation of residuals is considered [ticks]."""
+_PROBE_SIZE_RAD = 0.01
+"""Size of slack and dead zone whose effect is compared with the residual [rad]."""
 _SINGULAR = 1e-10
-"""Share of the largest eigenvalue below which information counts as zero."""
+"""Relative eigenvalue below which information counts as zero."""
 
 
-def groups(parts: Sequence[Passage], skips: Sequence[int]) -> Labels:
-    """Return a group for each judged window, all passages in a row: one for similar half beats.
+def group_windows(parts: Sequence[Passage], skips: Sequence[int]) -> Labels:
+    """Return the group of each window, passages joined; a group holds similar half beats.
 
-    skips: how many windows at the start of each passage are not judged
+    skips: number of windows at the start of each passage that are left out
     """
     kinds = np.concatenate(
         [_kinds(part)[:, skip:] for part, skip in zip(parts, skips, strict=True)], axis=1
     )
     order = np.lexsort(kinds)
     changes = np.any(np.diff(kinds[:, order], axis=1) != 0, axis=0)
-    smallest = _SHARE_OF_A_GROUP * order.size
+    smallest = _MIN_GROUP_SHARE * order.size
     labels = np.zeros(order.size, dtype=np.int_)
     label, begin = 0, 0
     for end in (np.flatnonzero(changes) + 1).tolist():
@@ -64,27 +64,27 @@ def _kinds(part: Passage) -> Labels:
     return np.repeat(whole, lengths, axis=1)[:, part.ends[1:] - 1]
 
 
-def predicted(jacobian: Array, innovations: Array, labels: Labels) -> Array:
-    """Return innovations of each group as a fit of the other groups leaves them, shape (2, n).
+def predict_groups(jacobian: Array, innovations: Array, labels: Labels) -> Array:
+    """Return the innovations of each group for a fit of the other groups, shape (2, n).
 
-    jacobian: (2, n, names), of what is within its bounds
-    innovations: of the fit of all, (2, n)
-    labels: the group of each of the n
+    jacobian: derivatives by the parameters that are not at a bound, (2, n, names)
+    innovations: innovations of the fit of all groups, (2, n)
+    labels: group of each window, (n,)
     """
-    left = innovations.copy()
+    predictions = innovations.copy()
     information = np.einsum("cni,cnj->ij", jacobian, jacobian)
     score = np.einsum("cni,cn->i", jacobian, innovations)
     for label in np.unique(labels):
-        inside = labels == label
-        part, rest = jacobian[:, inside], innovations[:, inside]
-        others = information - np.einsum("cni,cnj->ij", part, part)
-        step = -_inverse(others) @ (score - np.einsum("cni,cn->i", part, rest))
-        left[:, inside] = rest + part @ step
-    return left
+        in_group = labels == label
+        own_jacobian, own_innovations = jacobian[:, in_group], innovations[:, in_group]
+        others = information - np.einsum("cni,cnj->ij", own_jacobian, own_jacobian)
+        step = -_inverse(others) @ (score - np.einsum("cni,cn->i", own_jacobian, own_innovations))
+        predictions[:, in_group] = own_innovations + own_jacobian @ step
+    return predictions
 
 
-def disagreement(jacobian: Array, innovations: Array, labels: Labels) -> Array:
-    """Return the covariance of a fit whose misfit is one draw for each group and force.
+def misfit_covariance(jacobian: Array, innovations: Array, labels: Labels) -> Array:
+    """Return the covariance of a fit whose misfit is independent between groups and forces.
 
     The formula is that of standard errors robust to clusters (Liang and Zeger, "Longitudinal data
     analysis using generalized linear models"), with the groups as clusters.
@@ -93,21 +93,21 @@ def disagreement(jacobian: Array, innovations: Array, labels: Labels) -> Array:
     meat = np.zeros_like(inverse)
     count = 0
     for label in np.unique(labels):
-        inside = labels == label
-        for slopes, rest in zip(jacobian[:, inside], innovations[:, inside], strict=True):
-            score = slopes.T @ rest
+        in_group = labels == label
+        for slopes, residual in zip(jacobian[:, in_group], innovations[:, in_group], strict=True):
+            score = slopes.T @ residual
             meat += np.outer(score, score)
             count += 1
     covariance: Array = inverse @ meat @ inverse * (count / max(1, count - 1))
     return covariance
 
 
-def likeness(column: Array, jacobian: Array, innovations: Array) -> tuple[float, float]:
-    """Return how much of what is left over one more parameter would explain, and its value.
+def explained_by(column: Array, jacobian: Array, innovations: Array) -> tuple[float, float]:
+    """Return the fall of the sum of squares that one more parameter would cause, and its value.
 
-    The first is the fall of the sum of squares of the innovations, in units of noise².
+    The fall is that of the innovations, in units of noise².
 
-    column: (2, n), derivative of the innovations by that parameter
+    column: derivative of the innovations by that parameter, (2, n)
     """
     slopes = jacobian.reshape(-1, jacobian.shape[2])
     inverse = _inverse(slopes.T @ slopes)
@@ -121,7 +121,7 @@ def likeness(column: Array, jacobian: Array, innovations: Array) -> tuple[float,
 
 
 def _inverse(information: Array) -> Array:
-    """Return the inverse of a symmetric matrix without its directions of no information."""
+    """Return the inverse of a symmetric matrix, 0 in directions without information."""
     size = np.sqrt(np.maximum(np.diag(information), 0.0))
     size[size == 0.0] = 1.0
     values, vectors = np.linalg.eigh(information / np.outer(size, size))
@@ -132,40 +132,40 @@ def _inverse(information: Array) -> Array:
 
 
 def all_white(problem: Problem, values: dict[str, float]) -> bool:
-    """Return whether what is left over of both forces is no more than noise."""
+    """Return whether the residuals of both forces are white noise."""
     return all(map(is_white, problem.whitened(problem.residuals(values))))
 
 
-def likenesses(
+def find_missing_parameters(
     problem: Problem, values: dict[str, float], names: Sequence[str]
 ) -> list[tuple[str, float, float]]:
-    """Return what is not fitted and looks like what is left over, the most alike first.
+    """Return parameters that would explain a part of the residual, the largest part first.
 
-    Each is a name, the fall of the sum of squares in units of noise², and the likely value.
+    Each item is a name, the fall of the sum of squares in units of noise², and the likely value.
     """
     innovations = problem.whitened(problem.residuals(values))
-    jacobian = problem.jacobian(values)[:, :, inside(problem.names, values)]
-    found = []
+    jacobian = problem.jacobian(values)[:, :, are_free(problem.names, values)]
+    candidates = []
     for name in names:
         if name in problem.names or values[name]:
             continue
-        step = None if name in SIGNED else _PROBED
-        fall, size = likeness(problem.column(values, name, step), jacobian, innovations)
+        step = None if name in SIGNED else _PROBE_SIZE_RAD
+        fall, size = explained_by(problem.column(values, name, step), jacobian, innovations)
         if name in SIGNED or size > 0.0:
-            found.append((name, fall, size))
-    return sorted(found, key=lambda each: -each[1])
+            candidates.append((name, fall, size))
+    return sorted(candidates, key=lambda candidate: -candidate[1])
 
 
-def inside(names: Sequence[str], values: dict[str, float]) -> NDArray[np.bool_]:
-    """Return which of what is fitted is not at an end of where a fit looks."""
+def are_free(names: Sequence[str], values: dict[str, float]) -> NDArray[np.bool_]:
+    """Return which fitted parameters are not at a bound."""
     lows = [values[name] <= BOUNDS[name][0] + 1e-7 * BOUNDS[name][1] for name in names]
-    ends = [at_end(name, values[name]) for name in names]
+    ends = [is_at_bound(name, values[name]) for name in names]
     free: NDArray[np.bool_] = ~(np.array(lows) | np.array(ends))
     return free
 
 
 def is_white(innovations: Array) -> bool:
-    """Return the answer of the test of Ljung and Box, at one in a thousand."""
+    """Return whether innovations pass the Ljung-Box test at a level of 0.001."""
     count = len(innovations)
     squares = float(innovations @ innovations)
     lags = range(1, min(LAGS, count - 1) + 1)
@@ -174,8 +174,8 @@ def is_white(innovations: Array) -> bool:
     return bool(chi2.sf(count * (count + 2) * total, len(correlations)) > 1e-3)
 
 
-def at_end(name: str, value: float) -> bool:
-    """Return whether a value is at an end of where a fit looks, where that is not zero."""
+def is_at_bound(name: str, value: float) -> bool:
+    """Return whether a value is at a bound other than zero."""
     low, high = BOUNDS[name]
     if name in LOGARITHMIC:
         return value < 1.001 * low or value > 0.999 * high

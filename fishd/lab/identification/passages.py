@@ -1,4 +1,4 @@
-"""Recorded ticks as passages without a gap, of which each can be simulated from its start."""
+"""Passages: recorded ticks without a gap, each of which can be simulated from its start."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 COLUMNS = ("t", "seq", "missed", "fx", "fy", "phi_c", "servo_on", "samples")
-"""What is read of a table of ticks."""
-SHORTEST = 5.0
-"""Shorter passages tell little beyond how they began [s]."""
-_LONGEST_WINDOW = 20
-"""More slots than this at once is a suspended machine [slots]."""
+"""Columns of a table of ticks that an identification reads."""
+MIN_PASSAGE_S = 5.0
+"""Length of the shortest passage that is used [s]."""
+_MAX_WINDOW_SLOTS = 20
+"""Largest number of periods in one window; a longer window means that the machine was suspended."""
 
 
 class Unidentifiable(FishdError, ValueError):
-    """These ticks do not tell what the fish is; the message says what is missing."""
+    """The ticks do not suffice for an identification; the message says what is missing."""
 
 
 @dataclass(frozen=True)
@@ -40,20 +40,20 @@ class Passage:
     forces: Array
     """Mean F_x and F_y of each window as measured [N], shape (2, windows)."""
     times: Array
-    """When each window ended, since the first tick of all [s], shape (windows,)."""
+    """End of each window, as time since the first tick of all [s], shape (windows,)."""
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Length of the passage [s]."""
         return float(self.ends[-1] * self.tick)
 
 
 def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
-    """The passages of some runs, in order.
+    """Return the passages of runs, in order.
 
-    Raises `Unidentifiable` where there are none, or columns are missing.
+    Raises `Unidentifiable` where no passage is long enough, or a column is missing.
     """
-    found = []
+    usable = []
     begin = 0.0
     for table in tables:
         missing = [name for name in COLUMNS if name not in table]
@@ -65,44 +65,44 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
         if len(table) < 2:
             continue
         columns = {name: table[name].to_numpy() for name in COLUMNS}
-        if "suspect" in table:  # a force that is not to be believed is none
+        if "suspect" in table:  # a suspect force counts as missing
             columns["samples"] = np.where(table["suspect"].fillna("") == "", columns["samples"], 0)
         tick = _period(columns)
-        for rows in _unbroken(columns):
+        for rows in _unbroken_rows(columns):
             passage = _passage(columns, rows, tick, begin)
-            if passage.duration >= SHORTEST:
-                found.append(passage)
+            if passage.duration >= MIN_PASSAGE_S:
+                usable.append(passage)
         begin += float(columns["t"][-1] - columns["t"][0])
-    if not found:
+    if not usable:
         raise Unidentifiable(
-            f"there is no passage of {SHORTEST:g} s without a gap in which the servo has pulses; "
-            "a recording of a fish that swims is needed"
+            f"there is no passage of {MIN_PASSAGE_S:g} s without a gap in which the servo has "
+            "pulses; a recording of a fish that swims is needed"
         )
-    return found
+    return usable
 
 
 def _period(columns: dict[str, Array]) -> float:
-    """The period of the loop, from the times of ticks, which a busy machine stamps late [s]."""
+    """Return the period of the loop [s], from times of ticks, some of which are late."""
     slots = np.diff(columns["seq"]) + np.diff(columns["missed"])
     good = slots > 0
-    each = np.diff(columns["t"])[good] / slots[good]
-    if not len(each) or not (median := float(np.median(each))) > 0.0:
-        raise Unidentifiable("the times of these ticks do not increase: this is no run of a fish")
-    # What one tick is late, the next one is early: the mean is good where clocks do not jump.
-    mean = float(np.mean(each[np.abs(each - median) < 0.5 * median]))
+    intervals = np.diff(columns["t"])[good] / slots[good]
+    if not len(intervals) or not (median := float(np.median(intervals))) > 0.0:
+        raise Unidentifiable("the times of the ticks do not increase: use a recording of a fish")
+    # A late tick shortens the next interval: the mean is right where clocks do not jump.
+    mean = float(np.mean(intervals[np.abs(intervals - median) < 0.5 * median]))
     rounded = float(f"{mean:.3g}")
     return rounded if abs(rounded - mean) < 2e-3 * mean else mean
 
 
-def _unbroken(columns: dict[str, Array]) -> Iterator[slice]:
-    """Rows between which nothing is missing, and that can be used."""
+def _unbroken_rows(columns: dict[str, Array]) -> Iterator[slice]:
+    """Yield slices of usable rows without a gap."""
     usable = (
         columns["servo_on"].astype(bool)
         & (columns["samples"] > 0)
         & np.isfinite(columns["fx"] + columns["fy"] + columns["phi_c"])
     )
     slots = 1 + np.diff(columns["missed"])
-    follows = (np.diff(columns["seq"]) == 1) & (slots >= 1) & (slots <= _LONGEST_WINDOW)
+    follows = (np.diff(columns["seq"]) == 1) & (slots >= 1) & (slots <= _MAX_WINDOW_SLOTS)
     joined = np.concatenate(([False], follows & usable[1:] & usable[:-1]))
     starts = np.flatnonzero(~joined)
     for start, stop in zip(starts, [*starts[1:], len(joined)], strict=True):
@@ -111,9 +111,10 @@ def _unbroken(columns: dict[str, Array]) -> Iterator[slice]:
 
 
 def _passage(columns: dict[str, Array], rows: slice, tick: float, begin: float) -> Passage:
+    """Return the passage of these rows; begin: time of the first tick of the table [s]."""
     slots = 1 + np.diff(columns["missed"][rows]).astype(int)
     phi_c = columns["phi_c"][rows].astype(float)
-    # The command of a tick acts until the next one; the forces of a tick are those before it.
+    # The command of a tick applies until the next one; its forces are means since the last one.
     commands = np.repeat(phi_c[:-1], slots)
     forces = np.stack((columns["fx"][rows], columns["fy"][rows])).astype(float)[:, 1:]
     times = begin + (columns["t"][rows][1:] - columns["t"][0]).astype(float)

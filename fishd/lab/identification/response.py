@@ -1,8 +1,8 @@
-"""What a fish of given parameters answers to recorded commands, fast enough for a fit.
+"""Fast simulation of the response of a fish to recorded commands, for a fit.
 
 The same equations as fishd.virtual.plant, for a whole run at once: the servo in closed form, tick
 by tick; the fin, which is linear, by its exact discrete filter on a grid that is shifted by the
-delay, so that every jump of the command falls on it.
+delay, so that every step of the command is at a grid point.
 """
 
 import math
@@ -18,16 +18,16 @@ from fishd.virtual.plant.tethered import REACTION_TIME
 
 Array = NDArray[np.float64]
 
-_FINEST = 0.0025
-"""Steps of the grid are at most this long [s]."""
-_MOST_SAMPLES = 40
-"""More samples in a period than this are as good as the continuous force."""
+_MAX_STEP_S = 0.0025
+"""Largest step of the grid [s]."""
+_MAX_SAMPLES = 40
+"""Largest number of samples in a period; more would not change the mean force."""
 _MAX_ITERATIONS = 100
-"""Iterations of quadratic drag, at most."""
-_CLOSE = 1e-7
-"""Largest change of the fin's speed in the last iteration, as a share of its largest speed."""
-_EARLIER = 2
-"""Slots before the first command, in which the servo already holds it."""
+"""Largest number of iterations for quadratic drag."""
+_TOLERANCE = 1e-7
+"""Largest change of the fin's speed in the last iteration, relative to its largest speed."""
+_SLOTS_BEFORE = 2
+"""Number of slots before the first command, in which the servo already holds it."""
 
 
 @dataclass(frozen=True)
@@ -35,23 +35,23 @@ class Drive:
     """Parameters of the servo and of the fin; docs/explanation/concepts.md explains the symbols."""
 
     omega0: float
-    """ω₀ [rad/s]"""
+    """Natural frequency ω₀ [rad/s]."""
     xi: float
-    """ξ [1]"""
+    """Damping ξ [1]."""
     servo_speed: float
-    """Ω [rad/s]"""
+    """Speed of the servo Ω [rad/s]."""
     servo_lag: float
-    """Δ [rad]"""
+    """Lag of the servo Δ [rad]."""
     servo_delay: float = 0.0
-    """[s]"""
+    """Dead time of the servo [s]."""
     backlash: float = 0.0
-    """[rad]"""
+    """Backlash [rad]."""
     cable_slack: float = 0.0
-    """[rad]"""
+    """Slack of the cables [rad]."""
     servo_dead_zone: float = 0.0
-    """[rad]"""
+    """Dead zone of the servo [rad]."""
     quadratic_drag: float = 0.0
-    """That of the fin times its coupling, cλ, as the fin here has λ = 1 [1/rad]."""
+    """Quadratic drag times coupling, cλ, as the fin here has λ = 1 [1/rad]."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class Motion:
     """Motion of the wheel and of a fin with λ = 1, at the points of a grid."""
 
     servo: tuple[float, ...]
-    """What of the drive the wheel depends on."""
+    """Parameters of the drive that determine the motion of the wheel."""
     pull: Array
-    """Wheel angle that drives the fin, also half way between the points [rad]."""
+    """Wheel angle that drives the fin, at the points and half way between them [rad]."""
     turned: Array
     """Angle of the wheel itself at the same instants [rad]."""
     rate: Array
@@ -83,25 +83,25 @@ def respond(
     samples: int,
     near: Motion | None = None,
 ) -> tuple[Array, Motion]:
-    """Return what the sensor feels, and the motion.
+    """Return the forces on the sensor, and the motion.
 
-    The first are window means of [−α α̈, −α̈, −α̇, −φ̈, −|α̇| α̇] for λ = 1, of shape
+    The forces are window means of [−α α̈, −α̈, −α̇, −φ̈, −|α̇| α̇] for λ = 1, of shape
     (5, len(ends) − 1).
 
-    With coupling λ, F_x = K λ² · the first, and F_y = K_y λ · the second + K_d λ · the third +
-    J · the fourth, which is smoothed as the mount of the servo does, + K_q λ² · the fifth.
+    With coupling λ, F_x = K λ² · row 0, and F_y = K_y λ · row 1 + K_d λ · row 2 + J · row 3 +
+    K_q λ² · row 4. Row 3 is smoothed as by the mount of the servo.
 
     commands: φ_c in each slot of one period [rad], from the start on
     ends: slots at whose starts windows end; the first one begins where the first window does
     tick: one period [s]
-    samples: how many samples, spread evenly over each period, the means are taken over
-    near: the motion for the same commands and a similar drive, which saves time
+    samples: number of samples in each mean, evenly spaced over each period
+    near: motion for the same commands and a similar drive, to save time
     """
-    samples = min(samples, _MOST_SAMPLES)
-    stride = math.ceil(tick / (samples * _FINEST))
+    samples = min(samples, _MAX_SAMPLES)
+    stride = math.ceil(tick / (samples * _MAX_STEP_S))
     steps = stride * samples
     h = tick / steps
-    before = _EARLIER + math.ceil(drive.servo_delay / tick - 1e-9)
+    before = _SLOTS_BEFORE + math.ceil(drive.servo_delay / tick - 1e-9)
     held = np.concatenate((np.full(before, commands[0]), commands))
     servo = (
         *(drive.servo_speed, drive.servo_lag, drive.backlash, drive.cable_slack),
@@ -110,48 +110,51 @@ def respond(
     if near and near.servo == servo:
         pull, turned = near.pull, near.turned
     else:
-        pull, turned = _pull(drive, held, steps, tick)
+        pull, turned = _wheel_motion(drive, held, steps, tick)
     similar = near.rate if near and near.pull.size == pull.size else None
     alpha, rate = _fin(drive, pull, h, similar)
-    # Slot k of the commands begins at k·tick; its command acts from grid point (k + before)·steps
-    # on, which is servo_delay later. So its first sample is at this grid point:
+    # Slot k of the commands begins at k·tick; its command applies from grid point
+    # (k + before)·steps on, which is servo_delay later. So its first sample is here:
     position = before * steps - drive.servo_delay / h + 0.5 * stride
     first = math.floor(position)
     part = position - first
     slots = int(ends[-1])
 
-    def taken(values: Array, later: int = 0, each: int = 1) -> Array:
-        return values[each * first + later :: each * stride][: slots * samples]
+    def sample_grid(values: Array, later: int = 0, factor: int = 1) -> Array:
+        return values[factor * first + later :: factor * stride][: slots * samples]
 
     acceleration = _acceleration(drive, alpha, rate, pull[::2])
-    here, there = taken(rate), taken(rate, 1)
-    a = _hermite(taken(alpha), taken(alpha, 1), here, there, part, h)
-    v = _hermite(here, there, taken(acceleration), taken(acceleration, 1), part, h)
-    pulls = taken(pull, 0, 2), taken(pull, 1, 2), taken(pull, 2, 2)
+    here, there = sample_grid(rate), sample_grid(rate, 1)
+    a = _hermite(sample_grid(alpha), sample_grid(alpha, 1), here, there, part, h)
+    v = _hermite(here, there, sample_grid(acceleration), sample_grid(acceleration, 1), part, h)
+    pulls = sample_grid(pull, 0, 2), sample_grid(pull, 1, 2), sample_grid(pull, 2, 2)
     pulled = np.tensordot(_parabola(part), np.stack(pulls), 1)
     minus = -_acceleration(drive, a, v, pulled)
     sums = np.stack((a * minus, minus, -v, -np.abs(v) * v))
     sums = sums.reshape(4, slots, samples).sum(axis=2)
     means: Array = np.add.reduceat(sums, ends[:-1], axis=1) / (samples * np.diff(ends))
     edges = 2.0 * (before * steps - drive.servo_delay / h + ends * steps)
-    passed_on = np.interp(edges, np.arange(turned.size), _passed_on(turned, 0.5 * h))
-    reaction = -np.diff(passed_on) / (tick * np.diff(ends))
+    mount_rates = np.interp(edges, np.arange(turned.size), _smoothed_speed(turned, 0.5 * h))
+    reaction = -np.diff(mount_rates) / (tick * np.diff(ends))
     forces = np.vstack((means[:3], reaction, means[3]))
     return forces, Motion(servo, pull, turned, rate)
 
 
-def _passed_on(angles: Array, step: float) -> Array:
-    """The speed of the wheel as the servo's mount passes it on; its angles are `step` s apart."""
+def _smoothed_speed(angles: Array, step: float) -> Array:
+    """Return the speed of the wheel, smoothed by the mount of the servo [rad/s].
+
+    angles: angles of the wheel [rad]; step: their spacing [s]
+    """
     decay = math.exp(-step / REACTION_TIME)
     speeds = np.diff(angles, prepend=angles[0]) / step
     smoothed: Array = lfilter([1.0 - decay], [1.0, -decay], speeds)
     return smoothed
 
 
-def _pull(drive: Drive, held: Array, steps: int, tick: float) -> tuple[Array, Array]:
-    """What drives the fin, in wheel angle [rad], and the angle of the wheel itself.
+def _wheel_motion(drive: Drive, held: Array, steps: int, tick: float) -> tuple[Array, Array]:
+    """Return the wheel angle that drives the fin, and the angle of the wheel itself [rad].
 
-    Both at the grid points and half way between them.
+    Both are at the grid points and half way between them.
     """
     speed, lag = drive.servo_speed, drive.servo_lag
     dead, play = drive.servo_dead_zone, drive.backlash
@@ -193,11 +196,11 @@ def _acceleration(drive: Drive, angle: Array, rate: Array, pull: Array) -> Array
 def _fin(drive: Drive, pull: Array, h: float, similar: Array | None) -> tuple[Array, Array]:
     """Return α and α̇ at the grid points for λ = 1, from rest at the first pull.
 
-    Quadratic drag is found by iteration: the fin is a linear filter of the pull and of the drag of
-    the motion found before. A linear drag of about its size, c·m, is part of the filter, so that
-    only the rest, c (|α̇| − m) α̇, is iterated.
+    Quadratic drag is computed by iteration: the fin is a linear filter of the pull and of the drag
+    in the last iteration. A linear drag of about its size, c·m, is part of the filter, so that
+    only the remainder, c (|α̇| − m) α̇, is iterated.
 
-    similar: a speed to begin with [rad/s]
+    similar: initial guess of the speed [rad/s]
     """
     drag = drive.quadratic_drag
     if not drag:
@@ -217,19 +220,19 @@ def _fin(drive: Drive, pull: Array, h: float, similar: Array | None) -> tuple[Ar
         driven = pull - share * (np.abs(rates) - mean) * rates
         before = rate
         alpha, rate = _linear_fin(drive.omega0, xi, driven, h)
-        if shrinks * np.abs(rate - before).max() <= _CLOSE * np.abs(rate).max():
+        if shrinks * np.abs(rate - before).max() <= _TOLERANCE * np.abs(rate).max():
             break
     return alpha, rate
 
 
 def _linear_fin(omega0: float, xi: float, pull: Array, h: float) -> tuple[Array, Array]:
     """Return α and α̇ at the grid points of a fin without quadratic drag, from rest."""
-    free, push = _discrete(omega0, xi, h)
+    free, push = _discretise(omega0, xi, h)
     relative = pull - pull[0]
     cells = np.stack((relative[:-2:2], relative[1:-1:2], relative[2::2]))
     kick_a, kick_v = push @ cells
     (p, q), (r, s) = free.tolist()
-    # x(n+1) = free x(n) + kick(n), solved for each of its two parts: both obey the characteristic
+    # x(n+1) = free x(n) + kick(n), solved for each component: both satisfy the characteristic
     # equation of `free`.
     denominator = [1.0, -(p + s), p * s - q * r]
     zero = np.zeros(1)
@@ -240,8 +243,11 @@ def _linear_fin(omega0: float, xi: float, pull: Array, h: float) -> tuple[Array,
 
 
 @lru_cache(maxsize=64)
-def _discrete(omega0: float, xi: float, h: float) -> tuple[Array, Array]:
-    """(2, 2) free motion over h; (2, 3) what pulls at start, middle and end add, as a parabola."""
+def _discretise(omega0: float, xi: float, h: float) -> tuple[Array, Array]:
+    """Return the free motion over h, (2, 2), and the effect of a parabolic pull, (2, 3).
+
+    The pull is given at start, middle and end of the cell.
+    """
     fin = np.array([[0.0, 1.0], [-(omega0**2), -xi * omega0]])
     chain = np.zeros((5, 5))
     chain[:2, :2] = fin
@@ -256,7 +262,7 @@ def _discrete(omega0: float, xi: float, h: float) -> tuple[Array, Array]:
 def _hermite(
     values: Array, next_values: Array, slopes: Array, next_slopes: Array, part: float, h: float
 ) -> Array:
-    """Cubic interpolation in cells of length h, at `part` of each, with 0 ≤ part < 1."""
+    """Return cubic interpolations in cells of length h, at the fraction `part`, 0 ≤ part < 1."""
     s, t = part, 1.0 - part
     return (
         (1.0 + 2.0 * s) * t * t * values
@@ -266,5 +272,5 @@ def _hermite(
 
 
 def _parabola(s: float) -> tuple[float, float, float]:
-    """Weights at `s` of what is at the start, the middle and the end of a cell."""
+    """Return the weights at `s` of the values at start, middle and end of a cell."""
     return (1.0 - s) * (1.0 - 2.0 * s), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0)

@@ -1,4 +1,4 @@
-"""What an identification has found: values with intervals, and how well they explain the forces."""
+"""Result of an identification: parameters with intervals, and the explained share of forces."""
 
 import math
 from dataclasses import dataclass
@@ -27,15 +27,15 @@ UNITS = {
     "offset_x": "N",
     "offset_y": "N",
 }
-"""What is estimated, in the order of tables; the names are those of the configuration."""
+"""Units of the estimates, in the order of tables; the names are those of the configuration."""
 PRODUCT_UNITS = {
     "thrust_coefficient * coupling^2": "N s^2/rad^2",
     "lateral_inertia * coupling": "N s^2/rad",
     "lateral_drag * coupling": "N s/rad",
 }
-"""Units of the products that forces tell without an assumption: K λ², K_y λ and K_d λ."""
-OF_THE_RIG = ("rotation", "offset_x", "offset_y")
-"""What belongs into the section `simulation`, not `plant`."""
+"""Units of the products that forces determine without assumptions: K λ², K_y λ and K_d λ."""
+RIG_PARAMETERS = ("rotation", "offset_x", "offset_y")
+"""Parameters of the section `simulation`, not `plant`."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Estimate:
     """Lower end of the interval; 0 or −inf, with `high` inf, where it is withheld."""
     high: float
     fitted: bool = True
-    """False for one that was taken from the configuration."""
+    """False for a value that was taken from the configuration."""
     if_ratio_holds: tuple[float, float] | None = None
     """Ends of the 95 % interval if K_y/K is as configured; None where that makes no difference."""
 
@@ -58,80 +58,80 @@ class Estimate:
         return UNITS.get(self.name) or PRODUCT_UNITS[self.name]
 
     @property
-    def known(self) -> tuple[float, float]:
-        """Ends of the narrowest interval: that of `if_ratio_holds`, where there is one."""
+    def narrowest_interval(self) -> tuple[float, float]:
+        """Ends of the narrowest interval: `if_ratio_holds`, or else `low` and `high`."""
         return self.if_ratio_holds or (self.low, self.high)
 
 
 @dataclass(frozen=True)
 class Channel:
-    """How one force was explained."""
+    """The explained share and the noise of one force."""
 
     name: str
     """`fx` or `fy`"""
     explained: float
-    """Share of the variance that the model explains, drift left out; 1 is all."""
+    """Share of the variance that the model explains, without drift; 1 is all of it."""
     explained_out_of_sample: float
-    """The same share of data that the model was not fitted to: each part is predicted from a fit
-    of the others, where a part holds half beats of similar length and amplitude."""
+    """Explained share of data that were left out of the fit: each group is predicted from a fit of
+    the others, where a group holds half beats of similar length and amplitude."""
     noise: float
-    """Rms of the white noise of a tick's mean [N]."""
+    """Rms of the white noise of the mean force of a tick [N]."""
     drift: float
-    """The sensor's drift over the runs, from lowest to highest [N]."""
+    """Range of the sensor's drift over the runs [N]."""
     white: bool
-    """Whether what is left over is no more than noise; else the model lacks something."""
+    """True where the residual is white noise; else the model is incomplete."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The forces that were measured, and those of the identified fish; arrays of equal length."""
+    """The measured forces and those of the identified fish, in arrays of equal length."""
 
     times: Array
-    """End of each window, since the start [s]; NaN between two passages."""
+    """End of each window, as time since the start [s]; NaN between two passages."""
     measured: Array
-    """F_x and F_y [N], shape (2, n)."""
+    """Measured F_x and F_y [N], shape (2, n)."""
     simulated: Array
-    """The same of the identified fish, without offset, drift and noise, shape (2, n)."""
+    """Simulated F_x and F_y [N], without offset, drift and noise, shape (2, n)."""
     drift: Array
     """Offset and drift of the sensor, smoothed, shape (2, n) [N]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Identification:
-    """A fish and its rig, as their forces tell."""
+    """A fish and its rig as identified from forces."""
 
     headline: str
-    """First line of what is shown: whether the numbers can be trusted, and why not."""
+    """First line of a report: whether the values can be trusted, and if not, why."""
     identified: bool
-    """Whether the model explains the forces well enough for intervals; else they are withheld."""
+    """True where the model explains the forces well enough; else intervals are withheld."""
     estimates: tuple[Estimate, ...]
     products: tuple[Estimate, ...]
-    """K λ², K_y λ and K_d λ, which forces tell whatever K_y/K is."""
+    """K λ², K_y λ and K_d λ, which forces determine for any K_y/K."""
     channels: tuple[Channel, Channel]
     seconds: float
-    """Length of what was fitted [s]."""
+    """Length of the fitted data [s]."""
     passages: int
-    """Parts of it without a gap."""
+    """Number of parts without a gap."""
     remarks: tuple[str, ...]
-    """What a reader must know before the numbers are used, a line each."""
+    """Warnings about the values, one line each."""
     names: tuple[str, ...]
-    """What was fitted, but for the offsets, and for K_y/K where no data tell it."""
+    """Names of the fitted parameters, without offsets, and without an undetermined K_y/K."""
     covariance: Array
-    """Covariance of the errors of `names`, of logarithms for those in `fit.LOGARITHMIC`, with what
-    misfit adds, for K_y/K as configured; shape (names, names)."""
+    """Covariance of the errors of `names`, of logarithms for those in `fit.LOGARITHMIC`, misfit
+    included, for K_y/K as configured; shape (names, names)."""
     inflation: float
-    """How many times as wide as noise alone makes them the intervals are, in the median."""
+    """Median ratio of the width of an interval to the width from noise alone."""
     failed_assumptions: tuple[str, ...]
-    """What was assumed of the fish and does not hold, the clearest first; empty in the best case.
+    """Assumptions about the fish that do not hold, the clearest first; empty in the best case.
 
-    `white residual of fx` or `fy`: what is left over is more than noise. `prediction of fx` or
-    `fy`: data left out of the fit are predicted worse than those in it. `<name> = 0`: the key
-    `<name>` of section `plant`, or `rotation`, explains a part of what is left over.
+    `white residual of fx` or `fy`: the residual is more than noise. `prediction of fx` or `fy`:
+    data left out of the fit are predicted worse than those in it. `<name> = 0`: the key `<name>`
+    of section `plant`, or `rotation`, explains a part of the residual.
     """
     fit: Fit
 
     def __getitem__(self, name: str) -> Estimate:
-        """The estimate of this name; raises KeyError."""
+        """Return the estimate of this name; raises KeyError."""
         for estimate in self.estimates:
             if estimate.name == name:
                 return estimate
@@ -139,27 +139,27 @@ class Identification:
 
     @property
     def plant(self) -> dict[str, float]:
-        """The section `plant` of a configuration."""
-        return {e.name: e.value for e in self.estimates if e.name not in OF_THE_RIG}
+        """Values of the section `plant` of a configuration."""
+        return {e.name: e.value for e in self.estimates if e.name not in RIG_PARAMETERS}
 
     @property
     def simulation(self) -> dict[str, float]:
-        """The section `simulation` of a configuration: the rig as it was, but for its drift."""
-        rig = {name: self[name].value for name in OF_THE_RIG}
+        """Values of the section `simulation` of a configuration: the rig without its drift."""
+        rig = {name: self[name].value for name in RIG_PARAMETERS}
         return {**rig, "noise": max(channel.noise for channel in self.channels)}
 
     @property
     def leak(self) -> float | None:
-        """The `estimator.leak` that restores the fin velocity, K_y/K_d [s]; None without a drag."""
+        """Key `estimator.leak` that restores the fin velocity, K_y/K_d [s]; None without drag."""
         drag = self["lateral_drag"].value
         inertia = self["lateral_inertia_ratio"].value * self["thrust_coefficient"].value
         leak = inertia / drag if drag > 0.0 else MAX_LEAK_S
         return leak if 0.0 < leak < MAX_LEAK_S else None
 
     def to_yaml(self, origin: str = "") -> str:
-        """Both sections and the leak, as a file that `fishd --config` reads.
+        """Return both sections and the leak as a configuration file for `fishd --config`.
 
-        origin: what it was identified from, for a comment
+        origin: source of the data, for a comment
         """
         lines = ["# A fish as identified" + (f" from {origin}" if origin else "") + "."]
         lines += [f"# {self.headline}."]
@@ -173,14 +173,14 @@ class Identification:
         return "\n".join(lines) + "\n"
 
     def to_builtins(self) -> dict[str, Any]:
-        """All but the series, for JSON."""
+        """Return everything except the series, for JSON."""
         return {
             "headline": self.headline,
             "identified": self.identified,
             "failed_assumptions": list(self.failed_assumptions),
             "inflation": self.inflation,
-            "estimates": {e.name: _plain(e) for e in self.estimates},
-            "products": {e.name: _plain(e) for e in self.products},
+            "estimates": {e.name: _to_builtins(e) for e in self.estimates},
+            "products": {e.name: _to_builtins(e) for e in self.products},
             "channels": {
                 c.name: {
                     "explained": c.explained,
@@ -198,41 +198,46 @@ class Identification:
 
     def _line(self, name: str, value: float) -> str:
         if name not in UNITS:
-            return f"  {name}: {_number(value)}"
-        found = self[name]
-        text = f"  {name}: {_number(_rounded(found))}"
-        unit = "" if found.unit == "1" else f" {found.unit}"
-        if not found.fitted:
+            return f"  {name}: {_format_number(value)}"
+        estimate = self[name]
+        text = f"  {name}: {_format_number(_round(estimate))}"
+        unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+        if not estimate.fitted:
             return f"{text}{unit and '  #' + unit}"
-        if not math.isfinite(found.high):
+        if not math.isfinite(estimate.high):
             return f"{text}  # not identified{unit and ',' + unit}"
-        return f"{text}  # {found.low:.5g} to {found.high:.5g}{unit}"
+        return f"{text}  # {estimate.low:.5g} to {estimate.high:.5g}{unit}"
 
 
-def _plain(found: Estimate) -> dict[str, Any]:
+def _to_builtins(estimate: Estimate) -> dict[str, Any]:
     """Return an estimate for JSON, which has no infinity: an end that is withheld is None."""
-    low, high = (end if math.isfinite(end) else None for end in (found.low, found.high))
-    plain: dict[str, Any] = {"value": found.value, "low": low, "high": high, "unit": found.unit}
-    if not found.fitted:
+    low, high = (end if math.isfinite(end) else None for end in (estimate.low, estimate.high))
+    plain: dict[str, Any] = {
+        "value": estimate.value,
+        "low": low,
+        "high": high,
+        "unit": estimate.unit,
+    }
+    if not estimate.fitted:
         plain["fitted"] = False
-    if found.if_ratio_holds:
-        plain["if_ratio_holds"] = list(found.if_ratio_holds)
+    if estimate.if_ratio_holds:
+        plain["if_ratio_holds"] = list(estimate.if_ratio_holds)
     return plain
 
 
-def _rounded(found: Estimate) -> float:
-    """Return the value rounded to a hundredth of its interval or better."""
-    low, high = found.known
+def _round(estimate: Estimate) -> float:
+    """Return the value, rounded to 1 % of the width of its interval or better."""
+    low, high = estimate.narrowest_interval
     width = high - low
-    if not found.fitted or not 0.0 < width < math.inf:
-        return found.value
-    rounded = round(found.value, 2 - math.floor(math.log10(width)))
-    # A fish that hardly answers is no fish without it: what must be positive stays so.
-    return rounded if rounded or low <= 0.0 else found.value
+    if not estimate.fitted or not 0.0 < width < math.inf:
+        return estimate.value
+    rounded = round(estimate.value, 2 - math.floor(math.log10(width)))
+    # A positive parameter must not be rounded to zero.
+    return rounded if rounded or low <= 0.0 else estimate.value
 
 
-def _number(value: float) -> str:
-    """Six digits, as YAML reads a number."""
+def _format_number(value: float) -> str:
+    """Return a number with six digits, in a form that YAML reads as a number."""
     text = f"{value:.6g}"
     mantissa, letter, exponent = text.partition("e")
     return f"{mantissa}{'' if '.' in mantissa else '.0'}{letter}{exponent}" if letter else text

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fishd.lab.drawing import BLUE, ORANGE, drawn, save
+from fishd.lab.drawing import BLUE, ORANGE, open_figure, save
 from fishd.lab.optimise.search import Proposal, Search
 
 _LOG_TICKS = [base * 10.0**k for k in range(-4, 4) for base in (1, 2, 3, 5)]
@@ -21,7 +21,7 @@ def draw(
     Raises `FishdError` if a file cannot be written.
     """
     names = [searched.name for searched in search.ranges]
-    with drawn(paths[0], (3.6 * len(names) + 2.4, 3.8)) as figure:
+    with open_figure(paths[0], (3.6 * len(names) + 2.4, 3.8)) as figure:
         axes = figure.subplots(1, len(names), squeeze=False)[0]
         for axis, searched in zip(axes, search.ranges, strict=True):
             x, y, error = search.read_measurements(searched.name)

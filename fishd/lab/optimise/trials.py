@@ -10,7 +10,7 @@ from fishd.core.schema import Field
 from fishd.core.signals import Tick
 from fishd.lab.error_budget import visible_rotation
 from fishd.lab.experiment import Experiment
-from fishd.lab.measurement import REST, Step, evaluate, samples_of
+from fishd.lab.measurement import MEAN_REST_S, Step, evaluate, to_samples
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.session import Session, refuse_lost
@@ -104,23 +104,23 @@ def measure_trials(
     rest: list[Tick] = []
     steps: list[Step] = []
     swum, passed = (before.swum, before.passed) if before else (0, 0.0)
-    passed += REST
+    passed += MEAN_REST_S
     while True:
         candidate = search.suggest()
         parameters = {**fixed, **candidate}
         settles, length = trial_durations(parameters)
-        if passed + length + REST > budget:
+        if passed + length + MEAN_REST_S > budget:
             return
         if not rest:
-            rest = session.rest(REST)
+            rest = session.rest(MEAN_REST_S)
         swim = session.swim(controller, parameters, length)
-        after = session.rest(REST)
+        after = session.rest(MEAN_REST_S)
         ticks = [*rest, *swim, *after]
-        refuse_lost(ticks, (REST, length, REST), session.tick)
-        evaluation = evaluate(samples_of(ticks), session.tick, settles, alike=steps)
+        refuse_lost(ticks, (MEAN_REST_S, length, MEAN_REST_S), session.tick)
+        evaluation = evaluate(to_samples(ticks), session.tick, settles, alike=steps)
         steps += evaluation.steps
         swum += len(swim)
-        passed += length + REST
+        passed += length + MEAN_REST_S
         power, power_error = (
             math.nan if value is None else value
             for value in (evaluation.watts, evaluation.watts_error)

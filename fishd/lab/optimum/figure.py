@@ -12,12 +12,12 @@ from fishd.lab.optimum.optimal_control import Array, OptimalControl
 def draw(control: OptimalControl, path: str | os.PathLike[str]) -> None:
     """Draw two periods of the command, wheel and fin, of the costate, and of the thrust.
 
-    path: as for `drawing.drawn`, whose errors are raised
+    path: as for `drawing.open_figure`, whose errors are raised
     """
     limit = control.amplitude
     n = len(control.time)
     edges = control.period / n * np.arange(2 * n + 1)
-    with drawing.drawn(path, (6.4, 5.2)) as figure:
+    with drawing.open_figure(path, (6.4, 5.2)) as figure:
         angles, costate, force = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 2))
         angles.stairs(_repeat_twice(control.command), edges, baseline=None, color=BLACK, lw=1.3)
         angles.plot(edges, _repeat_and_close(control.wheel), color=BLUE, ls=(0, (4, 2)))

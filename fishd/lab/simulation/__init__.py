@@ -1,4 +1,4 @@
-"""A run in virtual time: the robot's own loop on a simulated fish, its ticks or a report."""
+"""Runs in virtual time: the control loop of fishd on a simulated fish, with ticks or a report."""
 
 from fishd.lab.simulation.beats import Beats
 from fishd.lab.simulation.report import Report, check_whole_beat, judge, simulate

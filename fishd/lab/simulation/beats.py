@@ -1,4 +1,4 @@
-"""What a plant truly did over whole beats."""
+"""Means of the true motion and forces of a plant over whole beats."""
 
 import math
 import sys
@@ -10,54 +10,54 @@ from fishd.virtual.plant.base import TrueWindow
 
 
 class Beats:
-    """Adds up what the plant truly did over whole beats, from upward reversal to upward reversal.
+    """Sums of the true quantities of a plant over whole beats, between upward reversals.
 
-    A run without a whole beat is judged over all its time.
+    For a run without a whole beat, the sums cover all its time.
     """
 
     def __init__(self) -> None:
-        self._whole = _Sums()
-        self._open = _Sums()
-        self._before = _Sums()
-        """The time before the first beat."""
+        self._whole_beats = _Sums()
+        self._open_beat = _Sums()
+        self._before_beats = _Sums()
+        """Sums over the time before the first beat."""
         self.reversals = 0
         self._began = False
         self._reversals = Reversals()
-        self._each: list[tuple[float, float]] = []  # impulse N s, duration s
+        self._beats: list[tuple[float, float]] = []  # impulse N s, duration s
 
     @property
     def count(self) -> int:
-        """How many whole beats there were."""
-        return len(self._each)
+        """Number of whole beats."""
+        return len(self._beats)
 
     def add(self, angle: float, window: TrueWindow) -> None:
         """Add a window; angle: the instruction angle during it [rad]."""
         if reversal := self._reversals.add(angle):
-            self._open.close_half()
+            self._open_beat.close_half()
             self.reversals += 1
             if reversal > 0:
                 if self._began:
-                    self._whole += self._open
-                    self._each.append((self._open.impulse, self._open.duration))
+                    self._whole_beats += self._open_beat
+                    self._beats.append((self._open_beat.impulse, self._open_beat.duration))
                 else:
-                    self._before = self._open
+                    self._before_beats = self._open_beat
                 self._began = True
-                self._open = _Sums()
-        self._open.add(angle, window)
+                self._open_beat = _Sums()
+        self._open_beat.add(angle, window)
 
     def means(self) -> "BeatMeans":
-        """Means over the whole beats."""
-        sums = self._whole
+        """Return the means over the whole beats."""
+        sums = self._whole_beats
         frequency = 0.5 * sums.halves / sums.duration if sums.halves else 0.0
         if not sums.halves:
-            self._open.close_half()
-            sums = self._before
-            sums += self._open
+            self._open_beat.close_half()
+            sums = self._before_beats
+            sums += self._open_beat
         mean = sums.angle / sums.duration
         rms = math.sqrt(sums.angle_squared / sums.duration)
         return BeatMeans(
             thrust=sums.impulse / sums.duration,
-            thrust_deviation=_deviation(self._each),
+            thrust_deviation=_thrust_standard_error(self._beats),
             frequency=frequency,
             fin_amplitude=sums.peaks / sums.halves,
             mean_angle=mean,
@@ -77,20 +77,20 @@ class BeatMeans(NamedTuple):
     squareness: float  # mean |φ_c| over rms φ_c
     power: float | None  # electrical, of the servo, W; None for a fish without a motor
     half_beats: tuple[int, int]  # shortest and longest, ticks
-    thrust_deviation: float  # standard error of the thrust, by how beats differ, N; or NaN
+    thrust_deviation: float  # standard error of the thrust, from the spread of beats, N; or NaN
 
 
-def _deviation(beats: Sequence[tuple[float, float]]) -> float:
-    """Standard error of impulse over duration, a ratio of two means; NaN for fewer than two beats.
+def _thrust_standard_error(beats: Sequence[tuple[float, float]]) -> float:
+    """Return the standard error of total impulse over total duration; NaN for less than two beats.
 
     Cochran, Sampling Techniques, 3rd edition, equation 6.9.
     """
     n = len(beats)
     if n < 2:
         return math.nan
-    duration = sum(lasts for _, lasts in beats)
+    duration = sum(length for _, length in beats)
     mean = sum(impulse for impulse, _ in beats) / duration
-    squares = sum((impulse - mean * lasts) ** 2 for impulse, lasts in beats)
+    squares = sum((impulse - mean * length) ** 2 for impulse, length in beats)
     return math.sqrt(squares * n / (n - 1)) / duration
 
 

@@ -1,4 +1,4 @@
-"""A swim of the free swimmer in virtual time: its track, what it tells, and its checkpoints."""
+"""A swim of the free swimmer in virtual time: its track, a report, and checkpoints."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -26,46 +26,48 @@ from fishd.virtual.swimmer.track import Track
 
 
 class SwimReport(Gait, frozen=True, kw_only=True):
-    """The result of a swim: the gait once settled, and how the run went."""
+    """Result of a swim: the settled gait, and facts about the run."""
 
     controller: str
     parameters: dict[str, Any]
     seconds: float
-    """Length of the swim, that before a checkpoint included [s]."""
+    """Length of the swim, including the part before a checkpoint [s]."""
     resumed: float | None
-    """Time of the checkpoint that it goes on from, where the controller began anew [s]."""
+    """Time of the checkpoint from which the swim resumed, with the controller reset [s]."""
     ticks: int
     mode: str
     """Mode at the end."""
     reason: Reason | None
-    """Why, when that is fault."""
+    """Reason of mode fault."""
     fallback: Reason | None
-    """Why another controller took over, if one did."""
+    """Reason why the fallback took over; None if it did not."""
     real_time_factor: float
-    """Seconds of the fish per second."""
+    """Ratio of simulated time to computing time."""
 
 
-class Keeping(Struct, frozen=True):
-    """Where checkpoints go, and how often."""
+class CheckpointSettings(Struct, frozen=True):
+    """Settings of the checkpoints of a swim."""
 
     path: Path
+    """Path of the checkpoint, which is overwritten."""
     every: float = 5.0
-    """Of the fish's time [s]."""
+    """Interval in simulated time [s]."""
 
 
-class Swum(NamedTuple):
-    """What is left of a swim."""
+class SwimResult(NamedTuple):
+    """Result of a swim, possibly incomplete."""
 
     track: Track
     report: SwimReport | None
-    """None where the swim was ended before there was anything to judge."""
+    """Report of the swim; None where it ended before the gait had settled."""
     trouble: Diverged | None
-    """Why the fish could not go on."""
+    """Error of the simulation that ended the swim; None if there was none."""
     kept: float | None
-    """Time of the latest checkpoint that was written [s]."""
+    """Time of the latest written checkpoint [s]."""
     lost: OSError | None
-    """Why the latest one was not."""
+    """Error of writing the latest checkpoint; None if it was written."""
     complete: bool
+    """True where the swim has the requested length."""
 
 
 def swim(
@@ -78,21 +80,21 @@ def swim(
     begun: Callable[[VirtualRun], None] = lambda run: None,
     *,
     progress: Callable[[float, float], None] = lambda passed, speed: None,
-    keeping: Keeping | None = None,
+    keeping: CheckpointSettings | None = None,
     resume: Checkpoint | None = None,
     ended: Callable[[], bool] = lambda: False,
     watch: Callable[[Swimmer], None] = lambda fish: None,
     lost: Callable[[OSError], None] = lambda error: None,
-) -> Swum:
-    """Let a controller swim a free swimmer for `seconds`, and judge it after `settle` seconds.
+) -> SwimResult:
+    """Swim a free swimmer with a controller for `seconds`; report the gait after `settle` seconds.
 
-    publisher, begun: as for `fishd.lab.simulation.simulate`
-    progress: called after every tick with the time [s] and the mean speed since it settled [m/s]
-    keeping: write checkpoints, the last one when it ends
-    resume: go on from there; with the same controller the time before counts
-    ended: asked after every tick whether to end now
-    watch: shown the fish after every tick
-    lost: told the first time that a checkpoint cannot be written; the fish swims on
+    publisher, begun: see `fishd.lab.simulation.simulate`
+    progress: called after each tick with the time [s] and the mean speed since it settled [m/s]
+    keeping: settings of checkpoints; the last one is written at the end
+    resume: checkpoint to resume from; with the same controller the time before it counts
+    ended: called after each tick; the swim ends where it returns True
+    watch: called with the fish after each tick
+    lost: called with the first error of writing a checkpoint; the swim continues
     Raises `UnknownController`, `ParameterError`, `MissingPackage` and `CheckpointError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
@@ -104,7 +106,7 @@ def swim(
             f"{config.tick:g} s or more after the {settle:g} s that it may take to settle"
         )
     settings = settings_of(config)
-    keeper = _Keeper(keeping, lost)
+    writer = _CheckpointWriter(keeping, lost)
     kept_rows: Array | None = None
     if resume:
         resume.check(settings)
@@ -121,7 +123,7 @@ def swim(
         track = Track()
         if resume:
             resume.put_into(fish)
-            run.loop.applied = fish.command  # which the new controller goes on from
+            run.loop.applied = fish.command  # the new controller starts from this angle
             track = Track(kept_rows)
         before = len(track)
         track.begin(fish)
@@ -132,8 +134,8 @@ def swim(
         since = time.perf_counter()
         mean_speed = _Speed(fish, first - before)
 
-        def keep() -> None:
-            keeper.keep(fish, track, settings, name, given)
+        def write_checkpoint() -> None:
+            writer.write(fish, track, settings, name, given)
 
         while len(track) < ticks:
             command = run.loop.applied
@@ -144,13 +146,13 @@ def swim(
             watch(fish)
             progress(len(track) * config.tick, mean_speed.mean())
             if fish.fish.time >= next_kept - 1e-9:
-                keep()
+                write_checkpoint()
                 next_kept += keeping.every if keeping else 0.0
             if ended():
                 break
         elapsed = time.perf_counter() - since
         if not fish.trouble and len(track) > before:
-            keep()
+            write_checkpoint()
         loop = run.loop
         report = None
         if len(track) > first + 1:
@@ -167,58 +169,58 @@ def swim(
                 fallback=loop.active.fallback,
                 real_time_factor=(len(track) - before) * config.tick / elapsed,
             )
-    return Swum(
-        track, report, fish.trouble, keeper.kept, keeper.trouble, complete=len(track) >= ticks
+    return SwimResult(
+        track, report, fish.trouble, writer.kept, writer.trouble, complete=len(track) >= ticks
     )
 
 
 def settings_of(config: Config) -> dict[str, Any]:
-    """What the motion of a swimmer depends on, as in the configuration."""
+    """Return the settings on which the motion of a swimmer depends, as in the configuration."""
     swimmer = msgspec.to_builtins(config.swimmer)
     del swimmer["slow_motion"]
-    found = {"tick": config.tick, "swimmer": swimmer, "amplitude_limit": config.amplitude_limit}
+    settings = {"tick": config.tick, "swimmer": swimmer, "amplitude_limit": config.amplitude_limit}
     if config.swimmer.muscle.servo:
         plant = config.plant
-        found["plant"] = {"servo_speed": plant.servo_speed, "servo_lag": plant.servo_lag}
-    return found
+        settings["plant"] = {"servo_speed": plant.servo_speed, "servo_lag": plant.servo_lag}
+    return settings
 
 
-class _Keeper:
-    """Writes checkpoints; one that cannot be written is no reason to end a swim."""
+class _CheckpointWriter:
+    """A writer of checkpoints; an error does not end the swim."""
 
-    def __init__(self, keeping: Keeping | None, lost: Callable[[OSError], None]) -> None:
+    def __init__(self, keeping: CheckpointSettings | None, lost: Callable[[OSError], None]) -> None:
         self._keeping, self._lost = keeping, lost
-        self._told = False
+        self._has_reported = False
         self.kept: float | None = None
-        """Time of the latest checkpoint [s]."""
+        """Time of the latest written checkpoint [s]."""
         self.trouble: OSError | None = None
-        """Why the latest one was not written."""
+        """Error of writing the latest checkpoint; None if it was written."""
 
-    def keep(self, fish: Swimmer, *others: Any) -> None:
-        """Write one, where they are wanted; others: what `checkpoint.save` needs, too."""
+    def write(self, fish: Swimmer, *others: Any) -> None:
+        """Write a checkpoint, if requested; others: further arguments of `checkpoint.save`."""
         if not self._keeping:
             return
         try:
             checkpoint.save(self._keeping.path, fish, *others)
         except OSError as error:
             self.trouble = error
-            if not self._told:
-                self._told = True
+            if not self._has_reported:
+                self._has_reported = True
                 self._lost(error)
         else:
             self.kept, self.trouble = fish.fish.time, None
 
 
 class _Speed:
-    """Mean speed of a fish from the tick on that counts first."""
+    """Mean speed of a fish since it settled."""
 
     def __init__(self, fish: Swimmer, wait: int) -> None:
-        """wait: so many ticks, or none where that is negative"""
+        """wait: number of ticks until it settles; not positive for none"""
         self._fish, self._wait = fish, wait
         self._from = fish.motion
 
     def mean(self) -> float:
-        """After one more tick; from the start on before the first that counts [m/s]."""
+        """Count a tick and return the mean speed [m/s]; before it settles, that since the start."""
         self._wait -= 1
         now = self._fish.motion
         if self._wait == 0:

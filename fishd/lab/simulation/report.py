@@ -1,4 +1,4 @@
-"""A run in virtual time, judged by what the plant truly did."""
+"""A run in virtual time with a report on the true motion and forces of the plant."""
 
 import math
 import time
@@ -24,51 +24,51 @@ from fishd.virtual.plant.optimum import best_square_wave
 
 
 class Report(Struct, frozen=True):
-    """The result of a run. Forces are the plant's true ones, over whole beats once settled."""
+    """Result of a run, with true forces of the plant, as means over whole settled beats."""
 
     controller: str
     parameters: dict[str, Any]
     amplitude: float
-    """Φ: that of the controller, and of the best square wave it is compared with [rad]."""
+    """Amplitude Φ of the controller, and of the best square wave for comparison [rad]."""
     mean_thrust: float
-    """[N]"""
+    """Mean thrust [N]."""
     mean_power: float | None
     """Electrical power of the servo [W]; None for a plant without a motor."""
     frequency: float
-    """Tail beats per second; 0 when the tail does not beat [Hz]."""
+    """Frequency of the tail beat [Hz]; 0 where the tail does not beat."""
     half_beats: tuple[int, int]
-    """The shortest and the longest half beat, in ticks; 0 when the tail does not beat."""
+    """Length of the shortest and of the longest half beat [ticks]; 0 without tail beats."""
     reversals: int
-    """Changes of the command's side in the time that is judged."""
+    """Number of sign changes of the command, after settling."""
     fin_amplitude: float
-    """Largest fin angle of each half beat, mean over half beats [rad]."""
+    """Mean over half beats of the largest fin angle [rad]."""
     fullness: float
-    """Mean |φ_c|/Φ: 1 where the command uses all of the amplitude all of the time."""
+    """Mean |φ_c|/Φ: 1 where the command is always at full amplitude."""
     squareness: float
-    """Mean |φ_c| over the rms of φ_c: square wave 1, sine 0.900, triangle 0.866; 0 without any."""
+    """Mean |φ_c| over the rms of φ_c: square wave 1, sine 0.900, triangle 0.866, no command 0."""
     relative_thrust: float
-    """`mean_thrust` over `best_square_thrust`; 0 where no square wave moves the fin at all."""
+    """`mean_thrust` over `best_square_thrust`; 0 where no square wave moves the fin."""
     best_square_thrust: float
-    """What the best square wave at this amplitude gives [N]."""
+    """Mean thrust of the best square wave at this amplitude [N]."""
     best_square_frequency: float
-    """[Hz]"""
+    """Frequency of the best square wave [Hz]."""
     ticks: int
     mode: str
     """Mode at the end."""
     reason: Reason | None
-    """Why, when that is fault."""
+    """Reason of mode fault."""
     fallback: Reason | None
-    """Why another controller took over, if one did."""
+    """Reason why the fallback took over; None if it did not."""
     successor: str | None
-    """Which one that was."""
+    """Name of the controller that took over; None if there was none."""
     quantities: dict[str, float]
-    """Of the controller, at the end."""
+    """Quantities of the controller at the end."""
     took_over: float | None
-    """When it took over [s]; the figures are its own where that was before the end of settling."""
+    """Time when the fallback took over [s]; before settling ends, all figures are those of it."""
     microseconds_per_tick: float
-    """What one turn of the loop took on this machine, once settled [µs]."""
+    """Mean computing time of a tick on this machine, after settling [µs]."""
     real_time_factor: float
-    """Virtual seconds per second, once settled."""
+    """Ratio of simulated time to computing time, after settling."""
 
 
 def simulate(
@@ -80,10 +80,10 @@ def simulate(
     publisher: Publisher | None = None,
     begun: Callable[[VirtualRun], None] = lambda run: None,
 ) -> Report:
-    """Let a controller swim a simulated fish for `seconds`, and judge it after `settle` seconds.
+    """Swim a simulated fish with a controller for `seconds`; report on the time after `settle` [s].
 
-    publisher: gets the record of every tick, and every event; with None, no record is made
-    begun: called before the first of them
+    publisher: receiver of every tick and event; None to create no messages
+    begun: called before the first tick
     Raises `UnknownController` and `ParameterError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
@@ -91,7 +91,10 @@ def simulate(
 
 
 def count_ticks(seconds: float, settle: float, tick: float) -> tuple[int, int]:
-    """How many ticks a run has, and the first that counts; raises `ParameterError`."""
+    """Return the number of ticks of a run and of the first settled one.
+
+    Raises `ParameterError` where the times are not possible.
+    """
     check_length("run", seconds)
     check_length("time to settle", settle)
     ticks = round(seconds / tick)
@@ -105,14 +108,14 @@ def count_ticks(seconds: float, settle: float, tick: float) -> tuple[int, int]:
 
 
 def check_whole_beat(report: Report, seconds: float, settle: float) -> None:
-    """Raise `ParameterError` where the tail was reversed, but for less than a whole beat.
+    """Raise `ParameterError` where the tail was reversed, but made less than a whole beat.
 
-    The mean thrust over a part of a beat is that of no gait.
+    The mean thrust over a part of a beat says nothing about a gait.
     """
     if report.reversals and not report.frequency:
         raise ParameterError(
             f"{report.controller}: no whole tail beat in the {seconds - settle:g} s after the "
-            f"{settle:g} s of --settle, so there is no mean thrust; give more --seconds"
+            f"{settle:g} s of --settle, so the mean thrust is undefined; give more --seconds"
         )
 
 
@@ -125,12 +128,11 @@ def judge(
     publisher: Publisher | None,
     begun: Callable[[VirtualRun], None] = lambda run: None,
 ) -> Report:
-    """As `simulate`, with a controller that is ready-made.
+    """Swim a simulated fish with a controller object, and report as `simulate` does.
 
-    publisher: gets the record of every tick; with None, no record is made
-    begun: as for `simulate`
-    Raises `ParameterError` where the lengths do not fit one another, and `ConfigError` where the
-    fish swims freely.
+    publisher: receiver of every tick and event; None to create no messages
+    begun: called before the first tick
+    Raises `ParameterError` where `settle` is too long, and `ConfigError` for a free swimmer.
     """
     check_tethered(config.robot, "relative_thrust")
     ticks, first = count_ticks(seconds, settle, config.tick)
@@ -141,7 +143,7 @@ def judge(
         begun(virtual)
         virtual.loop.set_controller(name, controller)
         for index in range(ticks):
-            if index == first:  # the first ticks build what later ones reuse
+            if index == first:  # the first ticks are slower, as they fill caches
                 since = time.perf_counter()
             angle = virtual.loop.applied
             window = virtual.tick()

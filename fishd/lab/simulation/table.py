@@ -22,17 +22,17 @@ def run(
     *,
     overrides: Mapping[str, Any] | None = None,
 ) -> "DataFrame":
-    """Let a controller swim a simulated fish, and give its ticks as a table: see `frame`.
+    """Swim a simulated fish with a controller, and return its ticks as a table: see `frame`.
 
-    config: a YAML file or what `fishd.config.load` made of one; None for the defaults
-    overrides: keys in dotted form, such as `{"plant.xi": 0.9}`
+    config: path of a YAML file, or result of `fishd.config.load`; None for the defaults
+    overrides: values by dotted key, such as `{"plant.xi": 0.9}`
 
     A controller that fails ends in mode `fault`, as on a robot: the column `mode` says so.
     Raises `ConfigError`, `UnknownController`, `ParameterError`, and `MissingPackage` without
     pandas (extra: lab).
     """
     check_length("run", seconds)
-    settings = [f"{key}={_spelled(value)}" for key, value in (overrides or {}).items()]
+    settings = [f"{key}={_to_yaml(value)}" for key, value in (overrides or {}).items()]
     if isinstance(config, Config):
         config = adopt(msgspec.to_builtins(config), settings) if settings else config
     else:
@@ -45,6 +45,6 @@ def run(
     return frame(publisher.ticks)
 
 
-def _spelled(value: Any) -> str:
-    """A value as YAML has it; a number of numpy, too."""
+def _to_yaml(value: Any) -> str:
+    """Return a value, possibly a numpy number, as YAML text."""
     return msgspec.json.encode(value.item() if hasattr(value, "item") else value).decode()

@@ -1,4 +1,4 @@
-"""fishd's loop on a simulated fish in virtual time, and where its ticks go."""
+"""The control loop of fishd on a simulated fish in virtual time, and publishers of its ticks."""
 
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -17,12 +17,12 @@ from fishd.core.errors import ParameterError
 from fishd.core.signals import Event, Tick
 from fishd.virtual.plant.base import TrueWindow
 
-LONGEST = 1e8
-"""Runs are shorter than this [s]: three years."""
+MAX_RUN_S = 1e8
+"""Upper limit of the length of a run [s]: three years."""
 
 
 class EncodingPublisher:
-    """Does the work of telemetry up to the socket, so that timing says what the robot would do."""
+    """A publisher that encodes messages and drops them, so that computing times match a robot's."""
 
     def __init__(self) -> None:
         self._encode = msgspec.json.Encoder().encode
@@ -37,24 +37,24 @@ class EncodingPublisher:
 
 
 class KeepingPublisher:
-    """Keeps every tick; what matters of the events is in them."""
+    """A publisher that stores every tick and drops events."""
 
     def __init__(self) -> None:
         self.ticks: list[Tick] = []
 
     def tick(self, tick: Tick) -> None:
-        """Keep it."""
+        """Store a tick."""
         self.ticks.append(tick)
 
     def event(self, event: Event) -> None:
-        """Drop."""
+        """Drop an event."""
 
 
 class VirtualRun:
     """fishd's loop on a simulated fish in virtual time, a tick at a time; a context manager."""
 
     def __init__(self, config: Config, publisher: Publisher | None) -> None:
-        """publisher: gets the record of every tick, and every event; with None, no record is made
+        """publisher: receiver of every tick and event; None to create no messages
 
         Raises `MissingPackage`.
         """
@@ -63,7 +63,7 @@ class VirtualRun:
         with ExitStack() as stack:
             fish = open_fish_in_virtual_time(config, stack)
             self.swimmer = fish.swimmer
-            """The fish itself, where it swims freely."""
+            """The free swimmer; None for a tethered fish."""
             self._take_window = fish.take_window
             self.loop = build_loop(config, fish.robot, clock, publisher)
             stack.callback(self.loop.close)
@@ -77,11 +77,11 @@ class VirtualRun:
         self.close()
 
     def close(self) -> None:
-        """Let go of the controller and the robot; may be called twice."""
+        """Close the controller and the robot; may be called twice."""
         self._stack.close()
 
     def about(self) -> dict[str, str]:
-        """What is to be known of this fishd: its robot and limits, and the unit of its forces."""
+        """Return the facts about this run for a recording: robot, limits, unit of forces."""
         loop = self.loop
         return {
             "version": __version__,
@@ -102,14 +102,15 @@ class VirtualRun:
         self.loop.set_controller(name, registry.create(name, parameters, limits))
 
     def tick(self) -> TrueWindow:
-        """One tick; what truly happened between its read and the one before."""
+        """Run one tick; return the true motion between its read and the one before."""
         self.loop.tick(next(self._slots))
         return self._take_window()
 
 
 def check_length(what: str, seconds: float) -> None:
-    """Raise `ParameterError` where a length of time is not possible; what: what it is of."""
-    if not 0.0 <= seconds < LONGEST:  # NaN is not
+    """Raise `ParameterError` where a length of time is not possible; what: its noun."""
+    if not 0.0 <= seconds < MAX_RUN_S:  # NaN is not
         raise ParameterError(
-            f"a {what} of {seconds:g} s is not possible: a number from 0 to {LONGEST:g} s is needed"
+            f"a {what} of {seconds:g} s is not possible: a number from 0 to {MAX_RUN_S:g} s is "
+            "needed"
         )

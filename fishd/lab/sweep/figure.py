@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn, plain, save
+from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, open_figure, plain, save
 from fishd.lab.sweep.curves import Curve
 from fishd.lab.sweep.results import Quantity
 
@@ -45,7 +45,7 @@ def draw(
             points.append(curve)
         elif curve.peak:
             panels.setdefault(curve.over, []).append(curve)
-    with drawn(paths[0], (2.0 + 5.0 * len(panels), 4.2)) as figure:
+    with open_figure(paths[0], (2.0 + 5.0 * len(panels), 4.2)) as figure:
         panel_axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
         for axes, (over, group) in zip(panel_axes, panels.items(), strict=True):
             for index, curve in enumerate(group):

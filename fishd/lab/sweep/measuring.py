@@ -46,7 +46,7 @@ class Task(NamedTuple):
 
 def simulate_point(task: Task) -> tuple[PointResult, bytes] | None:
     """Return the result and the recording of a simulated fish at a point; None if stopped."""
-    if task.stop.asked()():
+    if task.stop.make_check()():
         return None
     with tempfile.TemporaryDirectory() as folder:
         extra = {name: str(value) for name, value in task.point.columns().items()}
@@ -61,7 +61,7 @@ def simulate_point(task: Task) -> tuple[PointResult, bytes] | None:
                 from fishd.lab.sweep.free_swimming import swim_freely
 
                 arguments = (task.point, task.config, task.lengths, writer)
-                speed = swim_freely(*arguments, describe_run, task.stop.asked())
+                speed = swim_freely(*arguments, describe_run, task.stop.make_check())
                 if speed is None:
                     return None
                 result = speed

@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 
-from fishd.lab.drawing import BLACK, GREY, drawn
+from fishd.lab.drawing import BLACK, GREY, open_figure
 from fishd.lab.swimmer.envelope import PHASE_COUNT, Envelope
 
 LINE_COUNT = 16
@@ -23,7 +23,7 @@ def draw_midlines(envelope: Envelope, title: str, path: str | os.PathLike[str]) 
     spread = envelope.amplitudes.std(axis=0, ddof=1) if len(envelope.amplitudes) > 1 else 0.0 * mean
     phases_of_lines = np.arange(LINE_COUNT) / LINE_COUNT
     colours = _DARKENING * colormaps[_COLOURS](phases_of_lines)[:, :3]
-    with drawn(path, (7.2, 5.0)) as figure:
+    with open_figure(path, (7.2, 5.0)) as figure:
         upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
         for line, colour in zip(
             envelope.midlines[:: PHASE_COUNT // LINE_COUNT], colours, strict=True

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fishd.lab.drawing import BLACK, drawn
+from fishd.lab.drawing import BLACK, open_figure
 from fishd.lab.swimmer.view import SIGNED_QUANTITIES, UNITS, View, Window, round_number
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def draw_wake(scene: View, limit: float, path: str | os.PathLike[str]) -> None:
     height = (
         (_WIDTH_IN - _SIDE_MARGIN_IN) * (window.top - window.bottom) / (window.right - window.left)
     )
-    with drawn(path, (_WIDTH_IN, height + _TOP_MARGIN_IN)) as figure:
+    with open_figure(path, (_WIDTH_IN, height + _TOP_MARGIN_IN)) as figure:
         axes = figure.subplots()
         image = axes.imshow(
             scene.values,

@@ -11,7 +11,7 @@ from fishd.core.errors import FishdError
 from fishd.lab import error_budget
 from fishd.lab.experiment import Progress
 from fishd.lab.identification import experiment
-from fishd.lab.measurement import REST, measure
+from fishd.lab.measurement import MEAN_REST_S, measure
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import simulate
 from fishd.learning.adapt import steps as do
@@ -111,7 +111,7 @@ class Adaptation:
             self._show.warn(f"fishctl: careful: {remark}")
 
     def _settle_swing(self, state: State) -> None:
-        seconds = do.BUDGET["swing"] * self._tank_time - REST
+        seconds = do.BUDGET["swing"] * self._tank_time - MEAN_REST_S
         path = self._run.experiment.recording("swing")
         with self._count_tank_time("swing", "swing --C auto"), self._session.recorded(path, _NOTE):
             state.swing = do.settle_swing(self._session, seconds)
@@ -235,7 +235,7 @@ class Adaptation:
                 **_true_thrusts(self._config, self._session, gait),
             )
         )
-        measured = error_budget.spelled(
+        measured = error_budget.format_with_budget(
             measurement.thrust,
             measurement.error,
             measurement.calibration_ci95,

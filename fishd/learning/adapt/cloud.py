@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from fishd.lab.identification import Identification
 from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC
-from fishd.lab.identification.result import OF_THE_RIG
+from fishd.lab.identification.result import RIG_PARAMETERS
 from fishd.virtual.plant.parameters import PlantParameters
 
 CLOUD_SIZE = 32
@@ -47,6 +47,6 @@ def _fish(fitted: PlantParameters, names: tuple[str, ...], z: list[float]) -> Pl
     for name, value in zip(names, z, strict=True):
         low, high = BOUNDS[name]
         plain = float(np.exp(value)) if name in LOGARITHMIC else value
-        if name not in OF_THE_RIG:
+        if name not in RIG_PARAMETERS:
             drawn[name] = min(high, max(low, plain))
     return replace(fitted, **drawn)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fishd.lab import error_budget
-from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, drawn
+from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, open_figure
 from fishd.lab.identification.fit import LOGARITHMIC
 from fishd.lab.identification.formatting import format_estimate
 from fishd.lab.identification.result import Estimate
@@ -46,7 +46,7 @@ def draw(state: State, folder: Path, amplitude: float, path: Path) -> None:
     folder: folder of the training
     """
     assert state.fitted
-    with drawn(path, (10.0, 7.0)) as figure:
+    with open_figure(path, (10.0, 7.0)) as figure:
         (fit, search), (training, contest) = figure.subplots(2, 2)
         _draw_fit(fit, state.fitted)
         _draw_search(search, state, amplitude)
@@ -196,7 +196,7 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
             relative_thrust = format_ratio(share)
         row = [
             NAMES[contender.name] + _role(contender.name, state.verdict),
-            error_budget.spelled(
+            error_budget.format_with_budget(
                 contender.thrust,
                 contender.error,
                 contender.calibration_ci95,

@@ -11,7 +11,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
-from fishd.lab.measurement import REST, SWIM
+from fishd.lab.measurement import MEAN_REST_S, MEAN_SWIM_S
 from fishd.lab.measurement import plan as plan_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
@@ -80,7 +80,7 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
 def settle_swing(session: Session, seconds: float) -> Rung:
     """Let `swing --C auto` search for `seconds`; return its final C and lead."""
     ticks = session.swim("swing", {"C": "auto"}, seconds)
-    session.rest(REST)
+    session.rest(MEAN_REST_S)
     end = ticks[len(ticks) // 2 :]
     shown = [tick.quantities for tick in end if tick.quantities]
     watching = [quantities for quantities in shown if not quantities["searching"]]
@@ -163,13 +163,17 @@ def best_of(
 
 def min_search_time(session: Session, search: Search) -> float:
     """Return the time of a search that tries the slowest wave once [s]."""
-    return 2.0 * REST + trial_durations({"frequency": search.ranges[0].values[0]})[1] + session.tick
+    return (
+        2.0 * MEAN_REST_S
+        + trial_durations({"frequency": search.ranges[0].values[0]})[1]
+        + session.tick
+    )
 
 
 def min_measurement_time(parameters: Mapping[str, Any]) -> float:
     """Return the shortest time in which a gait can be measured, rests included [s]."""
     frequency = float(parameters.get("frequency", 0.0))
-    swim = max(SWIM, 1.5 + 3.0 / frequency) if frequency else SWIM
-    seconds = 2.0 * swim + 3.0 * REST
+    swim = max(MEAN_SWIM_S, 1.5 + 3.0 / frequency) if frequency else MEAN_SWIM_S
+    seconds = 2.0 * swim + 3.0 * MEAN_REST_S
     plan_of(seconds + 1e-6, parameters)
     return seconds + 1e-6

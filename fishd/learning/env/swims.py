@@ -8,7 +8,7 @@ from msgspec import Struct
 from fishd.control.estimators.live_thrust import REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
 from fishd.controllers.dwell import DwellLimit
 from fishd.core.errors import ControllerFault
-from fishd.lab.measurement import Block, Sample, block_of
+from fishd.lab.measurement import Block, Sample, average_phase
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Decide, beat_frequency, is_stalled
 from fishd.virtual.plant.optimum import best_square_wave
@@ -81,7 +81,7 @@ class Swims:
         stalled = self._stalls(decide, phase)
         frequency, fullness = self._beat(phase)
         self._rest()
-        block = block_of(phase, self._tick, SWIM_SETTLE_TIME_S)
+        block = average_phase(phase, self._tick, SWIM_SETTLE_TIME_S)
         if block and block.beats:
             frequency = block.beats / block.lasts  # over whole beats, which is more exact
         thrust = None
@@ -114,7 +114,7 @@ class Swims:
         phase = list[Sample]()
         for _ in range(round(REST_TIME_S / self._tick)):
             self._step(0.0, False, phase)
-        self._zero, self._rested = block_of(phase, self._tick, REST_SETTLE_TIME_S), True
+        self._zero, self._rested = average_phase(phase, self._tick, REST_SETTLE_TIME_S), True
 
     def _step(self, angle: float, swims: bool, phase: list[Sample]) -> None:
         """Swim one tick at an angle [rad], and add it to a phase; raises `Stopped`."""

@@ -90,14 +90,14 @@ def _make_job(job: Job, folder: Path, index: int) -> Job:
 
 def _train_here(task: _Task) -> tuple[Outcome, bytes]:
     """Train in a worker process on this machine."""
-    return _train(task.job, task.stop.asked()), b""
+    return _train(task.job, task.stop.make_check()), b""
 
 
 def _train_remotely(task: _Task) -> tuple[Outcome, bytes]:
     """Train on a Dask worker, in a temporary folder whose files are sent back."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / task.job.folder.name
-        outcome = _train(replace(task.job, folder=folder), task.stop.asked())
+        outcome = _train(replace(task.job, folder=folder), task.stop.make_check())
         home = task.job.folder
         outcome = replace(
             outcome,

@@ -12,7 +12,7 @@ from rigs.policy_files import write
 from rigs.processes import fishctl
 
 from fishd.config import Config
-from fishd.lab.measurement import Measured, measure
+from fishd.lab.measurement import ThrustMeasurement, measure
 from fishd.lab.session import Replaced, VirtualSession
 
 
@@ -58,7 +58,7 @@ def test_earlier_runs_of_a_controller_that_gives_up_stand_in_the_table(
 ) -> None:
     swum: list[str] = []
 
-    def tiring(rig: VirtualSession, controller: str, *given: Any) -> Measured:
+    def tiring(rig: VirtualSession, controller: str, *given: Any) -> ThrustMeasurement:
         swum.append(controller)
         if swum == ["swing", "sine", "swing"]:
             raise Replaced("swing gave up")

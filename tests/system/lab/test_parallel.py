@@ -47,7 +47,7 @@ def test_what_one_that_was_killed_told_its_processes_does_not_stop_the_next(tmp_
     stop = tmp_path / "stop"
     stop.touch()
     with workers(stop) as crew:
-        is_asked = crew.stop.asked()
+        is_asked = crew.stop.make_check()
         assert not is_asked()
         crew.ask_to_stop()
         assert is_asked()

@@ -268,7 +268,7 @@ def test_a_cluster_that_does_not_answer_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    monkeypatch.setattr(parallel, "CONNECT", 0.2)
+    monkeypatch.setattr(parallel, "CONNECT_TIMEOUT_S", 0.2)
     done = fishctl(*command(tmp_path, "--seeds", "2", "--cluster", "tcp://127.0.0.1:1"))
     assert "no Dask scheduler answers at tcp://127.0.0.1:1" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)

@@ -18,7 +18,7 @@ def test_a_picture_that_cannot_be_written_is_refused_before_anything_swims(
 ) -> None:
     monkeypatch.setattr("fishd.lab.measurement.measure", lambda *_: pytest.fail("swims"))
     done = fishctl(*where, "--plot", str(tmp_path / "nowhere" / "x.png"))
-    assert "there is no folder" in one_line(done)
+    assert "does not exist" in one_line(done)
 
 
 def test_what_was_measured_is_printed_though_its_picture_fails(
@@ -35,7 +35,7 @@ def test_what_was_measured_is_printed_though_its_picture_fails(
 
 
 def test_what_makes_a_thrust_doubtful_is_in_its_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fishd.lab.measurement._remark", lambda _: "the fin was not steady")
+    monkeypatch.setattr("fishd.lab.measurement._find_remark", lambda _: "the fin was not steady")
     line = fishctl(*SIMULATED).stdout.splitlines()[-1]
     assert "mN" in line
     assert line.endswith("; careful: the fin was not steady")

@@ -40,7 +40,7 @@ def test_optimal_control_is_printed_and_drawn(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "complaint"),
     [
-        ("missing/best.png", "there is no folder"),
+        ("missing/best.png", "does not exist"),
         ("best.xyz", "a figure has no format .xyz: .pdf, .png or .svg is needed"),
     ],
 )

@@ -17,7 +17,7 @@ from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.core.errors import Refused
 from fishd.core.signals import Measurement, Observation, Tick
 from fishd.hardware.base import Robot
-from fishd.lab.other_fish import FIRST_SEED, HARSH_FISH, harsh
+from fishd.lab.other_fish import FIRST_SEED, HARSH_FISH_COUNT, harsh
 
 REST = 3.0
 Wrap = Callable[[Robot], Robot]
@@ -47,7 +47,7 @@ def started(rig: Rig, controller: str = "swing", **parameters: object) -> bool |
     return rig.loop.lateral_sign.reversed
 
 
-@pytest.mark.parametrize("seed", range(FIRST_SEED, FIRST_SEED + HARSH_FISH))
+@pytest.mark.parametrize("seed", range(FIRST_SEED, FIRST_SEED + HARSH_FISH_COUNT))
 def test_any_fish_shows_it_when_it_sets_off(seed: int) -> None:
     fish = harsh(seed).overrides
     for controller, parameters in (("swing", {}), ("square", {"frequency": 1.5}), ("sine", {})):

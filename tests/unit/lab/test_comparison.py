@@ -133,7 +133,7 @@ def test_a_contestant_that_is_spelled_wrong_is_refused_in_one_line(text: str) ->
 def test_a_trace_is_the_end_of_the_run() -> None:
     _, (trace,) = compare(CONFIG, [parse("square:frequency=1")], 20.0, 5.0)
     assert trace.time[-1] == 0.0
-    assert trace.time[0] <= -comparison.TRACE
+    assert trace.time[0] <= -comparison.TRACE_S
     assert set(trace.command) == {0.42, -0.42}
     assert max(trace.thrust) > 0.02
     assert 0.1 < max(trace.fin) < 0.4
@@ -145,7 +145,7 @@ def test_the_picture_begins_with_an_upward_reversal() -> None:
     command = [0.4 if k % 20 >= 10 else -0.4 for k in range(101)]
     shown = figures._from_upward_reversal(Trace(times, command, times, times))
     assert (shown.time[0], shown.command[0]) == (0.0, 0.4)
-    assert shown.time[-1] == pytest.approx(comparison.TRACE)
+    assert shown.time[-1] == pytest.approx(comparison.TRACE_S)
 
 
 @pytest.mark.slow

@@ -8,8 +8,8 @@ from msgspec.structs import replace
 from fishd.config import load
 from fishd.core.calibration import EXACT, ForceCalibration
 from fishd.lab.compare import LiveComparison
-from fishd.lab.error_budget import budget, spelled, unknown_calibration
-from fishd.lab.measurement import Measured, measure, summary
+from fishd.lab.error_budget import budget, format_with_budget, unknown_calibration
+from fishd.lab.measurement import ThrustMeasurement, measure, summarise
 from fishd.lab.other_fish import harsh
 from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
@@ -24,7 +24,7 @@ KNOWN = ForceCalibration(
 """Calibration of a sensor of 1 N/V: its gain is off by 2 %, with an interval of ± 3 %."""
 
 
-def measure_swing(*overrides: str, calibration: ForceCalibration | None = None) -> Measured:
+def measure_swing(*overrides: str, calibration: ForceCalibration | None = None) -> ThrustMeasurement:
     with VirtualSession(load(None, overrides), calibration) as rig:
         return measure(rig, "swing", {}, 30.0)
 
@@ -38,7 +38,7 @@ def test_a_gain_error_is_within_the_total_interval_and_its_part_is_named() -> No
         math.hypot(measurement.error, measurement.calibration_ci95)
     )
     assert measurement.error < abs(measurement.thrust - truth) < measurement.total_ci95
-    report = summary(measurement, 0.05)
+    report = summarise(measurement, 0.05)
     assert report.power is not None
     assert report.thrust_per_watt_total_ci95 == pytest.approx(
         measurement.total_ci95 / report.power, rel=1e-3
@@ -81,10 +81,10 @@ def test_a_hum_and_a_fin_at_rest_turn_no_sensor() -> None:
 def test_without_a_known_calibration_no_total_is_claimed() -> None:
     old = replace(KNOWN, covariance_x=None)
     assert budget(old, 0.025, 1e-4) == (None, None)
-    assert spelled(0.025, 1e-4, None, None, "N").endswith(
+    assert format_with_budget(0.025, 1e-4, None, None, "N").endswith(
         "± 0.10 mN (statistical ± 0.10, calibration unknown)"
     )
-    assert spelled(0.025, 1e-4, None, None, "V").endswith(
+    assert format_with_budget(0.025, 1e-4, None, None, "V").endswith(
         "mV (statistical ± 0.10, calibration none)"
     )
     assert "nothing says how well" in unknown_calibration(None, "N")

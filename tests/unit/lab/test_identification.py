@@ -88,7 +88,7 @@ def test_forces_tell_products_and_the_intervals_of_factors_allow_for_any_ratio(
         assert product.value == pytest.approx(scale * value, rel=0.01)
         assert product.high < 1.02 * product.low
     for name, factor in (("coupling", 2.0), ("thrust_coefficient", 4.0), ("lateral_drag", 2.0)):
-        low, high = identification[name].known
+        low, high = identification[name].narrowest_interval
         assert (identification[name].low, identification[name].high) == pytest.approx(
             (low / factor, high * factor)
         )

@@ -12,14 +12,14 @@ from fishd.core.errors import ParameterError
 from fishd.lab import drift
 from fishd.lab.disturbances import spell
 from fishd.lab.measurement import (
-    MOST_BLOCKS,
-    Measured,
+    MAX_BLOCKS,
     Sample,
     Step,
+    ThrustMeasurement,
     evaluate,
     measure,
     plan,
-    samples_of,
+    to_samples,
 )
 from fishd.lab.session import Disturbed, VirtualSession
 from fishd.lab.simulation import simulate
@@ -40,7 +40,7 @@ def truth() -> float:
     return simulate(RIG, "swing", {}).mean_thrust
 
 
-def measure_swim(config: Config, seconds: float = 30.0, controller: str = "swing") -> Measured:
+def measure_swim(config: Config, seconds: float = 30.0, controller: str = "swing") -> ThrustMeasurement:
     with VirtualSession(config) as rig:
         return measure(rig, controller, {}, seconds)
 
@@ -112,21 +112,21 @@ def test_a_force_that_is_not_to_be_believed_spoils_no_measurement() -> None:
         replace(tick, fx=tick.fx + 5.0, suspect="clipped") if tick.seq % 97 == 0 else tick
         for tick in measurement.ticks
     ]
-    again = evaluate(samples_of(ticks), RIG.tick)
+    again = evaluate(to_samples(ticks), RIG.tick)
     assert again.thrust == pytest.approx(measurement.thrust, abs=measurement.error)
     assert again.error < 3.0 * measurement.error
 
 
 @cache
-def measure_undisturbed(seconds: float) -> Measured:
+def measure_undisturbed(seconds: float) -> ThrustMeasurement:
     return measure_swim(replace(RIG, simulation=replace(RIG.simulation, seed=77)), seconds)
 
 
-def measure_disturbed(seconds: float, force: Callable[[float, bool], float]) -> Measured:
+def measure_disturbed(seconds: float, force: Callable[[float, bool], float]) -> ThrustMeasurement:
     """Return a measurement to whose F_x a force of time and swimming is added."""
     ticks = measure_undisturbed(seconds).ticks
     return evaluate(
-        samples_of(
+        to_samples(
             replace(
                 tick,
                 fx=tick.fx + force((tick.seq - ticks[0].seq) * RIG.tick, tick.mode == "running"),
@@ -259,7 +259,7 @@ def test_a_beat_that_is_longer_than_a_swim_is_told() -> None:
 @pytest.mark.slow
 def test_a_long_measurement_is_the_same_and_no_slower_to_judge() -> None:
     measurement = measure_swim(replace(RIG, simulation=replace(RIG.simulation, drift=5e-3)), 600.0)
-    assert len(measurement.blocks.time) <= MOST_BLOCKS + 2 * measurement.swims + 1
+    assert len(measurement.blocks.time) <= MAX_BLOCKS + 2 * measurement.swims + 1
     assert measurement.total_ci95
     assert abs(measurement.thrust - truth()) < 2.0 * measurement.total_ci95
     assert 2.0 * measurement.error < 0.2e-3

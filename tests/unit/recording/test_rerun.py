@@ -130,7 +130,7 @@ def test_another_controller_sees_what_the_recorded_one_saw(tmp_path: Path) -> No
     assert 0 < stretch.equal < stretch.ticks
     with pytest.raises(ParameterError, match="C: 7 is not valid"):
         rerun(run, "swing", {"C": 7})
-    with pytest.raises(RecordingError, match="remote asks a program"):
+    with pytest.raises(RecordingError, match="'remote' has no rerun"):
         rerun(run, "remote")
 
 

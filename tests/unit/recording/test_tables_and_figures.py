@@ -11,9 +11,9 @@ from rigs.harness import Rig
 from rigs.processes import fishctl, one_line
 from rigs.recordings import recorded, swum, write
 
-from fishd.lab.run_figure import picture
-from fishd.lab.run_page import page
-from fishd.lab.run_traces import LEAST_FORCE, limits, traces
+from fishd.lab.run_figure import draw_run
+from fishd.lab.run_page import write_page
+from fishd.lab.run_traces import MIN_FORCE_SPAN, limits, traces
 from fishd.recording import open_run
 
 
@@ -52,7 +52,7 @@ def test_a_recording_is_drawn_as_picture_and_as_page(path: Path, tmp_path: Path)
     refused = fishctl("plot", str(path), "--to", str(tmp_path))
     assert "is there already; --force replaces it" in one_line(refused)
     nothing = fishctl("plot", str(path), "--from", "9", "--to", str(tmp_path))
-    assert "there is no tick between these times; it is 3.0 s long" in one_line(nothing)
+    assert "no tick between these times; it is 3.0 s long" in one_line(nothing)
 
 
 @pytest.mark.slow
@@ -64,9 +64,9 @@ def test_an_interval_is_in_the_legend_where_there_is_one(tmp_path: Path) -> None
     for rig, expected in ((swum(), False), (known, True)):
         name = f"known-{expected}"
         drawn = traces(open_run(recorded(rig, tmp_path / name)))
-        page(drawn, tmp_path / f"{name}.html")
+        write_page(drawn, tmp_path / f"{name}.html")
         assert ("95 %" in (tmp_path / f"{name}.html").read_text()) == expected
-    picture(drawn, tmp_path / "known.svg")
+    draw_run(drawn, tmp_path / "known.svg")
     assert "95 %" in (tmp_path / "known.svg").read_text()
 
 
@@ -85,9 +85,9 @@ def test_a_resting_fish_has_no_phase_portrait_and_dust_is_not_blown_up(tmp_path:
     rig.run_for(1)
     drawn = traces(open_run(recorded(rig, tmp_path / "run")))
     assert drawn.portrait is None
-    low, high = limits(LEAST_FORCE, drawn.fx, drawn.fy)
+    low, high = limits(MIN_FORCE_SPAN, drawn.fx, drawn.fy)
     assert high - low == pytest.approx(1.0)
-    low, high = limits(LEAST_FORCE, drawn.fx + 500.0, drawn.fy)
+    low, high = limits(MIN_FORCE_SPAN, drawn.fx + 500.0, drawn.fy)
     assert low < 0 < 500 < high
 
 
