@@ -222,7 +222,7 @@ def test_a_second_fishd_on_the_same_chip_is_refused(
     monkeypatch.setattr(ownership, "FOLDER", tmp_path)
     config = load(None, ["robot=pi", *settings, f"state_folder={tmp_path}"])
     with (
-        ownership.owned(assembly.parts_of(config)[part : part + 1]),
+        ownership.claim_parts(assembly.parts_of(config)[part : part + 1]),
         ExitStack() as stack,
         pytest.raises(StartupError, match=complaint),
     ):
