@@ -24,7 +24,9 @@ KNOWN = ForceCalibration(
 """Calibration of a sensor of 1 N/V: its gain is off by 2 %, with an interval of ± 3 %."""
 
 
-def measure_swing(*overrides: str, calibration: ForceCalibration | None = None) -> ThrustMeasurement:
+def measure_swing(
+    *overrides: str, calibration: ForceCalibration | None = None
+) -> ThrustMeasurement:
     with VirtualSession(load(None, overrides), calibration) as rig:
         return measure(rig, "swing", {}, 30.0)
 

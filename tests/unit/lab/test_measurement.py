@@ -40,7 +40,9 @@ def truth() -> float:
     return simulate(RIG, "swing", {}).mean_thrust
 
 
-def measure_swim(config: Config, seconds: float = 30.0, controller: str = "swing") -> ThrustMeasurement:
+def measure_swim(
+    config: Config, seconds: float = 30.0, controller: str = "swing"
+) -> ThrustMeasurement:
     with VirtualSession(config) as rig:
         return measure(rig, controller, {}, seconds)
 
