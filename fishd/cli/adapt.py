@@ -9,8 +9,8 @@ import msgspec
 
 from fishd.cli.experiment_options import (
     ChosenFish,
-    Ending,
-    Place,
+    ExperimentEnding,
+    ExperimentFolder,
     Resumable,
     fish_choice,
     folder_options,
@@ -58,7 +58,7 @@ def adapt(
     seed: int,
     no_command: bool,
     fish: ChosenFish,
-    place: Place,
+    place: ExperimentFolder,
     as_json: bool,
 ) -> int:
     """Find the best gait of an unknown fish, in five minutes of tank time.
@@ -89,7 +89,7 @@ def adapt(
         session.check_calibrated()
         with place.open(fish, session.config, settings) as experiment:
             run = AdaptFolder(experiment)
-            ending = Ending(experiment)
+            ending = ExperimentEnding(experiment)
             fish.announce(as_json)
             with (
                 ending.measuring(FishdError),

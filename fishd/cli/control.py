@@ -9,7 +9,13 @@ import click
 
 from fishd import client
 from fishd.cli.completion import active_parameters, complete_pair
-from fishd.cli.options import ControllerGroup, ParameterType, Utf8Text, daemon_options, describe
+from fishd.cli.options import (
+    ControllerGroup,
+    ParameterType,
+    Utf8Text,
+    daemon_options,
+    describe_parameter,
+)
 from fishd.cli.output import echo, format_state, make_printable, print_json
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.core.addresses import ENDPOINT_VARIABLE
@@ -50,22 +56,22 @@ def controllers(name: str | None, endpoint: str | None, as_json: bool) -> None:
     """
     from fishd.controllers import registry
 
-    known = list_from_daemon(
+    infos = list_from_daemon(
         endpoint, client.Fish.controllers, registry.describe_all, "controllers"
     )
     if name is not None:
-        names = [info.name for info in known]
+        names = [info.name for info in infos]
         if name not in names:
             hint = nearest(name, names)
             raise UnknownController(f"no controller is named '{name}'; {hint}")
-        known = [info for info in known if info.name == name]
+        infos = [info for info in infos if info.name == name]
     if as_json:
-        print_json(known)
+        print_json(infos)
         return
-    for info in map(make_printable, known):
+    for info in map(make_printable, infos):
         click.echo(f"{click.style(info.name, bold=True)}  {info.summary}")
         for field in info.parameters:
-            echo(f"    --{field.name.replace('_', '-'):<22} {describe(field)}")
+            echo(f"    --{field.name.replace('_', '-'):<22} {describe_parameter(field)}")
         for quantity in info.quantities:
             unit = "" if quantity.unit == "1" else f" [{quantity.unit}]"
             echo(f"    shows {quantity.name:<18} {quantity.description.rstrip('.')}{unit}")
@@ -94,22 +100,23 @@ def _set_controller(
 @daemon_options
 def set_parameter(words: tuple[str, ...], endpoint: str | None, as_json: bool) -> None:
     """Change parameters of the running controller while the fish swims, all or none of them."""
-    pairs = list(_pairs(words))
+    pairs = list(_parse_pairs(words))
 
     def change(fish: client.Fish) -> State:
-        known = active_parameters(fish)
+        fields = active_parameters(fish)
         # The daemon refuses a name that the controller does not have, and says which it has.
         values = {
-            name: _converted(known[name], text) if name in known else text for name, text in pairs
+            name: _convert_value(fields[name], text) if name in fields else text
+            for name, text in pairs
         }
         state = fish.set_parameters(**values)
-        warn_of_values(known.values(), values, partial(running_config, fish))
+        warn_of_values(fields.values(), values, partial(running_config, fish))
         return state
 
     _change(endpoint, as_json, change)
 
 
-def _converted(field: Field, text: str) -> Any:
+def _convert_value(field: Field, text: str) -> Any:
     try:
         return ParameterType(field).convert(text, None, None)
     except click.BadParameter as error:
@@ -117,7 +124,7 @@ def _converted(field: Field, text: str) -> Any:
         raise
 
 
-def _pairs(words: Iterable[str]) -> Iterator[tuple[str, str]]:
+def _parse_pairs(words: Iterable[str]) -> Iterator[tuple[str, str]]:
     """Yield names and values of `NAME VALUE`, `NAME=VALUE` and `--NAME VALUE`, in any mixture."""
     remaining, names = iter(words), set[str]()
     for word in remaining:

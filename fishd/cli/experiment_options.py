@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 On = Literal["live", "simulation"]
 _RUN_ONLY_OPTIONS = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0}
 """Options that a resumed experiment does not take over, and the number of words after each."""
-_COMMAND_KEY = "fishd.words"
+_COMMAND = "fishd.words"
+"""Key of the command line in click's context, for the header of an experiment."""
 
 
 class ChosenFish(NamedTuple):
@@ -87,7 +88,7 @@ class ChosenFish(NamedTuple):
                 raise click.UsageError(f"{name} is for --on {'simulation' if live else 'live'}")
 
 
-class Place(NamedTuple):
+class ExperimentFolder(NamedTuple):
     """The folder of an experiment, new or to be resumed."""
 
     kind: str
@@ -141,13 +142,13 @@ def _fish_choice(function: F, *, live_config: bool) -> F:
         endpoint: str | None,
         **values: Any,
     ) -> Any:
-        place: Place | None = values.get("place")
+        place: ExperimentFolder | None = values.get("place")
         if on is None and place and place.resume:
-            on = _header(place.path).on
+            on = _read_header(place.path).on
         on = on or default_on(file, overrides, endpoint)
         if on == "live" and (file or overrides) and not live_config:
-            what = "--config" if file else "--set"
-            raise click.UsageError(f"{what} is for --on simulation: fishd keeps its configuration")
+            name = "--config" if file else "--set"
+            raise click.UsageError(f"{name} is for --on simulation: fishd keeps its configuration")
         return function(*args, fish=ChosenFish(on, file, overrides, endpoint), **values)
 
     scope = "" if live_config else "In simulation: "
@@ -195,11 +196,11 @@ def folder_options(function: F) -> F:
         from fishd.lab.experiment import default_folder
 
         context = click.get_current_context()
-        place = Place(
+        place = ExperimentFolder(
             kind=verb_words(context),
             path=resume or folder or default_folder(verb_words(context)),
             resume=resume is not None,
-            command=tuple(context.meta.get(_COMMAND_KEY, ())),
+            command=tuple(context.meta.get(_COMMAND, ())),
         )
         return function(*args, place=place, **values)
 
@@ -242,7 +243,9 @@ def keep_session(
         yield None
         return
     context = click.get_current_context()
-    place = Place(verb_words(context), folder, False, tuple(context.meta.get(_COMMAND_KEY, ())))
+    place = ExperimentFolder(
+        verb_words(context), folder, False, tuple(context.meta.get(_COMMAND, ()))
+    )
     config = session.config if session else to_builtins(fish.load())
     unit = session.unit if session else "N"
     with place.open(fish, config, settings, unit) as experiment:
@@ -259,13 +262,13 @@ def verb_words(context: click.Context) -> str:
     return " ".join(words[: 2 if words[0] in ("learn",) else 1])
 
 
-def _header(folder: Path) -> "Header":
+def _read_header(folder: Path) -> "Header":
     from fishd.lab.experiment import read_header
 
     return read_header(folder)
 
 
-def recall(context: click.Context, args: list[str]) -> list[str]:
+def restore_arguments(context: click.Context, args: list[str]) -> list[str]:
     """Return the arguments of a verb, after those of the experiment that `--resume` names.
 
     The arguments are kept for the header of a new experiment.
@@ -273,13 +276,13 @@ def recall(context: click.Context, args: list[str]) -> list[str]:
     folder = next((b for a, b in pairwise(args) if a == "--resume"), None)
     folder = folder or next((a[9:] for a in args if a.startswith("--resume=")), None)
     if folder is not None and (not args or args[0].startswith("-")):
-        header = _header(Path(folder))
+        header = _read_header(Path(folder))
         if header.kind != verb_words(context):
             raise click.UsageError(
                 f"--resume {folder}: it is of another verb: fishctl {header.kind} --resume {folder}"
             )
         args = [*header.command, *args]
-    context.meta[_COMMAND_KEY] = list(_without_run_options(args))
+    context.meta[_COMMAND] = list(_without_run_options(args))
     return args
 
 
@@ -299,10 +302,10 @@ class Resumable(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments after those of the resumed experiment."""
-        return super().parse_args(ctx, recall(ctx, args))
+        return super().parse_args(ctx, restore_arguments(ctx, args))
 
 
-class Ending:
+class ExperimentEnding:
     """State of the end of an experiment: whether it was interrupted, and how to resume it."""
 
     def __init__(self, experiment: "Experiment") -> None:

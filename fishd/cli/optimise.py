@@ -12,7 +12,13 @@ import click
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.cli.experiment_options import ChosenFish, Ending, Place, fish_choice, folder_options
+from fishd.cli.experiment_options import (
+    ChosenFish,
+    ExperimentEnding,
+    ExperimentFolder,
+    fish_choice,
+    folder_options,
+)
 from fishd.cli.options import (
     ControllerGroup,
     FiniteRange,
@@ -107,7 +113,7 @@ def _optimise(
     seed: int,
     objective: Literal["thrust", "thrust-per-watt"] | None,
     at_least: float | None,
-    place: Place,
+    place: ExperimentFolder,
     fish: ChosenFish,
     picture: Path | None,
     as_json: bool,
@@ -191,7 +197,7 @@ class _Optimisation:
         """Search, print and draw; return the exit status."""
         from fishd.lab.optimise.figure import draw
 
-        ending = Ending(self.experiment)
+        ending = ExperimentEnding(self.experiment)
         waited = self._measure(ending)
         if not self.trials:
             if ending.is_interrupted:
@@ -228,7 +234,7 @@ class _Optimisation:
     def _is_done(self, proposal: "Proposal") -> bool:
         return self.search.is_warm and proposal.improvement <= self.until
 
-    def _measure(self, ending: Ending) -> float:
+    def _measure(self, ending: ExperimentEnding) -> float:
         """Measure candidates until the search is done; those in the table are kept.
 
         Return the time that the fish waited for the choice of candidates [s].

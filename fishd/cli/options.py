@@ -41,7 +41,7 @@ endpoint_option = click.option(
 _TAKE = "fishd.take"
 
 
-def _remember_take(ctx: click.Context, _: click.Parameter, value: bool) -> None:
+def _store_take(ctx: click.Context, _: click.Parameter, value: bool) -> None:
     ctx.meta[_TAKE] = value
 
 
@@ -49,7 +49,7 @@ take_option = click.option(
     "--take",
     is_flag=True,
     expose_value=False,
-    callback=_remember_take,
+    callback=_store_take,
     help="Take the fish from another experiment that holds it; that one ends.",
 )
 
@@ -170,21 +170,25 @@ class ParameterType(click.ParamType[Any]):
         return complete_value(self.field, incomplete)
 
 
-def _finite(text: str) -> float:
+def _parse_finite(text: str) -> float:
     number = float(text)
     if not math.isfinite(number):
         raise ValueError(text)
     return number
 
 
-def _boolean(text: str) -> bool:
+def _parse_boolean(text: str) -> bool:
     words = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
     if text.lower() not in words:
         raise ValueError(text)
     return words[text.lower()]
 
 
-_PARSERS: dict[str, Callable[[str], Any]] = {"number": _finite, "integer": int, "boolean": _boolean}
+_PARSERS: dict[str, Callable[[str], Any]] = {
+    "number": _parse_finite,
+    "integer": int,
+    "boolean": _parse_boolean,
+}
 
 _PREFIX = "parameter_"
 
@@ -216,7 +220,7 @@ def parameter_options(
             [_PREFIX + field.name, "--" + field.name.replace("_", "-")],
             type=kind(field),
             metavar=("NAME|FILE" if field.file else field.kind.upper()) + list_metavar,
-            help=describe(field),
+            help=describe_parameter(field),
             default=None,
         )
         for field in fields
@@ -233,27 +237,29 @@ def given_parameters(context: click.Context, values: dict[str, Any]) -> dict[str
     }
 
 
-def describe(field: Field) -> str:
+def describe_parameter(field: Field) -> str:
     """Return description, permitted values, unit and default of a parameter in one line."""
     permitted = wanted(field)
     default = "required" if field.required else f"default {spelled(field.default)}"
     return f"{field.description} {permitted[0].upper()}{permitted[1:]}; {default}."
 
 
-def _fish_of(values: dict[str, Any]) -> "Config | None":
+def _read_fish_config(values: dict[str, Any]) -> "Config | None":
     """Return the configuration of the fish that the options of a verb are about.
 
     None if its forces are not in newtons. Raises `FishdError`.
     """
     from fishd.config import load
 
-    chosen = values.get("fish")
-    if chosen.on == "live" if chosen else "endpoint" in values:
+    chosen_fish = values.get("fish")
+    if chosen_fish.on == "live" if chosen_fish else "endpoint" in values:
         from fishd.client import Fish  # imports zmq, which simulations do not need
 
-        with Fish(chosen.endpoint if chosen else values["endpoint"]) as fish:
+        with Fish(chosen_fish.endpoint if chosen_fish else values["endpoint"]) as fish:
             return running_config(fish)
-    return chosen.load() if chosen else load(values.get("file"), values.get("overrides", ()))
+    return (
+        chosen_fish.load() if chosen_fish else load(values.get("file"), values.get("overrides", ()))
+    )
 
 
 class _ControllerCommand(click.Command):
@@ -313,9 +319,9 @@ class ControllerGroup(click.Group):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse `square:frequency=1.7,amplitude=0.3`, and the arguments of a resumed experiment."""
         if self._resumable:
-            from fishd.cli.experiment_options import recall
+            from fishd.cli.experiment_options import restore_arguments
 
-            args = recall(ctx, args)
+            args = restore_arguments(ctx, args)
         if args and ":" in args[0] and not args[0].startswith("-"):
             from fishd.controllers import registry
 
@@ -337,25 +343,25 @@ class ControllerGroup(click.Group):
         """Complete the name of a controller, and import only the matching controllers."""
         from fishd.controllers import registry
 
-        known = registry.describe_all(incomplete)
-        names = [CompletionItem(info.name, help=info.summary) for info in known]
+        controllers = registry.describe_all(incomplete)
+        names = [CompletionItem(info.name, help=info.summary) for info in controllers]
         return names + click.Command.shell_complete(self, ctx, incomplete)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the sub-command of one controller, or of several."""
         names = list(filter(None, cmd_name.split(","))) if self._several else [cmd_name]
-        infos = [self._info(ctx, name) for name in names]
+        infos = [self._find_controller(ctx, name) for name in names]
         fields = {field.name: field for info in infos for field in info.parameters}
 
         @click.pass_context
         def callback(ctx: click.Context, /, **values: Any) -> Any:
             parameters = given_parameters(ctx, values)
-            warn_of_values(fields.values(), parameters, partial(_fish_of, values))
+            warn_of_values(fields.values(), parameters, partial(_read_fish_config, values))
             return self._action(infos if self._several else cmd_name, parameters, **values)
 
         decorated = self._options(cast(Any, callback))
-        about = infos[0].summary if len(infos) == 1 else f"{', '.join(names)}, side by side."
-        command = click.command(cmd_name, _ControllerCommand, help=about, short_help=about)(
+        summary = infos[0].summary if len(infos) == 1 else f"{', '.join(names)}, side by side."
+        command = click.command(cmd_name, _ControllerCommand, help=summary, short_help=summary)(
             decorated
         )
         kind = ValuesType if self._several else ParameterType
@@ -374,7 +380,7 @@ class ControllerGroup(click.Group):
             formatter.write_dl([*records, ("-h, --help", "Show this message and exit.")])
         self.format_commands(ctx, formatter)
 
-    def _info(self, ctx: click.Context, name: str) -> ControllerInfo:
+    def _find_controller(self, ctx: click.Context, name: str) -> ControllerInfo:
         from fishd.controllers import registry
 
         try:
@@ -391,9 +397,9 @@ class ControllerGroup(click.Group):
 
         try:
             with Fish(endpoint_of(ctx)) as fish:
-                known = {info.name: info for info in map(make_printable, fish.controllers())}
+                controllers = {info.name: info for info in map(make_printable, fish.controllers())}
         except FishError:
             raise unknown from None
-        if name not in known:
+        if name not in controllers:
             raise unknown
-        return known[name]
+        return controllers[name]

@@ -46,12 +46,12 @@ def output_may_fail(done: str) -> Iterator[None]:
 def echo_rows(rows: Sequence[tuple[str, str]]) -> None:
     """Print names and values in two columns."""
     width = max(12, *(len(name) + 1 for name, _ in rows))
-    echo("\n".join(f"{name:<{width}}{what}" for name, what in rows))
+    echo("\n".join(f"{name:<{width}}{value}" for name, value in rows))
 
 
 def print_json(value: Any) -> None:
     """Print any struct, or list of them, as one indented JSON document."""
-    click.echo(_escaped(msgspec.json.format(msgspec.json.encode(value), indent=2)))
+    click.echo(_escape_unprintable(msgspec.json.format(msgspec.json.encode(value), indent=2)))
 
 
 def print_paths(paths: Iterable[Path], as_json: bool) -> None:
@@ -65,12 +65,12 @@ def print_paths(paths: Iterable[Path], as_json: bool) -> None:
 
 def print_json_line(value: Any) -> None:
     """Print any struct as one line of JSON."""
-    click.echo(_escaped(msgspec.json.encode(value)))
+    click.echo(_escape_unprintable(msgspec.json.encode(value)))
 
 
 def make_printable(value: T) -> T:
     """Return a struct, or a list of them, with each of its texts as one printable line."""
-    return msgspec.convert(_printable(msgspec.to_builtins(value)), type(value))
+    return msgspec.convert(_make_printable(msgspec.to_builtins(value)), type(value))
 
 
 def format_controller(controller: str, parameters: dict[str, Any]) -> str:
@@ -85,8 +85,8 @@ def format_controller(controller: str, parameters: dict[str, Any]) -> str:
 def format_state(state: "State") -> str:
     """Return mode, reason and controller."""
     state = make_printable(state)
-    why = f" ({format_reason(state.reason)})" if state.reason else ""
-    return f"{state.mode}{why}: {format_controller(state.controller, state.parameters)}"
+    reason = f" ({format_reason(state.reason)})" if state.reason else ""
+    return f"{state.mode}{reason}: {format_controller(state.controller, state.parameters)}"
 
 
 def format_reason(reason: Reason) -> str:
@@ -128,17 +128,17 @@ def format_time_of_day(t: float) -> str:
     return time.strftime("%H:%M:%S", time.localtime(t))
 
 
-def _printable(value: Any) -> Any:
+def _make_printable(value: Any) -> Any:
     if isinstance(value, str):
         return text.line(value)
     if isinstance(value, list | tuple):
-        return [_printable(part) for part in value]
+        return [_make_printable(part) for part in value]
     if isinstance(value, dict):
-        return {_printable(key): _printable(part) for key, part in value.items()}
+        return {_make_printable(key): _make_printable(part) for key, part in value.items()}
     return value
 
 
-def _escaped(document: bytes) -> str:
+def _escape_unprintable(document: bytes) -> str:
     """Return JSON with unprintable characters escaped; these can only be within its texts."""
 
     def escape(match: re.Match[str]) -> str:

@@ -24,9 +24,9 @@ def warn_of_values(
         only called if a parameter is a force, which the fish has to produce
     """
     fields = list(fields)
-    largest = {name: _largest(value) for name, value in parameters.items()}
+    largest = {name: _largest_value(value) for name, value in parameters.items()}
     forces = [force for force in fields if force.unit == "N" and is_valid_number(largest, force)]
-    beyond = _beyond_best(forces, largest, config) if forces else {}
+    beyond = _compare_with_best(forces, largest, config) if forces else {}
     lines = list(beyond.values())
     lines += find_doubts(largest, (field for field in fields if field.name not in beyond))
     for line in lines:
@@ -40,13 +40,13 @@ def running_config(fish: "Fish") -> "Config | None":
     return adopt(fish.config()) if fish.status().force_unit == "N" else None
 
 
-def _largest(value: Any) -> Any:
+def _largest_value(value: Any) -> Any:
     if not isinstance(value, list):
         return value
     return max((item for item in value if isinstance(item, int | float)), default=None)
 
 
-def _beyond_best(
+def _compare_with_best(
     forces: list[Field], values: Mapping[str, Any], read_config: "Callable[[], Config | None]"
 ) -> dict[str, str]:
     """Return a sentence for each force that is more than the best square wave's thrust."""

@@ -37,11 +37,11 @@ def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
     if ctx.invoked_subcommand:
         ctx.find_root().obj = endpoint
         return
-    known = _list_policies(endpoint)
+    infos = _list_policies(endpoint)
     if as_json:
-        print_json(known)
-    elif known:
-        echo(_table(known))
+        print_json(infos)
+    elif infos:
+        echo(_format_table(infos))
     else:
         echo(f"no policies here; put {library.SUFFIX} files into {library.folders()[0]}", err=True)
 
@@ -58,16 +58,16 @@ def show(ctx: click.Context, policy: str, endpoint: str | None, as_json: bool) -
     if names_file(policy, library.SUFFIX):
         policy_info = library.describe(policy)
     else:
-        known = {info.name: info for info in _list_policies(endpoint)}
-        if policy not in known:
-            raise PolicyError(library.unknown(policy, sorted(known)))
-        policy_info = known[policy]
+        infos = {info.name: info for info in _list_policies(endpoint)}
+        if policy not in infos:
+            raise PolicyError(library.unknown(policy, sorted(infos)))
+        policy_info = infos[policy]
     if policy_info.card is None:
         raise PolicyError(f"{policy_info.file}: {policy_info.problem}")
     if as_json or (ctx.parent and ctx.parent.params["as_json"]):
         print_json(policy_info)
     else:
-        echo(_as_text(policy_info), nl=False)
+        echo(_format_yaml(policy_info), nl=False)
 
 
 def _list_policies(endpoint: str | None) -> list[PolicyInfo]:
@@ -75,11 +75,11 @@ def _list_policies(endpoint: str | None) -> list[PolicyInfo]:
     return list_from_daemon(endpoint, Fish.policies, library.describe_all, "policies")
 
 
-def _table(known: list[PolicyInfo]) -> str:
-    rows = [HEADER, *(_row(info) for info in known)]
+def _format_table(infos: list[PolicyInfo]) -> str:
+    rows = [HEADER, *(_format_row(info) for info in infos)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(HEADER) - 1)]
     lines = []
-    for row, info in zip(rows, (None, *known), strict=True):
+    for row, info in zip(rows, (None, *infos), strict=True):
         cells = (f"{cell:<{width}}" for cell, width in zip(row, (*widths, 0), strict=True))
         lines.append("  ".join(cells).rstrip())
         if info and info.problem:
@@ -87,7 +87,7 @@ def _table(known: list[PolicyInfo]) -> str:
     return "\n".join(lines)
 
 
-def _row(info: PolicyInfo) -> tuple[str, ...]:
+def _format_row(info: PolicyInfo) -> tuple[str, ...]:
     folder = text.line(str(Path(info.file).parent))
     if info.card is None:
         return (text.line(info.name, MAX_CELL_CHARACTERS), *["–"] * (len(HEADER) - 2), folder)
@@ -108,7 +108,7 @@ def _row(info: PolicyInfo) -> tuple[str, ...]:
     return (*(text.line(cell, MAX_CELL_CHARACTERS) for cell in cells[:-1]), folder)
 
 
-def _as_text(info: PolicyInfo) -> str:
+def _format_yaml(info: PolicyInfo) -> str:
     import yaml
 
     head = {"name": info.name, "file": info.file}

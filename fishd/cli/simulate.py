@@ -47,7 +47,7 @@ def run_options(function: Any) -> Any:
     return function
 
 
-def _options(function: Any) -> Any:
+def _simulate_options(function: Any) -> Any:
     record = click.option(
         "--record",
         "recording",
@@ -58,7 +58,7 @@ def _options(function: Any) -> Any:
     return run_options(record(swimmer_options(function)))
 
 
-@click.group(cls=ControllerGroup, options=_options)
+@click.group(cls=ControllerGroup, options=_simulate_options)
 def simulate() -> None:
     """Swim a simulated fish in virtual time, with the loop that runs on the robot."""
 
@@ -88,7 +88,7 @@ def _simulate(
         if not is_swimmer:
             swimmer_options_given.refuse()
         if recording:
-            writer = stack.enter_context(_recorder(recording))
+            writer = stack.enter_context(_open_recording(recording))
             on_start = partial(_describe, writer, config)
         if is_swimmer:
             from fishd.cli.free_swim import swim
@@ -118,7 +118,7 @@ def _describe(writer: "RunWriter", config: Config, run: "VirtualRun") -> None:
     writer.describe(config, run.about())
 
 
-def _recorder(path: Path) -> "RunWriter":
+def _open_recording(path: Path) -> "RunWriter":
     try:
         from fishd.recording import RunWriter
     except ModuleNotFoundError as error:
@@ -135,12 +135,12 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
         (
             "controller",
             f"{format_controller(report.controller, report.parameters)} "
-            f"{_until(report, settle)}".rstrip(),
+            f"{_format_takeover(report, settle)}".rstrip(),
         ),
-        *_chosen_criterion(report),
+        *_criterion_rows(report),
         ("thrust", f"{report.mean_thrust * 1e3:.3f} mN"),
-        *_power(report),
-        ("frequency", _frequency(report, config.tick)),
+        *_power_rows(report),
+        ("frequency", _format_frequency(report, config.tick)),
         ("fin", f"±{report.fin_amplitude:.4f} rad"),
         (
             "command",
@@ -161,7 +161,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
     ]
 
 
-def _power(report: "Report") -> list[tuple[str, str]]:
+def _power_rows(report: "Report") -> list[tuple[str, str]]:
     """Return the power into the servo, by its loss model, and the thrust per watt."""
     if not report.mean_power:
         return []
@@ -169,7 +169,7 @@ def _power(report: "Report") -> list[tuple[str, str]]:
     return [("power", f"{power_words(report.mean_power)} into the servo: {per_watt:.3g} mN per W")]
 
 
-def _until(report: "Report", settle: float) -> str:
+def _format_takeover(report: "Report", settle: float) -> str:
     """Return until when the requested controller swam, if another one took over."""
     if report.took_over is None:
         return ""
@@ -177,14 +177,14 @@ def _until(report: "Report", settle: float) -> str:
     return f"until {report.took_over:.2f} s, then {report.successor}; {note}"
 
 
-def _chosen_criterion(report: "Report") -> list[tuple[str, str]]:
+def _criterion_rows(report: "Report") -> list[tuple[str, str]]:
     """Return the C that the controller chose, if that was left to it."""
     if report.parameters.get("C") != "auto" or "criterion" not in report.quantities:
         return []
     return [("", format_criterion(report.quantities, "at the end"))]
 
 
-def _frequency(report: "Report", tick: float) -> str:
+def _format_frequency(report: "Report", tick: float) -> str:
     """Return the tail-beat frequency, and the half beats, which are whole ticks."""
     lengths = sorted(set(report.half_beats) - {0})
     if not lengths:

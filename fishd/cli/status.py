@@ -60,11 +60,11 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         *mode,
         ("controller", format_controller(status.controller, status.parameters)),
         *([("", f"took over: {format_reason(status.fallback)}")] if status.fallback else []),
-        ("angle", f"{_angle(status)}, {_range(status)}"),
+        ("angle", f"{_format_angle(status)}, {_format_range(status)}"),
         *_thrust_rows(status),
         *([("leak", f"{status.leak:.3g} s, estimated")] if status.leak is not None else []),
-        *_criterion(status),
-        *([("shows", shown)] if (shown := _quantities(status)) else []),
+        *_criterion_rows(status),
+        *([("shows", shown)] if (shown := _format_shown(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("degraded", line) for line in status.degraded),
         *([("survived", format_values(errors, {}))] if errors else []),
@@ -74,7 +74,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
     ]
 
 
-def _criterion(status: Status) -> list[tuple[str, str]]:
+def _criterion_rows(status: Status) -> list[tuple[str, str]]:
     """Return the C that `swing --C auto` has chosen, or tries."""
     quantities = status.quantities
     if status.parameters.get("C") != "auto" or "criterion" not in quantities:
@@ -103,25 +103,25 @@ def _timing_rows(status: Status) -> list[tuple[str, str]]:
     return [
         loop,
         ("", f"slots missed: {status.missed}, overruns: {status.overruns}"),
-        ("late", _percentiles(timing.lateness)),
-        ("busy", _percentiles(timing.busy)),
-        *((f"  {phase}", _percentiles(times)) for phase, times in timing.phases.items()),
+        ("late", _format_percentiles(timing.lateness)),
+        ("busy", _format_percentiles(timing.busy)),
+        *((f"  {phase}", _format_percentiles(times)) for phase, times in timing.phases.items()),
     ]
 
 
-def _quantities(status: Status) -> str:
+def _format_shown(status: Status) -> str:
     pairs = format_quantities(status.quantities, status.quantity_units)
     return ", ".join(f"{name} {value}" for name, value in pairs)
 
 
-def _angle(status: Status) -> str:
+def _format_angle(status: Status) -> str:
     if not status.servo_on:
         return "no pulses"
     lost = "; the servo cannot be reached, may still have pulses" if status.servo_lost else ""
     return f"{status.phi_c:+.3f} rad{lost}"
 
 
-def _range(status: Status) -> str:
+def _format_range(status: Status) -> str:
     """Return the angles that the tail can be sent to."""
     limit = status.amplitude_limit
     if (status.lowest, status.highest) == (-limit, limit):
@@ -132,7 +132,7 @@ def _range(status: Status) -> str:
     )
 
 
-def _percentiles(times: Percentiles) -> str:
+def _format_percentiles(times: Percentiles) -> str:
     return (
         f"p50 {times.p50:.0f} µs, p99 {times.p99:.0f} µs, "
         f"worst {times.worst:.0f} µs in tick {times.worst_seq}"

@@ -8,7 +8,13 @@ import click
 import msgspec
 from msgspec.structs import replace
 
-from fishd.cli.experiment_options import ChosenFish, Ending, Place, fish_choice, folder_options
+from fishd.cli.experiment_options import (
+    ChosenFish,
+    ExperimentEnding,
+    ExperimentFolder,
+    fish_choice,
+    folder_options,
+)
 from fishd.cli.options import ControllerGroup, FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, warn_of_fin
 from fishd.cli.progress import show_progress
@@ -93,7 +99,7 @@ def _sweep(
     seconds: float | None,
     jobs: int | None,
     cluster: str | None,
-    place: Place,
+    place: ExperimentFolder,
     fish: ChosenFish,
     picture: Path | None,
     as_json: bool,
@@ -137,7 +143,7 @@ class _Sweep:
     points: "list[Point]"
     units: dict[str, str]
     """Units of the parameters, by name."""
-    place: Place
+    place: ExperimentFolder
     fish: ChosenFish
     picture: Path | None
     as_json: bool
@@ -154,7 +160,7 @@ class _Sweep:
         settings = {"lengths": msgspec.to_builtins(lengths)}
         with self.place.open(self.fish, msgspec.to_builtins(config), settings) as experiment:
             folder = self._open_folder(experiment)
-            ending = Ending(experiment)
+            ending = ExperimentEnding(experiment)
             with show_progress(len(pairs), "points", err=self.as_json) as show:
                 show.at(self.finished)
 
@@ -180,7 +186,7 @@ class _Sweep:
             grid.check_remote(self.points, Limits(session.amplitude, session.tick))
             with self.place.open(self.fish, session.config, settings, session.unit) as experiment:
                 folder = self._open_folder(experiment)
-                ending = Ending(experiment)
+                ending = ExperimentEnding(experiment)
                 session.used = self.finished * seconds
                 with (
                     ending.measuring(),
@@ -235,7 +241,7 @@ class _Sweep:
         self.finished += 1
         return f"{point.label()}: {_format_result(result, folder.quantity)}"
 
-    def _conclude(self, folder: "SweepFolder", ending: Ending, error_of: str) -> int:
+    def _conclude(self, folder: "SweepFolder", ending: ExperimentEnding, error_of: str) -> int:
         """Print the best points, and draw the curves; return the exit status."""
         from fishd.lab.sweep import curves, figure
 

@@ -30,7 +30,7 @@ CHIP_PRIORITY = 60
 """SCHED_FIFO priority of a virtual Pi, above that of the fishd that drives it."""
 
 
-def _complete(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
+def _complete_fault(_: click.Context, __: click.Parameter, incomplete: str) -> list[CompletionItem]:
     return [
         CompletionItem(name, help=about)
         for name, about in FAULTS.items()
@@ -70,7 +70,7 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
     path = virtual_pi_socket(settings.socket)
     pi = VirtualPi(settings, config.plant, config.simulation, config.tick, PunctualClock())
     if config.panel.estop_gpio is not None:
-        pi.set_level(config.panel.estop_gpio, _level(config.panel, pressed=False))
+        pi.set_level(config.panel.estop_gpio, _pin_level(config.panel, pressed=False))
     with _catch_signals() as stopped, LinkServer(pi, path):
         echo(
             f"virtual Pi on {path}: ADS1115 {settings.address:#04x} on I2C bus {settings.bus}, "
@@ -81,11 +81,11 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
             realtime.collect_garbage()
             state = pi.state()  # also advances the fish while no driver reads the sensor
             if sys.stdout.isatty():
-                echo(_line(state))
+                echo(_format_line(state))
 
 
 @virtual_pi.command()
-@click.argument("name", shell_complete=_complete)
+@click.argument("name", shell_complete=_complete_fault)
 @for_option("Duration of the fault [s]; by default it lasts until 'clear'.", kind=click.FLOAT)
 @fish_options
 def inject(name: str, seconds: float | None, file: Path | None, overrides: tuple[str, ...]) -> None:
@@ -95,7 +95,7 @@ def inject(name: str, seconds: float | None, file: Path | None, overrides: tuple
 
 
 @virtual_pi.command()
-@click.argument("name", required=False, shell_complete=_complete)
+@click.argument("name", required=False, shell_complete=_complete_fault)
 @fish_options
 def clear(name: str | None, file: Path | None, overrides: tuple[str, ...]) -> None:
     """End the fault NAME, or all faults."""
@@ -126,10 +126,10 @@ def status(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> None
         return
     truth = state.truth
     rows = [
-        ("pulses", _pulses(state)),
+        ("pulses", _format_pulses(state)),
         ("wheel", f"{truth.phi:+.3f} rad"),
         ("fin", f"{truth.alpha:+.3f} rad, {truth.alpha_rate:+.2f} rad/s"),
-        ("faults", _active(state) or "none"),
+        ("faults", _format_faults(state) or "none"),
         ("pigpiod", f"127.0.0.1:{state.pigpio_port}"),
     ]
     echo_rows(rows)
@@ -170,26 +170,26 @@ def _set_button(config: Config, pressed: bool) -> None:
     if panel.estop_gpio is None:
         complain("fishctl", "no E-stop button: panel.estop_gpio is null, its GPIO is needed", 1)
     with _connect(config) as pi:
-        pi.set_level(panel.estop_gpio, _level(panel, pressed))
+        pi.set_level(panel.estop_gpio, _pin_level(panel, pressed))
 
 
-def _level(panel: PanelSettings, pressed: bool) -> int:
+def _pin_level(panel: PanelSettings, pressed: bool) -> int:
     """Return the level to which the E-stop button drives its pin."""
     return int(pressed == (panel.estop_pressed == "high"))
 
 
-def _line(state: PiState) -> str:
-    faults = _active(state)
-    return f"pulses {_pulses(state):<24} fin {state.truth.alpha:+.3f} rad" + (
+def _format_line(state: PiState) -> str:
+    faults = _format_faults(state)
+    return f"pulses {_format_pulses(state):<24} fin {state.truth.alpha:+.3f} rad" + (
         f"  faults: {faults}" if faults else ""
     )
 
 
-def _pulses(state: PiState) -> str:
+def _format_pulses(state: PiState) -> str:
     return "none" if state.angle is None else f"{state.pulse:.0f} µs, {state.angle:+.3f} rad"
 
 
-def _active(state: PiState) -> str:
+def _format_faults(state: PiState) -> str:
     return ", ".join(
         name if left is None else f"{name} ({left:.1f} s left)"
         for name, left in state.faults.items()

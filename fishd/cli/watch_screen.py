@@ -73,43 +73,43 @@ class View:
     def outdated(self) -> bool:
         """Whether the status is a second old, or does not match the latest tick."""
         tick, status = self._ticks[-1], self.status
-        known = (status.mode, status.controller) == (tick.mode, tick.controller)
-        return not known or abs(tick.t - status.t) >= 1.0
+        is_current = (status.mode, status.controller) == (tick.mode, tick.controller)
+        return not is_current or abs(tick.t - status.t) >= 1.0
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield the header, as many traces as fit, and events below them on a tall screen."""
         width, height = options.max_width, options.height or console.height
-        header = [self._title()]
+        header = [self._title_line()]
         reason, fallback = self.status.reason, self.status.fallback
-        if why := reason or fallback or self.status.lease_expired:
+        if cause := reason or fallback or self.status.lease_expired:
             message = text.line(
-                f"{'took over: ' if why is fallback else ''}{why.code}: {why.message}"
+                f"{'took over: ' if cause is fallback else ''}{cause.code}: {cause.message}"
             )
             header += Text(message, "red" if reason else "yellow").wrap(console, width)
         if holder := self.status.lease:
-            header.append(_one_line(text.line(f"held by {holder}, for {holder.age:.0f} s")))
+            header.append(_cut_line(text.line(f"held by {holder}, for {holder.age:.0f} s")))
         yield from header
-        quantities = self._quantities()
-        yield self._figures()
+        quantities = self._quantity_lines()
+        yield self._figure_table()
         yield from quantities
         events = max(0, min(3, (height - 14) // 3))
         # 2 rows of figures, 1 for the time axis.
         free_rows = height - len(header) - 2 - len(quantities) - events - 1
         traces = TRACES[: max(0, free_rows // 2)] if width >= 2 * LABEL_COLUMNS else ()
         for trace in traces:
-            yield self._plot(trace, width, free_rows // len(traces))
+            yield self._draw_trace(trace, width, free_rows // len(traces))
         if traces:
             ago = f"-{TRACE_SPAN_S:g} s"
             yield Text(f"{'':{LABEL_COLUMNS + 1}}{ago:<{width - LABEL_COLUMNS - 4}}now", "dim")
         for event in list(self._events)[-events:] if events else ():
-            yield _one_line(
+            yield _cut_line(
                 (f"{format_time_of_day(event.t)} ", "dim"),
                 (text.line(f"{event.kind}: {event.message}"), LEVELS.get(event.level, "none")),
             )
 
-    def _title(self) -> Text:
+    def _title_line(self) -> Text:
         tick = self._ticks[-1]
-        return _one_line(
+        return _cut_line(
             f"{text.quoted(self.status.name)} " if self.status.name else "",
             (f" {text.quoted(tick.mode).upper()} ", f"bold reverse {MODES.get(tick.mode, 'none')}"),
             (f" {text.quoted(tick.controller)} ", "bold"),
@@ -118,7 +118,7 @@ class View:
             ("  servo not reached", "red") if self.status.servo_lost else "",
         )
 
-    def _figures(self) -> Table:
+    def _figure_table(self) -> Table:
         tick = self._ticks[-1]
         current = replace(
             self.status,
@@ -131,7 +131,7 @@ class View:
             "thrust": thrust_words(current),
             **({} if power is None else {"power": power_words(power)}),
             "tail beat": f"{tick.frequency:.2f} Hz",
-            **({} if self.status.robot == "swimmer" else self._timing()),
+            **({} if self.status.robot == "swimmer" else self._timing_figures()),
             "lost": f"{self._lost}",
         }
         table = Table.grid(padding=(0, 3, 0, 0))
@@ -141,7 +141,7 @@ class View:
         table.add_row(*figures.values(), style="bold")
         return table
 
-    def _timing(self) -> dict[str, str]:
+    def _timing_figures(self) -> dict[str, str]:
         """Return lateness, busy time and missed slots; not shown in slow motion."""
         return {
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
@@ -149,7 +149,7 @@ class View:
             "missed": f"{self._ticks[-1].missed}",
         }
 
-    def _quantities(self) -> list[Text]:
+    def _quantity_lines(self) -> list[Text]:
         """Return the quantities of the controller in one line; no line if it has none."""
         now = self._ticks[-1].quantities
         if not isinstance(now, dict):
@@ -157,43 +157,43 @@ class View:
         parts: list[str | tuple[str, str]] = []
         for name, value in format_quantities(now, self.status.quantity_units):
             parts += [(f"{name} ", "dim"), (f"{value}   ", "bold")]
-        return [_one_line(*parts)]
+        return [_cut_line(*parts)]
 
-    def _plot(self, trace: Trace, width: int, rows: int) -> Text:
+    def _draw_trace(self, trace: Trace, width: int, rows: int) -> Text:
         """Return a trace with its name and scale to the left; lost ticks leave a gap."""
         values = [trace.value(tick) for tick in self._ticks]
-        low, high = _scale(values, trace.min_end)
+        low, high = _choose_scale(values, trace.min_end)
         now = self._ticks[-1].t
         points = [(now - TRACE_SPAN_S, math.nan)]
-        for before, tick, value in zip((None, *self._ticks), self._ticks, values, strict=False):
-            if before and tick.seq - before.seq != 1:
-                points.append((before.t, math.nan))
+        for previous, tick, value in zip((None, *self._ticks), self._ticks, values, strict=False):
+            if previous and tick.seq - previous.seq != 1:
+                points.append((previous.t, math.nan))
             points.append((tick.t, (value - low) / (high - low)))
         labels = [""] * rows
         labels[round(high / (high - low) * (rows - 1))] = "0"
         labels[-1] = f"{low:g}"
         name = trace.name.format(force_unit=text.quoted(self.status.force_unit))
         labels[0] = f"{name:<9}{high:>{LABEL_COLUMNS - 9}g}"
-        drawn = _curve(points, now - TRACE_SPAN_S, now, rows, width - LABEL_COLUMNS - 1)
+        curve = _draw_curve(points, now - TRACE_SPAN_S, now, rows, width - LABEL_COLUMNS - 1)
         lines = (
-            f"{label:>{LABEL_COLUMNS}}┤{line}" for label, line in zip(labels, drawn, strict=True)
+            f"{label:>{LABEL_COLUMNS}}┤{line}" for label, line in zip(labels, curve, strict=True)
         )
         return Text("\n".join(lines), trace.style, no_wrap=True)
 
 
-def _one_line(*parts: str | tuple[str, str]) -> Text:
+def _cut_line(*parts: str | tuple[str, str]) -> Text:
     """Return a text that is cut where the screen ends; parts: each with its style."""
     return Text.assemble(*parts, no_wrap=True, overflow="ellipsis")
 
 
-def _scale(values: Sequence[float], min_end: float) -> tuple[float, float]:
+def _choose_scale(values: Sequence[float], min_end: float) -> tuple[float, float]:
     """Return round limits around `values`, zero and ±`min_end`, that seldom change."""
     low, high = min([-min_end, *values]), max([min_end, *values])
     step = 10.0 ** math.floor(math.log10(high - low)) / 2.0
     return step * math.floor(low / step), step * math.ceil(high / step)
 
 
-def _curve(
+def _draw_curve(
     points: Sequence[tuple[float, float]], start: float, end: float, rows: int, columns: int
 ) -> list[str]:
     """Draw the line through `points`, as `rows` strings of `columns` braille characters.

@@ -57,8 +57,8 @@ def read(path: Path, unit: str) -> list[Step]:
         reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
         names = [name.strip() for name in reader.fieldnames or []]
         reader.fieldnames = names
-        columns = _columns(path, names, unit)
-        steps = [_step(f"{path}:{reader.line_num}", row, columns) for row in reader]
+        columns = _find_columns(path, names, unit)
+        steps = [_parse_step(f"{path}:{reader.line_num}", row, columns) for row in reader]
     except files.FileProblem as problem:
         raise click.ClickException(f"{path}: {problem}") from None
     except csv.Error as error:
@@ -89,7 +89,7 @@ def write(path: Path, measured: Sequence[tuple[tuple[float, float], ForceSample]
     files.write_atomically(path, table.getvalue())
 
 
-def _columns(path: Path, names: list[str], unit: str) -> dict[str, tuple[str, float]]:
+def _find_columns(path: Path, names: list[str], unit: str) -> dict[str, tuple[str, float]]:
     """Return for each quantity its column, and the unit of that column in SI."""
     columns = {}
     for quantity in ("fx", "fy"):
@@ -109,7 +109,7 @@ def _columns(path: Path, names: list[str], unit: str) -> dict[str, tuple[str, fl
     return columns
 
 
-def _step(where: str, row: dict[str, str], columns: dict[str, tuple[str, float]]) -> Step:
+def _parse_step(where: str, row: dict[str, str], columns: dict[str, tuple[str, float]]) -> Step:
     values = {}
     unit = "N" if {columns["fx"][1], columns["fy"][1]} == {1.0} else "g"
     for quantity, (column, factor) in columns.items():

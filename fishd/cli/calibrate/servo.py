@@ -55,18 +55,18 @@ class Tail:
 
     def begin_trial(self) -> None:
         """Begin the trial: only the controller `hold` can become active from now on."""
-        self._try(self.calibration)
+        self._apply(self.calibration)
 
     def adjust(self, **changes: Any) -> None:
         """Let fishd use a changed calibration without saving it; print its refusal, if any."""
         try:
-            self._try(replace(self.calibration, **changes))
+            self._apply(replace(self.calibration, **changes))
         except Refused as refusal:
             if refusal.code != "bad-arguments":
                 raise
             echo(f"  no: {refusal}")
 
-    def go(self, angle: float) -> bool:
+    def move_to(self, angle: float) -> bool:
         """Move slowly to an angle [rad]; return False if the tail stops before it."""
         angle = max(-self.amplitude, min(self.amplitude, angle))
         while abs(angle - self.angle) > _ANGLE_TOLERANCE_RAD:
@@ -85,13 +85,13 @@ class Tail:
         status = self._fish.status()
         return status.lowest, status.highest
 
-    def neutral(self) -> None:
+    def go_to_neutral(self) -> None:
         """Fade to neutral, and wait until the tail is there."""
         state = self._fish.stop()
         self.angle = self._await_angle(0.0, state.seq)
 
-    def _try(self, calibration: ServoCalibration) -> None:
-        """Let fishd use a calibration; raises `click.ClickException` while it is in fault."""
+    def _apply(self, calibration: ServoCalibration) -> None:
+        """Let fishd use a calibration; raise `click.ClickException` while fishd is in fault."""
         status = self._fish.status()
         if status.reason:
             raise click.ClickException(
@@ -128,15 +128,15 @@ def servo(endpoint: str | None) -> None:
     in use again.
     """
     with Fish(endpoint) as fish, input_interrupted():
-        before = fish.calibrations().servo
-        tail = Tail(fish, before)
-        with hold_lease(fish, before, tail.begin_trial) as lease:
+        previous = fish.calibrations().servo
+        tail = Tail(fish, previous)
+        with hold_lease(fish, previous, tail.begin_trial) as lease:
             echo("Keep hands and cables clear of the tail. Ctrl-C stops it at any prompt.")
             _find_trim(tail)
             _find_direction(tail)
             _find_limit(tail, +1)
             _find_limit(tail, -1)
-            _print_changes(before, tail.calibration)
+            _print_changes(previous, tail.calibration)
             if not click.confirm("Save it?"):
                 raise click.ClickException("not saved")
             lease.when_lost = lambda: None
@@ -149,7 +149,7 @@ def _find_trim(tail: Tail) -> None:
         f"\nTrim: + and - turn the tail by {TRIM_STEP:g} µs, ++ and -- by {5 * TRIM_STEP:g} µs; "
         "ok when it is straight."
     )
-    tail.neutral()
+    tail.go_to_neutral()
     while True:
         word = choose(f"trim {tail.calibration.trim:+g} µs", *STEPS, "ok", suffix="> ")
         if word == "ok":
@@ -161,10 +161,10 @@ def _find_direction(tail: Tail) -> None:
     echo(f"\nDirection: the tail moves by {TEST_ANGLE:g} rad, slowly, and stays there.")
     answer = "a"
     while answer != "y":
-        tail.go(TEST_ANGLE)
+        tail.move_to(TEST_ANGLE)
         question = "Did it move to the fish's left? y, n, or a for again"
         answer = choose(question, "y", "n", "a")
-        tail.neutral()
+        tail.go_to_neutral()
         if answer == "n":
             old = tail.calibration
             # The mechanical stops stay in place, which is now on the other side of neutral.
@@ -190,10 +190,10 @@ def _find_limit(tail: Tail, side: int) -> None:
     while True:
         word = choose(f"{key} {tail.angle:+.2f} rad", *STEPS, "ok", "keep", suffix="> ")
         if word in STEPS:
-            wanted = max(0.0, side * tail.angle + LIMIT_STEP * STEPS[word])
-            if not tail.go(side * wanted):
+            target = max(0.0, side * tail.angle + LIMIT_STEP * STEPS[word])
+            if not tail.move_to(side * target):
                 echo("  no further: the pulses of a servo end here")
-            elif wanted > tail.amplitude:
+            elif target > tail.amplitude:
                 echo("  no further: this is amplitude_limit")
         elif word == "ok" and tail.angle == 0.0:
             echo("  the tail could not go this way at all; go to its limit first, or keep")
@@ -207,13 +207,13 @@ def _find_limit(tail: Tail, side: int) -> None:
     if reach < tail.amplitude and abs(limit) > reach:
         limit = side * math.floor(reach * 1e4) / 1e4
         echo(f"  {key} is {limit:+g} rad now, where the pulses of a servo end")
-    tail.neutral()
+    tail.go_to_neutral()
     tail.adjust(**{key: limit})
 
 
-def _print_changes(before: ServoCalibration, now: ServoCalibration) -> None:
+def _print_changes(previous: ServoCalibration, now: ServoCalibration) -> None:
     units = {"trim": "µs", "direction": "±1", "scale": "µs/rad", "lowest": "rad", "highest": "rad"}
     echo(f"\n{'':<16}{'before':>10}{'now':>10}")
     for name, unit in units.items():
-        old, new = getattr(before, name), getattr(now, name)
+        old, new = getattr(previous, name), getattr(now, name)
         echo(f"{f'{name} [{unit}]':<16}{old:>+10g}{new:>+10g}")

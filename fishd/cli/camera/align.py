@@ -13,11 +13,11 @@ from fishd.cli.camera.options import (
     Watcher,
     camera_option,
     check_png,
-    fish_of,
+    find_fishd,
+    format_yaml,
+    open_session,
     png_option,
     refuse_lockstep,
-    rig_of,
-    yaml_of,
 )
 from fishd.cli.options import FiniteRange, endpoint_option, for_option, json_option, take_option
 from fishd.cli.output import echo, echo_rows, print_json
@@ -64,7 +64,7 @@ def align(
 
     check_png(png)
     with ExitStack() as stack:
-        fish = fish_of(endpoint, stack)
+        fish = find_fishd(endpoint, stack)
         if swim and fish is None:
             raise NoDaemon("no fishd is running, so no fish can swim; leave --swim out")
         client = stack.enter_context(CameraClient(address, fish=fish if swim else None))
@@ -109,7 +109,7 @@ def _collect_frames(client: "CameraClient", seconds: float) -> list["Frame"]:
 
 def _film_swim(client: "CameraClient", fish: "Fish", seconds: float) -> list["Frame"]:
     refuse_lockstep(client.state.virtual)
-    with rig_of(fish, seconds) as rig, show_progress(seconds, "s") as bar:
+    with open_session(fish, seconds) as rig, show_progress(seconds, "s") as bar:
         watcher = Watcher(client, bar.at)
         rig.listener = watcher
         rig.swim("swing", {}, seconds)
@@ -149,7 +149,7 @@ def _print_alignment(alignment: "Alignment", frames: int) -> None:
         echo(line)
     if alignment.settings:
         echo("write into the file of the camera:")
-        echo(yaml_of(alignment.settings))
+        echo(format_yaml(alignment.settings))
         options = " ".join(f"--set {key}={value}" for key, value in alignment.settings.items())
         echo(f"or try: fishd-camera {options}")
 

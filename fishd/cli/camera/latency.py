@@ -5,7 +5,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.camera.options import Watcher, camera_option, refuse_lockstep, rig_of, yaml_of
+from fishd.cli.camera.options import (
+    Watcher,
+    camera_option,
+    format_yaml,
+    open_session,
+    refuse_lockstep,
+)
 from fishd.cli.options import FiniteRange, endpoint_option, for_option, json_option, take_option
 from fishd.cli.output import echo, echo_rows, print_json
 from fishd.cli.progress import show_progress
@@ -45,7 +51,7 @@ def latency(address: str | None, endpoint: str | None, seconds: float, as_json: 
         next(client.frames())  # before the fish moves
         settings = client.settings()
         try:
-            with rig_of(fish, seconds) as rig, show_progress(seconds, "s") as bar:
+            with open_session(fish, seconds) as rig, show_progress(seconds, "s") as bar:
                 watcher = Watcher(client, bar.at)
                 rig.listener = watcher
                 rig.swim("excitation", {}, seconds)
@@ -122,7 +128,7 @@ def suggest_settings(delays: "Latency", settings: "CameraSettings") -> list[str]
         else:
             key = f"{settings.source}.delay"
             delay = round(getattr(settings, settings.source).delay + delays.stamps, 4)
-            lines += ["write into the file of the camera:", yaml_of({key: delay})]
+            lines += ["write into the file of the camera:", format_yaml({key: delay})]
             lines.append(f"or try: fishd-camera --set {key}={delay}")
     else:
         lines.append("its time stamps are right: nothing to set in the camera")
@@ -131,7 +137,7 @@ def suggest_settings(delays: "Latency", settings: "CameraSettings") -> list[str]
             "frames come late; for frames of even distance, write into the file of a training, for "
             "--settings:"
         )
-        lines.append(yaml_of({"camera.stack.delay": delay}))
+        lines.append(format_yaml({"camera.stack.delay": delay}))
     else:
         lines.append("young enough for learning: nothing to set in a training")
     return lines

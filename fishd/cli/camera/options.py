@@ -48,7 +48,7 @@ def check_png(path: Path | None) -> None:
         raise click.UsageError(f"{prefix}nothing may be written into the folder {folder}")
 
 
-def yaml_of(settings: dict[str, Any]) -> str:
+def format_yaml(settings: dict[str, Any]) -> str:
     """Return YAML lines for a file of settings; dots in the keys separate sections."""
     data: dict[str, Any] = {}
     for key, value in settings.items():
@@ -81,7 +81,7 @@ class Watcher:
 
 
 @contextmanager
-def rig_of(fish: Fish, seconds: float) -> Iterator["LiveSession"]:
+def open_session(fish: Fish, seconds: float) -> Iterator["LiveSession"]:
     """Yield a session with the fish of a running fishd, which rests afterwards; print a notice."""
     from fishd.lab.session import LiveSession
 
@@ -92,7 +92,7 @@ def rig_of(fish: Fish, seconds: float) -> Iterator["LiveSession"]:
         yield rig
 
 
-def fish_of(endpoint: str | None, stack: ExitStack) -> Fish | None:
+def find_fishd(endpoint: str | None, stack: ExitStack) -> Fish | None:
     """Return the running fishd, until `stack` is closed; None if none runs and none was named."""
     fish = stack.enter_context(Fish(endpoint))
     try:

@@ -23,17 +23,17 @@ class TerminalPicture:
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield lines of characters, each one pixel wide and two high."""
         height, width = self._colours.shape[:2]
-        room = 2 * max(1, (options.height or console.height) - 4)
-        scale = min(1.0, options.max_width / width, room / height)
+        max_rows = 2 * max(1, (options.height or console.height) - 4)
+        scale = min(1.0, options.max_width / width, max_rows / height)
         columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
-        small = scaled(self._colours, columns, rows)
-        plain = console.color_system is None or console.no_color
-        for upper, lower in zip(small[::2], small[1::2], strict=True):
-            yield from _shades(upper, lower) if plain else _blocks(upper, lower)
+        scaled_picture = scaled(self._colours, columns, rows)
+        is_grey = console.color_system is None or console.no_color
+        for upper, lower in zip(scaled_picture[::2], scaled_picture[1::2], strict=True):
+            yield from _draw_shades(upper, lower) if is_grey else _draw_blocks(upper, lower)
             yield Segment.line()
 
 
-def _blocks(upper: Colours, lower: Colours) -> RenderResult:
+def _draw_blocks(upper: Colours, lower: Colours) -> RenderResult:
     """Yield half blocks: the upper pixel as foreground colour, the lower one as background."""
     pairs = np.concatenate([upper, lower], axis=1) // _COLOUR_STEP * _COLOUR_STEP
     begin = 0
@@ -48,6 +48,6 @@ def _blocks(upper: Colours, lower: Colours) -> RenderResult:
         begin = end
 
 
-def _shades(upper: Colours, lower: Colours) -> RenderResult:
+def _draw_shades(upper: Colours, lower: Colours) -> RenderResult:
     levels = (upper.astype(np.uint16) + lower).mean(axis=1) / 2.0
     yield Segment("".join(_SHADES[int(level * len(_SHADES) / 256.0)] for level in levels))

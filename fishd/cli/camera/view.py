@@ -133,8 +133,8 @@ def _follow(client: "CameraClient", watch: "AxisWatch", whole: bool) -> None:
 def _read_for(client: "CameraClient", watch: "AxisWatch", seconds: float) -> None:
     """Read frames for some seconds; raise `CameraLost` if they have stopped."""
     end = time.monotonic() + seconds
-    while (left := end - time.monotonic()) > 0.0:
-        _read_frames(client, watch, left)
+    while (remaining := end - time.monotonic()) > 0.0:
+        _read_frames(client, watch, remaining)
     client.check()
     if watch.due:
         watch.find()

@@ -55,22 +55,24 @@ def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
 
     A fishd at another control.address stays undetected, even if it owns the same bus.
     """
-    named, endpoint = endpoint, endpoint or find_control()
+    given_endpoint, endpoint = endpoint, endpoint or find_control()
     try:
         if is_unused(endpoint):
             return None
     except PermissionError:
         return Unreachable(f"there may be a fishd at {endpoint}, but this user may not ask", True)
     try:
-        with Fish(named, timeout=ANSWER_TIMEOUT_S) as fish:
-            return Running(fish.status(), _latest_tick(fish), _calibrations(fish), endpoint)
+        with Fish(given_endpoint, timeout=ANSWER_TIMEOUT_S) as fish:
+            return Running(fish.status(), _latest_tick(fish), _read_calibrations(fish), endpoint)
     except Untrusted as error:
-        why = str(error)
+        reason = str(error)
     except NoDaemon:
-        why = f"no answer from {endpoint} within {ANSWER_TIMEOUT_S:g} s, but a fishd may be there"
+        reason = (
+            f"no answer from {endpoint} within {ANSWER_TIMEOUT_S:g} s, but a fishd may be there"
+        )
     except FishError as error:
-        why = str(error)
-    return Unreachable(why, False)
+        reason = str(error)
+    return Unreachable(reason, False)
 
 
 def is_unused(endpoint: str) -> bool:
@@ -106,7 +108,7 @@ def _latest_tick(fish: Fish) -> Tick | None:
         return None
 
 
-def _calibrations(fish: Fish) -> Calibrations | None:
+def _read_calibrations(fish: Fish) -> Calibrations | None:
     try:
         return fish.calibrations()
     except Refused:
@@ -159,7 +161,7 @@ class Context(Machine):
         by_fishd: what a running fishd does with the hardware, such as "owns the sensor"
         """
         if isinstance(self.daemon, Unreachable):
-            return skipped(f"{self.daemon.why}; {self.reach(self.daemon)}")
+            return skipped(f"{self.daemon.why}; {self.suggest_remedy(self.daemon)}")
         if self.running:
             return skipped(f"fishd is running and {by_fishd}")
         if self.daemon:
@@ -169,7 +171,7 @@ class Context(Machine):
             )
         return skipped(f"{self.owner}; name it with --endpoint") if self.owner else None
 
-    def reach(self, daemon: Unreachable) -> str:
+    def suggest_remedy(self, daemon: Unreachable) -> str:
         """Return the remedy for a daemon that does not answer."""
         if daemon.forbidden:
             return f"{self.as_fishd}, or name another with --endpoint"
@@ -196,8 +198,8 @@ class Context(Machine):
     @property
     def drivers(self) -> tuple[tuple[str, Plugins[Any], Any], ...]:
         """Section, plugins and settings of each driver: sensor, servo, and a power meter if any."""
-        chosen = self.config.driver_settings.sections()
-        return tuple((name, CHOICES[name].plugins, settings) for name, settings in chosen.items())
+        sections = self.config.driver_settings.sections()
+        return tuple((name, CHOICES[name].plugins, settings) for name, settings in sections.items())
 
 
 def sudo_unless(uid: int) -> str:

@@ -73,7 +73,7 @@ def servo_opens(context: Context) -> Result:
 def force(context: Context) -> Result:
     """Check the measurements of the running daemon, or of the driver for a second."""
     if context.running:
-        return _force_of_daemon(context)
+        return _check_force_of_daemon(context)
     if occupied := context.occupied("owns the sensor"):
         return occupied
     config = context.config
@@ -101,7 +101,7 @@ def force(context: Context) -> Result:
     return _judge_rate(per_tick, context, "not clipped, not frozen")
 
 
-def _force_of_daemon(context: Context) -> Result:
+def _check_force_of_daemon(context: Context) -> Result:
     assert context.running
     status, tick, _, _ = context.running
     if tick is None:
@@ -162,31 +162,34 @@ def _trial_windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, st
 def pins(context: Context) -> Result | None:
     """Check that no program holds the configured pins, as far as the kernel knows."""
     config = context.config
-    wanted = {config.panel.estop_gpio: "panel.estop_gpio", config.panel.led_gpio: "panel.led_gpio"}
-    wanted |= {
+    configured = {
+        config.panel.estop_gpio: "panel.estop_gpio",
+        config.panel.led_gpio: "panel.led_gpio",
+    }
+    configured |= {
         pin: f"{section}.{claim.key}"
         for section, claims in claims_of(config.driver_settings).items()
         for claim in claims
         for pin in claim.pins
         if claim.key != "bus"  # the kernel drives the pins of a bus
     }
-    wanted.pop(None, None)
+    configured.pop(None, None)
     text = context.text(f"{_DEBUG}/gpio")
     if not text:
         return skipped(_explain_unseen(context))
     if occupied := context.occupied("uses its pins"):
         return occupied
     users = {int(match["pin"]): match["user"].strip() for match in _GPIO_LINE.finditer(text)}
-    taken = [
+    conflicts = [
         f"GPIO{pin} ({key}) is used by {users[pin]}"
-        for pin, key in wanted.items()
+        for pin, key in configured.items()
         if pin is not None and users.get(pin)
     ]
-    if taken:
+    if conflicts:
         return warning(
-            "; ".join(taken), "stop that program, remove its dtoverlay, or choose another pin"
+            "; ".join(conflicts), "stop that program, remove its dtoverlay, or choose another pin"
         )
-    return ok(", ".join(f"GPIO{pin}" for pin in wanted) + " free")
+    return ok(", ".join(f"GPIO{pin}" for pin in configured) + " free")
 
 
 def _explain_unseen(context: Context) -> str:

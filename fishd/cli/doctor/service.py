@@ -25,7 +25,7 @@ def daemon(context: Context) -> Result:
             )
         return ok("no fishd is running")
     if isinstance(context.daemon, Unreachable):
-        return warning(context.daemon.why, context.reach(context.daemon))
+        return warning(context.daemon.why, context.suggest_remedy(context.daemon))
     status, endpoint = context.daemon.status, context.daemon.endpoint
     message = f"fishd {status.version} (pid {status.pid}), robot {status.robot}, {status.mode}"
     if status.robot != context.config.robot:

@@ -44,7 +44,7 @@ def configuration(context: Context) -> Result:
 
 def packages(context: Context) -> Result:
     """Check the packages that this configuration needs, by the metadata of fishd."""
-    robot, wanted, drivers = context.robot, [], list[str]()
+    robot, requirements, drivers = context.robot, [], list[str]()
     texts, packages = list(metadata.requires("fishd") or []), set[str]()
     if context.config.has_hardware:
         for _, plugins, settings in context.drivers:
@@ -57,13 +57,15 @@ def packages(context: Context) -> Result:
         name, extra = match["name"].lower(), match["extra"]
         is_for_swimmer = robot == "swimmer" and (extra, name) in _SWIMMER_PACKAGES
         if extra is None or (extra == "pi" and name in packages) or is_for_swimmer:
-            wanted.append((name, match["bounds"]))
-    problems = [problem for name, bounds in wanted if (problem := _find_problem(name, bounds))]
+            requirements.append((name, match["bounds"]))
+    problems = [
+        problem for name, bounds in requirements if (problem := _find_problem(name, bounds))
+    ]
     if problems:
         extra = {"simulated": "fishd", "swimmer": "fishd[swimmer]"}.get(robot, "fishd[pi]")
         return fail("; ".join(problems), f"{sys.executable} -m pip install '{extra}'")
     user = f"robot {robot} with {' and '.join(drivers)}" if drivers else f"robot {robot}"
-    return ok(f"all {len(wanted)} that {user} needs, under {sys.executable}")
+    return ok(f"all {len(requirements)} that {user} needs, under {sys.executable}")
 
 
 def gpio_package(context: Context) -> Result | None:

@@ -73,28 +73,28 @@ def evaluate(
     from fishd.lab.compare.contestants import parse
     from fishd.lab.compare.survey import survey
 
-    chosen = [parse(text) for text in contestants]
+    parsed = [parse(text) for text in contestants]
     fish = list(other_fish.CHANGES) if which != "random" else []
     singles = len(fish)
     fish += other_fish.harsh_fish() if which != "changes" else ()
     configs = [(changed, load(file, (*overrides, *changed.overrides))) for changed in fish]
-    with show_progress(len(chosen) * len(fish) * seconds, "s swum") as bar:
-        surveys = survey(configs, chosen, seconds, settle, bar.at)
+    with show_progress(len(parsed) * len(fish) * seconds, "s swum") as bar:
+        surveys = survey(configs, parsed, seconds, settle, bar.at)
     if as_json:
         print_json(surveys)
     else:
         from rich.console import Console
 
         Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(
-            _table(surveys, singles)
+            _build_table(surveys, singles)
         )
-    faults = [(surveyed, swum) for surveyed in surveys for swum in surveyed.fish if swum.fault]
-    for surveyed, swum in faults:
-        echo(f"fishctl: {surveyed.contestant}: {swum.fish}: ended in fault: {swum.fault}", err=True)
+    faults = [(surveyed, run) for surveyed in surveys for run in surveyed.fish if run.fault]
+    for surveyed, run in faults:
+        echo(f"fishctl: {surveyed.contestant}: {run.fish}: ended in fault: {run.fault}", err=True)
     return 1 if faults else 0
 
 
-def _table(surveys: "list[ContestantSurvey]", singles: int) -> "Table":
+def _build_table(surveys: "list[ContestantSurvey]", singles: int) -> "Table":
     """Return a table: a row for each of the first `singles` fish, and figures of all others."""
     from rich.table import Table
 
@@ -104,25 +104,22 @@ def _table(surveys: "list[ContestantSurvey]", singles: int) -> "Table":
         table.add_column(surveyed.contestant, justify="right", overflow="fold")
     for row in range(singles):
         runs = [surveyed.fish[row] for surveyed in surveys]
-        table.add_row(runs[0].fish, *(f"{swum.relative_thrust:.1%}" for swum in runs))
+        table.add_row(runs[0].fish, *(f"{run.relative_thrust:.1%}" for run in runs))
     harsh_runs = [surveyed.fish[singles:] for surveyed in surveys]
     if harsh_runs[0]:
         label = f"{len(harsh_runs[0])} harsh fish"
         table.add_row(
             f"{label}, median",
-            *(
-                f"{statistics.median(swum.relative_thrust for swum in row):.1%}"
-                for row in harsh_runs
-            ),
+            *(f"{statistics.median(run.relative_thrust for run in row):.1%}" for row in harsh_runs),
         )
         table.add_row(
             f"{label}, worst",
-            *(f"{min(swum.relative_thrust for swum in row):.1%}" for row in harsh_runs),
+            *(f"{min(run.relative_thrust for run in row):.1%}" for row in harsh_runs),
         )
 
     def add_figure(name: str, figure: "Callable[[list[FishResult]], str]") -> None:
         table.add_row(name, *(figure(surveyed.fish) for surveyed in surveys))
 
-    add_figure("another took over", lambda row: f"{sum(swum.fallback is not None for swum in row)}")
-    add_figure("shaken, at most", lambda row: f"{max(swum.shaken for swum in row):.1f} s")
+    add_figure("another took over", lambda row: f"{sum(run.fallback is not None for run in row)}")
+    add_figure("shaken, at most", lambda row: f"{max(run.shaken for run in row):.1f} s")
     return table

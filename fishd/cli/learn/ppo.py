@@ -142,8 +142,8 @@ def ppo(
         )
         if resume:
             _refuse(BY_RESUME, {"--camera": camera})
-    given = {"steps": steps, "seed": seed, "see": see}
-    changed = {name: value for name, value in given.items() if value is not None}
+    given_settings = {"steps": steps, "seed": seed, "see": see}
+    changed = {name: value for name, value in given_settings.items() if value is not None}
     job = _add_camera(replace(job, agent=agent, settings=replace(job.settings, **changed)), camera)
     if seeds is not None:
         return _train_seeds(job, seeds, jobs, cluster, as_json)
@@ -269,10 +269,10 @@ def print_outcome(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
             err=True,
         )
         return INTERRUPTED
-    rest = NOT_COUNTED if job.on == "simulation" else ""
-    why = f"; {outcome.message}" if outcome.message else ""
+    remark = NOT_COUNTED if job.on == "simulation" else ""
+    reason = f"; {outcome.message}" if outcome.message else ""
     echo(
-        f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time{rest}{why}",
+        f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time{remark}{reason}",
         err=as_json,
     )
     if evaluation := outcome.best_evaluation:
@@ -297,8 +297,8 @@ def _find_run_folder(path: Path) -> Path:
     from fishd.learning.run_folder.runs import SETTINGS
 
     if not path.is_dir():
-        what = "a policy file has no value network" if path.exists() else "no such folder"
-        raise ConfigError(f"--from {path}: {what}; give a run folder or one of its checkpoints")
+        problem = "a policy file has no value network" if path.exists() else "no such folder"
+        raise ConfigError(f"--from {path}: {problem}; give a run folder or one of its checkpoints")
     return path if (path / SETTINGS).exists() else path.parent
 
 
@@ -337,8 +337,8 @@ def _print_seed(seed: int, outcome: "Outcome", err: bool) -> None:
     from fishd.learning.train.progress import describe_evaluation
 
     latest = outcome.latest_evaluation
-    swims = f": {describe_evaluation(latest).strip()}" if latest else ""
+    result = f": {describe_evaluation(latest).strip()}" if latest else ""
     is_finished = outcome.ended == "finished"
     ended = "" if is_finished else f" {outcome.ended}"
-    why = f" ({outcome.message})" if outcome.message else ""
-    echo(f"seed {seed}{ended}{why}{swims}", err=err or not is_finished)
+    reason = f" ({outcome.message})" if outcome.message else ""
+    echo(f"seed {seed}{ended}{reason}{result}", err=err or not is_finished)

@@ -49,14 +49,14 @@ def plot(
     is a page to zoom into, which needs no network.
     """
     recorded = open_recording(run, folder)
-    drawn = traces(recorded, begin, math.inf if end is None else end)
+    run_traces = traces(recorded, begin, math.inf if end is None else end)
     forms = [only] if only else ["png", "html"]
     paths = {form: target / f"{recorded.name}.{form}" for form in forms}
     check_new(paths.values(), replace=force)
     if "png" in paths:
-        draw_run(drawn, paths["png"])
+        draw_run(run_traces, paths["png"])
     if "html" in paths:
         from fishd.lab.run_page import write_page
 
-        write_page(drawn, paths["html"])
+        write_page(run_traces, paths["html"])
     print_paths(paths.values(), as_json)

@@ -45,9 +45,9 @@ def rerun(
     if controller:
         controller, pairs = registry.split_spec(controller)
         parameters = (*(f"{key}={value}" for key, value in pairs), *parameters)
-    given = _convert_parameters(controller, parameters)
+    values = _convert_parameters(controller, parameters)
     recorded = open_recording(run, folder)
-    result = choose_again(recorded, controller, given, overrides)
+    result = choose_again(recorded, controller, values, overrides)
     if as_json:
         print_json(result)
     else:
@@ -57,7 +57,7 @@ def rerun(
     if not result.stretches:
         echo(f"fishctl: {recorded.path}: no controller swam, so none can choose again", err=True)
         return 1
-    is_unchanged = controller is None and not given and not overrides
+    is_unchanged = controller is None and not values and not overrides
     differing = [s for s in result.stretches if s.from_start and s.equal < s.ticks]
     return 1 if is_unchanged and differing else 0
 
@@ -70,14 +70,14 @@ def _convert_parameters(controller: str | None, words: tuple[str, ...]) -> dict[
             f"'{words[0]}': --controller is needed, to say whose parameter it is"
         )
     fields = {field.name: field for field in registry.describe(controller).parameters}
-    given: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.partition("=")
         if not equals:
             raise click.UsageError(f"'{word}': NAME=VALUE is needed")
         field = fields.get(name)
-        given[name] = ParameterType(field).convert(value, None, None) if field else value
-    return given
+        values[name] = ParameterType(field).convert(value, None, None) if field else value
+    return values
 
 
 def _print_stretch(stretch: Stretch) -> None:

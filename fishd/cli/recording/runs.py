@@ -37,19 +37,19 @@ def runs(folder: Path | None, as_json: bool) -> int:
     """
     place = folder or runs_folder()
     recordings = list(glances(place))
-    good = [entry for entry in recordings if isinstance(entry, Glance)]
+    readable = [entry for entry in recordings if isinstance(entry, Glance)]
     experiments = [_ExperimentSummary.read(*entry) for entry in list_experiments(place)]
     if as_json:
-        print_json([*map(_to_json, good), *experiments])
+        print_json([*map(_to_json, readable), *experiments])
     else:
-        if good:
-            _print_recordings(good)
+        if readable:
+            _print_recordings(readable)
         if experiments:
             _print_experiments(experiments)
-        if not good and not experiments:
+        if not readable and not experiments:
             echo(f"there is no recording in {place} yet; see 'fishctl record --help'")
-    wrong = [entry for entry in recordings if isinstance(entry, RecordingError)]
-    problems = [str(error) for error in wrong] + [e.problem for e in experiments if e.problem]
+    errors = [entry for entry in recordings if isinstance(entry, RecordingError)]
+    problems = [str(error) for error in errors] + [e.problem for e in experiments if e.problem]
     for problem in problems:
         echo(f"fishctl: {problem}", err=True)
     return 1 if problems else 0
@@ -133,7 +133,7 @@ def _print_recordings(recordings: list[Glance]) -> None:
             str(summary.lost),
             str(summary.marks),
             text.line(", ".join(summary.swimming) or "–"),
-            text.line("; ".join(_remarks(glance))),
+            text.line("; ".join(_format_remarks(glance))),
         )
     # Nothing is wrapped in a file or a pipe.
     Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
@@ -156,7 +156,7 @@ def _format_thousandths(value: float) -> str:
     return f"{thousandths:.2f}" if abs(thousandths) < 1e6 else f"{thousandths:.3g}"
 
 
-def _remarks(glance: Glance) -> list[str]:
+def _format_remarks(glance: Glance) -> list[str]:
     state = _format_state(glance)
     restarts = glance.summary.restarts
     return [
