@@ -69,14 +69,14 @@ class _Outcome(NamedTuple):
     "--camera",
     metavar="FILE|ENDPOINT",
     help="For policies that see pictures: in simulation, the YAML file of a simulated camera, such "
-    "as config/camera-web.yaml; live, where its fishd-camera takes requests. [default: a "
-    "good simulated one; $FISHD_CAMERA, else that of this machine]",
+    "as config/camera-web.yaml; live, the endpoint of fishd-camera. [default: a good simulated "
+    "camera; live, $FISHD_CAMERA or that of this machine]",
 )
 @click.option(
     "--agent",
     metavar="ADDRESS",
-    help="For policies that see pictures, on a robot elsewhere: where its fishd reaches this "
-    "program. [default: any free port of this machine]",
+    help="For policies that see pictures, on a remote robot: address at which its fishd reaches "
+    "this program. [default: any free port of this machine]",
 )
 @keep_option
 @json_option
@@ -162,16 +162,18 @@ def _swim(task: _Task, settle: float) -> _Outcome:
     for contestant, reason in left_out:
         if is_missing(contestant):  # a misspelt path, not a policy for another fish
             raise reason
-    able = [
+    accepted = [
         contestant
         for contestant in chosen
         if contestant not in (refused for refused, _ in left_out)
     ] or chosen
     with (
         keep_session(task.folder, task.fish, None, task.settings) as experiment,
-        show_progress(len(able) * task.runs * task.seconds, "s swum") as bar,
+        show_progress(len(accepted) * task.runs * task.seconds, "s swum") as bar,
     ):
-        result = comparison.compare(config, able, task.seconds, settle, task.runs, bar.at, camera)
+        result = comparison.compare(
+            config, accepted, task.seconds, settle, task.runs, bar.at, camera
+        )
         task.write_result(experiment, result[0])
     task.fish.announce(task.as_json)
     return _Outcome(
@@ -276,8 +278,8 @@ def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
 
         if line := unknown_calibration(measured[0].calibration_ci95, outcome.unit):
             echo(f"fishctl: {line}", err=True)
-    for omitted, reason, swum in outcome.left_out:
-        when = f" after {swum} of {runs} runs, which stand in the table" if swum else ""
+    for omitted, reason, completed in outcome.left_out:
+        when = f" after {completed} of {runs} runs, which are in the table" if completed else ""
         echo(f"fishctl: {omitted.label}: left out{when}: {reason}", err=True)
     for standing in standings:
         for fallback in standing.fallbacks:
@@ -353,7 +355,7 @@ def _power_cells(standing: "Standing") -> list[str]:
 
 
 def _select_half_width(statistical_ci95: float | None, total_ci95: float | None) -> float | None:
-    """Return the error of a mean, with that of the calibration where it is known."""
+    """Return the total half-width of a mean; the statistical one if the total is unknown."""
     return statistical_ci95 if total_ci95 is None else total_ci95
 
 

@@ -38,7 +38,7 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
     if options.save:
         track.check_name(options.save)
     options.check()
-    keeping = (
+    checkpointing = (
         CheckpointSettings(options.checkpoint, options.checkpoint_every)
         if options.checkpoint
         else None
@@ -57,10 +57,10 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
             if options.save and options.save.suffix == ".npz":
                 midlines.add(fish)
 
-        swum = run(
+        outcome = run(
             *arguments,
             progress=lambda passed, speed: bar.at(passed, f"{speed * 1e3:.1f} mm/s"),
-            keeping=keeping,
+            keeping=checkpointing,
             resume=resume,
             ended=interrupted.is_set,
             watch=watch,
@@ -70,10 +70,10 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
             ),
         )
     is_unsaved = False
-    if options.save and len(swum.track):
+    if options.save and len(outcome.track):
         if resume and options.save.suffix == ".npz":
-            midlines.put_before(options.save, swum.track.rows())
-            if len(midlines) < len(swum.track):
+            midlines.put_before(options.save, outcome.track.rows())
+            if len(midlines) < len(outcome.track):
                 start = min(midlines.start, resume.time)
                 echo(
                     f"fishctl: {options.save}: its midlines begin at {start:.2f} s: to keep "
@@ -81,27 +81,27 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
                     err=True,
                 )
         try:
-            track.save(swum.track, options.save, midlines.arrays())
+            track.save(outcome.track, options.save, midlines.arrays())
         except OSError as error:
             is_unsaved = True
             reason = error.strerror or error
             echo(f"fishctl: {options.save}: the track cannot be written: {reason}", err=True)
-    if swum.report and as_json:
-        print_json(swum.report)
-    elif swum.report:
-        echo_rows(_report_rows(swum.report))
-    if swum.trouble:
-        raise FishdError(f"{swum.trouble}; {_describe_checkpoint(swum, options)}")
-    if not swum.complete:
-        echo(f"fishctl: interrupted; {_describe_checkpoint(swum, options)}", err=True)
+    if outcome.report and as_json:
+        print_json(outcome.report)
+    elif outcome.report:
+        echo_rows(_report_rows(outcome.report))
+    if outcome.trouble:
+        raise FishdError(f"{outcome.trouble}; {_describe_checkpoint(outcome, options)}")
+    if not outcome.complete:
+        echo(f"fishctl: interrupted; {_describe_checkpoint(outcome, options)}", err=True)
         return INTERRUPTED
-    report = swum.report
+    report = outcome.report
     if report and report.fallback:
         echo(f"fishctl: another controller took over: {report.fallback.message}", err=True)
     if report and report.reason:
         echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
         return 1
-    return 1 if is_unsaved or swum.lost else 0
+    return 1 if is_unsaved or outcome.lost else 0
 
 
 @contextmanager
@@ -116,10 +116,10 @@ def _open_film(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[
         yield lambda fish: film.add_frame(fish.fish)
 
 
-def _describe_checkpoint(swum: "SwimResult", options: SwimmerOptions) -> str:
+def _describe_checkpoint(outcome: "SwimResult", options: SwimmerOptions) -> str:
     """Return a clause about the checkpoint from which the run can be resumed."""
-    if swum.kept is not None:
-        return f"its last checkpoint is of {swum.kept:.2f} s: --resume {options.checkpoint}"
+    if outcome.kept is not None:
+        return f"its last checkpoint is at {outcome.kept:.2f} s: --resume {options.checkpoint}"
     if options.resume:
         return f"its last checkpoint is {options.resume}"
     return "no checkpoint was written" + (
@@ -161,9 +161,9 @@ def _trend_rows(report: "SwimReport") -> list[tuple[str, str]]:
     """Return a warning row if the speed has a trend, as its interval is then invalid."""
     if report.speed_trend is None:
         return []
-    how = "speeding up" if report.speed_trend > 0.0 else "slowing down"
+    direction = "speeding up" if report.speed_trend > 0.0 else "slowing down"
     share = f"{abs(report.speed_trend):.2%}".replace("%", " %/s")
-    return [("", f"still {how} by {share}: a longer --settle is needed")]
+    return [("", f"still {direction} by {share}: a longer --settle is needed")]
 
 
 def _format_or_dash(value: float | None, form: str) -> str:

@@ -99,8 +99,8 @@ def identify(
     from fishd.lab import identification as lab
 
     names = None if fit is None else _parse_names(fit)
-    known = _parse_names(fix or "")
-    lab.check(lab.DEFAULT if names is None else names, known)  # before minutes of swimming
+    fixed = _parse_names(fix or "")
+    lab.check(lab.DEFAULT if names is None else names, fixed)  # before minutes of swimming
     if experiment:
         try:
             config, tables = _swim_experiment(
@@ -116,7 +116,7 @@ def identify(
         check_tethered(config.robot, "identify")
         origin = ", ".join(path.name for path in tables)
     identification = lab.identify(
-        tables, start=config.plant, rig=config.simulation, fit=names, fix=known
+        tables, start=config.plant, rig=config.simulation, fit=names, fix=fixed
     )
     if as_json:
         print_json(identification.to_builtins() | {"origin": origin})

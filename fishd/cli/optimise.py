@@ -198,7 +198,7 @@ class _Optimisation:
         from fishd.lab.optimise.figure import draw
 
         ending = ExperimentEnding(self.experiment)
-        waited = self._measure(ending)
+        waiting = self._measure(ending)
         if not self.trials:
             if ending.is_interrupted:
                 return ending.interrupted("before the first candidate was measured")
@@ -207,16 +207,16 @@ class _Optimisation:
             )
         proposal = self.search.propose()
         with ending.measuring():
-            optimum = self._judge(proposal, waited)
+            optimum = self._judge(proposal, waiting)
             folder, unit = self.experiment.path, self.session.unit
             if self.as_json:
                 print_json(optimum)
             else:
                 _print_optimum(optimum, unit, self.units)
                 echo(f"table: {folder / 'rows.csv'}")
-            shown = self._search_to_draw()
+            drawn_search = self._search_to_draw()
             paths = [picture] if picture else [folder / "thrust.png", folder / "thrust.svg"]
-            draw(paths, shown, proposal, self.units, _axis_label(self.aim, unit))
+            draw(paths, drawn_search, proposal, self.units, _axis_label(self.aim, unit))
             if not self.as_json:
                 echo(f"picture: {', '.join(map(str, paths))}")
         if ending.is_interrupted:
@@ -322,15 +322,17 @@ def _parse_range(text: str, controller: str, given: dict[str, Any], session: "Se
     from fishd.lab.optimise.trials import check_bounds, default_range, restrict_to_whole_ticks
 
     name, equals, ends = text.partition("=")
-    known = _controller_fields()
-    if name not in known or known[name].kind != "number":
-        numbers = [other_name for other_name, field in known.items() if field.kind == "number"]
+    fields = _controller_fields()
+    if name not in fields or fields[name].kind != "number":
+        numbers = [other_name for other_name, field in fields.items() if field.kind == "number"]
         hint = nearest(name, numbers, listed="it has") if numbers else "it has none"
-        raise click.UsageError(f"--over {text}: {controller} has no such number; {hint}")
+        raise click.UsageError(
+            f"--over {text}: {controller} has no numeric parameter of this name; {hint}"
+        )
     if name in given:
         raise click.UsageError(f"--over {text}: --{name} is given, too: leave out one of them")
     if not equals:
-        searched = default_range(known[name], session)
+        searched = default_range(fields[name], session)
         if searched is None:
             raise click.UsageError(
                 f"--over {name}: it is not bounded on both sides: write --over {name}=LOW:HIGH"
@@ -344,7 +346,7 @@ def _parse_range(text: str, controller: str, given: dict[str, Any], session: "Se
         ) from None
     searched = Range(name, low, high)
     searched.check()
-    check_bounds(searched, known[name], session)
+    check_bounds(searched, fields[name], session)
     return restrict_to_whole_ticks(searched, session.tick) if name == "frequency" else searched
 
 
@@ -442,14 +444,16 @@ def _make_optimum(
     if all(math.isfinite(trial.power) for trial in trials):
         powers = [(trial.parameters, trial.power, trial.power_error) for trial in trials]
         power, power_error = search.with_observations(powers).predict(proposal.parameters)
-    gives, gives_error = per_watt(thrust, error, power, power_error)
+    per_watt_value, per_watt_error = per_watt(thrust, error, power, power_error)
     if aim.objective == "thrust-per-watt" and aim.target is None:
-        gives, gives_error = proposal.value, proposal.error
+        per_watt_value, per_watt_error = proposal.value, proposal.error
     rotations = [trial.rotation for trial in trials if trial.rotation]
     rotation = sum(rotations) / len(rotations) if rotations else 0.0
     error_parts = budget(calibration, thrust, error, rotation=rotation)
     per_watt_parts = (
-        None if gives is None else budget(calibration, gives, gives_error, rotation=rotation)
+        None
+        if per_watt_value is None
+        else budget(calibration, per_watt_value, per_watt_error, rotation=rotation)
     )
     return Optimum(
         controller=name,
@@ -464,8 +468,8 @@ def _make_optimum(
         target=aim.target,
         power=power,
         power_error=power_error,
-        thrust_per_watt=gives,
-        thrust_per_watt_error=gives_error,
+        thrust_per_watt=per_watt_value,
+        thrust_per_watt_error=per_watt_error,
         calibration_ci95=error_parts.calibration_ci95,
         total_ci95=error_parts.total_ci95,
         rotation=rotation,
@@ -489,7 +493,7 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
     )
     echo(f"thrust there: {thrust}")
     if optimum.power is not None and optimum.power_error is not None:
-        gives = error_budget.format_with_budget(
+        per_watt_text = error_budget.format_with_budget(
             optimum.thrust_per_watt or 0.0,
             optimum.thrust_per_watt_error or 0.0,
             optimum.thrust_per_watt_calibration_ci95,
@@ -497,7 +501,8 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
             f"{unit} per W",
         )
         echo(
-            f"power there: {optimum.power * 1e3:.0f} ± {optimum.power_error * 1e3:.0f} mW, {gives}"
+            f"power there: {optimum.power * 1e3:.0f} ± {optimum.power_error * 1e3:.0f} mW, "
+            f"{per_watt_text}"
         )
     unknown = error_budget.unknown_calibration(optimum.calibration_ci95, unit)
     for line in filter(None, (unknown, error_budget.rotation_remark(optimum.rotation))):

@@ -110,16 +110,16 @@ def _sweep(
     drawing.check_installed()
     if picture:
         drawing.check(picture)
-    of_simulation = {
+    simulation_options = {
         "--vary": vary, "--settle": settle, "--periods": periods, "--jobs": jobs,
         "--cluster": cluster,
     }  # fmt: skip
-    fish.refuse_other(of_simulation, {"--for": seconds})
+    fish.refuse_other(simulation_options, {"--for": seconds})
     names = [info.name for info in infos]
-    takes = {info.name: [field.name for field in info.parameters] for info in infos}
+    accepted = {info.name: [field.name for field in info.parameters] for info in infos}
     units = {field.name: field.unit for info in infos for field in info.parameters}
     points = grid.make_points(
-        names, parameters, takes, dict(_parse_variation(text) for text in vary)
+        names, parameters, accepted, dict(_parse_variation(text) for text in vary)
     )
     task = _Sweep(points, units, place, fish, picture, as_json)
     if fish.on == "live":
@@ -231,9 +231,12 @@ class _Sweep:
         columns = dict.fromkeys(name for point in self.points for name in point.columns())
         folder = SweepFolder(experiment, list(columns))
         self.finished = sum(folder.key(point) in folder.results for point in self.points)
-        there = f", {self.finished} of them measured already" if self.finished else ""
+        already_measured = f", {self.finished} of them measured already" if self.finished else ""
         self.fish.announce(self.as_json)
-        echo(f"{folder.path}: {format_count(len(self.points), 'point')}{there}", err=self.as_json)
+        echo(
+            f"{folder.path}: {format_count(len(self.points), 'point')}{already_measured}",
+            err=self.as_json,
+        )
         return folder
 
     def _finish_point(self, folder: "SweepFolder", point: "Point", result: "PointResult") -> str:
@@ -259,8 +262,8 @@ class _Sweep:
                 unit = self.units.get(best.over, "")
                 echo(f"{curve.label}: {_format_best(best, unit, quantity.unit)}")
                 if best.whole_ticks:
-                    whole = _format_whole_ticks(best.whole_ticks, quantity.unit)
-                    echo(f"{curve.label}, of whole ticks: {whole}")
+                    description = _format_whole_ticks(best.whole_ticks, quantity.unit)
+                    echo(f"{curve.label}, of whole ticks: {description}")
             echo(f"table: {folder.path / 'rows.csv'}")
         if any(curve.peak for curve in all_curves):
             stem = folder.path / quantity.name

@@ -56,7 +56,7 @@ def swim_freely(
         point.controller, point.parameters, replace(config.limits, virtual=True)
     )
     track = Track()
-    begins: list[int] = []
+    beat_starts: list[int] = []
     with VirtualRun(config, publisher) as run:
         fish = run.swimmer
         assert fish
@@ -65,7 +65,7 @@ def swim_freely(
         run.loop.set_controller(point.controller, controller)
         reversals = Reversals()
         first: int | None = None
-        while first is None and not _is_long_enough(track, begins, lengths, config.tick):
+        while first is None and not _is_long_enough(track, beat_starts, lengths, config.tick):
             command = run.loop.applied
             run.tick()
             problem = fish.trouble or run.loop.supervisor.reason or run.loop.active.fallback
@@ -74,50 +74,50 @@ def swim_freely(
                 return SpeedResult(seconds=len(track) * config.tick, trouble=message)
             track.add(fish, command)
             if reversals.add(command) > 0 and len(track) * config.tick > lengths.settle:
-                begins.append(len(track) - 1)
-                first = _find_first_row(track, begins, lengths, config)
+                beat_starts.append(len(track) - 1)
+                first = _find_first_row(track, beat_starts, lengths, config)
             if len(track) % _STOP_CHECK_TICKS == 0 and stop():
                 return None
-    return _make_result(track, begins, first, lengths, config)
+    return _make_result(track, beat_starts, first, lengths, config)
 
 
-def _is_long_enough(track: Track, begins: list[int], lengths: Lengths, tick: float) -> bool:
+def _is_long_enough(track: Track, beat_starts: list[int], lengths: Lengths, tick: float) -> bool:
     """Return whether the swim ends; a slow wave gets time for its beats, a still fin does not."""
     time, longest = len(track) * tick, max(MAX_SWIM_S, 4.0 * lengths.settle)
-    waiting = 0 < len(begins) <= lengths.periods and time < 4.0 * longest
+    waiting = 0 < len(beat_starts) <= lengths.periods and time < 4.0 * longest
     return time >= longest and not waiting
 
 
 def _find_first_row(
-    track: Track, begins: list[int], lengths: Lengths, config: Config
+    track: Track, beat_starts: list[int], lengths: Lengths, config: Config
 ) -> int | None:
     """Return the row of the first measured beat; None while the speed changes."""
-    if len(begins) - 1 < lengths.periods:
+    if len(beat_starts) - 1 < lengths.periods:
         return None
-    time, x = _read_positions(track, begins)
+    time, x = _read_positions(track, beat_starts)
     beat = find_first_measured(time, x)
-    if len(begins) - 1 - beat < lengths.periods:
+    if len(beat_starts) - 1 - beat < lengths.periods:
         return None
     is_settled = is_steady(time[beat:], x[beat:], config.swimmer.body.length)
-    return begins[beat] if is_settled else None
+    return beat_starts[beat] if is_settled else None
 
 
-def _read_positions(track: Track, begins: list[int]) -> tuple[Array, Array]:
+def _read_positions(track: Track, beat_starts: list[int]) -> tuple[Array, Array]:
     """Return the times [s] and positions [m] at which beats begin: the ends of the ticks before."""
     columns = track.columns()
-    rows = np.array(begins) - 1
+    rows = np.array(beat_starts) - 1
     return columns["time"][rows], columns["x"][rows]
 
 
 def _make_result(
-    track: Track, begins: list[int], first: int | None, lengths: Lengths, config: Config
+    track: Track, beat_starts: list[int], first: int | None, lengths: Lengths, config: Config
 ) -> SpeedResult:
     columns = track.columns()
     row = first
     if row is None:
-        count = len(begins) - 1
+        count = len(beat_starts) - 1
         beat = max(0, min(count // 2, count - lengths.periods))
-        row = begins[beat] if begins else len(track) // 2
+        row = beat_starts[beat] if beat_starts else len(track) // 2
     measured = gait({name: values[row - 1 :] for name, values in columns.items()}, config.swimmer)
     return SpeedResult(
         speed=measured.speed,
@@ -134,31 +134,31 @@ def _make_result(
     )
 
 
-def find_first_measured(begins: Array, x: Array) -> int:
+def find_first_measured(beat_starts: Array, x: Array) -> int:
     """Return the index of the first measured beat.
 
-    begins: times at which beats begin, and the last one ends, shape (beats + 1,) [s]
+    beat_starts: times at which beats begin, and the last one ends, shape (beats + 1,) [s]
     x: positions of the fish at these times, shape (beats + 1,) [m]
 
     The number of dropped beats is the one that minimises the standard error of the mean of the
     others, but at most half of them (the rule MSER of White, "An effective truncation heuristic for
     bias reduction in simulation output", Simulation 69, 1997, doi:10.1177/003754979706900601).
     """
-    speeds = -np.diff(x) / np.diff(begins)
+    speeds = -np.diff(x) / np.diff(beat_starts)
     count = len(speeds)
     errors = [speeds[first:].std() / math.sqrt(count - first) for first in range(count // 2 + 1)]
     return int(np.argmin(errors)) if errors else 0
 
 
-def is_steady(begins: Array, x: Array, length: float) -> bool:
+def is_steady(beat_starts: Array, x: Array, length: float) -> bool:
     """Return whether the mean speeds over the two halves of these beats agree.
 
-    begins, x: as for `find_first_measured`; length: body length of the fish [m]
+    beat_starts, x: as for `find_first_measured`; length: body length of the fish [m]
     """
-    count = len(begins) - 1
-    if count < 2 or begins[-1] - begins[0] < MIN_MEASURED_S:
+    count = len(beat_starts) - 1
+    if count < 2 or beat_starts[-1] - beat_starts[0] < MIN_MEASURED_S:
         return False
-    speeds = -np.diff(x) / np.diff(begins)
+    speeds = -np.diff(x) / np.diff(beat_starts)
     halves = speeds[: count // 2], speeds[count - count // 2 :]
     difference = abs(float(halves[0].mean() - halves[1].mean()))
     scale = max(abs(float(speeds.mean())), 0.1 * length)

@@ -118,27 +118,27 @@ def _expand_range(piece: str) -> list[str]:
 def make_points(
     controllers: Sequence[str],
     parameters: Mapping[str, Sequence[Any]],
-    takes: Mapping[str, Sequence[str]],
+    accepted: Mapping[str, Sequence[str]],
     keys: Mapping[str, Sequence[Any]] | None = None,
 ) -> list[Point]:
     """Return every combination, in order; the last parameter changes fastest.
 
     parameters: values of each parameter
-    takes: names of the parameters of each controller; a controller ignores the others
+    accepted: names of the parameters of each controller; a controller ignores the others
     keys: values of each key of the configuration
 
     Raises `ParameterError` for a parameter that no controller has, and for too many points.
     """
     keys = keys or {}
     for name in parameters:
-        if not any(name in takes[name_of_controller] for name_of_controller in controllers):
+        if not any(name in accepted[candidate] for candidate in controllers):
             if len(controllers) == 1:
                 raise ParameterError(f"{controllers[0]} has no parameter '{name}'")
             raise ParameterError(f"none of {', '.join(controllers)} has a parameter '{name}'")
     grid = []
     for key_values in _combine(keys):
         for controller in dict.fromkeys(controllers):
-            values = {name: parameters[name] for name in parameters if name in takes[controller]}
+            values = {name: parameters[name] for name in parameters if name in accepted[controller]}
             grid += [Point(controller, given, key_values) for given in _combine(values)]
             if len(grid) > MAX_POINTS:
                 raise ParameterError(f"this grid has more than {MAX_POINTS} points")

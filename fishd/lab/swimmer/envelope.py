@@ -44,18 +44,20 @@ def compute_envelope(time: Array, midlines: Array, since: float = 0.0) -> Envelo
     """
     later = time >= since
     time, midlines = time[later], midlines[later]
-    begins = _find_beats(time, midlines)
-    if len(begins) < 2:
+    beat_starts = _find_beats(time, midlines)
+    if len(beat_starts) < 2:
         raise FishdError(
             f"the tail does not complete a beat after {since:g} s, where the midlines begin: "
             "choose a shorter --settle"
         )
     length = float(np.linalg.norm(np.diff(midlines[0], axis=0), axis=1).sum())
-    beats = [_to_body_frame(beat) / length for beat in _interpolate_beats(time, midlines, begins)]
+    beats = [
+        _to_body_frame(beat) / length for beat in _interpolate_beats(time, midlines, beat_starts)
+    ]
     swings = [0.5 * (beat[..., 1].max(axis=0) - beat[..., 1].min(axis=0)) for beat in beats]
     last = beats[-1] - np.array([beats[-1][:, 0, 0].mean(), 0.0])
     along = np.linspace(0.0, 1.0, midlines.shape[1])
-    return Envelope(along, last, np.array(swings), np.diff(begins))
+    return Envelope(along, last, np.array(swings), np.diff(beat_starts))
 
 
 def _find_beats(time: Array, midlines: Array) -> Array:
@@ -80,9 +82,9 @@ def _find_beats(time: Array, midlines: Array) -> Array:
     return np.array(times)
 
 
-def _interpolate_beats(time: Array, midlines: Array, begins: Array) -> Iterator[Array]:
+def _interpolate_beats(time: Array, midlines: Array, beat_starts: Array) -> Iterator[Array]:
     """Yield the midlines of a beat and the first of the next; (PHASE_COUNT + 1, slices, 2) [m]."""
-    for begin, end in pairwise(begins):
+    for begin, end in pairwise(beat_starts):
         wanted = np.linspace(begin, end, PHASE_COUNT + 1)
         after = np.clip(np.searchsorted(time, wanted), 1, len(time) - 1)
         share = (wanted - time[after - 1]) / (time[after] - time[after - 1])

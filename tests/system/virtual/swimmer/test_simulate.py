@@ -206,7 +206,7 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
     assert done.returncode == 1
     assert "the swimmer cannot go on at" in line
     found = checkpoint.load(kept)
-    assert line.endswith(f"its last checkpoint is of {found.time:.2f} s: --resume {kept}\n")
+    assert line.endswith(f"its last checkpoint is at {found.time:.2f} s: --resume {kept}\n")
 
 
 @pytest.mark.parametrize(
@@ -281,7 +281,7 @@ def test_ctrl_c_keeps_what_was_swum_and_the_bar_shows_the_speed(tmp_path: Path) 
     os.close(ours)
     assert swimming.wait(PATIENCE) == 130
     assert "mm/s" in seen.decode()
-    assert "interrupted; its last checkpoint is of" in seen.decode()
+    assert "interrupted; its last checkpoint is at" in seen.decode()
     rows = len(saved.read_text().splitlines()) - 1
     assert len(checkpoint.load(kept).track) == rows >= 10
 
