@@ -67,7 +67,7 @@ def adapt(
     its C, and a search finds the best square wave. A policy is trained on the cloud of models that
     agree with the fit. All three gaits are measured on the fish, and it swims the best one
     from then on. If the measurement does not decide, it swims the simplest of the gaits that may
-    be the best. plant and simulation of the configuration are not used.
+    be the best. The search does not use the sections plant and simulation of the configuration.
 
     Ctrl-C lets the fish rest; --resume continues without repeating measurements.
     """

@@ -99,8 +99,8 @@ def compare(
     with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. The default is the
     best square wave, swing, and the named policies that are made for this fish.
 
-    In simulation the thrust is the true thrust, and relative thrust is its ratio to the best square
-    wave. The thrust of a live fish is measured, with rests between swims; Ctrl-C lets the fish
+    In simulation the thrust is the true thrust, and relative thrust is its ratio to that of the
+    best square wave. The thrust of a live fish is measured, with rests between swims; Ctrl-C lets the fish
     rest, and shows the results until then. A policy that sees pictures gets those of a simulated
     camera, or of a running fishd-camera for a live fish. ± is the 95 % interval of the mean thrust
     of all runs. It includes the differences between runs and, live, the error of each measurement

@@ -92,8 +92,8 @@ def measure_trials(
 ) -> Iterator[Trial]:
     """Measure candidates on a rig for as long as the budget lasts.
 
-    The fish swims with a candidate, then rests. The thrust is the force while swimming minus a
-    drift that is interpolated between the rests before and after (`fishd.lab.measurement`).
+    The fish swims with a candidate, then rests. The thrust is the force while swimming minus the
+    drift, which the rests before and after determine (`fishd.lab.measurement`).
 
     fixed: parameters that are not searched
     budget: time in the tank [s]
