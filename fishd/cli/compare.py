@@ -100,11 +100,11 @@ def compare(
     best square wave, swing, and the named policies that are made for this fish.
 
     In simulation the thrust is the true thrust, and relative thrust is its ratio to that of the
-    best square wave. The thrust of a live fish is measured, with rests between swims; Ctrl-C lets the fish
-    rest, and shows the results until then. A policy that sees pictures gets those of a simulated
-    camera, or of a running fishd-camera for a live fish. ± is the 95 % interval of the mean thrust
-    of all runs. It includes the differences between runs and, live, the error of each measurement
-    and of the sensor's calibration, which is the same fraction of all thrusts.
+    best square wave. The thrust of a live fish is measured, with rests between swims; Ctrl-C lets
+    the fish rest, and shows the results until then. A policy that sees pictures gets those of a
+    simulated camera, or of a running fishd-camera for a live fish. ± is the 95 % interval of the
+    mean thrust of all runs. It includes the differences between runs and, live, the error of each
+    measurement and of the sensor's calibration, which is the same fraction of all thrusts.
     The verdict names the contestants that may be the best, by intervals that hold together in 95 %
     of cases, and chooses the simplest of them.
     |φ_c|/Φ is the mean magnitude of the command. square is that divided by the rms: square wave 1,
