@@ -16,7 +16,7 @@ DT = 0.05
 
 
 def correlation(rig: Rig, seconds: float) -> float:
-    """How well the estimated fin velocity follows the true one, whatever its scale."""
+    """Return the correlation of the estimated and the true fin velocity."""
     ticks = rig.run_for(seconds)
     estimated = [tick.fin_velocity for tick in ticks]
     true = [tick.alpha_rate for tick in ticks]
@@ -30,7 +30,7 @@ def test_the_fin_velocity_follows_the_true_one(frequency: float) -> None:
     assert correlation(rig, 20) > 0.97
 
 
-def test_an_offset_of_the_sensor_is_found_and_taken_off() -> None:
+def test_an_offset_of_the_sensor_is_estimated_and_subtracted() -> None:
     rig = Rig("simulation.offset_y=0.05", "simulation.drift=0.02").start("square", frequency=1.7)
     rig.run_for(10)
     ticks = rig.run_for(20)
@@ -48,7 +48,7 @@ def test_the_force_rate_is_the_change_over_the_time_between_ticks() -> None:
 
 @pytest.mark.parametrize("samples", [10, 0])
 def test_a_new_zero_of_the_sensor_is_no_motion_of_the_fin(samples: int) -> None:
-    """samples: of the first tick after it; a sensor that has none says the old force again."""
+    """samples: samples of the first tick after the tare; with 0 it repeats the old force."""
     estimator = LateralForceEstimator(EstimatorSettings())
     for _ in range(100):
         estimator.update(Measurement(0.0, 0.0, 1.0, 10), 0.0, 0.0, DT)
@@ -59,17 +59,17 @@ def test_a_new_zero_of_the_sensor_is_no_motion_of_the_fin(samples: int) -> None:
         assert (seen.fin_velocity, seen.fy_rate) == (0.0, 0.0)
 
 
-def test_it_remembers_the_angle_before_the_one_in_force() -> None:
+def test_the_observation_has_the_previous_angle() -> None:
     estimator = LateralForceEstimator(EstimatorSettings())
     seen = [
         estimator.update(Measurement(0.1 * tick, 0.0, 0.0, 10), angle, 0.1 * tick, DT)
         for tick, angle in enumerate((0.1, 0.2, -0.3))
     ]
-    angles = [(one.previous_angle, one.instruction_angle) for one in seen]
+    angles = [(observation.previous_angle, observation.instruction_angle) for observation in seen]
     assert angles == [(0.1, 0.1), (0.1, 0.2), (0.2, -0.3)]
 
 
-def test_it_tells_for_how_long_the_angle_has_been_on_its_side() -> None:
+def test_the_side_time_is_the_time_since_the_angle_came_to_its_side() -> None:
     estimator = LateralForceEstimator(EstimatorSettings())
     angles = (0.0, 0.3, 0.1, -0.2, -0.4, 0.0, -0.4)
     times = [
@@ -82,13 +82,13 @@ def test_it_tells_for_how_long_the_angle_has_been_on_its_side() -> None:
     assert time == -2.0
 
 
-def test_nothing_but_the_measurement_and_the_own_command_goes_in() -> None:
-    """A fish that tells no truth swims exactly as one that does."""
-    here, there = Rig(), Rig()
-    for rig in (here, there):
+def test_only_measurements_and_commands_are_used() -> None:
+    """A fish without a known truth swims exactly as one with it."""
+    known, unknown = Rig(), Rig()
+    for rig in (known, unknown):
         rig.start("swing")
-    there.loop.robot = type(there.loop.robot)("blind", there.fish, there.fish)
-    for a, b in zip(here.run(200), there.run(200), strict=True):
+    unknown.loop.robot = type(unknown.loop.robot)("blind", unknown.fish, unknown.fish)
+    for a, b in zip(known.run(200), unknown.run(200), strict=True):
         assert (a.phi_c, a.fin_velocity) == (b.phi_c, b.fin_velocity)
 
 
@@ -118,13 +118,13 @@ def test_before_the_first_whole_beat_there_is_no_frequency() -> None:
     assert beats([30, 5, 5, 1]).frequency == pytest.approx(2.0)
 
 
-def test_a_tail_that_stops_is_noticed_after_twice_its_longest_half_beat() -> None:
+def test_a_stopped_tail_is_detected_after_twice_its_longest_half_beat() -> None:
     assert beats([5] * 10 + [11]).frequency > 0.0
     assert beats([5] * 10 + [14]).frequency == 0.0
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4])
-def test_how_long_a_tail_stood_still_is_no_half_beat(angle: float) -> None:
+def test_the_time_that_a_tail_stood_still_is_not_a_half_beat(angle: float) -> None:
     beat = beats([5] * 10)
     for _ in range(1200):
         beat.update(angle, 0.02, DT)

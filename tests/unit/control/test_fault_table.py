@@ -1,4 +1,4 @@
-"""The fault table, row by row: what broke, what the servo got, and recovery."""
+"""The fault table, row by row: the failure, the pulses of the servo, and the recovery."""
 
 import math
 from collections.abc import Iterator
@@ -18,8 +18,8 @@ from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.lab.simulation import simulate
 from fishd.virtual.pi.faults import TRANSFER_ERRORS
 
-# Of the virtual Pi: the fault that each leads to, when at the earliest and at the latest [s].
-# An old sample: two periods until it is too old, three bad reads in a row.
+# By fault of the virtual Pi: code, and earliest and latest time of the latched fault [s].
+# A sample is too old after two periods, and three bad reads in a row are a fault.
 SENSOR_FAULTS = {
     **dict.fromkeys(TRANSFER_ERRORS, ("sensor-stale", 0.0, 0.30)),
     "unplugged": ("sensor-stale", 0.0, 0.30),
@@ -27,13 +27,13 @@ SENSOR_FAULTS = {
     "clipped": ("sensor-range", 0.15, 0.15),
     "frozen-code": ("sensor-range", 2.0, 2.25),
 }
-FADE = 0.57
-"""A fade from Φ to neutral, the time that the servo settles, and the last frame [s]."""
+FADE_S = 0.57
+"""Time of a fade from Φ to neutral, of the settling of the servo, and of the last frame [s]."""
 
 
 @pytest.fixture
 def data_rate() -> int:
-    """Conversions of the force sensor per second: few, where what breaks is not the sensor."""
+    """Conversions of the force sensor per second: few, where another part fails."""
     return 250
 
 
@@ -47,7 +47,7 @@ def rig(tmp_path: Path, data_rate: int) -> Iterator[LockstepRig]:
 
 
 def assert_neutral_then_off(rig: LockstepRig, since: float, limit: float) -> None:
-    """The pulses came to neutral and then ended, within `limit` [s] of `since`."""
+    """Assert that the pulses came to neutral and then ended, within `limit` [s] of `since`."""
     rig.run_for(since + limit - rig.now)
     changes = rig.pulses_since(since)
     *_, (_, last), (ended, off) = changes
@@ -55,7 +55,7 @@ def assert_neutral_then_off(rig: LockstepRig, since: float, limit: float) -> Non
     assert last == pytest.approx(NEUTRAL, abs=5)
     assert ended - since <= limit
     rig.run_for(1.0)
-    assert rig.pulses_since(ended)[1:] == []  # and never began again
+    assert rig.pulses_since(ended)[1:] == []  # and did not start again
     assert not rig.recorder.ticks[-1].servo_on
 
 
@@ -74,14 +74,14 @@ def assert_recovers_by_clear_fault_only(rig: LockstepRig) -> None:
     assert rig.mode == "idle", rig.loop.supervisor.reason
     assert rig.pulse == pytest.approx(NEUTRAL, abs=5)
     rig.start("swing")
-    begun = rig.now
+    start = rig.now
     while rig.run_for(0.5)[-1].thrust <= 0.015:
-        assert rig.now - begun < 5.0
+        assert rig.now - start < 5.0
     assert rig.mode == "running"
 
 
-@pytest.mark.parametrize("code", [*FAULTS, "a code of somebody else's"])
-def test_whoever_latches_a_fault_the_servo_gets_what_its_row_says(code: str) -> None:
+@pytest.mark.parametrize("code", [*FAULTS, "a code of another package"])
+def test_the_servo_gets_what_the_row_of_a_latched_fault_says(code: str) -> None:
     rig, robot = fragile_rig()
     rig.start("square")
     rig.run(2)
@@ -110,7 +110,7 @@ def test_a_bad_force_ends_in_neutral_and_recovers_after_a_clear(
     rig.pi.faults.inject(name)
     assert earliest - 1e-9 <= rig.run_until_fault(3.0) <= latest + 1e-9
     assert_one_fault(rig, code)
-    assert_neutral_then_off(rig, broke, limit=latest + FADE)
+    assert_neutral_then_off(rig, broke, limit=latest + FADE_S)
     rig.pi.faults.clear()
     assert_recovers_by_clear_fault_only(rig)
 
@@ -128,7 +128,7 @@ def test_a_force_beyond_its_limit_is_a_fault(tmp_path: Path) -> None:
         assert_one_fault(rig, "sensor-range")
         assert rig.loop.supervisor.reason is not None
         assert "force_sensor.force_limit" in rig.loop.supervisor.reason.message
-        assert_neutral_then_off(rig, rig.now, limit=FADE)
+        assert_neutral_then_off(rig, rig.now, limit=FADE_S)
 
 
 def test_after_a_pigpiod_that_was_gone_pulses_come_only_with_a_clear(rig: LockstepRig) -> None:
@@ -136,7 +136,7 @@ def test_after_a_pigpiod_that_was_gone_pulses_come_only_with_a_clear(rig: Lockst
     rig.pi.faults.inject("pigpiod-gone", 1.0)
     assert rig.run_until_fault(1.0) <= 0.10
     assert_one_fault(rig, "servo-link")
-    rig.run_for(3.0)  # it has been back for two seconds
+    rig.run_for(3.0)  # pigpiod has run again for two seconds
     assert [width for _, width in rig.pulses_since(broke + 0.1)] in ([], [0.0])
     assert_recovers_by_clear_fault_only(rig)
 
@@ -147,7 +147,7 @@ def test_a_pigpiod_that_restarts_is_a_fault_and_gets_its_script_again(rig: Locks
     assert_one_fault(rig, "servo-link")
     assert_recovers_by_clear_fault_only(rig)
     silent = rig.now
-    rig.robot.sensor.read(rig.now + 1.5)  # time goes on, and the loop hangs
+    rig.robot.sensor.read(rig.now + 1.5)  # time passes, and the loop hangs
     widths = [width for _, width in rig.pulses_since(silent)]
     assert widths[-2:] == [NEUTRAL, 0.0]
 
@@ -156,7 +156,7 @@ def test_a_pigpiod_that_hangs_is_a_fault_and_is_released_when_it_wakes(rig: Lock
     rig.pi.faults.inject("pigpiod-frozen", 1.0)
     assert 0.10 < rig.run_until_fault(1.0) <= 0.16  # in the third tick
     assert_one_fault(rig, "servo-link")
-    assert rig.pulse != 0.0  # a daemon that hangs cannot be told to stop
+    assert rig.pulse != 0.0  # a daemon that hangs cannot stop the pulses
     rig.run_for(2.5)
     assert rig.pulse == 0.0
     assert "servo" in rig.recorder.kinds()
@@ -180,7 +180,7 @@ def test_an_exception_in_any_phase_ends_in_neutral_and_the_loop_goes_on(
     with monkeypatch.context() as broken:
         broken.setattr(part, method, lambda *_: 1 / 0)
         rig.run_until_fault(1.0)
-        if part is SampledSensor:  # which is what moves time on
+        if part is SampledSensor:  # its read advances the time
             monkeypatch.undo()
     assert_one_fault(rig, reason)
     rig.run_for(1.0)
@@ -189,11 +189,11 @@ def test_an_exception_in_any_phase_ends_in_neutral_and_the_loop_goes_on(
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_an_estimate_that_is_no_number_is_a_fault_and_nothing_keeps_it(
+def test_an_estimate_that_is_not_finite_is_a_fault_and_is_not_kept(
     rig: LockstepRig, monkeypatch: pytest.MonkeyPatch, value: float
 ) -> None:
     rig.loop.stop()
-    rig.run_for(3.0)  # the zero of the force is found
+    rig.run_for(3.0)  # so that the zero of the force is known
     rig.start("swing")
     rig.run_for(2.5)
     broke = rig.now
@@ -202,7 +202,7 @@ def test_an_estimate_that_is_no_number_is_a_fault_and_nothing_keeps_it(
         rig.run(1)
     assert_one_fault(rig, "estimate-error")
     assert math.isfinite(rig.recorder.ticks[-1].fin_velocity)
-    assert_neutral_then_off(rig, broke, limit=0.05 + FADE)
+    assert_neutral_then_off(rig, broke, limit=0.05 + FADE_S)
     assert_recovers_by_clear_fault_only(rig)
     thrust, error = rig.loop.known_thrust
     assert error is not None
@@ -218,23 +218,23 @@ def test_a_controller_that_takes_half_the_period_ends_in_neutral(rig: LockstepRi
     rig.start(Scripted(dawdle))
     assert rig.run_until_fault(1.0) == pytest.approx(0.15)
     assert_one_fault(rig, "controller-slow")
-    assert_neutral_then_off(rig, broke, limit=0.15 + FADE)
+    assert_neutral_then_off(rig, broke, limit=0.15 + FADE_S)
     assert_recovers_by_clear_fault_only(rig)
 
 
 def test_many_overruns_end_in_neutral(rig: LockstepRig, monkeypatch: pytest.MonkeyPatch) -> None:
-    keep = Recorder.tick
+    record = Recorder.tick
 
     def dawdle(recorder: Recorder, tick: Tick) -> None:
         rig.clock.now += 0.051
-        keep(recorder, tick)
+        record(recorder, tick)
 
     broke = rig.now
     with monkeypatch.context() as slow:
         slow.setattr(Recorder, "tick", dawdle)
         assert rig.run_until_fault(3.0) == pytest.approx(21 * 0.05)
     assert_one_fault(rig, "overrun")
-    assert_neutral_then_off(rig, broke, limit=21 * 0.05 + FADE)
+    assert_neutral_then_off(rig, broke, limit=21 * 0.05 + FADE_S)
     assert_recovers_by_clear_fault_only(rig)
 
 

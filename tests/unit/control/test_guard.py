@@ -1,4 +1,4 @@
-"""The guard: nothing that is not finite, within ±Φ and slow enough reaches the servo."""
+"""The guard: only finite angles within ±Φ and the slew limit reach the servo."""
 
 import math
 import random
@@ -59,9 +59,9 @@ def test_a_fade_takes_the_fade_time_from_the_limit_to_neutral() -> None:
 
 @given(angles, angles, st.lists(st.floats(allow_nan=False, allow_infinity=False)))
 def test_a_restricted_guard_permits_neither_more_than_the_servo_reaches_nor_more_than_phi(
-    one: float, other: float, commands: list[float]
+    left: float, right: float, commands: list[float]
 ) -> None:
-    lowest, highest = -abs(one), abs(other)
+    lowest, highest = -abs(left), abs(right)
     guard = Guard(0.42, 0.05, None, fade_time=0.4)
     guard.restrict(lowest, highest)
     angle = 0.0
@@ -80,7 +80,7 @@ def test_any_finite_real_number_is_an_angle(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_what_is_no_finite_real_number_is_refused_with_its_type(name: str) -> None:
+def test_a_command_that_is_not_a_finite_real_number_is_refused_with_its_type(name: str) -> None:
     with pytest.raises(ValueError, match=r"the command is (of type \w+, not one real|nan|inf)"):
         Guard(0.42, 0.05, None, 0.4).apply(BAD[name], 0.0)
 
@@ -106,7 +106,9 @@ def test_hundreds_of_switches_stay_within_amplitude_and_slew(slew_limit: float |
         if generator.random() < 0.1:
             rig.loop.stop()
         else:
-            rig.start(name, **{k: generator.uniform(*v) for k, v in CHOICES[name].items()})
+            rig.start(
+                name, **{key: generator.uniform(*bounds) for key, bounds in CHOICES[name].items()}
+            )
         for tick in rig.run(generator.choice((1, 1, 2, 3, 7))):
             assert abs(tick.phi_c) <= 0.42
             assert abs(tick.phi_c - angle) <= step * (1 + 1e-8)

@@ -1,6 +1,6 @@
-"""A reversed F_y is noticed when the tail sets off, on any fish, and a right one never doubted.
+"""A reversed F_y is detected when the tail starts to move, on any fish, and a right one is not.
 
-Then controllers swim as if it were right, or are refused, as configured.
+Then its sign is corrected for controllers, or they are refused, as configured.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from fishd.core.signals import Measurement, Observation, Tick
 from fishd.hardware.base import Robot
 from fishd.lab.other_fish import FIRST_SEED, HARSH_FISH_COUNT, harsh
 
-REST = 3.0
+REST_S = 3.0
 Wrap = Callable[[Robot], Robot]
 
 
@@ -29,44 +29,46 @@ def thrust(ticks: list[Tick], rig: Rig) -> float:
     return rig.config.plant.thrust_coefficient * statistics.mean(squares)
 
 
-def swum(controller: str, parameters: dict[str, object], *overrides: str, wrap: Wrap) -> float:
+def mean_thrust(
+    controller: str, parameters: dict[str, object], *overrides: str, wrap: Wrap
+) -> float:
     """Return the mean thrust from 5 to 20 s after a start from rest [N]."""
     rig = Rig(*overrides, wrap=wrap)
-    rig.run_for(REST)
+    rig.run_for(REST_S)
     rig.start(controller, **parameters)
     rig.run_for(5.0)
     return thrust(rig.run_for(15.0), rig)
 
 
-def started(rig: Rig, controller: str = "swing", **parameters: object) -> bool | None:
-    """What is known of the sign once a controller has swum for a second, after a rest."""
+def detect_reversal(rig: Rig, controller: str = "swing", **parameters: object) -> bool | None:
+    """Return whether F_y is reversed, as detected in a second of swimming after a rest."""
     rig.loop.stop()
-    rig.run_for(REST)
+    rig.run_for(REST_S)
     rig.start(controller, **parameters)
     rig.run_for(1.0)
     return rig.loop.lateral_sign.reversed
 
 
 @pytest.mark.parametrize("seed", range(FIRST_SEED, FIRST_SEED + HARSH_FISH_COUNT))
-def test_any_fish_shows_it_when_it_sets_off(seed: int) -> None:
+def test_a_reversed_force_is_detected_on_any_fish_when_it_sets_off(seed: int) -> None:
     fish = harsh(seed).overrides
     for controller, parameters in (("swing", {}), ("square", {"frequency": 1.5}), ("sine", {})):
-        assert started(Rig(*fish), controller, **parameters) is not True
-        assert started(Rig(*fish, wrap=reversed_robot), controller, **parameters) is True
+        assert detect_reversal(Rig(*fish), controller, **parameters) is not True
+        assert detect_reversal(Rig(*fish, wrap=reversed_robot), controller, **parameters) is True
 
 
 @pytest.mark.parametrize("tick", [0.005, 0.02, 0.1])
-def test_at_other_ticks_too(tick: float) -> None:
+def test_a_reversed_force_is_detected_at_other_ticks_too(tick: float) -> None:
     right = Rig(f"tick={tick}")
-    assert started(right) is False
+    assert detect_reversal(right) is False
     assert right.loop.lateral_sign.complaint == ""
     assert "calibration" not in right.recorder.kinds()
-    assert started(Rig(f"tick={tick}", wrap=reversed_robot)) is True
+    assert detect_reversal(Rig(f"tick={tick}", wrap=reversed_robot)) is True
 
 
-def test_it_is_told_once_in_one_line_that_says_what_to_do() -> None:
+def test_a_reversed_force_is_reported_once_in_one_line_with_its_remedy() -> None:
     rig = Rig(wrap=reversed_robot)
-    assert [started(rig) for _ in range(2)] == [True, True]
+    assert [detect_reversal(rig) for _ in range(2)] == [True, True]
     (event,) = (event for event in rig.recorder.events if event.kind == "calibration")
     assert (event.level, event.message) == ("warning", rig.loop.lateral_sign.complaint)
     assert event.message.startswith("F_y is reversed: ")
@@ -74,7 +76,7 @@ def test_it_is_told_once_in_one_line_that_says_what_to_do() -> None:
     assert "fishctl calibrate servo" in event.message
 
 
-def test_a_hang_as_the_tail_sets_off_shows_nothing() -> None:
+def test_a_hang_as_the_tail_sets_off_decides_nothing() -> None:
     sign = LateralSign()
     for _ in range(100):
         sign.update(replace(observe(), dt=0.05, instruction_angle=0.0), 0.0)
@@ -83,9 +85,9 @@ def test_a_hang_as_the_tail_sets_off_shows_nothing() -> None:
 
 
 @pytest.mark.parametrize("tick", [-10, 0, 1, 4])
-def test_a_push_with_a_force_that_is_not_to_be_believed_shows_nothing(tick: int) -> None:
+def test_a_push_with_a_suspect_force_decides_nothing(tick: int) -> None:
     rig, robot = fragile_rig()
-    rig.run_for(REST)
+    rig.run_for(REST_S)
     rig.run(10 + min(tick, 0))
     if tick >= 0:
         rig.start("swing")
@@ -98,7 +100,7 @@ def test_a_push_with_a_force_that_is_not_to_be_believed_shows_nothing(tick: int)
     assert rig.loop.lateral_sign.reversed is None
 
 
-def test_a_push_without_a_rest_or_small_or_short_or_drowned_in_noise_shows_nothing() -> None:
+def test_a_push_without_a_rest_or_small_or_short_or_hidden_by_noise_decides_nothing() -> None:
     restless = Rig().start("swing")
     restless.run_for(5.0)
     assert restless.loop.lateral_sign.reversed is None
@@ -107,32 +109,32 @@ def test_a_push_without_a_rest_or_small_or_short_or_drowned_in_noise_shows_nothi
         ((), {"frequency": 10.0}),
         (("simulation.noise=0.5",), {"frequency": 1.0}),
     ):
-        assert started(Rig(*overrides), "square", **parameters) is None
+        assert detect_reversal(Rig(*overrides), "square", **parameters) is None
 
 
-def test_a_policy_that_trembles_before_it_swims_shows_it_by_its_first_true_push() -> None:
+def test_a_policy_with_small_movements_at_first_is_judged_by_its_first_large_push() -> None:
     rig = Rig(wrap=reversed_robot)
-    rig.run_for(REST)
+    rig.run_for(REST_S)
     for angle, ticks in ((-0.03, 4), (0.42, 10)):
         rig.start("hold", angle=angle)
         rig.run(ticks)
     assert rig.loop.lateral_sign.reversed is True
 
 
-def test_a_new_calibration_is_seen_anew_and_a_tare_asks_for_a_rest() -> None:
+def test_a_new_calibration_resets_the_sign_and_a_tare_requires_a_rest() -> None:
     rig = Rig(wrap=reversed_robot)
-    assert started(rig) is True
+    assert detect_reversal(rig) is True
     assert rig.loop.fy_corrected
     rig.loop.forget_force(scale=True)
     assert rig.run()[0].fy_corrected is UNSET
     assert rig.loop.lateral_sign.complaint == ""
     rig.loop.stop()
-    rig.run_for(REST)
+    rig.run_for(REST_S)
     rig.loop.lateral_sign.rest()
     rig.start("swing")
     rig.run_for(1.0)
     assert rig.loop.lateral_sign.reversed is None
-    assert started(rig) is True
+    assert detect_reversal(rig) is True
 
 
 @pytest.mark.parametrize(
@@ -150,8 +152,8 @@ def test_a_new_calibration_is_seen_anew_and_a_tare_asks_for_a_rest() -> None:
 def test_after_the_first_push_a_fish_with_a_reversed_force_swims_as_well_as_with_a_right_one(
     controller: str, parameters: dict[str, object], overrides: tuple[str, ...]
 ) -> None:
-    right = swum(controller, parameters, *overrides, wrap=lambda robot: robot)
-    corrected = swum(controller, parameters, *overrides, wrap=reversed_robot)
+    right = mean_thrust(controller, parameters, *overrides, wrap=lambda robot: robot)
+    corrected = mean_thrust(controller, parameters, *overrides, wrap=reversed_robot)
     assert corrected == pytest.approx(right, rel=0.02)
 
 
@@ -164,7 +166,7 @@ def test_controllers_see_the_other_sign_and_telemetry_the_force_as_measured() ->
         seen.append(observation)
         return square[len(seen) % 12]
 
-    rig.run_for(REST)
+    rig.run_for(REST_S)
     rig.start(Scripted(act))
     before, *ticks = rig.run_for(2.0)[-25:]
     for last, tick, observation in zip([before, *ticks], ticks, seen[-24:], strict=False):
@@ -180,44 +182,46 @@ def test_controllers_see_the_other_sign_and_telemetry_the_force_as_measured() ->
     )
 
 
-def test_where_it_is_to_be_refused_the_first_push_is_a_fault_and_the_next_start_refused() -> None:
+def test_with_refuse_the_first_push_is_a_fault_and_the_next_start_is_refused() -> None:
     rig = Rig("estimator.reversed_fy=refuse", wrap=reversed_robot)
-    started(rig)
+    detect_reversal(rig)
     assert (rig.mode, rig.reason) == ("fault", "fy-reversed")
-    rig.run_for(REST)
+    rig.run_for(REST_S)
     rig.loop.clear_fault()
     for controller, parameters in (("swing", {}), ("ppo", {"policy": "default-fish"})):
         with pytest.raises(Refused, match="F_y is reversed") as refused:
             rig.start(controller, **parameters)
         assert refused.value.code == "fy-reversed"
-    assert started(rig, "square", frequency=1.5) is True  # which ignores the force
+    assert (
+        detect_reversal(rig, "square", frequency=1.5) is True
+    )  # this controller ignores the force
     assert rig.mode == "running"
     rig.loop.forget_force(scale=True)
     rig.start("swing")
 
 
-def test_where_it_is_only_to_be_warned_of_nothing_is_corrected() -> None:
+def test_with_warn_nothing_is_corrected() -> None:
     rig = Rig("estimator.reversed_fy=warn", wrap=reversed_robot)
-    assert started(rig) is True
+    assert detect_reversal(rig) is True
     assert not rig.loop.fy_corrected
     assert "so swing and policies fail" in rig.loop.lateral_sign.complaint
 
 
 class Touched(ReversedSensor):
-    """A force sensor that somebody touches now and then, so that F_y seems to be reversed."""
+    """A force sensor that is touched at times, so that F_y seems to be reversed."""
 
     touched = False
 
     def read(self, now: float) -> Measurement:
-        measured = self._sensor.read(now)
-        return replace(measured, fy=-measured.fy) if self.touched else measured
+        measurement = self._sensor.read(now)
+        return replace(measurement, fy=-measurement.fy) if self.touched else measurement
 
 
 @pytest.mark.parametrize(
     ("touches", "corrected"),
     [((1, 0), (True, False)), ((0, 1, 0), (False,) * 3), ((0, 0, 1, 1, 0), (False,) * 5)],
 )
-def test_a_force_from_elsewhere_turns_no_sign_that_was_known_and_one_at_first_not_for_long(
+def test_a_disturbance_changes_no_known_sign_and_its_wrong_first_sign_does_not_last(
     touches: tuple[int, ...], corrected: tuple[bool, ...]
 ) -> None:
     sensors: list[Touched] = []
@@ -227,14 +231,14 @@ def test_a_force_from_elsewhere_turns_no_sign_that_was_known_and_one_at_first_no
         return dataclasses.replace(robot, sensor=sensors[0])
 
     rig = Rig(wrap=touchable)
-    found = []
+    corrections = []
     for touch in touches:
         rig.loop.stop()
-        rig.run_for(REST)
+        rig.run_for(REST_S)
         sensors[0].touched = bool(touch)
         rig.start("square", frequency=1.0)
         rig.run_for(0.5)
         sensors[0].touched = False
         rig.run_for(0.5)
-        found.append(rig.loop.fy_corrected)
-    assert tuple(found) == corrected
+        corrections.append(rig.loop.fy_corrected)
+    assert tuple(corrections) == corrected

@@ -1,4 +1,4 @@
-"""The lease of an experiment on the virtual clock: how it ends, and what swims then."""
+"""The lease of an experiment on the virtual clock: how it ends, and the fish after it."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ SECONDS = 2.0
 
 
 def experiment(rig: Rig, name: str = "measure", seconds: float = SECONDS) -> str:
-    """Take the fish and let it swim, as a client would; the lease."""
+    """Take the fish and let it swim, as a client does; return the token of the lease."""
     lease = rig.loop.lease.take(name, "lab", 42, seconds)
     rig.start("swing")
     rig.loop.lease.drives = True
@@ -31,10 +31,10 @@ def test_a_fish_whose_lease_is_not_renewed_fades_to_neutral_in_time() -> None:
     ticks = rig.run_for(0.5)
     assert ticks[0].mode == "idle"
     assert ticks[-1].phi_c == 0.0
-    said = "measure (pid 42 on lab) has not renewed its lease of the fish for 2 s"
-    assert expirations(rig) == [f"{said}: the fish fades to neutral"]
+    message = "measure (pid 42 on lab) has not renewed its lease of the fish for 2 s"
+    assert expirations(rig) == [f"{message}: the fish fades to neutral"]
     assert rig.loop.lease.expired
-    assert (rig.loop.lease.expired.message, rig.reason) == (said, None)
+    assert (rig.loop.lease.expired.message, rig.reason) == (message, None)
     assert rig.recorder.kinds()[-2:] == ["lease-expired", "mode"]
     rig.start("swing")  # nothing is latched
     assert rig.run_for(3.0)[-1].mode == "running"
@@ -44,7 +44,7 @@ def test_a_fishd_that_stood_still_gives_its_experiment_time_to_renew() -> None:
     rig = Rig()
     lease = experiment(rig)
     rig.run_for(SECONDS - 2.0 * MAX_STEP_S)
-    rig.run(missed=200)  # 10 s, in which it could hear nothing
+    rig.run(missed=200)  # 10 s without a chance to receive a renewal
     assert rig.mode == "running"
     for _ in range(5):
         rig.loop.lease.renew(lease)
@@ -68,7 +68,7 @@ def test_an_experiment_that_computed_beside_a_resting_fish_goes_on_with_its_leas
     rig.run_for(2.0 * SECONDS)
     assert rig.mode == "idle"
     with pytest.raises(Refused, match=r"no longer holds the fish: it was not renewed for 2 s"):
-        rig.loop.lease.renew(lease)  # it swam
+        rig.loop.lease.renew(lease)  # the fish swam, so the lease is over
 
 
 @pytest.mark.parametrize("ran_out", [False, True])
@@ -95,7 +95,7 @@ def test_a_lease_is_over_once_another_client_has_the_fish_or_a_fault_has_come(
     assert refusal.value.code == "no-lease"
 
 
-def test_a_second_experiment_is_told_who_has_the_fish_and_since_when() -> None:
+def test_a_second_experiment_is_refused_with_the_holder_and_its_time() -> None:
     rig = Rig()
     lease = experiment(rig, seconds=60.0)
     rig.run_for(12.0)

@@ -1,4 +1,4 @@
-"""The thrust that is shown says how well it is known."""
+"""The live thrust and its confidence interval."""
 
 from collections.abc import Sequence
 
@@ -19,8 +19,8 @@ def rig(seed: int = 0) -> VirtualSession:
     return VirtualSession(replace(CONFIG, simulation=replace(CONFIG.simulation, seed=seed)))
 
 
-def known(ticks: Sequence[Tick]) -> tuple[float, float]:
-    """Thrust and error of the last of them."""
+def thrust_and_ci95(ticks: Sequence[Tick]) -> tuple[float, float]:
+    """Return the thrust of the last tick, and the half-width of its interval [N]."""
     error = ticks[-1].thrust_error
     assert error is not UNSET
     return ticks[-1].thrust, error
@@ -34,25 +34,25 @@ def test_nothing_is_known_of_a_fish_that_never_rested() -> None:
 
 
 @pytest.mark.slow
-def test_after_a_rest_of_three_seconds_it_holds_the_truth() -> None:
+def test_after_a_rest_of_three_seconds_the_interval_contains_the_truth() -> None:
     for seed in range(5):
         with rig(seed) as fish:
             fish.rest(3.0)
-            thrust, error = known(fish.swim("swing", {}, 1.5))  # the first whole beats
+            thrust, error = thrust_and_ci95(fish.swim("swing", {}, 1.5))  # the first whole beats
             assert abs(thrust - TRUTH) < error < 8e-3
             for _ in range(3):
-                thrust, error = known(fish.swim("swing", {}, 20.0))
+                thrust, error = thrust_and_ci95(fish.swim("swing", {}, 20.0))
                 assert abs(thrust - TRUTH) < error < 5e-3
 
 
 @pytest.mark.slow
-def test_it_is_known_better_after_each_change_and_worse_with_time() -> None:
+def test_the_interval_shrinks_with_each_change_and_grows_with_time() -> None:
     with rig() as fish:
         fish.rest(3.0)
-        _, first = known(fish.swim("swing", {}, 8.0))
+        _, first = thrust_and_ci95(fish.swim("swing", {}, 8.0))
         fish.rest(3.0)
-        _, second = known(fish.swim("swing", {}, 8.0))
-        _, later = known(fish.swim("swing", {}, 600.0))
+        _, second = thrust_and_ci95(fish.swim("swing", {}, 8.0))
+        _, later = thrust_and_ci95(fish.swim("swing", {}, 600.0))
         assert second < 0.8 * first
         assert later > 1.3 * second
 
@@ -63,15 +63,15 @@ def test_another_wave_is_known_at_once() -> None:
         fish.swim("swing", {}, 8.0)
         fish.rest(3.0)
         fish.swim("swing", {}, 8.0)
-        thrust, error = known(fish.swim("sine", {"frequency": 5.0 / 3.0}, 8.0))
+        thrust, error = thrust_and_ci95(fish.swim("sine", {"frequency": 5.0 / 3.0}, 8.0))
         assert abs(thrust - 17.6e-3) < error
-        thrust, error = known(fish.rest(3.0))
+        thrust, error = thrust_and_ci95(fish.rest(3.0))
         assert abs(thrust) < error < 2e-3
 
 
-def test_who_holds_still_rests_whoever_has_command() -> None:
+def test_a_tail_that_does_not_move_rests_whichever_controller_is_active() -> None:
     with rig() as fish:
-        _, error = known(fish.swim("hold", {}, 6.0))
+        _, error = thrust_and_ci95(fish.swim("hold", {}, 6.0))
         assert error < 3e-3
 
 
@@ -80,7 +80,7 @@ def test_a_measured_factor_is_used_at_once_and_without_a_zero() -> None:
         ticks = fish.swim("swing", {}, 20.0)
         power = sum(tick.fin_velocity**2 for tick in ticks[-240:]) / 240
         fish._run.loop.thrust.calibrate(TRUTH / power, 0.2e-3 / power)
-        thrust, error = known(fish.swim("swing", {}, 8.0))
+        thrust, error = thrust_and_ci95(fish.swim("swing", {}, 8.0))
         assert thrust == pytest.approx(TRUTH, abs=0.3e-3)
         assert 0.01 * TRUTH < error < 0.6e-3  # no wave is known better
 
@@ -90,7 +90,7 @@ def test_a_new_zero_of_the_sensor_is_found_again_and_the_factor_stays() -> None:
         fish.rest(3.0)
         fish.swim("swing", {}, 8.0)
         fish._run.loop.thrust.forget_zero()
-        assert abs(known(fish.swim("swing", {}, 8.0))[0] - TRUTH) < 3e-3
+        assert abs(thrust_and_ci95(fish.swim("swing", {}, 8.0))[0] - TRUTH) < 3e-3
         fish._run.loop.thrust.forget()
         assert fish.swim("swing", {}, 8.0)[-1].thrust_error is UNSET
 
@@ -104,15 +104,17 @@ def test_a_wave_for_which_the_factor_is_another_is_known_soon(leak: float) -> No
         for frequency, truth in ((1.0, 15.23e-3), (2.0, 23.83e-3), (0.5, 7.26e-3)):
             fish.rest(3.0)
             for seconds in (5.0, 15.0):
-                thrust, error = known(fish.swim("square", {"frequency": frequency}, seconds))
+                thrust, error = thrust_and_ci95(
+                    fish.swim("square", {"frequency": frequency}, seconds)
+                )
                 assert abs(thrust - truth) < error < 4e-3
         for frequency, truth in ((1.0, 15.23e-3), (2.0, 23.83e-3)):  # without a rest between
-            thrust, error = known(fish.swim("square", {"frequency": frequency}, 8.0))
+            thrust, error = thrust_and_ci95(fish.swim("square", {"frequency": frequency}, 8.0))
             assert abs(thrust - truth) < error < 6e-3
 
 
 @pytest.mark.parametrize("noise", [1e-3, 1e-2])
-def test_at_rest_the_interval_knows_of_the_noise(noise: float) -> None:
+def test_at_rest_the_interval_includes_the_noise(noise: float) -> None:
     outside = 0
     for seed in range(8):
         config = replace(CONFIG, simulation=replace(CONFIG.simulation, seed=seed, noise=noise))
@@ -122,7 +124,7 @@ def test_at_rest_the_interval_knows_of_the_noise(noise: float) -> None:
     assert outside < 0.1 * 8 * len(ticks)
 
 
-def test_a_rest_that_shows_a_larger_drift_widens_what_comes_after() -> None:
+def test_a_rest_with_a_larger_drift_widens_later_intervals() -> None:
     errors = []
     for drift in (0.0, 2e-3):
         config = replace(CONFIG, simulation=replace(CONFIG.simulation, drift_walk=drift))
@@ -130,11 +132,11 @@ def test_a_rest_that_shows_a_larger_drift_widens_what_comes_after() -> None:
             for _ in range(4):
                 fish.rest(3.0)
                 ticks = fish.swim("swing", {}, 12.0)
-        errors.append(known(ticks)[1])
+        errors.append(thrust_and_ci95(ticks)[1])
     assert errors[1] > 1.5 * errors[0]
 
 
-def test_a_factor_that_overflows_stops_no_fish() -> None:
+def test_a_factor_that_overflows_does_not_stop_the_fish() -> None:
     with rig() as fish:
         fish.rest(3.0)
         fish.swim("swing", {}, 6.0)
@@ -144,50 +146,52 @@ def test_a_factor_that_overflows_stops_no_fish() -> None:
 
 
 def clip(rig: Rig, robot: Wrapped, fx: float) -> None:
-    """One tick whose force is not to be believed."""
+    """Run one tick with a suspect force."""
     robot.fx, robot.suspect = fx, "F_x is clipped"
     rig.run(1)
     robot.fx, robot.suspect = None, ""
 
 
-def test_beats_that_suspect_forces_have_made_old_are_not_shown() -> None:
+def test_beats_that_are_old_because_of_suspect_forces_are_not_shown() -> None:
     rig, robot = fragile_rig()
     rig.run_for(3.0)
     rig.start("square", frequency=5.0 / 3.0)
     thrust = rig.run_for(5.0)[-1].thrust
-    for _ in range(15):  # no whole beat is left between them
+    for _ in range(15):  # there is no whole beat between the suspect ticks
         clip(rig, robot, 0.1)
         ticks = rig.run_for(0.8)
     assert ticks[-1].thrust != thrust
-    assert known(ticks)[1] > 3e-3
+    assert thrust_and_ci95(ticks)[1] > 3e-3
 
 
 @pytest.mark.parametrize("fx", [0.1, -5.0])
-def test_a_force_at_rest_that_is_not_to_be_believed_moves_no_zero(fx: float) -> None:
+def test_a_suspect_force_at_rest_does_not_change_the_zero(fx: float) -> None:
     rig, robot = fragile_rig()
     rig.run_for(2.75)
     clip(rig, robot, fx)
     rig.run_for(0.2)
     rig.start("square", frequency=5.0 / 3.0)
-    thrust, error = known(rig.run_for(30))
+    thrust, error = thrust_and_ci95(rig.run_for(30))
     assert abs(thrust - TRUTH) < error < 3e-3
 
 
 @pytest.mark.parametrize("fx", [1.0, -5.0])
-def test_one_in_a_beat_spoils_no_thrust(fx: float) -> None:
+def test_one_suspect_force_in_a_beat_does_not_change_the_thrust(fx: float) -> None:
     rig, robot = fragile_rig()
     rig.run_for(3.0)
     rig.start("square", frequency=5.0 / 3.0)
     rig.run_for(10.0)
     for ticks in range(40, 52):  # each tick of a beat once, the reversals among them
         clip(rig, robot, fx)
-        thrust, error = known(rig.run(ticks))
+        thrust, error = thrust_and_ci95(rig.run(ticks))
         assert abs(thrust - TRUTH) < error < 3e-3
 
 
 @pytest.mark.parametrize("tick", [43, 57, 59])
 @pytest.mark.parametrize("fx", [0.2, -5.0])
-def test_a_spike_without_doubt_makes_the_zero_uncertain_not_wrong(fx: float, tick: int) -> None:
+def test_a_spike_that_is_not_suspect_makes_the_zero_uncertain_not_wrong(
+    fx: float, tick: int
+) -> None:
     rig, robot = fragile_rig()
     rig.run(tick)
     robot.fx = fx
@@ -197,12 +201,12 @@ def test_a_spike_without_doubt_makes_the_zero_uncertain_not_wrong(fx: float, tic
     rig.start("square", frequency=5.0 / 3.0)
     ticks = rig.run_for(30)
     if ticks[-1].thrust_error is not UNSET:
-        thrust, error = known(ticks)
+        thrust, error = thrust_and_ci95(ticks)
         assert abs(thrust - TRUTH) < error
     rig.loop.stop()
     rig.run_for(3.0)
     rig.start("square", frequency=5.0 / 3.0)
-    thrust, error = known(rig.run_for(30))
+    thrust, error = thrust_and_ci95(rig.run_for(30))
     assert abs(thrust - TRUTH) < error < 3e-3
 
 
@@ -211,5 +215,5 @@ def test_a_load_that_stays_is_the_zero_after_two_pieces_of_a_rest(load: float) -
     rig, robot = fragile_rig()
     rig.run_for(3.0)
     robot.fx = load
-    thrust, error = known(rig.run_for(1.7))
+    thrust, error = thrust_and_ci95(rig.run_for(1.7))
     assert abs(thrust) < error < 4e-3

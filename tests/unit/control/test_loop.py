@@ -1,4 +1,4 @@
-"""One tick: what goes in, what comes out, and what happens when a part of it fails."""
+"""One tick: its inputs, its outputs, and failures of its parts."""
 
 import math
 from dataclasses import replace
@@ -62,7 +62,7 @@ def test_in_fault_the_servo_gets_neutral_for_a_tenth_of_a_second_before_it_is_re
     rig.run(3)
     rig.loop.supervisor.fail("controller-error", "a test")
     while robot.log[-1]:
-        rig.run(1, missed=missed)  # as on a machine that is overloaded
+        rig.run(1, missed=missed)  # as on an overloaded machine
     since = rig.now
     while robot.log[-1] is not None:
         rig.run(1)
@@ -86,11 +86,11 @@ def test_an_emergency_stop_ends_the_pulses_before_the_next_tick() -> None:
     assert rig.mode == "estop"
     sent = len(robot.log)
     assert not rig.run(5)[-1].servo_on
-    assert set(robot.log[sent:]) == {None}  # and each tick makes sure of it
+    assert set(robot.log[sent:]) == {None}  # each tick releases it again
     assert rig.recorder.events[-1].message == "running → estop: the tank leaks"
 
 
-def test_after_an_emergency_stop_the_way_back_is_clear_and_gentle() -> None:
+def test_an_emergency_stop_must_be_cleared_and_is_followed_by_a_fade() -> None:
     rig = Rig().start("hold", angle=0.42)
     rig.run(2)
     rig.loop.estop("test")
@@ -107,15 +107,15 @@ def test_after_an_emergency_stop_the_way_back_is_clear_and_gentle() -> None:
 
 def test_a_tick_that_takes_longer_than_a_period_is_blamed_on_its_slowest_phase() -> None:
     rig = Rig()
-    naps = iter([0.12])
+    delays = iter([0.12])
 
-    def doze(_: Observation) -> float:
-        rig.clock.now += next(naps, 0.0)
+    def wait(_: Observation) -> float:
+        rig.clock.now += next(delays, 0.0)
         return 0.0
 
-    rig.start(Scripted(doze))
+    rig.start(Scripted(wait))
     assert rig.run()[0].busy_us == pytest.approx(120e3)
-    (tick,) = rig.run(missed=2, lateness=2e-3)  # the slots that it cost are not reported again
+    (tick,) = rig.run(missed=2, lateness=2e-3)  # its missed slots are not reported again
     assert (tick.lateness_us, tick.busy_us) == (pytest.approx(2e3), 0.0)
     assert rig.loop.statistics.overruns == 1
     (event,) = (event for event in rig.recorder.events if event.kind == "overrun")
@@ -167,7 +167,7 @@ def test_clearing_a_fault_that_is_still_there_latches_it_again() -> None:
     assert rig.recorder.kinds().count("fault") == 2
 
 
-def test_a_force_that_is_not_to_be_believed_is_told_but_reaches_no_estimator() -> None:
+def test_a_suspect_force_is_published_but_reaches_no_estimator() -> None:
     rig, robot = fragile_rig()
     seen: list[Observation] = []
     rig.start(Scripted(lambda observation: seen.append(observation) or 0.42))  # type: ignore[func-returns-value]
@@ -181,7 +181,7 @@ def test_a_force_that_is_not_to_be_believed_is_told_but_reaches_no_estimator() -
     assert (tick.fx, tick.fy, tick.samples, tick.suspect) == (good.fx, good.fy, 0, UNSET)
 
 
-def test_nor_does_it_when_a_slow_sensor_says_it_again() -> None:
+def test_a_suspect_force_that_a_slow_sensor_repeats_reaches_no_estimator() -> None:
     rig, robot = fragile_rig(kind=SlowSensor)
     good = rig.run(10)[-1]
     robot.fx, robot.fy, robot.suspect = 1.0, 5.0, "F_y is clipped"
@@ -193,7 +193,7 @@ def test_nor_does_it_when_a_slow_sensor_says_it_again() -> None:
 
 
 @pytest.mark.parametrize("tick", range(0, 12, 3))
-def test_one_such_force_costs_swing_no_beat(tick: int) -> None:
+def test_one_suspect_force_costs_swing_no_beat(tick: int) -> None:
     rig, robot = fragile_rig()
     rig.start("swing")
     rig.run_for(10.0)
@@ -221,20 +221,20 @@ def test_a_release_that_fails_is_tried_again_until_it_works() -> None:
 
 
 class Slow(Scripted):
-    """Takes longer than half a period."""
+    """A controller that takes longer than half a period."""
 
     def __init__(self, rig: Rig, then: Exception | None = None) -> None:
-        """then: raised in its third update"""
+        """then: exception of the third update"""
         self._updates = 0
 
-        def doze(_: Observation) -> float:
+        def wait(_: Observation) -> float:
             self._updates += 1
             if then and self._updates == 3:
                 raise then
             rig.clock.now += 0.03
             return 0.0
 
-        super().__init__(doze)
+        super().__init__(wait)
 
 
 @pytest.mark.parametrize("between", ["stop", "nothing"])
@@ -249,7 +249,7 @@ def test_a_controller_is_not_blamed_for_the_slow_updates_of_the_one_before(betwe
     assert rig.reason is None
 
 
-def test_nor_is_one_that_takes_over_from_one_that_gave_up() -> None:
+def test_a_successor_is_not_blamed_for_the_slow_updates_of_the_controller_that_gave_up() -> None:
     rig = Rig()
     successor = ("slow", Slow(rig))
     rig.start(Slow(rig, then=ControllerFault("chatter", "a test", successor=successor)))
@@ -260,7 +260,7 @@ def test_nor_is_one_that_takes_over_from_one_that_gave_up() -> None:
 
 
 class Waiting(Scripted):
-    """Notes what the servo had got when it was closed."""
+    """A controller that notes the last command of the servo when it is closed."""
 
     def __init__(self, robot: Wrapped) -> None:
         super().__init__(lambda _: 0.4)
@@ -273,16 +273,16 @@ class Waiting(Scripted):
 
 def test_an_emergency_stop_releases_the_servo_before_it_closes_a_controller() -> None:
     rig, robot = fragile_rig()
-    active, awaited = Waiting(robot), Waiting(robot)
+    active, pending = Waiting(robot), Waiting(robot)
     rig.start(active)
-    rig.loop.set_controller_after(10.0, "waiting", awaited)
+    rig.loop.set_controller_after(10.0, "waiting", pending)
     rig.run(2)
     rig.loop.estop("test")
-    assert (active.closed_after, awaited.closed_after) == ([None], [None])
+    assert (active.closed_after, pending.closed_after) == ([None], [None])
 
 
 class SlowSensor(Wrapped):
-    """A robot whose force sensor has no sample for each tick."""
+    """A robot whose force sensor does not have a new sample in each tick."""
 
     samples = 10
 
@@ -291,7 +291,7 @@ class SlowSensor(Wrapped):
 
 
 class Restless(Wrapped):
-    """A robot of which nothing is ever the same in two ticks."""
+    """A robot whose values all differ from tick to tick."""
 
     clock = VirtualClock()
     reads = 0
@@ -299,23 +299,25 @@ class Restless(Wrapped):
     def robot(self) -> Robot:
         return replace(
             super().robot(),
-            truth=lambda: Truth(*self.news(3)),
-            power=lambda now: self.news(1)[0],
+            truth=lambda: Truth(*self.next_values(3)),
+            power=lambda now: self.next_values(1)[0],
         )
 
-    def news(self, count: int) -> list[float]:
+    def next_values(self, count: int) -> list[float]:
         return [1e-3 * (self.reads**2 + k / 10) for k in range(count)]
 
     def read(self, now: float) -> Measurement:
         self.reads += 1
         self.clock.now += self.reads * 1e-6
-        extremes = Extremes(*self.news(4))
-        forces = (1e-3 * force for force in self.news(2))  # a drift, so that there is a zero
+        extremes = Extremes(*self.next_values(4))
+        forces = (
+            1e-3 * force for force in self.next_values(2)
+        )  # a drift, so that the zero is known
         return Measurement(now - self.reads * 1e-6, *forces, self.reads, "", extremes)
 
 
 ABSENT = {"x", "y", "speed", "heading", "leak", "suspect", "fy_corrected"}
-"""Fields of a swimmer, of an estimator that finds its leak, and of a force that is as it should."""
+"""Fields that are absent with this robot and estimator, and with a normal force."""
 
 
 @pytest.mark.parametrize(
@@ -324,10 +326,10 @@ ABSENT = {"x", "y", "speed", "heading", "leak", "suspect", "fy_corrected"}
 def test_no_field_of_a_tick_keeps_a_value_of_the_controller(mode: str, may_stay: set[str]) -> None:
     rig, restless = fragile_rig(kind=Restless)
     restless.clock = rig.clock
-    rig.run(60)  # the zero of the force is found
+    rig.run(60)  # so that the zero of the force is known
     rig.start("square", frequency=4.9)
     rig.run(39, missed=1, lateness=5e-3)
-    rig.loop.thrust.calibrate(70.0, 0.5)  # which these forces do not tell
+    rig.loop.thrust.calibrate(70.0, 0.5)  # since these forces do not determine it
     running = rig.run(1, missed=1, lateness=5e-3)[-1]
     leave = {
         "idle": rig.loop.stop,
@@ -342,10 +344,10 @@ def test_no_field_of_a_tick_keeps_a_value_of_the_controller(mode: str, may_stay:
 
 def test_only_the_active_controller_warms_up_and_the_angle_stays() -> None:
     rig, controller = Rig(), Scripted(lambda _: 0.1)
-    warmed = []
-    controller.warm_up = lambda: warmed.append(rig.loop.seq)  # type: ignore[method-assign]
+    ticks = []
+    controller.warm_up = lambda: ticks.append(rig.loop.seq)  # type: ignore[method-assign]
     rig.loop.warm_up()
     rig.start(controller)
     rig.run()
     rig.loop.warm_up()
-    assert (warmed, rig.loop.applied, rig.loop.seq) == ([1], 0.1, 1)
+    assert (ticks, rig.loop.applied, rig.loop.seq) == ([1], 0.1, 1)

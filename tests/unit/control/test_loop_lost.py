@@ -1,4 +1,4 @@
-"""A fishd that stood still, a servo that cannot be reached, and a force that is not there."""
+"""A fishd that stood still, a servo that cannot be reached, and a force that cannot be read."""
 
 import dataclasses
 from collections.abc import Iterator
@@ -16,7 +16,9 @@ from fishd.hardware.base import Robot
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[LockstepRig]:
-    with lockstep_rig(tmp_path, "force_sensor.data_rate=250") as rig:  # no sensor is judged here
+    with lockstep_rig(
+        tmp_path, "force_sensor.data_rate=250"
+    ) as rig:  # the sensor is not tested here
         rig.start("hold", angle=0.3)
         rig.run_for(1.0)
         assert rig.pulse > NEUTRAL + 100
@@ -24,7 +26,7 @@ def rig(tmp_path: Path) -> Iterator[LockstepRig]:
 
 
 def stand_still(rig: LockstepRig, seconds: float) -> None:
-    """As a process that was stopped, or a machine that was suspended."""
+    """Skip ticks, as if the process was stopped or the machine suspended."""
     rig.index += round(seconds / rig.config.tick)
 
 
@@ -41,7 +43,7 @@ def test_after_a_hang_the_servo_is_released_until_a_clear(rig: LockstepRig, seco
     )
     assert rig.recorder.kinds().count("fault") == 1
     widths = [width for _, width in rig.pulses_since(since)]
-    assert widths == [pytest.approx(NEUTRAL, abs=5), 0.0]  # and nothing after it
+    assert widths == [pytest.approx(NEUTRAL, abs=5), 0.0]  # and no pulse after it
     assert not rig.loop.servo.on
     rig.loop.clear_fault()
     rig.run_for(0.2)
@@ -49,7 +51,7 @@ def test_after_a_hang_the_servo_is_released_until_a_clear(rig: LockstepRig, seco
     assert rig.pulse == pytest.approx(NEUTRAL, abs=5)
 
 
-def test_a_hang_at_rest_is_no_reason_to_begin_pulses_again_either(rig: LockstepRig) -> None:
+def test_after_a_hang_at_rest_pulses_do_not_start_again(rig: LockstepRig) -> None:
     rig.loop.stop()
     rig.run_for(1.0)
     stand_still(rig, 1.0)
@@ -82,24 +84,24 @@ def test_a_shorter_hang_is_survived(rig: LockstepRig) -> None:
 
 
 def rig_with_countdown(seconds: float) -> tuple[Rig, Wrapped]:
-    made: list[Wrapped] = []
+    robots: list[Wrapped] = []
 
     def wrap(robot: Robot) -> Robot:
-        made.append(Wrapped(robot))
-        return dataclasses.replace(made[0].robot(), countdown=seconds)
+        robots.append(Wrapped(robot))
+        return dataclasses.replace(robots[0].robot(), countdown=seconds)
 
-    return Rig(wrap=wrap), made[0]
+    return Rig(wrap=wrap), robots[0]
 
 
 def test_a_hang_within_a_tick_is_noticed_before_its_angle_is_sent() -> None:
     rig, robot = rig_with_countdown(0.2)
-    naps = iter([0.0, 0.0, 0.3])
+    delays = iter([0.0, 0.0, 0.3])
 
-    def doze(_: Observation) -> float:
-        rig.clock.now += next(naps, 0.0)
+    def hang(_: Observation) -> float:
+        rig.clock.now += next(delays, 0.0)
         return 0.4
 
-    rig.start(Scripted(doze))
+    rig.start(Scripted(hang))
     rig.run(2)
     robot.log.clear()
     tick = rig.run(1)[-1]
@@ -107,22 +109,22 @@ def test_a_hang_within_a_tick_is_noticed_before_its_angle_is_sent() -> None:
     assert robot.log == [None]
 
 
-def test_a_hang_in_the_very_write_that_fails_is_told_as_the_hang() -> None:
+def test_a_hang_during_a_write_that_fails_is_reported_as_a_hang() -> None:
     rig, robot = rig_with_countdown(0.2)
     rig.start("square")
     rig.run(2)
 
-    def doze(angle: float) -> None:
+    def hang(angle: float) -> None:
         rig.clock.now += 0.3
         raise ServoError("pigpiod has answered too late")
 
-    robot.write = doze  # type: ignore[method-assign]
+    robot.write = hang  # type: ignore[method-assign]
     assert rig.run(1)[-1].mode == "fault"
     assert rig.loop.supervisor.reason
     assert rig.loop.supervisor.reason.code == "overrun"
 
 
-def test_a_servo_that_waits_for_ever_goes_on_after_a_hang() -> None:
+def test_a_servo_without_a_countdown_continues_after_a_hang() -> None:
     rig = Rig().start("square")
     rig.run(10)
     assert rig.run(1, missed=40)[-1].mode == "running"

@@ -10,7 +10,7 @@ from fishd.hardware.base import Robot
 
 
 class Button:
-    """A panel whose button a test presses."""
+    """A panel whose button is pressed by a test."""
 
     on_press: Callable[[], None]
 

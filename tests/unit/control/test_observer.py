@@ -12,7 +12,7 @@ REAL = ("simulation.offset_y=0.02", "simulation.drift=0.005")
 
 
 def error(rig: Rig, seconds: float, delay: int = 0) -> float:
-    """Rms error of the fin velocity `delay` ticks later, as a share of its rms."""
+    """Return the rms error of the fin velocity `delay` ticks later, as a share of its rms."""
     ticks = rig.run_for(seconds)
     true = np.array([tick.alpha_rate for tick in ticks], dtype=float)[delay:]
     seen = np.array([tick.fin_velocity for tick in ticks])[: len(true)]
@@ -20,13 +20,13 @@ def error(rig: Rig, seconds: float, delay: int = 0) -> float:
 
 
 @pytest.mark.parametrize("plant", [(), ("plant.backlash=0.02", "plant.cable_slack=0.02")])
-def test_it_gives_the_fin_velocity_in_rad_per_second(plant: tuple[str, ...]) -> None:
+def test_the_fin_velocity_is_in_rad_per_second(plant: tuple[str, ...]) -> None:
     rig = Rig(OBSERVER, *REAL, *plant).start("square", frequency=1.7)
     rig.run_for(10)
     assert error(rig, 20) < 0.02
 
 
-def test_it_looks_ahead_by_the_delay_of_the_servo() -> None:
+def test_the_fin_velocity_is_predicted_over_the_delay_of_the_servo() -> None:
     rig = Rig(OBSERVER, *REAL, "plant.servo_delay=0.1").start("square", frequency=1.25)
     rig.run_for(10)
     assert error(rig, 20, delay=2) < 0.25  # the commands of these two ticks are not known yet
@@ -45,7 +45,7 @@ def test_skipped_slots_and_a_sensor_that_fails_once_cost_little() -> None:
 
 
 @pytest.mark.parametrize("seconds", [1.2, 600.0])
-def test_after_a_fishd_that_stood_still_it_finds_the_fin_anew(seconds: float) -> None:
+def test_after_a_suspension_of_fishd_the_observer_converges_again(seconds: float) -> None:
     rig = Rig(OBSERVER, *REAL).start("square", frequency=1.7)
     rig.run_for(10)
     rig.run(1, missed=round(seconds / rig.config.tick))
@@ -54,7 +54,7 @@ def test_after_a_fishd_that_stood_still_it_finds_the_fin_anew(seconds: float) ->
     assert error(rig, 10) < 0.02
 
 
-def test_a_fin_that_water_stops_quickly_is_no_harder_to_follow() -> None:
+def test_a_strongly_damped_fin_is_observed_as_well() -> None:
     rig = Rig(OBSERVER, *REAL, "tick=0.2", "plant.omega0=50", "plant.xi=14")
     rig.start("square", frequency=0.5)
     rig.run_for(10)
@@ -66,7 +66,9 @@ def test_a_fin_that_water_stops_quickly_is_no_harder_to_follow() -> None:
 
 @pytest.mark.parametrize(("kind", "least", "most"), [("observer", 0.97, 1.0),
                                                      ("lateral_force", 0.6, 0.9)])  # fmt: skip
-def test_swing_on_it_does_not_mind_a_slow_servo(kind: str, least: float, most: float) -> None:
+def test_swing_with_the_observer_tolerates_a_slow_servo(
+    kind: str, least: float, most: float
+) -> None:
     from fishd.config import load
 
     config = load(None, [f"estimator.kind={kind}", "plant.servo_delay=0.1", *REAL])

@@ -1,4 +1,4 @@
-"""The servo's power in the ticks, and a power meter that fails."""
+"""The power of the servo in the ticks, and a power meter that fails."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +12,7 @@ from fishd.hardware.base import Robot
 
 
 class Metered(Wrapped):
-    """A robot whose power meter does what a test tells it to."""
+    """A robot with a scripted power meter."""
 
     def __init__(self, robot: Robot) -> None:
         super().__init__(robot)
@@ -33,7 +33,7 @@ def broken(now: float) -> float:
     raise SensorError("nothing answers at 0x40")
 
 
-def test_a_simulated_servo_tells_its_power_in_every_tick() -> None:
+def test_every_tick_has_the_power_of_a_simulated_servo() -> None:
     rig = Rig()
     resting = rig.run(3)[-1].power
     rig.start("square", frequency=2)
@@ -60,7 +60,7 @@ def test_a_power_meter_that_fails_is_one_event_and_no_fault(
     rig.run(2)
     robot.meter = lambda now: 2.0
     rig.run(1)
-    assert "power" not in rig.recorder.kinds()  # two failed reads are no news
+    assert "power" not in rig.recorder.kinds()  # two failed reads give no event
     robot.meter = failing
     ticks = rig.run(40)
     assert {tick.power for tick in ticks} == {UNSET}

@@ -1,4 +1,4 @@
-"""The supervisor: which mode follows which, and that a reason once latched stays."""
+"""The supervisor: the changes of mode, and the latched reason."""
 
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ codes = st.sampled_from([code for code, row in FAULTS.items() if row.effect is E
 
 
 class Transitions(RuleBasedStateMachine):
-    """Whatever is done in whatever order, a latched fish moves only after an explicit clear."""
+    """A state machine: in any order of requests, a latched fish moves only after a clear."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class Transitions(RuleBasedStateMachine):
 
     @rule()
     def estop(self) -> None:
-        self.supervisor.estop("somebody pressed")
+        self.supervisor.estop("the button was pressed")
         assert self.supervisor.mode is Mode.ESTOP
         self.latched = self.supervisor.reason
 
@@ -90,7 +90,7 @@ def test_three_failed_checks_in_a_row_are_a_fault(code: str) -> None:
     assert supervisor.reason.message == "odd, 3 times in a row"
 
 
-def test_clearing_starts_all_counts_anew() -> None:
+def test_clearing_resets_all_counts() -> None:
     supervisor = Supervisor()
     for code in [*COUNTED] * 3:
         supervisor.check(code, "odd")
@@ -111,10 +111,10 @@ def test_up_to_twenty_overruns_in_a_hundred_ticks_are_tolerated_more_are_a_fault
     assert supervisor.reason.code == "overrun"
 
 
-def test_every_change_of_mode_is_told_once_with_the_mode_before() -> None:
-    told: list[tuple[Mode, Mode]] = []
-    supervisor = Supervisor(lambda before: told.append((before, supervisor.mode)))
-    for deed in (
+def test_every_change_of_mode_is_reported_once_with_the_mode_before() -> None:
+    changes: list[tuple[Mode, Mode]] = []
+    supervisor = Supervisor(lambda before: changes.append((before, supervisor.mode)))
+    for request in (
         supervisor.start,
         supervisor.start,
         supervisor.stop,
@@ -126,6 +126,6 @@ def test_every_change_of_mode_is_told_once_with_the_mode_before() -> None:
         supervisor.clear,
         supervisor.clear,
     ):
-        deed()
+        request()
     modes = [Mode.IDLE, Mode.RUNNING, Mode.IDLE, Mode.FAULT, Mode.ESTOP, Mode.IDLE]
-    assert told == [*pairwise(modes)]
+    assert changes == [*pairwise(modes)]

@@ -1,4 +1,4 @@
-"""The ratio of thrust to power is learned from changes of the force, and from nothing else."""
+"""The ratio of thrust to power is estimated only from changes of the force."""
 
 import math
 import random
@@ -11,14 +11,14 @@ from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.core.signals import Observation
 
 TICK = 0.3
-"""A beat has two ticks [s]."""
+"""Period of the loop [s]; a beat has two ticks."""
 TRUE_FACTOR = 75.0
 POWER = 3.4e-4
-"""Mean square of the fin velocity: a thrust of 25.5 mN."""
+"""Mean square of the fin velocity, which gives a thrust of 25.5 mN."""
 
 
 class Rig:
-    """Whole beats of a fish whose force sensor is noisy and drifts."""
+    """A fish with a noisy, drifting force sensor, which swims whole beats."""
 
     def __init__(
         self,
@@ -54,7 +54,7 @@ class Rig:
             self._tick(0.0, 0.0, 0.0)
 
     def beats(self, count: int, power: float = POWER) -> None:
-        """Swim; the power of each beat is measured with an error."""
+        """Swim `count` beats; the power of each is measured with an error."""
         for _ in range(count):
             measured = power * max(0.1, self.random.gauss(1.0, self.power_noise))
             velocity = math.sqrt(measured)
@@ -62,33 +62,33 @@ class Rig:
                 self._tick(angle, TRUE_FACTOR * power, velocity)
 
 
-class Judged(NamedTuple):
-    """Errors of the factor, as fractions of it."""
+class FactorError(NamedTuple):
+    """The error of the factor and the half-width of its interval, as fractions of the truth."""
 
     error: float
     ci95: float
 
 
-def judged(rig: Rig) -> Judged:
+def factor_error(rig: Rig) -> FactorError:
     assert rig.live.factor
     value, ci95 = rig.live.factor
-    return Judged(value / TRUE_FACTOR - 1.0, ci95 / TRUE_FACTOR)
+    return FactorError(value / TRUE_FACTOR - 1.0, ci95 / TRUE_FACTOR)
 
 
 def test_a_steady_swim_of_5_000_beats_changes_no_factor() -> None:
     rig = Rig(0)
     rig.rest()
     rig.beats(20)
-    before = judged(rig)
+    before = factor_error(rig)
     rig.beats(5_000)
-    after = judged(rig)
+    after = factor_error(rig)
     assert after.error == pytest.approx(before.error, abs=1e-5)
     assert abs(after.error) < after.ci95
     assert after.ci95 > before.ci95
 
 
-def random_swims(rig: Rig, beats: int) -> Iterator[Judged]:
-    """Rests, waves of several sizes, and changes between them at random."""
+def random_swims(rig: Rig, beats: int) -> Iterator[FactorError]:
+    """Rest and swim waves of several sizes at random; yield the error after each."""
     swum = 0
     while swum < beats:
         if rig.random.random() < 0.4:
@@ -98,7 +98,7 @@ def random_swims(rig: Rig, beats: int) -> Iterator[Judged]:
         rig.beats(count, power)
         swum += count
         if rig.live.factor:
-            yield judged(rig)
+            yield factor_error(rig)
 
 
 @pytest.mark.slow
@@ -113,10 +113,9 @@ def test_the_factor_is_unbiased_over_20_000_beats_whatever_the_noise_and_the_dri
             walk=chance.choice((0.0, 6e-4, 3e-3)),
         )
         errors += random_swims(rig, 1_000)
-    # each weighed by how well it claims to be known
-    weights = [each.ci95**-2 for each in errors]
-    weighed = zip(errors, weights, strict=True)
-    mean = sum(each.error * weight for each, weight in weighed) / sum(weights)
+    weights = [error.ci95**-2 for error in errors]
+    weighted = zip(errors, weights, strict=True)
+    mean = sum(error.error * weight for error, weight in weighted) / sum(weights)
     assert abs(mean) < 0.01
-    assert sum(abs(each.error) < each.ci95 for each in errors) > 0.9 * len(errors)
-    assert all(abs(each.error) < 3.0 * each.ci95 for each in errors)
+    assert sum(abs(error.error) < error.ci95 for error in errors) > 0.9 * len(errors)
+    assert all(abs(error.error) < 3.0 * error.ci95 for error in errors)
