@@ -1,4 +1,4 @@
-"""Where the commands begin: a Ctrl-C while they are still being loaded ends them quietly."""
+"""Entry points of the commands; a Ctrl-C while a command is loading ends it without a traceback."""
 
 import os
 import sys
@@ -7,8 +7,8 @@ import sys
 def _leave_working_directory_out() -> None:
     """Import nothing from the working directory from now on, in this process or its children.
 
-    `python -m fishd` puts that folder first; what Python itself loads before, such as `runpy`, only
-    `python -P -m fishd` protects. A folder that PYTHONPATH names stays.
+    `python -m fishd` puts that folder first. Only `python -P -m fishd` also protects the modules
+    that Python itself loads earlier, such as `runpy`. Folders in PYTHONPATH are kept.
     """
     os.environ["PYTHONSAFEPATH"] = "1"
     try:
@@ -30,7 +30,7 @@ except KeyboardInterrupt:
 
 
 def fishd() -> None:
-    """The `fishd` command."""
+    """Run the `fishd` command."""
     _prepare()
     with _loading():
         from fishd.daemon.main import main
@@ -38,7 +38,7 @@ def fishd() -> None:
 
 
 def fishctl() -> None:
-    """The `fishctl` command."""
+    """Run the `fishctl` command."""
     _prepare()
     with _loading():
         from fishd.cli.main import main
@@ -46,7 +46,7 @@ def fishctl() -> None:
 
 
 def fishd_camera() -> None:
-    """The `fishd-camera` command."""
+    """Run the `fishd-camera` command."""
     _prepare()
     with _loading():
         from fishd.camera.main import main
@@ -54,7 +54,7 @@ def fishd_camera() -> None:
 
 
 def _prepare() -> None:
-    """Make up for odd conditions in which a command was started."""
+    """Correct unusual conditions in which a command was started."""
     _open_closed_streams()
     _use_utf8()
 
@@ -62,13 +62,13 @@ def _prepare() -> None:
 def _open_closed_streams() -> None:
     """Open standard streams that were closed, so that no other file gets their descriptors.
 
-    Writing to standard output fails then as on any descriptor that is not open for it.
+    Writing to such a standard output fails as on any descriptor that is not open for writing.
     """
     for number, mode in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
             os.fstat(number)
         except OSError:
-            os.set_inheritable(os.open(os.devnull, mode), True)  # takes the lowest that is free
+            os.set_inheritable(os.open(os.devnull, mode), True)  # the lowest free descriptor
     if sys.stdin is None:
         sys.stdin = os.fdopen(0, closefd=False)
     if sys.stdout is None:
@@ -78,9 +78,9 @@ def _open_closed_streams() -> None:
 
 
 def _use_utf8() -> None:
-    """Start again in UTF-8 mode where texts are ASCII: locale C with that mode switched off.
+    """Start again in UTF-8 mode if texts are ASCII: in locale C with that mode switched off.
 
-    Neither an option such as é nor an output such as ± could be read or written.
+    Otherwise an argument such as é could not be read, and an output such as ± not be written.
     """
     if sys.getfilesystemencoding() == "ascii":
         os.environ["PYTHONUTF8"] = "1"
@@ -91,9 +91,10 @@ def _use_utf8() -> None:
 
 @contextmanager
 def _loading() -> Iterator[None]:
-    """Let a Ctrl-C meanwhile be the end of the process, unless it is ignored as below `nohup`.
+    """Let a Ctrl-C end the process within the context, unless it is ignored as under `nohup`.
 
-    Nothing that is loaded is garbage: to look for it takes a tenth of the time.
+    The garbage collector is off in the context: imports leave no garbage, and searching for it
+    takes a tenth of the time.
     """
     gc.disable()
     before = signal.getsignal(signal.SIGINT)

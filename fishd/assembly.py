@@ -1,4 +1,4 @@
-"""From a configuration to the robot and its control loop, in real or virtual time."""
+"""Construction of the robot and its control loop from a configuration, in real or virtual time."""
 
 import logging
 import os
@@ -40,7 +40,7 @@ from fishd.hardware.servo.pigpio import Pigpio
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.plant.base import TrueWindow
 
-if TYPE_CHECKING:  # drivers and emulation are loaded where they are used: most runs need neither
+if TYPE_CHECKING:  # most runs need neither drivers nor emulation, so they are loaded on demand
     from fishd.hardware.panel import RpiGpioPanel
     from fishd.hardware.power_meter.sampled_power import SampledPower
     from fishd.virtual.pi.virtual_pi import VirtualPi
@@ -48,8 +48,8 @@ if TYPE_CHECKING:  # drivers and emulation are loaded where they are used: most 
 
 log = logging.getLogger(__name__)
 
-START_LIMIT = 1.0
-"""How long the force sensor may take for its first sample [s]."""
+FIRST_SAMPLE_TIMEOUT_S = 1.0
+"""Longest wait for the first sample of the force sensor [s]."""
 
 
 def open_robot(
@@ -59,26 +59,26 @@ def open_robot(
     file: Path | None = None,
     control: Path | None = None,
 ) -> Robot:
-    """The robot, in real time; leaving `stack` releases its servo first, then lets go of the rest.
+    """Return the robot in real time; closing `stack` releases its servo first, then the rest.
 
-    file: the configuration file, by which `fishd-release` will ask for this servo
-    control: the control socket, by which `fishctl estop` will ask for it
-    A sensor or servo that does not answer is no error here: the loop will say so, and recovers
-    when it comes back. Raises `StartupError` when a package is missing, no virtual Pi is running or
-    another fishd drives this robot, `ConfigError` when a calibration file is broken.
+    file: configuration file, with which `fishd-release` finds the recipe for this servo
+    control: control socket, with which `fishctl estop` finds it
+    A sensor or servo that does not answer is not an error here: the loop reports it, and recovers
+    when the hardware answers again. Raises `StartupError` when a package is missing, no virtual Pi
+    is running or another fishd drives this robot, and `ConfigError` for a bad calibration file.
     """
     if control:
 
-        def forget(kind: object, error: object, trace: object) -> None:
-            if error is None:  # else there may be pulses
+        def remove_recipe(kind: object, error: object, trace: object) -> None:
+            if error is None:  # otherwise there may be pulses
                 release_recipe.remove(str(control))
 
-        stack.push(forget)
+        stack.push(remove_recipe)
         if not config.has_hardware:
             release_recipe.write_without_servo(str(control))
     if config.robot == "simulated":
         if file and not (release_recipe.read(str(file)) or {}).get("fresh"):
-            release_recipe.remove(str(file))  # of what the file said before
+            release_recipe.remove(str(file))  # of an earlier content of the file
         return simulated_fish(config).robot()
     if config.robot == "swimmer":
         swimmer = open_swimmer(config)
@@ -94,12 +94,12 @@ def open_robot(
 
 
 def simulated_fish(config: Config) -> SimulatedFish:
-    """A fish on its rod, without any hardware; nothing has to be closed."""
+    """Return a simulated fish on its rod; it needs no hardware and has not to be closed."""
     return SimulatedFish(config.plant, config.simulation, config.tick)
 
 
 def open_swimmer(config: Config) -> "Swimmer":
-    """A fish that swims freely; raises `MissingPackage`."""
+    """Return a fish that swims freely; raise `MissingPackage` if a package is missing."""
     try:
         from fishd.virtual.swimmer.robot import Swimmer
     except ModuleNotFoundError as error:
@@ -111,7 +111,7 @@ def open_swimmer(config: Config) -> "Swimmer":
 
 
 def parts_of(config: Config) -> tuple[ownership.Part, ...]:
-    """What no other fishd may drive meanwhile; `fishctl release`, the last resort, does not ask."""
+    """Return the parts that no other fishd may drive; `fishctl release` ignores such claims."""
     if config.robot == "pi":
         return ownership.parts_of_pi(claims_of(config.driver_settings))
     if config.robot == "virtual-pi":
@@ -120,24 +120,24 @@ def parts_of(config: Config) -> tuple[ownership.Part, ...]:
 
 
 class InVirtualTime(NamedTuple):
-    """A robot whose whole hardware path runs in virtual time, and the virtual Pi behind it."""
+    """Robot whose drivers run in virtual time, with its virtual Pi."""
 
     robot: Robot
     pi: "VirtualPi"
 
 
 def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
-    """A virtual Pi and the drivers on it in virtual time: it moves when the loop reads the sensor.
+    """Return a robot with a virtual Pi, whose time advances when the loop reads the sensor.
 
-    Its own clock runs ahead of the loop's by the rest of a conversion.
+    The clock of the virtual Pi is ahead of the loop's by the remainder of a conversion.
     """
     from fishd.virtual.pi.lgpio import EmulatedLgpio
     from fishd.virtual.pi.linux_i2c import LinuxI2c
     from fishd.virtual.pi.virtual_pi import VirtualPi
 
     clock = VirtualClock()
-    clock.now = -config.tick  # so that the first read, at 0, finds a window
-    settings = replace(config.virtual_pi, pigpio_port=0)  # several may run at once
+    clock.now = -config.tick  # so that the first read, at 0, has a window
+    settings = replace(config.virtual_pi, pigpio_port=0)  # several virtual Pis may run at once
     pi = VirtualPi(settings, config.plant, config.simulation, config.tick, clock)
     stack.callback(pi.close)
     pi.start()
@@ -159,17 +159,20 @@ def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
 
 
 class FishInVirtualTime(NamedTuple):
-    """What swims in virtual time, whichever robot the configuration names."""
+    """Fish in virtual time, of every robot that a configuration can name."""
 
     robot: Robot
     take_window: Callable[[], TrueWindow]
-    """What the fish truly did since the last time that this was asked."""
+    """Function that returns the true motion since its previous call."""
     swimmer: "Swimmer | None" = None
-    """The fish itself, where it swims freely."""
+    """The fish itself if it swims freely."""
 
 
 def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> FishInVirtualTime:
-    """A simulated fish, free or on its rod, or one behind a virtual Pi; raises `MissingPackage`."""
+    """Return a simulated fish, free, on its rod or behind a virtual Pi.
+
+    Raises `MissingPackage` if a package is missing.
+    """
     if config.robot == "swimmer":
         swimmer = open_swimmer(config)
         return FishInVirtualTime(swimmer.robot(), swimmer.take_window, swimmer)
@@ -181,9 +184,9 @@ def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> FishInVirtual
 
 
 def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
-    """Let the I2C bus and the pins of this process be those of the virtual Pi that is running.
+    """Connect the I2C bus and the pins of this process to the virtual Pi that is running.
 
-    Raises `StartupError` if none runs, or a package is missing.
+    Raises `StartupError` if none is running, or a package is missing.
     """
     from fishd.virtual.pi.lgpio import EmulatedLgpio
     from fishd.virtual.pi.link import RemotePi
@@ -204,7 +207,7 @@ def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
 
 
 def state_folder(config: Config) -> Path:
-    """Where the calibrations of this robot are kept."""
+    """Return the folder of the calibrations of this robot."""
     folder = config.state_folder or os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if folder:
         return files.expanded(folder) / config.robot
@@ -213,7 +216,7 @@ def state_folder(config: Config) -> Path:
 
 
 def end_pulses(config: Config) -> bool:
-    """The last resort, when fishd is dead: neutral, then no pulses; False where there were none.
+    """Send neutral and end the pulses, when fishd is dead; return False if there were none.
 
     Raises `ServoError`, `StartupError` when a package is missing, and `ConfigError` when the
     calibration cannot be read.
@@ -233,7 +236,7 @@ def end_pulses(config: Config) -> bool:
 
 
 def read_pulses(config: Config) -> bool | None:
-    """Read back whether the servo has pulses; None where its driver cannot tell.
+    """Read back whether the servo has pulses; return None if its driver does not know.
 
     Raises `ServoError`, and `StartupError` when a package is missing.
     """
@@ -242,8 +245,8 @@ def read_pulses(config: Config) -> bool | None:
 
 
 def _servo_calibration(config: Config) -> ServoCalibration:
-    found = CalibrationFolder(state_folder(config)).newest(ServoCalibration)
-    return found[0] if found else config.servo.calibration
+    newest = CalibrationFolder(state_folder(config)).newest(ServoCalibration)
+    return newest[0] if newest else config.servo.calibration
 
 
 def assemble(
@@ -256,18 +259,18 @@ def assemble(
     truth: Callable[[], Truth] | None = None,
     servo_driver: Callable[..., ServoDriver[Any]] | None = None,
 ) -> Robot:
-    """The robot on the buses and pins that this process has now; as `open_robot` without claims.
+    """Return the robot on the buses and pins of this process; do as `open_robot` without claims.
 
     threaded: False for a clock in virtual time
-    recipes: the names of `release_recipe` by which others will ask for this servo
-    servo_driver: what opens the servo; by default the class that the configuration names
+    recipes: names for `release_recipe` with which other programs find this servo
+    servo_driver: function that opens the servo, by default the class that the configuration names
     """
     panel = _open_panel(config, clock, stack)
     folder = CalibrationFolder(state_folder(config))
     for line in folder.ignored():
         log.warning("%s", line)
     meter = _open_power_meter(config, clock, stack, threaded=threaded)
-    between_samples = meter.catch_up if meter else _nothing
+    between_samples = meter.catch_up if meter else _do_nothing
     sensor = open_sensor(config, clock, threaded=threaded, between_samples=between_samples)
     stack.callback(sensor.close)
     settings = config.servo
@@ -280,34 +283,34 @@ def assemble(
             threaded=threaded,
             tick=config.tick,
         )
-    stack.callback(servo.close)  # last in, first out: whatever fails, this is done first
+    stack.callback(servo.close)  # last in, first out: on any failure, this is done first
 
-    def tell_release(calibration: ServoCalibration) -> None:
-        """Leave what `fishd-release` needs to end these pulses quickly, whatever happens."""
+    def write_recipes(calibration: ServoCalibration) -> None:
+        """Write the recipes with which `fishd-release` can end these pulses quickly."""
         if recipes and (resort := servo.driver.last_resort(settings)):
             for name in recipes:
                 release_recipe.write(name, resort.function, servo.driver.neutral, resort.arguments)
 
-    tell_release(servo.calibration)
+    write_recipes(servo.calibration)
     if threaded:
         _await_first_sample(sensor.read, clock)
 
-    if left := pulses.cut(settings, config.amplitude_limit):
-        log.info("servo.lowest and servo.highest permit %s, amplitude_limit", left)
-    if line := _cut_by_calibration(config, servo):
+    if permitted := pulses.cut(settings, config.amplitude_limit):
+        log.info("servo.lowest and servo.highest permit %s, amplitude_limit", permitted)
+    if line := _calibration_warning(config, servo):
         log.warning("%s", line)
 
     def degraded() -> tuple[str, ...]:
         lines = tuple(servo.driver.degraded)
         if sensor.calibration.untouched:
-            shown = f"the force is not calibrated, and shown in {sensor.unit}"
-            lines += (f"{shown}: fishctl calibrate force",)
+            force = f"the force is not calibrated, and shown in {sensor.unit}"
+            lines += (f"{force}: fishctl calibrate force",)
             if config.estimator.kind == "observer":
                 lines += (
                     "estimator.kind: observer needs forces in N, so the fin velocity is wrong",
                 )
-        cut = _cut_by_calibration(config, servo)
-        return (*lines, cut) if cut else lines
+        warning = _calibration_warning(config, servo)
+        return (*lines, warning) if warning else lines
 
     return Robot(
         name=config.robot,
@@ -316,7 +319,7 @@ def assemble(
         truth=truth,
         panel=panel,
         tared=sensor,
-        calibrated=CalibratedParts(sensor, servo, tell_release),
+        calibrated=CalibratedParts(sensor, servo, write_recipes),
         degraded=degraded,
         counters=lambda: {
             **sensor.counters(),
@@ -328,14 +331,14 @@ def assemble(
     )
 
 
-def _nothing() -> None:
+def _do_nothing() -> None:
     pass
 
 
 def _open_power_meter(
     config: Config, clock: Clock, stack: ExitStack, *, threaded: bool
 ) -> "SampledPower | None":
-    """The power meter, where there is one; one that does not answer is no error."""
+    """Return the power meter if one is configured; it need not answer yet."""
     settings = config.power_meter
     if settings is None:
         return None
@@ -353,16 +356,16 @@ def open_sensor(
     clock: Clock,
     *,
     threaded: bool,
-    between_samples: Callable[[], None] = _nothing,
+    between_samples: Callable[[], None] = _do_nothing,
 ) -> SampledSensor:
-    """The force sensor alone, with the calibration that was saved last.
+    """Return the force sensor alone, with the newest saved calibration.
 
-    between_samples: as of `SampledSensor`
+    between_samples: that of `SampledSensor`
     Raises `StartupError` when a package is missing, and `ConfigError` for a damaged calibration.
     """
     settings = config.force_sensor
-    found = CalibrationFolder(state_folder(config)).newest(ForceCalibration)
-    calibration = found[0] if found else ForceCalibration()
+    newest = CalibrationFolder(state_folder(config)).newest(ForceCalibration)
+    calibration = newest[0] if newest else ForceCalibration()
     with driver_packages(settings.driver):
         driver = FORCE_SENSORS.find(settings.driver)(settings, clock)
     return SampledSensor(
@@ -375,13 +378,13 @@ def open_sensor(
     )
 
 
-def _cut_by_calibration(config: Config, servo: CalibratedServo) -> str:
-    """A line about a calibration of the servo with which it cannot go to ±Φ; empty if it can."""
-    left = servo.cut(config.amplitude_limit)
-    if not left or servo.calibration == config.servo.calibration:
+def _calibration_warning(config: Config, servo: CalibratedServo) -> str:
+    """Return a line if the calibration of the servo does not permit ±Φ; empty if it does."""
+    permitted = servo.cut(config.amplitude_limit)
+    if not permitted or servo.calibration == config.servo.calibration:
         return ""
     return (
-        f"the servo's calibration of {servo.calibration.date or 'no date'} permits {left}, "
+        f"the servo's calibration of {servo.calibration.date or 'no date'} permits {permitted}, "
         "amplitude_limit: fishctl calibrate servo"
     )
 
@@ -401,8 +404,8 @@ def _has_panel(config: Config) -> bool:
 
 
 def _await_first_sample(read: Callable[[float], object], clock: Clock) -> None:
-    """Give the sensor the time that it needs to begin, so that a healthy start is no fault."""
-    deadline = clock.monotonic() + START_LIMIT
+    """Give the sensor time to start, so that a normal start does not cause a fault."""
+    deadline = clock.monotonic() + FIRST_SAMPLE_TIMEOUT_S
     while clock.monotonic() < deadline:
         try:
             read(clock.monotonic())
@@ -413,7 +416,7 @@ def _await_first_sample(read: Callable[[float], object], clock: Clock) -> None:
 
 
 def build_estimator(config: Config) -> Estimator:
-    """The one that `estimator.kind` names."""
+    """Return the estimator that `estimator.kind` names."""
     if config.estimator.kind == "observer":
         return Observer(config.estimator, config.plant, config.tick)
     if config.estimator.kind == "sensor":
@@ -428,10 +431,10 @@ def build_loop(
     publisher: Publisher | None,
     notify: Callable[[float], None] | None = None,
 ) -> ControlLoop:
-    """A loop in which `config.start.controller` is active, if there is one.
+    """Return a loop in which `config.start.controller` is active, if one is set.
 
-    publisher: gets the record of every tick, and every event; with None, no record is made
-    notify: called at the end of every tick with the time of its start [s, monotonic]
+    publisher: receiver of the record of every tick and of every event; None to make no records
+    notify: function called at the end of every tick with the time of its start [s, monotonic]
     Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.
     """
     guard = Guard(config.amplitude_limit, config.tick, config.slew_limit, config.fade_time)

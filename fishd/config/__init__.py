@@ -1,4 +1,4 @@
-"""The configuration: YAML in, one frozen `Config` out."""
+"""Configuration: conversion of YAML into one frozen `Config`."""
 
 from fishd.config.configuration import (
     FILE_VARIABLE,

@@ -1,6 +1,6 @@
-"""The sections of the configuration, and how a file with its overrides becomes a `Config`.
+"""Sections of the configuration, and conversion of a file with its overrides into a `Config`.
 
-Each section is a struct of the part that it configures; this module only puts them together.
+Each section is a struct of the part that it configures; this module only combines them.
 """
 
 import logging
@@ -48,30 +48,31 @@ from fishd.virtual.swimmer.settings import SwimmerSettings
 log = logging.getLogger(__name__)
 
 SERVICE_FILE = Path("/etc/fishd/fishd.yaml")
-"""What the service runs with, as installed by 'make install-pi'."""
+"""Configuration file of the service, installed by 'make install-pi'."""
 FILE_VARIABLE = "FISHD_CONFIG"
+"""Environment variable with the path of the configuration file."""
 
 
 Name = Annotated[
     str, Meta(min_length=1, max_length=40, pattern=r"^(?! )[^\x00-\x1f\x7f-\x9f]+$(?<! )(?!\n)")
 ]
-"""Printable, and without spaces around it."""
+"""Printable name without spaces at its ends."""
 
 
 class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the fish does once the daemon runs."""
+    """Controller that is started with the daemon."""
 
     controller: Annotated[
         str | None, note("Controller to start with; null starts in mode idle.")
     ] = None
     parameters: Annotated[
-        dict[str, Any], note("Its parameters; those left out keep their defaults.")
+        dict[str, Any], note("Parameters of that controller; those left out keep their defaults.")
     ] = {}
     rest: Annotated[
         float,
         unit(
             "s",
-            "How long the fish rests before: 3 s are enough to find the zero of the force sensor.",
+            "Time at rest before the start: 3 s are enough to find the zero of the force sensor.",
             ge=0,
             le=3600,
             usual=600,
@@ -80,7 +81,7 @@ class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
 
 class TelemetrySettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where telemetry is published."""
+    """Address at which telemetry is published."""
 
     address: Annotated[
         str,
@@ -92,7 +93,7 @@ class TelemetrySettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where requests are taken."""
+    """Address at which requests are accepted, and the leases."""
 
     address: Annotated[
         str | None,
@@ -106,8 +107,8 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "s",
-            "An experiment that does not renew its lease for this time is over, and the fish fades "
-            "to neutral; longer for slow links.",
+            "Time after which an experiment that does not renew its lease ends, and the fish fades "
+            "to neutral; use a longer time for slow links.",
             ge=SHORTEST_LEASE,
             le=LONGEST_LEASE,
         ),
@@ -115,13 +116,13 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How hard fishd tries to be on time; without the privilege it warns once and goes on."""
+    """Real-time scheduling; without the privilege, fishd warns once and continues."""
 
     priority: Annotated[
         int,
         note(
-            "SCHED_FIFO priority; 0 keeps the normal scheduler. More than 50 needs more than the "
-            "LimitRTPRIO=51 of the service: one above the priority.",
+            "SCHED_FIFO priority; 0 keeps the normal scheduler. A priority above 50 needs a larger "
+            "LimitRTPRIO than the 51 of the service: one more than the priority.",
             ge=0,
             le=99,
         ),
@@ -129,7 +130,7 @@ class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     warm_up: Annotated[
         bool,
         note(
-            "Run mock ticks just before each real one, so that it finds warm caches; has no effect "
+            "Run mock ticks just before each real tick, so that it has warm caches; has no effect "
             "for ticks below 10 ms."
         ),
     ] = True
@@ -137,7 +138,7 @@ class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Everything that can be configured; `Config()` is a simulated fish at rest."""
+    """The whole configuration; `Config()` is a simulated fish at rest."""
 
     name: Annotated[
         Name | None,
@@ -146,35 +147,35 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     robot: Annotated[
         Literal["simulated", "pi", "virtual-pi", "swimmer"],
         note(
-            "What swims: a simulated fish, the robot on this Raspberry Pi, or a simulated fish "
-            "behind the robot's own drivers (fishctl virtual-pi), or a fish that swims freely in a "
+            "Robot: a simulated fish, the robot on this Raspberry Pi, a simulated fish behind the "
+            "robot's own drivers (fishctl virtual-pi), or a fish that swims freely in a "
             "two-dimensional fluid."
         ),
     ] = "simulated"
     tick: Annotated[float, unit("s", "Period of the loop.", ge=0.002, le=0.2)] = 0.05
     amplitude_limit: Annotated[
-        float, unit("rad", "Φ: no instruction angle goes beyond ±Φ.", gt=0, le=1.57)
+        float, unit("rad", "Φ: instruction angles stay within ±Φ.", gt=0, le=1.57)
     ] = 0.42
     slew_limit: Annotated[
         Annotated[float, Meta(gt=0, le=10_000)] | None,
         unit(
             "rad/s",
-            "Fastest change of the instruction angle. null allows one full reversal, 2Φ, in each "
-            "tick and so leaves a square wave untouched.",
+            "Largest rate of change of the instruction angle. null allows one full reversal, 2Φ, "
+            "in each tick, and so does not change a square wave.",
         ),
     ] = None
     fade_time: Annotated[
         float, unit("s", "Time to fade from Φ to neutral on stop, fault and exit.", gt=0, le=0.5)
     ] = 0.4
-    start: Annotated[Start, note("What the fish does at once.")] = Start()
-    chatter: Annotated[ChatterSettings, note("A policy that would reverse too fast.")] = (
+    start: Annotated[Start, note("Controller that is started with fishd.")] = Start()
+    chatter: Annotated[ChatterSettings, note("Limits for a policy that reverses too fast.")] = (
         ChatterSettings()
     )
     lockstep: Annotated[
         bool,
         note(
             "Virtual time, for a simulated fish: while remote is active, each tick waits for "
-            "its agent, and the next one follows at once."
+            "its agent, and the next tick starts at once."
         ),
     ] = False
     estimator: Annotated[EstimatorSettings, note("Fin velocity and thrust from the forces.")] = (
@@ -182,7 +183,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     )
     plant: Annotated[
         PlantParameters,
-        note("Physics of the fish: of the simulated one, and of what the observer believes in."),
+        note("Physics of the fish, for the simulated fish and for the model of the observer."),
     ] = PlantParameters()
     simulation: Annotated[
         SimulationSettings, note("The simulated fish: imperfections of the rig.")
@@ -196,18 +197,18 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     power_meter: Annotated[
         PowerMeterSettings | None,
         note(
-            "The power meter of the servo, where there is one; null without. Not for a simulated "
-            "fish, whose servo has a model."
+            "The power meter of the servo; null if the robot has none. Not for a simulated fish, "
+            "whose servo has a model."
         ),
     ] = None
     panel: Annotated[
-        PanelSettings, note("E-stop button and status light, where there are any.")
+        PanelSettings, note("E-stop button and status light, if the robot has them.")
     ] = PanelSettings()
     state_folder: Annotated[
         str | None,
         note(
-            "Folder for calibrations; null: $STATE_DIRECTORY, else $XDG_STATE_HOME/fishd, else "
-            "~/.local/state/fishd; in it, a folder for each robot."
+            "Folder for calibrations, with a subfolder for each robot; null for $STATE_DIRECTORY, "
+            "else $XDG_STATE_HOME/fishd, else ~/.local/state/fishd."
         ),
     ] = None
     swimmer: Annotated[SwimmerSettings, note("The fish that swims freely, with robot swimmer.")] = (
@@ -216,25 +217,23 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     virtual_pi: Annotated[VirtualPiSettings, note("The virtual Pi, with robot virtual-pi.")] = (
         VirtualPiSettings()
     )
-    telemetry: Annotated[TelemetrySettings, note("What is published, and where.")] = (
-        TelemetrySettings()
-    )
-    control: Annotated[ControlSettings, note("Where requests are taken.")] = ControlSettings()
+    telemetry: Annotated[TelemetrySettings, note("Publication of telemetry.")] = TelemetrySettings()
+    control: Annotated[ControlSettings, note("Requests and leases.")] = ControlSettings()
     realtime: Annotated[RealtimeSettings, note("Scheduling and memory.")] = RealtimeSettings()
 
     @property
     def has_hardware(self) -> bool:
-        """Does it have a force sensor and a servo, real or emulated ones?"""
+        """Whether the robot has a force sensor and a servo, real or emulated."""
         return self.robot in ("pi", "virtual-pi")
 
     @property
-    def driver_settings(self) -> drivers.Chosen:
-        """What its sections of drivers say."""
-        return drivers.Chosen(self.force_sensor, self.servo, self.power_meter)
+    def driver_settings(self) -> drivers.DriverSettings:
+        """Settings of the drivers."""
+        return drivers.DriverSettings(self.force_sensor, self.servo, self.power_meter)
 
     @property
     def limits(self) -> Limits:
-        """What controllers must respect."""
+        """Limits that controllers must respect."""
         return Limits(
             amplitude=self.amplitude_limit,
             tick=self.tick,
@@ -253,16 +252,16 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         """Shortest time between two reversals of a policy [s]."""
         if self.chatter.dwell != "auto":
             return self.chatter.dwell
-        if self.robot == "swimmer":  # whose muscles are no servo
+        if self.robot == "swimmer":  # it has muscles instead of a servo
             return DWELL
         shortest = min(shortest_dwell(self.plant, self.amplitude_limit), LONGEST_DWELL)
         return round(math.ceil(shortest / self.tick - 1e-9) * self.tick, 9)
 
 
 def service_file() -> Path | None:
-    """The file that the fishd of this machine most likely runs with; None for the defaults.
+    """Return the file that the fishd of this machine probably uses; None for the defaults.
 
-    $FISHD_CONFIG where it is set, empty for none; else that of the service where there is one.
+    That is $FISHD_CONFIG if it is set (empty for none), else the file of the service if it exists.
     """
     given = os.environ.get(FILE_VARIABLE)
     if given is not None:
@@ -291,16 +290,16 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Iterable[str] = 
 def read(
     path: str | os.PathLike[str], mistakes: list[str] | None = None
 ) -> tuple[dict[str, Any], dict[tuple[str, ...], str]]:
-    """Return what stands in a configuration file, and the place of each key.
+    """Return the content of a configuration file, and the place of each key.
 
-    mistakes: takes what is wrong with single values, which are left out then
+    mistakes: list to which errors of single values are added; those values are left out
     Raises `ConfigError`.
     """
     return strict_yaml.read(path, "a configuration", "tick: 0.05", mistakes)
 
 
 def _warn_of_values(config: Config, sources: Mapping[tuple[str, ...], str]) -> None:
-    """Log a warning for each value that was given and is far beyond what makes sense."""
+    """Log a warning for each value that was set and is far from usual values."""
     for path, place in sources.items():
         section: Any = config
         for key in path[:-1]:
@@ -314,11 +313,11 @@ def _warn_of_values(config: Config, sources: Mapping[tuple[str, ...], str]) -> N
 
 
 def check_tethered(robot: str, what: str) -> None:
-    """Raise `ConfigError` where the fish swims freely; what: that which needs a tethered one."""
+    """Raise `ConfigError` if the fish swims freely; what: name of what needs a tethered fish."""
     if robot == "swimmer":
         raise ConfigError(
-            f"robot: swimmer is not valid for {what}, which is about the thrust of a tethered "
-            "fish; robot: simulated is needed, and what a swimmer does 'fishctl simulate' tells"
+            f"robot: swimmer is not valid for {what}, which needs the thrust of a tethered fish; "
+            "set robot: simulated, or use 'fishctl simulate' for a swimmer"
         )
 
 
@@ -339,50 +338,50 @@ CHECKS: tuple[Check, ...] = (
     lambda c: checks.check_virtual_pi(c.virtual_pi),
     lambda c: checks.check_swimmer(c.swimmer, c.tick) if c.robot == "swimmer" else None,
 )
-"""Checks of keys against each other, in their order; each raises `Problem`."""
+"""Checks of keys against each other, in order; each raises `Problem`."""
 
 
 def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
-    """The configuration that a running fishd reports (`Fish.config`), with overrides.
+    """Return the configuration that a running fishd reports (`Fish.config`), with overrides.
 
-    It is not validated across fields again: fishd has done so. Raises `ConfigError`.
+    The checks across fields are not repeated, as fishd has done them. Raises `ConfigError`.
     """
     sources = apply_overrides(data, overrides)
     try:
         return convert_sections(data)
     except Problem as problem:
-        where = sources.get(problem.path, "the configuration of the fishd that runs")
-        raise ConfigError(problem.located({problem.path: where})) from None
+        place = sources.get(problem.path, "the configuration of the running fishd")
+        raise ConfigError(problem.located({problem.path: place})) from None
 
 
 def convert_sections(data: Mapping[str, Any]) -> Config:
-    """Validate each section on its own; raises `Problem`."""
-    rest = {key: value for key, value in data.items() if key not in drivers.CHOICES}
-    config = convert(rest, Config, elsewhere=drivers.keys)
+    """Convert and validate each section separately; raise `Problem` for an invalid value."""
+    common = {key: value for key, value in data.items() if key not in drivers.CHOICES}
+    config = convert(common, Config, elsewhere=drivers.keys)
     return msgspec.structs.replace(config, **drivers.convert_sections(data, keys))
 
 
 def keys() -> list[str]:
-    """Every key in dotted form, those of all drivers and plants that load among them."""
+    """Return every key in dotted form, including those of all drivers and plants that load."""
     return list(dict.fromkeys(leaves(Config) + drivers.keys()))
 
 
 def to_yaml(config: Config | dict[str, Any]) -> str:
-    """The whole configuration, defaults included, as YAML that `load` reads back."""
+    """Return the whole configuration with its defaults as YAML that `load` accepts."""
     return strict_yaml.dump(msgspec.to_builtins(config))
 
 
 def json_schema() -> dict[str, Any]:
-    """The JSON Schema of the configuration, with the keys of all drivers and plants that load."""
+    """Return the JSON Schema of the configuration, with all drivers and plants that load."""
     choices = {section: drivers.settings_of_drivers(section) for section in drivers.CHOICES}
-    types = [Config, *(struct for found in choices.values() for struct in found.values())]
+    types = [Config, *(struct for structs in choices.values() for struct in structs.values())]
     (top, *_), parts = msgspec.json.schema_components(types, ref_template="#/$defs/{name}")
     properties = parts["Config"]["properties"]
-    for section, found in choices.items():
+    for section, structs in choices.items():
         refs = []
-        for struct in dict.fromkeys(found.values()):
-            named = [name for name, keys_of in found.items() if keys_of is struct]
-            parts[struct.__name__]["properties"][drivers.CHOICES[section].key] = {"enum": named}
+        for struct in dict.fromkeys(structs.values()):
+            names = [name for name, settings in structs.items() if settings is struct]
+            parts[struct.__name__]["properties"][drivers.CHOICES[section].key] = {"enum": names}
             refs.append({"$ref": f"#/$defs/{struct.__name__}"})
         default = {key: value for key, value in properties[section].items() if key == "default"}
         properties[section] = {"anyOf": refs, **default}

@@ -1,6 +1,6 @@
-"""Cross-field validation of the configuration, and of what no bound can express.
+"""Checks of keys against each other, and of values beyond simple bounds.
 
-Each check raises `Problem` with the key at fault and what would be right.
+Each check raises `Problem` with the wrong key and what would be right.
 """
 
 import math
@@ -22,17 +22,17 @@ from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.swimmer.settings import SwimmerSettings
 
-MOST_STEPS = 200
-"""Of a swimmer in a tick: between two ticks fishd answers nobody."""
+MAX_STEPS_PER_TICK = 200
+"""Largest number of a swimmer's steps in a tick, during which fishd answers no request."""
 
 
 def check_start(controller: str | None, parameters: Mapping[str, Any], limits: Limits) -> None:
-    """The controller to start with is installed and accepts its parameters."""
+    """Check that the start controller is installed and accepts its parameters."""
     if controller is None:
         if parameters:
             raise Problem(
                 ("start", "parameters"),
-                "there is no start.controller to take these; name one, or remove them",
+                "start.controller is not set; set it, or remove the parameters",
             )
         return
     try:
@@ -44,7 +44,7 @@ def check_start(controller: str | None, parameters: Mapping[str, Any], limits: L
 
 
 def check_addresses(telemetry: str, control: str | None) -> None:
-    """Both are valid and differ, and only this machine can reach `control`."""
+    """Check that both addresses are valid and differ, and that `control` is of this machine."""
     if complaint := why_not_served(telemetry):
         raise Problem(("telemetry", "address"), f"'{telemetry}' is not valid: {complaint}")
     if control is None:
@@ -52,39 +52,39 @@ def check_addresses(telemetry: str, control: str | None) -> None:
     complaint = why_not_served(control)
     if complaint.startswith(FORM) or not (complaint or is_local(control)):
         complaint = (
-            "ipc://PATH or tcp://127.0.0.1:PORT is needed; who can send requests can move the "
-            "fish, so they are taken from this machine only"
+            "ipc://PATH or tcp://127.0.0.1:PORT is needed; requests can move the fish, so they are "
+            "accepted only from this machine"
         )
     if complaint:
         raise Problem(("control", "address"), f"'{control}' is not valid: {complaint}")
     if control == telemetry:
-        raise Problem(("control", "address"), f"'{control}' is the address of telemetry already")
+        raise Problem(("control", "address"), f"'{control}' is already the address of telemetry")
 
 
 def check_state_folder(folder: str | None) -> None:
-    """It is a path, in no home that this machine does not have."""
+    """Check that the folder is a valid path, not in the home of an unknown user."""
     if folder is None:
         return
     try:
-        good = b"\0" not in os.fsencode(folder)
+        is_valid = b"\0" not in os.fsencode(folder)
     except UnicodeEncodeError:
-        good = False
-    if not good:
+        is_valid = False
+    if not is_valid:
         raise Problem(
             ("state_folder",),
-            f"'{folder}' is not valid: a path has no zero byte and no half of a character",
+            f"'{folder}' is not valid: a path has no zero byte and no lone surrogate",
         )
     if str(files.expanded(folder)).startswith("~"):
         user = folder.partition("/")[0].removeprefix("~")
-        why = f"no user here is '{user}'" if user else "this user has no home"
+        why = f"this machine has no user '{user}'" if user else "this user has no home"
         raise Problem(
             ("state_folder",),
-            f"'{folder}' is not valid: {why}; write it out, such as /var/lib/fishd",
+            f"'{folder}' is not valid: {why}; write the full path, such as /var/lib/fishd",
         )
 
 
 def check_neutral(servo: ServoSettings) -> None:
-    """Neutral has a pulse."""
+    """Check that neutral has a valid pulse."""
     low, high = pulses.reach(servo)
     if not low <= 0.0 <= high:
         raise Problem(
@@ -94,7 +94,7 @@ def check_neutral(servo: ServoSettings) -> None:
 
 
 def check_pulses(servo: ServoSettings, amplitude: float) -> None:
-    """Pulse widths permit what Φ [rad] and the soft limits do; who wants less says so by those."""
+    """Check that pulse widths permit all angles that Φ [rad] and the soft limits permit."""
     wanted = max(servo.lowest, -amplitude), min(servo.highest, amplitude)
     possible = pulses.pulse_reach(servo)
     if (
@@ -107,63 +107,63 @@ def check_pulses(servo: ServoSettings, amplitude: float) -> None:
     lowest, highest = pulses.MIN_PULSE_US - below, pulses.MAX_PULSE_US - above
     if lowest > highest:
         key = "scale"
-        most = (pulses.MAX_PULSE_US - pulses.MIN_PULSE_US) / (wanted[1] - wanted[0])
-        right = f"at most {math.floor(most)} µs/rad"
+        largest = (pulses.MAX_PULSE_US - pulses.MIN_PULSE_US) / (wanted[1] - wanted[0])
+        remedy = f"at most {math.floor(largest)} µs/rad"
     else:
         key = "trim" if servo.trim else "centre"
-        right = f"centre + trim from {math.ceil(lowest)} to {math.floor(highest)} µs"
-    less = min(
+        remedy = f"centre + trim from {math.ceil(lowest)} to {math.floor(highest)} µs"
+    amplitude_reach = min(
         end for end, angle in zip(map(abs, possible), map(abs, wanted), strict=True) if end < angle
     )
-    smaller = f", or an amplitude_limit of at most {math.floor(less * 1e3) / 1e3:g} rad"
+    smaller = f", or an amplitude_limit of at most {math.floor(amplitude_reach * 1e3) / 1e3:g} rad"
     raise Problem(
         ("servo", key),
         f"{getattr(servo, key):g} is not valid: angles from {wanted[0]:+.4g} to {wanted[1]:+.4g} "
         f"rad would need pulses of {neutral + below:.0f} to {neutral + above:.0f} µs, beyond 500 "
-        f"to 2500 µs; {right} is needed" + (smaller if less >= 1e-3 else ""),
+        f"to 2500 µs; {remedy} is needed" + (smaller if amplitude_reach >= 1e-3 else ""),
     )
 
 
 def check_pins(claims: Mapping[str, Iterable[Claim]], panel: PanelSettings) -> None:
-    """No pin has two jobs. claims: those of the drivers, by their sections"""
-    wanted = [
+    """Check that no pin is used twice. claims: claims of the drivers, by section"""
+    uses = [
         (section, claim.key, pin, claim.what, f"{section}.{claim.key}")
-        for section, found in claims.items()
-        for claim in found
+        for section, section_claims in claims.items()
+        for claim in section_claims
         for pin in claim.pins
     ]
     for key, pin in (("estop_gpio", panel.estop_gpio), ("led_gpio", panel.led_gpio)):
         if pin is not None:
-            wanted.append(("panel", key, pin, key, f"panel.{key}"))
-    jobs: dict[int, tuple[str, str]] = {}
-    for section, key, pin, what, job in wanted:
-        taken, by = jobs.setdefault(pin, (what, job))
-        if taken != what:  # else two drivers are on one bus
-            raise Problem((section, key), f"GPIO {pin} is taken by {by} already")
+            uses.append(("panel", key, pin, key, f"panel.{key}"))
+    users: dict[int, tuple[str, str]] = {}
+    for section, key, pin, what, user in uses:
+        first_what, first_user = users.setdefault(pin, (what, user))
+        if first_what != what:  # otherwise two drivers share a bus
+            raise Problem((section, key), f"GPIO {pin} is already used by {first_user}")
 
 
 def check_i2c_addresses(settings: Mapping[str, Any]) -> None:
-    """No two chips have the same address. settings: of the drivers, by their sections"""
-    taken: dict[tuple[int, int], str] = {}
-    for section, each in settings.items():
-        bus, address = (getattr(each, key, None) for key in ("bus", "address"))
+    """Check that no two chips have the same address. settings: those of the drivers, by section"""
+    sections: dict[tuple[int, int], str] = {}
+    for section, driver_settings in settings.items():
+        bus, address = (getattr(driver_settings, key, None) for key in ("bus", "address"))
         if isinstance(bus, int) and isinstance(address, int):
-            by = taken.setdefault((bus, address), section)
-            if by != section:
+            first_section = sections.setdefault((bus, address), section)
+            if first_section != section:
                 raise Problem(
                     (section, "address"),
-                    f"{address:#04x} on /dev/i2c-{bus} is that of {by} already: each chip needs "
-                    "an address of its own",
+                    f"{address:#04x} on /dev/i2c-{bus} is already the address of {first_section}: "
+                    "each chip needs a different address",
                 )
 
 
 def check_lockstep(robot: str, lockstep: bool) -> None:
-    """Lockstep needs a simulated fish: only its time can stand still."""
+    """Check that lockstep is used only with a simulated fish, whose time can stand still."""
     if lockstep and robot == "swimmer":
         raise Problem(
             ("lockstep",),
-            "true is not valid with robot: swimmer, whose time is virtual anyway: its ticks wait "
-            "for an agent of remote; false is needed",
+            "true is not valid with robot: swimmer, whose time is always virtual and whose ticks "
+            "wait for the agent of remote; false is needed",
         )
     if lockstep and robot != "simulated":
         raise Problem(
@@ -174,30 +174,30 @@ def check_lockstep(robot: str, lockstep: bool) -> None:
 
 
 def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
-    """An observer needs a model of the fish that swims, and a sensor has to be there."""
+    """Check that an observer has a model of the fish, and that a fin sensor exists."""
     if (robot, kind) == ("swimmer", "observer"):
         raise Problem(
             ("estimator", "kind"),
-            "observer is not valid with robot: swimmer, since it believes in a tethered fish; "
+            "observer is not valid with robot: swimmer, since its model is of a tethered fish; "
             "sensor or lateral_force is needed",
         )
     if kind == "sensor" and robot != "swimmer":
         raise Problem(
             ("estimator", "kind"),
-            f"sensor is not valid with robot: {robot}, which has no sensor of its fin; "
+            f"sensor is not valid with robot: {robot}, which has no fin sensor; "
             "lateral_force or observer is needed",
         )
     if kind == "observer" and robot == "pi" and plant == PlantParameters():
         raise Problem(
             ("estimator", "kind"),
-            "observer needs a model of this fish, and section plant is not given; 'fishctl "
-            "identify' writes it",
+            "observer needs a model of this fish, but section plant is not set; run 'fishctl "
+            "identify' to write it",
         )
 
 
 def check_swimmer(swimmer: SwimmerSettings, tick: float) -> None:
-    """It can be computed; tick: period of the loop [s]."""
-    from fishd.virtual.swimmer import feasibility  # of which no other robot has any need
+    """Check that a swimmer can be computed; tick: period of the loop [s]"""
+    from fishd.virtual.swimmer import feasibility  # only this robot needs it
 
     feasibility.check(swimmer)
     step = swimmer.numerics.step
@@ -205,19 +205,19 @@ def check_swimmer(swimmer: SwimmerSettings, tick: float) -> None:
     if abs(tick / step - steps) > 1e-6:
         raise Problem(
             ("tick",),
-            f"{tick:g} s is no whole number of steps of swimmer.numerics.step, {step:g} s; "
+            f"{tick:g} s is not a multiple of swimmer.numerics.step, {step:g} s; "
             f"{steps * step:g} s would be",
         )
-    if steps > MOST_STEPS:
+    if steps > MAX_STEPS_PER_TICK:
         raise Problem(
             ("swimmer", "numerics", "step"),
-            f"{step:g} s makes {steps} steps of a tick, and nothing answers meanwhile: at most "
-            f"{MOST_STEPS} are possible",
+            f"{step:g} s makes {steps} steps in a tick, during which fishd answers no request: at "
+            f"most {MAX_STEPS_PER_TICK} are possible",
         )
 
 
 def check_virtual_pi(pi: VirtualPiSettings) -> None:
-    """The virtual Pi can be built."""
+    """Check that the virtual Pi can be built."""
     if pi.socket is not None:
         if not pi.socket:
             raise Problem(("virtual_pi", "socket"), "'' is not valid: a path or null is needed")
@@ -230,6 +230,4 @@ def check_virtual_pi(pi: VirtualPiSettings) -> None:
     if pi.servo_scale == 0.0:
         raise Problem(("virtual_pi", "servo_scale"), "0 is not valid: the servo would not turn")
     if pi.channel_x == pi.channel_y:
-        raise Problem(
-            ("virtual_pi", "channel_y"), f"'{pi.channel_y}' is what channel_x is wired to"
-        )
+        raise Problem(("virtual_pi", "channel_y"), f"'{pi.channel_y}' is already channel_x")

@@ -1,6 +1,6 @@
-"""The sections whose keys depend on a name: `force_sensor`, `servo`, `power_meter` and `plant`.
+"""Sections whose keys depend on a name: `force_sensor`, `servo`, `power_meter` and `plant`.
 
-The name is that of a driver, or of the plant that swims; packages beside fishd may offer others.
+The name is that of a driver, or of the plant; other packages may add drivers and plants.
 """
 
 import math
@@ -26,18 +26,18 @@ from fishd.virtual.plant.registry import PLANTS
 
 
 class Choice(NamedTuple):
-    """What a section may be about."""
+    """Section whose keys depend on a name."""
 
     plugins: Plugins[Any]
-    """Where it is found by name."""
+    """Registry of the drivers or plants."""
     default: str | None
-    """None: the section may be left out."""
+    """Default name; None if the section may be left out."""
     settings: type[Struct]
-    """The keys with the default; without one, those that all have."""
+    """Struct of the keys with the default name; without a default, of the common keys."""
     key: str
-    """The key that names it."""
+    """Key that contains the name."""
     page: str
-    """Page in docs/how-to/ about how to write another one."""
+    """Page in docs/how-to/ on how to write a driver or plant."""
 
 
 CHOICES = {
@@ -48,62 +48,62 @@ CHOICES = {
     "power_meter": Choice(POWER_METERS, None, PowerMeterSettings, "driver", "writing-a-driver.md"),
     "plant": Choice(PLANTS, TETHERED, PlantParameters, "model", "writing-a-plant.md"),
 }
-"""By section."""
+"""Choices by section."""
 VIRTUAL_PI = {"force_sensor": "ads1115", "servo": "pigpio", "power_meter": "ina219' or 'ina226"}
-"""What a virtual Pi has, by their drivers."""
+"""Drivers of the hardware of a virtual Pi, by section."""
 
 
-class Chosen(NamedTuple):
-    """The settings of each section, of its driver."""
+class DriverSettings(NamedTuple):
+    """Settings of the driver in each section."""
 
     force_sensor: ForceSensorSettings
     servo: ServoSettings
     power_meter: PowerMeterSettings | None
 
     def sections(self) -> dict[str, Any]:
-        """Those that there are, by name."""
-        return {name: found for name, found in self._asdict().items() if found is not None}
+        """Return the sections that are not None, by name."""
+        return {name: section for name, section in self._asdict().items() if section is not None}
 
 
 def convert_sections(
     data: Mapping[str, Any], elsewhere: Callable[[], list[str]] = list
 ) -> dict[str, Any]:
-    """These sections of a configuration, each with the keys that it then has; raises `Problem`.
+    """Return these sections of a configuration, converted and validated; raise `Problem`.
 
-    elsewhere: gives keys of other sections to suggest, in dotted form
+    elsewhere: function that returns keys of other sections as suggestions, in dotted form
     """
     return {name: _convert(name, data.get(name), elsewhere) for name in CHOICES}
 
 
 def driver_of(section: str, name: str) -> type[Any]:
-    """The driver or plant of that name; raises `Problem` that lists those there are."""
+    """Return the driver or plant of that name; raise `Problem`, which lists those installed."""
     plugins, key = CHOICES[section].plugins, CHOICES[section].key
     if not plugins.has(name):
-        close = nearest(name, plugins.names())
-        meant = f", {close}" if close.startswith("did") else ""
+        hint = nearest(name, plugins.names())
+        suggestion = f", {hint}" if hint.startswith("did") else ""
         raise Problem(
             (section, key),
-            f"no {plugins.kind} is named '{text.quoted(name)}'{meant}; installed: "
-            f"{', '.join(plugins.names())}; for another one, install its package beside fishd",
+            f"no {plugins.kind} is named '{text.quoted(name)}'{suggestion}; installed: "
+            f"{', '.join(plugins.names())}; for another one, install its package",
         )
     try:
-        found: type[Any] = plugins.find(name)
+        plugin: type[Any] = plugins.find(name)
     except (UnknownDriver, UnknownPlant) as error:
         raise Problem((section, key), str(error)) from None
-    return found
+    return plugin
 
 
 def settings_of_drivers(section: str) -> dict[str, type[Struct]]:
-    """The settings of each driver or plant that loads, by its name."""
-    found: dict[str, type[Struct]] = {}
+    """Return the settings class of each driver or plant that loads, by name."""
+    structs: dict[str, type[Struct]] = {}
     for name in CHOICES[section].plugins.names():
         with suppress(Problem):
-            found[name] = _settings(section, name)
-    return found
+            structs[name] = _settings(section, name)
+    return structs
 
 
 def keys() -> list[str]:
-    """The keys of all drivers and plants that load, in dotted form."""
+    """Return the keys of all drivers and plants that load, in dotted form."""
     return [
         f"{section}.{field.name}"
         for section in CHOICES
@@ -112,14 +112,14 @@ def keys() -> list[str]:
     ]
 
 
-def check_drivers(robot: str, tick: float, chosen: Chosen) -> None:
-    """What each driver itself demands of its settings, and that the robot has its hardware.
+def check_drivers(robot: str, tick: float, driver_settings: DriverSettings) -> None:
+    """Check the settings of each driver with the driver, and that the robot has its hardware.
 
     tick: period of the loop [s]
     """
-    if robot in ("simulated", "swimmer"):  # whose loop may be faster than any hardware
+    if robot in ("simulated", "swimmer"):  # their loop may be faster than the hardware permits
         tick = math.inf
-    for section, settings in chosen.sections().items():
+    for section, settings in driver_settings.sections().items():
         driver: type[Driver[Any]] = driver_of(section, settings.driver)
         if robot == "virtual-pi" and not driver.on_virtual_pi:
             raise Problem(
@@ -131,20 +131,20 @@ def check_drivers(robot: str, tick: float, chosen: Chosen) -> None:
 
 
 def check_plant(plant: PlantParameters) -> None:
-    """What a plant of another package itself demands of its parameters."""
+    """Check the parameters of a plant of another package with that plant."""
     if plant.model == TETHERED:
         return
     _check("plant", plant.model, partial(driver_of("plant", plant.model).check, plant))
     try:
         hash(plant)
     except TypeError:
-        what = f"plant '{plant.model}' has keys that no two fish can be compared by: numbers, "
+        what = f"plant '{plant.model}' has keys that cannot be compared between fish: numbers, "
         raise Problem(("plant",), what + "texts and tuples are needed") from None
 
 
-def _check(section: str, name: str, demands: Callable[[], None]) -> None:
+def _check(section: str, name: str, check: Callable[[], None]) -> None:
     try:
-        contained(demands)
+        contained(check)
     except Problem as problem:
         raise Problem((section, *problem.path), str(problem)) from None
     except Exception as error:
@@ -153,18 +153,18 @@ def _check(section: str, name: str, demands: Callable[[], None]) -> None:
         raise Problem((section,), what) from error
 
 
-def claims_of(chosen: Chosen) -> dict[str, tuple[Claim, ...]]:
-    """What the drivers use alone, by their sections."""
+def claims_of(driver_settings: DriverSettings) -> dict[str, tuple[Claim, ...]]:
+    """Return the claims of the drivers, by section."""
     return {
         section: driver_of(section, settings.driver).claims(settings)
-        for section, settings in chosen.sections().items()
+        for section, settings in driver_settings.sections().items()
     }
 
 
 def _settings(section: str, name: str) -> type[Struct]:
-    """The keys of a section with this driver or plant; raises `Problem`."""
+    """Return the settings class of a driver or plant; raise `Problem`."""
     choice = CHOICES[section]
-    if name == choice.default:  # which is not loaded for that: plants bring numpy
+    if name == choice.default:  # do not load the default for this: plants import numpy
         return choice.settings
     settings: type[Struct] = driver_of(section, name).Settings
     return settings
@@ -187,13 +187,13 @@ def _convert(section: str, data: Any, elsewhere: Callable[[], list[str]]) -> Any
         return convert({**data, key: name}, target, prefix=(section,), elsewhere=elsewhere)
     except UnknownKey as problem:
         unknown = problem.path[-1]
-        having = [
+        names = [
             other
             for other, struct in settings_of_drivers(section).items()
             if any(field.name == unknown for field in fields_of(struct))
         ]
-        if not having:
+        if not names:
             raise
-        others = ", ".join(having)
+        others = ", ".join(names)
         message = f"unknown key with {key} {name}; {key}s that have it: {others}"
         raise UnknownKey(problem.path, message) from None

@@ -1,6 +1,6 @@
-"""All mistakes of a configuration, where `load` stops at the first.
+"""Search for all mistakes of a configuration; `load` stops at the first.
 
-Each mistake is repaired, by leaving its key out, until none is left.
+Each key with a mistake is left out, until the rest is valid.
 """
 
 import math
@@ -23,7 +23,7 @@ MAX_MISTAKES = 100
 def find(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> list[str]:
     """Return every mistake of a file with its overrides, each as `load` would report it.
 
-    Empty where `load` accepts the file. What no value at all can be read from is one mistake.
+    Empty if `load` accepts the file. A file from which no value can be read is one mistake.
     """
     mistakes: list[str] = []
     try:
@@ -41,25 +41,25 @@ def find(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> list[st
 
 
 class _Repair:
-    """A configuration whose mistakes are noted and left out."""
+    """Configuration whose mistakes are collected and left out."""
 
     def __init__(self, data: dict[str, Any]) -> None:
         self.problems: list[Problem] = []
         self._data = data
-        if (config := self._converted()) is None:
+        if (config := self._convert()) is None:
             return
-        # Another key of such a section may be right with the value that was meant.
+        # Another key of such a section may be valid with the right value of the wrong key.
         unsure = {problem.path[:1] for problem in self.problems}
         for check in configuration.CHECKS:
-            while config is not None and (problem := _problem_of(check, config)):
+            while config is not None and (problem := _find_problem(check, config)):
                 if problem.path[:1] not in unsure:
                     self.problems.append(problem)
                 if not self._leave_out(problem.path):
                     break
-                config = self._converted()
+                config = self._convert()
 
-    def _converted(self) -> Config | None:
-        """Return what is left, or None where that is still not valid."""
+    def _convert(self) -> Config | None:
+        """Return the rest of the configuration, or None if it is still not valid."""
         while len(self.problems) <= MAX_MISTAKES:
             try:
                 return configuration.convert_sections(without_empty_sections(self._data, Config))
@@ -89,7 +89,7 @@ def _line(mistake: str) -> float:
     return int(match[1]) if match else math.inf
 
 
-def _problem_of(check: configuration.Check, config: Config) -> Problem | None:
+def _find_problem(check: configuration.Check, config: Config) -> Problem | None:
     try:
         check(config)
     except Problem as problem:

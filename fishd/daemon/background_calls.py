@@ -1,4 +1,4 @@
-"""Calls in threads of their own: they load files, may never return, and hold up no tick."""
+"""Calls in separate threads: they may load files or never return, and delay no tick."""
 
 import asyncio
 import os
@@ -12,34 +12,34 @@ from fishd.core.foreign_code import Attempt
 
 T = TypeVar("T")
 
-MOST_AT_ONCE = 4
-"""Calls that may be under way, each in a thread of its own."""
-MOST_GIVEN_UP = 8
-"""Threads of calls that were given up and do not end; with more, no call begins."""
+MAX_CALLS = 4
+"""Largest number of calls that run at the same time, each in a separate thread."""
+MAX_ABANDONED_CALLS = 8
+"""Number of abandoned calls that still run, from which on no call is started."""
 
 
 class BackgroundCalls:
-    """Makes calls in threads, and gives up those that take too long.
+    """Calls in threads, which are abandoned if they take too long.
 
-    The interpreter does not wait for these threads when it ends, as it does for asyncio's own.
+    The interpreter does not wait for these threads when it ends, as it does for those of asyncio.
     """
 
-    def __init__(self, patience: float) -> None:
-        """patience: how long a call may take [s]"""
-        self.patience = patience
-        self._under_way = 0
-        self._given_up: list[Attempt[Any]] = []
+    def __init__(self, timeout: float) -> None:
+        """timeout: longest time of a call [s]"""
+        self.timeout = timeout
+        self._running = 0
+        self._abandoned: list[Attempt[Any]] = []
 
     def check_busy(self) -> None:
-        """Raises `Refused` while too many calls are under way, or would not end."""
-        if self._under_way >= MOST_AT_ONCE:
-            raise Refused("busy", f"{self._under_way} requests are reading files; try again")
-        self._given_up = [attempt for attempt in self._given_up if attempt.alive]
-        if len(self._given_up) >= MOST_GIVEN_UP:
+        """Raise `Refused` while too many calls are running or do not end."""
+        if self._running >= MAX_CALLS:
+            raise Refused("busy", f"{self._running} requests are reading files; try again")
+        self._abandoned = [attempt for attempt in self._abandoned if attempt.alive]
+        if len(self._abandoned) >= MAX_ABANDONED_CALLS:
             raise Refused(
                 "busy",
-                f"{len(self._given_up)} calls that were given up, of controllers mostly, still "
-                "run; restart fishd",
+                f"{len(self._abandoned)} abandoned calls, mostly of controllers, still run; "
+                "restart fishd",
             )
 
     async def call(
@@ -50,52 +50,54 @@ class BackgroundCalls:
         *,
         interrupt: bool = True,
     ) -> T:
-        """What the function returns or raises.
+        """Call a function in a thread; return what it returns, or raise what it raises.
 
-        complaint: begins the message when it takes too long, such as `'chirp' has not loaded`
-        late: takes the result of a call that returns after it was given up
-        interrupt: as for `Attempt`
-        Raises `Refused`: busy as `check_busy` says, too-slow for a call that takes too long. It is
-        given up then, and likewise where this coroutine is cancelled.
+        complaint: start of the message if it takes too long, such as `'chirp' has not loaded`
+        late: function that takes the result of an abandoned call that returns after all
+        interrupt: that of `Attempt`
+        Raises `Refused`: busy as in `check_busy`, too-slow for a call that takes too long. Such a
+        call is abandoned, and so is a call whose coroutine is cancelled.
         """
         self.check_busy()
         events = asyncio.get_running_loop()
-        news = asyncio.Event()
+        is_done = asyncio.Event()
 
         def done() -> None:
-            with suppress(RuntimeError):  # the loop is closed: nobody waits any more
-                events.call_soon_threadsafe(news.set)
+            with suppress(RuntimeError):  # the asyncio loop is closed
+                events.call_soon_threadsafe(is_done.set)
 
-        work = partial(_kept_running, function)
+        work = partial(_run_with_priority, function)
         attempt = Attempt(work, done=done, late=late, interrupt=interrupt)
-        self._under_way += 1
+        self._running += 1
         try:
-            async with asyncio.timeout(self.patience):
-                await news.wait()
+            async with asyncio.timeout(self.timeout):
+                await is_done.wait()
         except TimeoutError:
-            pass  # unless it is done just now
+            pass  # the call may still end just now
         finally:
-            self._under_way -= 1
+            self._running -= 1
             if attempt.give_up():
-                self._given_up.append(attempt)
+                self._abandoned.append(attempt)
         if not attempt.wait(0.0):
-            raise Refused("too-slow", f"{complaint} within {self.patience:g} s; it is given up")
+            raise Refused(
+                "too-slow", f"{complaint} within {self.timeout:g} s; the call is abandoned"
+            )
         return attempt.result()
 
     def dispose(self, function: Callable[[], Any]) -> None:
-        """Make a call that nobody waits for, such as the `close` of an unused controller."""
-        self._given_up.append(Attempt(function))
+        """Start a call without waiting for it, such as the `close` of an unused controller."""
+        self._abandoned.append(Attempt(function))
 
 
-def _kept_running(function: Callable[[], T]) -> T:
-    """Call it at the lowest FIFO priority, where the thread that ticks has a FIFO priority.
+def _run_with_priority(function: Callable[[], T]) -> T:
+    """Call a function at the lowest FIFO priority if the thread that ticks has a FIFO priority.
 
-    A thread that holds the interpreter must not be preempted by ordinary programs: the tick would
-    have to wait for it. On a single core the kernel's limit for real-time threads would hold up
-    both, which is worse.
+    A thread that holds the interpreter must not be preempted by ordinary programs, because the tick
+    would have to wait for it. On a single core the priority stays normal: the kernel's limit for
+    real-time threads would delay both, which is worse.
     """
-    ticks = os.sched_getscheduler(os.getpid()) & ~os.SCHED_RESET_ON_FORK
-    if ticks == os.SCHED_FIFO and len(os.sched_getaffinity(0)) > 1:
+    policy_of_ticks = os.sched_getscheduler(os.getpid()) & ~os.SCHED_RESET_ON_FORK
+    if policy_of_ticks == os.SCHED_FIFO and len(os.sched_getaffinity(0)) > 1:
         with suppress(OSError):
             policy, lowest = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1)
             os.sched_setscheduler(0, policy, lowest)

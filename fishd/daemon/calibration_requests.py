@@ -1,4 +1,4 @@
-"""What can be asked about calibrations: measure, tare, and apply another one."""
+"""Requests about calibrations: measure, tare, and apply another calibration."""
 
 import asyncio
 import datetime
@@ -36,31 +36,31 @@ from fishd.daemon.trial_calibration import (
 )
 from fishd.hardware.calibration_files import CalibrationFolder, check
 
-MOST_SAMPLES = 4
-"""Samples of the force that may be taken at once: each adds to every read of the sensor."""
-_LOOK = 0.05
-"""Time between two looks at whether a controller has been started meanwhile [s]."""
-_GLANCE = 0.2
-"""How long the present force is looked at before another calibration is applied [s]."""
+MAX_CONCURRENT_SAMPLES = 4
+"""Largest number of force samples taken at once; each adds work to every read of the sensor."""
+_CHECK_PERIOD_S = 0.05
+"""Time between two checks whether a controller has been started [s]."""
+_FORCE_CHECK_S = 0.2
+"""Time for which the present force is measured before another calibration is applied [s]."""
 
 Handlers = dict[str, Callable[[Any], Awaitable[Any]]]
-"""What answers, by the name of an operation; `protocol.OPERATIONS` says what its arguments are."""
+"""Handlers of requests by name of the operation; `protocol.OPERATIONS` lists the arguments."""
 
 
 class CalibrationRequests:
-    """Answers the requests about calibrations; a simulated fish can only be tared."""
+    """Handler of the requests about calibrations; a simulated fish can only be tared."""
 
     def __init__(self, loop: ControlLoop, clock: Clock, config: Config, folder: Path) -> None:
-        """folder: where calibrations are kept"""
+        """folder: folder of the calibration files"""
         self._loop = loop
         self._clock = clock
         self._folder = CalibrationFolder(folder)
         self._sensor = config.force_sensor
         self._changing = asyncio.Lock()
-        """Held while a calibration is replaced: the newest file must be the one that is used."""
+        """Lock held while a calibration is replaced: the newest file must be the one in use."""
         self._servo = TrialCalibration(loop, config.servo, self._changing)
         self._samples: dict[int, tuple[float, ForceSample]] = {}
-        """When each fresh sample was taken, and what it says, by its number."""
+        """Time and content of each fresh sample, by number."""
         self._sampled = 0
         self._sampling = 0
         self._calls = BackgroundCalls(LOADING)
@@ -74,7 +74,7 @@ class CalibrationRequests:
             "calibrate-servo": self._calibrate_servo,
         }
         self.check_startable = self._servo.check_startable
-        """Raises `Refused` while a controller of that name must not take over, under a lease."""
+        """Function that raises `Refused` while a controller must not take over, under a lease."""
 
     @property
     def calibrating(self) -> bool:
@@ -96,19 +96,19 @@ class CalibrationRequests:
             force_limit=self._sensor.force_limit,
         )
 
-    async def _sample_force(self, wanted: SampleForce) -> ForceSample:
+    async def _sample_force(self, request: SampleForce) -> ForceSample:
         sensor = tared_sensor_at_rest(self._loop)
-        if self._sampling >= MOST_SAMPLES:
+        if self._sampling >= MAX_CONCURRENT_SAMPLES:
             raise Refused("busy", f"{self._sampling} samples are being taken; try again")
         watch = sensor.watch()
         self._sampling += 1
         try:
-            await self._rest_for(wanted.seconds)
+            await self._rest_for(request.seconds)
         finally:
             self._sampling -= 1
             sample = watch.close()
         if sample.pairs == 0:
-            raise Refused("no-samples", f"the force sensor gave nothing for {wanted.seconds:g} s")
+            raise Refused("no-samples", f"the force sensor gave nothing for {request.seconds:g} s")
         self._forget_old_samples()
         self._sampled += 1
         sample = msgspec.structs.replace(sample, number=self._sampled)
@@ -118,42 +118,42 @@ class CalibrationRequests:
     async def _rest_for(self, seconds: float) -> None:
         """Wait; raises `Refused` as soon as a controller is active."""
         now = asyncio.get_running_loop().time
-        until = now() + seconds
-        while (left := until - now()) > 0.0:
-            await asyncio.sleep(min(left, _LOOK))
+        end = now() + seconds
+        while (remaining := end - now()) > 0.0:
+            await asyncio.sleep(min(remaining, _CHECK_PERIOD_S))
             tared_sensor_at_rest(self._loop)
 
     def _forget_old_samples(self) -> None:
         oldest = self._clock.monotonic() - FRESH
-        self._samples = {n: taken for n, taken in self._samples.items() if taken[0] >= oldest}
+        self._samples = {n: sample for n, sample in self._samples.items() if sample[0] >= oldest}
 
-    async def _tare(self, wanted: Tare) -> Calibrations:
-        # Of a sample that is there already: who gives up while measuring changes nothing.
-        self._loop.lease.check_free(wanted.lease)
+    async def _tare(self, request: Tare) -> Calibrations:
+        # The sample exists already: a client that gives up while measuring changes nothing.
+        self._loop.lease.check_free(request.lease)
         self._forget_old_samples()
-        if wanted.sample not in self._samples:
+        if request.sample not in self._samples:
             raise Refused(
                 "no-samples",
-                f"there is no sample {wanted.sample} of the last {FRESH:g} s; take another with "
-                "sample-force",
+                f"sample {request.sample} does not exist or is older than {FRESH:g} s; take "
+                "another one with sample-force",
             )
-        _, sample = self._samples[wanted.sample]
+        _, sample = self._samples[request.sample]
         if sample.suspect:
-            raise Refused("suspect", f"the forces are not to be believed: {sample.suspect}")
+            raise Refused("suspect", f"the forces cannot be trusted: {sample.suspect}")
         async with self._changing:
             before = tared_sensor_at_rest(self._loop).calibration
-            restless = max(
+            noise = max(
                 math.hypot(before.xx * sample.vx_std, before.xy * sample.vy_std),
                 math.hypot(before.yx * sample.vx_std, before.yy * sample.vy_std),
             )
-            if restless > self._sensor.still:
+            if noise > self._sensor.still:
                 raise Refused(
                     "not-still",
-                    f"the force varies by {restless * 1e3:.1f} mN rms, more than the "
+                    f"the force varies by {noise * 1e3:.1f} mN rms, more than the "
                     f"{self._sensor.still * 1e3:g} mN of force_sensor.still; wait until the water "
                     "and the fish are still",
                 )
-            # From voltages: another tare since may have changed what they mean.
+            # Use the voltages: another tare may have changed the calibration since.
             fx, fy = before.forces(sample.vx, sample.vy)
             if max(abs(fx), abs(fy)) > self._sensor.tare_limit:
                 raise Refused(
@@ -167,18 +167,18 @@ class CalibrationRequests:
                 msgspec.structs.replace(before, x0=before.x0 - fx, y0=before.y0 - fy, tared=date)
             )
 
-    async def _calibrate_force(self, wanted: CalibrateForce) -> Calibrations:
-        calibration = _sensible(wanted.calibration)
-        self._loop.lease.check_free(wanted.lease)
+    async def _calibrate_force(self, request: CalibrateForce) -> Calibrations:
+        calibration = _check_calibration(request.calibration)
+        self._loop.lease.check_free(request.lease)
         async with self._changing:
             await self._check_present_force(calibration)
             return await self._adopt_force(calibration)
 
     async def _check_present_force(self, calibration: ForceCalibration) -> None:
-        """Of what the sensor says now, the calibration must not make a fault in the next ticks."""
+        """Raise `Refused` if the calibration would turn the present voltages into a fault."""
         watch = calibrated_parts_at_rest(self._loop).sensor.watch()
         try:
-            await asyncio.sleep(_GLANCE)
+            await asyncio.sleep(_FORCE_CHECK_S)
         finally:
             sample = watch.close()
         fx, fy = calibration.forces(sample.vx, sample.vy)
@@ -188,7 +188,7 @@ class CalibrationRequests:
                 "too-large",
                 f"({fx:.4g}, {fy:.4g}) N would be the present force, beyond "
                 f"force_sensor.force_limit, {limit:g} N; were the loads in another unit, such as "
-                "grams? Else take off what pulls at the fish",
+                "grams? If not, remove what pulls at the fish",
             )
 
     async def _adopt_force(self, calibration: ForceCalibration) -> Calibrations:
@@ -198,29 +198,29 @@ class CalibrationRequests:
             calibration, path = await self._save(calibration)
             self._force_file = str(path)
             self._announce("force sensor", path)
-        # The newest file is used from the next start on, so it is now, whatever else began.
+        # Apply it in any case, since the next start will use the newest file.
         sensor.recalibrate(calibration)
         self._loop.forget_force(scale=_matrix(before) != _matrix(calibration))
         return self._used()
 
-    async def _calibrate_servo(self, wanted: CalibrateServo) -> Calibrations:
+    async def _calibrate_servo(self, request: CalibrateServo) -> Calibrations:
         async with self._changing:
-            calibration = _sensible(wanted.calibration)
-            self._servo.check(calibration, wanted.lease, keep=wanted.save)
-            if wanted.save:
+            calibration = _check_calibration(request.calibration)
+            self._servo.check(calibration, request.lease, save=request.save)
+            if request.save:
                 calibration, path = await self._save(calibration)
                 try:
-                    self._servo.check(calibration, wanted.lease, keep=True)
-                except Refused:  # the lease has ended meanwhile, or the fish swims
+                    self._servo.check(calibration, request.lease, save=True)
+                except Refused:  # the lease has ended, or the fish has started to swim
                     with suppress(OSError):
-                        path.unlink()  # not to be used from the next start on
+                        path.unlink()  # the next start must not use it
                     raise
-                self._servo.keep(calibration)
+                self._servo.apply_saved(calibration)
                 self._servo_file = str(path)
                 self._announce("servo", path)
             else:
-                assert wanted.lease
-                self._servo.try_out(calibration, wanted.lease)
+                assert request.lease
+                self._servo.try_out(calibration, request.lease)
             return self._used()
 
     async def _save(self, calibration: C) -> tuple[C, Path]:
@@ -228,8 +228,8 @@ class CalibrationRequests:
             return await self._calls.call(
                 "the calibration has not been written",
                 partial(self._folder.save, calibration, self._date()),
-                late=lambda saved: saved[1].unlink(),  # not to be used from the next start on
-                interrupt=False,  # between the file's coming into being and its name in the result
+                late=lambda saved: saved[1].unlink(),  # the next start must not use it
+                interrupt=False,  # an interrupt could leave a file whose path is not returned
             )
         except ConfigError as error:
             raise Refused("not-saved", str(error)) from None
@@ -239,8 +239,8 @@ class CalibrationRequests:
             ) from None
 
     def _file(self, kind: type[C]) -> str | None:
-        found = self._folder.newest(kind) if self._loop.robot.calibrated else None
-        return str(found[1]) if found else None
+        newest = self._folder.newest(kind) if self._loop.robot.calibrated else None
+        return str(newest[1]) if newest else None
 
     def _date(self) -> datetime.datetime:
         return datetime.datetime.fromtimestamp(self._clock.wall()).astimezone()
@@ -253,8 +253,8 @@ def _matrix(calibration: ForceCalibration) -> tuple[float, ...]:
     return calibration.xx, calibration.xy, calibration.yx, calibration.yy
 
 
-def _sensible(calibration: C) -> C:
-    """The same calibration; raises `Refused` where it is one that a file could not hold."""
+def _check_calibration(calibration: C) -> C:
+    """Return the same calibration; raise `Refused` if it is not valid."""
     try:
         return check(calibration)
     except Problem as problem:

@@ -1,7 +1,7 @@
-"""fishd's own socket for an emergency stop, beside the control socket; it needs no gateway.
+"""Separate socket for an emergency stop, next to the control socket; it needs no gateway.
 
-A client sends the request `estop` there as one datagram where the control socket does not answer.
-The kernel holds few datagrams, each of a limited size, and fishd takes one per tick.
+A client sends the request `estop` there as one datagram if the control socket does not answer. The
+kernel queues only a few datagrams, each of a limited size, and fishd reads one per tick.
 """
 
 import asyncio
@@ -18,14 +18,14 @@ log = logging.getLogger(__name__)
 
 
 class EstopSocket:
-    """A datagram socket that the asyncio loop reads."""
+    """Datagram socket that the asyncio loop reads."""
 
     def __init__(
         self, path: Path, perform: Callable[[bytes], Awaitable[bytes]], period: float
     ) -> None:
-        """Listen at a path beside a socket that is `claimed`, or log why that is not possible.
+        """Listen at a path next to a socket that is `claimed`, or log why that is not possible.
 
-        perform: carries out a request, or refuses it, and returns the reply
+        perform: function that carries out or refuses a request and returns the reply
         period: shortest time between two requests [s]
         """
         self._perform = perform
@@ -39,7 +39,9 @@ class EstopSocket:
             unix_sockets.check_length(str(path))
             unix_sockets.bind(self._socket, path, unix_sockets.GROUP_MASK)
         except (OSError, ValueError) as error:
-            log.warning("%s: an emergency stop needs the control socket: %s", path, error)
+            log.warning(
+                "%s: not available, so an emergency stop needs the control socket: %s", path, error
+            )
             self._stack.close()
             return
         self._stack.callback(path.unlink, missing_ok=True)
@@ -69,5 +71,5 @@ class EstopSocket:
     async def _answer(self, payload: bytes, sender: str | bytes | None) -> None:
         reply = await self._perform(payload)
         if sender:
-            with suppress(OSError):  # the client has gone, or takes nothing
+            with suppress(OSError):  # the client has ended, or does not read
                 self._socket.sendto(reply, sender)

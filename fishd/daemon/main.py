@@ -1,4 +1,4 @@
-"""The daemon: from a configuration to a fish that swims until a signal ends it."""
+"""Daemon: it runs the fish that a configuration describes until a signal ends it."""
 
 import asyncio
 import dataclasses
@@ -43,18 +43,18 @@ from fishd.hardware.servo.pulses import NEUTRAL_TIME_S
 log = logging.getLogger(__name__)
 console = logging.getLogger("console")
 
-FADE_LIMIT = 0.5
-"""Longest time from a signal to exit that fading to neutral may take [s]."""
-STATUS_PERIOD = 1.0
+MAX_FADE_S = 0.5
+"""Longest time of fading to neutral after a signal [s]."""
+STATUS_PERIOD_S = 1.0
 """Time between two status messages [s]."""
 
 
 class Daemon:
-    """Everything that lives as long as the process; use it as a context manager.
+    """All objects that live as long as the process; used as a context manager.
 
-    Raises `StartupError` when an address is in use or the robot's drivers are missing. Whatever
-    happens inside, leaving releases the servo first and lets go of the rest then, each even if
-    another step fails.
+    Raises `StartupError` when an address is in use or the robot's drivers are missing. Leaving the
+    context always releases the servo first and closes the rest afterwards; every step is done even
+    if another step fails.
     """
 
     def __init__(self, config: Config, print_status: bool, file: Path | None = None) -> None:
@@ -82,25 +82,25 @@ class Daemon:
             stack.enter_context(addresses.claimed(address))
             stack.enter_context(addresses.claimed(config.telemetry.address))
             self._gateways = Gateways(address, config.telemetry.address, stack)
-            stack.callback(realtime.leave)  # before they end, after the servo is released
+            stack.callback(realtime.leave)  # before the gateways end, after the servo is released
             self._telemetry = Telemetry(self._gateways.telemetry.send)
             self._mock_ticks = None if self._virtual else mock_ticks(config)
-            controllers = registry.describe_all()  # imports what other packages offer
+            controllers = registry.describe_all()  # imports the controllers of other packages
             if not self._virtual:
-                preload()  # which would hold up the ticks later
+                preload()  # importing it later would delay ticks
             robot = assembly.open_robot(
                 config, self._clock, stack, self._file, addresses.socket_path(address)
             )
             if self._slow:
-                robot = _slowed(robot, self._slow)
+                robot = _with_slow_motion(robot, self._slow)
             self._loop = assembly.build_loop(
                 config, robot, self._clock, self._telemetry, self._ticked
             )
-            if self._virtual:  # programs that hold a lease live in real time
+            if self._virtual:  # the programs that hold a lease run in real time
                 self._loop.lease = Lease(time.monotonic)
             stack.callback(self._loop.close)
             stack.callback(self._release)
-            stack.callback(self._come_to_rest)
+            stack.callback(self._move_to_neutral)
             if robot.panel:
                 robot.panel.on_press = self._on_press
             calibration_requests = CalibrationRequests(
@@ -129,11 +129,11 @@ class Daemon:
         return self
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
-        """Raises `ServoError` when the servo could not be released."""
+        """Release and close everything; raise `ServoError` if the servo could not be released."""
         try:
             self._stack.close()
         except ServoError as failure:
-            if isinstance(error, Exception):  # which the one below takes the place of
+            if isinstance(error, Exception):  # the exception below replaces it
                 log.critical("fishd failed", exc_info=error)
             raise ServoError(
                 f"the servo could not be released and may keep its pulses: {failure}; "
@@ -154,7 +154,7 @@ class Daemon:
         realtime.quiet_garbage_collector()
         if self._slow:
             self._slow.stopping = stopping
-            self._slow.meanwhile = self._between_ticks
+            self._slow.while_waiting = self._between_ticks
         clock = self._clock
         lockstep = (
             Lockstep(self._loop, clock, self._config.tick, self._slow)
@@ -178,37 +178,37 @@ class Daemon:
                 if stopping.is_set():
                     break
             self._notifier.stopping()
-            if self._slow:  # there is no servo, and a fade would take long
+            if self._slow:  # it has no servo to release, and a fade would take long
                 log.info("stopping")
                 return
             log.info("stopping: fading to neutral")
             self._loop.stop()
-            deadline = self._clock.monotonic() + FADE_LIMIT + SETTLE_TIME_S
+            deadline = self._clock.monotonic() + MAX_FADE_S + SETTLE_TIME_S
             async for slot in ticker:
                 if self._loop.has_settled or slot.now > deadline:
                     break
                 self._loop.tick(slot)
-                self._server.ticked()
+                self._server.end_tick()
         finally:
             ticker.close()
 
     def _between_ticks(self) -> None:
-        """Housekeeping, one job at a time, to fit between two ticks of 2 ms."""
-        self._server.ticked()
+        """Do housekeeping, one job at a time, so that it fits between two ticks of 2 ms."""
+        self._server.end_tick()
         now = time.monotonic()
-        if self._virtual:  # a tick may be waited for, until an agent answers or in slow motion
+        if self._virtual:  # the next tick may wait for an agent, or for slow motion
             self._notifier.ticked(now)
             if self._loop.lease.active:
                 self._loop.expire_lease()
         if now >= self._next_housekeeping:
-            self._next_housekeeping = now + STATUS_PERIOD / 2
+            self._next_housekeeping = now + STATUS_PERIOD_S / 2
             next(self._housekeeping)()
 
     def _collect_garbage(self) -> None:
         realtime.collect_garbage(thorough=self._loop.supervisor.mode is not Mode.RUNNING)
 
     def _ticked(self, now: float) -> None:
-        """now: start of the tick, on the loop's clock [s]"""
+        """Notify systemd of a tick; `now` is its start on the loop's clock [s]."""
         self._notifier.ticked(time.monotonic() if self._virtual else now)
 
     def _warm_up(self) -> None:
@@ -216,31 +216,34 @@ class Daemon:
         self._mock_ticks()
         self._loop.warm_up()
 
-    def _come_to_rest(self) -> None:
-        """Where fishd failed and could not fade: neutral, and time to get there."""
+    def _move_to_neutral(self) -> None:
+        """Send neutral and wait until the servo is there, if fishd failed and could not fade."""
         if self._loop.servo.on and self._loop.applied != 0.0:
-            with suppress(Exception):  # closing it comes later, and says what could not be done
+            with suppress(Exception):  # closing the servo comes later, and reports errors
                 servo = self._loop.robot.servo
                 servo.write(0.0)
-                servo.write(0.0)  # a driver that forgives a late answer may not have sent the first
+                servo.write(
+                    0.0
+                )  # a driver that tolerates a late answer may not have sent the first
                 self._clock.sleep(NEUTRAL_TIME_S)
 
     def _release(self) -> None:
-        """Before a controller is closed, which may never return."""
-        with suppress(ServoError):  # closing it comes later, and says what could not be done
+        """Release the servo before a controller is closed, because that may never return."""
+        with suppress(ServoError):  # closing the servo comes later, and reports errors
             self._loop.robot.servo.release()
 
     def release_at_once(self) -> None:
-        """Let go of the servo from another thread, while this one hangs.
+        """Release the servo from another thread, while the main thread hangs.
 
-        Where a countdown ends the pulses it has done so, and the servo is not woken again.
+        If the servo has a countdown, that has ended the pulses already, and they are not started
+        again.
         """
         if self._loop.robot.countdown == math.inf:
-            self._come_to_rest()
+            self._move_to_neutral()
         self._loop.robot.servo.close()
 
     def _on_press(self) -> None:
-        """Called from a thread of the driver; the E-stop does not wait for a tick."""
+        """Stop the fish at once, between ticks; called from a thread of the driver."""
         self._events.call_soon_threadsafe(self._loop.estop, "the E-stop button was pressed")
 
     def _report(self) -> None:
@@ -256,17 +259,17 @@ def _clock(config: Config) -> Clock:
     return VirtualClock() if config.lockstep else SystemClock()
 
 
-def _slowed(robot: Robot, slow: SlowMotion) -> Robot:
-    """The robot, which says of itself that it swims in slow motion."""
+def _with_slow_motion(robot: Robot, slow: SlowMotion) -> Robot:
+    """Return the robot with a line about slow motion in its `degraded`."""
     return dataclasses.replace(robot, degraded=lambda: (*robot.degraded(), slow.degraded()))
 
 
 async def swim(
     config: Config, print_status: bool, shutdown: Shutdown, file: Path | None = None
 ) -> None:
-    """Run a daemon until a signal; one that comes before the servo is touched counts as well.
+    """Run a daemon until a signal, which may also come before the servo is driven.
 
-    file: where the configuration comes from
+    file: file of the configuration
     """
     stopping = asyncio.Event()
     events = asyncio.get_running_loop()
@@ -285,7 +288,7 @@ async def swim(
     "--config",
     "path",
     type=click.Path(path_type=Path, readable=False),
-    help="YAML file; without it, a simulated fish at rest.",
+    help="Configuration file (YAML); without it, a simulated fish at rest.",
 )
 @click.option(
     "--set",
@@ -297,14 +300,14 @@ async def swim(
 @click.option(
     "--print-status/--no-print-status",
     default=None,
-    help="Print a status line a second; by default when standard output is a terminal.",
+    help="Print a status line every second; the default if standard output is a terminal.",
 )
 @click.option(
     "--log-format",
     type=click.Choice(["text", "json"]),
     default="text",
     show_default=True,
-    help="How logs on standard error look.",
+    help="Format of the log on standard error.",
 )
 @click.version_option(__version__, prog_name="fishd")
 def fishd(
@@ -328,17 +331,17 @@ def fishd(
     except FishdError as error:
         log.critical("%s", error)
         return 1
-    except BaseException:  # an exit that nobody has asked for is a failure, too
+    except BaseException:  # an unexpected exit is a failure too
         log.critical("fishd failed; the servo is released", exc_info=True)
         return 1
     finally:
         if shutdown.release:
             logs.close()
-        else:  # it has driven nothing, and why is its only line
+        else:  # fishd has driven nothing, and the log holds only the reason
             logs.close(UNHURRIED)
     return 0
 
 
 def main() -> None:
-    """The `fishd` command."""
+    """Run the `fishd` command."""
     leave(run(fishd, "fishd"))

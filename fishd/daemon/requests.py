@@ -1,4 +1,4 @@
-"""What can be asked of a running daemon: each operation of the control protocol, over one loop."""
+"""Operations of the control protocol on the loop of a running daemon."""
 
 import logging
 import os
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 class Operations:
-    """Answers requests from what the loop knows, and makes changes between its ticks."""
+    """Handlers of the requests, which read the loop's state and change it between its ticks."""
 
     def __init__(
         self,
@@ -45,12 +45,13 @@ class Operations:
         realtime: bool,
         counters: Callable[[], dict[str, int]] = dict,
     ) -> None:
-        """
-        config: what fishd was started with
-        controllers: all that can be made active
-        telemetry: the address that clients are told
-        realtime: does the loop run under SCHED_FIFO?
-        counters: what was survived outside of the robot, since start
+        """Prepare to answer requests.
+
+        config: configuration that fishd was started with
+        controllers: controllers that can be made active
+        telemetry: address of telemetry for clients
+        realtime: whether the loop runs under SCHED_FIFO
+        counters: function that returns the numbers of recovered errors outside of the robot
         """
         self._loop = loop
         self._clock = clock
@@ -64,9 +65,9 @@ class Operations:
         self._started = self._monotonic()
         self._boot = boot_id()
         self._arrivals = 0
-        """How many requests have come that choose the controller."""
+        """Number of requests since start that choose the controller."""
         self._carried_out = 0
-        """The newest of them that was carried out."""
+        """Number of the newest of them that was carried out."""
         self._calls = BackgroundCalls(protocol.LOADING)
         self._controllers = controllers
         self._at_start = set(registry.names())
@@ -74,7 +75,7 @@ class Operations:
             "status": self._status,
             "controllers": self._list_controllers,
             "policies": self._list_policies,
-            "config": self._tell_config,
+            "config": self._get_config,
             "set-controller": self._set_controller,
             "set-parameter": self._set_parameter,
             "stop": self._stop,
@@ -89,7 +90,7 @@ class Operations:
         }
 
     async def perform(self, op: str, args: dict[str, Any]) -> Any:
-        """Do what a request asks for and return its result; raises `Refused`."""
+        """Carry out a request and return its result; raise `Refused` if that is not possible."""
         if op not in self._handlers:
             hint = nearest(op, list(self._handlers))
             raise Refused("unknown-op", f"no such op '{text.quoted(op)}'; {hint}")
@@ -101,7 +102,7 @@ class Operations:
         return await self._handlers[op](arguments)
 
     def status(self) -> Status:
-        """The daemon in one snapshot."""
+        """Return a snapshot of the daemon's state."""
         loop = self._loop
         observation = loop.observation
         thrust, error = loop.known_thrust
@@ -174,39 +175,39 @@ class Operations:
         describe = partial(library.describe_all, limits.tick, limits.amplitude)
         return await self._calls.call("the policy files have not been read", describe)
 
-    async def _tell_config(self, _: protocol.NoArguments) -> Config:
+    async def _get_config(self, _: protocol.NoArguments) -> Config:
         return self._config
 
-    async def _set_controller(self, wanted: protocol.SetController) -> State:
-        self._loop.supervisor.check_startable()  # before it is loaded in vain
-        self._calibrations.check_startable(wanted.name, wanted.lease)
-        self._renew(wanted.lease)
+    async def _set_controller(self, request: protocol.SetController) -> State:
+        self._loop.supervisor.check_startable()  # before loading it in vain
+        self._calibrations.check_startable(request.name, request.lease)
+        self._renew(request.lease)
         self._calls.check_busy()
         arrival = self._arrive()
-        controller = await self._load(wanted)
-        if arrival < self._carried_out:  # one that loads slowly must not undo a newer one
+        controller = await self._load(request)
+        if arrival < self._carried_out:  # a slow request must not undo a newer one
             self._dispose(controller)
             raise Refused(
-                "superseded", f"while '{wanted.name}' was loading, a newer request was carried out"
+                "superseded", f"while '{request.name}' was loading, a newer request was carried out"
             )
         try:
-            self._calibrations.check_startable(wanted.name, wanted.lease)
-            self._renew(wanted.lease)
-            self._loop.set_controller(wanted.name, controller)
-        except Exception as error:  # a fault since, a calibration, or parameters that it has lost
+            self._calibrations.check_startable(request.name, request.lease)
+            self._renew(request.lease)
+            self._loop.set_controller(request.name, controller)
+        except Exception as error:  # such as a fault or a calibration since, or missing parameters
             self._dispose(controller)
-            raise _refusal(wanted.name, "cannot start", error) from error
+            raise _refusal(request.name, "cannot start", error) from error
         self._carried_out = arrival
         self._loop.lease.drives = True
-        return self._state(self._end_unless(wanted.lease, f"{wanted.name} was set by hand"))
+        return self._state(self._end_unless(request.lease, f"{request.name} was set by hand"))
 
     def _renew(self, lease: str | None) -> None:
-        """Renew the lease that a request names; raises `Refused` where it has ended."""
+        """Renew the lease that a request names; raise `Refused` if it has ended."""
         if lease is not None:
             self._loop.lease.renew(lease)
 
     def _end_unless(self, lease: str | None, why: str) -> LeaseHolder | None:
-        """End the lease that there is, where a request by hand names none; returns its holder."""
+        """End the present lease for a request without a lease; return the lease's former holder."""
         if lease is not None:
             return None
         former = self._loop.lease.end(why)
@@ -218,26 +219,26 @@ class Operations:
         name, host, pid = holder.name, holder.host, holder.pid
         self._loop.reporter.event("lease", message, lease=what, name=name, host=host, pid=pid)
 
-    async def _take_lease(self, wanted: protocol.TakeLease) -> Grant:
+    async def _take_lease(self, request: protocol.TakeLease) -> Grant:
         loop = self._loop
         loop.supervisor.check_startable()
-        if not wanted.take:
+        if not request.take:
             loop.lease.check_free()
-        former = self._end_unless(None, f"{wanted.name} took the fish")
+        former = self._end_unless(None, f"{request.name} took the fish")
         if former and loop.lease.drives:
             loop.stop()
-        seconds = wanted.seconds or self._config.control.lease
-        token = loop.lease.take(wanted.name, wanted.host, wanted.pid, seconds)
+        seconds = request.seconds or self._config.control.lease
+        token = loop.lease.take(request.name, request.host, request.pid, seconds)
         if holder := loop.lease.holder:
             self._announce("taken", holder, f"{holder} takes the fish")
         return Grant(token, seconds, former)
 
-    async def _renew_lease(self, wanted: protocol.HeldLease) -> State:
-        self._loop.lease.renew(wanted.lease)
+    async def _renew_lease(self, request: protocol.HeldLease) -> State:
+        self._loop.lease.renew(request.lease)
         return self._state()
 
-    async def _end_lease(self, wanted: protocol.HeldLease) -> State:
-        self._loop.lease.renew(wanted.lease)
+    async def _end_lease(self, request: protocol.HeldLease) -> State:
+        self._loop.lease.renew(request.lease)
         self._carried_out = self._arrive()
         former = self._loop.lease.end(RETURN_REASON)
         if self._loop.lease.drives:
@@ -246,25 +247,27 @@ class Operations:
             self._announce("returned", former, f"{former} gives the fish back")
         return self._state()
 
-    async def _load(self, wanted: protocol.SetController) -> Controller[Any]:
-        create = partial(registry.create, wanted.name, wanted.parameters, self._loop.limits)
-        new = wanted.name not in self._at_start
-        if new:
-            create = partial(_create_newly_installed, wanted.name, create)
+    async def _load(self, request: protocol.SetController) -> Controller[Any]:
+        create = partial(registry.create, request.name, request.parameters, self._loop.limits)
+        is_new = request.name not in self._at_start
+        if is_new:
+            create = partial(_create_newly_installed, request.name, create)
         try:
-            found = await self._calls.call(f"'{wanted.name}' has not loaded", create, late=_close)
+            controller = await self._calls.call(
+                f"'{request.name}' has not loaded", create, late=_close
+            )
         except Exception as error:
-            raise _refusal(wanted.name, "cannot start", error) from error
-        if new and wanted.name not in (info.name for info in self._controllers):
-            self._controllers.append(registry.describe(wanted.name))
+            raise _refusal(request.name, "cannot start", error) from error
+        if is_new and request.name not in (info.name for info in self._controllers):
+            self._controllers.append(registry.describe(request.name))
             self._controllers.sort(key=lambda info: info.name)
-        return found
+        return controller
 
-    async def _set_parameter(self, wanted: protocol.SetParameter) -> State:
+    async def _set_parameter(self, request: protocol.SetParameter) -> State:
         loop = self._loop
         loop.supervisor.check_startable()
-        self._calibrations.check_startable(loop.active.name, wanted.lease)
-        self._renew(wanted.lease)
+        self._calibrations.check_startable(loop.active.name, request.lease)
+        self._renew(request.lease)
         if loop.supervisor.mode is not Mode.RUNNING:
             raise Refused(
                 "not-running",
@@ -272,7 +275,7 @@ class Operations:
                 "start one with 'fishctl set-controller'",
             )
         try:
-            loop.active.retune(contained(self._retuned, wanted.parameters))
+            loop.active.retune(contained(self._retuned, request.parameters))
         except Exception as error:
             raise _refusal(loop.active.name, "refused", error) from error
         return self._state()
@@ -280,7 +283,7 @@ class Operations:
     def _retuned(self, values: dict[str, Any]) -> Struct:
         loop = self._loop
         for field in fields_of(loop.active.controller.Parameters):
-            if field.file and field.name in values:  # no tick waits for a file
+            if field.file and field.name in values:  # a tick must not wait for a file
                 name, option = loop.active.name, field.name.replace("_", "-")
                 raise ParameterError(
                     f"{name}: {field.name}: it cannot change in flight; start the controller "
@@ -288,16 +291,16 @@ class Operations:
                 )
         return registry.merged(loop.active.controller, loop.active.name, values)
 
-    async def _stop(self, wanted: protocol.Stop) -> State:
-        self._renew(wanted.lease)
+    async def _stop(self, request: protocol.Stop) -> State:
+        self._renew(request.lease)
         self._carried_out = self._arrive()
-        former = self._end_unless(wanted.lease, "the fish was stopped by hand")
+        former = self._end_unless(request.lease, "the fish was stopped by hand")
         self._loop.stop()
         return self._state(former)
 
-    async def _estop(self, wanted: protocol.Estop) -> State:
+    async def _estop(self, request: protocol.Estop) -> State:
         self._carried_out = self._arrive()
-        self._loop.estop(wanted.message)
+        self._loop.estop(request.message)
         return self._state()
 
     async def _clear_fault(self, _: protocol.NoArguments) -> State:
@@ -305,20 +308,20 @@ class Operations:
         self._loop.clear_fault()
         return self._state()
 
-    async def _mark(self, wanted: protocol.Mark) -> State:
-        self._loop.reporter.event("mark", wanted.text)
+    async def _mark(self, request: protocol.Mark) -> State:
+        self._loop.reporter.event("mark", request.text)
         return self._state()
 
-    async def _calibrate_thrust(self, wanted: protocol.CalibrateThrust) -> State:
-        self._loop.thrust.calibrate(wanted.factor, wanted.error)
+    async def _calibrate_thrust(self, request: protocol.CalibrateThrust) -> State:
+        self._loop.thrust.calibrate(request.factor, request.error)
         return self._state()
 
     def _dispose(self, controller: Controller[Any]) -> None:
-        """Close a controller that was never active, which may take its time."""
+        """Close a controller that was never active, in a thread."""
         self._calls.dispose(partial(_close, controller))
 
     def _arrive(self) -> int:
-        """The number of a request that chooses the controller."""
+        """Return a number for a request that chooses the controller."""
         self._arrivals += 1
         return self._arrivals
 
@@ -335,11 +338,13 @@ class Operations:
 
 
 def _create_newly_installed(name: str, create: Callable[[], Controller[Any]]) -> Controller[Any]:
-    """Create a controller that was not there when fishd started."""
+    """Create a controller that was not installed when fishd started."""
     try:
         return create()
     except UnknownController as error:
-        if name in registry.names():  # its package cannot be imported: a new folder to look in, say
+        if (
+            name in registry.names()
+        ):  # its package cannot be imported, for example from a new folder
             raise UnknownController(
                 f"{text.said(error)}; it was installed after fishd had started: restart fishd"
             ) from error
@@ -350,11 +355,11 @@ def _close(controller: Controller[Any]) -> None:
     try:
         contained(controller.close)
     except Exception as error:
-        log.error("a controller that was not wanted any more could not be closed", exc_info=error)
+        log.error("a controller that is no longer needed could not be closed", exc_info=error)
 
 
 def _refusal(name: str, what: str, error: Exception) -> Refused:
-    """What a client is told when a controller cannot be had."""
+    """Return the refusal for an error of creating or starting a controller."""
     if isinstance(error, Refused):
         return error
     if isinstance(error, UnknownController):

@@ -1,6 +1,6 @@
-"""Which calibration of the servo applies: the saved one, or one that is tried under a lease.
+"""Calibration of the servo that applies: the saved one, or one on trial under a lease.
 
-When the lease ends, for whatever reason, the previous calibration is used again.
+When the lease ends, for any reason, the previous calibration is used again.
 """
 
 import asyncio
@@ -16,12 +16,12 @@ from fishd.hardware.base import CalibratedParts, TaredSensor
 from fishd.hardware.servo import pulses
 from fishd.hardware.settings import ServoSettings
 
-_WATCH = 0.1
-"""Time between two looks at a lease [s]."""
+_LEASE_CHECK_PERIOD_S = 0.1
+"""Time between two checks of a lease [s]."""
 
 
 def calibrated_parts(loop: ControlLoop) -> CalibratedParts:
-    """What can be calibrated; raises `Refused` for a simulated fish."""
+    """Return the parts that can be calibrated; raise `Refused` for a simulated fish."""
     parts = loop.robot.calibrated
     if parts is None:
         raise Refused(
@@ -31,14 +31,14 @@ def calibrated_parts(loop: ControlLoop) -> CalibratedParts:
 
 
 def calibrated_parts_at_rest(loop: ControlLoop) -> CalibratedParts:
-    """The same while nothing swims; `hold` may be active. Raises `Refused`."""
+    """Do as `calibrated_parts`; also raise `Refused` while a controller except `hold` is active."""
     parts = calibrated_parts(loop)
     _check_rest(loop)
     return parts
 
 
 def tared_sensor_at_rest(loop: ControlLoop) -> TaredSensor:
-    """The force sensor, a simulated one too, while nothing swims; raises `Refused`."""
+    """Return the force sensor, real or simulated; raise `Refused` while the fish swims."""
     if loop.robot.tared is None:
         raise Refused("simulated", "this fish's force sensor has no zero to set")
     _check_rest(loop)
@@ -53,7 +53,7 @@ def _check_rest(loop: ControlLoop) -> None:
 
 
 class _Trial:
-    """A trial calibration: the lease that it needs, and the previous calibration."""
+    """Trial of a calibration: the lease that it needs, and the previous calibration."""
 
     def __init__(self, lease: str, before: ServoCalibration) -> None:
         self.lease = lease
@@ -61,10 +61,10 @@ class _Trial:
 
 
 class TrialCalibration:
-    """Applies calibrations of the servo, and undoes a trial when its lease has ended."""
+    """Calibrations of the servo: applied or on trial; a trial is undone when its lease ends."""
 
     def __init__(self, loop: ControlLoop, settings: ServoSettings, changing: asyncio.Lock) -> None:
-        """changing: held while a calibration is replaced"""
+        """changing: lock that is held while a calibration is replaced"""
         self._loop = loop
         self._settings = settings
         self._changing = changing
@@ -73,14 +73,14 @@ class TrialCalibration:
 
     @property
     def active(self) -> bool:
-        """True while a calibration that is not saved is used."""
+        """True while a calibration that is not saved is in use."""
         return self._trial is not None
 
     def check_startable(self, controller: str, lease: str | None) -> None:
-        """Raise `Refused` during a trial for all but `hold` under its lease."""
+        """Raise `Refused` during a trial for every controller except `hold` under its lease."""
         trial = self._trial
         if trial and not (
-            controller == "hold" and lease == trial.lease and self._why_over(trial) is None
+            controller == "hold" and lease == trial.lease and self._why_ended(trial) is None
         ):
             raise Refused(
                 "calibrating",
@@ -88,15 +88,15 @@ class TrialCalibration:
                 "of the calibration, or end it with 'fishctl stop'",
             )
 
-    def check(self, calibration: ServoCalibration, lease: str | None, *, keep: bool) -> None:
-        """Raise `Refused` unless a client with this lease may apply that just now.
+    def check(self, calibration: ServoCalibration, lease: str | None, *, save: bool) -> None:
+        """Raise `Refused` unless a client with this lease may apply the calibration now.
 
-        keep: to save it, so that its pulses must do what a configuration's must
+        save: whether it will be saved; then its pulses must satisfy the checks of a configuration
         """
         parts = calibrated_parts_at_rest(self._loop)
         if lease is not None:
             self._loop.lease.renew(lease)
-        elif not keep:
+        elif not save:
             raise Refused("no-lease", "a calibration that is not saved needs a lease: take-lease")
         self._loop.lease.check_free(lease)
         if self._trial and self._trial.lease != lease:
@@ -104,7 +104,7 @@ class TrialCalibration:
         servo = self._settings.calibrated(calibration)
         try:
             check_neutral(servo)
-            if keep:
+            if save:
                 check_pulses(servo, self._loop.limits.amplitude)
         except Problem as problem:
             raise Refused("bad-arguments", f"{problem.path[-1]}: {problem}") from None
@@ -119,48 +119,51 @@ class TrialCalibration:
             )
 
     def try_out(self, calibration: ServoCalibration, lease: str) -> None:
-        """Apply a calibration that `check` lets pass, until the lease ends."""
+        """Apply a calibration that `check` accepts, until the lease ends."""
         if self._trial is None:
             self._trial = _Trial(lease, calibrated_parts_at_rest(self._loop).servo.calibration)
             self._watcher = asyncio.create_task(self._watch(self._trial))
         self._loop.lease.drives = True
-        self._put(calibration)
+        self._apply(calibration)
 
-    def keep(self, calibration: ServoCalibration) -> None:
-        """Apply a calibration that `check` lets pass, whatever becomes of a lease."""
+    def apply_saved(self, calibration: ServoCalibration) -> None:
+        """Apply a calibration that `check` accepts, independently of a lease."""
         self._trial = None
-        self._put(calibration)
+        self._apply(calibration)
 
-    def _why_over(self, trial: _Trial) -> str | None:
+    def _why_ended(self, trial: _Trial) -> str | None:
         return self._loop.lease.why_ended(trial.lease)
 
     async def _watch(self, trial: _Trial) -> None:
-        """Use the previous calibration again once the lease of a trial is over, at neutral."""
+        """Use the previous calibration again when the lease of a trial has ended, at neutral."""
         while True:
-            await asyncio.sleep(_WATCH)
-            async with self._changing:  # it must not end while what it led to is being saved
+            await asyncio.sleep(_LEASE_CHECK_PERIOD_S)
+            async with self._changing:  # a trial must not end while its calibration is being saved
                 if self._trial is not trial:
                     return
-                why = self._why_over(trial)
+                why = self._why_ended(trial)
                 if why is not None:
                     self._loop.lease.forget(trial.lease)
                 if why is not None and self._at_rest(trial.before):
                     self._trial = None
-                    self._put(trial.before)
+                    self._apply(trial.before)
                     self._loop.reporter.event(
                         "calibration",
-                        f"servo: that of before is used again, as the lease has ended: {why}",
+                        f"servo: the previous calibration is used again; lease ended: {why}",
                         "info" if why == RETURN_REASON else "warning",
                     )
                     return
 
     def _at_rest(self, before: ServoCalibration) -> bool:
-        """Is the tail where no calibration moves it, or free to move and within the limits?"""
+        """Return whether another calibration cannot make the tail jump.
+
+        It cannot at angle 0, nor without pulses at an angle within the limits.
+        """
         lowest, highest = pulses.reach(self._settings.calibrated(before))
         angle = self._loop.applied
         return angle == 0.0 or (not self._loop.servo.on and lowest <= angle <= highest)
 
-    def _put(self, calibration: ServoCalibration) -> None:
+    def _apply(self, calibration: ServoCalibration) -> None:
         parts = calibrated_parts(self._loop)
         if parts.servo.calibration.direction != calibration.direction:
             self._loop.lateral_sign.forget()

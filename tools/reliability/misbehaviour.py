@@ -23,7 +23,7 @@ from common.processes import BIN
 from common.report import DOCS, Options, Report, progress, table
 from fishd.client import Fish, NoDaemon, Refused
 from fishd.core.protocol import LOADING
-from fishd.daemon.background_calls import MOST_AT_ONCE
+from fishd.daemon.background_calls import MAX_CALLS
 
 DOCUMENT = "reference/reliability.md"
 ZOO = DOCS.parent / "tests" / "rigs" / "zoo"
@@ -176,7 +176,7 @@ def loading(patience: float | None = None) -> Outcome:
     cases = [(method, way) for way in HANGS for method in ("check", "__init__")]
     computing = [case for case in cases if case[1] in COMPUTE]
     waiting = [case for case in cases if case[1] not in COMPUTE]
-    groups = computing, waiting[:MOST_AT_ONCE], waiting[MOST_AT_ONCE:]
+    groups = computing, waiting[:MAX_CALLS], waiting[MAX_CALLS:]
     with ThreadPoolExecutor(len(groups)) as pool:
         found = list(pool.map(partial(refused_loads, patience=patience), groups))
     ended, times, statuses = zip(*found, strict=True)

@@ -1,8 +1,8 @@
-"""The fork server of the gateways: `python -m fishd.daemon.gateway LINK`.
+"""Fork server of the gateways: `python -m fishd.daemon.gateway LINK`.
 
-It has loaded all that gateways need, and forks one when fishd asks for it: that takes hundredths of
-a second, where the start of Python takes tenths. Only fishd starts it. It ends with fishd, and the
-gateways end with it, even where they are stopped: the kernel sends them SIGKILL.
+It has loaded everything that gateways need, and forks one when fishd requests it: that takes
+hundredths of a second, while the start of Python takes tenths. Only fishd starts it. It ends with
+fishd, and the gateways end with it, even if they are stopped: the kernel sends them SIGKILL.
 
 LINK: file descriptor of the link to fishd.
 """
@@ -26,14 +26,14 @@ _PR_SET_PDEATHSIG, _PR_SET_NAME = 1, 15
 def main(number: str) -> int:
     """Fork gateways on request until fishd ends."""
     _end_with_parent()
-    own = os.getpid()
+    server_pid = os.getpid()
     _set_name("fishd-gateways")
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(ignored, signal.SIG_IGN)  # these processes end when fishd does
-    gc.disable()  # nothing that is loaded is garbage: to look for it takes a tenth of the time
+        signal.signal(ignored, signal.SIG_IGN)  # these processes end when fishd ends
+    gc.disable()  # imports leave no garbage, and searching for it takes a tenth of the time
     from fishd.daemon.gateway import publisher, router
 
-    gc.freeze()  # keeps the pages shared with the gateways
+    gc.freeze()  # keeps memory pages shared with the gateways
     modules = {link.TELEMETRY: publisher, link.CONTROL: router}
     connection = socket.socket(fileno=int(number))
     connection.setblocking(True)
@@ -41,13 +41,13 @@ def main(number: str) -> int:
     try:
         connection.send(link.READY)
         while True:
-            message, descriptors, _, _ = socket.recv_fds(connection, link.LONGEST, 2)
+            message, descriptors, _, _ = socket.recv_fds(connection, link.MAX_MESSAGE_BYTES, 2)
             if message == link.PING:
                 connection.send(link.PONG)
             elif message.startswith(link.START):
                 kind, address = link.kind_and_address(message)
                 former = children.pop(kind, None)
-                if former is not None:  # an ended child keeps its number until waitpid
+                if former is not None:  # an ended child keeps its pid until waitpid
                     os.kill(former, signal.SIGKILL)
                 try:
                     pid = os.fork()
@@ -57,7 +57,7 @@ def main(number: str) -> int:
                     if not pid:
                         _end_with_parent()
                         connection.close()
-                        if os.getppid() != own:
+                        if os.getppid() != server_pid:
                             os._exit(1)
                         _serve(modules[kind], kind, address, *descriptors)
                     children[kind] = pid
@@ -75,7 +75,7 @@ def main(number: str) -> int:
 
 
 def _serve(module: ModuleType, kind: str, address: str, link_number: int, listener: int) -> None:
-    """Be a gateway until fishd ends or a limit is exceeded; never returns."""
+    """Run a gateway until fishd ends or a limit is exceeded; never return."""
     status = 1
     try:
         _set_name(f"fishd-{kind}")
@@ -85,11 +85,11 @@ def _serve(module: ModuleType, kind: str, address: str, link_number: int, listen
         sys.excepthook(*sys.exc_info())
     finally:
         sys.stderr.flush()
-        os._exit(status)  # without closing ZeroMQ, which would take long to free what it holds
+        os._exit(status)  # without closing ZeroMQ, which would take long to free its memory
 
 
 def _run(module: ModuleType, address: str, connection: socket.socket, listener: int) -> int:
-    """Serve at the listener; returns the exit status."""
+    """Serve at the listener; return the exit status."""
     import zmq
 
     from fishd.daemon.gateway.limits import ResourceLimits
@@ -100,12 +100,12 @@ def _run(module: ModuleType, address: str, connection: socket.socket, listener: 
     module.configure(server)
     server.set(zmq.USE_FD, listener)
     server.bind(address)
-    limits = ResourceLimits(module.MEMORY, module.CONNECTIONS)
-    with suppress(OSError):  # as below
+    limits = ResourceLimits(module.MAX_MEMORY_BYTES, module.MAX_CONNECTIONS)
+    with suppress(OSError):  # see below
         connection.send(link.READY)
     why = module.run(connection, server, limits)
     if why:
-        with suppress(OSError):  # fishd has ended, or takes nothing just now
+        with suppress(OSError):  # fishd has ended, or the link is full
             connection.send(link.NOTICE + why.encode())
         return 1
     server.close(linger=_LINGER_MS)

@@ -1,7 +1,7 @@
-"""The gateways as fishd sees them: links to processes that are started again when they end or hang.
+"""Gateways from the side of fishd: links to processes that are restarted when they end or hang.
 
-Each process answers heartbeats over its link. One that does not is killed by its parent, the fork
-server, and a new one serves in its place; a fork server that does not is killed with its gateways.
+Each process answers heartbeats over its link. A gateway that does not is killed by its parent, the
+fork server, and replaced; a fork server that does not is killed together with its gateways.
 """
 
 import asyncio
@@ -26,48 +26,48 @@ from fishd.daemon.control_server import ControlServer
 from fishd.daemon.gateway.link import (
     CONTROL,
     END,
-    LONGEST,
+    MAX_MESSAGE_BYTES,
     NOTICE,
     PING,
     PONG,
     READY,
     STARTED,
     TELEMETRY,
+    join_frames,
     kind_and_outcome,
     pair,
-    published,
     start,
 )
 
 BEAT_S = 0.08
 """Time between two heartbeats [s]."""
 MAX_UNANSWERED = {CONTROL: 4, TELEMETRY: 8}
-"""Heartbeats in a row that a gateway may leave unanswered; then it hangs."""
+"""Number of unanswered heartbeats in a row from which on a gateway counts as hung."""
 MAX_STARTING = 25
-"""Heartbeats during which a gateway may start; then it hangs."""
+"""Longest start of a gateway, in heartbeats; after that it counts as hung."""
 MAX_SERVER_STARTING = 750
-"""Heartbeats during which the fork server may start: a busy Pi may take long to load Python."""
+"""Longest start of the fork server, in heartbeats: a busy Pi may take long to load Python."""
 MIN_PERIOD_S = 0.05
 """Shortest time between two starts of a gateway [s]."""
 MIN_FAILED_PERIOD_S = 0.25
-"""The same where the one before has never served [s]."""
+"""Shortest time between two starts of a gateway if the first never served [s]."""
 LIMIT_PAUSE_S = 0.3
-"""Time without a gateway after one that has exceeded a limit [s]."""
+"""Time until the next start after a gateway that has exceeded a limit [s]."""
 MIN_SERVER_PERIOD_S = 1.0
 """Shortest time between two starts of the fork server [s]."""
-RETURN = 1.0
-"""Longest time for subscribers to connect again, once a gateway serves [s]."""
+RECONNECT_TIME_S = 1.0
+"""Time for subscribers to connect again after a gateway has started to serve [s]."""
 MAX_REPORT_DELAY_S = {CONTROL: 2.0, TELEMETRY: 30.0}
 """Time after which a restart is reported, even if the new gateway does not serve yet [s]."""
-FAREWELL = 0.5
-"""Longest time for a gateway to pass on the last messages, once it is to end [s]."""
+END_TIMEOUT_S = 0.5
+"""Longest time for a gateway to pass on the last messages before it ends [s]."""
 
-# Memory that a flood took goes back to the system.
+# With these settings, memory that a flood used is returned to the system.
 _ENVIRONMENT = {"MALLOC_ARENA_MAX": "2", "MALLOC_TRIM_THRESHOLD_": "1048576"}
 
 
 class _Peer:
-    """A process at the other end of a link; for the thread of the asyncio loop only."""
+    """Process at the other end of a link; only for the thread of the asyncio loop."""
 
     def __init__(self, max_unanswered: int, max_starting: int) -> None:
         self._events = asyncio.get_running_loop()
@@ -76,53 +76,55 @@ class _Peer:
         self._unanswered = 0
         """Heartbeats since the latest sign of life."""
         self._max_unanswered, self._max_starting = max_unanswered, max_starting
-        self._wanted = True
+        self._enabled = True
         self._reading = False
 
     def beat(self) -> None:
-        """Send a heartbeat, or end the link to a process that left too many unanswered."""
-        if self._link is None or not self._reading:  # an answer may wait unread
+        """Send a heartbeat, or close the link to a process that left too many unanswered."""
+        if self._link is None or not self._reading:  # an answer may be waiting unread
             return
         if self._unanswered >= (self._max_unanswered if self._serves else self._max_starting):
-            self._lost(f"it left {self._unanswered} heartbeats unanswered")
+            self._handle_loss(f"it left {self._unanswered} heartbeats unanswered")
             return
         self._unanswered += 1
         if self._serves:
-            with suppress(OSError):  # full, or its end is noticed where it is read from
+            with suppress(
+                OSError
+            ):  # the link is full, or a read will notice the end of the process
                 self._link.send(PING)
 
     def _connect(self, ours: socket.socket) -> None:
         self._link = ours
         self._serves = False
         self._unanswered = 0
-        self._listen(self._wanted)
+        self._listen(self._enabled)
 
-    def _readable(self) -> None:
+    def _read_message(self) -> None:
         assert self._link
         try:
-            message = self._link.recv(2 * LONGEST)
+            message = self._link.recv(2 * MAX_MESSAGE_BYTES)
         except BlockingIOError:
             return
         except OSError:
             message = b""
         if not message:
-            self._lost("")
+            self._handle_loss("")
             return
         self._unanswered = 0
         if message == READY:
             self._serves = True
-            self._ready()
+            self._handle_ready()
         elif message != PONG:
             self._take(message)
 
-    def _ready(self) -> None:
-        """The process serves from now on."""
+    def _handle_ready(self) -> None:
+        """Handle the message that the process has started to serve."""
 
     def _take(self, message: bytes) -> None:
         raise NotImplementedError
 
-    def _lost(self, why: str) -> None:
-        """The process has ended; why: or why it is of no use any more."""
+    def _handle_loss(self, why: str) -> None:
+        """Handle the end of the process, or an error that `why` describes."""
         raise NotImplementedError
 
     def _drop_link(self) -> None:
@@ -131,20 +133,20 @@ class _Peer:
             self._link.close()
             self._link = None
 
-    def _listen(self, wanted: bool) -> None:
-        if self._link is not None and wanted is not self._reading:
-            if wanted:
-                self._events.add_reader(self._link, self._readable)
+    def _listen(self, enabled: bool) -> None:
+        if self._link is not None and enabled is not self._reading:
+            if enabled:
+                self._events.add_reader(self._link, self._read_message)
             else:
                 self._events.remove_reader(self._link)
-            self._reading = wanted
+            self._reading = enabled
 
 
 class ForkServer(_Peer):
-    """The parent of the gateways; started again when it ends or hangs, and they with it."""
+    """Parent of the gateways; when it ends or hangs, it and they are started again."""
 
     def __init__(self) -> None:
-        """Start it; must be made inside a running asyncio loop. Raises `StartupError`."""
+        """Start the process; must be called in a running asyncio loop. Raises `StartupError`."""
         super().__init__(MAX_UNANSWERED[TELEMETRY], MAX_SERVER_STARTING)
         self.gateways: dict[str, Gateway] = {}
         self._timer: asyncio.TimerHandle | None = None
@@ -157,17 +159,17 @@ class ForkServer(_Peer):
 
     @property
     def serves(self) -> bool:
-        """Whether it has begun to fork gateways."""
+        """Whether it has started to serve."""
         return self._serves
 
     def fork(self, kind: str, address: str, link: socket.socket, listener: socket.socket) -> None:
-        """Ask for a gateway, in place of the one before it; raises OSError."""
+        """Request a gateway that replaces the one before it; raise OSError if that fails."""
         if self._link is None:
             raise ConnectionError
         socket.send_fds(self._link, [start(kind, address)], [link.fileno(), listener.fileno()])
 
     def close(self) -> None:
-        """Kill it, and with it what is left of its gateways; may be called twice."""
+        """Kill the process and with it its remaining gateways; may be called twice."""
         if self._timer:
             self._timer.cancel()
         self._drop_link()
@@ -184,7 +186,7 @@ class ForkServer(_Peer):
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 env=os.environ | _ENVIRONMENT,
-                start_new_session=True,  # a Ctrl-C in the terminal is for fishd alone
+                start_new_session=True,  # a Ctrl-C in the terminal must reach only fishd
             )
             stack.pop_all()
         self._started = self._events.time()
@@ -195,8 +197,8 @@ class ForkServer(_Peer):
             kind, outcome = kind_and_outcome(message)
             self.gateways[kind].started(outcome)
 
-    def _lost(self, why: str) -> None:
-        """Kill it, which ends its gateways as well."""
+    def _handle_loss(self, why: str) -> None:
+        """Kill the process, which also ends its gateways, and start it again later."""
         self._drop_link()
         self._process.kill()
         for gateway in self.gateways.values():
@@ -205,59 +207,59 @@ class ForkServer(_Peer):
         self._timer = self._events.call_later(max(0.0, pause), self._start_again)
 
     def _start_again(self) -> None:
-        """Start it, once the one before has ended."""
+        """Start a new process, after the one before has ended."""
         try:
             if self._process.poll() is None:
                 self._timer = self._events.call_later(0.2 * MIN_PERIOD_S, self._start_again)
                 return
             self._start()
-        except OSError:  # Python is being upgraded, perhaps
+        except OSError:  # for example while Python is being upgraded
             self._timer = self._events.call_later(MIN_SERVER_PERIOD_S, self._start_again)
 
 
 class Gateway(_Peer):
-    """The link to the process of one socket."""
+    """Link to the process of one socket."""
 
     def __init__(
         self, kind: str, listener: socket.socket, address: str, server: ForkServer
     ) -> None:
-        """Start it; must be made inside a running asyncio loop.
+        """Start the process; must be called in a running asyncio loop.
 
         kind: TELEMETRY or CONTROL
-        listener: what clients connect to; it stays open while the process is started again
-        address: the ZeroMQ address of the listener
+        listener: socket that clients connect to; it stays open during restarts of the process
+        address: ZeroMQ address of the listener
         """
         super().__init__(MAX_UNANSWERED[kind], MAX_STARTING)
         self.kind = kind
         self.address = address
         self.take: Callable[[bytes], None] = lambda message: None
-        """Called with every message that comes, once `read` has let them in."""
+        """Function called with every message, after `read` has enabled them."""
         self.restarts = 0
         """Number of restarts."""
         self.lost = 0
-        """Messages to it that were dropped."""
+        """Number of dropped messages to the process."""
         self.on_restart: Callable[[str], None] = lambda why: None
-        """Called once it was started again, or should have been, with the latest reason."""
+        """Function called with the latest reason after a restart, or after its deadline."""
         self._listener = listener
         self._server = server
-        self._wanted = kind == TELEMETRY  # its only messages: that it serves, and why it ends
+        self._enabled = kind == TELEMETRY  # it sends only that it serves, and why it ends
         self._why = ""
         self._notice = ""
-        """Which limit the process has exceeded, by itself."""
-        self._begun = 0.0
+        """Limit that the process says it has exceeded."""
+        self._started_at = 0.0
         """Time of the latest start [s]."""
-        self._telling: asyncio.TimerHandle | None = None
-        self._tell_by = 0.0
+        self._report_timer: asyncio.TimerHandle | None = None
+        self._report_deadline = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._ending: float | None = None
-        """Time until which it may pass on the last messages, once it is to end [s]."""
+        """Time until which it may pass on the last messages before it ends [s, monotonic]."""
         server.gateways[kind] = self
         self._start()
 
     def send(self, message: bytes) -> bool:
-        """Send without waiting; False if the pipe is full: the message counts as lost.
+        """Send a message without waiting; return False if the link is full and the message lost.
 
-        Messages without a process to take them are lost as well: no client waits for them there.
+        Without a process, messages are lost too: then no client waits for them.
         """
         try:
             if self._link is None:
@@ -266,21 +268,21 @@ class Gateway(_Peer):
         except BlockingIOError:
             self.lost += 1
             return False
-        except OSError:  # its end is noticed where it is read from
+        except OSError:  # a read will notice the end of the process
             self.lost += 1
         return True
 
-    def read(self, wanted: bool) -> None:
-        """Take messages, or let them wait in the link."""
-        self._wanted = wanted
-        self._listen(wanted)
+    def read(self, enabled: bool) -> None:
+        """Read messages, or let them wait in the link."""
+        self._enabled = enabled
+        self._listen(enabled)
 
     def end(self) -> None:
-        """Let it pass on what it has, and end; may be called twice."""
+        """Let the process pass on its messages and end; may be called twice."""
         if self._ending is not None:
             return
-        self._ending = time.monotonic() + FAREWELL
-        for timer in (self._timer, self._telling):
+        self._ending = time.monotonic() + END_TIMEOUT_S
+        for timer in (self._timer, self._report_timer):
             if timer:
                 timer.cancel()
         self._listen(False)
@@ -288,15 +290,15 @@ class Gateway(_Peer):
             self.send(END)
 
     def close(self) -> None:
-        """Wait until it has ended; may be called twice."""
+        """Wait until the process has ended; may be called twice."""
         self.end()
         assert self._ending is not None
         while self._link is not None:
-            left = self._ending - time.monotonic()
-            if left <= 0.0 or not select.select([self._link], [], [], left)[0]:
+            remaining = self._ending - time.monotonic()
+            if remaining <= 0.0 or not select.select([self._link], [], [], remaining)[0]:
                 break
             try:
-                ended = not self._link.recv(2 * LONGEST)
+                ended = not self._link.recv(2 * MAX_MESSAGE_BYTES)
             except OSError:
                 ended = True
             if ended:
@@ -304,27 +306,27 @@ class Gateway(_Peer):
         self._drop_link()
 
     def beat(self) -> None:
-        """Send a heartbeat; a gateway that waits for the fork server has not begun to start."""
+        """Send a heartbeat, unless the gateway still waits for the fork server."""
         if self._serves or self._server.serves:
             super().beat()
 
     def started(self, outcome: str) -> None:
-        """Take note of how the process before this one ended."""
+        """Store how the process before this one ended."""
         self._why = self._why or outcome
 
     def server_lost(self, why: str) -> None:
-        """The fork server has ended, and with it the process."""
+        """Handle the end of the fork server, and with it of the process."""
         if self._link is not None and self._ending is None:
-            self._lost(why)
+            self._handle_loss(why)
 
     def _start(self) -> None:
-        """Raises OSError."""
+        """Request a new process; raise OSError if that fails."""
         ours, theirs = pair()
         with theirs, ExitStack() as stack:
             stack.callback(ours.close)
             self._server.fork(self.kind, self.address, theirs, self._listener)
             stack.pop_all()
-        self._begun = self._events.time()
+        self._started_at = self._events.time()
         self._connect(ours)
 
     def _take(self, message: bytes) -> None:
@@ -333,48 +335,48 @@ class Gateway(_Peer):
         else:
             self.take(message)
 
-    def _lost(self, why: str) -> None:
+    def _handle_loss(self, why: str) -> None:
         period = MIN_PERIOD_S if self._serves else MIN_FAILED_PERIOD_S
-        pause = LIMIT_PAUSE_S if self._notice else self._begun + period - self._events.time()
+        pause = LIMIT_PAUSE_S if self._notice else self._started_at + period - self._events.time()
         self._drop_link()
         self._why = why or self._notice
         self._notice = ""
-        if self._telling:  # subscribers are gone again
-            self._tell_at(self._tell_by)
+        if self._report_timer:  # subscribers have lost their connections again
+            self._report_at(self._report_deadline)
         self._timer = self._events.call_later(max(0.0, pause), self._start_again)
 
     def _start_again(self) -> None:
         try:
             self._start()
-        except OSError:  # the fork server is being started, or has no room for the request
+        except OSError:  # the fork server is starting, or its link is full
             self._timer = self._events.call_later(MIN_PERIOD_S, self._start_again)
             return
         self.restarts += 1
-        if not self._telling:
-            self._tell_by = self._events.time() + MAX_REPORT_DELAY_S[self.kind]
-            self._tell_at(self._tell_by)
+        if not self._report_timer:
+            self._report_deadline = self._events.time() + MAX_REPORT_DELAY_S[self.kind]
+            self._report_at(self._report_deadline)
 
-    def _ready(self) -> None:
-        """Report a restart; one of telemetry when subscribers have had time to connect again."""
-        if self._telling:
-            pause = RETURN if self.kind == TELEMETRY else 0.0
-            self._tell_at(min(self._tell_by, self._events.time() + pause))
+    def _handle_ready(self) -> None:
+        """Report a restart; of telemetry, when subscribers have had time to connect again."""
+        if self._report_timer:
+            pause = RECONNECT_TIME_S if self.kind == TELEMETRY else 0.0
+            self._report_at(min(self._report_deadline, self._events.time() + pause))
 
-    def _tell_at(self, when: float) -> None:
-        if self._telling:
-            self._telling.cancel()
-        self._telling = self._events.call_at(when, self._tell)
+    def _report_at(self, when: float) -> None:
+        if self._report_timer:
+            self._report_timer.cancel()
+        self._report_timer = self._events.call_at(when, self._report_restart)
 
-    def _tell(self) -> None:
-        self._telling = None
+    def _report_restart(self) -> None:
+        self._report_timer = None
         self.on_restart(self._why or "its process ended")
 
 
 class Gateways:
-    """Listens at both addresses from now on, until `stack` is closed."""
+    """Both gateways, which listen at their addresses until `stack` is closed."""
 
     def __init__(self, control: str, telemetry: str, stack: ExitStack) -> None:
-        """Must be made inside a running asyncio loop.
+        """Start the gateways; must be called in a running asyncio loop.
 
         control, telemetry: addresses, which must be `claimed`
         Raises `StartupError`.
@@ -389,12 +391,12 @@ class Gateways:
         stack.callback(lambda: self._timer.cancel())
 
     def serve(self, server: ControlServer, reporter: Reporter) -> None:
-        """Let requests come in and replies go out, and tell when a gateway was started again."""
+        """Pass on requests and replies, and report when a gateway was started again."""
         server.send, server.read = self.control.send, self.control.read
         self.control.take = server.take
         self.control.read(True)
         for gateway in (self.control, self.telemetry):
-            gateway.on_restart = partial(_tell_restart, reporter, gateway.kind)
+            gateway.on_restart = partial(_report_event, reporter, gateway.kind)
 
     def _beat(self) -> None:
         for peer in (self._server, self.control, self.telemetry):
@@ -402,7 +404,7 @@ class Gateways:
         self._timer = self._events.call_later(BEAT_S, self._beat)
 
     def counters(self) -> dict[str, int]:
-        """What was survived, since start."""
+        """Return the numbers of recovered errors since start."""
         return {
             "telemetry_lost": self.telemetry.lost,
             "telemetry_restarts": self.telemetry.restarts,
@@ -421,27 +423,27 @@ def _open(kind: str, address: str, server: ForkServer, stack: ExitStack) -> Gate
     return gateway
 
 
-def _tell_restart(reporter: Reporter, kind: str, why: str) -> None:
+def _report_event(reporter: Reporter, kind: str, why: str) -> None:
     message = f"the gateway of {kind} was started again: {why}"
     reporter.event("gateway", message, "warning", gateway=kind)
 
 
 class Telemetry:
-    """Publishes ticks, events and status: a topic and one JSON object each, without waiting."""
+    """Publisher of ticks, events and status: a topic and one JSON object each, without waiting."""
 
     def __init__(self, send: Callable[[bytes], object]) -> None:
-        """send: takes a message for the gateway, without waiting"""
+        """send: function that sends a message to the gateway without waiting"""
         self._encode = msgspec.json.Encoder().encode
         self._send = send
 
     def tick(self, tick: Tick) -> None:
-        """Publish on topic `tick`."""
-        self._send(published(b"tick", self._encode(tick)))
+        """Publish a tick on topic `tick`."""
+        self._send(join_frames(b"tick", self._encode(tick)))
 
     def event(self, event: Event) -> None:
-        """Publish on topic `event`."""
-        self._send(published(b"event", self._encode(event)))
+        """Publish an event on topic `event`."""
+        self._send(join_frames(b"event", self._encode(event)))
 
     def status(self, status: Status) -> None:
-        """Publish on topic `status`."""
-        self._send(published(b"status", self._encode(status)))
+        """Publish a status on topic `status`."""
+        self._send(join_frames(b"status", self._encode(status)))

@@ -1,4 +1,4 @@
-"""Limits of a gateway's process. When it exceeds one, it ends, and a new process begins."""
+"""Limits of a gateway's process. When it exceeds one, it ends, and a new process starts."""
 
 import ctypes
 import os
@@ -7,76 +7,81 @@ import time
 from contextlib import suppress
 from typing import IO, Literal
 
-_PAGE = resource.getpagesize()
+_PAGE_BYTES = resource.getpagesize()
 _NICE = 5
-"""Nice value of a gateway, and by how much it is nicer than a fishd that is below 0."""
-_PAUSE = 0.1
-"""Time between two looks at what is used [s]."""
-_MOST_FILES = 4096
-"""File descriptors, where the system permits that many: more than connections can be made between
-two looks."""
+"""Nice value of a gateway; for a fishd with a negative nice value, the difference to it."""
+_CHECK_PERIOD_S = 0.1
+"""Time between two checks of the limits [s]."""
+_MAX_FILES = 4096
+"""Largest number of file descriptors, if the system permits it.
+
+More than the number of connections that clients can make between two checks.
+"""
 _SPARE_FILES = 16
-"""Kept free: ZeroMQ cannot refuse a connection for which there is no file descriptor."""
-_TRIM = 8 * 2**20
-"""Of memory more than at the start, unused parts are given back [bytes]."""
-_TRIM_PAUSE = 2.0
-"""Shortest time between two times of that [s]."""
+"""Descriptors kept free: ZeroMQ cannot refuse a connection without a file descriptor for it."""
+_TRIM_BYTES = 8 * 2**20
+"""Growth of the memory since the start from which on unused parts are released [bytes]."""
+_TRIM_PERIOD_S = 2.0
+"""Shortest time between two such releases [s]."""
 
 
 class ResourceLimits:
-    """The limits of this process, and how far they are used."""
+    """Limits of this process, and their present use."""
 
     def __init__(self, memory: int, connections: int) -> None:
-        """Take them; to be called once everything is loaded.
+        """Set the limits; call it after all imports.
 
-        memory: what it may take beyond what it has now [bytes]
-        connections: file descriptors beyond those that are open now
+        memory: memory permitted in addition to the present use [bytes]
+        connections: file descriptors permitted in addition to those that are open
         """
-        _stand_back()
-        with suppress(OSError), _own("oom_score_adj", "wb") as file:
-            file.write(b"500")  # rather than fishd
+        _lower_priority()
+        with suppress(OSError), _open_proc_file("oom_score_adj", "wb") as file:
+            file.write(b"500")  # the kernel shall kill a gateway rather than fishd
         highest = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-        files = _MOST_FILES if highest == resource.RLIM_INFINITY else min(_MOST_FILES, highest)
+        files = _MAX_FILES if highest == resource.RLIM_INFINITY else min(_MAX_FILES, highest)
         resource.setrlimit(resource.RLIMIT_NOFILE, (files, highest))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        # The kernel enforces twice of it, also between two looks.
+        # The kernel enforces twice the limit, also between two checks.
         highest = resource.getrlimit(resource.RLIMIT_DATA)[1]
-        most = _data() + 2 * memory
+        max_data = _data_bytes() + 2 * memory
         if highest != resource.RLIM_INFINITY:
-            most = min(most, highest)
-        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
-        self._memory = _resident() + memory
-        self._trim = _resident() + _TRIM
+            max_data = min(max_data, highest)
+        resource.setrlimit(resource.RLIMIT_DATA, (max_data, max_data))
+        self._memory = _resident_bytes() + memory
+        self._trim = _resident_bytes() + _TRIM_BYTES
         self._files = min(_files() + connections, max(_files(), files - _SPARE_FILES))
-        self._next_look = self._next_trim = 0.0
+        self._next_check = self._next_trim = 0.0
 
     def exceeded(self) -> str:
-        """Which limit is exceeded, in words; empty for none. Cheap enough for every message."""
+        """Return a phrase that names the exceeded limit, or an empty text.
+
+        Fast enough for a call with each message.
+        """
         now = time.monotonic()
-        if now < self._next_look:
+        if now < self._next_check:
             return ""
-        self._next_look = now + _PAUSE
+        self._next_check = now + _CHECK_PERIOD_S
         if (files := _files()) > self._files:
             return f"it had {files} connections, more than {self._files}"
-        used = _resident()
+        used = _resident_bytes()
         if used > self._trim and now > self._next_trim:
-            self._next_trim = now + _TRIM_PAUSE
+            self._next_trim = now + _TRIM_PERIOD_S
             ctypes.CDLL(None).malloc_trim(0)
-            used = _resident()
+            used = _resident_bytes()
         if used > self._memory:
             return f"it used {used / 2**20:.0f} MB, more than {self._memory / 2**20:.0f} MB"
         return ""
 
 
-def _stand_back() -> None:
-    """Take a lower priority than fishd, whose priority this process was forked with."""
-    os.setpriority(os.PRIO_PROCESS, 0, _behind(os.getpriority(os.PRIO_PROCESS, 0)))
+def _lower_priority() -> None:
+    """Lower the priority of this process below that of fishd, which it inherited."""
+    os.setpriority(os.PRIO_PROCESS, 0, _nice_value(os.getpriority(os.PRIO_PROCESS, 0)))
 
 
-def _behind(fishd: int) -> int:
-    """Return the nice value of a gateway, from that of fishd.
+def _nice_value(fishd: int) -> int:
+    """Return the nice value of a gateway for that of fishd.
 
-    That of a fishd that goes before others goes before them as well.
+    If fishd has priority over other programs, its gateways have it too.
     """
     return max(fishd, min(_NICE, fishd + _NICE))
 
@@ -85,19 +90,19 @@ def _files() -> int:
     return len(list(os.scandir("/proc/self/fd")))
 
 
-def _resident() -> int:
+def _resident_bytes() -> int:
     return _memory(1)
 
 
-def _data() -> int:
+def _data_bytes() -> int:
     return _memory(5)
 
 
 def _memory(number: int) -> int:
-    with _own("statm", "rb") as file:
-        return int(file.read().split()[number]) * _PAGE
+    with _open_proc_file("statm", "rb") as file:
+        return int(file.read().split()[number]) * _PAGE_BYTES
 
 
-def _own(name: str, mode: Literal["rb", "wb"]) -> IO[bytes]:
-    """A file of the kernel about this process; pathlib takes longer to load than all of it."""
+def _open_proc_file(name: str, mode: Literal["rb", "wb"]) -> IO[bytes]:
+    """Open a file in /proc/self; pathlib would take longer to load than the whole module."""
     return open(f"/proc/self/{name}", mode)  # noqa: PTH123

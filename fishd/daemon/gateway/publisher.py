@@ -1,4 +1,4 @@
-"""The gateway of telemetry: a PUB socket that publishes what comes over the link."""
+"""Gateway of telemetry: a PUB socket that publishes the messages from the link."""
 
 import select
 import socket
@@ -7,30 +7,30 @@ from contextlib import suppress
 import zmq
 
 from fishd.daemon.gateway.limits import ResourceLimits
-from fishd.daemon.gateway.link import END, PING, PONG, frames
+from fishd.daemon.gateway.link import END, PING, PONG, split_frames
 
 SOCKET = zmq.PUB
-MEMORY = 16 * 2**20
-"""Beyond what it starts with [bytes]."""
-CONNECTIONS = 200
-"""Subscribers, and others that connect."""
+MAX_MEMORY_BYTES = 16 * 2**20
+"""Largest memory in addition to that at the start [bytes]."""
+MAX_CONNECTIONS = 200
+"""Largest number of connections, of subscribers and of other programs."""
 
-QUEUE = 100
-"""Messages kept for a slow subscriber, five seconds of ticks; later ones are dropped for it."""
-LONGEST = 512
-"""Of what a subscriber sends: a topic, or the greeting of its connection [bytes]."""
-GREETING = 2000
-"""How long a connection may take for it [ms]."""
-_LOOK = 100
-"""Longest time between two looks at the limits [ms]."""
+MAX_QUEUED_MESSAGES = 100
+"""Messages kept for a slow subscriber, five seconds of ticks; it misses the later ones."""
+MAX_RECEIVED_BYTES = 512
+"""Largest message from a subscriber, a topic or a handshake [bytes]."""
+HANDSHAKE_TIMEOUT_MS = 2000
+"""Longest time for the handshake of a connection [ms]."""
+_CHECK_PERIOD_MS = 100
+"""Longest time between two checks of the limits [ms]."""
 
 
 def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits) -> str:
-    """Publish until fishd ends; returns which limit was exceeded, or nothing."""
-    waiting = select.poll()
-    waiting.register(link, select.POLLIN)
+    """Publish until fishd ends; return the exceeded limit, if any."""
+    poller = select.poll()
+    poller.register(link, select.POLLIN)
     while not (why := limits.exceeded()):
-        if not waiting.poll(_LOOK):
+        if not poller.poll(_CHECK_PERIOD_MS):
             continue
         try:
             message = link.recv(2**20)
@@ -39,15 +39,15 @@ def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits
         if message in (b"", END):
             return ""
         if message == PING:
-            with suppress(OSError):  # of a fishd that was killed, the next look tells
+            with suppress(OSError):  # the next `recv` notices that fishd was killed
                 link.send(PONG)
             continue
-        server.send_multipart(frames(message), zmq.DONTWAIT)
+        server.send_multipart(split_frames(message), zmq.DONTWAIT)
     return why
 
 
 def configure(server: "zmq.Socket[bytes]") -> None:
-    """What holds for every subscriber."""
-    server.set(zmq.SNDHWM, QUEUE)
-    server.set(zmq.MAXMSGSIZE, LONGEST)
-    server.set(zmq.HANDSHAKE_IVL, GREETING)
+    """Set the limits for each subscriber."""
+    server.set(zmq.SNDHWM, MAX_QUEUED_MESSAGES)
+    server.set(zmq.MAXMSGSIZE, MAX_RECEIVED_BYTES)
+    server.set(zmq.HANDSHAKE_IVL, HANDSHAKE_TIMEOUT_MS)

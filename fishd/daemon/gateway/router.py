@@ -1,4 +1,4 @@
-"""The gateway of the control channel: a ROUTER socket that lets through what fishd can bear."""
+"""Gateway of the control channel: a ROUTER socket that limits the requests to fishd."""
 
 import socket
 import time
@@ -10,50 +10,50 @@ import zmq
 from fishd.core import protocol
 from fishd.core.errors import Refused
 from fishd.daemon.gateway.limits import ResourceLimits
-from fishd.daemon.gateway.link import END, LONGEST, PING, PONG, Replies, request
+from fishd.daemon.gateway.link import END, MAX_MESSAGE_BYTES, PING, PONG, Replies, request
 
 SOCKET = zmq.ROUTER
-MEMORY = 48 * 2**20
-"""Beyond what it starts with [bytes]."""
-CONNECTIONS = 1500
-"""Clients, and others that connect."""
+MAX_MEMORY_BYTES = 48 * 2**20
+"""Largest memory in addition to that at the start [bytes]."""
+MAX_CONNECTIONS = 1500
+"""Largest number of connections, of clients and of other programs."""
 
-QUEUE_IN, QUEUE_OUT = 8, 64
-"""Requests and replies in ZeroMQ's hands for one client; further replies are dropped."""
-MOST_OPEN = 16
-"""Requests that fishd has and has not answered yet; more wait here."""
-MOST_WAITING = 600
-"""Requests that wait, of all clients together; each has its share, which is one at least."""
-URGENT = {"estop", "stop"}
-"""Operations that wait for no other."""
-SPARE = 2
-"""Requests beyond MOST_OPEN that may be open, if they are urgent."""
-REFUSALS, REFUSALS_AT_ONCE = 20.0, 50.0
-"""Requests of one client per second, and at once, that are refused; others get no reply."""
-GREETING = 2000
-"""How long a connection may take until it speaks ZeroMQ [ms]."""
-_LOOK = 100
-"""Longest time between two looks at the limits [ms]."""
-_AT_ONCE = 20
-"""Requests that are taken before replies are looked at."""
-_FORGET = 10.0
-"""A client that was silent for so long is forgotten [s]."""
+MAX_QUEUED_REQUESTS, MAX_QUEUED_REPLIES = 8, 64
+"""Requests and replies that ZeroMQ queues for one client; further replies are dropped."""
+MAX_OPEN_REQUESTS = 16
+"""Largest number of requests that fishd has not answered yet; further requests wait here."""
+MAX_WAITING_REQUESTS = 600
+"""Largest number of waiting requests of all clients; each has an equal share of at least one."""
+URGENT_OPERATIONS = {"estop", "stop"}
+"""Operations that do not wait for others."""
+MAX_EXTRA_URGENT = 2
+"""Number of urgent requests that may be open in addition to MAX_OPEN_REQUESTS."""
+MAX_REFUSAL_RATE, MAX_REFUSAL_BURST = 20.0, 50.0
+"""Refusals to one client: largest rate [1/s] and burst; further requests get no reply."""
+HANDSHAKE_TIMEOUT_MS = 2000
+"""Longest time for the handshake of a connection [ms]."""
+_CHECK_PERIOD_MS = 100
+"""Longest time between two checks of the limits [ms]."""
+_REQUESTS_PER_TURN = 20
+"""Number of requests that are read before replies are read."""
+_CLIENT_TIMEOUT_S = 10.0
+"""Time after which a silent client is forgotten [s]."""
 
 
 class _Client:
-    """A client's requests that wait, and how many may still be refused."""
+    """Waiting requests of a client, and the number of refusals that it may still get."""
 
     def __init__(self, now: float) -> None:
         self.waiting: deque[bytes] = deque()
         self.seen = now
-        """When it last made a request [s, monotonic]."""
-        self._refusals = REFUSALS_AT_ONCE
+        """Time of its latest request [s, monotonic]."""
+        self._refusals = MAX_REFUSAL_BURST
         self._refused = now
 
     def may_refuse(self, now: float) -> bool:
-        """Is this refusal answered? Not where the client goes on whatever it is told."""
-        gained = (now - self._refused) * REFUSALS
-        self._refusals = min(REFUSALS_AT_ONCE, self._refusals + gained)
+        """Return whether to answer with a refusal; not if the client ignores earlier ones."""
+        gained = (now - self._refused) * MAX_REFUSAL_RATE
+        self._refusals = min(MAX_REFUSAL_BURST, self._refusals + gained)
         self._refused = now
         if self._refusals < 1.0:
             return False
@@ -62,7 +62,7 @@ class _Client:
 
 
 class Router:
-    """Passes requests from a ROUTER socket to the link to fishd; clients take turns."""
+    """Router of requests from a ROUTER socket to the link to fishd; clients take turns."""
 
     def __init__(
         self, link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits
@@ -73,23 +73,23 @@ class Router:
         self._clients: dict[bytes, _Client] = {}
         self._urgent: deque[bytes] = deque()
         self._turns: deque[_Client] = deque()
-        """Clients with requests that wait, the next one first."""
+        """Clients with waiting requests, the next one first."""
         self._envelopes: dict[int, list[bytes]] = {}
-        """What the reply to a request needs, by its number."""
+        """Envelopes for the replies, by the number of the request."""
         self._open = 0
         self._replies = Replies()
         self._number = 0
-        """When the latest request came [ns, monotonic]; no two have the same."""
+        """Time when the latest request arrived [ns, monotonic], made unique."""
         self._next_purge = 0.0
         self._ended = False
 
     def run(self) -> str:
-        """Pass requests and replies on until fishd ends; returns which limit was exceeded."""
+        """Pass on requests and replies until fishd ends; return the exceeded limit, if any."""
         poller = zmq.Poller()
         poller.register(self._link, zmq.POLLIN)
         poller.register(self._server, zmq.POLLIN)
         while not (self._ended or (why := self._limits.exceeded())):
-            ready = dict(poller.poll(_LOOK))
+            ready = dict(poller.poll(_CHECK_PERIOD_MS))
             if self._link.fileno() in ready:
                 self._take_replies()
             if self._server in ready:
@@ -101,7 +101,7 @@ class Router:
     def _take_replies(self) -> None:
         while not self._ended:
             try:
-                message = self._link.recv(2 * LONGEST)
+                message = self._link.recv(2 * MAX_MESSAGE_BYTES)
             except BlockingIOError:
                 return
             except ConnectionResetError:  # fishd was killed
@@ -110,19 +110,19 @@ class Router:
                 self._ended = True
                 return
             if message == PING:
-                with suppress(OSError):  # of a fishd that was killed, the next look tells
+                with suppress(OSError):  # the next `recv` notices that fishd was killed
                     self._link.send(PONG)
                 continue
-            found = self._replies.take(message)
-            if found:
-                number, payload = found
+            reply = self._replies.take(message)
+            if reply:
+                number, payload = reply
                 envelope = self._envelopes.pop(number, None)
-                if envelope:  # else the gateway before this one was asked
+                if envelope:  # otherwise the request came through an earlier gateway
                     self._open -= 1
                     self._answer(envelope, payload)
 
     def _take_requests(self) -> None:
-        for _ in range(_AT_ONCE):
+        for _ in range(_REQUESTS_PER_TURN):
             try:
                 frames = self._server.recv_multipart(zmq.DONTWAIT)
             except zmq.Again:
@@ -138,11 +138,11 @@ class Router:
             client = self._clients[envelope[0]] = _Client(now)
         client.seen = now
         try:
-            urgent = protocol.decode_request(payload).op in URGENT
-            urgent = urgent and len(self._urgent) < MOST_OPEN  # of a flood of them, these will do
+            urgent = protocol.decode_request(payload).op in URGENT_OPERATIONS
+            urgent = urgent and len(self._urgent) < MAX_OPEN_REQUESTS  # limits a flood of them
             waiting = len(client.waiting)
-            if waiting >= max(1, MOST_WAITING // max(1, len(self._turns))) and not urgent:
-                raise Refused("busy", f"{waiting} of your requests wait already; slow down")
+            if waiting >= max(1, MAX_WAITING_REQUESTS // max(1, len(self._turns))) and not urgent:
+                raise Refused("busy", f"{waiting} of your requests are already waiting; slow down")
         except Refused as error:
             if client.may_refuse(now):
                 self._answer(envelope, protocol.failure(protocol.request_id(payload), error))
@@ -159,7 +159,7 @@ class Router:
 
     def _pass_on(self) -> None:
         while self._urgent or self._turns:
-            if self._open >= MOST_OPEN + SPARE * bool(self._urgent):
+            if self._open >= MAX_OPEN_REQUESTS + MAX_EXTRA_URGENT * bool(self._urgent):
                 return
             waiting = self._urgent or self._turns[0].waiting
             try:
@@ -177,28 +177,28 @@ class Router:
                     self._turns.append(client)
 
     def _answer(self, envelope: list[bytes], payload: bytes) -> None:
-        # Never blocks: ROUTER drops what a client does not take.
+        # Never blocks: ROUTER drops the messages that a client does not read.
         self._server.send_multipart([*envelope, payload], zmq.DONTWAIT)
 
     def _forget_silent_clients(self) -> None:
         now = time.monotonic()
         if now >= self._next_purge:
-            self._next_purge = now + _FORGET
+            self._next_purge = now + _CLIENT_TIMEOUT_S
             self._clients = {
                 name: client
                 for name, client in self._clients.items()
-                if client.waiting or now - client.seen < _FORGET
+                if client.waiting or now - client.seen < _CLIENT_TIMEOUT_S
             }
 
 
 def configure(server: "zmq.Socket[bytes]") -> None:
-    """What holds for every client."""
-    server.set(zmq.RCVHWM, QUEUE_IN)
-    server.set(zmq.SNDHWM, QUEUE_OUT)
+    """Set the limits for each client."""
+    server.set(zmq.RCVHWM, MAX_QUEUED_REQUESTS)
+    server.set(zmq.SNDHWM, MAX_QUEUED_REPLIES)
     server.set(zmq.MAXMSGSIZE, protocol.MAX_MESSAGE)
-    server.set(zmq.HANDSHAKE_IVL, GREETING)
+    server.set(zmq.HANDSHAKE_IVL, HANDSHAKE_TIMEOUT_MS)
 
 
 def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits) -> str:
-    """Pass requests and replies on until fishd ends; returns which limit was exceeded."""
+    """Pass on requests and replies until fishd ends; return the exceeded limit, if any."""
     return Router(link, server, limits).run()

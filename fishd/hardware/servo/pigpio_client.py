@@ -112,7 +112,7 @@ class TimedSocket:
         return answer
 
     def _fill(self, size: int) -> None:
-        """Wait until `size` bytes have arrived; after the deadline, read only what is there."""
+        """Wait until `size` bytes have arrived; after the deadline, only read."""
         while len(self._received) < size:
             data = self._receive()
             if not data:

@@ -9,7 +9,7 @@ import pytest
 from rigs.processes import wait_until
 
 from fishd.core.errors import Refused
-from fishd.daemon.background_calls import MOST_AT_ONCE, MOST_GIVEN_UP, BackgroundCalls
+from fishd.daemon.background_calls import MAX_ABANDONED_CALLS, MAX_CALLS, BackgroundCalls
 
 PATIENCE = 60.0
 
@@ -50,12 +50,12 @@ def test_one_that_takes_too_long_is_refused_in_time_and_others_go_on() -> None:
     async def run() -> None:
         background = BackgroundCalls(0.1)
         begun = time.monotonic()
-        answers = await asyncio.gather(*(refusal(background, stuck) for _ in range(MOST_AT_ONCE)))
+        answers = await asyncio.gather(*(refusal(background, stuck) for _ in range(MAX_CALLS)))
         assert time.monotonic() - begun < 2.0
         assert {answer.code for answer in answers} == {"too-slow"}
-        assert str(answers[0]) == "it has not loaded within 0.1 s; it is given up"
+        assert str(answers[0]) == "it has not loaded within 0.1 s; the call is abandoned"
         background.check_busy()  # those that are given up no longer count
-        background.patience = PATIENCE
+        background.timeout = PATIENCE
         assert await background.call("", lambda: 42) == 42
 
     asyncio.run(run())
@@ -67,7 +67,7 @@ def test_four_at_once_are_all() -> None:
 
     async def run() -> None:
         background = BackgroundCalls(PATIENCE)
-        pending = [asyncio.create_task(background.call("", stuck)) for _ in range(MOST_AT_ONCE)]
+        pending = [asyncio.create_task(background.call("", stuck)) for _ in range(MAX_CALLS)]
         await asyncio.sleep(0)  # all of them begin
         with pytest.raises(Refused, match="4 requests are reading files; try again"):
             background.check_busy()
@@ -83,7 +83,7 @@ def test_so_many_that_would_not_end_are_enough_until_one_ends() -> None:
 
     async def run() -> None:
         background = BackgroundCalls(PATIENCE)
-        for _ in range(MOST_GIVEN_UP):
+        for _ in range(MAX_ABANDONED_CALLS):
             background.check_busy()
             stuck.entered.clear()
             call = asyncio.create_task(background.call("", stuck))
@@ -91,7 +91,9 @@ def test_so_many_that_would_not_end_are_enough_until_one_ends() -> None:
             call.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await call
-        with pytest.raises(Refused, match="of controllers mostly, still run; restart fishd"):
+        with pytest.raises(
+            Refused, match="abandoned calls, mostly of controllers, still run; restart fishd"
+        ):
             background.check_busy()
         stuck.let_go()
         background.check_busy()

@@ -21,7 +21,7 @@ from fishd.core.protocol import (
     SampleForce,
     Tare,
 )
-from fishd.daemon.calibration_requests import MOST_SAMPLES, CalibrationRequests
+from fishd.daemon.calibration_requests import MAX_CONCURRENT_SAMPLES, CalibrationRequests
 
 ANOTHER_BUS = ("force_sensor.bus=2", "virtual_pi.bus=2")
 BRIEFLY = SampleForce(seconds=0.2)
@@ -138,7 +138,7 @@ def test_four_samples_at_once_are_all(rig: LockstepRig) -> None:
             return refusal.code
 
     async def run() -> list[Any]:
-        answers = asyncio.gather(*(ask(BRIEFLY) for _ in range(MOST_SAMPLES + 3)))
+        answers = asyncio.gather(*(ask(BRIEFLY) for _ in range(MAX_CONCURRENT_SAMPLES + 3)))
         while not answers.done():
             rig.run_for(rig.config.tick)
             await asyncio.sleep(0)
@@ -158,14 +158,14 @@ def test_samples_that_are_under_way_end_as_soon_as_a_controller_starts(rig: Lock
         long = SampleForce(seconds=60.0)
         request = asked.handlers["sample-force"]
         answers = asyncio.gather(
-            *(request(long) for _ in range(MOST_SAMPLES)), return_exceptions=True
+            *(request(long) for _ in range(MAX_CONCURRENT_SAMPLES)), return_exceptions=True
         )
         await asyncio.sleep(0.1)
         rig.start("square")
         return await asyncio.wait_for(answers, 30.0)
 
     refusals = asyncio.run(run())
-    assert [refusal.code for refusal in refusals] == ["running"] * MOST_SAMPLES
+    assert [refusal.code for refusal in refusals] == ["running"] * MAX_CONCURRENT_SAMPLES
     assert str(refusals[0]) == "square is the active controller; stop it with 'fishctl stop'"
 
 

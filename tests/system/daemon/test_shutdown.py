@@ -190,7 +190,7 @@ def test_an_answer_of_pigpiod_that_is_late_just_then_keeps_no_tail_from_neutral(
         async def come_to_rest() -> None:
             daemon = Inside(Config(lockstep=True), print_status=False)
             daemon._loop, daemon._clock = loop, SimpleNamespace(sleep=rest)  # type: ignore
-            daemon._come_to_rest()
+            daemon._move_to_neutral()
 
         asyncio.run(come_to_rest())
         assert servo.driver.counters()["servo_late_answers"] == 1

@@ -183,7 +183,7 @@ def test_hx711_a_fish_swims_on_it(tmp_path: Path) -> None:
         ("rate=10", "longer than a tick of 50 ms"),
         ("rate=20", "one of 10 | 80 1/s is needed"),
         ("data_y=6", "6 is the pin of data_x already"),
-        ("data_x=18", "GPIO 18 is taken by force_sensor.data_x already"),
+        ("data_x=18", "GPIO 18 is already used by force_sensor.data_x"),
         ("clok=3", "did you mean 'clock'?"),
         ("address=72", "unknown key with driver hx711; drivers that have it: ads1115"),
     ],
@@ -412,7 +412,7 @@ def test_a_driver_whose_package_is_not_installed_is_one_line() -> None:
         load(None, ["servo.driver=pca9685"])
     assert str(refusal.value).endswith(
         "no servo driver is named 'pca9685'; installed: pigpio, rpi-gpio, sysfs-pwm; for another "
-        "one, install its package beside fishd"
+        "one, install its package"
     )
 
 

@@ -155,11 +155,11 @@ plant.xi: 2
 => plant.xi: unknown key; write 'plant:' and below it, indented, 'xi:'
 
 control: {address: 'tcp://127.evil.com:99'}
-=> taken from this machine only
+=> accepted only from this machine
 
 control: {address: 'ipc:///tmp/a'}
 telemetry: {address: 'ipc:///tmp/a'}
-=> fish.yaml:1: control.address: 'ipc:///tmp/a' is the address of telemetry already
+=> fish.yaml:1: control.address: 'ipc:///tmp/a' is already the address of telemetry
 
 start: {controller: swim}
 => fish.yaml:1: start.controller: no controller is named 'swim'; did you mean 'swing'?
@@ -171,7 +171,7 @@ start:
 => fish.yaml:4: start.parameters.c: unknown parameter 'c' of controller swing; did you mean 'C'?
 
 start: {parameters: {C: 1}}
-=> there is no start.controller to take these
+=> start.controller is not set; set it
 
 telemetry: {address: localhost}
 => fish.yaml:1: telemetry.address: 'localhost' is not valid: tcp://HOST:PORT or ipc://PATH is needed
@@ -258,7 +258,11 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         (["panel.estop_gpio=5", "panel.led_gpio=5"], "panel.led_gpio", "panel.estop_gpio"),
         (["robot=virtual-pi", "servo.driver=sysfs-pwm"], "servo.driver", "pigpiod"),
         (["virtual_pi.servo_scale=0"], "virtual_pi.servo_scale", "would not turn"),
-        (["state_folder=~nobody-here/fish"], "state_folder", "no user here is 'nobody-here'"),
+        (
+            ["state_folder=~nobody-here/fish"],
+            "state_folder",
+            "this machine has no user 'nobody-here'",
+        ),
         (['state_folder="/var/\\0fish"'], "state_folder", "a path has no zero byte"),
     ],
 )
@@ -291,8 +295,8 @@ def test_a_name_is_short_printable_text(name: str, tmp_path: Path) -> None:
 def test_an_observer_of_a_robot_needs_a_plant_of_its_own(tmp_path: Path) -> None:
     text = "robot: pi\nestimator:\n  kind: observer\n"
     assert complaint(text, tmp_path) == (
-        "fish.yaml:3: estimator.kind: observer needs a model of this fish, and section plant is "
-        "not given; 'fishctl identify' writes it"
+        "fish.yaml:3: estimator.kind: observer needs a model of this fish, but section plant is "
+        "not set; run 'fishctl identify' to write it"
     )
     file = tmp_path / "fish.yaml"
     file.write_text(text + "plant:\n  omega0: 11.2\n")

@@ -20,15 +20,15 @@ from rigs.processes import PATIENCE, Daemon, Process, Subscriber, call, running,
 from fishd.client import AsyncFish, Fish
 from fishd.daemon.gateway import link
 from fishd.daemon.gateway.gateways import (
-    FAREWELL,
+    END_TIMEOUT_S,
     MAX_UNANSWERED,
     MIN_FAILED_PERIOD_S,
-    RETURN,
+    RECONNECT_TIME_S,
     Gateway,
     Gateways,
     _Peer,
 )
-from fishd.daemon.gateway.limits import _behind
+from fishd.daemon.gateway.limits import _nice_value
 
 ATTACKERS = ROOT / "tools" / "reliability" / "attackers.py"
 
@@ -76,7 +76,7 @@ def test_subscribers_hear_of_a_restart_however_long_the_new_gateway_takes(tmp_pa
 import os, pathlib, sys, time
 def slow():
     if pathlib.Path({str(slow)!r}).exists():
-        time.sleep({1.5 * RETURN})
+        time.sleep({1.5 * RECONNECT_TIME_S})
 if "fishd.daemon.gateway" in sys.orig_argv:
     os.register_at_fork(after_in_child=slow)
 """
@@ -319,7 +319,7 @@ def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are
             lasting.process.send_signal(signal.SIGCONT)
         assert calm.status().mode == "running"
     assert reply["error"]["code"] == "busy"
-    assert "of your requests wait already; slow down" in reply["error"]["message"]
+    assert "of your requests are already waiting; slow down" in reply["error"]["message"]
 
 
 @pytest.mark.realtime
@@ -430,7 +430,7 @@ def test_a_gateway_that_dies_again_and_again_is_reported_all_the_same(daemon: Da
 def test_a_gateway_stands_back_behind_fishd_but_not_behind_everything(
     fishd: int, expected: int
 ) -> None:
-    assert _behind(fishd) == expected
+    assert _nice_value(fishd) == expected
 
 
 def nice(pid: int) -> int:
@@ -471,7 +471,7 @@ def test_gateways_that_hang_are_waited_for_together(
     asyncio.run(begin_and_end())
     assert len(hung) == 3
     assert len(waited) == 2
-    assert max(waited) <= FAREWELL
+    assert max(waited) <= END_TIMEOUT_S
     wait_until(lambda: all(gone(pid) for pid in hung))
 
 

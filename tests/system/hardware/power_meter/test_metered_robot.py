@@ -101,8 +101,8 @@ def test_a_meter_at_the_address_of_the_force_sensor_is_refused() -> None:
     with pytest.raises(ConfigError) as caught:
         load(None, ["robot=pi", METER, "power_meter.address=0x48"])
     assert str(caught.value) == (
-        "--set power_meter.address=0x48: power_meter.address: 0x48 on /dev/i2c-1 is that of "
-        "force_sensor already: each chip needs an address of its own"
+        "--set power_meter.address=0x48: power_meter.address: 0x48 on /dev/i2c-1 is already the "
+        "address of force_sensor: each chip needs a different address"
     )
 
 

@@ -9,19 +9,22 @@ from fishd.daemon.gateway import link
 
 @given(topic=st.sampled_from([b"tick", b"event", b"status"]), payload=st.binary())
 def test_a_published_message_arrives_as_its_two_frames(topic: bytes, payload: bytes) -> None:
-    assert link.frames(link.published(topic, payload)) == [topic, payload]
+    assert link.split_frames(link.join_frames(topic, payload)) == [topic, payload]
 
 
 @given(number=st.integers(0, 2**64 - 1), payload=st.binary())
 def test_a_request_arrives_with_its_number(number: int, payload: bytes) -> None:
-    assert link.numbered(link.request(number, payload)) == (number, payload)
+    assert link.number_and_payload(link.request(number, payload)) == (number, payload)
 
 
-@pytest.mark.parametrize("length", [0, 1, link.LONGEST - 10, link.LONGEST, 3 * link.LONGEST])
+@pytest.mark.parametrize(
+    "length",
+    [0, 1, link.MAX_MESSAGE_BYTES - 10, link.MAX_MESSAGE_BYTES, 3 * link.MAX_MESSAGE_BYTES],
+)
 def test_replies_of_any_length_travel_in_parts_and_may_be_mixed(length: int) -> None:
     long, short = bytes(length), b"short"
     parts = list(link.reply(1, long))
-    assert all(len(part) <= link.LONGEST for part in parts)
+    assert all(len(part) <= link.MAX_MESSAGE_BYTES for part in parts)
     replies = link.Replies()
     assert all(replies.take(part) is None for part in parts[:-1])
     assert [replies.take(part) for part in link.reply(2, short)] == [(2, short)]

@@ -110,7 +110,7 @@ def test_the_schema_knows_its_keys_and_takes_the_others_that_add_none() -> None:
     [
         (["plant.model=unfinished"], "does not define advance"),
         (["plant.model=unrelated"], "has no Settings, a subclass of fishd.virtual.plant.param"),
-        (["plant.model=listing"], "has keys that no two fish can be compared by: numbers, "),
+        (["plant.model=listing"], "has keys that cannot be compared between fish: numbers, "),
         (["plant.model=choosy"], "plant.size: 0.1 m is longer than the tank"),
         (["plant.model=good", "plant.size=2"], "2 is not valid: a number in (0, 1] m is needed"),
         (["plant.model=good", "plant.sizes=2"], "plant.sizes: unknown key; did you mean 'size'?"),

@@ -28,7 +28,7 @@ def test_a_configuration_is_checked_without_what_computes_the_fish() -> None:
 @pytest.mark.parametrize(
     ("override", "complaint"),
     [
-        ("tick=0.0125", "tick: 0.0125 s is no whole number of steps of swimmer.numerics.step, "
+        ("tick=0.0125", "tick: 0.0125 s is not a multiple of swimmer.numerics.step, "
          "0.001 s; 0.012 s would be"),
         ("swimmer.numerics.cell=0.005", "swimmer.numerics.cell: 0.005 m is too coarse"),
         ("swimmer.numerics.step=0.005", "swimmer.numerics.step: 0.005 s is beyond the limit"),
