@@ -210,9 +210,9 @@ def state_folder(config: Config) -> Path:
     """Return the folder of the calibrations of this robot."""
     folder = config.state_folder or os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if folder:
-        return files.expanded(folder) / config.robot
+        return files.expand_user(folder) / config.robot
     state = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
-    return files.expanded(state) / "fishd" / config.robot
+    return files.expand_user(state) / "fishd" / config.robot
 
 
 def end_pulses(config: Config) -> bool:
@@ -302,7 +302,7 @@ def assemble(
 
     def degraded() -> tuple[str, ...]:
         lines = tuple(servo.driver.degraded)
-        if sensor.calibration.untouched:
+        if sensor.calibration.is_unset:
             force = f"the force is not calibrated, and shown in {sensor.unit}"
             lines += (f"{force}: fishctl calibrate force",)
             if config.estimator.kind == "observer":

@@ -28,7 +28,7 @@ from fishd.camera.settings import CameraSettings
 from fishd.client import Fish
 from fishd.client.zmq_sockets import milliseconds_until
 from fishd.core import text
-from fishd.core.camera_frames import EQUAL, Frame, FrameHistory, Stack, StackSettings
+from fishd.core.camera_frames import TIME_TOLERANCE_S, Frame, FrameHistory, Stack, StackSettings
 from fishd.core.errors import FishError
 
 __all__ = ["CameraClient", "CameraLost"]
@@ -194,7 +194,7 @@ class CameraClient:
     def _await_frames_until(self, tick: float, patience: float) -> None:
         """Wait until all frames before a tick have arrived."""
         deadline = time.monotonic() + patience
-        while self._until is None or self._until < tick - EQUAL:
+        while self._until is None or self._until < tick - TIME_TOLERANCE_S:
             last_message_time = self._last_message_time
             wait = (
                 min(_STATUS_PERIOD_S, max(0.0, deadline - time.monotonic()))
@@ -202,7 +202,7 @@ class CameraClient:
                 else _POLL_PERIOD_S
             )
             self.poll(wait)
-            if self._until is not None and self._until >= tick - EQUAL:
+            if self._until is not None and self._until >= tick - TIME_TOLERANCE_S:
                 return
             if self._last_message_time > last_message_time and time.monotonic() < deadline:
                 continue
@@ -215,7 +215,7 @@ class CameraClient:
                 continue
             # Messages published before this client subscribed will not arrive.
             self._until = max(self._until or 0.0, state.until)
-            if self._until < tick - EQUAL and time.monotonic() >= deadline:
+            if self._until < tick - TIME_TOLERANCE_S and time.monotonic() >= deadline:
                 raise CameraLost(
                     f"the camera at {self.endpoint} has no frames for the tick at {tick:.3f} s: it "
                     f"has come to {self._until:.3f} s and is {self.state.state}"

@@ -13,7 +13,7 @@ from contextlib import suppress
 from typing import NamedTuple
 
 from fishd.client import Fish
-from fishd.core.clock import boot_id
+from fishd.core.clock import read_boot_id
 from fishd.core.errors import FishError
 
 MAX_DRIFT = 1e-4
@@ -35,7 +35,7 @@ class Reading(NamedTuple):
     clock: float
     """Time of the program's monotonic clock [s]."""
     boot: str
-    """Identifier of the boot of its machine; see `fishd.core.clock.boot_id`."""
+    """Identifier of the boot of its machine; see `fishd.core.clock.read_boot_id`."""
 
 
 class Offset(NamedTuple):
@@ -79,7 +79,7 @@ class ClockOffset:
         """ask: reads the other program's clock, or raises an error; now: reads this clock [s]"""
         self._ask = ask
         self._now = now
-        self._boot = boot_id()
+        self._boot = read_boot_id()
         self._other_boot = ""
         self._exchanges: deque[_Exchange] = deque(maxlen=2 * FIRST_ROUND_TRIPS)
         self._last_request_time = 0.0

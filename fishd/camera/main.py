@@ -15,8 +15,8 @@ from fishd.core import text
 from fishd.core.console import complain, run
 from fishd.core.errors import FishdError
 from fishd.core.process.interruption import on_signal
-from fishd.core.process.logs import UNHURRIED, LogWriter
-from fishd.core.process.shutdown import leave
+from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
+from fishd.core.process.shutdown import exit_now
 
 log = logging.getLogger(__name__)
 NAME = "fishd-camera"
@@ -71,7 +71,9 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
 
         source = open_source(settings)
     except ImportError as error:
-        complain(NAME, f"{text.said(error)}; install the extra: pip install 'fishd[camera]'", 1)
+        complain(
+            NAME, f"{text.error_message(error)}; install the extra: pip install 'fishd[camera]'", 1
+        )
     logs = LogWriter(log_format)
     logging.getLogger("linuxpy").setLevel(logging.WARNING)
     if path is not None:
@@ -87,7 +89,7 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
         log.critical("fishd-camera failed", exc_info=True)
         return 1
     finally:
-        logs.close(UNHURRIED)
+        logs.close(UNHURRIED_FLUSH_TIMEOUT_S)
     return 0
 
 
@@ -107,4 +109,4 @@ def warn_of_readers(path: Path, settings: CameraSettings) -> None:
 
 def main() -> None:
     """Run the command `fishd-camera`."""
-    leave(run(camera, NAME))
+    exit_now(run(camera, NAME))

@@ -123,7 +123,7 @@ def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
             "fish; give the address at which a running fishd-camera takes requests, such as "
             f"{PublishSettings().requests}"
         )
-    if complaint := addresses.why_not_connected(address):
+    if complaint := addresses.find_connect_problem(address):
         raise CameraLost(f"'{address}' is not an address of a camera: {complaint}")
     try:
         socket.set(zmq.IPV6, addresses.is_ipv6(address))

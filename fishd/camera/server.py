@@ -150,7 +150,7 @@ class Server:
             try:
                 self._source.run(self, self._stopping.wait)
             except Exception as error:
-                problem = f"{self._source.device} cannot be used: {text.named(error)}"
+                problem = f"{self._source.device} cannot be used: {text.describe_error(error)}"
                 if str(error) != self._last_error:
                     log.exception("%s", problem)
                 self._last_error = str(error)

@@ -11,10 +11,10 @@ from msgspec.structs import replace
 
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.core import strict_yaml, text
-from fishd.core.addresses import why_not_connected, why_not_served
+from fishd.core.addresses import find_connect_problem, find_listen_problem
 from fishd.core.errors import ConfigError
 from fishd.core.overrides import apply_overrides
-from fishd.core.schema import PRINTABLE, Problem, convert, note, unit, without_empty_sections
+from fishd.core.schema import PRINTABLE, Problem, convert, drop_empty_sections, note, unit
 
 _Delay = Annotated[
     float,
@@ -171,11 +171,11 @@ def load(
     )
     sources |= apply_overrides(data, overrides)
     try:
-        settings = convert(without_empty_sections(data, CameraSettings), CameraSettings)
+        settings = convert(drop_empty_sections(data, CameraSettings), CameraSettings)
         _check(settings)
         return settings
     except Problem as problem:
-        raise ConfigError(problem.located(sources)) from None
+        raise ConfigError(problem.message_with_place(sources)) from None
 
 
 def simulated(path: str | os.PathLike[str] | None = None) -> SimulatedSettings:
@@ -221,7 +221,7 @@ def _check(settings: CameraSettings) -> None:
     """Raise `Problem` for values that are valid on their own but not together."""
     publish, stream = settings.publish, settings.stream
     for key, address in (("frames", publish.frames), ("requests", publish.requests)):
-        if complaint := why_not_served(address):
+        if complaint := find_listen_problem(address):
             raise Problem(("publish", key), f"'{address}' is not valid: {complaint}")
     if publish.frames == publish.requests and not publish.frames.endswith(":0"):
         raise Problem(("publish", "requests"), f"'{publish.requests}' is that of frames already")
@@ -243,5 +243,5 @@ def _check(settings: CameraSettings) -> None:
                 f"{value!r} is not valid: a whole number, true or false is needed",
             )
     fishd = settings.simulated.fishd
-    if fishd is not None and (complaint := why_not_connected(fishd)):
+    if fishd is not None and (complaint := find_connect_problem(fishd)):
         raise Problem(("simulated", "fishd"), f"'{fishd}' is not valid: {complaint}")

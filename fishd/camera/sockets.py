@@ -12,7 +12,7 @@ import zmq
 from fishd.camera.messages import FRAME, STATE, UNTIL, VIEW
 from fishd.core import addresses, protocol, text
 from fishd.core.errors import Refused
-from fishd.core.schema import nearest
+from fishd.core.schema import suggest
 
 MAX_QUEUED_MESSAGES = 256
 """Largest number of messages that wait for a slow subscriber; later ones are dropped for it."""
@@ -126,7 +126,7 @@ class Requests:
         try:
             request = protocol.decode_request(payload)
             if request.op not in self.operations:
-                hint = nearest(request.op, list(self.operations))
+                hint = suggest(request.op, list(self.operations))
                 raise Refused("unknown-op", f"no such op '{text.quoted(request.op)}'; {hint}")
             if request.args:
                 raise Refused("bad-arguments", f"{request.op} takes no arguments")
@@ -156,10 +156,10 @@ def _listen(address: str, key: str, stack: ExitStack) -> tuple[sockets.socket, s
 
     Raises `StartupError`.
     """
-    stack.enter_context(addresses.claimed(address, _RIVAL, _ADVICE))
+    stack.enter_context(addresses.claim_address(address, _RIVAL, _ADVICE))
     listener = addresses.listen(address, key, in_use=_IN_USE)
     stack.callback(listener.close)
-    return listener, addresses.served(address, listener)
+    return listener, addresses.reachable_address(address, listener)
 
 
 def _bind(

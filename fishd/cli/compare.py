@@ -18,7 +18,7 @@ from fishd.config import Config, check_tethered
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError
-from fishd.core.process.interruption import interrupted_once
+from fishd.core.process.interruption import raise_on_first_signal
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -191,7 +191,7 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
     ended, status = "", 0
     chosen = [absolute(parse(text)) for text in task.texts]
     with (  # the fish is at rest after any kind of end
-        interrupted_once(),
+        raise_on_first_signal(),
         task.fish.session(camera=task.camera, agent=agent) as session,
     ):
         chosen = chosen or _default_contestants(session.read_config())

@@ -21,7 +21,7 @@ from fishd.config import (
     service_file,
     to_yaml,
 )
-from fishd.core.console import MAX_COMPLAINT
+from fishd.core.console import MAX_COMPLAINT_CHARACTERS
 from fishd.core.errors import ConfigError
 from fishd.core.schema import fields_of
 from fishd.core.text import line
@@ -99,7 +99,7 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
         sys.exit(os.EX_CONFIG if problems else 0)
     if problems:
         for mistake in problems:
-            echo(f"fishctl: {line(' '.join(mistake.split()), MAX_COMPLAINT)}", err=True)
+            echo(f"fishctl: {line(' '.join(mistake.split()), MAX_COMPLAINT_CHARACTERS)}", err=True)
         sys.exit(os.EX_CONFIG)
     loaded = load(file, overrides)
     echo(f"{file}: good")

@@ -21,7 +21,7 @@ from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.core.addresses import ENDPOINT_VARIABLE
 from fishd.core.errors import NoDaemon, UnknownController
 from fishd.core.protocol import State
-from fishd.core.schema import Field, nearest
+from fishd.core.schema import Field, suggest
 
 T = TypeVar("T")
 
@@ -62,7 +62,7 @@ def controllers(name: str | None, endpoint: str | None, as_json: bool) -> None:
     if name is not None:
         names = [info.name for info in infos]
         if name not in names:
-            hint = nearest(name, names)
+            hint = suggest(name, names)
             raise UnknownController(f"no controller is named '{name}'; {hint}")
         infos = [info for info in infos if info.name == name]
     if as_json:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from fishd.core.process.interruption import held_back
+from fishd.core.process.interruption import defer_signals
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -17,7 +17,7 @@ def open_full_screen() -> Iterator["Live"]:
 
     live = Live(screen=True, auto_refresh=False)
     try:
-        with held_back():  # rich does not undo an interrupted start
+        with defer_signals():  # rich does not undo an interrupted start
             live.start()
         yield live
     finally:

@@ -12,7 +12,7 @@ from fishd.cli.output import echo, format_state, output_may_fail, print_json
 from fishd.client import Fish
 from fishd.core.addresses import socket_path
 from fishd.core.errors import NoDaemon, StartupError, Untrusted
-from fishd.core.process.interruption import SIGNALS, handled
+from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.core.protocol import State
 from fishd.hardware import release_recipe
 
@@ -78,7 +78,7 @@ def _end_pulses(no_answer: NoDaemon, path: Path | None, file: Path | None) -> st
     if not recipe["function"]:
         return f"no pulses: the fish is simulated, and its fishd does not answer ({no_answer})"
     try:
-        with handled(SIGNALS, signal.SIG_IGN):  # it must not end halfway
+        with handle_signals(SIGNALS, signal.SIG_IGN):  # it must not end halfway
             result = release_recipe.carry_out(
                 recipe["function"], recipe["neutral"], recipe["arguments"]
             )

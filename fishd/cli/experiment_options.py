@@ -16,11 +16,11 @@ from fishd.cli.config import config_option, set_option
 from fishd.cli.options import F, endpoint_option, take_option, verb_lease
 from fishd.cli.output import echo
 from fishd.config import Config, Start, load
-from fishd.core.addresses import ENDPOINT_VARIABLE, find_control, socket_path
+from fishd.core.addresses import ENDPOINT_VARIABLE, find_control_address, socket_path
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, NoDaemon
 from fishd.core.process import unix_sockets
-from fishd.core.process.interruption import interrupted_once
+from fishd.core.process.interruption import raise_on_first_signal
 
 if TYPE_CHECKING:
     from fishd.lab.experiment import Experiment, Header
@@ -45,7 +45,7 @@ class ChosenFish(NamedTuple):
     def __str__(self) -> str:
         """Return which fish it is, in words."""
         if self.on == "live":
-            return f"the fish of fishd at {self.endpoint or find_control()}"
+            return f"the fish of fishd at {self.endpoint or find_control_address()}"
         fish = f"the simulated fish of {self.file}" if self.file else "the default simulated fish"
         return f"{fish}, changed by --set" if self.overrides else fish
 
@@ -180,7 +180,7 @@ def default_on(file: Path | None, overrides: tuple[str, ...], endpoint: str | No
 
 def is_fishd_running() -> bool:
     """Return whether a client would reach a fishd by default; $FISHD_ENDPOINT counts as one."""
-    path = socket_path(find_control())
+    path = socket_path(find_control_address())
     return bool(os.environ.get(ENDPOINT_VARIABLE)) or bool(
         path and path.exists() and not unix_sockets.is_deserted(path)
     )
@@ -322,7 +322,7 @@ class ExperimentEnding:
         from fishd.lab.session import Disturbed
 
         try:
-            with interrupted_once():
+            with raise_on_first_signal():
                 yield
         except KeyboardInterrupt:
             self.is_interrupted = True

@@ -21,7 +21,7 @@ from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
-from fishd.core.process.interruption import interrupted_once
+from fishd.core.process.interruption import raise_on_first_signal
 from fishd.recording.folder import find
 
 if TYPE_CHECKING:
@@ -144,7 +144,7 @@ def _swim_experiment(
     """Swim an experiment; return the start configuration of the fit, and the ticks."""
     from fishd.lab.identification import experiment
 
-    with interrupted_once(), fish.session() as session:
+    with raise_on_first_signal(), fish.session() as session:
         if fish.on == "simulation":
             config = fish.load()
         elif fish.file:

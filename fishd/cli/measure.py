@@ -10,8 +10,8 @@ from fishd.cli.experiment_options import ChosenFish, fish_choice, keep_option, k
 from fishd.cli.options import ControllerGroup, FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, format_controller, print_json
 from fishd.cli.progress import show_progress
-from fishd.core.console import INTERRUPTED, power_words
-from fishd.core.process.interruption import interrupted_once
+from fishd.core.console import INTERRUPTED, format_power
+from fishd.core.process.interruption import raise_on_first_signal
 
 if TYPE_CHECKING:
     from fishd.lab.measurement import ThrustMeasurement
@@ -68,7 +68,7 @@ def _measure(
     settings = {"controller": name, "parameters": parameters, "for": seconds, "settle": settle}
     try:
         with (
-            interrupted_once(),
+            raise_on_first_signal(),
             fish.session() as session,
             session,
             keep_session(folder, fish, session, settings) as experiment,
@@ -155,4 +155,4 @@ def _format_power(measured: "ThrustMeasurement") -> str:
     budget = error_budget.format_with_budget(
         thrust_per_watt, error, calibration_ci95, total_ci95, f"{measured.unit} per W"
     )
-    return f"; {power_words(measured.watts)}, {budget}"
+    return f"; {format_power(measured.watts)}, {budget}"

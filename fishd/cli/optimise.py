@@ -32,9 +32,9 @@ from fishd.cli.progress import show_progress
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core import text
-from fishd.core.console import power_words
+from fishd.core.console import format_power
 from fishd.core.errors import ParameterError
-from fishd.core.schema import Field, format_values, nearest, units_of
+from fishd.core.schema import Field, format_values, suggest, units_of
 
 if TYPE_CHECKING:
     from fishd.core.calibration import ForceCalibration
@@ -325,7 +325,7 @@ def _parse_range(text: str, controller: str, given: dict[str, Any], session: "Se
     fields = _controller_fields()
     if name not in fields or fields[name].kind != "number":
         numbers = [other_name for other_name, field in fields.items() if field.kind == "number"]
-        hint = nearest(name, numbers, listed="it has") if numbers else "it has none"
+        hint = suggest(name, numbers, listed="it has") if numbers else "it has none"
         raise click.UsageError(
             f"--over {text}: {controller} has no numeric parameter of this name; {hint}"
         )
@@ -414,7 +414,7 @@ def _format_trial(
     thrust = text.format_measured(trial.thrust, trial.error, unit)
     measured = f"{number}: {_format_parameters(trial.parameters, units)}: {thrust}"
     if math.isfinite(trial.power):
-        measured += f" for {power_words(trial.power)}"
+        measured += f" for {format_power(trial.power)}"
     if best is None:
         return measured
     more = f"another may give {best.improvement:.1%} more"
@@ -512,7 +512,9 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
             f"fishctl: no parameters are known that give {optimum.target * 1e3:g} m{unit}", err=True
         )
     if optimum.true_thrust is not None:
-        power_text = "" if optimum.true_power is None else f" for {power_words(optimum.true_power)}"
+        power_text = (
+            "" if optimum.true_power is None else f" for {format_power(optimum.true_power)}"
+        )
         echo(
             f"true thrust there: {optimum.true_thrust * 1e3:.2f} mN{power_text}, "
             f"{optimum.relative_thrust:.1%} of the best square wave"

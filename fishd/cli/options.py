@@ -15,7 +15,7 @@ from fishd.cli.output import make_printable
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.core import text
 from fishd.core.errors import FishError, ParameterError, UnknownController
-from fishd.core.schema import Field, names_file, spelled, wanted
+from fishd.core.schema import Field, describe_permitted, format_literal, names_file
 from fishd.core.signals import ControllerInfo
 
 if TYPE_CHECKING:
@@ -157,11 +157,11 @@ class ParameterType(click.ParamType[Any]):
         if field.file and names_file(value, field.file):
             from fishd.core import files
 
-            return str(files.expanded(value).absolute())  # fishd may run in another folder
+            return str(files.expand_user(value).absolute())  # fishd may run in another folder
         try:
             return _PARSERS.get(field.kind, str)(value)
         except ValueError:
-            self.fail(f"'{value}' is not valid: {wanted(field)} is needed", param, ctx)
+            self.fail(f"'{value}' is not valid: {describe_permitted(field)} is needed", param, ctx)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
@@ -239,8 +239,8 @@ def given_parameters(context: click.Context, values: dict[str, Any]) -> dict[str
 
 def describe_parameter(field: Field) -> str:
     """Return description, permitted values, unit and default of a parameter in one line."""
-    permitted = wanted(field)
-    default = "required" if field.required else f"default {spelled(field.default)}"
+    permitted = describe_permitted(field)
+    default = "required" if field.required else f"default {format_literal(field.default)}"
     return f"{field.description} {permitted[0].upper()}{permitted[1:]}; {default}."
 
 

@@ -11,7 +11,7 @@ import click
 import msgspec
 
 from fishd.core import text
-from fishd.core.console import lose_output, why_not_written
+from fishd.core.console import describe_write_error, discard_output
 from fishd.core.schema import format_values
 from fishd.core.signals import Reason
 
@@ -38,9 +38,9 @@ def output_may_fail(done: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        lose_output()
+        discard_output()
         with suppress(OSError):
-            echo(f"fishctl: {done}; {why_not_written(error)}", err=True)
+            echo(f"fishctl: {done}; {describe_write_error(error)}", err=True)
 
 
 def echo_rows(rows: Sequence[tuple[str, str]]) -> None:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import click
 
-from fishd.core.process.interruption import handled
+from fishd.core.process.interruption import handle_signals
 
 _REPEAT_INTERVAL_S = 0.1
 """Time between two interruptions of a system call [s]."""
@@ -33,7 +33,7 @@ def input_interrupted() -> Iterator[None]:
                 signal.pthread_kill(main, signal.SIGURG)
 
     thread = threading.Thread(target=interrupt, name="interrupt", daemon=True)
-    with handled([signal.SIGURG], lambda *_: None):
+    with handle_signals([signal.SIGURG], lambda *_: None):
         previous_fd = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         thread.start()
         try:

@@ -14,9 +14,9 @@ from fishd.cli.output import echo, output_may_fail, print_json
 from fishd.client import Fish
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file
 from fishd.core import text
-from fishd.core.addresses import find_control
+from fishd.core.addresses import find_control_address
 from fishd.core.errors import ConfigError, FishError, NoDaemon, ServoError, StartupError
-from fishd.core.process.interruption import SIGNALS, handled
+from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.hardware.release_recipe import NOT_RELEASED, outcome
 
 _NO_FOLDER = "/proc/self/no-calibrations"
@@ -85,7 +85,7 @@ def release_by_config(no_answer: NoDaemon, file: Path | None) -> str:
 def _release(config: Config) -> str:
     """Stop a fishd that drives the servo, or end the pulses; return what was done, in words."""
     try:
-        with handled(SIGNALS, signal.SIG_IGN):
+        with handle_signals(SIGNALS, signal.SIG_IGN):
             driver_pid = _find_driver(config)
             if driver_pid and (summary := _stop_fishd(config, driver_pid)):
                 return summary
@@ -111,7 +111,7 @@ def _find_driver(config: Config) -> str:
 
 
 def _endpoint(config: Config) -> str:
-    return config.control.address or find_control()
+    return config.control.address or find_control_address()
 
 
 def _stop_fishd(config: Config, driver_pid: str) -> str:

@@ -19,7 +19,7 @@ from fishd.cli.output import (
     warn_of_fin,
 )
 from fishd.config import Config, load
-from fishd.core.console import power_words
+from fishd.core.console import format_power
 from fishd.core.errors import MissingPackage
 
 if TYPE_CHECKING:
@@ -166,7 +166,7 @@ def _power_rows(report: "Report") -> list[tuple[str, str]]:
     if not report.mean_power:
         return []
     per_watt = report.mean_thrust * 1e3 / report.mean_power
-    return [("power", f"{power_words(report.mean_power)} into the servo: {per_watt:.3g} mN per W")]
+    return [("power", f"{format_power(report.mean_power)} into the servo: {per_watt:.3g} mN per W")]
 
 
 def _format_takeover(report: "Report", settle: float) -> str:

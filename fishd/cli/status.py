@@ -15,7 +15,7 @@ from fishd.cli.output import (
     print_json,
 )
 from fishd.client import Fish
-from fishd.core.console import power_words, thrust_words
+from fishd.core.console import format_power, format_thrust
 from fishd.core.schema import format_values
 from fishd.core.signals import Percentiles, Status
 
@@ -86,11 +86,11 @@ def _criterion_rows(status: Status) -> list[tuple[str, str]]:
 def _thrust_rows(status: Status) -> list[tuple[str, str]]:
     if status.speed is not None:
         return [("speed", f"{status.speed * 1e3:.1f} mm/s at {status.frequency:.2f} Hz")]
-    rows = [("thrust", f"{thrust_words(status)} at {status.frequency:.2f} Hz")]
+    rows = [("thrust", f"{format_thrust(status)} at {status.frequency:.2f} Hz")]
     if status.thrust_error is None and not status.sensor_lost:
         rows.append(("", _ZERO_UNKNOWN_NOTE))
     if status.power is not None:
-        rows.append(("power", f"{power_words(status.power)} into the servo, mean of 2 s"))
+        rows.append(("power", f"{format_power(status.power)} into the servo, mean of 2 s"))
     return rows
 
 

@@ -76,7 +76,7 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
             f"virtual Pi on {path}: ADS1115 {settings.address:#04x} on I2C bus {settings.bus}, "
             f"pigpiod on 127.0.0.1:{pi.pigpiod.port} with the servo on GPIO {settings.servo_gpio}"
         )
-        realtime.quiet_garbage_collector()
+        realtime.freeze_garbage_collector()
         while not stopped(1.0):
             realtime.collect_garbage()
             state = pi.state()  # also advances the fish while no driver reads the sensor

@@ -14,7 +14,7 @@ from rich.text import Text
 
 from fishd.cli.output import format_controller, format_quantities, format_time_of_day
 from fishd.core import text
-from fishd.core.console import power_words, thrust_words
+from fishd.core.console import format_power, format_thrust
 from fishd.core.signals import Event, Status, Tick
 
 TRACE_SPAN_S = 5.0
@@ -128,8 +128,8 @@ class View:
         speed, power = tick.speed, self.status.power
         figures = {
             **({"speed": f"{speed * 1e3:.1f} mm/s"} if isinstance(speed, float) else {}),
-            "thrust": thrust_words(current),
-            **({} if power is None else {"power": power_words(power)}),
+            "thrust": format_thrust(current),
+            **({} if power is None else {"power": format_power(power)}),
             "tail beat": f"{tick.frequency:.2f} Hz",
             **({} if self.status.robot == "swimmer" else self._timing_figures()),
             "lost": f"{self._lost}",

@@ -12,7 +12,7 @@ import msgspec
 import zmq
 
 from fishd.client.zmq_sockets import milliseconds_until
-from fishd.core.addresses import claimed, is_ipv6, parse
+from fishd.core.addresses import claim_address, is_ipv6, parse
 from fishd.core.agent_messages import (
     MAX_MESSAGE,
     VERSION,
@@ -181,7 +181,7 @@ def _bound(address: str, stack: ExitStack) -> "zmq.Socket[bytes]":
     """A socket that listens there until the stack is closed; raises `FishError`."""
     try:
         parse(address)
-        stack.enter_context(claimed(address, "another program", "choose another address"))
+        stack.enter_context(claim_address(address, "another program", "choose another address"))
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         stack.callback(context.destroy, linger=100)
         socket = context.socket(zmq.ROUTER)

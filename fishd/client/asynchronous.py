@@ -23,7 +23,7 @@ from fishd.client.zmq_sockets import dealer, milliseconds_until, subscriber
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted
-from fishd.core.protocol import LOADING, Calibrations, Grant, PolicyInfo, State
+from fishd.core.protocol import LOADING_TIMEOUT_S, Calibrations, Grant, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
 T = TypeVar("T")
@@ -62,7 +62,7 @@ class AsyncFish(Connection):
 
     async def policies(self) -> list[PolicyInfo]:
         """The named policies that the daemon finds, with what their files say about themselves."""
-        return await self._call(list[PolicyInfo], "policies", patience=LOADING)
+        return await self._call(list[PolicyInfo], "policies", patience=LOADING_TIMEOUT_S)
 
     async def config(self) -> dict[str, Any]:
         """The configuration that the daemon was started with, defaults included."""
@@ -71,7 +71,7 @@ class AsyncFish(Connection):
     async def set_controller(self, name: str, /, **parameters: Any) -> State:
         """Select another controller; parameters left out take their defaults."""
         return await self._call(
-            State, "set-controller", patience=LOADING, name=name, parameters=parameters
+            State, "set-controller", patience=LOADING_TIMEOUT_S, name=name, parameters=parameters
         )
 
     async def set_parameters(self, **parameters: Any) -> State:
@@ -116,12 +116,14 @@ class AsyncFish(Connection):
     async def tare(self, seconds: float = 2.0) -> Calibrations:
         """Measure for a while and call that zero force; refused unless all is still."""
         sample = await self.sample_force(seconds)
-        return await self._call(Calibrations, "tare", patience=LOADING, sample=sample.number)
+        return await self._call(
+            Calibrations, "tare", patience=LOADING_TIMEOUT_S, sample=sample.number
+        )
 
     async def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
         """Apply another calibration of the force sensor, and save it."""
         return await self._call(
-            Calibrations, "calibrate-force", patience=LOADING, calibration=calibration
+            Calibrations, "calibrate-force", patience=LOADING_TIMEOUT_S, calibration=calibration
         )
 
     async def calibrate_thrust(self, factor: float, error: float) -> State:
@@ -133,7 +135,7 @@ class AsyncFish(Connection):
         return await self._call(
             Calibrations,
             "calibrate-servo",
-            patience=LOADING if save else 0.0,
+            patience=LOADING_TIMEOUT_S if save else 0.0,
             calibration=calibration,
             save=save,
         )

@@ -14,7 +14,7 @@ from fishd.core import protocol, text
 from fishd.core.addresses import (
     ENDPOINT_VARIABLE,
     estop_path,
-    find_control,
+    find_control_address,
     socket_path,
 )
 from fishd.core.decoding import decoder
@@ -26,7 +26,7 @@ from fishd.core.errors import (
     Refused,
     Untrusted,
 )
-from fishd.core.process.unix_sockets import Listener, is_deserted, listener, stranger
+from fishd.core.process.unix_sockets import Listener, find_listener, find_trust_problem, is_deserted
 from fishd.core.protocol import State
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class Connection:
     """What both clients share: addresses, the form of requests and replies, and complaints."""
 
     def __init__(self, endpoint: str | None, timeout: float, telemetry: str | None) -> None:
-        self.endpoint = endpoint or find_control()
+        self.endpoint = endpoint or find_control_address()
         self._path = socket_path(self.endpoint)
         self._was_named = bool(endpoint or os.environ.get(ENDPOINT_VARIABLE))
         self.timeout = timeout
@@ -77,7 +77,7 @@ class Connection:
                 f"this user may not ask the fishd at {self.endpoint}: join the group of its socket "
                 "('sudo usermod -aG fishd USER' for the service), log in again, then try again"
             ) from None
-        if self._path and not self._was_named and (why := stranger(self._path)):
+        if self._path and not self._was_named and (why := find_trust_problem(self._path)):
             raise Untrusted(
                 f"what listens at {self.endpoint} is not asked, it may be anybody: {why}; where "
                 "you trust it, name it with --endpoint or $FISHD_ENDPOINT"
@@ -105,7 +105,7 @@ class Connection:
 
     def _listener(self) -> Listener | None:
         """Who listens, where that can be told; raises PermissionError."""
-        return listener(self._path) if self._path else None
+        return find_listener(self._path) if self._path else None
 
     def request(self, op: str, args: Mapping[str, Any]) -> tuple[int, bytes]:
         """Return a new id, and the request as JSON.

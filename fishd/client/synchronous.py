@@ -18,7 +18,7 @@ from fishd.client.request_socket import RequestSocket
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted
-from fishd.core.protocol import LOADING, Calibrations, Grant, PolicyInfo, State
+from fishd.core.protocol import LOADING_TIMEOUT_S, Calibrations, Grant, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class Fish(Connection):
 
     def policies(self) -> list[PolicyInfo]:
         """The named policies that the daemon finds, with what their files say about themselves."""
-        return self._call(list[PolicyInfo], "policies", patience=LOADING)
+        return self._call(list[PolicyInfo], "policies", patience=LOADING_TIMEOUT_S)
 
     def config(self) -> dict[str, Any]:
         """The configuration that the daemon was started with, defaults included."""
@@ -88,10 +88,10 @@ class Fish(Connection):
     def set_controller(self, name: str, /, **parameters: Any) -> State:
         """Select another controller; parameters left out take their defaults.
 
-        It may take `protocol.LOADING` seconds to load, beyond the time-out.
+        It may take `protocol.LOADING_TIMEOUT_S` seconds to load, beyond the time-out.
         """
         return self._call(
-            State, "set-controller", patience=LOADING, name=name, parameters=parameters
+            State, "set-controller", patience=LOADING_TIMEOUT_S, name=name, parameters=parameters
         )
 
     def set_parameters(self, **parameters: Any) -> State:
@@ -148,12 +148,12 @@ class Fish(Connection):
         Nothing changes where that is given up while it measures.
         """
         sample = self.sample_force(seconds)
-        return self._call(Calibrations, "tare", patience=LOADING, sample=sample.number)
+        return self._call(Calibrations, "tare", patience=LOADING_TIMEOUT_S, sample=sample.number)
 
     def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
         """Apply another calibration of the force sensor, and save it."""
         return self._call(
-            Calibrations, "calibrate-force", patience=LOADING, calibration=calibration
+            Calibrations, "calibrate-force", patience=LOADING_TIMEOUT_S, calibration=calibration
         )
 
     def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
@@ -164,7 +164,7 @@ class Fish(Connection):
         return self._call(
             Calibrations,
             "calibrate-servo",
-            patience=LOADING if save else 0.0,
+            patience=LOADING_TIMEOUT_S if save else 0.0,
             calibration=calibration,
             save=save,
         )

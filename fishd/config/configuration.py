@@ -20,16 +20,16 @@ from fishd.controllers.base import DWELL, LONGEST_DWELL, ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.overrides import apply_overrides
-from fishd.core.protocol import LEASE, LONGEST_LEASE, SHORTEST_LEASE
+from fishd.core.protocol import DEFAULT_LEASE_S, MAX_LEASE_S, MIN_LEASE_S
 from fishd.core.schema import (
     Problem,
     convert,
+    drop_empty_sections,
     fields_of,
     find_doubts,
-    leaves,
+    list_keys,
     note,
     unit,
-    without_empty_sections,
 )
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
 from fishd.hardware.servo.pigpio import PigpioSettings
@@ -109,10 +109,10 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             "s",
             "Time after which an experiment that does not renew its lease ends, and the fish fades "
             "to neutral; use a longer time for slow links.",
-            ge=SHORTEST_LEASE,
-            le=LONGEST_LEASE,
+            ge=MIN_LEASE_S,
+            le=MAX_LEASE_S,
         ),
-    ] = LEASE
+    ] = DEFAULT_LEASE_S
 
 
 class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -278,11 +278,11 @@ def load(path: str | os.PathLike[str] | None = None, overrides: Iterable[str] = 
     data, sources = read(path) if path is not None else ({}, {})
     sources |= apply_overrides(data, overrides)
     try:
-        config = convert_sections(without_empty_sections(data, Config))
+        config = convert_sections(drop_empty_sections(data, Config))
         for check in CHECKS:
             check(config)
     except Problem as problem:
-        raise ConfigError(problem.located(sources)) from None
+        raise ConfigError(problem.message_with_place(sources)) from None
     _warn_of_values(config, sources)
     return config
 
@@ -351,7 +351,7 @@ def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
         return convert_sections(data)
     except Problem as problem:
         place = sources.get(problem.path, "the configuration of the running fishd")
-        raise ConfigError(problem.located({problem.path: place})) from None
+        raise ConfigError(problem.message_with_place({problem.path: place})) from None
 
 
 def convert_sections(data: Mapping[str, Any]) -> Config:
@@ -363,7 +363,7 @@ def convert_sections(data: Mapping[str, Any]) -> Config:
 
 def keys() -> list[str]:
     """Return every key in dotted form, including those of all drivers and plants that load."""
-    return list(dict.fromkeys(leaves(Config) + drivers.keys()))
+    return list(dict.fromkeys(list_keys(Config) + drivers.keys()))
 
 
 def to_yaml(config: Config | dict[str, Any]) -> str:

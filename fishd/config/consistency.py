@@ -11,7 +11,7 @@ from typing import Any
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core import files
-from fishd.core.addresses import FORM, is_local, why_not_served
+from fishd.core.addresses import ADDRESS_FORM, find_listen_problem, is_local
 from fishd.core.errors import ParameterError, UnknownController
 from fishd.core.process.unix_sockets import check_length
 from fishd.core.schema import Problem
@@ -45,12 +45,12 @@ def check_start(controller: str | None, parameters: Mapping[str, Any], limits: L
 
 def check_addresses(telemetry: str, control: str | None) -> None:
     """Check that both addresses are valid and differ, and that `control` is of this machine."""
-    if complaint := why_not_served(telemetry):
+    if complaint := find_listen_problem(telemetry):
         raise Problem(("telemetry", "address"), f"'{telemetry}' is not valid: {complaint}")
     if control is None:
         return
-    complaint = why_not_served(control)
-    if complaint.startswith(FORM) or not (complaint or is_local(control)):
+    complaint = find_listen_problem(control)
+    if complaint.startswith(ADDRESS_FORM) or not (complaint or is_local(control)):
         complaint = (
             "ipc://PATH or tcp://127.0.0.1:PORT is needed; requests can move the fish, so they are "
             "accepted only from this machine"
@@ -74,7 +74,7 @@ def check_state_folder(folder: str | None) -> None:
             ("state_folder",),
             f"'{folder}' is not valid: a path has no zero byte and no lone surrogate",
         )
-    if str(files.expanded(folder)).startswith("~"):
+    if str(files.expand_user(folder)).startswith("~"):
         user = folder.partition("/")[0].removeprefix("~")
         why = f"this machine has no user '{user}'" if user else "this user has no home"
         raise Problem(

@@ -13,9 +13,9 @@ from msgspec import Struct
 
 from fishd.core import text
 from fishd.core.errors import UnknownDriver, UnknownPlant
-from fishd.core.foreign_code import contained
+from fishd.core.foreign_code import call_foreign
 from fishd.core.plugins import Plugins
-from fishd.core.schema import Problem, UnknownKey, convert, fields_of, nearest, shown
+from fishd.core.schema import Problem, UnknownKey, convert, fields_of, format_excerpt, suggest
 from fishd.hardware.driver import Claim, Driver
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
 from fishd.hardware.registry import FORCE_SENSORS, POWER_METERS, SERVOS
@@ -79,7 +79,7 @@ def driver_of(section: str, name: str) -> type[Any]:
     """Return the driver or plant of that name; raise `Problem`, which lists those installed."""
     plugins, key = CHOICES[section].plugins, CHOICES[section].key
     if not plugins.has(name):
-        hint = nearest(name, plugins.names())
+        hint = suggest(name, plugins.names())
         suggestion = f", {hint}" if hint.startswith("did") else ""
         raise Problem(
             (section, key),
@@ -144,12 +144,12 @@ def check_plant(plant: PlantParameters) -> None:
 
 def _check(section: str, name: str, check: Callable[[], None]) -> None:
     try:
-        contained(check)
+        call_foreign(check)
     except Problem as problem:
         raise Problem((section, *problem.path), str(problem)) from None
     except Exception as error:
         kind = CHOICES[section].key if section != "plant" else section
-        what = f"{kind} '{name}' cannot check its settings: {text.named(error)}"
+        what = f"{kind} '{name}' cannot check its settings: {text.describe_error(error)}"
         raise Problem((section,), what) from error
 
 
@@ -177,7 +177,7 @@ def _convert(section: str, data: Any, elsewhere: Callable[[], list[str]]) -> Any
             return None
         data = {}
     if not isinstance(data, Mapping):
-        what = f"{shown(data)} is not valid: a section (a mapping of keys to values) is needed"
+        what = f"{format_excerpt(data)} is not valid: a section (a mapping of keys to values) is needed"
         raise Problem((section,), what)
     name = data.get(key, default) or None
     if not isinstance(name, str):

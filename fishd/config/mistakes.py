@@ -14,7 +14,7 @@ from fishd.config.configuration import Config
 from fishd.config.drivers import CHOICES
 from fishd.core.errors import ConfigError
 from fishd.core.overrides import apply_overrides
-from fishd.core.schema import Problem, without_empty_sections
+from fishd.core.schema import Problem, drop_empty_sections
 
 MAX_MISTAKES = 100
 """Largest number of mistakes that are listed."""
@@ -36,7 +36,7 @@ def find(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> list[st
         except ConfigError as error:
             mistakes.append(str(error))
     problems = _Repair(data).problems
-    mistakes += [problem.located(sources) for problem in problems]
+    mistakes += [problem.message_with_place(sources) for problem in problems]
     return sorted(mistakes, key=_line)[:MAX_MISTAKES]
 
 
@@ -62,7 +62,7 @@ class _Repair:
         """Return the rest of the configuration, or None if it is still not valid."""
         while len(self.problems) <= MAX_MISTAKES:
             try:
-                return configuration.convert_sections(without_empty_sections(self._data, Config))
+                return configuration.convert_sections(drop_empty_sections(self._data, Config))
             except Problem as problem:
                 self.problems.append(problem)
                 if not self._leave_out(problem.path):

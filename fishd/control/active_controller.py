@@ -12,7 +12,7 @@ from fishd.controllers.hold import Hold, HoldParameters
 from fishd.controllers.quantities import quantities_of, values_of
 from fishd.core import text
 from fishd.core.errors import ControllerFault
-from fishd.core.foreign_code import contained
+from fishd.core.foreign_code import call_foreign
 from fishd.core.schema import fields_of, units_of
 from fishd.core.signals import Observation, Reason
 
@@ -56,7 +56,7 @@ class ActiveController:
     def dispose(self, controller: Controller[Any], what: str) -> None:
         """Close a controller that will not be active again; what: its description for the log."""
         try:
-            contained(controller.close)
+            call_foreign(controller.close)
         except Exception as error:
             self._reporter.problem(f"{what} could not be closed", error)
 
@@ -68,7 +68,7 @@ class ActiveController:
         """Activate the successor that a controller named when it gave up, and report that."""
         before = self.name
         self.replace(*successor)
-        self.fallback = Reason(code, text.line(f"{before} gave up: {text.said(error)}"))
+        self.fallback = Reason(code, text.line(f"{before} gave up: {text.error_message(error)}"))
         self._reporter.fallback(
             before, self.name, self.parameters, self.parameter_units, self.fallback
         )
@@ -76,7 +76,7 @@ class ActiveController:
     def update(self, observation: Observation) -> Any:
         """Return the command of the controller, unchecked.
 
-        Raises what the controller raises, so call this through `contained`.
+        Raises what the controller raises, so call this through `call_foreign`.
         """
         controller = self.controller
         if self._is_new:
@@ -86,14 +86,14 @@ class ActiveController:
 
     def retune(self, parameters: Struct) -> None:
         """Give the controller new, already checked parameters; raises what its `retune` raises."""
-        contained(self.controller.retune, parameters)
+        call_foreign(self.controller.retune, parameters)
         self.parameters = _encode_parameters(self.controller)
         self.wave = _wave_kind(self.name, self.controller, self.parameters)
         self._reporter.controller("parameters", self.name, self.parameters, self.parameter_units)
 
     def warm_up(self) -> None:
         """Warm the controller up for the imminent update; raises what the controller raises."""
-        contained(self.controller.warm_up)
+        call_foreign(self.controller.warm_up)
 
 
 @lru_cache(maxsize=64)
@@ -122,7 +122,7 @@ def fault_and_successor(error: ControllerFault) -> tuple[str, Successor | None]:
         return code, None
 
     try:
-        return contained(read)
+        return call_foreign(read)
     except Exception:
         return "controller-error", None
 
@@ -149,4 +149,4 @@ def _encode_parameters(controller: Controller[Any]) -> dict[str, Any]:
         encoded = msgspec.json.encode(msgspec.structs.asdict(controller.parameters))
         return msgspec.json.decode(encoded, type=dict[str, Any])
 
-    return contained(encode)
+    return call_foreign(encode)

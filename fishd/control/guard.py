@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from fishd.core.foreign_code import contained, real_number
+from fishd.core.foreign_code import call_foreign, real_number
 
 
 class Guard:
@@ -42,7 +42,7 @@ class Guard:
         Raises ValueError when the command is not a number, or not finite.
         """
         is_float = type(command) is float
-        angle = command if is_float else contained(real_number, command, "the command")
+        angle = command if is_float else call_foreign(real_number, command, "the command")
         if not math.isfinite(angle):
             raise ValueError(f"the command is {angle}, not an angle")
         if angle > self.highest:

@@ -28,7 +28,7 @@ from fishd.core import text
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock, Slot
 from fishd.core.errors import ControllerFault, FishLost, Refused, SensorError
-from fishd.core.foreign_code import contained
+from fishd.core.foreign_code import call_foreign
 from fishd.core.signals import Measurement, Observation
 from fishd.hardware.base import Robot
 
@@ -307,7 +307,7 @@ class ControlLoop:
         except Exception as error:
             if isinstance(error, FishLost):
                 self._fail("fish-lost", "the fish cannot be read any more", error)
-            problem = f"the force sensor cannot be read: {text.named(error)}"
+            problem = f"the force sensor cannot be read: {text.describe_error(error)}"
             measurement = self._last_trusted_measurement()
         else:
             if measurement.suspect or self.supervisor.failures:
@@ -400,7 +400,7 @@ class ControlLoop:
             return self.guard.fade(self.applied)
         name = self.active.name
         try:
-            command = contained(self.active.update, observation)
+            command = call_foreign(self.active.update, observation)
             applied = self.guard.apply(command, self.applied)
         except ControllerFault as error:
             code, successor = fault_and_successor(error)
@@ -449,7 +449,10 @@ class ControlLoop:
                 self.supervisor.fail("overrun", problem)
             self._fail("servo-link", "the servo cannot be driven", error)
             if latched and not lost:  # the latched reason does not say that
-                message = f"it may still have pulses, and cannot be released: {text.named(error)}"
+                message = (
+                    "it may still have pulses, and cannot be released: "
+                    f"{text.describe_error(error)}"
+                )
                 self.reporter.event("servo", message, "error")
 
     def _publish(self, turn: Turn, now: float) -> None:

@@ -101,7 +101,7 @@ class Reporter:
 
     def problem(self, what: str, error: Exception) -> str:
         """Log that something failed, unless the latest problem was the same; return the line."""
-        line = text.line(f"{what}: {text.named(error)}")
+        line = text.line(f"{what}: {text.describe_error(error)}")
         if line != self._latest_problem:
             log.error("%s", line, exc_info=None if isinstance(error, FishdError) else error)
         self._latest_problem = line

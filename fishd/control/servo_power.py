@@ -46,7 +46,7 @@ class ServoPower:
             if not math.isfinite(power):
                 raise ValueError(f"it gave {power} W")
         except Exception as error:
-            self._note_failure(f"the power meter cannot be read: {text.named(error)}")
+            self._note_failure(f"the power meter cannot be read: {text.describe_error(error)}")
             return None
         self._failures = 0
         if self.trouble:

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from fishd.core import text
-from fishd.core.foreign_code import contained, real_number
+from fishd.core.foreign_code import call_foreign, real_number
 from fishd.core.signals import QuantityInfo
 
 MOST = 16
@@ -81,7 +81,7 @@ def values_of(controller: object, names: Iterable[str]) -> dict[str, float]:
             if value is None:
                 continue
             try:
-                value = contained(real_number, value, name)
+                value = call_foreign(real_number, value, name)
             except Exception:  # which costs no more than the quantity
                 continue
         if value - value == 0.0:  # it is finite

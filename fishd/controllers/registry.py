@@ -12,9 +12,9 @@ from fishd.controllers.base import Controller, Limits
 from fishd.controllers.quantities import quantities_of
 from fishd.core import text
 from fishd.core.errors import ParameterError, UnknownController
-from fishd.core.foreign_code import Attempt, contained
+from fishd.core.foreign_code import Attempt, call_foreign
 from fishd.core.plugins import Plugins
-from fishd.core.schema import Problem, UnknownKey, convert, fields_of, nearest, units_of
+from fishd.core.schema import Problem, UnknownKey, convert, fields_of, suggest, units_of
 from fishd.core.signals import ControllerInfo
 
 LONGEST_IMPORT = 10.0
@@ -99,11 +99,11 @@ def check(name: str, values: Mapping[str, Any], limits: Limits) -> Struct:
     """
     found = find(name)
     try:
-        parameters = contained(convert, dict(values), found.Parameters)
+        parameters = call_foreign(convert, dict(values), found.Parameters)
     except Problem as problem:
         if isinstance(problem, UnknownKey) and len(problem.path) == 1:
             key = problem.path[0]
-            hint = nearest(
+            hint = suggest(
                 key, [field.name for field in fields_of(found.Parameters)], listed="it has"
             )
             raise ParameterError(
@@ -112,15 +112,15 @@ def check(name: str, values: Mapping[str, Any], limits: Limits) -> Struct:
         what = text.quoted(".".join(problem.path)) or "parameters"
         raise ParameterError(f"{name}: {what}: {problem}", problem.path) from None
     try:
-        contained(found.check, parameters, limits)
+        call_foreign(found.check, parameters, limits)
     except ParameterError as error:
-        raise ParameterError(f"{name}: {text.said(error)}", error.path) from None
+        raise ParameterError(f"{name}: {text.error_message(error)}", error.path) from None
     return parameters
 
 
 def create(name: str, values: Mapping[str, Any], limits: Limits) -> Controller[Any]:
     """A new controller, ready to be swapped in; raises `UnknownController`, `ParameterError`."""
-    return contained(find(name), check(name, values, limits), limits)
+    return call_foreign(find(name), check(name, values, limits), limits)
 
 
 def merged(controller: Controller[Any], name: str, values: Mapping[str, Any]) -> Struct:

@@ -1,1 +1,1 @@
-"""What every part may import and that imports none of them: signals, errors, clocks, files."""
+"""Code that every part may import and that imports none of them: signals, errors, clocks, files."""

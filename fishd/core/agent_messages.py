@@ -1,7 +1,7 @@
 """The messages between fishd and an agent, one JSON object each; see docs/how-to/remote.md.
 
-fishd connects to the agent. Each observation is numbered within its session, and an action names
-the observation that it answers: one that comes too late is dropped.
+fishd connects to the agent. Each observation is numbered within its session, and an action
+names the observation that it answers: an action that comes too late is dropped.
 """
 
 from collections.abc import Callable
@@ -15,15 +15,15 @@ from fishd.core.signals import Observation
 
 VERSION = 1
 MAX_MESSAGE = 65536
-"""Of a message; ZeroMQ closes the connection of whoever sends more [bytes]."""
+"""Maximum size of a message; ZeroMQ closes a connection that sends a longer one [bytes]."""
 
 
 class Observed(Observation, frozen=True, tag="observation", tag_field="kind", kw_only=True):
-    """fishd → agent: what was observed in a tick; an action is wanted."""
+    """fishd → agent: the observation of a tick; requests an action."""
 
     v: int = VERSION
     session: str
-    """Names one activation of the controller `remote`; a new one each time."""
+    """Name of one activation of the controller `remote`; each activation has a new one."""
     seq: int
     """Number of this observation in the session, from 1; ticks in a pause are not numbered."""
     answered: int
@@ -37,7 +37,7 @@ class Observed(Observation, frozen=True, tag="observation", tag_field="kind", kw
 
 
 class Ended(Struct, frozen=True, tag="ended", tag_field="kind", kw_only=True):
-    """fishd → agent: `remote` is no longer the active controller; no action is wanted."""
+    """fishd → agent: `remote` is no longer the active controller; requests no action."""
 
     v: int = VERSION
     session: str
@@ -46,7 +46,7 @@ class Ended(Struct, frozen=True, tag="ended", tag_field="kind", kw_only=True):
 class Action(
     Struct, frozen=True, tag="action", tag_field="kind", kw_only=True, forbid_unknown_fields=True
 ):
-    """Agent → fishd: the answer to an observation."""
+    """Agent → fishd: the action that answers an observation."""
 
     v: int = VERSION
     session: str
@@ -59,12 +59,13 @@ class Action(
 class Pause(
     Struct, frozen=True, tag="pause", tag_field="kind", kw_only=True, forbid_unknown_fields=True
 ):
-    """Agent → fishd, instead of an action: stay at neutral, send no observations; 0 ends it."""
+    """Agent → fishd, instead of an action: stay at neutral and send no observations."""
 
     v: int = VERSION
     session: str
     seconds: Annotated[float, Meta(ge=0, le=3600)]
-    """After this time without a `Pause` of 0 s the agent counts as silent."""
+    """Length of the pause [s]; a `Pause` of 0 s ends it. An agent that has not ended its pause by
+    then counts as silent."""
 
 
 FromFish = Observed | Ended

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 
 class Reversals:
-    """Detector of the reversals of a command; an angle of 0 is on the side of the one before."""
+    """Detector of the reversals of a command; an angle of 0 keeps the side of the previous one."""
 
     def __init__(self) -> None:
         self._side = 0.0

@@ -1,4 +1,4 @@
-"""Calibrations of force sensor and servo: what voltages and angles are believed to mean."""
+"""Calibrations of force sensor and servo: volts to newtons, and angles to pulse widths."""
 
 import math
 from typing import Annotated, Literal, TypeVar
@@ -12,16 +12,19 @@ Trim = Annotated[
     float, unit("us", "Correction of the centre that makes the fin straight.", ge=-500, le=500)
 ]
 Scale = Annotated[float, unit("us/rad", "Change of the pulse per angle.", ge=10, le=5000)]
-Lowest = Annotated[float, unit("rad", "Soft limit: no angle below.", ge=-math.pi, le=0)]
-Highest = Annotated[float, unit("rad", "Soft limit: no angle above.", ge=0, le=math.pi)]
+Lowest = Annotated[float, unit("rad", "Soft limit: the lowest permitted angle.", ge=-math.pi, le=0)]
+Highest = Annotated[
+    float, unit("rad", "Soft limit: the highest permitted angle.", ge=0, le=math.pi)
+]
 
 Covariance = tuple[float, float, float]
 """Variance of a row's first gain, covariance of both, and variance of the second [N²/V²]."""
 
 Z95 = 1.96
 """Half-width of a 95 % interval, in standard deviations of a normal distribution."""
-WORST_CONDITION = 1e5
-"""A matrix of a larger condition number says the same of both forces; that of a fit is less."""
+MAX_CONDITION_NUMBER = 1e5
+"""Largest condition number of a calibration matrix that can separate the two forces; that of a
+fit is far smaller."""
 
 
 class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -36,39 +39,40 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     yy: float = 1.0
     y0: float = 0.0
     date: str = ""
-    """When it was made, ISO 8601; empty for one that nobody made."""
+    """Date of the calibration, ISO 8601; empty for the default."""
     loads: int = 0
-    """How many loads it was fitted to; 0 for one that was not."""
+    """Number of loads of the fit; 0 for a calibration that was not fitted."""
     residual: float = 0.0
-    """Root mean square of what the fit leaves over [N]."""
+    """Root mean square of the residuals of the fit [N]."""
     condition: float = 0.0
     """Condition number of the fit."""
     covariance_x: Covariance | None = None
-    """Covariance of xx and xy; null where the uncertainty of this calibration is unknown.
+    """Covariance of xx and xy; null if the uncertainty of this calibration is unknown.
 
     `Z95` times the root of a variance is the half-width of a 95 % confidence interval.
     """
     covariance_y: Covariance | None = None
-    """Covariance of yx and yy, in the same way."""
+    """Covariance of yx and yy; null if unknown."""
     load_error: float | None = None
-    """Half-width of the 95 % interval of the error that all loads share, as a fraction of a load;
-    part of both covariances, null where they are null."""
+    """Half-width of the 95 % confidence interval of the error that all loads share, as a fraction
+    of a load; part of both covariances, null if they are null."""
     tared: str = ""
-    """When x0 and y0 were last set by a tare, ISO 8601; empty for never."""
+    """Date of the latest tare, which set x0 and y0, ISO 8601; empty if there was none."""
 
     def forces(self, vx: float, vy: float) -> tuple[float, float]:
-        """F_x and F_y [N] for two voltages [V]."""
+        """Return F_x and F_y [N] for two voltages [V]."""
         return (
             self.xx * vx + self.xy * vy + self.x0,
             self.yx * vx + self.yy * vy + self.y0,
         )
 
     def thrust_ci95(self, fx: float, fy: float = 0.0) -> float | None:
-        """Return the half-width of the 95 % interval that the gains leave to a force fx [N].
+        """Return the half-width of the 95 % confidence interval of a force difference [N].
 
-        The force is a difference, such as that of swimming to rest, so that no zero is in it.
-        fy: the difference of F_y at the same time [N]
-        None where the uncertainty of this calibration is unknown.
+        It covers the uncertainty of the gains only: a difference, such as that of swimming to rest,
+        does not depend on the zeros. None if the uncertainty of this calibration is unknown.
+
+        fx, fy: differences of F_x and F_y at the same time [N]
         """
         if self.covariance_x is None:
             return None
@@ -79,13 +83,13 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return Z95 * math.sqrt(max(0.0, first * vx**2 + 2.0 * both * vx * vy + second * vy**2))
 
     @property
-    def untouched(self) -> bool:
-        """True while nobody found the matrix, and volts count as newtons; a tare does not."""
+    def is_unset(self) -> bool:
+        """True if the matrix is the default, which takes volts for newtons; a tare may be set."""
         return self.loads == 0 and (self.xx, self.xy, self.yx, self.yy) == (1.0, 0.0, 0.0, 1.0)
 
     @property
-    def singular(self) -> bool:
-        """True where the matrix, whatever its size, does not tell F_x from F_y."""
+    def is_singular(self) -> bool:
+        """True if the matrix, whatever its scale, cannot separate F_x from F_y."""
         gains = (self.xx, self.xy, self.yx, self.yy)
         largest = max(map(abs, gains))
         if largest == 0.0:
@@ -94,7 +98,7 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         # With singular values s and t: s t = |det|, s² + t² = sum of squares, condition = s / t.
         squares = xx * xx + xy * xy + yx * yx + yy * yy
         determinant = abs(xx * yy - xy * yx)
-        return squares > determinant * (WORST_CONDITION + 1.0 / WORST_CONDITION)
+        return squares > determinant * (MAX_CONDITION_NUMBER + 1.0 / MAX_CONDITION_NUMBER)
 
 
 EXACT = ForceCalibration(covariance_x=(0.0, 0.0, 0.0), covariance_y=(0.0, 0.0, 0.0), load_error=0.0)
@@ -102,7 +106,7 @@ EXACT = ForceCalibration(covariance_x=(0.0, 0.0, 0.0), covariance_y=(0.0, 0.0, 0
 
 
 class ServoCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The keys of section `servo` that a calibration finds; takes precedence over them."""
+    """Calibrated values of keys of section `servo`, which override the configuration."""
 
     trim: Trim = 0.0
     direction: Direction = 1
@@ -113,9 +117,10 @@ class ServoCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class ForceSample(Struct, frozen=True):
-    """What the force sensor said over a while; means and standard deviations over pairs."""
+    """Means and standard deviations of the output of the force sensor over some time."""
 
     pairs: int
+    """Number of sample pairs."""
     seconds: float
     vx: float
     """[V]"""
@@ -123,12 +128,12 @@ class ForceSample(Struct, frozen=True):
     vx_std: float
     vy_std: float
     fx: float
-    """By the calibration that is used [N]."""
+    """Mean force by the active calibration [N]."""
     fy: float
     suspect: str = ""
-    """Why this is not to be believed; empty where it is."""
+    """Reason not to trust this sample; empty if there is none."""
     number: int = 0
-    """By which a tare names it, for a while."""
+    """Number by which a tare refers to this sample, for a limited time."""
 
 
 C = TypeVar("C", ForceCalibration, ServoCalibration)

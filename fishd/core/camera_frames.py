@@ -1,4 +1,4 @@
-"""Frames of a camera, and the choice of the frames that a policy sees in a tick."""
+"""Frames of a camera, and the selection of the frames that a policy sees in a tick."""
 
 from collections import deque
 from typing import Annotated, NamedTuple
@@ -16,57 +16,59 @@ Pixels = NDArray[np.uint8]
 Stack = tuple[Pixels, ...]
 """Frames of one size, newest first."""
 
-EQUAL = 1e-6
-"""Times that differ by less are equal [s]."""
+TIME_TOLERANCE_S = 1e-6
+"""Largest difference of two times that count as equal [s]."""
 
 
 class Frame(NamedTuple):
     """One picture of the tail."""
 
     time: float
-    """Middle of its exposure [s, monotonic clock of fishd]."""
+    """Middle of the exposure [s, monotonic clock of fishd]."""
     available: float
-    """When it could first be had, on the same clock [s]."""
+    """Time of arrival, on the same clock [s]."""
     pixels: Pixels
 
 
 class StackSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Which frames a policy is shown in a tick; part of a policy that sees."""
+    """Settings of the frames that a policy with a camera gets in a tick; part of such a policy."""
 
     size: Annotated[int, unit("px", "Height and width of a frame.", ge=16, le=256)] = 84
     frames: Annotated[int, note("Frames in the stack, newest first.", ge=1, le=8)] = 4
-    interval: Annotated[float, unit("s", "Time between two of them.", ge=1e-3, le=1)] = 0.05
+    interval: Annotated[
+        float, unit("s", "Time between two frames of the stack.", ge=1e-3, le=1)
+    ] = 0.05
     delay: Annotated[
         float,
         unit(
             "s",
-            "The stack ends so long before the tick: as a camera delivers its frames late, frames "
-            "of even distance are then to be had.",
+            "Time by which the newest frame of the stack precedes the tick: the camera's frames "
+            "arrive late, and with this delay frames at even intervals are available.",
             ge=0,
             le=1,
         ),
     ] = 0.0
     oldest: Annotated[
-        float, unit("s", "A frame may be so much older than it should be.", ge=1e-3, le=2)
+        float, unit("s", "Maximum time by which a frame may be too old.", ge=1e-3, le=2)
     ] = 0.15
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Of a stack: frames, height, width."""
+        """Shape of a stack: frames, height, width."""
         return self.frames, self.size, self.size
 
 
 class FrameHistory:
-    """The latest frames, in the order of their times."""
+    """Buffer of the latest frames, in the order of their times."""
 
     def __init__(self, settings: StackSettings) -> None:
         self.settings = settings
-        self._frames: deque[Frame] = deque(maxlen=_MOST)
+        self._frames: deque[Frame] = deque(maxlen=_MAX_FRAMES)
         span = settings.delay + (settings.frames - 1) * settings.interval + settings.oldest
-        self._span = span + _AHEAD
+        self._span = span + _MAX_LEAD_S
 
     def add(self, frame: Frame) -> None:
-        """Keep a frame; one that is not newer than all others is dropped."""
+        """Store a frame; drop it if it is not newer than all others."""
         frames = self._frames
         if frames and frame.time <= frames[-1].time:
             return
@@ -75,32 +77,32 @@ class FrameHistory:
             frames.popleft()
 
     def clear(self) -> None:
-        """Forget all frames."""
+        """Remove all frames."""
         self._frames.clear()
 
     def stack(self, tick: float) -> Stack | None:
-        """What a policy is shown at `tick` [s].
+        """Return the frames that a policy gets at `tick` [s].
 
         The k-th frame is the newest that was exposed at or before tick - delay - k·interval and had
-        arrived by the tick. None where one of them is missing, or older than permitted.
+        arrived by the tick. None if a frame is missing, or older than permitted.
         """
         settings = self.settings
-        wanted = tick - settings.delay + EQUAL
+        latest_time = tick - settings.delay + TIME_TOLERANCE_S
         chosen: list[Pixels] = []
         for frame in reversed(self._frames):
-            if frame.available > tick + EQUAL:
+            if frame.available > tick + TIME_TOLERANCE_S:
                 continue
-            while frame.time <= wanted:
-                if frame.time < wanted - settings.oldest:
+            while frame.time <= latest_time:
+                if frame.time < latest_time - settings.oldest:
                     return None
                 chosen.append(frame.pixels)
                 if len(chosen) == settings.frames:
                     return tuple(chosen)
-                wanted -= settings.interval
+                latest_time -= settings.interval
         return None
 
 
-_AHEAD = 2.0
-"""Frames may come so much earlier than the tick that they are for [s]."""
-_MOST = 4096
-"""Frames that are kept."""
+_MAX_LEAD_S = 2.0
+"""Maximum time by which a frame may arrive before the tick that uses it [s]."""
+_MAX_FRAMES = 4096
+"""Maximum number of stored frames."""

@@ -1,7 +1,7 @@
-"""Time: clocks, a timer of the kernel, and the tickers that say when the next tick is due.
+"""Time: clocks, a timer of the kernel, and tickers that wait until the next tick is due.
 
 Deadlines are absolute, t0 + k·period, so nothing drifts. A late tick runs as soon as it can; slots
-that have passed meanwhile are skipped and counted, and the phase is kept.
+that have passed by then are skipped and counted, and the phase is kept.
 """
 
 import ctypes
@@ -21,38 +21,38 @@ class Slot(Struct, frozen=True, gc=False):
     """One turn of the loop; times in seconds, monotonic."""
 
     index: int
-    """Number of periods since the first slot, which is 0."""
+    """Number of periods since the first slot, which has index 0."""
     deadline: float
-    """When the tick should begin."""
+    """Time at which the tick should begin."""
     now: float
-    """When it does begin."""
+    """Time at which the tick begins."""
     missed: int
-    """Slots skipped just before this one."""
+    """Number of slots skipped just before this one."""
 
 
 class Clock(Protocol):
     """A source of time."""
 
     def monotonic(self) -> float:
-        """Time that never jumps [s]; for control."""
+        """Return a time that never jumps [s]; for control."""
 
     def wall(self) -> float:
-        """Unix time [s]; for people."""
+        """Return the unix time [s]; for display."""
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass."""
+        """Wait for a time [s]."""
 
 
 class SystemClock:
-    """The machine's own clocks."""
+    """The clocks of the machine."""
 
     monotonic = staticmethod(time.monotonic)
     wall = staticmethod(time.time)
     sleep = staticmethod(time.sleep)
 
 
-def boot_id() -> str:
-    """Names this start of the machine; its monotonic clock counts from then. Empty if unknown."""
+def read_boot_id() -> str:
+    """Return the name of this boot, from which the monotonic clock counts; empty if unknown."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -60,32 +60,32 @@ def boot_id() -> str:
 
 
 class VirtualClock:
-    """Time that moves only when it is told to; it starts at zero."""
+    """Clock that advances only when the program sets it or sleeps; it starts at zero."""
 
     def __init__(self) -> None:
         self.now = 0.0
 
     def monotonic(self) -> float:
-        """Virtual time [s]."""
+        """Return the virtual time [s]."""
         return self.now
 
     def wall(self) -> float:
-        """Virtual time [s], so that a run gives the same bytes whenever it is made."""
+        """Return the virtual time [s], so that each run gives the same bytes."""
         return self.now
 
     def sleep(self, seconds: float) -> None:
-        """Move on at once."""
+        """Advance the clock at once."""
         self.now += max(0.0, seconds)
 
 
 class SlowClock(VirtualClock):
-    """The same for what people watch: its unix time is that of the machine."""
+    """Virtual clock for runs that a person watches: its unix time is that of the machine."""
 
     wall = staticmethod(time.time)
 
 
 def virtual_slots(clock: VirtualClock, period: float) -> Iterator[Slot]:
-    """Slots of virtual time for ever, never late; moves the clock. period: [s]"""
+    """Yield slots of virtual time without end, never late, and advance the clock. period: [s]"""
     for index in itertools.count():
         clock.now = index * period
         yield Slot(index, clock.now, clock.now, 0)
@@ -106,7 +106,7 @@ class _Itimerspec(ctypes.Structure):
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-def _checked(result: int) -> int:
+def _check_result(result: int) -> int:
     if result < 0:
         number = ctypes.get_errno()
         raise OSError(number, os.strerror(number))
@@ -114,27 +114,29 @@ def _checked(result: int) -> int:
 
 
 class TimerFd:
-    """A one-shot timer on CLOCK_MONOTONIC whose descriptor an event loop can wait for.
+    """One-shot timer on CLOCK_MONOTONIC whose descriptor an event loop can wait for.
 
-    Python has os.timerfd_create only from 3.13 on; the C library has it everywhere. Raises OSError
-    where the kernel refuses.
+    Python has os.timerfd_create only from 3.13 on; the C library always has it. Raises OSError
+    if the kernel refuses.
     """
 
     def __init__(self) -> None:
-        self._fd = _checked(_libc.timerfd_create(_CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC))
+        self._fd = _check_result(
+            _libc.timerfd_create(_CLOCK_MONOTONIC, os.O_NONBLOCK | os.O_CLOEXEC)
+        )
         self._spec = _Itimerspec()
 
     def fileno(self) -> int:
-        """The descriptor, which is readable once the timer has expired."""
+        """Return the descriptor, which is readable once the timer has expired."""
         return self._fd
 
     def arm(self, deadline: float) -> None:
-        """Expire at `deadline` [s, monotonic]; at once when that has passed."""
+        """Set the timer to expire at `deadline` [s, monotonic]; at once if that has passed."""
         seconds = int(deadline)
         value = self._spec.value
         value.seconds = seconds
         value.nanoseconds = max(1, int((deadline - seconds) * 1e9))  # all zero would disarm
-        _checked(_libc.timerfd_settime(self._fd, _ABSOLUTE, ctypes.byref(self._spec), None))
+        _check_result(_libc.timerfd_settime(self._fd, _ABSOLUTE, ctypes.byref(self._spec), None))
 
     def clear(self) -> None:
         """Make the descriptor unreadable again."""
@@ -147,7 +149,7 @@ class TimerFd:
         return self._fd < 0
 
     def close(self) -> None:
-        """Give the descriptor back; may be called twice."""
+        """Close the descriptor; may be called twice."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
@@ -156,26 +158,26 @@ class TimerFd:
 class Ticker:
     """Ticks of real time for an asyncio loop.
 
-    A timerfd wakes the asyncio loop a little early, and the rest is slept off with clock_nanosleep:
-    so neither epoll's latency nor another task that was just running makes a tick late.
+    A timerfd wakes the asyncio loop a little early, and clock_nanosleep waits for the rest, so that
+    neither epoll's latency nor another running task makes a tick late.
     """
 
-    MARGIN = 2e-3
-    """How long before the deadline to stop other work [s], at most a quarter of the period."""
+    MARGIN_S = 2e-3
+    """Time before the deadline at which other work stops, at most a quarter of the period [s]."""
 
     def __init__(self, period: float, warm_up: Callable[[], None] | None = None) -> None:
-        """Must be made inside a running asyncio loop; the first slot is next, two margins from now.
+        """Start the ticker inside a running asyncio loop; the first slot is two margins from now.
 
         warm_up: called just before each deadline, if there is time for it
         """
-        import asyncio  # a tenth of the start of those that have only the clocks from here
+        import asyncio  # slow to import: a tenth of the start of programs that use only the clocks
 
         self._period = period
         self._warm_up = warm_up
-        self._margin = min(self.MARGIN, period / 4)
+        self._margin = min(self.MARGIN_S, period / 4)
         self._warm_up_time = self._margin / 2
         self._latest_warm_up = math.inf
-        """How long the latest one took [s]."""
+        """Duration of the latest warm-up [s]."""
         self._start = time.monotonic() + 2.0 * self._margin
         self._index = -1
         self._timer = TimerFd()
@@ -193,7 +195,7 @@ class Ticker:
         return self
 
     async def __anext__(self) -> Slot:
-        """Wait for the next slot; the caller is expected to tick at once."""
+        """Wait for the next slot, in which the caller must tick at once."""
         following = self._index + 1
         self._woken.clear()
         self._timer.arm(self._start + following * self._period - self._margin)
@@ -212,15 +214,15 @@ class Ticker:
         self._woken.set()
 
     def _warm_up_before(self, deadline: float, warm_up: Callable[[], None]) -> None:
-        """Warm up as late as is safe, then wait awake: a sleep would lose the caches again."""
+        """Warm up as late as is safe, then busy-wait, since a sleep would lose the caches again."""
         self._sleep_until(deadline - 2.0 * self._warm_up_time)
-        begun = time.monotonic()
-        # One that took long, on a machine that was busy just then, must not end them for good.
+        start = time.monotonic()
+        # Decay: one slow warm-up, on a busy machine, must not disable warm-ups permanently.
         self._warm_up_time *= 0.98
-        if deadline - begun > self._warm_up_time:
+        if deadline - start > self._warm_up_time:
             warm_up()
-            before, self._latest_warm_up = self._latest_warm_up, time.monotonic() - begun
-            # One that took much longer than that before it says something of the machine only.
+            before, self._latest_warm_up = self._latest_warm_up, time.monotonic() - start
+            # A warm-up much slower than the previous one shows only that the machine was busy.
             usual = min(before, self._latest_warm_up)
             self._warm_up_time = max(self._warm_up_time, usual)
             while time.monotonic() < deadline:

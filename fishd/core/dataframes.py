@@ -1,4 +1,4 @@
-"""Ticks as a table: one row a tick, one column a field."""
+"""Ticks as a table: one row per tick, one column per field."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -12,15 +12,15 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 
-def frame(ticks: Sequence[Tick]) -> "DataFrame":
-    """The ticks as a table: a column a field of `Tick`, in its unit; fields that are unset are NaN.
+def ticks_to_frame(ticks: Sequence[Tick]) -> "DataFrame":
+    """Return ticks as a table with a column per field of `Tick`, in its unit; unset fields are NaN.
 
-    Raises `MissingPackage` without pandas (extra: lab).
+    Raise `MissingPackage` without pandas (extra: lab).
     """
     try:
         import pandas
     except ImportError:
         raise MissingPackage(
-            "a table needs the package pandas; with pip: pip install 'fishd[lab]'"
+            "a table needs the package pandas; install it with: pip install 'fishd[lab]'"
         ) from None
     return pandas.json_normalize([msgspec.to_builtins(tick) for tick in ticks])

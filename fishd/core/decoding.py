@@ -1,4 +1,4 @@
-"""Decodes JSON that comes from elsewhere, whatever it is."""
+"""Decoding of JSON from untrusted sources."""
 
 from collections.abc import Callable
 from typing import Any
@@ -7,9 +7,9 @@ import msgspec
 
 
 def decoder(kind: Any) -> Callable[[bytes], Any]:
-    """What makes a message of this kind of bytes; raises `msgspec.DecodeError`, and nothing else.
+    """Return a function that decodes bytes into this type; it raises only `msgspec.DecodeError`.
 
-    By itself msgspec raises other errors for text that is no UTF-8, and for what is nested deeply.
+    msgspec alone raises other errors for text that is not UTF-8 and for deep nesting.
     """
     decode = msgspec.json.Decoder(kind).decode
 

@@ -1,4 +1,4 @@
-"""The exceptions that fishd raises on purpose.
+"""Exceptions that fishd raises on purpose.
 
 Each message is one line that says what is wrong, where, and what would be right.
 """
@@ -17,7 +17,7 @@ class ConfigError(FishdError, ValueError):
 class ParameterError(FishdError, ValueError):
     """A controller's parameter is unknown, of the wrong type or out of range.
 
-    `path` names it where there is one to blame.
+    `path` leads to that parameter, if it is known.
     """
 
     def __init__(self, message: str, path: tuple[str, ...] = ()) -> None:
@@ -38,13 +38,13 @@ class UnknownPlant(FishdError, LookupError):
 
 
 class PolicyError(FishdError, ValueError):
-    """A file holds no policy, or one that does not fit this robot."""
+    """A file does not contain a policy, or its policy does not fit this robot."""
 
 
 class ControllerFault(FishdError, RuntimeError):
-    """A controller cannot go on; raised from `update`, it latches a fault with this `code`.
+    """A controller cannot continue; raised from `update`, it latches a fault with this `code`.
 
-    Where there is a `successor`, a name and a ready-made controller, that takes over instead.
+    With a `successor`, a name and a controller instance, that controller takes over instead.
     """
 
     def __init__(self, code: str, message: str, successor: tuple[str, Any] | None = None) -> None:
@@ -54,7 +54,7 @@ class ControllerFault(FishdError, RuntimeError):
 
 
 class StartupError(FishdError, RuntimeError):
-    """The daemon cannot start on this machine as it is."""
+    """The daemon cannot start in the current state of this machine."""
 
 
 class MissingPackage(StartupError):
@@ -66,7 +66,7 @@ class SensorError(FishdError, OSError):
 
 
 class FishLost(FishdError):
-    """A simulated fish cannot go on, and no later read will find it again."""
+    """A simulated fish cannot continue; later reads will fail, too."""
 
 
 class ServoError(FishdError, OSError):
@@ -74,7 +74,7 @@ class ServoError(FishdError, OSError):
 
 
 class RecordingError(FishdError, OSError):
-    """A recording cannot be written, or a file holds none."""
+    """A recording cannot be written, or a file does not contain one."""
 
 
 class FishError(FishdError):
@@ -86,7 +86,7 @@ class NoDaemon(FishError, ConnectionError):
 
 
 class Untrusted(NoDaemon):
-    """Another user listens where the fishd of this one would be."""
+    """Another user's process listens where the fishd of this user would."""
 
 
 class Refused(FishError, RuntimeError):
@@ -105,4 +105,7 @@ class LeaseLost(Refused):
 
 
 class Escaped(Exception):
-    """Code that is not fishd's raised what is no Exception, such as SystemExit: its cause."""
+    """Code of another package raised an error that is not an `Exception`, such as SystemExit.
+
+    `__cause__` is that error.
+    """

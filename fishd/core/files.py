@@ -1,6 +1,6 @@
-"""Reads the files that people name, and writes files atomically.
+"""Reading of files that a user names, and atomic writing of files.
 
-Whatever a name leads to, a pipe, a device or a file without an end, the answer comes at once.
+A read never blocks, whether the name belongs to a pipe, a device or a file without an end.
 """
 
 import os
@@ -8,10 +8,10 @@ import stat
 from contextlib import suppress
 from pathlib import Path
 
-SETTINGS = 64 * 2**10
-"""Longest file that people write by hand [bytes]."""
-TABLE = 16 * 2**20
-"""Longest table of numbers [bytes]."""
+MAX_SETTINGS_BYTES = 64 * 2**10
+"""Maximum size of a hand-written file [bytes]."""
+MAX_TABLE_BYTES = 16 * 2**20
+"""Maximum size of a table of numbers [bytes]."""
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -23,27 +23,27 @@ _KINDS = {
 
 
 class FileProblem(Exception):
-    """Why a file cannot be read; the message goes after its name."""
+    """A file cannot be read or written; the message continues a sentence after its name."""
 
 
 class NoFile(FileProblem):
-    """There is none."""
+    """The file does not exist."""
 
 
 def read(path: Path, longest: int, reader: str) -> bytes:
-    """The content of a regular file; raises `FileProblem`.
+    """Return the content of a regular file; raise `FileProblem`.
 
-    longest: more is not read [bytes]
-    reader: what the file is for, such as `a policy`; the message names it
+    longest: maximum size [bytes]
+    reader: purpose of the file for messages, such as `a policy`
     """
     try:
-        _check_kind(path.stat())  # first: to open a device may already do something to it
+        _check_kind(path.stat())  # first: opening a device may already have an effect on it
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
         with os.fdopen(descriptor, "rb") as file:
-            found = os.fstat(descriptor)
-            _check_kind(found)
+            status = os.fstat(descriptor)
+            _check_kind(status)
             # A file of /proc has no size until it is read.
-            content = file.read(longest + 1) if found.st_size <= longest else None
+            content = file.read(longest + 1) if status.st_size <= longest else None
     except (FileNotFoundError, NotADirectoryError):
         raise NoFile("no such file") from None
     except OSError as error:
@@ -57,7 +57,7 @@ def read(path: Path, longest: int, reader: str) -> bytes:
 
 
 def read_text(path: Path, longest: int, reader: str, encoding: str = "utf-8") -> str:
-    """The same as text; line ends are \\n. Raises `FileProblem`."""
+    """Return the content of a text file with line ends `\\n`; raise `FileProblem`."""
     try:
         text = read(path, longest, reader).decode(encoding)
     except UnicodeDecodeError as error:
@@ -65,29 +65,29 @@ def read_text(path: Path, longest: int, reader: str, encoding: str = "utf-8") ->
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _check_kind(found: os.stat_result) -> None:
-    if not stat.S_ISREG(found.st_mode):
-        kind = _KINDS.get(stat.S_IFMT(found.st_mode), "something else")
+def _check_kind(status: os.stat_result) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
         raise FileProblem(f"is {kind}; a regular file is needed")
 
 
-def expanded(path: str | os.PathLike[str]) -> Path:
-    """The path with its `~` or `~user` replaced; as it is where there is no such user or home."""
+def expand_user(path: str | os.PathLike[str]) -> Path:
+    """Return the path with `~` or `~user` replaced; unchanged without such a user or home."""
     try:
         return Path(path).expanduser()
-    except (RuntimeError, ValueError):  # the latter for a zero byte in the user's name
+    except (RuntimeError, ValueError):  # ValueError: a zero byte in the user's name
         return Path(path)
 
 
 def write_atomically(path: Path, content: str | bytes, *, new: bool = False) -> None:
-    """Write a file, or replace it; a full disk or a kill leaves the old one, never half a file.
+    """Write or replace a file; a full disk or a kill leaves the old file, never a part of the new.
 
-    Of several writers at a time, the last one's is left, whole.
+    If several processes write at once, the file of the last one remains.
 
-    new: there must be none of that name
-    Raises OSError, with the name of the file.
+    new: fail if the file exists
+    Raise OSError, with the name of the file.
     """
-    part = _beside(path)
+    part = _temporary_path(path)
     data = content.encode() if isinstance(content, str) else content
     try:
         with part.open("xb") as file:
@@ -103,12 +103,12 @@ def write_atomically(path: Path, content: str | bytes, *, new: bool = False) -> 
             raise
         raise OSError(error.errno, error.strerror, str(path)) from None
     finally:
-        with suppress(OSError):  # what went wrong before is to be told
+        with suppress(OSError):  # must not hide an earlier error
             part.unlink(missing_ok=True)
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until a power cut no longer takes the names in it away again; raises OSError."""
+    """Wait until the entries of a folder are safe against a power cut; raise OSError."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)
@@ -117,20 +117,17 @@ def sync_folder(folder: Path) -> None:
 
 
 def check_writable(path: Path) -> None:
-    """Find out before long work whether a file can be written at its end.
-
-    Raises `FileProblem`.
-    """
-    part = _beside(path)
+    """Raise `FileProblem` if a file cannot be written, before the long work that produces it."""
+    part = _temporary_path(path)
     try:
         if os.path.lexists(path):
             _check_kind(path.stat())
         else:
             with suppress(FileNotFoundError):
-                path.lstat()  # which complains about a name that is too long
+                path.lstat()  # raises OSError if the name is too long
         part.open("xb").close()
     except FileNotFoundError:
-        raise FileProblem("there is no folder to put it into") from None
+        raise FileProblem("its folder does not exist; create it") from None
     except OSError as error:
         raise FileProblem(f"cannot be written: {error.strerror}") from None
     except ValueError:
@@ -140,6 +137,6 @@ def check_writable(path: Path) -> None:
             part.unlink(missing_ok=True)
 
 
-def _beside(path: Path) -> Path:
-    """A temporary name in the same folder, no other writer's, and of permitted length."""
+def _temporary_path(path: Path) -> Path:
+    """Return a unique temporary path in the same folder, of permitted length."""
     return path.parent / f".{path.name[:50]}.{os.urandom(6).hex()}.part"

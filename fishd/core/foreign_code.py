@@ -1,4 +1,4 @@
-"""How code of other packages is called, such as a controller's or a driver's.
+"""Calls of code of other packages, such as a controller's or a driver's.
 
 Such code may raise anything, and may never return.
 """
@@ -17,16 +17,16 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def contained(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-    """Call a function; whatever it raises is an `Exception`, if need be an `Escaped`.
+def call_foreign(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+    """Call a function; convert whatever it raises that is not an `Exception` to `Escaped`.
 
-    Only a true Ctrl-C passes: a KeyboardInterrupt where Python raises it for SIGINT, as it does in
-    `fishctl`, not in the daemon.
+    Only a true Ctrl-C passes: a KeyboardInterrupt where Python raises it for SIGINT, which is so in
+    `fishctl`, but not in the daemon.
     """
     try:
         return function(*args, **kwargs)
-    except (StopIteration, StopAsyncIteration) as error:  # which no coroutine may raise
-        raise Escaped(text.named(error)) from error
+    except (StopIteration, StopAsyncIteration) as error:  # not permitted in a coroutine
+        raise Escaped(text.describe_error(error)) from error
     except Exception:
         raise
     except BaseException as error:
@@ -34,7 +34,7 @@ def contained(function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
             isinstance(error, KeyboardInterrupt) and _ctrl_c_is_raised()
         ):
             raise
-        raise Escaped(text.named(error)) from error
+        raise Escaped(text.describe_error(error)) from error
 
 
 def _ctrl_c_is_raised() -> bool:
@@ -43,12 +43,12 @@ def _ctrl_c_is_raised() -> bool:
 
 
 def real_number(value: Any, what: str) -> float:
-    """A real number as a float; raises ValueError for what is none, such as a text or True.
+    """Return a real number as a float; raise ValueError for anything else, such as a text or True.
 
-    what: what it is called in the error
+    what: name of the number in the error
     """
     try:
-        # An array of one number, whatever its shape, or one of numpy's own kinds of number.
+        # An array of one number, of any shape, or a numpy scalar.
         number = value.item() if hasattr(value, "item") else value
         if not isinstance(number, bool | str | bytes | bytearray):
             return float(number)
@@ -63,7 +63,7 @@ class GivenUp(BaseException):
 
 
 class Attempt(Generic[T]):
-    """A call in a thread of its own, which can be given up. The process does not wait for it."""
+    """A call in a separate thread that can be given up; the process does not wait for it to end."""
 
     def __init__(
         self,
@@ -74,16 +74,17 @@ class Attempt(Generic[T]):
         interrupt: bool = True,
     ) -> None:
         """
-        done: called in that thread as soon as there is a result, unless the call was given up
-        late: takes the result of a call that was given up and returned after all
-        interrupt: end a loop in Python when the call is given up; False where that would do harm
+        done: called in that thread when there is a result, unless the call was given up
+        late: receives the result of a call that returns after it was given up
+        interrupt: end a loop in Python when the call is given up; False where that is unsafe
         """
         self._function = function
         self._done = done
         self._late = late
         self._interrupt = interrupt
         self._begun = False
-        """Is the thread in code that `GivenUp` may end? Not in that of `threading` at its start."""
+        """Whether the thread is in code that `GivenUp` may end, past the start code of
+        `threading`."""
         self._result: list[T] = []
         self._error: Exception | None = None
         self._settling = threading.Lock()
@@ -94,25 +95,27 @@ class Attempt(Generic[T]):
 
     @property
     def alive(self) -> bool:
-        """Does the thread still run?"""
+        """Whether the thread still runs."""
         return self._thread.is_alive()
 
     def wait(self, seconds: float) -> bool:
-        """Wait for the result; False when it has not come in that time."""
+        """Wait for the result; return False if there is none in that time."""
         return self._settled.wait(seconds)
 
     def result(self) -> T:
-        """What the function returned; raises what it raised, once. Only when it is `done`."""
+        """Return the result of the function, or raise its error, once; only after `done`."""
         error, self._error = self._error, None
         try:
             if error:
                 raise error
             return self._result[0]
         finally:
-            del error  # its traceback leads here: a cycle would keep what the function had read
+            del (
+                error
+            )  # its traceback refers to this frame: the cycle would keep the function's data alive
 
     def give_up(self) -> bool:
-        """End a loop in Python, and leave alone what cannot be ended; False if it is done."""
+        """Give up the call, and end a loop in Python; return False if the call has finished."""
         with self._settling:
             if self._settled.is_set():
                 return False
@@ -122,10 +125,10 @@ class Attempt(Generic[T]):
         return True
 
     def _raise_in_thread(self, error: Any) -> None:
-        """Raise there, as soon as it is in Python; None takes back what was not raised yet."""
+        """Raise an error in the thread at its next Python code; None cancels a pending error."""
         if not (self._interrupt and self._begun):
             return
-        import ctypes  # only where a call is given up
+        import ctypes  # slow to import, and only needed when a call is given up
 
         error = ctypes.py_object(error) if error else None
         ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread.ident or 0), error)
@@ -139,21 +142,21 @@ class Attempt(Generic[T]):
             self._done()
         elif self._result:
             with suppress(Exception):
-                contained(self._late, self._result[0])
+                call_foreign(self._late, self._result[0])
 
     def _attempt(self) -> bool:
-        """Call the function; True unless it was given up before or meanwhile."""
+        """Call the function; return False if the call was given up before or during it."""
         with self._settling:
             if self._given_up and self._interrupt:
                 return False
             self._begun = True
         try:
-            self._result.append(contained(self._function))
+            self._result.append(call_foreign(self._function))
         except Exception as error:
             self._error = error
         with self._settling:
             if self._given_up:
-                self._error = None  # nobody asks for it
+                self._error = None  # no caller will read it
                 self._raise_in_thread(None)
             else:
                 self._settled.set()

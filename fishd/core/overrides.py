@@ -1,4 +1,4 @@
-"""`--set KEY=VALUE` of the command line, which overrides a key of a configuration."""
+"""Option `--set KEY=VALUE` of the command line, which overrides a key of a configuration."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -8,9 +8,9 @@ from fishd.core.errors import ConfigError
 
 
 def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> dict[tuple[str, ...], str]:
-    """Put each `KEY=VALUE` into the data; return, for messages, what set each key.
+    """Put each `KEY=VALUE` into the data; return the option that set each key, for messages.
 
-    Raises `ConfigError`.
+    Raise `ConfigError`.
     """
     return {_apply(data, override): f"--set {override}" for override in overrides}
 
@@ -33,7 +33,7 @@ def _apply(data: dict[str, Any], override: str) -> tuple[str, ...]:
 
 
 def _value(text: str, dotted: str, override: str) -> Any:
-    """A number as Python reads it, such as `1e-3`; anything else as YAML."""
+    """Parse a value as a Python number, such as `1e-3`, else as YAML."""
     for number in (int, float):
         try:
             return number(text)

@@ -1,7 +1,7 @@
-"""Finds classes that fishd or other packages offer by name: controllers, drivers.
+"""Registry of classes that fishd or other packages offer by name: controllers, drivers.
 
-fishd's own stand in a table in the code. Those of other packages are entry points of a group, which
-are read again once something was installed: a running fishd finds it without a restart.
+fishd's classes are in a table in the code. Those of other packages are entry points of a group,
+which are read again after an installation: a running fishd finds new ones without a restart.
 """
 
 import importlib
@@ -18,8 +18,8 @@ from msgspec import Struct
 
 from fishd.core import text
 from fishd.core.errors import FishdError
-from fishd.core.foreign_code import contained
-from fishd.core.schema import fields_of, nearest
+from fishd.core.foreign_code import call_foreign
+from fishd.core.schema import fields_of, suggest
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 class Plugins(Generic[T]):
-    """Subclasses of `base`, each of which names a struct of its parameters."""
+    """Subclasses of `base`, each with a struct of its parameters as a class attribute."""
 
     def __init__(
         self,
@@ -41,12 +41,12 @@ class Plugins(Generic[T]):
         of: type[Struct] = Struct,
     ) -> None:
         """
-        kind: what one is called in messages, such as `controller`
-        group: entry points of other packages; a name of fishd's own is not replaced by theirs
+        kind: name of a plug-in in messages, such as `controller`
+        group: group of entry points; they cannot replace a built-in plug-in of the same name
         struct: name of the class attribute that is the struct, such as `Parameters`
-        built_in: fishd's own, each with `module:class`
-        unknown: raised where a name is unknown, or its package does not load
-        of: what that struct is a subclass of
+        built_in: names of fishd's plug-ins, each with `module:class`
+        unknown: error for a name that is unknown, or whose package does not load
+        of: base class of the struct
         """
         self.kind = kind
         self._group = group
@@ -59,72 +59,75 @@ class Plugins(Generic[T]):
         self._entries: dict[str, EntryPoint] = {}
         self._stamps: list[int] = []
         self.problems: dict[str, str] = {}
-        """Why a plug-in, by its name, or all of a package, by the package's, is not available."""
+        """Reasons why plug-ins are unavailable, by name of the plug-in, or of the package if its
+        entry points cannot be read."""
 
     def names(self) -> list[str]:
-        """All names, sorted, whether they load or not."""
+        """Return all names, sorted, whether they load or not."""
         return sorted({*self._built_in, *self._offered()})
 
     def has(self, name: str) -> bool:
-        """Is there one of that name, whether it loads or not?"""
+        """Return whether a plug-in of that name exists, whether it loads or not."""
         return name in self._built_in or name in self._offered()
 
     def package(self, name: str) -> str:
-        """Where one comes from: `fishd`, or the name and version of another package."""
-        found = None if name in self._built_in else self._offered()[name].dist
-        return f"{found.name} {found.version}" if found else "fishd"
+        """Return the source of a plug-in: `fishd`, or the name and version of another package."""
+        distribution = None if name in self._built_in else self._offered()[name].dist
+        return f"{distribution.name} {distribution.version}" if distribution else "fishd"
 
     def requirements(self, name: str) -> list[str]:
-        """What the metadata of another package that offers one demands; none of fishd's own."""
-        found = None if name in self._built_in else self._offered()[name].dist
-        return (found.requires or []) if found else []
+        """Return the requirements of the package that offers a plug-in; empty for fishd."""
+        distribution = None if name in self._built_in else self._offered()[name].dist
+        return (distribution.requires or []) if distribution else []
 
     def find(self, name: str) -> type[T]:
-        """The class of that name; raises `unknown` if it does not exist, or does not load.
+        """Return the class of that name; raise `unknown` if it does not exist or does not load.
 
-        `problems` keeps why one does not load, until it does.
+        `problems` has the reason why a plug-in does not load, until it does.
         """
         if name not in self._found:
             try:
                 self._found[name] = self._load(name)
             except self._unknown as error:
                 if name in self._built_in or name in self._entries:
-                    self.problems[name] = text.said(error)
+                    self.problems[name] = text.error_message(error)
                 raise
             self.problems.pop(name, None)
         return self._found[name]
 
     def _load(self, name: str) -> type[T]:
-        # Entry points only where they are needed: to find them takes tens of milliseconds.
+        # Entry points only if they are needed: finding them takes tens of milliseconds.
         value = self._built_in.get(name) or getattr(self._offered().get(name), "value", "")
         if not value:
-            hint = nearest(name, self.names())
+            hint = suggest(name, self.names())
             raise self._unknown(f"no {self.kind} is named '{text.quoted(name)}'; {hint}")
         where = f"{self.kind} '{name}' ({value} in {self.package(name)})"
         try:
-            found = contained(_load_class, value.partition(" [")[0])
+            plugin = call_foreign(_load_class, value.partition(" [")[0])
         except Exception as error:
-            raise self._unknown(f"{where} does not load: {text.named(error)}") from error
+            raise self._unknown(f"{where} does not load: {text.describe_error(error)}") from error
         base = self._base
-        if not (isinstance(found, type) and issubclass(found, base)):
-            raise self._unknown(f"{where} is no subclass of {base.__module__}.{base.__qualname__}")
-        if missing := sorted(getattr(found, "__abstractmethods__", ())):
+        if not (isinstance(plugin, type) and issubclass(plugin, base)):
+            raise self._unknown(
+                f"{where} is not a subclass of {base.__module__}.{base.__qualname__}"
+            )
+        if missing := sorted(getattr(plugin, "__abstractmethods__", ())):
             raise self._unknown(f"{where} does not define {', '.join(missing)}")
-        struct: Any = getattr(found, self._struct, None)
+        struct: Any = getattr(plugin, self._struct, None)
         if not (isinstance(struct, type) and issubclass(struct, self._of)):
-            wanted = f"{self._of.__module__}.{self._of.__qualname__}"
-            wanted = "msgspec.Struct" if self._of is Struct else f"subclass of {wanted}"
-            raise self._unknown(f"{where} has no {self._struct}, a {wanted}")
+            required = f"{self._of.__module__}.{self._of.__qualname__}"
+            required = "msgspec.Struct" if self._of is Struct else f"subclass of {required}"
+            raise self._unknown(f"{where} has no {self._struct}, a {required}")
         try:
-            contained(msgspec.json.encode, fields_of(struct))
+            call_foreign(msgspec.json.encode, fields_of(struct))
         except Exception as error:
             raise self._unknown(
-                f"{where} has {self._struct} that cannot be read: {text.named(error)}"
+                f"{where} has {self._struct} that cannot be read: {text.describe_error(error)}"
             ) from error
-        return found
+        return plugin
 
     def _offered(self) -> "dict[str, EntryPoint]":
-        """The entry points of other packages, by name."""
+        """Return the entry points of other packages, by name."""
         stamps = _stamps()
         if stamps != self._stamps:
             importlib.invalidate_caches()
@@ -135,37 +138,40 @@ class Plugins(Generic[T]):
     def _read_entry_points(self) -> "dict[str, EntryPoint]":
         if not _mentioned(self._group):
             return {}
-        from importlib.metadata import distributions  # takes longer than to look
+        from importlib.metadata import distributions  # slow to import
 
         entries: dict[str, EntryPoint] = {}
         for package in distributions():
             try:
                 for entry in package.entry_points.select(group=self._group):
-                    entries.setdefault(entry.name, entry)  # as for imports, the first counts
+                    entries.setdefault(entry.name, entry)  # the first one wins, as for imports
             except Exception as error:
                 name = package.metadata["Name"] or "without a name"
-                problem = f"the entry points of package {name} cannot be read: {text.named(error)}"
+                problem = (
+                    f"the entry points of package {name} cannot be read: "
+                    f"{text.describe_error(error)}"
+                )
                 self.problems[name] = problem
-                import logging  # with as much as all else that is loaded here
+                import logging  # as slow to import as everything else here
 
                 logging.getLogger(__name__).warning("%s", problem)
         return entries
 
 
 def _load_class(name: str) -> Any:
-    """Return what `module:class` names."""
+    """Return the object that `module:class` names."""
     module, _, attributes = name.partition(":")
     return reduce(getattr, filter(None, attributes.split(".")), importlib.import_module(module))
 
 
 def _mentioned(group: str) -> bool:
-    """May an installed package offer entry points of this group? Only then all are looked at."""
+    """Return whether a package may offer entry points of this group; only then all are read."""
     finders = [finder for finder in sys.meta_path if hasattr(finder, "find_distributions")]
     return finders != [PathFinder] or any(_mentions(path, group.encode()) for path in sys.path)
 
 
 def _mentions(path: str, group: bytes) -> bool:
-    """Does a package in this folder of sys.path? In an archive, one may.
+    """Return whether a package in this folder of sys.path mentions the group; True for an archive.
 
     Without pathlib, which takes twice as long for hundreds of files.
     """
@@ -184,7 +190,7 @@ def _mentions(path: str, group: bytes) -> bool:
 
 
 def _stamps() -> list[int]:
-    """When each folder of sys.path changed last [ns]: a package that is installed changes one."""
+    """Return when each folder of sys.path was last changed, such as by an installation [ns]."""
     stamps = []
     for path in sys.path:
         try:

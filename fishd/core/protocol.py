@@ -1,7 +1,7 @@
 """The control protocol: JSON requests and replies, shared by server and client.
 
 docs/reference/protocol.md is its reference for clients in other languages; its tables are
-written from what is declared here (`make docs`).
+generated from the declarations here (`make docs`).
 """
 
 from collections.abc import Callable
@@ -19,24 +19,23 @@ from fishd.core.signals import MODES, LeaseHolder, Reason
 
 VERSION = 1
 MAX_MESSAGE = 16384
-"""Longer messages are not even received [bytes]."""
+"""Maximum size of a message; longer ones are not received [bytes]."""
 
-LEASE = 2.0
-"""Time for which a lease of the fish lasts without being renewed, by default [s]."""
-SHORTEST_LEASE = 0.5
-"""[s]"""
-LONGEST_LEASE = 60.0
-"""[s]"""
-FRESH = 10.0
-"""How long after it was taken a force sample is good for a tare [s]."""
+DEFAULT_LEASE_S = 2.0
+"""Default duration of a lease without a renewal [s]."""
+MIN_LEASE_S = 0.5
+MAX_LEASE_S = 60.0
+MAX_SAMPLE_AGE_S = 10.0
+"""Maximum age of a force sample that a tare may use [s]."""
 
-LOADING = 10.0
-"""How long a controller may take to load, and files to be read or written [s]."""
+LOADING_TIMEOUT_S = 10.0
+"""Maximum time to load a controller, and to read or write files [s]."""
 
-BEGINNINGS = {"set-controller", "clear-fault", "calibrate-servo"}
-"""Operations after which a fish at rest moves, or its servo gets pulses."""
-WAITED = 5.0
-"""One of these that waited longer is refused: whoever asked may have given up [s]."""
+MOVING_OPERATIONS = {"set-controller", "clear-fault", "calibrate-servo"}
+"""Operations that may move a fish at rest, or start the pulses of its servo."""
+MAX_WAIT_S = 5.0
+"""Maximum time that such an operation waits before it is refused: its client may have given up
+[s]."""
 
 RequestId = int | Annotated[str, Meta(max_length=256)] | None
 
@@ -45,75 +44,75 @@ Line = Annotated[str, Meta(max_length=1000, pattern=PRINTABLE)]
 
 
 class Request(Struct, forbid_unknown_fields=True):
-    """What a client asks for."""
+    """Request of a client."""
 
     v: Annotated[int, note("Version of this protocol: 1.")]
-    op: Annotated[str, note("What to do.", max_length=64)]
-    id: Annotated[RequestId, note("Comes back in the reply; optional.")] = None
+    op: Annotated[str, note("Name of the operation.", max_length=64)]
+    id: Annotated[RequestId, note("Identifier that the reply repeats; optional.")] = None
     args: Annotated[
-        dict[str, Any], note("Arguments of the operation; optional where it needs none.")
+        dict[str, Any], note("Arguments of the operation; optional if it needs none.")
     ] = {}
 
 
 class OnlyId(Struct):
-    """A request of which nothing but its id matters."""
+    """Request of which only the id is decoded."""
 
     id: RequestId = None
 
 
 class Failure(Struct, frozen=True):
-    """Why a request was refused."""
+    """Error of a refused request."""
 
     code: Annotated[str, note("One of the codes below.")]
-    message: Annotated[str, note("One line that says what would be right.")]
+    message: Annotated[str, note("Explanation in one line, with a remedy.")]
 
 
 class Reply(Struct, frozen=True):
-    """The answer: `result` where `ok`, else `error`."""
+    """Reply: `result` if `ok`, else `error`."""
 
     v: Annotated[int, note("Version of this protocol: 1.")]
-    id: Annotated[RequestId, note("That of the request; null where it cannot be read.")]
-    ok: Annotated[bool, note("Was the request carried out?")]
-    result: Annotated[msgspec.Raw | UnsetType, note("What the operation gives.")] = UNSET
-    error: Annotated[Failure | UnsetType, note("Why it was refused.")] = UNSET
+    id: Annotated[RequestId, note("The id of the request; null if it cannot be read.")]
+    ok: Annotated[bool, note("Whether the request was carried out.")]
+    result: Annotated[msgspec.Raw | UnsetType, note("Result of the operation.")] = UNSET
+    error: Annotated[Failure | UnsetType, note("Reason of the refusal.")] = UNSET
 
 
 class State(Struct, frozen=True):
-    """The answer to every request that changes something."""
+    """Result of every request that changes something."""
 
     seq: Annotated[int, note("Number of the first tick that is affected.")]
     mode: Annotated[str, note(MODES)]
-    reason: Annotated[Reason | None, note("Why, in mode fault and estop.")]
+    reason: Annotated[Reason | None, note("Reason of mode fault or estop; else null.")]
     controller: Annotated[str, note("The active controller.")]
-    parameters: Annotated[dict[str, Any], note("All its parameters.")]
+    parameters: Annotated[dict[str, Any], note("All parameters of the controller.")]
     took_from: Annotated[
         LeaseHolder | None,
-        note("The experiment whose [lease](#leases) this request has ended; null where none did."),
+        note("The experiment whose [lease](#leases) this request has ended; null if none."),
     ] = None
 
 
 class Grant(Struct, frozen=True):
-    """The answer to take-lease."""
+    """Result of take-lease."""
 
-    lease: Annotated[str, note("Names the lease in the requests of its holder.")]
-    seconds: Annotated[float, unit("s", "Time that it lasts from each renewal on.")]
+    lease: Annotated[str, note("Identifier of the lease for the requests of its holder.")]
+    seconds: Annotated[float, unit("s", "Duration of the lease from each renewal on.")]
     took_from: Annotated[
-        LeaseHolder | None, note("The holder before, from whom the fish was taken; else null.")
+        LeaseHolder | None, note("The previous holder, if the fish was taken from one; else null.")
     ] = None
 
 
 class PolicyInfo(Struct, frozen=True, kw_only=True):
-    """A policy, named or by its path."""
+    """A policy file, found by its name or its path."""
 
     name: str
     file: str
-    """Its path."""
+    """Path of the file."""
     problem: str
-    """Why it cannot be used, in one line; empty where it can."""
+    """Reason why the policy cannot be used, in one line; empty if it can."""
     card: dict[str, Any] | None
-    """What the file says about itself, as JSON; None where it is not a policy file."""
+    """Metadata in the file, as JSON; None if it is not a policy file."""
     sees: str = ""
-    """What it is shown of the fish: `forces`, `pictures` or `forces, pictures`."""
+    """Inputs of the policy: `forces`, `pictures` or `forces, pictures`."""
 
 
 class NoArguments(Struct, frozen=True, forbid_unknown_fields=True):
@@ -154,7 +153,7 @@ class SampleForce(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Tare(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of tare: the `number` of a sample that is at most `FRESH` seconds old."""
+    """Arguments of tare: the `number` of a sample of at most the age `MAX_SAMPLE_AGE_S`."""
 
     sample: int
     lease: str | None = None
@@ -168,7 +167,7 @@ class CalibrateForce(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CalibrateServo(Struct, frozen=True, forbid_unknown_fields=True):
-    """Arguments of calibrate-servo; without `save`, the calibration ends with the lease."""
+    """Arguments of calibrate-servo; without `save`, the calibration is dropped with the lease."""
 
     calibration: ServoCalibration
     save: bool = False
@@ -180,20 +179,20 @@ class CalibrateThrust(Struct, frozen=True, forbid_unknown_fields=True):
 
     factor: Annotated[float, Meta(ge=1e-9, le=1e9)]
     error: Annotated[float, Meta(ge=1e-12, le=1e9)]
-    """Half of its 95 % interval."""
+    """Half-width of the 95 % confidence interval of `factor` [N]."""
 
 
 class TakeLease(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of take-lease."""
 
     name: Annotated[str, Meta(min_length=1, max_length=60, pattern=PRINTABLE)]
-    """What the experiment is called in messages, such as `measure`."""
+    """Name of the experiment in messages, such as `measure`."""
     host: Annotated[str, Meta(max_length=64, pattern=PRINTABLE)] = ""
-    """The machine on which it runs."""
+    """Name of the machine on which it runs."""
     pid: int = 0
-    """Its process."""
-    seconds: Annotated[float, Meta(ge=SHORTEST_LEASE, le=LONGEST_LEASE)] | None = None
-    """Time that the lease lasts without a renewal [s]; None: as configured."""
+    """Process id of the experiment; 0 if unknown."""
+    seconds: Annotated[float, Meta(ge=MIN_LEASE_S, le=MAX_LEASE_S)] | None = None
+    """Duration of the lease without a renewal [s]; None for the configured one."""
     take: bool = False
     """Whether to take the fish from another holder."""
 
@@ -205,20 +204,20 @@ class HeldLease(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Calibrations(Struct, frozen=True):
-    """The calibrations that are used now, and their files."""
+    """The active calibrations and their files."""
 
-    force: Annotated[ForceCalibration, note("That of the force sensor, see below.")]
-    force_file: Annotated[str | None, note("Its file; null where it comes from the configuration.")]
+    force: Annotated[ForceCalibration, note("Calibration of the force sensor, see below.")]
+    force_file: Annotated[str | None, note("File of `force`; null if the configuration sets it.")]
     servo: Annotated[
         ServoCalibration,
         note("`trim` [µs], `direction`, `scale` [µs/rad], `lowest`, `highest` [rad], `date`."),
     ]
-    servo_file: Annotated[str | None, note("Its file, likewise.")]
+    servo_file: Annotated[str | None, note("File of `servo`; null if the configuration sets it.")]
     force_limit: Annotated[
-        float, unit("N", "A force beyond ± this is not believed: `force_sensor.force_limit`.")
+        float, unit("N", "Limit of a plausible force, either sign: `force_sensor.force_limit`.")
     ]
     on_trial: Annotated[
-        bool, note("True while that of the servo is only tried, under a [lease](#leases).")
+        bool, note("True while the servo calibration is on trial, under a [lease](#leases).")
     ] = False
 
 
@@ -229,18 +228,20 @@ class Mark(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Operation(NamedTuple):
-    """What can be asked for."""
+    """An operation of the protocol."""
 
     arguments: type[Struct]
     result: str
-    """What it gives, in the words of docs/reference/protocol.md."""
+    """Description of the result for docs/reference/protocol.md."""
     does: str
-    """What it does, likewise."""
+    """Description of the effect, likewise."""
 
 
 _STATE = "[state](#state)"
 _CALIBRATIONS = "[calibrations](#calibrations)"
-_CONFIG = "the [configuration](configuration.md) that `fishd` was started with, an object a section"
+_CONFIG = (
+    "the [configuration](configuration.md) that `fishd` was started with, one object per section"
+)
 OPERATIONS = {
     "status": Operation(NoArguments, "[status](#status)", "nothing"),
     "controllers": Operation(NoArguments, "list of [controllers](#controllers)", "nothing"),
@@ -249,7 +250,7 @@ OPERATIONS = {
     "set-controller": Operation(
         SetController,
         _STATE,
-        "makes a new controller the active one; parameters left out take their defaults",
+        "activates a new controller; omitted parameters take their defaults",
     ),
     "set-parameter": Operation(
         SetParameter, _STATE, "changes these parameters of the active controller, all or none"
@@ -262,26 +263,27 @@ OPERATIONS = {
     "take-lease": Operation(
         TakeLease,
         "[lease](#leases)",
-        "gives the client the fish for as long as it renews the lease; moves nothing",
+        "reserves the fish for the client while it renews the lease; moves nothing",
     ),
-    "renew-lease": Operation(HeldLease, _STATE, "lets the lease last again for its full time"),
+    "renew-lease": Operation(HeldLease, _STATE, "restarts the full duration of the lease"),
     "end-lease": Operation(
-        HeldLease, _STATE, "ends the lease, and fades to neutral what was set under it"
+        HeldLease, _STATE, "ends the lease, and fades to neutral if a controller was set under it"
     ),
     "mark": Operation(Mark, _STATE, "publishes an event `mark`"),
     "calibrations": Operation(NoArguments, _CALIBRATIONS, "nothing"),
     "sample-force": Operation(
-        SampleForce, "[force sample](#calibrations)", "measures for this time"
+        SampleForce, "[force sample](#calibrations)", "measures for `seconds`"
     ),
     "tare": Operation(
         Tare,
         _CALIBRATIONS,
-        f"calls the force sample of that `number`, one of the last {FRESH:g} s, zero force; saved",
+        f"takes the force sample of that `number`, at most {MAX_SAMPLE_AGE_S:g} s old, as zero; "
+        "saved",
     ),
     "calibrate-force": Operation(
         CalibrateForce,
         _CALIBRATIONS,
-        "saves it and uses it from the next tick on; what is left out takes its default",
+        "saves it and uses it from the next tick on; omitted fields take their defaults",
     ),
     "calibrate-servo": Operation(
         CalibrateServo,
@@ -291,7 +293,7 @@ OPERATIONS = {
     "calibrate-thrust": Operation(
         CalibrateThrust,
         _STATE,
-        "takes the factor from a measurement, and shows the thrust by it until fishd ends",
+        "uses this measured factor for the displayed thrust until fishd ends",
     ),
 }
 """All operations, by name."""
@@ -303,20 +305,20 @@ _decode_id: Callable[[bytes], OnlyId] = decoder(OnlyId)
 
 
 def decode_request(payload: bytes) -> Request:
-    """The request in `payload`; raises `Refused` with code `bad-request` or `version`."""
+    """Decode a request; raise `Refused` with code `bad-request` or `version`."""
     try:
         request = _decode_request(payload)
     except msgspec.DecodeError as error:
         raise Refused("bad-request", f"not a request: {error}") from None
     if request.v != VERSION:
         raise Refused(
-            "version", f"protocol version {request.v} is not spoken here; this is {VERSION}"
+            "version", f"protocol version {request.v} is not supported; use version {VERSION}"
         )
     return request
 
 
 def request_id(payload: bytes) -> RequestId:
-    """The id of a request that may be broken otherwise; None where it cannot be told."""
+    """Return the id of a request that may otherwise be invalid; None if it cannot be read."""
     try:
         return _decode_id(payload).id
     except msgspec.DecodeError:
@@ -324,11 +326,11 @@ def request_id(payload: bytes) -> RequestId:
 
 
 def success(identity: RequestId, result: Any) -> bytes:
-    """A reply with a result."""
+    """Encode a reply with a result."""
     return encode(Reply(v=VERSION, id=identity, ok=True, result=msgspec.Raw(encode(result))))
 
 
 def failure(identity: RequestId, error: Refused) -> bytes:
-    """A reply with an error."""
-    why = Failure(text.quoted(error.code), text.said(error))
+    """Encode a reply with an error."""
+    why = Failure(text.quoted(error.code), text.error_message(error))
     return encode(Reply(VERSION, identity, ok=False, error=why))

@@ -1,4 +1,4 @@
-"""One source for the bounds, units and descriptions of parameters.
+"""Bounds, units and descriptions of parameters, declared in one place.
 
 Configuration sections and controller parameters are msgspec structs whose fields carry bounds, unit
 and description (`unit`, `note`). From those this module takes validation with readable errors
@@ -18,9 +18,9 @@ from msgspec import Meta, Struct, inspect
 
 from fishd.core import text
 
-LONGEST_WORD = 100
-"""For a longer one no suggestion is looked for [characters]."""
-_CANDIDATES = 5
+MAX_SUGGESTION_CHARACTERS = 100
+"""Maximum length of a word for which a suggestion is searched [characters]."""
+_MAX_CANDIDATES = 5
 PRINTABLE = "^[^\x00-\x1f\x7f-\x9f]*$"
 """Pattern of a text without control characters."""
 
@@ -32,12 +32,12 @@ Scalar = bool | int | float | str | None
 def unit(
     symbol: str, description: str, *, file: str = "", usual: float = 0.0, **constraints: Any
 ) -> Meta:
-    """What a field means: `Annotated[float, unit("Hz", "Frequency of the command.", gt=0, le=10)]`.
+    """Describe a field: `Annotated[float, unit("Hz", "Frequency of the command.", gt=0, le=10)]`.
 
-    symbol: the unit in SI notation, `1` for a pure number
-    file: suffix, such as `.onnx`, where a text may be the path of a file
-    usual: largest size that makes sense on a real fish, where the bounds are wider, as
-        `find_doubts` uses it
+    symbol: unit in SI notation, `1` for a pure number
+    file: suffix, such as `.onnx`, of a text that may be the path of a file
+    usual: largest magnitude that is reasonable on a real fish, if the bounds are wider; see
+    `find_doubts`
     constraints: those of `msgspec.Meta`, such as gt, ge, lt, le, min_length, pattern
     """
     extra: dict[str, Any] = {"unit": symbol}
@@ -46,12 +46,12 @@ def unit(
 
 
 def note(description: str, **constraints: Any) -> Meta:
-    """`unit` for a field that is no quantity, such as a name, a switch or a section."""
+    """Describe a field without a unit, such as a name, a switch or a section; see `unit`."""
     return Meta(description=description, **constraints)
 
 
 class Field(Struct, frozen=True, omit_defaults=True):
-    """One field of a struct, as a person or an option parser wants to know it."""
+    """Description of one field of a struct, for help texts and option parsers."""
 
     name: str
     kind: str
@@ -62,38 +62,40 @@ class Field(Struct, frozen=True, omit_defaults=True):
     interval: str
     """Permitted values: an interval such as `(0, 2]`, or choices such as `a | b`; empty for any."""
     optional: bool
-    """True where null is permitted."""
+    """True if null is permitted."""
     required: bool = False
-    """True if it has no default."""
+    """True if the field has no default."""
     file: str = ""
-    """Suffix, such as `.onnx`, where a text may be the path of a file: see `names_file`."""
+    """Suffix, such as `.onnx`, of a text that may be the path of a file: see `names_file`."""
     words: tuple[str, ...] = ()
-    """Permitted beside a number, such as `auto`."""
+    """Words that are permitted besides a number, such as `auto`."""
     usual: float = 0.0
-    """Largest size that makes sense on a real fish, where the bounds are wider; else 0."""
+    """Largest magnitude that is reasonable on a real fish, if the bounds are wider; else 0."""
 
 
 class Problem(Exception):
-    """A value that does not fit; `path` holds the keys that lead to it."""
+    """A value is invalid; `path` holds the keys that lead to it."""
 
     def __init__(self, path: tuple[str, ...], message: str) -> None:
         super().__init__(message)
         self.path = path
 
-    def located(self, sources: Mapping[tuple[str, ...], str]) -> str:
-        """The message with the place of its key, of one within it, or of the section around it.
+    def message_with_place(self, sources: Mapping[tuple[str, ...], str]) -> str:
+        """Return the message with the place of its key, of a key below it, or of its section.
 
-        sources: the place where each key was set, such as `fish.yaml:3`
+        sources: place where each key was set, such as `fish.yaml:3`
         """
         path = self.path
-        within = [place for key, place in sources.items() if path and key[: len(path)] == path]
-        above = [sources[path[:n]] for n in range(len(path) + 1) if path[:n] in sources]
-        where = sources.get(path) or (within or above[::-1] or [""])[0]
+        places_within = [
+            place for key, place in sources.items() if path and key[: len(path)] == path
+        ]
+        places_above = [sources[path[:n]] for n in range(len(path) + 1) if path[:n] in sources]
+        where = sources.get(path) or (places_within or places_above[::-1] or [""])[0]
         return ": ".join(part for part in (where, ".".join(path), str(self)) if part)
 
 
 class UnknownKey(Problem):
-    """There is no such key; it is the last of `path`."""
+    """A key does not exist; it is the last of `path`."""
 
 
 _KINDS: dict[type[inspect.Type], str] = {
@@ -108,20 +110,20 @@ _KINDS: dict[type[inspect.Type], str] = {
 }
 
 
-def without_empty_sections(data: Mapping[str, Any], target: type[Struct]) -> dict[str, Any]:
-    """`data` without its empty sections (null), which then take their defaults."""
+def drop_empty_sections(data: Mapping[str, Any], target: type[Struct]) -> dict[str, Any]:
+    """Return `data` without its empty sections (null), which then take their defaults."""
     kept = dict(data)
     for name, section in _sections(target):
         if isinstance(kept.get(name), Mapping):
-            kept[name] = without_empty_sections(kept[name], section)
+            kept[name] = drop_empty_sections(kept[name], section)
         elif name in kept and kept[name] is None:
             del kept[name]
     return kept
 
 
-@lru_cache(maxsize=256)  # controllers are asked for theirs in every request
+@lru_cache(maxsize=256)  # requests need the fields of controllers
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
-    """The fields of a parameter struct, in the order in which they are declared."""
+    """Return the fields of a parameter struct, in the order of their declaration."""
     return tuple(_describe(field) for field in _info(struct).fields)
 
 
@@ -140,10 +142,10 @@ def convert(
 ) -> T:
     """Validate `data` into the struct `target`.
 
-    Raises `Problem`, whose message names the permitted values or the nearest valid key and whose
-    path begins with `prefix`.
+    Raise `Problem`, whose message names the permitted values or the most similar valid key and
+    whose path begins with `prefix`.
 
-    elsewhere: gives further keys to suggest, in dotted form
+    elsewhere: returns more keys for suggestions, in dotted form
     """
     _prepare(target)
     try:
@@ -159,7 +161,7 @@ _preparing = threading.Lock()
 
 
 def _prepare(target: Any) -> None:
-    """Let one thread alone use a type for the first time: in two at once, msgspec crashes."""
+    """Use a type for the first time in one thread only: in two threads at once, msgspec crashes."""
     if target in _prepared:
         return
     with _preparing:
@@ -167,8 +169,8 @@ def _prepare(target: Any) -> None:
         _prepared.add(target)
 
 
-def wanted(field: Field) -> str:
-    """What a field takes, in words: `a number in [0, 1] rad (or null)`."""
+def describe_permitted(field: Field) -> str:
+    """Return the permitted values of a field in words: `a number in [0, 1] rad (or null)`."""
     if field.file:
         return f"a name or the path of a *{field.file} file" + (" (or null)" * field.optional)
     kind = {
@@ -181,19 +183,21 @@ def wanted(field: Field) -> str:
         "list": "a list",
     }[field.kind]
     preposition = {"choice": "", "text": "of ", "list": "of "}.get(field.kind, "in ")
-    within = preposition + field.interval
-    words = (kind, within if field.interval else "", field.unit if field.unit != "1" else "")
-    others = [*field.words, *(["null"] if field.optional else [])]
-    return " ".join(filter(None, words)) + (f" (or {' or '.join(others)})" if others else "")
+    range_words = preposition + field.interval
+    words = (kind, range_words if field.interval else "", field.unit if field.unit != "1" else "")
+    alternatives = [*field.words, *(["null"] if field.optional else [])]
+    return " ".join(filter(None, words)) + (
+        f" (or {' or '.join(alternatives)})" if alternatives else ""
+    )
 
 
 def names_file(text: str, suffix: str) -> bool:
-    """Is this text the path of a file, rather than a name?"""
+    """Return whether this text is the path of a file rather than a name."""
     return "/" in text or text.endswith(suffix)
 
 
 def nested_too_deeply(data: Any, levels: int = 20) -> bool:
-    """Are lists and mappings nested in more levels, so that an encoder might overflow the stack?"""
+    """Return whether lists and mappings have more levels, which may overflow an encoder's stack."""
     if isinstance(data, Mapping):
         data = list(data.values())
     if not isinstance(data, list):
@@ -201,21 +205,23 @@ def nested_too_deeply(data: Any, levels: int = 20) -> bool:
     return levels == 0 or any(nested_too_deeply(part, levels - 1) for part in data)
 
 
-def nearest(word: str, words: list[str], *, listed: str = "valid") -> str:
-    """A did-you-mean for `word`, or the list of what there is, introduced by `listed`."""
-    close = [known for known in words if known.lower() == word.lower()] or _close(word, words)
-    if not close:  # 'noise' for 'simulation.noise'
-        close = [known for known in words if known.rpartition(".")[2] == word]
-    if close:
-        return f"did you mean '{close[0]}'?"
+def suggest(word: str, words: list[str], *, listed: str = "valid") -> str:
+    """Return a did-you-mean hint for `word`, or the list of `words`, introduced by `listed`."""
+    matches = [known for known in words if known.lower() == word.lower()] or _find_similar(
+        word, words
+    )
+    if not matches:  # 'noise' for 'simulation.noise'
+        matches = [known for known in words if known.rpartition(".")[2] == word]
+    if matches:
+        return f"did you mean '{matches[0]}'?"
     return f"{listed}: {', '.join(words)}" if words else "none is valid here"
 
 
-def _close(word: str, words: list[str]) -> list[str]:
-    """The nearest, if it is near enough; in microseconds, however long the word is."""
-    if len(word) > LONGEST_WORD:
+def _find_similar(word: str, words: list[str]) -> list[str]:
+    """Return the most similar word, if it is similar enough; takes microseconds for any length."""
+    if len(word) > MAX_SUGGESTION_CHARACTERS:
         return []
-    import difflib  # only where a word is wrong
+    import difflib  # only needed for a wrong word
     import heapq
 
     letters = set(word)
@@ -223,20 +229,22 @@ def _close(word: str, words: list[str]) -> list[str]:
     def distance(known: str) -> int:
         return len(letters.symmetric_difference(known)) + abs(len(known) - len(word))
 
-    candidates = heapq.nsmallest(_CANDIDATES, words, distance)  # difflib alone takes milliseconds
+    candidates = heapq.nsmallest(
+        _MAX_CANDIDATES, words, distance
+    )  # difflib alone takes milliseconds
     return difflib.get_close_matches(word, candidates, n=1, cutoff=0.6)
 
 
-def leaves(struct: type[Struct], prefix: str = "") -> list[str]:
-    """Every key of `struct` and its sections in dotted form."""
+def list_keys(struct: type[Struct], prefix: str = "") -> list[str]:
+    """Return all keys of `struct` and its sections in dotted form."""
     keys = [prefix + field.name for field in fields_of(struct)]
     for name, section in _sections(struct):
-        keys += leaves(section, f"{prefix}{name}.")
+        keys += list_keys(section, f"{prefix}{name}.")
     return keys
 
 
-def _unwrapped(kind: inspect.Type) -> tuple[inspect.Type, dict[str, Any], bool]:
-    """A field's type without metadata and null, its metadata, and whether null is permitted."""
+def _unwrap(kind: inspect.Type) -> tuple[inspect.Type, dict[str, Any], bool]:
+    """Return a type without metadata and null, its metadata, and whether null is permitted."""
     extra: dict[str, Any] = {}
     if isinstance(kind, inspect.Metadata):
         extra, kind = kind.extra_json_schema or {}, kind.type
@@ -246,42 +254,42 @@ def _unwrapped(kind: inspect.Type) -> tuple[inspect.Type, dict[str, Any], bool]:
     return kind, extra, False
 
 
-def _words(kind: inspect.Type) -> tuple[str, ...]:
-    """What a field takes beside the first of its types: the words of a Literal."""
+def _literal_words(kind: inspect.Type) -> tuple[str, ...]:
+    """Return the words of a Literal that a field accepts besides its first type."""
     if isinstance(kind, inspect.Metadata):
         kind = kind.type
     if not isinstance(kind, inspect.UnionType):
         return ()
-    rest = [part for part in kind.types if isinstance(part, inspect.LiteralType)]
-    return tuple(str(word) for part in rest for word in part.values)
+    literals = [part for part in kind.types if isinstance(part, inspect.LiteralType)]
+    return tuple(str(word) for part in literals for word in part.values)
 
 
 def _describe(field: inspect.Field) -> Field:
-    kind, extra, optional = _unwrapped(field.type)
+    kind, extra, optional = _unwrap(field.type)
     return Field(
         name=field.encode_name,
         kind=_KINDS.get(type(kind), "text"),
         unit=extra.get("unit", ""),
         description=extra.get("description", ""),
         default=field.default if isinstance(field.default, Scalar) else None,
-        interval=_interval(kind),
+        interval=_format_interval(kind),
         optional=optional,
         required=field.required,
         file=extra.get("file", ""),
-        words=_words(field.type) if isinstance(kind, inspect.FloatType) else (),
+        words=_literal_words(field.type) if isinstance(kind, inspect.FloatType) else (),
         usual=extra.get("usual", 0.0),
     )
 
 
-def _interval(kind: inspect.Type) -> str:
+def _format_interval(kind: inspect.Type) -> str:
     if isinstance(kind, inspect.StrType) and kind.max_length is not None:
-        least = f"{kind.min_length}" if kind.min_length else "up"
-        return f"{least} to {kind.max_length} printable characters"
+        shortest = f"{kind.min_length}" if kind.min_length else "up"
+        return f"{shortest} to {kind.max_length} printable characters"
     if isinstance(kind, inspect.LiteralType):
         return " | ".join(str(value) for value in kind.values)
     if isinstance(kind, inspect.VarTupleType):
-        whole = "whole numbers in " if isinstance(kind.item_type, inspect.IntType) else ""
-        return whole + _interval(kind.item_type)
+        prefix = "whole numbers in " if isinstance(kind.item_type, inspect.IntType) else ""
+        return prefix + _format_interval(kind.item_type)
     if not isinstance(kind, inspect.FloatType | inspect.IntType):
         return ""
     low = f"({kind.gt:g}" if kind.gt is not None else f"[{kind.ge:g}" if kind.ge is not None else ""
@@ -297,17 +305,19 @@ def _explain(
     target: type[Struct],
     elsewhere: Callable[[], list[str]],
 ) -> Problem:
-    """Turn msgspec's first error into a path and one readable sentence."""
-    complaint, _, where = str(error).partition(" - at `$")
-    keys = re.findall(r"[^.\[\]`]+", where)
-    while keys and keys[-1].isdigit():  # an element of a list is shown with all of the list
+    """Convert msgspec's error to a path and one readable sentence."""
+    complaint, _, location = str(error).partition(" - at `$")
+    keys = re.findall(r"[^.\[\]`]+", location)
+    while keys and keys[-1].isdigit():  # for an element of a list, the message has the whole list
         keys.pop()
     path = tuple(key for key in keys if not key.isdigit())
     if unknown := re.search(r"unknown field `(.*)`", complaint):
-        return _unknown(unknown[1], path, target, elsewhere())
+        return _unknown_key(unknown[1], path, target, elsewhere())
     if missing := re.search(r"missing required field `(.*)`", complaint):
         path = (*path, missing[1])
-        return Problem(path, f"is missing: {wanted(_describe(_field_at(target, path)))} is needed")
+        return Problem(
+            path, f"is missing: {describe_permitted(_describe(_field_at(target, path)))} is needed"
+        )
     value = data
     for key in keys:
         if isinstance(value, Mapping):
@@ -315,46 +325,48 @@ def _explain(
         elif isinstance(value, list | tuple):
             value = value[int(key)]
     if not path:
-        return Problem(path, f"{shown(value)} is not valid: a mapping of keys to values is needed")
+        return Problem(
+            path, f"{format_excerpt(value)} is not valid: a mapping of keys to values is needed"
+        )
     field = _field_at(target, path)
     return Problem(
         path,
-        f"{shown(value)} is not valid: {wanted(_describe(field))} is needed"
-        + _other_unit(value, field)
-        + _entries(value, field),
+        f"{format_excerpt(value)} is not valid: {describe_permitted(_describe(field))} is needed"
+        + _ask_for_other_unit(value, field)
+        + _entry_hint(value, field),
     )
 
 
-def _unknown(
+def _unknown_key(
     key: str, path: tuple[str, ...], target: type[Struct], elsewhere: list[str]
 ) -> UnknownKey:
-    """Suggests a key of the same section, else one of any, else lists those of the section."""
+    """Suggest a key of the same section, else of any section, else list the keys of the section."""
     valid = [field.name for field in fields_of(_struct_at(target, path))]
-    everywhere = [".".join((*path, name)) for name in valid] + leaves(target) + elsewhere
-    hint = nearest(key, valid)
-    if "." in key and key in everywhere:
+    all_keys = [".".join((*path, name)) for name in valid] + list_keys(target) + elsewhere
+    hint = suggest(key, valid)
+    if "." in key and key in all_keys:
         section, _, name = key.rpartition(".")
         hint = f"write '{section}:' and below it, indented, '{name}:'"
-    elif not hint.startswith("did") and (other := nearest(key, everywhere)).startswith("did"):
-        hint = other
+    elif not hint.startswith("did") and (wider_hint := suggest(key, all_keys)).startswith("did"):
+        hint = wider_hint
     return UnknownKey((*path, key), f"unknown key; {hint}")
 
 
-def _other_unit(value: Any, field: inspect.Field) -> str:
-    """Return a question where a value is valid only in a unit that people use as well.
+def _ask_for_other_unit(value: Any, field: inspect.Field) -> str:
+    """Return a question if a value is valid only in another common unit.
 
-    An angle may be in degrees, others in thousandths: ` (mN? that is 0.02 N)`.
+    An angle may be in degrees, other values in thousandths: ` (mN? that is 0.02 N)`.
     """
-    kind, extra, _ = _unwrapped(field.type)
+    kind, extra, _ = _unwrap(field.type)
     if not isinstance(kind, inspect.FloatType) or not _is_number(value):
         return ""
     symbol = extra.get("unit", "")
     name, factor = _OTHER_UNITS.get(symbol, ("", 0.0))
     if not name or not abs(value) <= (360 if symbol == "rad" else _MAX_IN_OTHER_UNIT):
         return ""
-    meant = factor * value
-    above = meant >= kind.ge if kind.ge is not None else kind.gt is None or meant > kind.gt
-    below = meant <= kind.le if kind.le is not None else kind.lt is None or meant < kind.lt
+    converted = factor * value
+    above = converted >= kind.ge if kind.ge is not None else kind.gt is None or converted > kind.gt
+    below = converted <= kind.le if kind.le is not None else kind.lt is None or converted < kind.lt
     return f" ({ask_for_unit(value, symbol)})" if above and below else ""
 
 
@@ -372,7 +384,7 @@ _OTHER_UNITS = {
     "V": ("mV", 1e-3),
     "A": ("mA", 1e-3),
 }
-"""Units that people use instead of those of a field, and how many of the latter one of them is."""
+"""Other common unit of a field by its unit, and the factor that converts it to that unit."""
 
 
 _MAX_IN_OTHER_UNIT = 1e6
@@ -380,26 +392,26 @@ _MAX_IN_OTHER_UNIT = 1e6
 
 
 def find_doubts(values: Mapping[str, Any], fields: Iterable[Field]) -> list[str]:
-    """Return a sentence for each value that is valid, but far more than makes sense.
+    """Return a sentence for each value that is valid, but unreasonably large.
 
-    values: parameters by their names
+    values: parameters by name
     """
-    found = []
+    doubts = []
     for field in fields:
         if not (field.usual and is_valid_number(values, field)):
             continue
         value, symbol = values[field.name], field.unit
         if abs(value) > field.usual:
             hint = f" ({ask_for_unit(value, symbol)})" if symbol in _OTHER_UNITS else ""
-            found.append(
+            doubts.append(
                 f"{field.name}: {format_quantity(value, symbol)} is more than makes sense: up to "
                 f"{format_quantity(field.usual, symbol)} does{hint}"
             )
-    return found
+    return doubts
 
 
 def is_valid_number(values: Mapping[str, Any], field: Field) -> bool:
-    """Is the value of this field a number within its interval?"""
+    """Return whether the value of this field is a number within its interval."""
     value = values.get(field.name)
     if not _is_number(value):
         return False
@@ -415,7 +427,7 @@ def is_valid_number(values: Mapping[str, Any], field: Field) -> bool:
 
 
 def format_quantity(value: Any, symbol: str) -> str:
-    """Return a value with its unit, if it is a number with one: `0.01 N`, `0.6`, `default`."""
+    """Return a value as text, a number with its unit: `0.01 N`, `0.6`, `default`."""
     if value is None:
         return "default"
     number = f"{value:g}" if _is_number(value) and float(f"{value:g}") == value else str(value)
@@ -445,9 +457,9 @@ def _is_number(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _entries(value: Any, field: inspect.Field) -> str:
-    """Brackets around an entry that stands alone, or which word of a list is wrong."""
-    kind, _, _ = _unwrapped(field.type)
+def _entry_hint(value: Any, field: inspect.Field) -> str:
+    """Return a hint to write a single value as a list, or the wrong word of a list."""
+    kind, _, _ = _unwrap(field.type)
     if not isinstance(kind, inspect.VarTupleType):
         return ""
     item = kind.item_type
@@ -460,7 +472,7 @@ def _entries(value: Any, field: inspect.Field) -> str:
             and (item.le is None or value <= item.le)
         )
         return f": write [{value}]" if fits else ""
-    wrong = [shown(entry) for entry in value if words and entry not in words]
+    wrong = [format_excerpt(entry) for entry in value if words and entry not in words]
     return f"; {wrong[0]} is none of them" if wrong else ""
 
 
@@ -478,35 +490,35 @@ def _struct_at(target: type[Struct], path: tuple[str, ...]) -> type[Struct]:
 def _sections(
     target: type[Struct], *, everywhere: bool = False
 ) -> Iterator[tuple[str, type[Struct]]]:
-    """The fields of a struct that are structs themselves.
+    """Yield name and type of each field of a struct that is a struct itself.
 
-    everywhere: also those that may be null, and lists of structs
+    everywhere: include fields that may be null, and lists of structs
     """
     for field in _info(target).fields:
         kind = field.type.type if isinstance(field.type, inspect.Metadata) else field.type
         if everywhere:
-            kind = _unwrapped(kind)[0]
+            kind = _unwrap(kind)[0]
         if everywhere and isinstance(kind, inspect.VarTupleType):
             kind = kind.item_type
         if isinstance(kind, inspect.StructType):
             yield field.name, kind.cls
 
 
-def shown(value: Any) -> str:
-    """A value in a message, as much of it as is worth showing."""
+def format_excerpt(value: Any) -> str:
+    """Return a value for a message, shortened if it is long."""
     if value is None or isinstance(value, bool):
-        return spelled(value)
-    return text.quoted(_glimpse.repr(value))
+        return format_literal(value)
+    return text.quoted(_excerpt.repr(value))
 
 
-_glimpse = reprlib.Repr()
-"""Spells only as much of a value as is shown."""
-_glimpse.maxstring = _glimpse.maxother = _glimpse.maxlong = text.LONGEST_WORD
-_glimpse.maxlist = _glimpse.maxtuple = _glimpse.maxdict = 10
+_excerpt = reprlib.Repr()
+"""Formatter of shortened values."""
+_excerpt.maxstring = _excerpt.maxother = _excerpt.maxlong = text.MAX_WORD_CHARACTERS
+_excerpt.maxlist = _excerpt.maxtuple = _excerpt.maxdict = 10
 
 
-def spelled(value: Any) -> str:
-    """A value as it would be written in YAML or JSON."""
+def format_literal(value: Any) -> str:
+    """Return a value in the notation of YAML or JSON."""
     if value is None:
         return "null"
     if isinstance(value, bool):

@@ -1,7 +1,7 @@
-"""Reads YAML, with the line of each key, and refuses values that YAML reads unexpectedly.
+"""Reader of YAML that keeps the line of each key and refuses values with surprising meanings.
 
 PyYAML follows YAML 1.1, in which `on` is true, `1e2` is a text, `1:30` is ninety and the second of
-two equal keys wins. Each of these is refused here, with the line and what to write instead.
+two equal keys wins. This reader refuses each of these, with the line and the right notation.
 """
 
 import os
@@ -26,7 +26,7 @@ class Document(NamedTuple):
 
 
 class YamlProblem(Exception):
-    """What is wrong with the YAML; `line` counts from 1."""
+    """The YAML is invalid; `line` counts from 1."""
 
     def __init__(self, line: int, message: str) -> None:
         super().__init__(message)
@@ -34,32 +34,32 @@ class YamlProblem(Exception):
 
 
 class ValueProblem(YamlProblem):
-    """What is wrong with one value; the rest of the document can be read."""
+    """One value is invalid; the rest of the document can be read."""
 
 
 _WORDS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false", "n": "false"}
 _BARE_EXPONENT = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
 _SEXAGESIMAL = re.compile(r"[-+]?[0-9]+(:[0-5]?[0-9])+(\.[0-9]*)?")
-_DEEPEST = 20
-_MOST = 2000
-"""Values and keys in one document; an alias counts as all that it stands for."""
-_LONGEST_NUMBER = 100
-_LONGEST_INTEGER = 1e12
+_MAX_DEPTH = 20
+_MAX_NODES = 2000
+"""Maximum number of values and keys in one document; an alias counts as everything it refers to."""
+_MAX_NUMBER_CHARACTERS = 100
+_MAX_PLAIN_INTEGER = 1e12
 _OCTAL = re.compile(r"[-+]?0[0-7_]+")
 
 
 def read(
     file: str | os.PathLike[str], reader: str, example: str, mistakes: list[str] | None = None
 ) -> tuple[dict[str, Any], dict[Path, str]]:
-    """The mapping in a file, and the place of each key, such as `fish.yaml:3`.
+    """Return the mapping in a file, and the place of each key, such as `fish.yaml:3`.
 
-    reader: what the file is for, such as `a configuration`; example: a line that would be right
-    mistakes: takes what is wrong with single values, which are left out then
-    Raises `ConfigError` that names file and line.
+    reader: purpose of the file, such as `a configuration`; example: a valid line
+    mistakes: receives the problems of single values, which are then left out
+    Raise `ConfigError` with file and line.
     """
     problems: list[ValueProblem] | None = None if mistakes is None else []
     try:
-        text = files.read_text(pathlib.Path(file), files.SETTINGS, reader)
+        text = files.read_text(pathlib.Path(file), files.MAX_SETTINGS_BYTES, reader)
         data, lines = parse(text, problems=problems)
     except YamlProblem as problem:
         raise ConfigError(f"{file}:{problem.line}: {problem}") from None
@@ -77,12 +77,13 @@ def read(
 def parse(
     text: str, name: str = "the document", problems: list[ValueProblem] | None = None
 ) -> Document:
-    """Parse `text`; raises `YamlProblem`, which calls a value outside of any key `name`.
+    """Parse `text`; raise `YamlProblem`.
 
-    problems: takes what is wrong with the value of a key, which is left out then
+    name: name of a value outside of any key, for the error
+    problems: receives the problems of single values, which are then left out
     """
-    if len(text) > files.SETTINGS:
-        raise YamlProblem(1, f"longer than {files.SETTINGS // 2**10} kB")
+    if len(text) > files.MAX_SETTINGS_BYTES:
+        raise YamlProblem(1, f"longer than {files.MAX_SETTINGS_BYTES // 2**10} kB")
     try:
         root = _Loader(text).get_single_node()
     except yaml.MarkedYAMLError as error:
@@ -98,18 +99,18 @@ def parse(
 
 
 class _Loader(yaml.SafeLoader):
-    """Stops as soon as a document has too many values or levels."""
+    """Loader that stops as soon as a document has too many values or levels."""
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
         self._count = self._depth = 0
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Count the node, which the loader asks for, and its level."""
+        """Return the next node, and count it and its level."""
         self._count += 1
         self._depth += 1
         line = int(self.line) + 1
-        if self._depth > _DEEPEST + 1:
+        if self._depth > _MAX_DEPTH + 1:
             raise YamlProblem(line, "nested too deeply")
         _check_count(self._count, line)
         node = super().compose_node(parent, index)
@@ -118,11 +119,11 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes the texts that the reader would refuse."""
+    """Dumper that quotes the texts that the reader would refuse."""
 
     def represent_str(self, data: str) -> yaml.ScalarNode:
         """Return the node of a text."""
-        style = "'" if _surprise(data, _TEXT) else None
+        style = "'" if _explain_surprise(data, _TEXT) else None
         return self.represent_scalar(_TEXT, data, style=style)
 
 
@@ -131,12 +132,12 @@ _Dumper.add_representer(str, _Dumper.represent_str)
 
 
 def dump(data: Any) -> str:
-    """Return plain values as YAML that `read` takes back."""
+    """Return plain values as YAML that `read` accepts."""
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
 
 
 class _Builder:
-    """Converts the nodes of a document to plain values."""
+    """Converter of the nodes of a document to plain values."""
 
     def __init__(self, name: str, problems: list[ValueProblem] | None) -> None:
         self.lines: dict[Path, int] = {}
@@ -146,11 +147,11 @@ class _Builder:
         self._constructor = yaml.constructor.SafeConstructor()
 
     def build(self, node: yaml.Node, path: Path) -> Any:
-        """The value of the node at this path of keys."""
+        """Return the value of the node at this path of keys."""
         line = node.start_mark.line + 1
         self._count += 1
         _check_count(self._count, line)
-        if len(path) > _DEEPEST:  # an alias of itself has no end
+        if len(path) > _MAX_DEPTH:  # an alias that contains itself has no end
             raise YamlProblem(line, f"{'.'.join(path[:3])}...: nested too deeply")
         self.lines.setdefault(path, line)
         if isinstance(node, yaml.MappingNode):
@@ -168,16 +169,17 @@ class _Builder:
                 raise YamlProblem(line, "a key must be a plain word")
             key = str(key_node.value)
             _check_characters(key, "a key", line)
-            here = (*path, key)
+            key_path = (*path, key)
             try:
                 if key in mapping:
                     raise ValueProblem(
                         line,
-                        f"{'.'.join(here)}: duplicate key, first given on line {self.lines[here]}; "
+                        f"{'.'.join(key_path)}: duplicate key, first given on line "
+                        f"{self.lines[key_path]}; "
                         "keep one",
                     )
-                self.lines[here] = line
-                mapping[key] = self.build(value_node, here)
+                self.lines[key_path] = line
+                mapping[key] = self.build(value_node, key_path)
             except ValueProblem as problem:
                 if self._problems is None:
                     raise
@@ -186,10 +188,14 @@ class _Builder:
 
     def _scalar(self, node: yaml.ScalarNode, name: str, line: int) -> Any:
         length = len(node.value)
-        if length > _LONGEST_NUMBER and node.tag.endswith((":int", ":float")):
-            raise ValueProblem(line, f"{name}: a number of {length} letters")
-        if length <= _LONGEST_NUMBER and node.style is None:  # plain, not quoted
-            surprise = _surprise(str(node.value), node.tag)
+        if length > _MAX_NUMBER_CHARACTERS and node.tag.endswith((":int", ":float")):
+            raise ValueProblem(
+                line,
+                f"{name}: a number of {length} characters; at most {_MAX_NUMBER_CHARACTERS} are "
+                "permitted",
+            )
+        if length <= _MAX_NUMBER_CHARACTERS and node.style is None:  # plain, not quoted
+            surprise = _explain_surprise(str(node.value), node.tag)
             if surprise:
                 raise ValueProblem(line, f"{name}: '{node.value}' {surprise}")
         _check_characters(str(node.value), name, line)
@@ -197,13 +203,13 @@ class _Builder:
             return self._constructor.construct_object(node, deep=True)
         except (yaml.YAMLError, ValueError) as error:
             raise ValueProblem(line, f"{name}: {' '.join(str(error).split())}") from None
-        except (LookupError, AttributeError):  # PyYAML's, of an explicit tag
+        except (LookupError, AttributeError):  # PyYAML's errors for an explicit tag
             tag = node.tag.rpartition(":")[2]
             raise ValueProblem(line, f"{name}: a value that is not of the tag '{tag}'") from None
 
 
 def _check_characters(text: str, name: str, line: int) -> None:
-    """Refuse the halves of characters, which an escape can make and no file can hold."""
+    """Refuse surrogates (halves of characters), which an escape can create and no file can hold."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -211,19 +217,20 @@ def _check_characters(text: str, name: str, line: int) -> None:
 
 
 def _check_count(count: int, line: int) -> None:
-    if count > _MOST:
+    if count > _MAX_NODES:
         raise YamlProblem(
-            line, f"more than {_MOST} values and keys, each alias counted as all that it stands for"
+            line,
+            f"more than {_MAX_NODES} values and keys, each alias counted as all that it refers to",
         )
 
 
-def _surprise(text: str, tag: str) -> str | None:
-    """What YAML 1.1 makes of a plain scalar that few people expect, and what to write instead."""
+def _explain_surprise(text: str, tag: str) -> str | None:
+    """Return the surprising meaning of a plain scalar in YAML 1.1, and what to write instead."""
     if text.lower() in _WORDS:
-        meant = _WORDS[text.lower()]
-        return f"is {meant} in YAML; write {meant}, or quote it where a text is meant"
+        value = _WORDS[text.lower()]
+        return f"is {value} in YAML; write {value}, or quote it where a text is meant"
     if tag.endswith(":str") and _BARE_EXPONENT.fullmatch(text):
-        return f"is a text in YAML, not a number; write {_dotted(text)}"
+        return f"is a text in YAML, not a number; write {_format_number(text)}"
     if tag.endswith((":int", ":float")) and _SEXAGESIMAL.fullmatch(text):
         return "counts in sixties in YAML; write a plain number"
     if tag.endswith(":int") and _OCTAL.fullmatch(text):
@@ -231,9 +238,9 @@ def _surprise(text: str, tag: str) -> str | None:
     return None
 
 
-def _dotted(text: str) -> str:
-    """As YAML 1.1 wants a number: whole ones in digits, else with a dot and a signed exponent."""
-    if float(text).is_integer() and abs(float(text)) < _LONGEST_INTEGER:
+def _format_number(text: str) -> str:
+    """Return a number for YAML 1.1: an integer in digits, else with a dot and a signed exponent."""
+    if float(text).is_integer() and abs(float(text)) < _MAX_PLAIN_INTEGER:
         return f"{float(text):.0f}"
     mantissa, _, exponent = text.lower().partition("e")
     mantissa = mantissa if "." in mantissa else mantissa + ".0"

@@ -1,28 +1,28 @@
-"""Makes text from outside, such as an exception's, safe for logs, replies and terminals."""
+"""Conversion of foreign text, such as an exception's, for logs, replies and terminals."""
 
 from fishd.core.errors import Escaped, FishdError
 
-LONGEST = 1000
-"""Longer texts are cut, in the middle [characters]."""
-LONGEST_WORD = 60
-"""Of a word that is quoted in a message [characters]."""
-FORMULAS = tuple("=+-@＝＋－＠")
-"""Characters at the beginning of a text that a spreadsheet computes."""
+MAX_LINE_CHARACTERS = 1000
+"""Maximum length of a text; longer ones are cut in the middle [characters]."""
+MAX_WORD_CHARACTERS = 60
+"""Maximum length of a word that is quoted in a message [characters]."""
+FORMULA_CHARACTERS = tuple("=+-@＝＋－＠")
+"""First characters of a text that a spreadsheet would evaluate as a formula."""
 EXACT_CI95 = 1e-9
-"""Half-width of a 95 % interval below which a value is called exact [N, or another unit]."""
+"""Half-width of a 95 % confidence interval below which a value counts as exact [N, or its unit]."""
 
 
-def line(text: str, longest: int = LONGEST) -> str:
-    """One printable line that can be encoded: line breaks become spaces, odd characters `?`."""
+def line(text: str, longest: int = MAX_LINE_CHARACTERS) -> str:
+    """Return one printable line: line breaks become spaces, unprintable characters `?`."""
     text = block(text, longest)
     if "\n" not in text:
         return text.strip()
     return " ".join(part.strip() for part in text.splitlines() if part.strip())
 
 
-def block(text: str, longest: int = LONGEST) -> str:
-    """The same, but with its line breaks and indentation."""
-    if len(text) > longest:  # what is in the middle is left out
+def block(text: str, longest: int = MAX_LINE_CHARACTERS) -> str:
+    """Return printable text that keeps its line breaks and indentation."""
+    if len(text) > longest:  # cut the middle
         end = longest // 3
         text = f"{text[: longest - end - 1]}…{text[-end:]}"
     if text.isascii() and text.isprintable():
@@ -34,7 +34,7 @@ def block(text: str, longest: int = LONGEST) -> str:
 
 
 def escaped(text: str) -> str:
-    """Return the text with what cannot be printed as escapes, such as `\\x1b` or `\\n`."""
+    """Return the text with unprintable characters as escapes, such as `\\x1b` or `\\n`."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -44,27 +44,27 @@ def escaped(text: str) -> str:
 
 
 def for_spreadsheet(text: str) -> str:
-    """Escape control characters, and put a `'` before what a spreadsheet would compute."""
-    return ("'" if text.startswith(FORMULAS) else "") + escaped(text)
+    """Escape control characters, and put a `'` before a text that a spreadsheet would evaluate."""
+    return ("'" if text.startswith(FORMULA_CHARACTERS) else "") + escaped(text)
 
 
 def quoted(word: str) -> str:
-    """A word from outside, cut to fit in a message."""
-    return line(word, LONGEST_WORD)
+    """Return a foreign word, cut to fit in a message."""
+    return line(word, MAX_WORD_CHARACTERS)
 
 
 def format_half_width(ci95: float) -> str:
-    """Return the half-width of a 95 % interval in thousandths: `± 0.12`, or `exact`."""
+    """Return the half-width of a 95 % confidence interval in thousandths: `± 0.12`, or `exact`."""
     if ci95 < EXACT_CI95:
         return "exact"
     return f"± {1e3 * ci95:.2f}" if ci95 >= 5e-6 else f"± {1e3 * ci95:.1g}"
 
 
 def format_measured(value: float, ci95: float | None, unit: str = "") -> str:
-    """Return a value in thousandths, with its interval: `25.74 ± 0.12 mN` or `25.74 mN (exact)`.
+    """Return a value in thousandths with its interval: `25.74 ± 0.12 mN` or `25.74 mN (exact)`.
 
-    ci95: half-width of the 95 % interval; None where it is not known
-    unit: such as N; `m` goes before it
+    ci95: half-width of the 95 % confidence interval; None if unknown
+    unit: unit such as N, printed with the prefix `m`
     """
     unit = f" m{quoted(unit)}" if unit else ""
     if ci95 is None:
@@ -75,18 +75,18 @@ def format_measured(value: float, ci95: float | None, unit: str = "") -> str:
     return f"{1e3 * value:.2f} {interval}{unit}"
 
 
-def said(error: BaseException) -> str:
-    """The text of an exception in one line, which may be empty. Never raises."""
+def error_message(error: BaseException) -> str:
+    """Return the text of an exception in one line, which may be empty. Never raises."""
     try:
         return line(str(error))
-    except BaseException as worse:  # whoever wrote the exception wrote its __str__, too
-        return f"(its text cannot be had: {quoted(type(worse).__name__)})"
+    except BaseException as str_error:  # __str__ may be foreign code, too
+        return f"(no text: its __str__ raised {quoted(type(str_error).__name__)})"
 
 
-def named(error: BaseException) -> str:
-    """An exception in one line: one of fishd's is a sentence by itself, others say their type."""
-    what = said(error)
+def describe_error(error: BaseException) -> str:
+    """Return an exception in one line: the message of one of fishd's, else type and message."""
+    message = error_message(error)
     if isinstance(error, FishdError | Escaped):
-        return what
+        return message
     kind = quoted(type(error).__name__)
-    return f"{kind}: {what}" if what else kind
+    return f"{kind}: {message}" if message else kind

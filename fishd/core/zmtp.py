@@ -1,8 +1,9 @@
-"""As much of ZeroMQ's protocol, ZMTP 3, as a DEALER needs; only `wait` blocks.
+"""The part of ZeroMQ's protocol, ZMTP 3, that a DEALER needs; only `wait` blocks.
 
 It loads in a tenth of the time of zmq, and has bounds that ZeroMQ lacks: a message is one frame of
-a limited size, and nothing more is read before that is taken. It also knows which connection
-brought it. The controller `remote` talks to its agent with it, and clients to fishd.
+a limited size, and no more is read before that message is received. It also counts connections, so
+that a message belongs to a known one. The controller `remote` uses it for its agent, and clients
+use it for fishd.
 """
 
 import errno
@@ -20,7 +21,7 @@ from fishd.core.addresses import Ipc, Tcp, parse
 T = TypeVar("T")
 
 _CHUNK = 65536
-"""Largest number of bytes that are read at a time."""
+"""Maximum number of bytes per read."""
 
 _MORE_FLAG, _LONG_FLAG, _COMMAND_FLAG = 1, 2, 4
 """Flags of a frame: others follow, its size has 8 bytes, it is a command."""
@@ -44,42 +45,42 @@ _READY = _frame(
 
 
 class Dealer(ABC, Generic[T]):
-    """A DEALER that connects to a peer, and connects again when the connection was lost."""
+    """DEALER socket that connects to a peer, and reconnects when the connection was lost."""
 
     RETRY_S = 0.1
     """Time between two attempts to connect [s]."""
     HANDSHAKE_S = 2.0
-    """Longest time for a connection to be made, and greeted by the peer [s]."""
+    """Maximum time until a connection is established and the peer has sent its greeting [s]."""
 
     def __init__(self, address: str, max_message: int) -> None:
-        """Raises ValueError where the address is none; max_message: of its messages [bytes]"""
+        """Raises ValueError for an invalid address; max_message: size limit of a message [bytes]"""
         self._where = parse(address)
         self._max_message = max_message
         self.connections = 0
-        """Number of connections that were made until the latest `state`."""
+        """Number of connections established until the latest `state`."""
         self.bound = False
-        """Whether the peer of this connection is the only one: no other connection is made."""
+        """Whether to stay with the peer of this connection, and never reconnect."""
         self.lost = False
-        """Whether the connection of that peer was lost."""
+        """Whether the connection to that peer was lost."""
         self._socket: socket.socket | None = None
         self._greeting_taken = False
         self._ready = False
-        """Whether the peer has greeted, and said that it is ready."""
+        """Whether the peer has sent its greeting and READY."""
         self._inbox: deque[T] = deque()
         self._received = bytearray()
         self._unsent = b""
         self._next_attempt = 0.0
         self._give_up = 0.0
-        """Time until which the peer has to greet [s, monotonic]."""
+        """Deadline for the greeting of the peer [s, monotonic]."""
         self._closed = False
         self._poll = select.epoll()
         self._targets: list[tuple[int, object]] | None = None
-        """Families and addresses to connect to; None until they are known."""
+        """Address families and addresses to connect to; None until they are known."""
         self._look_up()
         self._advance()
 
     def fileno(self) -> int:
-        """A descriptor that is readable once `state` may have changed."""
+        """Return a descriptor that is readable once `state` may have changed."""
         return self._poll.fileno()
 
     def state(self) -> tuple[bool, bool]:
@@ -89,24 +90,24 @@ class Dealer(ABC, Generic[T]):
         return self._ready and not self._unsent, bool(self._inbox)
 
     def send(self, payload: bytes) -> None:
-        """Send a message, where `state` says that this is possible."""
+        """Send a message; only if `state` allows it."""
         try:
             self._write(_frame(0, payload))
         except OSError:
             self._drop()
 
     def wait(self, seconds: float) -> None:
-        """Return when `state` may have changed, or after a while."""
+        """Wait until `state` may have changed, at most for this time [s]."""
         self._poll.poll(self._until_attempt(seconds))
 
     def _until_attempt(self, seconds: float) -> float:
-        """Return a time to wait, or that until the next attempt to connect if it is shorter [s]."""
+        """Return the time to wait [s], at most until the next attempt to connect."""
         if self._socket is None:
             seconds = min(seconds, max(1e-3, self._next_attempt - time.monotonic()))
         return seconds
 
     def close(self, farewell: bytes = b"") -> None:
-        """Send a last message, if there is one and the peer takes it, and disconnect.
+        """Send a last message, if there is one and the peer accepts it, and disconnect.
 
         May be called twice.
         """
@@ -117,13 +118,15 @@ class Dealer(ABC, Generic[T]):
             with suppress(OSError):
                 self._socket.send(_frame(0, farewell))
                 self._socket.shutdown(socket.SHUT_WR)
-                while self._socket.recv(_CHUNK):  # else the kernel would take it back
+                while self._socket.recv(
+                    _CHUNK
+                ):  # with unread data, the kernel would discard the message
                     pass
         self._drop()
         self._poll.close()
 
     def _look_up(self) -> None:
-        """Find the addresses to connect to; a name in another thread, as that may take long."""
+        """Resolve the addresses to connect to; a host name in a thread, since that may block."""
         if isinstance(self._where, Ipc):
             self._targets = [(socket.AF_UNIX, self._where.path)]
             return
@@ -141,7 +144,7 @@ class Dealer(ABC, Generic[T]):
                 time.sleep(1.0)
 
     def _advance(self) -> None:
-        """Do whatever is possible without waiting: connect, send, and read one portion."""
+        """Connect, send, and read one chunk, as far as possible without blocking."""
         now = time.monotonic()
         try:
             if self._socket is None:
@@ -160,7 +163,7 @@ class Dealer(ABC, Generic[T]):
             self._drop()
 
     def _connect(self, now: float) -> None:
-        """Begin to connect, and to greet."""
+        """Start to connect, and queue the greeting."""
         assert self._targets
         family, target = self._targets[0]
         self._targets = self._targets[1:] + self._targets[:1]
@@ -176,9 +179,9 @@ class Dealer(ABC, Generic[T]):
         self._poll.register(self._socket, select.EPOLLIN | select.EPOLLOUT)
 
     def _write(self, data: bytes) -> None:
-        """Send what the kernel takes, and keep the rest."""
+        """Send as much as the kernel accepts, and keep the rest."""
         assert self._socket
-        waited = bool(self._unsent)
+        was_waiting = bool(self._unsent)
         self._unsent += data
         try:
             self._unsent = self._unsent[self._socket.send(self._unsent) :]
@@ -187,12 +190,12 @@ class Dealer(ABC, Generic[T]):
         except OSError as error:
             if error.errno != errno.ENOTCONN:  # not connected yet
                 raise
-        if waited != bool(self._unsent):
-            also = select.EPOLLOUT if self._unsent else 0
-            self._poll.modify(self._socket, select.EPOLLIN | also)
+        if was_waiting != bool(self._unsent):
+            write_event = select.EPOLLOUT if self._unsent else 0
+            self._poll.modify(self._socket, select.EPOLLIN | write_event)
 
     def _read(self) -> None:
-        """Read one portion, and take the messages that are whole."""
+        """Read one chunk, and process the complete frames."""
         assert self._socket
         data = self._socket.recv(_CHUNK)
         if not data:
@@ -210,7 +213,7 @@ class Dealer(ABC, Generic[T]):
                 self._inbox.append(self._decode(payload))
 
     def _greeted(self) -> bool:
-        """Whether the greeting of the peer has come; raises ConnectionError where it is none."""
+        """Return whether the greeting of the peer has arrived; raise ConnectionError if invalid."""
         start, version = bytes(self._received[:1]), bytes(self._received[10:11])
         if start not in (b"", b"\xff") or version not in (b"", b"\x03"):
             raise ConnectionError
@@ -223,7 +226,7 @@ class Dealer(ABC, Generic[T]):
         return True
 
     def _next_frame(self) -> tuple[int, bytes] | None:
-        """Return flags and payload of the next frame, once it is whole, and refuse a long one."""
+        """Return flags and payload of the next frame, None if incomplete; refuse a long one."""
         if len(self._received) < 2:
             return None
         flags = self._received[0]
@@ -240,34 +243,34 @@ class Dealer(ABC, Generic[T]):
         return flags, payload
 
     def _obey(self, command: bytes) -> None:
-        """Do what a command of ZMTP asks for; raises ConnectionError for what ends a connection."""
+        """Handle a ZMTP command; raise ConnectionError if it ends the connection."""
         name = command[1 : 1 + command[0]] if command else b""
         if name == b"READY" and not self._ready:
             self._ready = True
             self.connections += 1
-        elif name == b"PING" and not self._unsent:  # else it does not read
+        elif name == b"PING" and not self._unsent:  # a peer that does not read gets no PONG
             self._write(_frame(_COMMAND_FLAG, b"\x04PONG" + command[7:]))
         elif name == b"ERROR":
             raise ConnectionError
 
     def _refuse(self, what: str) -> None:
-        """End the connection, with a fault to be received; raises ConnectionError."""
+        """Queue an invalid message for the receiver, and raise ConnectionError to disconnect."""
         self._inbox.append(self._bad(what))
         raise ConnectionError
 
     @abstractmethod
     def _decode(self, payload: bytes) -> T:
-        """Return what is to be received of a message."""
+        """Return the received object of a message."""
 
     @abstractmethod
     def _bad(self, what: str) -> T:
-        """Return what is to be received in place of a message that may not be; what: it is"""
+        """Return the object received in place of a forbidden message, which `what` describes."""
 
     def _drop(self) -> None:
-        """Forget a connection."""
+        """Close the connection and reset its state."""
         if self._socket is None:
             return
-        self._socket.close()  # which epoll forgets, too
+        self._socket.close()  # also removes it from epoll
         self._socket = None
         self.lost = self.lost or self.bound
         self._ready = self._greeting_taken = False
@@ -276,7 +279,7 @@ class Dealer(ABC, Generic[T]):
 
 
 def _addresses(where: Tcp, flags: int) -> list[tuple[int, object]]:
-    """Look a host up; raises OSError."""
+    """Resolve a host; raise OSError."""
     family = socket.AF_INET6 if ":" in where.host else socket.AF_INET
     hosts = socket.getaddrinfo(where.host, int(where.port), family, socket.SOCK_STREAM, flags=flags)
     return [(host[0], host[4]) for host in hosts]

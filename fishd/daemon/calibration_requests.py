@@ -17,8 +17,8 @@ from fishd.core.calibration import C, ForceCalibration, ForceSample, ServoCalibr
 from fishd.core.clock import Clock
 from fishd.core.errors import ConfigError, Refused
 from fishd.core.protocol import (
-    FRESH,
-    LOADING,
+    LOADING_TIMEOUT_S,
+    MAX_SAMPLE_AGE_S,
     CalibrateForce,
     CalibrateServo,
     Calibrations,
@@ -63,7 +63,7 @@ class CalibrationRequests:
         """Time and content of each fresh sample, by number."""
         self._sampled = 0
         self._sampling = 0
-        self._calls = BackgroundCalls(LOADING)
+        self._calls = BackgroundCalls(LOADING_TIMEOUT_S)
         self._force_file = self._file(ForceCalibration)
         self._servo_file = self._file(ServoCalibration)
         self.handlers: Handlers = {
@@ -124,7 +124,7 @@ class CalibrationRequests:
             tared_sensor_at_rest(self._loop)
 
     def _forget_old_samples(self) -> None:
-        oldest = self._clock.monotonic() - FRESH
+        oldest = self._clock.monotonic() - MAX_SAMPLE_AGE_S
         self._samples = {n: sample for n, sample in self._samples.items() if sample[0] >= oldest}
 
     async def _tare(self, request: Tare) -> Calibrations:
@@ -134,7 +134,7 @@ class CalibrationRequests:
         if request.sample not in self._samples:
             raise Refused(
                 "no-samples",
-                f"sample {request.sample} does not exist or is older than {FRESH:g} s; take "
+                f"sample {request.sample} does not exist or is older than {MAX_SAMPLE_AGE_S:g} s; take "
                 "another one with sample-force",
             )
         _, sample = self._samples[request.sample]
@@ -258,4 +258,4 @@ def _check_calibration(calibration: C) -> C:
     try:
         return check(calibration)
     except Problem as problem:
-        raise Refused("bad-arguments", problem.located({})) from None
+        raise Refused("bad-arguments", problem.message_with_place({})) from None

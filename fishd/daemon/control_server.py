@@ -79,13 +79,13 @@ class ControlServer:
             return protocol.failure(identity, error)
         except Exception as error:
             log.exception("a request failed")
-            internal = Refused("internal", f"fishd failed: {text.named(error)}")
+            internal = Refused("internal", f"fishd failed: {text.describe_error(error)}")
             return protocol.failure(identity, internal)
 
 
 def _check_age(operation: str, seconds: float) -> None:
     """Raise `Refused` for an old request that would start to move the fish unexpectedly."""
-    if operation in protocol.BEGINNINGS and seconds > protocol.WAITED:
+    if operation in protocol.MOVING_OPERATIONS and seconds > protocol.MAX_WAIT_S:
         raise Refused(
             "stale",
             f"this {operation} waited for {seconds:.0f} s, as fishd stood still or was flooded;"

@@ -26,8 +26,8 @@ from fishd.core.clock import Clock, SlowClock, SystemClock, Ticker, VirtualClock
 from fishd.core.console import run, status_line
 from fishd.core.errors import ConfigError, FishdError, ServoError
 from fishd.core.process import realtime
-from fishd.core.process.logs import UNHURRIED, LogWriter
-from fishd.core.process.shutdown import Shutdown, leave
+from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
+from fishd.core.process.shutdown import Shutdown, exit_now
 from fishd.core.process.systemd_notify import SystemdNotifier
 from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.control_server import ControlServer
@@ -79,10 +79,12 @@ class Daemon:
             self._notifier = SystemdNotifier()
             stack.callback(self._notifier.close)
             address = config.control.address or addresses.control_address()
-            stack.enter_context(addresses.claimed(address))
-            stack.enter_context(addresses.claimed(config.telemetry.address))
+            stack.enter_context(addresses.claim_address(address))
+            stack.enter_context(addresses.claim_address(config.telemetry.address))
             self._gateways = Gateways(address, config.telemetry.address, stack)
-            stack.callback(realtime.leave)  # before the gateways end, after the servo is released
+            stack.callback(
+                realtime.drop_priority
+            )  # before the gateways end, after the servo is released
             self._telemetry = Telemetry(self._gateways.telemetry.send)
             self._mock_ticks = None if self._virtual else mock_ticks(config)
             controllers = registry.describe_all()  # imports the controllers of other packages
@@ -151,7 +153,7 @@ class Daemon:
             self._gateways.control.address,
             self._gateways.telemetry.address,
         )
-        realtime.quiet_garbage_collector()
+        realtime.freeze_garbage_collector()
         if self._slow:
             self._slow.stopping = stopping
             self._slow.while_waiting = self._between_ticks
@@ -273,11 +275,11 @@ async def swim(
     """
     stopping = asyncio.Event()
     events = asyncio.get_running_loop()
-    shutdown.when_asked(partial(events.call_soon_threadsafe, stopping.set))
+    shutdown.call_when_requested(partial(events.call_soon_threadsafe, stopping.set))
     with Daemon(config, print_status, file) as daemon:
         shutdown.release = daemon.release_at_once
         if daemon.is_realtime:
-            shutdown.outrank(config.realtime.priority)
+            shutdown.raise_priority(config.realtime.priority)
         await asyncio.sleep(0)  # lets an earlier signal set `stopping`
         if not stopping.is_set():
             await daemon.run(stopping)
@@ -338,10 +340,10 @@ def fishd(
         if shutdown.release:
             logs.close()
         else:  # fishd has driven nothing, and the log holds only the reason
-            logs.close(UNHURRIED)
+            logs.close(UNHURRIED_FLUSH_TIMEOUT_S)
     return 0
 
 
 def main() -> None:
     """Run the `fishd` command."""
-    leave(run(fishd, "fishd"))
+    exit_now(run(fishd, "fishd"))

@@ -19,11 +19,11 @@ from fishd.controllers import registry
 from fishd.controllers.base import Controller
 from fishd.controllers.policy import library
 from fishd.core import protocol, text
-from fishd.core.clock import Clock, SlowClock, boot_id
+from fishd.core.clock import Clock, SlowClock, read_boot_id
 from fishd.core.errors import ParameterError, Refused, UnknownController
-from fishd.core.foreign_code import contained
+from fishd.core.foreign_code import call_foreign
 from fishd.core.protocol import Grant, PolicyInfo, State
-from fishd.core.schema import Problem, convert, fields_of, nearest
+from fishd.core.schema import Problem, convert, fields_of, suggest
 from fishd.core.signals import ControllerInfo, LeaseHolder, Status
 from fishd.daemon.background_calls import BackgroundCalls
 from fishd.daemon.calibration_requests import CalibrationRequests, Handlers
@@ -63,12 +63,12 @@ class Operations:
         self._name = config.name or text.line(socket.gethostname(), 40) or "fish"
         self._monotonic = time.monotonic if isinstance(clock, SlowClock) else clock.monotonic
         self._started = self._monotonic()
-        self._boot = boot_id()
+        self._boot = read_boot_id()
         self._arrivals = 0
         """Number of requests since start that choose the controller."""
         self._carried_out = 0
         """Number of the newest of them that was carried out."""
-        self._calls = BackgroundCalls(protocol.LOADING)
+        self._calls = BackgroundCalls(protocol.LOADING_TIMEOUT_S)
         self._controllers = controllers
         self._at_start = set(registry.names())
         self._handlers: Handlers = {
@@ -92,7 +92,7 @@ class Operations:
     async def perform(self, op: str, args: dict[str, Any]) -> Any:
         """Carry out a request and return its result; raise `Refused` if that is not possible."""
         if op not in self._handlers:
-            hint = nearest(op, list(self._handlers))
+            hint = suggest(op, list(self._handlers))
             raise Refused("unknown-op", f"no such op '{text.quoted(op)}'; {hint}")
         try:
             arguments: Any = convert(args, protocol.OPERATIONS[op].arguments)
@@ -275,7 +275,7 @@ class Operations:
                 "start one with 'fishctl set-controller'",
             )
         try:
-            loop.active.retune(contained(self._retuned, request.parameters))
+            loop.active.retune(call_foreign(self._retuned, request.parameters))
         except Exception as error:
             raise _refusal(loop.active.name, "refused", error) from error
         return self._state()
@@ -346,14 +346,14 @@ def _create_newly_installed(name: str, create: Callable[[], Controller[Any]]) ->
             name in registry.names()
         ):  # its package cannot be imported, for example from a new folder
             raise UnknownController(
-                f"{text.said(error)}; it was installed after fishd had started: restart fishd"
+                f"{text.error_message(error)}; it was installed after fishd had started: restart fishd"
             ) from error
         raise
 
 
 def _close(controller: Controller[Any]) -> None:
     try:
-        contained(controller.close)
+        call_foreign(controller.close)
     except Exception as error:
         log.error("a controller that is no longer needed could not be closed", exc_info=error)
 
@@ -363,7 +363,7 @@ def _refusal(name: str, what: str, error: Exception) -> Refused:
     if isinstance(error, Refused):
         return error
     if isinstance(error, UnknownController):
-        return Refused("unknown-controller", text.said(error))
+        return Refused("unknown-controller", text.error_message(error))
     if isinstance(error, ParameterError):
-        return Refused("bad-parameter", text.said(error))
-    return Refused("controller-error", f"controller '{name}' {what}: {text.named(error)}")
+        return Refused("bad-parameter", text.error_message(error))
+    return Refused("controller-error", f"controller '{name}' {what}: {text.describe_error(error)}")

@@ -44,12 +44,12 @@ class CalibrationFolder:
             return None
         path = self.folder / names[-1]
         try:
-            text = files.read_text(path, files.SETTINGS, "a calibration")
+            text = files.read_text(path, files.MAX_SETTINGS_BYTES, "a calibration")
             return _load(strict_yaml.parse(text).data, kind), path
         except strict_yaml.YamlProblem as problem:
             raise ConfigError(f"{path}:{problem.line}: {problem}; {_REMEDY}") from None
         except Problem as problem:
-            raise ConfigError(f"{path}: {problem.located({})}; {_REMEDY}") from None
+            raise ConfigError(f"{path}: {problem.message_with_place({})}; {_REMEDY}") from None
         except files.FileProblem as problem:
             raise ConfigError(f"{path}: {problem}; {_REMEDY}") from None
 
@@ -107,7 +107,7 @@ def check(calibration: C) -> C:
         if key in ("date", "tared") and value and not _is_date(value):
             raise Problem((key,), f"'{value}' is not a date: one in ISO 8601 is needed")
     if isinstance(calibration, ForceCalibration):
-        if calibration.singular:
+        if calibration.is_singular:
             raise Problem(
                 (), "the matrix xx xy, yx yy is singular: it cannot tell the two forces apart"
             )

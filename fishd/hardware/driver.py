@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from fishd.core.clock import Clock
-from fishd.core.foreign_code import contained
+from fishd.core.foreign_code import call_foreign
 from fishd.core.schema import Problem, note, unit
 from fishd.hardware.checks import Check, Machine, Result
 from fishd.hardware.settings import (
@@ -103,7 +103,7 @@ class Driver(ABC, Generic[S]):
 def read_counters(driver: Driver[Any]) -> dict[str, int]:
     """Return the counters of a driver; none if it raises, because that must not end fishd."""
     try:
-        return {str(name): int(count) for name, count in contained(driver.counters).items()}
+        return {str(name): int(count) for name, count in call_foreign(driver.counters).items()}
     except Exception:
         return {}
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fishd.core.errors import StartupError
-from fishd.core.process.lockfile import Taken, holder, lock_path, locked
+from fishd.core.process.lockfile import LockHeld, find_lock_holder, lock_path, locked
 from fishd.core.process.runtime_folder import runtime_folder
-from fishd.core.process.unix_sockets import stranger
+from fishd.core.process.unix_sockets import find_trust_problem
 from fishd.hardware.driver import Claim
 
 log = logging.getLogger(__name__)
@@ -93,20 +93,20 @@ def claim_parts(parts: Iterable[Part]) -> Iterator[None]:
 def owner(parts: Iterable[Part]) -> str:
     """Return a line that names the fishd that drives one of these parts; empty if none is known."""
     for part in parts:
-        if pid := holder(part.path):
+        if pid := find_lock_holder(part.path):
             return f"a fishd (pid {pid}) drives {part.what}"
     return ""
 
 
 def owner_pid(parts: Iterable[Part]) -> str:
     """Return the pid of a fishd that drives one of these parts; empty if none is known."""
-    return next(filter(None, (holder(part.path) for part in parts)), "")
+    return next(filter(None, (find_lock_holder(part.path) for part in parts)), "")
 
 
 def _make_private(folder: Path) -> None:
     """Create the folder of this user; raise `StartupError` if another user may write to it."""
     folder.mkdir(mode=0o700, exist_ok=True)
-    if why := stranger(folder / "fishd"):
+    if why := find_trust_problem(folder / "fishd"):
         raise StartupError(f"lock files are not safe: {why}; remove that folder")
 
 
@@ -115,7 +115,7 @@ def _claim(part: Part, stack: ExitStack) -> None:
         try:
             stack.enter_context(locked(part.path, shared=True))
             return
-        except Taken as taken:
+        except LockHeld as taken:
             if attempt == MAX_ATTEMPTS:
                 raise StartupError(
                     f"another fishd (pid {taken.pid}) drives {part.what}; end it, or give this "

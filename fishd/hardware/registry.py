@@ -70,7 +70,9 @@ def driver_packages(driver: str = "") -> Iterator[None]:
     except Exception as error:
         if not driver:
             raise
-        raise StartupError(f"driver '{driver}' cannot start: {text.named(error)}") from error
+        raise StartupError(
+            f"driver '{driver}' cannot start: {text.describe_error(error)}"
+        ) from error
 
 
 def why_not_imported(error: ImportError, driver: str = "") -> str:

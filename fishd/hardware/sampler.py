@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from fishd.core import text
 from fishd.core.clock import Clock
-from fishd.core.foreign_code import contained
+from fishd.core.foreign_code import call_foreign
 from fishd.hardware.driver import Pair, PowerSample, SampledDriver
 
 X = TypeVar("X", Pair, PowerSample)
@@ -48,9 +48,9 @@ class Sampler(Generic[X]):
             self._clock.sleep(wait)
         try:
             if not self._open:
-                contained(self._driver.open)
+                call_foreign(self._driver.open)
                 self._open = True
-            sample = contained(self._driver.sample)
+            sample = call_foreign(self._driver.sample)
         except Exception as error:  # the libraries of drivers raise all kinds of exceptions
             self._recover(error)
         else:
@@ -64,7 +64,7 @@ class Sampler(Generic[X]):
         """Release the hardware; never raises, may be called twice."""
         self._open = False
         with suppress(Exception):
-            contained(self._driver.close)
+            call_foreign(self._driver.close)
 
     def _recover(self, error: Exception) -> None:
         """Give the hardware time to settle, and more after several failures."""
@@ -79,6 +79,6 @@ class Sampler(Generic[X]):
 
     def _explain(self, error: Exception) -> str:
         try:
-            return contained(self._driver.explain, error)
+            return call_foreign(self._driver.explain, error)
         except Exception:  # a failure of `explain` must not hide the error itself
-            return text.named(error)
+            return text.describe_error(error)

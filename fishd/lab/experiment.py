@@ -18,7 +18,7 @@ from fishd import __version__
 from fishd.core import files
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
-from fishd.core.process.lockfile import NotALock, Taken, locked
+from fishd.core.process.lockfile import LockHeld, NotALock, locked
 from fishd.lab import tables
 from fishd.lab.tables import Table
 from fishd.recording.folder import runs_folder
@@ -182,7 +182,7 @@ def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iter
                 check_free(path)
                 experiment.write_struct(HEADER, _with_start_time(header))
             yield experiment
-    except Taken as taken:
+    except LockHeld as taken:
         raise ConfigError(f"{path}: another experiment uses it, process {taken.pid}") from None
     except NotALock as error:
         raise ConfigError(f"{error.filename}: {error.strerror}") from None
@@ -298,7 +298,9 @@ def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def _read_struct(path: Path, kind: type[T]) -> T:
     try:
-        return msgspec.json.decode(files.read(path, files.SETTINGS, "an experiment"), type=kind)
+        return msgspec.json.decode(
+            files.read(path, files.MAX_SETTINGS_BYTES, "an experiment"), type=kind
+        )
     except FileProblem as problem:
         raise ConfigError(f"{path}: {problem}") from None
     except msgspec.MsgspecError as error:

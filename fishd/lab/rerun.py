@@ -20,7 +20,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import Controller
 from fishd.core import text
 from fishd.core.errors import FishdError, RecordingError
-from fishd.core.foreign_code import contained
+from fishd.core.foreign_code import call_foreign
 from fishd.core.signals import Event, Measurement, Observation, Status, Tick
 from fishd.recording.reader import Run
 from fishd.recording.summary import Tally
@@ -278,11 +278,11 @@ class _Rerun:
     def _call(self, tick: Tick, method: Callable[[Observation], T], seen: Observation) -> T:
         """Call a method of the controller; raises `RecordingError` where it fails."""
         try:
-            return contained(method, seen)
+            return call_foreign(method, seen)
         except Exception as error:
             raise RecordingError(
                 f"{self._run.path}: in tick {tick.seq}, {self.stretches[-1].controller} failed: "
-                f"{text.named(error)}"
+                f"{text.describe_error(error)}"
             ) from error
 
     def _begin(
@@ -310,7 +310,7 @@ class _Rerun:
                 checked = registry.check(stretch.controller, values, swims.limits)
             except FishdError as error:
                 raise RecordingError(f"{self._run.path}: {error}") from None
-            contained(swims.retune, checked)
+            call_foreign(swims.retune, checked)
 
     def _parameters_of(self, tick: Tick, upcoming: Messages) -> dict[str, Any]:
         """Return the parameters of a controller without a recorded start, from the next status."""

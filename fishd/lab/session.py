@@ -370,7 +370,7 @@ def _lease_loss_as_disturbed() -> Iterator[None]:
     try:
         yield
     except LeaseLost as error:
-        raise Disturbed(f"{text.said(error)}: this measurement is lost") from None
+        raise Disturbed(f"{text.error_message(error)}: this measurement is lost") from None
 
 
 def _restarted() -> Disturbed:

@@ -27,7 +27,7 @@ class Table:
             file.write(lines([values]))
 
 
-def read(path: Path, longest: int = files.TABLE) -> list[list[str]]:
+def read(path: Path, longest: int = files.MAX_TABLE_BYTES) -> list[list[str]]:
     """Return all rows, the header first, without a last row that a kill left incomplete.
 
     longest: largest size of the file [bytes]
@@ -60,7 +60,7 @@ def _escape(value: Any) -> Any:
 
 
 def _unescape(word: str) -> str:
-    return word[1:] if word[:1] == "'" and word[1:].startswith(text.FORMULAS) else word
+    return word[1:] if word[:1] == "'" and word[1:].startswith(text.FORMULA_CHARACTERS) else word
 
 
 def _to_plain_number(value: Any) -> Any:

@@ -11,7 +11,7 @@ from fishd.controllers.policy.card import COMMANDS, LONGEST_HISTORY, FeatureName
 from fishd.core import strict_yaml
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import ConfigError
-from fishd.core.schema import Problem, convert, note, unit, without_empty_sections
+from fishd.core.schema import Problem, convert, drop_empty_sections, note, unit
 from fishd.virtual.plant.parameters import PlantParameters
 
 MIN_FRAME_SIZES_PX = {"modes": 16, "cnn": 68, "nature": 36}
@@ -311,11 +311,11 @@ def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
         return TrainingSettings()
     data, sources = strict_yaml.read(path, "a training", "steps: 8000")
     try:
-        settings = convert(without_empty_sections(data, TrainingSettings), TrainingSettings)
+        settings = convert(drop_empty_sections(data, TrainingSettings), TrainingSettings)
         _check(settings)
         return settings
     except Problem as problem:
-        raise ConfigError(problem.located(sources)) from None
+        raise ConfigError(problem.message_with_place(sources)) from None
 
 
 def check(settings: TrainingSettings) -> None:
@@ -323,7 +323,7 @@ def check(settings: TrainingSettings) -> None:
     try:
         _check(settings)
     except Problem as problem:
-        raise ConfigError(problem.located({})) from None
+        raise ConfigError(problem.message_with_place({})) from None
 
 
 def to_yaml(settings: TrainingSettings) -> str:

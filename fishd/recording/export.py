@@ -131,7 +131,8 @@ def _write_parquet(path: Path, frame: pandas.DataFrame, about: bytes, run: Run) 
         table = pyarrow.Table.from_pandas(frame, preserve_index=False)
     except (pyarrow.ArrowException, OverflowError) as error:
         raise RecordingError(
-            f"{run.path} cannot be written as Parquet: {text.said(error)}; --csv takes any number"
+            f"{run.path} cannot be written as Parquet: {text.error_message(error)}; --csv takes "
+            "any number"
         ) from None
     table = table.replace_schema_metadata({**(table.schema.metadata or {}), b"fishd": about})
     sink = pyarrow.BufferOutputStream()

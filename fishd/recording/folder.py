@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fishd.core import files
 from fishd.core.errors import RecordingError
-from fishd.core.schema import nearest
+from fishd.core.schema import suggest
 from fishd.recording.mcap_file import metadata
 from fishd.recording.part_file import PART, SUFFIX, is_being_written
 from fishd.recording.reader import open_run
@@ -78,7 +78,7 @@ def named(run: str, folder: Path | None = None) -> Path:
     """
     if Path(run).name in ("", ".."):  # "/", "." and their like
         raise RecordingError(f"'{run}' is no name of a recording")
-    path = files.expanded(run) if "/" in run else made(folder or runs_folder()) / run
+    path = files.expand_user(run) if "/" in run else made(folder or runs_folder()) / run
     return path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
 
 
@@ -99,7 +99,7 @@ def find(run: str, folder: Path | None = None) -> Path:
 
     Raises `RecordingError`.
     """
-    path = files.expanded(run)
+    path = files.expand_user(run)
     if path.is_file():
         return path
     folder = folder or runs_folder()
@@ -112,7 +112,7 @@ def find(run: str, folder: Path | None = None) -> Path:
         if "/" not in run and (found := folder / (run + suffix)).is_file():
             return found
     names = [name_of(path) for path in known]
-    hint = nearest(run, names[-10:], listed="there are") if names else "there is none yet"
+    hint = suggest(run, names[-10:], listed="there are") if names else "there is none yet"
     raise RecordingError(f"no recording '{run}', neither a file nor a name in {folder}; {hint}")
 
 

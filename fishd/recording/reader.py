@@ -13,7 +13,7 @@ from mcap.records import Attachment, Channel, Footer, Message, Metadata
 
 from fishd.config import Config, adopt
 from fishd.core import strict_yaml, text
-from fishd.core.dataframes import frame
+from fishd.core.dataframes import ticks_to_frame
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, RecordingError
 from fishd.core.protocol import Calibrations
@@ -222,7 +222,7 @@ class Run:
                 yield record.data
 
     def frame(self) -> "DataFrame":
-        """The ticks as a table: `fishd.core.dataframes.frame`; raises `RecordingError`."""
+        """The ticks as a table: `fishd.core.dataframes.ticks_to_frame`; raises `RecordingError`."""
         names: set[str] = set()
         for tick in self.ticks:
             names.update(tick.quantities or ())
@@ -231,7 +231,7 @@ class Run:
                     f"{self.path}: its controllers have more than {MAX_COLUMNS} quantities, too "
                     "many for a table"
                 )
-        return frame(self.ticks)
+        return ticks_to_frame(self.ticks)
 
     def _scan(self) -> None:
         topics = dict(TOPICS)
@@ -257,7 +257,7 @@ class Run:
                     self._take_attachment(record.name, record.data)
                 except ValueError as error:  # also msgspec.DecodeError
                     self._damages.append(ticks)
-                    why = f"{text.quoted(record.name)}: {text.said(error)}"
+                    why = f"{text.quoted(record.name)}: {text.error_message(error)}"
                     self.damage_reason = self.damage_reason or why
         if not self.about and not (self.is_damaged and self.entries):
             why = f": {self.damage_reason}" if self.damage_reason else ""

@@ -104,7 +104,7 @@ class Recorder:
         self._close()
         if self._refused > 1:
             self._tell(f"messages that are none of fishd's, left out: {self._refused}")
-        self.writer.close(self.reason if error is None else text.named(error))
+        self.writer.close(self.reason if error is None else text.describe_error(error))
 
     @property
     def began(self) -> bool:

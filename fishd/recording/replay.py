@@ -50,9 +50,9 @@ class Replay:
             context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
             stack.callback(context.destroy, linger=200)
             for address, option in ((control, "--control"), (telemetry, "--address")):
-                if why := addresses.why_not_served(address):
+                if why := addresses.find_listen_problem(address):
                     raise StartupError(f"{option}: '{address}' is no address to serve: {why}")
-                stack.enter_context(addresses.claimed(address, RIVAL, ADVICE))
+                stack.enter_context(addresses.claim_address(address, RIVAL, ADVICE))
             self._publisher = context.socket(zmq.PUB)
             self.telemetry = _bound(self._publisher, telemetry, "--address")
             self._router = context.socket(zmq.ROUTER)

@@ -12,7 +12,7 @@ import pytest
 import zmq
 from rigs.processes import PATIENCE, Daemon, Subscriber, wait_until
 
-from fishd.core.protocol import WAITED
+from fishd.core.protocol import MAX_WAIT_S
 
 
 def ask(socket: "zmq.Socket[bytes]", payload: bytes) -> dict[str, Any]:
@@ -45,7 +45,7 @@ def test_many_requests_sent_at_once_are_all_answered(daemon: Daemon) -> None:
 @pytest.mark.parametrize(
     ("request_", "code", "message"),
     [
-        ({"v": 2, "op": "status"}, "version", "protocol version 2 is not spoken here"),
+        ({"v": 2, "op": "status"}, "version", "protocol version 2 is not supported"),
         ({"op": "statsu"}, "unknown-op", "did you mean 'status'?"),
         ({"op": "set-controller"}, "bad-arguments", "name: is missing"),
         ({"op": "set-controller", "args": {"name": 3}}, "bad-arguments", "name: 3 is"),
@@ -105,7 +105,7 @@ def test_a_fishd_that_goes_on_after_a_hang_begins_nothing_of_before(own_daemon: 
         socket.send(b'{"v":1,"id":2,"op":"stop"}')
         # Their age counts from when the gateway has taken them: what it answers itself comes next.
         assert ask(socket, b'{"v":2,"id":3,"op":"status"}')["error"]["code"] == "version"
-        time.sleep(WAITED + 0.5)
+        time.sleep(MAX_WAIT_S + 0.5)
         own_daemon.process.send_signal(signal.SIGCONT)
         replies = {reply["id"]: reply for reply in (json.loads(socket.recv()) for _ in range(2))}
     assert replies[2]["ok"]

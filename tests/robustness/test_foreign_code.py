@@ -13,7 +13,7 @@ from fishd_zoo import RAISED
 from rigs.processes import PATIENCE, wait_until
 
 from fishd.core.errors import Escaped
-from fishd.core.foreign_code import Attempt, contained
+from fishd.core.foreign_code import Attempt, call_foreign
 
 
 @pytest.mark.usefixtures("sigint_ignored")
@@ -23,7 +23,7 @@ def test_whatever_is_raised_is_an_exception_outside(deed: str) -> None:
         raise RAISED[deed]
 
     with pytest.raises(Exception) as caught:  # noqa: PT011  (that is what it is about)
-        contained(misbehave)
+        call_foreign(misbehave)
     error = caught.value
     assert error is RAISED[deed] or error.__cause__ is RAISED[deed]
 
@@ -34,7 +34,7 @@ def test_a_true_ctrl_c_passes() -> None:
 
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     with pytest.raises(KeyboardInterrupt):
-        contained(interrupt)
+        call_foreign(interrupt)
 
 
 def test_an_attempt_gives_what_is_returned_or_raises_what_is_raised() -> None:

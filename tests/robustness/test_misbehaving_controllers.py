@@ -23,7 +23,7 @@ def check_latched(rig: Rig) -> None:
     assert reason.code == "controller-error"
     assert reason.message.startswith("controller zoo ")
     assert reason.message.isprintable()
-    assert len(reason.message) <= text.LONGEST
+    assert len(reason.message) <= text.MAX_LINE_CHARACTERS
     msgspec.json.encode(reason)
     assert rig.recorder.kinds().count("fault") == 1
     for event in rig.recorder.events:
@@ -62,7 +62,7 @@ def test_an_exception_in_retune_is_for_whoever_asked(deed: str) -> None:
     rig.run(3)
     with pytest.raises(Exception) as caught:  # noqa: PT011  (that it is one is what matters)
         rig.loop.active.retune(ZooParameters(method="retune", deed=deed, nudge=1))
-    assert text.named(caught.value)
+    assert text.describe_error(caught.value)
     assert rig.loop.active.parameters["nudge"] == 0
     assert rig.run(3)[-1].mode == "running"
 
@@ -88,6 +88,6 @@ def test_a_controller_that_lost_its_parameters_does_not_take_over(lost: Any) -> 
     rig.run(3)
     with pytest.raises(Exception) as caught:  # noqa: PT011  (that it is one is what matters)
         rig.start(Forgetful(lost))
-    assert text.named(caught.value)
+    assert text.describe_error(caught.value)
     assert rig.loop.active.name == "square"
     assert rig.run(3)[-1].mode == "running"

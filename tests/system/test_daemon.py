@@ -160,7 +160,7 @@ def test_a_telemetry_address_of_another_machine_is_one_line_with_what_would_be_r
     tmp_path: Path, host: str
 ) -> None:
     assert (
-        f"telemetry.address: cannot listen on tcp://{host}:9872: {host} is no address of this "
+        f"telemetry.address: cannot listen on tcp://{host}:9872: {host} is not an address of this "
         "machine; write tcp://127.0.0.1:9872, or tcp://0.0.0.0:9872 for all\n"
     ) in refused(tmp_path, f"telemetry.address=tcp://{host}:9872")
 
@@ -170,7 +170,7 @@ def test_a_file_that_is_no_socket_is_left_alone(tmp_path: Path, key: str) -> Non
     precious = tmp_path / "precious.txt"
     precious.write_text("data")
     errors = refused(tmp_path, f"{key}.address=ipc://{precious}")
-    assert f"{precious} is there already and is no socket" in errors
+    assert f"{precious} exists and is not a socket" in errors
     assert precious.read_text() == "data"
 
 

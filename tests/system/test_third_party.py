@@ -122,7 +122,7 @@ def test_the_good_ones_are_listed_beside_the_built_in_ones(daemon: Daemon) -> No
         ("absent", "(nowhere:Absent in slow 1.0) does not load: ModuleNotFoundError"),
         (
             "function",
-            "(time:sleep in slow 1.0) is no subclass of fishd.controllers.base.Controller",
+            "(time:sleep in slow 1.0) is not a subclass of fishd.controllers.base.Controller",
         ),
         ("explosive", "controller 'explosive' cannot start: RuntimeError: no such model"),
     ],

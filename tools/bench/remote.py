@@ -104,7 +104,7 @@ async def swim(controller: TimedRemote, config: Config, trips: int) -> None:
     loop = build_loop(config, fish.robot(), SystemClock(), Telemetry(lambda message: None))
     loop.set_controller("remote", controller)
     ticker = Ticker(config.tick, mock_ticks(config))
-    realtime.quiet_garbage_collector()
+    realtime.freeze_garbage_collector()
     async for slot in ticker:
         loop.tick(slot)
         if loop.supervisor.reason:

@@ -22,7 +22,7 @@ from common.daemon import PATIENCE, Fishd
 from common.processes import BIN
 from common.report import DOCS, Options, Report, progress, table
 from fishd.client import Fish, NoDaemon, Refused
-from fishd.core.protocol import LOADING
+from fishd.core.protocol import LOADING_TIMEOUT_S
 from fishd.daemon.background_calls import MAX_CALLS
 
 DOCUMENT = "reference/reliability.md"
@@ -31,7 +31,7 @@ LONGEST_END = 3.0
 """What fishd may take from a signal to its end, whatever hangs [s]."""
 IMPATIENT_FISHD = """
 from fishd.core import protocol
-protocol.LOADING = {loading}
+protocol.LOADING_TIMEOUT_S = {loading}
 from fishd.__main__ import fishd
 fishd()
 """
@@ -97,7 +97,7 @@ def running(
             output=output,
         )
         with fishd, Fish(fishd.endpoint, timeout=5.0) as fish:
-            fishd.next_tick(PATIENCE + LOADING)
+            fishd.next_tick(PATIENCE + LOADING_TIMEOUT_S)
             yield fishd, fish
 
 
@@ -180,7 +180,7 @@ def loading(patience: float | None = None) -> Outcome:
     with ThreadPoolExecutor(len(groups)) as pool:
         found = list(pool.map(partial(refused_loads, patience=patience), groups))
     ended, times, statuses = zip(*found, strict=True)
-    does = f"refusal `too-slow` after {patience or LOADING:g} s; others load"
+    does = f"refusal `too-slow` after {patience or LOADING_TIMEOUT_S:g} s; others load"
     what = "a load that never ends"
     return Outcome(what, does, len(cases), sum(ended), max(times), sorted(set(statuses)))
 
@@ -220,7 +220,7 @@ def importing() -> Outcome:
                 ended += refusal.code not in ("unknown-controller", "too-slow")
         took = fishd.seconds_to_end(signal.SIGTERM)
         status = fishd.process.returncode
-    does = f"left out, after {LOADING:g} s at most"
+    does = f"left out, after {LOADING_TIMEOUT_S:g} s at most"
     return Outcome("an import that raises or never ends", does, 2, ended, took, [status])
 
 

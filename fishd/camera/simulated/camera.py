@@ -7,7 +7,7 @@ import numpy as np
 
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.camera.simulated.tail_painter import TailPainter
-from fishd.core.camera_frames import EQUAL, Frame
+from fishd.core.camera_frames import TIME_TOLERANCE_S, Frame
 
 
 class Tail(NamedTuple):
@@ -53,7 +53,7 @@ class SimulatedCamera:
         rate = self._settings.rate
         if rate is None:  # frames are available when a tick begins
             tick = end - begin
-            ticks = math.floor((self._settings.latency + EQUAL) / tick)
+            ticks = math.floor((self._settings.latency + TIME_TOLERANCE_S) / tick)
             return [end - max(0.0, self._settings.latency - ticks * tick)]
         first = math.floor(begin * rate - self._phase) + 1
         last = math.floor(end * rate - self._phase)

@@ -22,8 +22,8 @@ from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.client import Fish
 from fishd.client.connection import SECOND_LOOK
 from fishd.client.zmq_sockets import subscriber
-from fishd.core.addresses import find_control
-from fishd.core.camera_frames import EQUAL
+from fishd.core.addresses import find_control_address
+from fishd.core.camera_frames import TIME_TOLERANCE_S
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError
 from fishd.core.schema import Problem, convert
@@ -83,7 +83,7 @@ class Foresight:
             self._fish = TetheredFish(self._swimmer.plant, PlantState(phi=tick.phi))
             if self._swimmer.plant.servo_delay:  # the commands within the servo's delay are unknown
                 self._swim(command, self._swimmer.plant.servo_delay + period)
-        elif tick.time > self._end.time + EQUAL:  # after ticks that fishd has skipped
+        elif tick.time > self._end.time + TIME_TOLERANCE_S:  # after ticks that fishd has skipped
             self._swim(last_seq.phi_c if last_seq.servo_on else None, tick.time - self._end.time)
             parts.append((self._end, now))
         self._fish.state = PlantState(tick.phi, tick.alpha, tick.alpha_rate)
@@ -114,7 +114,7 @@ class SimulatedSource:
         self._settings = settings
         self._size = size
         self._decode: Callable[[bytes], TickTruth] = decoder(TickTruth)
-        where = settings.fishd or find_control()
+        where = settings.fishd or find_control_address()
         self.device = f"a simulated camera above the fish at {where}"
 
     def run(self, sink: Sink, stopping: Callable[[float], bool]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from fishd.camera.settings import StreamSettings, hide_secrets
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.core.camera_frames import Pixels
-from fishd.core.clock import boot_id
+from fishd.core.clock import read_boot_id
 
 PAUSES = 1.0, 10.0
 """Shortest and longest pause before a stream is opened again [s]."""
@@ -68,7 +68,7 @@ class StreamSource:
             if not capture.isOpened():
                 raise self._open_failure()
             sink.begin(
-                Timeline(False, boot_id(), time.monotonic), (_LIVE if self._live else _FILE,)
+                Timeline(False, read_boot_id(), time.monotonic), (_LIVE if self._live else _FILE,)
             )
             stated_rate = capture.get(cv2.CAP_PROP_FPS)
             rate = self._settings.rate or (

@@ -13,7 +13,7 @@ from fishd.camera.settings import V4l2Settings
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.camera.sources.decoding import Broken, decode_grey
 from fishd.camera.sources.v4l2_device import BUFFERS, OpenCamera, explain_error, open_camera
-from fishd.core.clock import boot_id
+from fishd.core.clock import read_boot_id
 
 RETRY_PERIOD_S = 1.0
 """Time between two attempts to open the camera [s]."""
@@ -161,7 +161,9 @@ class _Stream:
         if has_valid_stamp is not self._has_valid_stamp:
             self._has_valid_stamp = has_valid_stamp
             arrival_note = () if has_valid_stamp else (_ARRIVAL,)
-            sink.begin(Timeline(False, boot_id(), time.monotonic), (*self._degraded, *arrival_note))
+            sink.begin(
+                Timeline(False, read_boot_id(), time.monotonic), (*self._degraded, *arrival_note)
+            )
         half = 0.5 * (self._exposure or 0.0)
         if has_valid_stamp and flags & _SOURCE_MASK == _START_OF_EXPOSURE:
             half = -half

@@ -11,7 +11,7 @@ from linuxpy.video.device import Device, Format, V4L2Error, VideoCapture
 from fishd.camera.settings import V4l2Settings
 from fishd.camera.sources.base import Trouble
 from fishd.core import text
-from fishd.core.schema import nearest
+from fishd.core.schema import suggest
 
 BUFFERS = 4
 """Number of frames that the kernel can hold."""
@@ -43,7 +43,7 @@ def open_camera(settings: V4l2Settings) -> Iterator[OpenCamera]:
         capture.open()
         yield OpenCamera(capture, camera_format, exposure, degraded)
     except V4L2Error as error:
-        raise _no_camera(settings.device, text.said(error)) from None
+        raise _no_camera(settings.device, text.error_message(error)) from None
     finally:
         _close(device, capture)
 
@@ -116,14 +116,14 @@ def _set_controls(device: Device, settings: V4l2Settings) -> float | None:
     for name, value in settings.controls.items():
         control = controls.get(name)
         if control is None:
-            raise _bad_control(settings, name, f"there is none; {nearest(name, list(controls))}")
+            raise _bad_control(settings, name, f"there is none; {suggest(name, list(controls))}")
         if not control.minimum <= value <= control.maximum:
             range_text = f"{control.minimum} to {control.maximum} is needed"
             raise _bad_control(settings, name, f"{value} is not valid: {range_text}")
         try:
             control.value = int(value)
         except (AttributeError, ValueError) as error:
-            raise _bad_control(settings, name, text.said(error)) from None
+            raise _bad_control(settings, name, text.error_message(error)) from None
         except OSError as error:
             if error.errno == errno.ENODEV:
                 raise
@@ -184,6 +184,6 @@ def explain_error(error: OSError, device: str) -> Trouble:
         return _no_camera(device, "it is not a video device")
     return Trouble(
         "stalled",
-        f"{device}: {error.strerror or text.said(error)}; it is opened again",
+        f"{device}: {error.strerror or text.error_message(error)}; it is opened again",
         "plug it in again, into another port if that does not help",
     )

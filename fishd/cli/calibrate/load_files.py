@@ -53,7 +53,7 @@ def read(path: Path, unit: str) -> list[Step]:
     with one line that names file and line.
     """
     try:
-        text = files.read_text(path, files.TABLE, "a table of loads", "utf-8-sig")
+        text = files.read_text(path, files.MAX_TABLE_BYTES, "a table of loads", "utf-8-sig")
         reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
         names = [name.strip() for name in reader.fieldnames or []]
         reader.fieldnames = names

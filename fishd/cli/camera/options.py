@@ -13,7 +13,7 @@ from fishd.cli.options import verb_lease
 from fishd.cli.output import echo
 from fishd.client import Fish
 from fishd.core.errors import FishdError, NoDaemon
-from fishd.core.process.interruption import interrupted_once
+from fishd.core.process.interruption import raise_on_first_signal
 from fishd.core.signals import Event, Tick
 
 if TYPE_CHECKING:
@@ -86,7 +86,7 @@ def open_session(fish: Fish, seconds: float) -> Iterator["LiveSession"]:
     from fishd.lab.session import LiveSession
 
     with ExitStack() as stack:
-        stack.enter_context(interrupted_once())
+        stack.enter_context(raise_on_first_signal())
         rig = stack.enter_context(LiveSession(fish, *verb_lease()))
         echo(f"fishctl: it swims for {seconds:g} s; Ctrl-C stops it", err=True)
         yield rig

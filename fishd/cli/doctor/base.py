@@ -16,7 +16,7 @@ from fishd.client import Fish
 from fishd.client.connection import TIMEOUT
 from fishd.config import Config
 from fishd.config.drivers import CHOICES
-from fishd.core.addresses import find_control, socket_path
+from fishd.core.addresses import find_control_address, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
 from fishd.core.plugins import Plugins
 from fishd.core.process.unix_sockets import is_deserted
@@ -55,7 +55,7 @@ def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
 
     A fishd at another control.address stays undetected, even if it owns the same bus.
     """
-    given_endpoint, endpoint = endpoint, endpoint or find_control()
+    given_endpoint, endpoint = endpoint, endpoint or find_control_address()
     try:
         if is_unused(endpoint):
             return None

@@ -20,7 +20,8 @@ def daemon(context: Context) -> Result:
     if context.daemon is None:
         if context.owner:
             return warning(
-                f"no fishd at {context.endpoint or addresses.find_control()}, but {context.owner}",
+                f"no fishd at {context.endpoint or addresses.find_control_address()}, but "
+                f"{context.owner}",
                 "name its control.address with --endpoint",
             )
         return ok("no fishd is running")
@@ -109,7 +110,7 @@ def _check_address(context: Context, address: str, key: str) -> Result:
     if daemon and address in (daemon.status.telemetry, daemon.endpoint):
         return ok(f"{address} is served by the running fishd")
     try:
-        with addresses.claimed(address), addresses.listen(address, key):
+        with addresses.claim_address(address), addresses.listen(address, key):
             pass
     except StartupError as error:
         return fail(str(error), f"stop what uses it, or set {key} to another address")

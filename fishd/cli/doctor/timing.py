@@ -7,7 +7,7 @@ import subprocess
 
 from fishd.cli.doctor.base import Context
 from fishd.core.process import safe_path
-from fishd.core.process.realtime import limit_for
+from fishd.core.process.realtime import required_priority_limit
 from fishd.hardware.checks import Check, Result, ok, skipped, warning
 
 _TRIAL = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"
@@ -33,7 +33,7 @@ def realtime(context: Context) -> Result:
             return ok("the running fishd has real-time scheduling")
         return warning("the running fishd has no real-time scheduling", _allow_priority(priority))
     if _is_permitted(priority):
-        above = limit_for(priority)
+        above = required_priority_limit(priority)
         if _is_permitted(above):
             return ok(f"SCHED_FIFO {priority} is permitted")
         return warning(
@@ -48,7 +48,7 @@ def realtime(context: Context) -> Result:
 
 
 def _is_permitted(priority: int) -> bool:
-    command = safe_path.python("-I", "-S", "-c", _TRIAL, str(priority))
+    command = safe_path.python_command("-I", "-S", "-c", _TRIAL, str(priority))
     return subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
@@ -109,7 +109,7 @@ def _kernel_is_synchronised() -> bool:
 
 
 def _allow_priority(priority: int) -> str:
-    needed = limit_for(priority)
+    needed = required_priority_limit(priority)
     extra = f" with LimitRTPRIO={needed} (sudo systemctl edit fishd)"
     return _allow(f"rtprio {needed}", extra if needed > SERVICE_PRIORITY_LIMIT else "")
 

@@ -9,8 +9,8 @@ import click
 from fishd.cli.options import FiniteRange, json_option
 from fishd.cli.output import echo, format_count, print_json_line
 from fishd.cli.recording.choice import folder_option, open_recording
-from fishd.core.addresses import control_address, find_control
-from fishd.core.process.interruption import interrupted_once
+from fishd.core.addresses import control_address, find_control_address
+from fishd.core.process.interruption import raise_on_first_signal
 from fishd.recording.replay import Replay
 
 DEFAULT_ADDRESS = "tcp://127.0.0.1:9872"
@@ -55,7 +55,7 @@ def replay(
     recorded = open_recording(run, folder)
     with (
         suppress(KeyboardInterrupt),
-        interrupted_once(),
+        raise_on_first_signal(),
         Replay(recorded, address, control or control_address()) as player,
     ):
         seconds = recorded.summary.duration / speed
@@ -67,7 +67,7 @@ def replay(
         echo(f"{recorded.name}: {seconds:.0f} s at {player.telemetry}; Ctrl-C ends it")
         if recorded.frame_heads:
             echo(f"its {format_count(len(recorded.frame_heads), 'frame')} of a camera are left out")
-        is_default = find_control() == player.control
+        is_default = find_control_address() == player.control
         endpoint = "" if is_default else f"--endpoint {shlex.quote(player.control)} "
         echo(f"watch it with: fishctl {endpoint}watch")
         player.play(speed)

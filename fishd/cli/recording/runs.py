@@ -13,7 +13,7 @@ from fishd.cli.options import json_option
 from fishd.cli.output import echo, format_count, print_json
 from fishd.cli.recording.choice import folder_option, format_damage
 from fishd.core import text
-from fishd.core.console import power_words
+from fishd.core.console import format_power
 from fishd.core.errors import ConfigError, RecordingError
 from fishd.lab.experiment import Header, count_rows, list_experiments
 from fishd.recording.folder import Glance, glances, runs_folder
@@ -128,7 +128,7 @@ def _print_recordings(recordings: list[Glance]) -> None:
             _format_start(glance.about.get("started", "")),
             _format_duration(summary.duration),
             _format_thrust(summary),
-            "–" if summary.power is None else power_words(summary.power),
+            "–" if summary.power is None else format_power(summary.power),
             str(summary.ticks),
             str(summary.lost),
             str(summary.marks),

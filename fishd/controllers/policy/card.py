@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
-from fishd.core.files import SETTINGS
-from fishd.core.schema import Problem, convert, nested_too_deeply, spelled
+from fishd.core.files import MAX_SETTINGS_BYTES
+from fishd.core.schema import Problem, convert, format_literal, nested_too_deeply
 from fishd.core.signals import Observation
 
 KEY = "fishd.card"
@@ -26,7 +26,7 @@ KEY = "fishd.card"
 FORMAT = 3
 """Version of the card; a file with another one is refused."""
 
-LONGEST = SETTINGS
+LONGEST = MAX_SETTINGS_BYTES
 """Of a card as text; that of a training has some two thousand [characters]."""
 
 SAME_TICK = 1e-9
@@ -235,7 +235,8 @@ def decode(text: str) -> Card:
         older = isinstance(found, int) and found < FORMAT
         advice = ": it was written by an older fishd; train and export it again" if older else ""
         raise PolicyError(
-            f"its card has format {spelled(found)[:60]}; this fishd reads format {FORMAT}{advice}"
+            f"its card has format {format_literal(found)[:60]}; this fishd reads format "
+            f"{FORMAT}{advice}"
         )
     past = data.get("provenance")
     if isinstance(past, dict) and "efficiency" in past:  # as sealed files of before call it

@@ -15,7 +15,7 @@ from fishd.controllers.policy.card import KEY, Card, decode
 from fishd.controllers.policy.size_check import EXPORT, NOT_ONNX
 from fishd.core import files
 from fishd.core.errors import PolicyError
-from fishd.core.text import named, quoted
+from fishd.core.text import describe_error, quoted
 
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto, ValueInfoProto
@@ -208,7 +208,7 @@ def _check_tensor(tensor: "TensorProto") -> None:
     try:
         array = numpy_helper.to_array(tensor)
     except Exception as error:  # a tensor may contradict itself in many ways
-        raise PolicyError(f"its {what} cannot be read: {named(error)}") from None
+        raise PolicyError(f"its {what} cannot be read: {describe_error(error)}") from None
     numbers = array if array.dtype.kind in "biufc" else array.astype(np.float32)
     if not np.isfinite(numbers).all():
         raise PolicyError(_not_finite(what))

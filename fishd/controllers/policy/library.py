@@ -11,7 +11,7 @@ from pathlib import Path
 from fishd.core import files
 from fishd.core.errors import PolicyError
 from fishd.core.protocol import PolicyInfo
-from fishd.core.schema import names_file, nearest
+from fishd.core.schema import names_file, suggest
 
 SUFFIX = ".onnx"
 FOLDERS_VARIABLE = "FISHD_POLICIES"
@@ -23,7 +23,7 @@ def folders() -> list[Path]:
     """Where policies are looked for, in this order; some may not exist."""
     given = os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep)
     return [
-        *(files.expanded(folder).absolute() for folder in given if folder),
+        *(files.expand_user(folder).absolute() for folder in given if folder),
         _state_folder() / "policies",
         _SYSTEM,
         _shipped(),
@@ -41,7 +41,7 @@ def find(text: str) -> Path:
     Raises `PolicyError` for an unknown name; a path is not checked here.
     """
     if names_file(text, SUFFIX):
-        return files.expanded(text)
+        return files.expand_user(text)
     known = _files()
     if text not in known:
         if run := of_run(Path(text)):
@@ -112,7 +112,7 @@ def unknown(name: str, known: list[str]) -> str:
             f"no policy is named '{name}', and no other was found; put one into {folders()[0]}, or "
             f"give the path of a {SUFFIX} file"
         )
-    hint = nearest(name, known)
+    hint = suggest(name, known)
     there_are = f" There are: {', '.join(known)}" if hint.startswith("did") else ""
     return f"no policy is named '{name}'; {hint}{there_are}"
 
@@ -121,7 +121,7 @@ def _state_folder() -> Path:
     service = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     if service:
         return Path(service)
-    return files.expanded(os.environ.get("XDG_STATE_HOME") or "~/.local/state") / "fishd"
+    return files.expand_user(os.environ.get("XDG_STATE_HOME") or "~/.local/state") / "fishd"
 
 
 def _shipped() -> Path:

@@ -9,7 +9,7 @@ from math import prod
 from typing import TYPE_CHECKING
 
 from fishd.core.errors import PolicyError
-from fishd.core.text import quoted, said
+from fishd.core.text import error_message, quoted
 
 if TYPE_CHECKING:
     from onnx import ModelProto, NodeProto, ValueInfoProto
@@ -62,9 +62,10 @@ def check(model: "ModelProto") -> None:
         raise PolicyError("it is a model that trains itself; export it for inference")
     versions = [entry.version for entry in model.opset_import if entry.domain in _OWN]
     if len(versions) != 1 or versions[0] not in OPSETS:
-        said = ", ".join(map(str, versions)) or "none"
+        error_message = ", ".join(map(str, versions)) or "none"
         raise PolicyError(
-            f"its version of ONNX's operators: {said}; one from {OPSETS[0]} to {OPSETS[-1]} is "
+            f"its version of ONNX's operators: {error_message}; one from {OPSETS[0]} to "
+            f"{OPSETS[-1]} is "
             "needed"
         )
     nodes = model.graph.node
@@ -136,7 +137,7 @@ def _shapes(model: "ModelProto") -> Shapes:
     try:
         graph = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=True).graph
     except Exception as error:  # of its own, of protobuf, and ValueError
-        raise PolicyError(f"its network contradicts itself: {said(error)}") from None
+        raise PolicyError(f"its network contradicts itself: {error_message(error)}") from None
     shapes: dict[str, tuple[int, ...] | None] = {
         tensor.name: tuple(tensor.dims) for tensor in graph.initializer
     }

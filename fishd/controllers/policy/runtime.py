@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fishd.controllers.policy.file import FRAMES, INPUT, MISSING, OUTPUT, PolicyFile
 from fishd.core.errors import PolicyError
-from fishd.core.text import named
+from fishd.core.text import describe_error
 
 _PROBES = 64
 """Inputs on which a network is tried, which warms it up as well."""
@@ -67,7 +67,9 @@ class Network:
         except PolicyError as error:
             raise PolicyError(f"{policy.path}: {error}") from None
         except Exception as error:  # onnxruntime has a class of its own for each kind of error
-            raise PolicyError(f"{policy.path}: onnxruntime cannot run it: {named(error)}") from None
+            raise PolicyError(
+                f"{policy.path}: onnxruntime cannot run it: {describe_error(error)}"
+            ) from None
 
     def run(self) -> float:
         """The output for what is in `frames` and `row`."""

@@ -11,7 +11,7 @@ from fishd.controllers.base import LONGEST_DWELL, Controller, Limits
 from fishd.controllers.dwell import DwellLimit
 from fishd.controllers.quantities import quantity
 from fishd.controllers.remote.wire import Wire
-from fishd.core.addresses import why_not_connected
+from fishd.core.addresses import find_connect_problem
 from fishd.core.agent_messages import Ended, FromAgent, Observed, Pause, encode
 from fishd.core.errors import ControllerFault, ParameterError
 from fishd.core.schema import unit
@@ -117,7 +117,7 @@ class Remote(Controller[RemoteParameters]):
     def check(cls, parameters: Any, limits: Limits) -> None:
         """Refuse what is no address, and a deadline that the tick has no room for."""
         super().check(parameters, limits)
-        complaint = why_not_connected(parameters.agent)
+        complaint = find_connect_problem(parameters.agent)
         if complaint:
             raise ParameterError(
                 f"agent: '{parameters.agent}' is not valid: {complaint}", ("agent",)

@@ -1,1 +1,1 @@
-"""Plumbing of a process: its log, end, lock, priority, sockets, and systemd."""
+"""Infrastructure of a process: logs, shutdown, locks, priority, sockets, and systemd."""

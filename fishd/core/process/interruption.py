@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and SIGHUP: what a program that moves a fish or computes for long does then."""
+"""Handling of Ctrl-C, SIGTERM and SIGHUP in programs that move a fish or compute for long."""
 
 import signal
 import threading
@@ -10,62 +10,64 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(KeyboardInterrupt):
-    """One of these signals came; no code of others may catch it."""
+    """One of these signals arrived; code of other packages must not catch it."""
 
 
 @contextmanager
 def on_signal(ask: Callable[[], object]) -> Iterator[None]:
-    """While this lasts, SIGINT, SIGTERM and SIGHUP call `ask`; the second of a kind acts as before.
+    """Call `ask` on SIGINT, SIGTERM and SIGHUP; the second signal of a kind acts as before.
 
-    Only the main thread receives signals; in any other nothing happens.
+    Only the main thread receives signals; in any other thread this has no effect.
     """
 
     def heard(number: int, _: object) -> None:
         signal.signal(number, former[number])
         ask()
 
-    with handled(SIGNALS, heard) as former:
+    with handle_signals(SIGNALS, heard) as former:
         yield
 
 
 @contextmanager
-def interrupted_once() -> Iterator[None]:
-    """While this lasts, the first of the three raises `Interrupted`, and the others nothing.
+def raise_on_first_signal() -> Iterator[None]:
+    """Raise `Interrupted` on the first of the three signals, and ignore later ones.
 
-    So what is done then, such as stopping a fish, is done to its end. Main thread only.
+    The cleanup then, such as stopping a fish, runs to its end. Main thread only.
     """
 
     def heard(number: int, _: object) -> None:
-        for each in SIGNALS:
-            signal.signal(each, signal.SIG_IGN)
+        for signal_number in SIGNALS:
+            signal.signal(signal_number, signal.SIG_IGN)
         raise Interrupted
 
-    with handled(SIGNALS, heard):
+    with handle_signals(SIGNALS, heard):
         yield
 
 
 @contextmanager
-def held_back(signals: Iterable[int] = SIGNALS) -> Iterator[None]:
-    """What comes while this lasts acts as before as soon as it ends."""
-    came: list[int] = []
+def defer_signals(signals: Iterable[int] = SIGNALS) -> Iterator[None]:
+    """Defer these signals until the end of the context."""
+    received: list[int] = []
     try:
-        with handled(signals, lambda number, _: came.append(number)):
+        with handle_signals(signals, lambda number, _: received.append(number)):
             yield
     finally:
-        for number in came:
+        for number in received:
             signal.raise_signal(number)
 
 
 @contextmanager
-def handled(signals: Iterable[int], handler: Any) -> Iterator[dict[int, Any]]:
-    """While this lasts, these go to `handler`, in the main thread; yields who had them before.
+def handle_signals(signals: Iterable[int], handler: Any) -> Iterator[dict[int, Any]]:
+    """Handle these signals with `handler`, in the main thread; yield the former handlers.
 
-    One that is ignored, as `nohup` has it, stays so.
+    A signal that is ignored, as below `nohup`, stays ignored.
     """
     former: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
-        heard = [each for each in signals if signal.getsignal(each) is not signal.SIG_IGN]
-        former = {number: signal.signal(number, handler) for number in heard}
+        active = [
+            candidate for candidate in signals if signal.getsignal(candidate) is not signal.SIG_IGN
+        ]
+        former = {number: signal.signal(number, handler) for number in active}
     try:
         yield former
     finally:

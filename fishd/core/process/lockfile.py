@@ -1,7 +1,7 @@
-"""Lock files, each beside what only one process may use; it names that process.
+"""Lock files, each next to a resource that only one process may use; they contain its pid.
 
-The lock ends with its process, however that ends; a socket file stays. What another user has put
-in place of the lock file, such as a link to another file, is left alone.
+Unlike a socket file, the lock ends with its process, however that ends. If another user has put
+something in place of the lock file, such as a link to another file, that is not touched.
 """
 
 import errno
@@ -12,13 +12,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-_LOCKS = Path("/proc/locks")
-"""File of the kernel that lists the locks and the processes that hold them."""
-_CAREFULLY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_KERNEL_LOCKS = Path("/proc/locks")
+"""The kernel's list of locks and the processes that hold them."""
+_SAFE_OPEN_FLAGS = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
 
 
-class Taken(Exception):
-    """Another process holds the lock; `pid` is its number, or `unknown`."""
+class LockHeld(Exception):
+    """Another process holds the lock; `pid` is its id, or `unknown`."""
 
     def __init__(self, pid: str) -> None:
         super().__init__(f"held by process {pid}")
@@ -26,27 +26,27 @@ class Taken(Exception):
 
 
 class NotALock(OSError):
-    """Something else has the name of the lock file; `strerror` says what."""
+    """The path of the lock file belongs to something else, which `strerror` describes."""
 
     def __init__(self, path: Path, what: str) -> None:
-        super().__init__(errno.EPERM, f"is {what}, no lock file of fishd", str(path))
+        super().__init__(errno.EPERM, f"is {what}, not a lock file of fishd", str(path))
 
 
 def lock_path(path: Path) -> Path:
-    """Where the lock file of `path` is."""
+    """Return the path of the lock file of `path`."""
     return path.with_name(path.name + ".lock")
 
 
 @contextmanager
 def locked(path: Path, *, shared: bool = False, remove: bool = False) -> Iterator[None]:
-    """Hold the lock file of `path`, and make it if it does not exist.
+    """Hold the lock of `path`, and create the lock file if it does not exist.
 
-    shared: the group of the file may lock it, too, and another user may have made it
-    remove: take the lock file away at the end, where that is permitted
-    Raises `Taken` when a process holds it, this one included, OSError when it cannot be made,
-    and `NotALock`, an OSError, where it is something else.
+    shared: the group of the file may lock it, too, and another user may have created it
+    remove: remove the lock file at the end, if that is permitted
+    Raise `LockHeld` if a process holds it, this one included, OSError if it cannot be created, and
+    `NotALock`, an OSError, if the path is something else.
     """
-    lock = _held(path, shared)
+    lock = _acquire_lock(path, shared)
     try:
         os.ftruncate(lock, 0)
         os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
@@ -58,47 +58,47 @@ def locked(path: Path, *, shared: bool = False, remove: bool = False) -> Iterato
         os.close(lock)
 
 
-def holder(path: Path) -> str:
-    """The pid of the process that holds the lock of `path`, or `unknown`; empty where none does.
+def find_lock_holder(path: Path) -> str:
+    """Return the pid of the process that holds the lock of `path`, or `unknown`; empty if none.
 
-    Asking takes the lock for a moment.
+    The check holds the lock for a moment.
     """
     try:
-        lock = _opened(lock_path(path), os.O_RDONLY, shared=True)
-    except OSError:  # it was never held, or this user may not know
+        lock = _open_lock(lock_path(path), os.O_RDONLY, shared=True)
+    except OSError:  # it was never held, or this user may not read it
         return ""
     try:
         fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
-        return _pid_in(lock)
+        return _read_pid(lock)
     finally:
         os.close(lock)
     return ""
 
 
-def _held(path: Path, shared: bool) -> int:
-    """The lock file, open and locked; tries again where its holder has just removed it."""
+def _acquire_lock(path: Path, shared: bool) -> int:
+    """Return the lock file, open and locked; retry if its holder has just removed it."""
     while True:
-        lock = _opened(lock_path(path), os.O_RDWR, shared=shared)
+        lock = _open_lock(lock_path(path), os.O_RDWR, shared=shared)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             with suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(lock), lock_path(path).lstat()):
                     return lock
         except BlockingIOError:
-            pid = _pid_in(lock)
+            pid = _read_pid(lock)
             os.close(lock)
-            raise Taken(pid) from None
+            raise LockHeld(pid) from None
         except OSError:
             os.close(lock)
             raise
         os.close(lock)
 
 
-def _opened(path: Path, flags: int, *, shared: bool) -> int:
-    flags |= _CAREFULLY
+def _open_lock(path: Path, flags: int, *, shared: bool) -> int:
+    flags |= _SAFE_OPEN_FLAGS
     try:
-        # First without O_CREAT: there, Linux refuses that for an existing file of another user.
+        # First without O_CREAT, which Linux may refuse for an existing file of another user.
         lock = os.open(path, flags)
     except FileNotFoundError:
         if flags & os.O_ACCMODE == os.O_RDONLY:
@@ -108,37 +108,37 @@ def _opened(path: Path, flags: int, *, shared: bool) -> int:
         if error.errno == errno.ELOOP:
             raise NotALock(path, "a symbolic link") from None
         raise
-    found = os.fstat(lock)
-    if what := _strange(found, path.parent, shared):
+    status = os.fstat(lock)
+    if problem := _find_lock_problem(status, path.parent, shared):
         os.close(lock)
-        raise NotALock(path, what)
-    # To open a file for reading is enough to lock it.
+        raise NotALock(path, problem)
+    # Read permission is enough to lock a file.
     mode = 0o660 if shared else 0o600
-    if found.st_uid == os.geteuid() and stat.S_IMODE(found.st_mode) != mode:
+    if status.st_uid == os.geteuid() and stat.S_IMODE(status.st_mode) != mode:
         os.fchmod(lock, mode)
     return lock
 
 
-def _strange(found: os.stat_result, folder: Path, shared: bool) -> str:
-    """Why an open file is no lock file of fishd; empty where it is one."""
-    if not stat.S_ISREG(found.st_mode):
-        return "no regular file"
-    if found.st_nlink > 1:
-        return "another name of some file"
+def _find_lock_problem(status: os.stat_result, folder: Path, shared: bool) -> str:
+    """Return why an open file is not a lock file of fishd; empty if it is one."""
+    if not stat.S_ISREG(status.st_mode):
+        return "not a regular file"
+    if status.st_nlink > 1:
+        return "a hard link to another file"
     owners = {os.geteuid(), 0, folder.stat().st_uid}
-    if not shared and found.st_uid not in owners:
-        return f"a file of user {found.st_uid}"
+    if not shared and status.st_uid not in owners:
+        return f"a file of user {status.st_uid}"
     return ""
 
 
-def _pid_in(lock: int) -> str:
-    """Return the pid of the process that holds the lock, by the kernel; else the one written there.
+def _read_pid(lock: int) -> str:
+    """Return the pid of the process that holds the lock: from the kernel, else from the file.
 
-    What is written there may be old, or not true.
+    The pid in the file may be outdated, or false.
     """
     inode = str(os.fstat(lock).st_ino)
     with suppress(OSError):
-        for line in _LOCKS.read_text(encoding="ascii").splitlines():
+        for line in _KERNEL_LOCKS.read_text(encoding="ascii").splitlines():
             fields = line.split()  # 1: FLOCK ADVISORY WRITE 4711 08:02:131090 0 EOF
             if fields[1] == "FLOCK" and fields[5].rpartition(":")[2] == inode:
                 return fields[4]

@@ -1,6 +1,6 @@
-"""Structured logs on standard error, written by a thread of their own.
+"""Structured logs on standard error, written by a separate thread.
 
-A stopped terminal or a pipe that nobody reads blocks its writer, which must not be the tick.
+A stopped terminal or an unread pipe blocks its writer, which must not be the tick.
 """
 
 import logging
@@ -19,34 +19,37 @@ from fishd.core import text
 log = logging.getLogger(__name__)
 
 _JOURNAL_LEVELS = {"DEBUG": 7, "INFO": 6, "WARNING": 4, "ERROR": 3, "CRITICAL": 2}
-_QUEUE = 1000
-"""Lines kept while standard error is stuck; later ones are dropped."""
-_CLOSING = 0.3
-"""How long the last lines may take to be written [s]."""
-UNHURRIED = 2.0
-"""The same where nothing is driven; on a busy machine the thread that writes may come late [s]."""
-_LONGEST_MESSAGE = 2000
-_LONGEST_TRACEBACK = 10_000
-"""Longer ones are cut [characters]."""
+_MAX_QUEUED_LINES = 1000
+"""Maximum number of lines kept while standard error blocks; later ones are dropped."""
+_FLUSH_TIMEOUT_S = 0.3
+"""Maximum time to write the last lines [s]."""
+UNHURRIED_FLUSH_TIMEOUT_S = 2.0
+"""Maximum time to write the last lines if no servo is driven: long enough for a busy machine
+[s]."""
+_MAX_MESSAGE_CHARACTERS = 2000
+_MAX_TRACEBACK_CHARACTERS = 10_000
+"""Maximum length of a traceback; longer ones are cut [characters]."""
 
 
-def _safe(formatter: logging.Formatter, record: logging.LogRecord) -> tuple[str, str]:
-    """The message in one line, and the traceback where there is one, both safe to read."""
+def _format_safely(formatter: logging.Formatter, record: logging.LogRecord) -> tuple[str, str]:
+    """Return the message in one line, and the traceback if there is one, both printable."""
     trace = formatter.formatException(record.exc_info) if record.exc_info else ""
-    return text.line(record.getMessage(), _LONGEST_MESSAGE), text.block(trace, _LONGEST_TRACEBACK)
+    return text.line(record.getMessage(), _MAX_MESSAGE_CHARACTERS), text.block(
+        trace, _MAX_TRACEBACK_CHARACTERS
+    )
 
 
 class TextFormatter(logging.Formatter):
-    """`12:00:00.123 warning fishd.daemon.main: text`, with journald's prefix in a journal."""
+    """Formatter of `12:00:00.123 warning fishd.daemon.main: text`; for journald, a level prefix."""
 
     def __init__(self, journal: bool) -> None:
         super().__init__()
         self._journal = journal
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line, and the traceback where there is one."""
-        message, trace = _safe(self, record)
-        if self._journal:  # journald stamps the time itself
+        """Return one line, and the traceback if there is one."""
+        message, trace = _format_safely(self, record)
+        if self._journal:  # journald adds the time itself
             head = f"<{_JOURNAL_LEVELS.get(record.levelname, 6)}>"
         else:
             clock = time.strftime("%H:%M:%S", time.localtime(record.created))
@@ -55,11 +58,11 @@ class TextFormatter(logging.Formatter):
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: t, level, logger, message, and traceback where there is one."""
+    """Formatter of one JSON object per line: t, level, logger, message, and traceback if any."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """One line."""
-        message, trace = _safe(self, record)
+        """Return one line."""
+        message, trace = _format_safely(self, record)
         fields = {
             "t": record.created,
             "level": record.levelname.lower(),
@@ -72,49 +75,49 @@ class JsonFormatter(logging.Formatter):
 
 
 class _NoLock:
-    """In place of a lock that a controller may never release: this one cannot be held."""
+    """Replacement of a lock that a controller might never release: it never blocks."""
 
     def acquire(self) -> bool:
-        """Succeeds."""
+        """Return True."""
         return True
 
     def release(self) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
     __enter__ = acquire
 
     def __exit__(self, *_: object) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
 
 class _Queued(logging.handlers.QueueHandler):
     def createLock(self) -> None:  # noqa: N802  (logging's name)
-        """A queue needs no lock: a thread that hangs while it formats must not block the others."""
+        """Use no lock: a queue needs none, and a thread that hangs here must not block others."""
         self.lock = _NoLock()  # type: ignore[assignment]
 
     def enqueue(self, record: logging.LogRecord) -> None:
-        """Drop the line rather than wait."""
+        """Add the record to the queue; drop it if the queue is full."""
         with suppress(queue.Full):
             self.queue.put_nowait(record)
 
     def prepare(self, record: logging.LogRecord) -> logging.LogRecord:
-        """Leave the formatting, tracebacks included, to the writing thread."""
-        record.msg, record.args = record.getMessage()[: 2 * _LONGEST_MESSAGE], None
+        """Format only the message; the writing thread formats the rest, tracebacks included."""
+        record.msg, record.args = record.getMessage()[: 2 * _MAX_MESSAGE_CHARACTERS], None
         return record
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
-        """Ignore it: standard error, where it would be printed, may be stuck."""
+        """Ignore the error: standard error, where it would be printed, may block."""
 
 
 class LogWriter:
-    """Sends all logs to standard error; lines for `console` go to standard output as they are.
+    """Writer of all logs to standard error, and of the logger `console` to standard output.
 
-    Python's own warnings and errors go the same way.
+    Warnings and uncaught errors of Python are logged, too.
     """
 
     def __init__(self, style: str) -> None:
-        """style: text or json."""
-        self._lines: queue.Queue[logging.LogRecord | None] = queue.Queue(_QUEUE)
+        """style: `text` or `json`"""
+        self._lines: queue.Queue[logging.LogRecord | None] = queue.Queue(_MAX_QUEUED_LINES)
         self._errors = logging.StreamHandler(sys.stderr)
         journal = bool(os.environ.get("JOURNAL_STREAM")) and not sys.stderr.isatty()
         self._errors.setFormatter(JsonFormatter() if style == "json" else TextFormatter(journal))
@@ -128,12 +131,12 @@ class LogWriter:
         self._thread = threading.Thread(target=self._write, name="logs", daemon=True)
         self._thread.start()
 
-    def close(self, patience: float = _CLOSING) -> None:
-        """Write what is left, within `patience` [s]; may be called twice."""
-        until = time.monotonic() + patience
+    def close(self, timeout: float = _FLUSH_TIMEOUT_S) -> None:
+        """Write the remaining lines, within `timeout` [s]; may be called twice."""
+        deadline = time.monotonic() + timeout
         with suppress(queue.Full):
-            self._lines.put(None, timeout=patience)
-        self._thread.join(max(0.0, until - time.monotonic()))
+            self._lines.put(None, timeout=timeout)
+        self._thread.join(max(0.0, deadline - time.monotonic()))
 
     def _write(self) -> None:
         for record in iter(self._lines.get, None):
@@ -141,15 +144,15 @@ class LogWriter:
 
 
 def _log_unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
-    """An exception that nobody can catch, such as one of a __del__."""
+    """Log an exception that cannot be caught, such as one of a __del__."""
     error = unraisable.exc_value
     if error is not None:
-        log.error("ignored: %s", text.named(error), exc_info=error)
+        log.error("ignored: %s", text.describe_error(error), exc_info=error)
 
 
 def _log_thread(hook: threading.ExceptHookArgs) -> None:
-    """An exception that ended a thread, such as one that a controller has begun."""
+    """Log an exception that ended a thread, such as one that a controller started."""
     error = hook.exc_value
     if error is not None and not isinstance(error, SystemExit):
         name = text.quoted(hook.thread.name) if hook.thread else "?"
-        log.error("thread %s failed: %s", name, text.named(error), exc_info=error)
+        log.error("thread %s failed: %s", name, text.describe_error(error), exc_info=error)

@@ -1,10 +1,10 @@
-"""Where fishd keeps what lasts as long as it runs; needs nothing but the standard library."""
+"""Folder of fishd's files that exist only while it runs; uses only the standard library."""
 
 import os
 
 
 def runtime_folder() -> str:
-    """systemd's folder, else the login session's, else one under /tmp; it need not exist."""
+    """Return systemd's folder, else that of the login session, else one in /tmp; may not exist."""
     runtime = os.environ.get("RUNTIME_DIRECTORY", "").partition(":")[0]
     if runtime:
         return runtime

@@ -1,4 +1,4 @@
-"""Keeps files of the working directory from being imported by what fishd starts.
+"""Protection of Python processes that fishd starts against modules in the working directory.
 
 In a folder that others can write to, such as /tmp, another user may have put a `joblib.py`.
 `fishd.__main__` does the same for fishd itself.
@@ -10,15 +10,15 @@ import sys
 _VARIABLE = "PYTHONSAFEPATH"
 
 
-def python(*arguments: str) -> list[str]:
+def python_command(*arguments: str) -> list[str]:
     """Return the command that runs this Python with arguments, such as `-m fishd`."""
     return [sys.executable, "-P", *arguments]
 
 
 class SafeChildren:
-    """A context in which Python processes are started that ignore the working directory.
+    """Context in which started Python processes ignore the working directory.
 
-    For libraries that start processes by themselves; `python` is for all others.
+    For libraries that start processes themselves; use `python_command` for all others.
     """
 
     def __enter__(self) -> None:

@@ -1,4 +1,4 @@
-"""The orderly shutdown that a signal asks for, and a last resort where the process hangs."""
+"""Orderly shutdown on a signal, and a last resort if the process hangs."""
 
 import logging
 import os
@@ -18,31 +18,32 @@ from fishd.core.process import realtime
 log = logging.getLogger(__name__)
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-PATIENCE = 2.0
-"""Time from a signal until fishd no longer waits for an orderly shutdown [s]."""
-_RELEASE = 0.5
-"""Time that the last resort has to release the servo then [s]."""
-_WORDS = 0.4
-"""Time that it has to say so, and more if the release left some: a busy machine is slow [s]."""
-_FLUSH = 0.1
-"""Time to write the rest of the output at the very end, the last part of that [s]."""
+SHUTDOWN_TIMEOUT_S = 2.0
+"""Maximum time from a signal to the end of an orderly shutdown [s]."""
+_RELEASE_TIMEOUT_S = 0.5
+"""Maximum time for the last resort to release the servo after that [s]."""
+_MESSAGE_TIMEOUT_S = 0.4
+"""Time to log the outcome, in addition to what the release has left: a busy machine is slow [s]."""
+_FLUSH_TIMEOUT_S = 0.1
+"""Time to write the rest of the output at the very end, the last part of the time above [s]."""
 
 
 class Shutdown:
-    """Waits for a signal in a thread, asks for an orderly shutdown, and ends what hangs.
+    """Thread that waits for a signal, requests an orderly shutdown, and ends a process that hangs.
 
-    A signal reaches this thread even where the main one is stuck, as long as that does not keep
-    the interpreter to itself: then only SIGKILL helps, which systemd's watchdog sends.
+    A signal reaches this thread even if the main thread hangs, unless that keeps the interpreter:
+    then only SIGKILL helps, which systemd's watchdog sends.
     """
 
     def __init__(self) -> None:
-        """Call it from the main thread. SIGHUP stays ignored where it is, as below `nohup`."""
+        """Create it in the main thread. SIGHUP stays ignored if it is, as below `nohup`."""
         self._asked = threading.Event()
         self._tell: Callable[[], object] = lambda: None
         self.release: Callable[[], None] | None = None
-        """Releases the servo, from any thread; called where fishd hangs. None while it starts."""
+        """Function that releases the servo, from any thread; called if fishd hangs. None at
+        startup."""
         self.last_words: Callable[[], None] = lambda: None
-        """Writes the rest of the log, as far as that is possible at once."""
+        """Function that writes the rest of the log, as far as that is possible at once."""
         self._main = threading.get_ident()
         self._reader, writer = os.pipe()
         os.set_blocking(writer, False)
@@ -53,54 +54,55 @@ class Shutdown:
         self._thread = threading.Thread(target=self._watch, name="shutdown", daemon=True)
         self._thread.start()
 
-    def outrank(self, priority: int) -> None:
-        """Let its thread preempt a loop of this SCHED_FIFO priority, where that is permitted."""
+    def raise_priority(self, priority: int) -> None:
+        """Let this thread preempt a loop of this SCHED_FIFO priority, if that is permitted."""
         assert self._thread.native_id
-        realtime.outrank(self._thread.native_id, priority)
+        realtime.raise_priority(self._thread.native_id, priority)
 
-    def when_asked(self, tell: Callable[[], object]) -> None:
-        """Call `tell` from the waiting thread at the first signal; at once if there was one."""
-        self._tell = tell
+    def call_when_requested(self, request: Callable[[], object]) -> None:
+        """Call `request` from the waiting thread at the first signal; at once if there was one."""
+        self._tell = request
         if self._asked.is_set():
-            tell()
+            request()
 
     def _watch(self) -> None:
         while (number := os.read(self._reader, 1)[0]) not in SIGNALS:
-            pass  # of others that have a handler
+            pass  # other signals that have a handler
         self._asked.set()
         with suppress(RuntimeError):  # asyncio's loop has ended
             self._tell()
-        time.sleep(PATIENCE)
+        time.sleep(SHUTDOWN_TIMEOUT_S)
         self._end_at_once(signal.Signals(number).name)
 
     def _end_at_once(self, name: str) -> NoReturn:
-        """Waits for no lock: the thread that hangs may hold any, that of logging too."""
-        end = time.monotonic() + _RELEASE + _WORDS
+        """Release the servo, log, and exit, without any lock: the hanging thread may hold it."""
+        end = time.monotonic() + _RELEASE_TIMEOUT_S + _MESSAGE_TIMEOUT_S
         if not self.release:
-            what = "it has not begun to drive the servo;"
-        elif _within(_RELEASE, self.release):
-            what = "the servo is released and"
+            outcome = "it has not begun to drive the servo;"
+        elif _call_within(_RELEASE_TIMEOUT_S, self.release):
+            outcome = "the servo is released and"
         else:
-            what = "the servo may keep its pulses ('fishctl release' releases it) and"
-        place = _place(sys._current_frames().get(self._main))
+            outcome = "the servo may keep its pulses ('fishctl release' releases it) and"
+        place = _format_place(sys._current_frames().get(self._main))
         line = (
-            f"{name} came {PATIENCE:g} s ago, and fishd hangs {place}: {what} the process is ended"
+            f"{name} came {SHUTDOWN_TIMEOUT_S:g} s ago, and fishd hangs {place}: {outcome} the "
+            "process is ended"
         )
-        _within(end - _FLUSH - time.monotonic(), partial(log.critical, "%s", line))
-        _within(max(_FLUSH, end - time.monotonic()), self.last_words)
+        _call_within(end - _FLUSH_TIMEOUT_S - time.monotonic(), partial(log.critical, "%s", line))
+        _call_within(max(_FLUSH_TIMEOUT_S, end - time.monotonic()), self.last_words)
         os._exit(1)
 
 
-def leave(status: int) -> NoReturn:
+def exit_now(status: int) -> NoReturn:
     """End the process without waiting for threads or for a reader of the output."""
     for stream in (sys.stdout, sys.stderr):
-        if stream is not None:  # as where it was closed before the start
-            _within(_FLUSH, stream.flush)
+        if stream is not None:  # None if it was closed before the start
+            _call_within(_FLUSH_TIMEOUT_S, stream.flush)
     os._exit(status)
 
 
-def _within(seconds: float, function: Callable[[], object]) -> bool:
-    """Call it, and wait for so long [s] at most: has it returned, and raised nothing?"""
+def _call_within(seconds: float, function: Callable[[], object]) -> bool:
+    """Call a function in a thread; return whether it returned in time [s] without an error."""
     returned = threading.Event()
 
     def call() -> None:
@@ -115,11 +117,11 @@ def _within(seconds: float, function: Callable[[], object]) -> bool:
 
 
 def _ignore(number: int, frame: FrameType | None) -> None:
-    """A signal needs a handler to wake the thread that waits for it."""
+    """Ignore the signal; it needs a handler to wake the thread that waits for it."""
 
 
-def _place(frame: FrameType | None) -> str:
-    """Where a thread is, in words."""
+def _format_place(frame: FrameType | None) -> str:
+    """Return the place of a frame, in words."""
     if frame is None:
         return "somewhere"
     code = frame.f_code

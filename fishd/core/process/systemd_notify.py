@@ -1,4 +1,4 @@
-"""Tells systemd that fishd is ready, still ticks, or stops.
+"""Notifications to systemd that fishd is ready, still ticks, or stops.
 
 The protocol of sd_notify(3): datagrams to the socket that $NOTIFY_SOCKET names. Without systemd,
 nothing is sent.
@@ -8,24 +8,24 @@ import os
 import socket
 
 _FEEDS_PER_LIMIT = 8
-"""How many times the watchdog is fed in the time that systemd allows."""
+"""Number of watchdog notifications in the time that systemd allows."""
 
 
 class SystemdNotifier:
-    """Sends without waiting; what cannot be sent is dropped, and sent again with the next tick."""
+    """Sender that never blocks; a message that cannot be sent is sent again with the next tick."""
 
     def __init__(self) -> None:
         path = os.environ.get("NOTIFY_SOCKET", "")
         self._address = "\0" + path[1:] if path.startswith("@") else path
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
-        self._feed_period = _watchdog_limit() / _FEEDS_PER_LIMIT
+        self._feed_period = _read_watchdog_limit() / _FEEDS_PER_LIMIT
         self._next_feed = 0.0
         self._ready = False
 
     def ticked(self, now: float) -> None:
-        """Feed the watchdog, and be ready with the first tick; to be called from the tick only.
+        """Feed the watchdog, and report readiness with the first tick; call it only from the tick.
 
-        In virtual time also where a tick is waited for: nothing moves meanwhile.
+        In virtual time, call it also while a tick is awaited, when nothing moves.
 
         now: start of the tick [s, monotonic]
         """
@@ -36,11 +36,11 @@ class SystemdNotifier:
             self._next_feed = now + self._feed_period
 
     def status(self, line: str) -> None:
-        """What `systemctl status` shows."""
+        """Set the line that `systemctl status` shows."""
         self._send(f"STATUS={line}")
 
     def stopping(self) -> None:
-        """The daemon has begun to stop."""
+        """Report that the daemon stops."""
         self._send("STOPPING=1")
 
     def close(self) -> None:
@@ -48,7 +48,7 @@ class SystemdNotifier:
         self._socket.close()
 
     def _send(self, state: str) -> bool:
-        """True when systemd has got it."""
+        """Send a message; return whether systemd received it."""
         if not self._address:
             return False
         try:
@@ -58,8 +58,8 @@ class SystemdNotifier:
         return True
 
 
-def _watchdog_limit() -> float:
-    """Longest silence that systemd allows this process [s]; infinite without a watchdog."""
+def _read_watchdog_limit() -> float:
+    """Return the longest silence that systemd allows, infinite without a watchdog [s]."""
     if os.environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
         return float("inf")
     microseconds = os.environ.get("WATCHDOG_USEC", "")

@@ -1,6 +1,6 @@
-"""Unix sockets: who listens at one, whether a client may trust it, and how to take one over.
+"""Unix sockets: finding and checking their listener, and replacing abandoned ones.
 
-In /tmp anybody can make the folder in which fishd's socket would be, and answer there.
+In /tmp any user can create the folder of fishd's socket, and answer there.
 """
 
 import errno
@@ -15,72 +15,72 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fishd.core.errors import StartupError
-from fishd.core.process.lockfile import NotALock, Taken, lock_path, locked
+from fishd.core.process.lockfile import LockHeld, NotALock, lock_path, locked
 
-LONGEST_PATH = 107
-"""Of the path of a Unix socket, by Linux [bytes]."""
-LEAVING, AGAIN = 1.0, 0.02
-"""How long the gateways of a fishd that was killed may take to leave, and a pause meanwhile [s]."""
+MAX_PATH_BYTES = 107
+"""Maximum length of the path of a Unix socket in Linux [bytes]."""
+RELEASE_TIMEOUT_S, RETRY_INTERVAL_S = 1.0, 0.02
+"""Maximum time for the gateways of a killed fishd to end, and the interval of retries [s]."""
 GROUP_MASK = 0o117
-"""The umask of a socket to which user and group of this process may connect, and no other user."""
-_OTHERS = stat.S_IWGRP | stat.S_IWOTH
+"""Umask of a socket to which only the user and the group of this process may connect."""
+_WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 _ROOT = 0
 
 
 def check_length(path: str) -> None:
-    """Raises ValueError where the path is too long for a Unix socket."""
+    """Raise ValueError if the path is too long for a Unix socket."""
     length = len(os.fsencode(path))
-    if length > LONGEST_PATH:
+    if length > MAX_PATH_BYTES:
         raise ValueError(
-            f"the path of a Unix socket has at most {LONGEST_PATH} bytes, this one has {length}; "
+            f"the path of a Unix socket has at most {MAX_PATH_BYTES} bytes, this one has {length}; "
             "choose a shorter one, such as in /run or /tmp"
         )
 
 
-def stranger(path: Path) -> str:
-    """Why this user must not trust who serves the socket at `path`; empty where nothing is wrong.
+def find_trust_problem(path: Path) -> str:
+    """Return why this user must not trust the server at `path`; empty if it can be trusted.
 
-    Trusted are this user, root, and the owner of a folder that only root can have made for him, as
-    /run/fishd is for the service. Nobody else may write to the folder, nor be the one who listens.
-    Where there is no socket, there is no stranger.
+    Trusted users are this user, root, and the owner of a folder that only root can have created for
+    them, such as /run/fishd for the service. No other user may write to the folder or listen there.
+    Empty also if there is no socket.
     """
     folder = path.parent
     try:
-        found, above = folder.lstat(), folder.parent.stat()
+        folder_status, parent_status = folder.lstat(), folder.parent.stat()
     except OSError:
         return ""
-    if stat.S_ISLNK(found.st_mode) and not _is_roots_alone(above):
+    if stat.S_ISLNK(folder_status.st_mode) and not _only_root_may_write(parent_status):
         return f"{folder} is a symbolic link"
-    found = folder.stat() if stat.S_ISLNK(found.st_mode) else found
+    folder_status = folder.stat() if stat.S_ISLNK(folder_status.st_mode) else folder_status
     trusted = {os.geteuid(), _ROOT}
-    if _is_roots_alone(above):
-        trusted.add(found.st_uid)
-    if found.st_uid not in trusted:
-        return f"{folder} belongs to user {found.st_uid}"
-    if found.st_mode & _OTHERS:
-        return f"others may write to {folder}"
+    if _only_root_may_write(parent_status):
+        trusted.add(folder_status.st_uid)
+    if folder_status.st_uid not in trusted:
+        return f"{folder} belongs to user {folder_status.st_uid}"
+    if folder_status.st_mode & _WRITABLE_BY_OTHERS:
+        return f"other users may write to {folder}"
     with suppress(PermissionError):
-        found_there = listener(path)
-        if found_there and found_there.user not in trusted:
-            return f"it is user {found_there.user} who listens there"
+        listener = find_listener(path)
+        if listener and listener.user not in trusted:
+            return f"a process of user {listener.user} listens there"
     return ""
 
 
-def _is_roots_alone(folder: os.stat_result) -> bool:
-    return folder.st_uid == _ROOT and not folder.st_mode & _OTHERS
+def _only_root_may_write(folder: os.stat_result) -> bool:
+    return folder.st_uid == _ROOT and not folder.st_mode & _WRITABLE_BY_OTHERS
 
 
 class Listener(NamedTuple):
-    """Who listens at a socket."""
+    """Process that listens on a socket, and its user."""
 
     pid: int
     user: int
 
 
-def listener(path: Path) -> Listener | None:
-    """Who listens at a socket; None where nobody does, or none can be asked now.
+def find_listener(path: Path) -> Listener | None:
+    """Return the listener of a socket; None if there is none, or it cannot accept now.
 
-    Raises PermissionError where this user may not connect.
+    Raise PermissionError if this user may not connect.
     """
     with socket.socket(socket.AF_UNIX) as probe:
         failure = _connect(probe, path)
@@ -94,65 +94,64 @@ def listener(path: Path) -> Listener | None:
 
 
 def is_deserted(path: Path) -> bool:
-    """True when it is certain, without a wait, that nobody listens at a socket."""
+    """Return whether it is certain that no process listens on a socket; does not block."""
     with socket.socket(socket.AF_UNIX) as probe:
         failure = _connect(probe, path)
     return failure in (errno.ENOENT, errno.ENOTDIR, errno.ECONNREFUSED)
 
 
 def _connect(probe: socket.socket, path: Path) -> int:
-    """Connect without a wait; 0, or the errno of why that failed."""
+    """Connect without blocking; return 0 or the errno of the failure."""
     probe.setblocking(False)
     try:
         return probe.connect_ex(os.fspath(path))
-    except OSError:  # no socket has a path that long
+    except OSError:  # the path is too long for a socket
         return errno.ENOENT
 
 
 @contextmanager
-def claimed(path: Path, name: str, rival: str, advice: str) -> Iterator[None]:
-    """Make sure that nobody else serves this socket, and remove its files at the end.
+def claim_socket(path: Path, name: str, rival: str, advice: str) -> Iterator[None]:
+    """Make sure that no other process serves this socket, and remove its files at the end.
 
-    name: what messages call the socket
-    Binding alone does not tell: ZeroMQ takes the socket file of a living process away from it, and
-    leaves its own behind. Raises `StartupError`, which names the `rival` and gives the `advice`,
-    when somebody is there, this process included.
+    Binding alone is not enough: ZeroMQ replaces the socket file of a running process, and leaves
+    its own behind.
+
+    name: name of the socket in messages
+    Raise `StartupError` with `rival` and `advice` if a process, even this one, serves the socket.
     """
     with ExitStack() as stack:
         try:
             if path.exists() and not path.is_socket():
-                raise StartupError(
-                    f"{path} is there already and is no socket; choose another address"
-                )
+                raise StartupError(f"{path} exists and is not a socket; choose another address")
             stack.enter_context(locked(path.resolve(), remove=True))
-        except Taken as taken:
+        except LockHeld as held:
             raise StartupError(
-                f"{rival} (pid {taken.pid}) already serves {name}; {advice}"
+                f"{rival} (pid {held.pid}) already serves {name}; {advice}"
             ) from None
         except NotALock as error:
             raise StartupError(
                 f"{error.filename} {error.strerror}; remove it, or choose an address in a folder "
-                "of your own"
+                "that you own"
             ) from None
         except OSError as error:
             raise StartupError(
-                f"{lock_path(path)}: cannot be made: {error.strerror}; "
+                f"{lock_path(path)} cannot be created: {error.strerror}; "
                 "choose an address in a folder that exists and that you may write to"
             ) from None
-        given_up = time.monotonic() + LEAVING
+        deadline = time.monotonic() + RELEASE_TIMEOUT_S
         while path.is_socket() and not is_deserted(path):
-            if time.monotonic() > given_up:  # a program that locks nothing
+            if time.monotonic() > deadline:  # a program without a lock file
                 raise StartupError(f"another program already serves {name}; {advice}")
-            time.sleep(AGAIN)
+            time.sleep(RETRY_INTERVAL_S)
         stack.callback(path.unlink, missing_ok=True)
         yield
 
 
 def bind(server: socket.socket, path: Path, mask: int | None = None) -> None:
-    """Bind a socket at a path that is `claimed`, in place of what a killed process left there.
+    """Bind a socket at a path held by `claim_socket`, and replace the file of a killed process.
 
-    mask: umask for it, which says who may connect; None for that of this process
-    Raises OSError.
+    mask: umask for the socket, which decides which users may connect; None for that of the process
+    Raise OSError.
     """
     path.unlink(missing_ok=True)
     before = os.umask(mask) if mask is not None else None

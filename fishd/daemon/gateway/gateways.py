@@ -181,7 +181,7 @@ class ForkServer(_Peer):
         with theirs, ExitStack() as stack:
             stack.callback(ours.close)
             self._process = subprocess.Popen(
-                safe_path.python("-m", "fishd.daemon.gateway", str(theirs.fileno())),
+                safe_path.python_command("-m", "fishd.daemon.gateway", str(theirs.fileno())),
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -416,7 +416,7 @@ def _open(kind: str, address: str, server: ForkServer, stack: ExitStack) -> Gate
     listener = addresses.listen(address, f"{kind}.address", group=kind == CONTROL)
     stack.callback(listener.close)
     try:
-        gateway = Gateway(kind, listener, addresses.served(address, listener), server)
+        gateway = Gateway(kind, listener, addresses.reachable_address(address, listener), server)
     except OSError as error:
         raise StartupError(f"the gateway of {kind} cannot be started: {error.strerror}") from None
     stack.callback(gateway.close)

@@ -49,7 +49,7 @@ class WindowEvaluation:
 
     def unit(self, calibration: ForceCalibration) -> str:
         """Return the unit of the forces that this calibration gives."""
-        return self._raw_unit if calibration.untouched else "N"
+        return self._raw_unit if calibration.is_unset else "N"
 
     def _beyond_limit(self, extremes: Extremes, calibration: ForceCalibration) -> str:
         limit = self._limit
@@ -60,7 +60,7 @@ class WindowEvaluation:
             if not (low >= -limit and high <= limit):
                 force = high if high > limit else low
                 reason = f"{name} is {force:+.4g} N, beyond force_sensor.force_limit, {limit:g} N"
-                if calibration.untouched:
+                if calibration.is_unset:
                     reason += f" (not calibrated: 1 {self._raw_unit} counts as 1 N)"
                 return reason
         return ""

@@ -7,7 +7,7 @@ from fishd.core import text
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock
 from fishd.core.errors import ServoError
-from fishd.core.foreign_code import contained
+from fishd.core.foreign_code import call_foreign
 from fishd.hardware.driver import ServoDriver
 from fishd.hardware.servo import pulses
 from fishd.hardware.settings import ServoSettings
@@ -62,7 +62,7 @@ class CalibratedServo:
 
         Raises `ServoError` when the servo cannot be reached, and for an angle beyond its limits.
         """
-        contained(self.driver.write, pulses.pulse_width(self._settings, angle))
+        call_foreign(self.driver.write, pulses.pulse_width(self._settings, angle))
 
     def release(self) -> None:
         """Stop the pulses; may be called twice. Raises `ServoError`."""
@@ -76,8 +76,8 @@ class CalibratedServo:
 def _end_pulses(end: Callable[[], None]) -> None:
     """Call a function that ends the pulses; turn every exception of it into a `ServoError`."""
     try:
-        contained(end)
+        call_foreign(end)
     except ServoError:
         raise
     except Exception as error:
-        raise ServoError(text.named(error)) from error
+        raise ServoError(text.describe_error(error)) from error

@@ -13,7 +13,7 @@ from fishd.controllers.policy import library
 from fishd.controllers.policy.controller import PpoParameters
 from fishd.core import files, strict_yaml
 from fishd.core.errors import FishdError, ParameterError, PolicyError, UnknownController
-from fishd.core.schema import names_file, nearest
+from fishd.core.schema import names_file, suggest
 from fishd.lab.compare.seeing import SeeingController, sees_pictures
 from fishd.virtual.plant.optimum import SteadyState, square_wave
 
@@ -45,7 +45,7 @@ def parse(text: str) -> Contestant:
                 raise ParameterError(f"{text} {run}")
             comparable = [controller for controller in registry.names() if controller != "remote"]
             files = [f"{text}{library.SUFFIX}"] if Path(f"{text}{library.SUFFIX}").is_file() else []
-            hint = nearest(name, files or [*comparable, *library.names()])
+            hint = suggest(name, files or [*comparable, *library.names()])
             raise ParameterError(
                 f"'{name}' is not a controller, named policy or {library.SUFFIX} file; {hint}"
             )
@@ -64,7 +64,7 @@ def absolute(contestant: Contestant) -> Contestant:
     policy = contestant.parameters.get("policy")
     if not (isinstance(policy, str) and names_file(policy, library.SUFFIX)):
         return contestant
-    parameters = {**contestant.parameters, "policy": str(files.expanded(policy).absolute())}
+    parameters = {**contestant.parameters, "policy": str(files.expand_user(policy).absolute())}
     return contestant._replace(parameters=parameters)
 
 
@@ -73,7 +73,7 @@ def is_missing(contestant: Contestant) -> bool:
     policy = contestant.parameters.get("policy")
     if not (isinstance(policy, str) and names_file(policy, library.SUFFIX)):
         return False
-    return not files.expanded(policy).is_file()
+    return not files.expand_user(policy).is_file()
 
 
 def best_on_grid(config: Config) -> SteadyState:

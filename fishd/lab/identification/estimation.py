@@ -15,7 +15,7 @@ import numpy as np
 
 from fishd.core import text
 from fishd.core.errors import ParameterError
-from fishd.core.schema import nearest
+from fishd.core.schema import suggest
 from fishd.lab.identification import misfit
 from fishd.lab.identification.fit import (
     BOUNDS,
@@ -140,7 +140,7 @@ def check(fit: Sequence[str], fix: Sequence[str] = ()) -> tuple[str, ...]:
     """
     for name in (*fit, *fix):
         if name not in POSSIBLE:
-            raise ParameterError(f"'{name}' cannot be fitted; {nearest(name, list(POSSIBLE))}")
+            raise ParameterError(f"'{name}' cannot be fitted; {suggest(name, list(POSSIBLE))}")
     names = tuple(name for name in POSSIBLE if name in fit and name not in fix)
     if not names:
         raise ParameterError(f"nothing to fit; possible: {', '.join(POSSIBLE)}")

@@ -3,7 +3,7 @@
 import math
 from typing import TYPE_CHECKING
 
-from fishd.core.dataframes import frame
+from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
 from fishd.lab.session import Session
 
@@ -29,4 +29,4 @@ def experiment(session: Session, seconds: float = 180.0) -> "DataFrame":
         )
     ticks = session.rest(REST_S)
     ticks += session.swim("excitation", {}, seconds - REST_S)
-    return frame(ticks)
+    return ticks_to_frame(ticks)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from fishd.config import Config, adopt, load
-from fishd.core.dataframes import frame
+from fishd.core.dataframes import ticks_to_frame
 from fishd.lab.simulation.virtual_run import KeepingPublisher, VirtualRun, check_length
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ def run(
     *,
     overrides: Mapping[str, Any] | None = None,
 ) -> "DataFrame":
-    """Swim a simulated fish with a controller, and return its ticks as a table: see `frame`.
+    """Swim a simulated fish with a controller; return its ticks as a table, see `ticks_to_frame`.
 
     config: path of a YAML file, or result of `fishd.config.load`; None for the defaults
     overrides: values by dotted key, such as `{"plant.xi": 0.9}`
@@ -42,7 +42,7 @@ def run(
         virtual.set_controller(controller, parameters or {})
         for _ in range(max(1, round(seconds / config.tick))):
             virtual.tick()
-    return frame(publisher.ticks)
+    return ticks_to_frame(publisher.ticks)
 
 
 def _to_yaml(value: Any) -> str:

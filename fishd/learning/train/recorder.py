@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 
 from fishd.controllers.policy.card import Card
 from fishd.core.errors import ConfigError
-from fishd.core.process.lockfile import Taken, locked
+from fishd.core.process.lockfile import LockHeld, locked
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints, runs
@@ -163,7 +163,7 @@ class RunRecorder:
         folder = self._job.folder
         try:
             lock.enter_context(locked(folder / "training", remove=True))
-        except Taken as taken:
+        except LockHeld as taken:
             raise ConfigError(f"{folder} is being trained in, by process {taken.pid}") from None
 
     def _save(self, kind: Literal["step", "best"]) -> Path:

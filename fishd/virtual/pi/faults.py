@@ -9,7 +9,7 @@ import random
 from collections.abc import Callable
 
 from fishd.core.clock import Clock
-from fishd.core.schema import nearest
+from fishd.core.schema import suggest
 
 FAULTS: dict[str, str] = {
     "nack": "I2C: nobody acknowledges (error 121)",
@@ -121,4 +121,4 @@ class Faults:
     @staticmethod
     def _check(name: str) -> None:
         if name not in FAULTS:
-            raise ValueError(f"no fault is called '{name}'; {nearest(name, list(FAULTS))}")
+            raise ValueError(f"no fault is called '{name}'; {suggest(name, list(FAULTS))}")

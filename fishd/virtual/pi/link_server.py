@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 
 from fishd.core.errors import StartupError
-from fishd.core.process.unix_sockets import bind, claimed
+from fishd.core.process.unix_sockets import bind, claim_socket
 from fishd.virtual.pi.i2c import Message, Read, Write
 from fishd.virtual.pi.link import (
     LONG_POLL,
@@ -48,7 +48,7 @@ class LinkServer:
         path = self._path.resolve()  # a symbolic link leads to the same virtual Pi
         advice = "end it, or give this one another virtual_pi.socket"
         with ExitStack() as stack:
-            stack.enter_context(claimed(path, str(path), "another virtual Pi", advice))
+            stack.enter_context(claim_socket(path, str(path), "another virtual Pi", advice))
             stack.enter_context(self._pi)
             listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
             try:

@@ -5,7 +5,7 @@ from typing import Any
 
 from fishd.core import text
 from fishd.core.errors import FishLost, StartupError, UnknownPlant
-from fishd.core.foreign_code import contained
+from fishd.core.foreign_code import call_foreign
 from fishd.core.plugins import Plugins
 from fishd.virtual.plant.base import Plant, Window
 from fishd.virtual.plant.parameters import TETHERED, MotorSettings, PlantParameters
@@ -42,16 +42,16 @@ class _Contained(Plant[PlantParameters]):
     def __init__(self, kind: type[Plant[Any]], parameters: PlantParameters) -> None:
         super().__init__(parameters)
         try:
-            self._plant = contained(kind, parameters)
+            self._plant = call_foreign(kind, parameters)
             self.state = self._plant.state
         except Exception as error:
-            what = f"plant '{parameters.model}' cannot begin: {text.named(error)}"
+            what = f"plant '{parameters.model}' cannot begin: {text.describe_error(error)}"
             raise StartupError(what) from error
 
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> Window:
         """As `Plant.advance`; raises `FishLost`, then and ever after."""
         try:
-            window = contained(self._plant.advance, instruction_angle, duration, samples)
+            window = call_foreign(self._plant.advance, instruction_angle, duration, samples)
             self.state = self._plant.state
             numbers = (
                 *(window.thrust, window.lateral_force, window.fin_peak),
@@ -60,6 +60,6 @@ class _Contained(Plant[PlantParameters]):
             if not all(map(math.isfinite, numbers)):
                 raise ArithmeticError("its forces or its state are not finite")
         except Exception as error:
-            what = f"plant '{self.parameters.model}' cannot go on: {text.named(error)}"
+            what = f"plant '{self.parameters.model}' cannot go on: {text.describe_error(error)}"
             raise FishLost(what) from error
         return window

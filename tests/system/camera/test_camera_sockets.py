@@ -208,7 +208,7 @@ def test_the_doctor_says_how_the_camera_is(
 def test_a_port_that_is_taken_is_that_of_another_camera_perhaps(tmp_path: Path) -> None:
     taken = addresses.listen("tcp://127.0.0.1:0", "test")
     with closing(taken):
-        address = addresses.served("tcp://127.0.0.1:0", taken)
+        address = addresses.reachable_address("tcp://127.0.0.1:0", taken)
         own = sets(f"publish.frames={address}", f"publish.requests=ipc://{tmp_path}/requests")
         done = call(*COMMAND, *own)
     assert done.returncode == 1

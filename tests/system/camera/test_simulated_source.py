@@ -16,7 +16,7 @@ from fishd.camera.messages import FrameHeader
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.client import Agent, Fish
-from fishd.core.camera_frames import EQUAL, Frame, Stack, StackSettings
+from fishd.core.camera_frames import TIME_TOLERANCE_S, Frame, Stack, StackSettings
 from fishd.core.signals import Tick
 
 TICK = 0.05
@@ -149,7 +149,7 @@ def test_in_lockstep_a_frame_is_the_same_as_beside_the_simulation(tmp_path: Path
                 run.swim(40)
                 assert run.agent.latest
                 ticks = [msgspec.convert(telemetry.message(), Tick)]
-                while ticks[-1].time < run.agent.latest.time - EQUAL:
+                while ticks[-1].time < run.agent.latest.time - TIME_TOLERANCE_S:
                     ticks.append(msgspec.convert(telemetry.message(), Tick))
                 frames = {round(f.time, 6): f.pixels for f in run.client.history._frames}
     truth = expected(ticks, SimulatedCameraSettings(noise=0.0))

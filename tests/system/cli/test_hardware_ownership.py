@@ -152,7 +152,7 @@ def test_a_folder_of_lock_files_that_another_user_made_is_not_used(
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(folder))
     part = ownership.Part(folder / "fishd-bus", "/dev/i2c-7", "force_sensor.bus")
     with (
-        pytest.raises(StartupError, match=f"others may write to {folder}"),
+        pytest.raises(StartupError, match=f"other users may write to {folder}"),
         ownership.claim_parts([part]),
     ):
         pass

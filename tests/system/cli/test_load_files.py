@@ -56,7 +56,7 @@ def test_the_file_for_recorded_loads_is_checked_before_the_first_load(
     assert one_line(ended) == f"fishctl: {record}: is there already; --force replaces it\n"
     assert record.read_text() == "precious\n"
     ended = daemon.fishctl(*words, str(tmp_path / "none" / "loads.csv"), "--force")
-    assert one_line(ended).endswith("none/loads.csv: there is no folder to put it into\n")
+    assert one_line(ended).endswith("none/loads.csv: its folder does not exist; create it\n")
 
 
 def test_a_refusal_for_now_names_the_file_that_still_holds_the_loads(

@@ -6,7 +6,14 @@ from pathlib import Path
 import pytest
 
 from fishd.config import load
-from fishd.core.addresses import is_local, listen, parse, served, why_not_connected, why_not_served
+from fishd.core.addresses import (
+    find_connect_problem,
+    find_listen_problem,
+    is_local,
+    listen,
+    parse,
+    reachable_address,
+)
 from fishd.core.errors import ConfigError, StartupError
 
 
@@ -28,10 +35,10 @@ from fishd.core.errors import ConfigError, StartupError
     ],
 )
 def test_what_zeromq_would_understand_in_another_way_is_no_address(address: str) -> None:
-    assert why_not_served(address)
+    assert find_listen_problem(address)
     with pytest.raises(ValueError, match=r"^tcp://HOST:PORT or ipc://PATH is needed"):
         parse(address)
-    assert why_not_connected(address)
+    assert find_connect_problem(address)
 
 
 @pytest.mark.parametrize(
@@ -39,8 +46,8 @@ def test_what_zeromq_would_understand_in_another_way_is_no_address(address: str)
     ["tcp://127.0.0.1:9872", "tcp://fish.local:1", "tcp://[::1]:9872", "ipc:///tmp/x", "ipc://x"],
 )
 def test_hosts_and_paths_are_addresses(address: str) -> None:
-    assert not why_not_served(address)
-    assert not why_not_connected(address)
+    assert not find_listen_problem(address)
+    assert not find_connect_problem(address)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +78,7 @@ def test_requests_from_elsewhere_are_never_advised(address: str) -> None:
 def test_port_0_is_any_that_is_free_and_clients_are_told_which() -> None:
     with listen("tcp://127.0.0.1:0", "telemetry.address") as server:
         port = server.getsockname()[1]
-        assert served("tcp://127.0.0.1:0", server) == f"tcp://127.0.0.1:{port}"
+        assert reachable_address("tcp://127.0.0.1:0", server) == f"tcp://127.0.0.1:{port}"
         socket.create_connection(("127.0.0.1", port), 5.0).close()
 
 
@@ -83,7 +90,7 @@ def test_a_control_socket_is_for_user_and_group_only(tmp_path: Path) -> None:
 
 def test_a_port_that_is_taken_is_named_with_its_key() -> None:
     with listen("tcp://127.0.0.1:0", "telemetry.address") as server:
-        address = served("tcp://127.0.0.1:0", server)
+        address = reachable_address("tcp://127.0.0.1:0", server)
         with pytest.raises(StartupError, match=f"telemetry.address: cannot listen on {address}"):
             listen(address, "telemetry.address")
 
@@ -105,4 +112,4 @@ def test_a_port_that_a_rival_has_bound_too_and_listens_at_is_waited_for(
         monkeypatch.setattr(socket, "socket", Second)
         monkeypatch.setattr("time.sleep", lambda seconds: rival.close())
         with listen(address, "telemetry.address") as server:
-            assert served(address, server) == address
+            assert reachable_address(address, server) == address

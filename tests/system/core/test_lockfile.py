@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from fishd.core.addresses import claimed
+from fishd.core.addresses import claim_address
 from fishd.core.errors import StartupError
-from fishd.core.process.lockfile import NotALock, Taken, holder, lock_path, locked
+from fishd.core.process.lockfile import LockHeld, NotALock, find_lock_holder, lock_path, locked
 
 HOLDER = """
 import sys, time
@@ -25,13 +25,13 @@ with locked(Path(sys.argv[1])):
 def test_a_lock_names_the_process_that_holds_it_and_ends_when_it_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "control"
     command = [sys.executable, "-c", HOLDER, str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as holder:
-        assert holder.stdout is not None
-        assert holder.stdout.readline() == "held\n"
-        with pytest.raises(Taken) as caught, locked(path):
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as find_lock_holder:
+        assert find_lock_holder.stdout is not None
+        assert find_lock_holder.stdout.readline() == "held\n"
+        with pytest.raises(LockHeld) as caught, locked(path):
             pass
-        assert caught.value.pid == str(holder.pid)
-        holder.kill()
+        assert caught.value.pid == str(find_lock_holder.pid)
+        find_lock_holder.kill()
     with locked(path):
         assert lock_path(path).read_text() == f"{os.getpid()}\n"
 
@@ -40,7 +40,7 @@ def test_a_lock_that_is_to_be_removed_is_gone_afterwards_and_held_before(tmp_pat
     path = tmp_path / "agent"
     with locked(path, remove=True):
         for remove in (True, False):
-            with pytest.raises(Taken, match=str(os.getpid())), locked(path, remove=remove):
+            with pytest.raises(LockHeld, match=str(os.getpid())), locked(path, remove=remove):
                 pass
     assert list(tmp_path.iterdir()) == []
 
@@ -63,14 +63,14 @@ def test_a_lock_that_its_holder_removed_while_another_opened_it_is_no_lock(
     with locked(path):
         assert removed
         assert lock_path(path).read_text() == f"{os.getpid()}\n"
-        with pytest.raises(Taken), locked(path):
+        with pytest.raises(LockHeld), locked(path):
             pass
 
 
 PLANTS: dict[str, Callable[[Path, Path], None]] = {
     "a symbolic link": Path.symlink_to,
-    "another name of some file": Path.hardlink_to,
-    "no regular file": lambda lock, victim: os.mkfifo(lock),
+    "a hard link to another file": Path.hardlink_to,
+    "not a regular file": lambda lock, victim: os.mkfifo(lock),
 }
 
 
@@ -84,12 +84,14 @@ def test_what_was_planted_for_a_lock_is_refused_and_left_as_it_is(
     PLANTS[what](lock_path(tmp_path / "control"), victim)
     with pytest.raises(NotALock, match=what), locked(tmp_path / "control", shared=shared):
         pass
-    assert holder(tmp_path / "control") == ""  # and without a wait for the pipe's other end
-    with pytest.raises(StartupError) as caught, claimed(f"ipc://{tmp_path}/control"):
+    assert (
+        find_lock_holder(tmp_path / "control") == ""
+    )  # and without a wait for the pipe's other end
+    with pytest.raises(StartupError) as caught, claim_address(f"ipc://{tmp_path}/control"):
         pass
     assert str(caught.value) == (
-        f"{tmp_path}/control.lock is {what}, no lock file of fishd; remove it, or choose an "
-        "address in a folder of your own"
+        f"{tmp_path}/control.lock is {what}, not a lock file of fishd; remove it, or choose an "
+        "address in a folder that you own"
     )
     assert victim.read_text() == "precious"
 
@@ -109,7 +111,7 @@ def test_a_lock_of_another_user_counts_where_all_share_or_the_folder_is_his(tmp_
     with pytest.raises(NotALock, match="is a file of user 60101, no lock"), locked(path):
         pass
     with locked(path, shared=True):
-        assert holder(path) == str(os.getpid())
+        assert find_lock_holder(path) == str(os.getpid())
     os.chown(tmp_path, 60101, 60101)
     with locked(path):
         pass
@@ -121,11 +123,11 @@ def test_a_pid_that_is_none_is_unknown(
 ) -> None:
     path = tmp_path / "control"
     monkeypatch.setattr(
-        "fishd.core.process.lockfile._LOCKS", tmp_path / "nowhere"
+        "fishd.core.process.lockfile._KERNEL_LOCKS", tmp_path / "nowhere"
     )  # the kernel says none
     with locked(path):
         lock_path(path).write_bytes(text)
-        with pytest.raises(Taken) as caught, locked(path):
+        with pytest.raises(LockHeld) as caught, locked(path):
             pass
         assert caught.value.pid in ("unknown", "9" * 20)
 
@@ -134,9 +136,9 @@ def test_two_names_of_one_address_are_one(tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "real")
     with (
-        claimed(f"ipc://{tmp_path}/real/control"),
+        claim_address(f"ipc://{tmp_path}/real/control"),
         pytest.raises(StartupError, match=rf"\(pid {os.getpid()}\) already serves"),
-        claimed(f"ipc://{tmp_path}/link/control"),
+        claim_address(f"ipc://{tmp_path}/link/control"),
     ):
         pass
     assert list((tmp_path / "real").iterdir()) == []

@@ -15,7 +15,7 @@ from rigs.processes import PATIENCE, running, wait_until
 from fishd.client import Fish, NoDaemon
 from fishd.core import addresses
 from fishd.core.errors import Untrusted
-from fishd.core.process.unix_sockets import stranger
+from fishd.core.process.unix_sockets import find_trust_problem
 
 USER, OTHER = 60101, 60102
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be two other users")
@@ -109,7 +109,7 @@ def test_a_planted_folder_hides_no_service(shared: Path, monkeypatch: pytest.Mon
     with user(OTHER):
         session.mkdir()
     with Listener(run / "fishd" / "control", USER), Listener(session / "fishd" / "control", OTHER):
-        assert addresses.find_control() == f"ipc://{run}/fishd/control"
+        assert addresses.find_control_address() == f"ipc://{run}/fishd/control"
         with Fish(timeout=0.2) as fish, pytest.raises(NoDaemon, match="no answer within"):
             fish.status()  # so it was asked
 
@@ -124,20 +124,23 @@ def test_a_stranger_is_told_by_folder_rights_and_by_who_listens(shared: Path) ->
         with Listener(folder / "control", listener) if listener else nullcontext():
             folder.chmod(mode)
             with user(USER):
-                return stranger(folder / "control").replace(str(folder), "FOLDER")
+                return find_trust_problem(folder / "control").replace(str(folder), "FOLDER")
 
     assert judged("mine", USER, USER) == ""
     assert judged("deserted", USER, 0) == ""
     assert judged("roots", 0, USER) == ""
     assert judged("his", OTHER, OTHER) == f"FOLDER belongs to user {OTHER}"
     assert judged("his-with-me", OTHER, USER) == f"FOLDER belongs to user {OTHER}"
-    assert judged("open", USER, USER, 0o777) == "others may write to FOLDER"
-    assert judged("group", USER, USER, 0o770) == "others may write to FOLDER"
-    assert judged("slipped-in", USER, OTHER) == f"it is user {OTHER} who listens there"
+    assert judged("open", USER, USER, 0o777) == "other users may write to FOLDER"
+    assert judged("group", USER, USER, 0o770) == "other users may write to FOLDER"
+    assert judged("slipped-in", USER, OTHER) == f"a process of user {OTHER} listens there"
     (shared / "link").symlink_to(shared / "mine")
     with user(USER):
-        assert stranger(shared / "link" / "control") == f"{shared / 'link'} is a symbolic link"
-        assert stranger(shared / "nowhere" / "control") == ""
+        assert (
+            find_trust_problem(shared / "link" / "control")
+            == f"{shared / 'link'} is a symbolic link"
+        )
+        assert find_trust_problem(shared / "nowhere" / "control") == ""
 
 
 def test_a_fishd_of_the_same_user_is_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from fishd.assembly import state_folder
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import Refused
 from fishd.core.protocol import (
-    FRESH,
+    MAX_SAMPLE_AGE_S,
     CalibrateForce,
     CalibrateServo,
     NoArguments,
@@ -172,7 +172,7 @@ def test_samples_that_are_under_way_end_as_soon_as_a_controller_starts(rig: Lock
 def test_a_sample_is_good_for_a_tare_only_while_it_is_fresh(rig: LockstepRig) -> None:
     asked = subject(rig)
     (sample,) = perform(rig, asked, ("sample-force", BRIEFLY))
-    rig.run_for(FRESH + 1.0)
+    rig.run_for(MAX_SAMPLE_AGE_S + 1.0)
     for number in (sample.number, sample.number + 1, 0):
         with pytest.raises(Refused, match=f"no sample {number} of the last 10 s") as refusal:
             perform(rig, asked, ("tare", Tare(number)))

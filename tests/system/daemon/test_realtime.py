@@ -12,7 +12,7 @@ from fishd.core.process import realtime
 
 granted = realtime.enter(1, lock_memory=False)
 os.setuid(65534)  # as in the service: a user without capabilities
-realtime.leave()
+realtime.drop_priority()
 print(granted, os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER)
 """
 
@@ -55,7 +55,7 @@ def test_a_limit_that_leaves_nothing_above_the_loop_is_one_warning_with_the_righ
 
     granted: list[int] = []
     monkeypatch.setattr(os, "sched_setscheduler", schedule)
-    realtime.outrank(7, priority)
+    realtime.raise_priority(7, priority)
     lines = [record.getMessage() for record in caplog.records]
     if not remedy:
         assert (granted, lines) == ([51], [])

@@ -15,7 +15,7 @@ from fishd.assembly import state_folder
 from fishd.controllers import registry
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import Refused
-from fishd.core.protocol import LEASE
+from fishd.core.protocol import DEFAULT_LEASE_S
 from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.requests import Operations
 from fishd.hardware.calibration_files import CalibrationFolder
@@ -148,14 +148,14 @@ def test_a_lease_that_nobody_renews_ends_at_neutral_with_the_calibration_of_befo
 def test_a_lease_lasts_as_long_as_it_is_renewed_or_changed(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         lease = await client.begin_trial(WIDE)
-        rig.run_for(0.5 * LEASE)
+        rig.run_for(0.5 * DEFAULT_LEASE_S)
         await client.ask("renew-lease", lease=lease)
-        rig.run_for(0.5 * LEASE)
+        rig.run_for(0.5 * DEFAULT_LEASE_S)
         await client.calibrate(WIDE, lease=lease)
-        rig.run_for(0.5 * LEASE)
+        rig.run_for(0.5 * DEFAULT_LEASE_S)
         await watched()
         assert (await client.ask("calibrations")).on_trial
-        rig.run_for(LEASE)
+        rig.run_for(DEFAULT_LEASE_S)
         await watched()
         assert not (await client.ask("calibrations")).on_trial
         for op in ("renew-lease", "end-lease"):
@@ -256,7 +256,7 @@ def test_only_who_has_the_lease_changes_or_saves_a_servo_calibration(rig: Lockst
             assert refusal.value.code == "no-lease"
         saved = await client.calibrate(WIDE, save=True, lease=lease)
         assert (saved.on_trial, saved.servo.trim) == (False, 30.0)
-        rig.run_for(LEASE + 1.0)
+        rig.run_for(DEFAULT_LEASE_S + 1.0)
         await watched()
         found = await client.ask("calibrations")
         assert (found.servo, found.servo_file) == (saved.servo, saved.servo_file)

@@ -34,7 +34,7 @@ from fishd.core.process.shutdown import Shutdown, leave
 
 shutdown = Shutdown()
 asked = threading.Event()
-shutdown.when_asked(asked.set)
+shutdown.call_when_requested(asked.set)
 shutdown.release = lambda: (print("released", flush=True), {release})
 logging.basicConfig(format="%(message)s", stream=sys.stdout)
 shutdown.last_words = sys.stdout.flush
@@ -45,7 +45,7 @@ asked.wait()
 leave(7)
 """
 LIMIT = 3.0
-UNHURRIED = "module._WORDS = 10.0"
+UNHURRIED = "module._MESSAGE_TIMEOUT_S = 10.0"
 """For what the last resort says, and not how soon: what has come to its end is not waited for."""
 
 
@@ -98,7 +98,7 @@ def test_a_process_that_hangs_lets_go_of_the_servo_and_ends() -> None:
         "threading.Lock().acquire(); import os; os.read(os.pipe()[0], 1)",
         "signal = __import__('signal'); signal.signal(15, lambda *_: None); time.sleep(60)",
     ]
-    limits = f"{UNHURRIED}; module._RELEASE = 10.0"
+    limits = f"{UNHURRIED}; module._RELEASE_TIMEOUT_S = 10.0"
     for status, output in ends(*({"hang": hang, "limits": limits} for hang in hangs)):
         assert (status, output.partition("\n")[0]) == (1, "released")
         said = r"fishd hangs in .+: the servo is released and the process is ended"

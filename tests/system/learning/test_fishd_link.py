@@ -303,7 +303,7 @@ def test_a_closed_link_says_so(link: FishdLink) -> None:
 
 
 def test_an_address_that_no_agent_can_have_is_refused(daemon: Daemon) -> None:
-    with pytest.raises(FishError, match="99999 is no port"):
+    with pytest.raises(FishError, match="99999 is not a port"):
         FishdLink(daemon.endpoint, address="tcp://127.0.0.1:99999")
 
 

@@ -96,12 +96,16 @@ def test_an_address_in_use_is_said_in_one_line(replay: Replay, tmp_path: Path) -
 def test_a_replay_leaves_the_telemetry_of_a_fishd_alone(tmp_path: Path) -> None:
     run = recorded(swum(0.2), tmp_path / "run")
     address = f"ipc://{tmp_path}/telemetry"
-    with addresses.claimed(address), zmq.Context() as context, context.socket(zmq.PUB) as publisher:
+    with (
+        addresses.claim_address(address),
+        zmq.Context() as context,
+        context.socket(zmq.PUB) as publisher,
+    ):
         publisher.bind(address)
         words = ("--address", address, "--control", f"ipc://{tmp_path}/control")
         refused = fishctl("replay", str(run), *words)
         assert f"already serves {address}" in one_line(refused)
-        assert unix_sockets.listener(tmp_path / "telemetry")
+        assert unix_sockets.find_listener(tmp_path / "telemetry")
 
 
 def test_a_replay_names_the_command_that_shows_it_and_not_the_live_fish(

@@ -12,7 +12,7 @@ from fishd.camera.clock_offset import (
     ClockOffset,
     Reading,
 )
-from fishd.core.clock import boot_id
+from fishd.core.clock import read_boot_id
 from fishd.core.errors import NoDaemon
 
 AHEAD = 1234.5
@@ -54,7 +54,7 @@ def test_on_one_machine_it_is_exactly_zero_and_asked_once() -> None:
 
     def ask(_: float | None) -> Reading:
         asked.append(1)
-        return Reading(123.0, boot_id())
+        return Reading(123.0, read_boot_id())
 
     clock = ClockOffset(ask)
     assert [clock.update() for _ in range(3)] == [NO_OFFSET] * 3

@@ -187,7 +187,10 @@ telemetry: {address: localhost}
         (BOMB, "fish.yaml:1: more than 2000 values and keys, each alias counted as all that it"),
         ("a: [" + "x, " * 3000 + "]", "fish.yaml:1: more than 2000 values and keys"),
         ("# " + "x" * 70000, "fish.yaml: is longer than 64 kB, far more than a configuration"),
-        ("a: " + "1" * 200, "fish.yaml:1: a: a number of 200 letters"),
+        (
+            "a: " + "1" * 200,
+            "fish.yaml:1: a: a number of 200 characters; at most 100 are permitted",
+        ),
     ],
 )
 def test_a_bad_file_gets_a_line_with_a_remedy(text: str, message: str, tmp_path: Path) -> None:

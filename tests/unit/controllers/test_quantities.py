@@ -10,7 +10,7 @@ from rigs.harness import Rig, Scripted
 
 from fishd.controllers import quantity, registry
 from fishd.controllers.base import Controller
-from fishd.core.dataframes import frame
+from fishd.core.dataframes import ticks_to_frame
 from fishd.core.signals import Observation
 
 
@@ -33,7 +33,7 @@ def test_every_tick_shows_the_speeds_that_swing_reverses_by() -> None:
     ticks = rig.run(100)
     assert all(set(tick.quantities) == {"top_speed", "reversal_speed", "since_reversal"}
                for tick in ticks)  # fmt: skip
-    table = frame(ticks)
+    table = ticks_to_frame(ticks)
     assert list(table["quantities.reversal_speed"]) == list(0.5 * table["quantities.top_speed"])
     top = table["quantities.top_speed"]
     assert top[40:].min() > 0.5 * top[40:].max()

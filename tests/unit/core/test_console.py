@@ -38,7 +38,7 @@ def test_a_command_that_is_interrupted_says_so(end: Run, error: BaseException) -
     ("error", "words"),
     [
         (OSError(errno.ENOSPC, "No space left on device", "track.csv"), "track.csv: No space"),
-        (MemoryError(), "there is not enough memory"),
+        (MemoryError(), "not enough memory"),
         (OSError(errno.ENOENT, "No such file or directory"), "the working folder was deleted; "),
         (OSError(errno.EMFILE, "Too many open files"), "Too many open files"),
     ],

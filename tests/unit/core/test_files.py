@@ -163,8 +163,8 @@ def test_a_new_file_replaces_none_and_has_the_usual_permissions(tmp_path: Path) 
 
 @pytest.mark.parametrize("path", ["~nobody-here/file", "~nobody\0here", "file/~root", ""])
 def test_a_home_that_nobody_has_leaves_a_path_as_it_is(path: str) -> None:
-    assert files.expanded(path) == Path(path)
-    assert files.expanded("~root/file").is_absolute()
+    assert files.expand_user(path) == Path(path)
+    assert files.expand_user("~root/file").is_absolute()
 
 
 def test_a_name_may_be_as_long_as_the_file_system_permits(tmp_path: Path) -> None:
@@ -177,7 +177,7 @@ def test_a_name_may_be_as_long_as_the_file_system_permits(tmp_path: Path) -> Non
     ("name", "complaint"),
     [
         ("x" * 256, "cannot be written: File name too long"),
-        ("none/file", "there is no folder to put it into"),
+        ("none/file", "its folder does not exist; create it"),
         ("file/file", "cannot be written: Not a directory"),
         ("link", "is a device; a regular file is needed"),
         ("a\0b", "cannot be written: a name has no zero byte"),

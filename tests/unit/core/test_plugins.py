@@ -60,7 +60,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
         ("keys", r"^no gadget is named 'keys'; did you mean 'key'\?$"),
         (
             "text",
-            rf"^gadget 'text' \(string:digits in fishd\) is no subclass of {__name__}.Gadget$",
+            rf"^gadget 'text' \(string:digits in fishd\) is not a subclass of {__name__}.Gadget$",
         ),
         (
             "shapeless",

@@ -56,7 +56,7 @@ def test_a_request_arrives_as_sent(op: str, identity: int | str, args: dict[str,
 
 
 def test_another_version_is_refused_by_name() -> None:
-    with pytest.raises(Refused, match="version 2 is not spoken here; this is 1") as caught:
+    with pytest.raises(Refused, match="version 2 is not supported; use version 1") as caught:
         protocol.decode_request(b'{"v":2,"op":"status"}')
     assert caught.value.code == "version"
 

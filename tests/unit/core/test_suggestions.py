@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 
 from fishd.config import Config, keys
-from fishd.core.schema import LONGEST_WORD, Problem, convert, nearest
+from fishd.core.schema import MAX_SUGGESTION_CHARACTERS, Problem, convert, suggest
 
 POLICIES = [f"policy-{number:04d}-swim" for number in range(500)]
 KEYS = keys()
@@ -33,20 +33,20 @@ def fastest(function: Callable[[], object]) -> float:
     ids=["64 kB", "500 names"],
 )
 def test_a_suggestion_is_quick(word: str, words: list[str], limit: int) -> None:
-    assert cost(lambda: nearest(word, words)) < limit
+    assert cost(lambda: suggest(word, words)) < limit
 
 
 def test_the_nearest_of_many_is_found() -> None:
-    assert nearest("policy-0123-swum", POLICIES) == "did you mean 'policy-0123-swim'?"
-    assert nearest("servo.gpoi", KEYS) == "did you mean 'servo.gpio'?"
+    assert suggest("policy-0123-swum", POLICIES) == "did you mean 'policy-0123-swim'?"
+    assert suggest("servo.gpoi", KEYS) == "did you mean 'servo.gpio'?"
     for known in KEYS:
         swapped = known[:-2] + known[-1] + known[-2]
-        assert nearest(swapped, KEYS).startswith("did you mean"), swapped
+        assert suggest(swapped, KEYS).startswith("did you mean"), swapped
 
 
 def test_a_word_that_is_too_long_to_be_meant_gets_no_suggestion() -> None:
-    known = "x" * (LONGEST_WORD + 1)
-    assert nearest(known + "y", [known]).startswith("valid: ")
+    known = "x" * (MAX_SUGGESTION_CHARACTERS + 1)
+    assert suggest(known + "y", [known]).startswith("valid: ")
 
 
 @pytest.mark.parametrize("value", ["x" * 60_000, {"a": ["b"] * 20_000}, 10**4000])

@@ -14,8 +14,8 @@ anything = st.text(st.characters(codec=None, exclude_categories=()), max_size=30
 def test_a_line_is_printable_encodable_and_short(odd: str) -> None:
     line = text.line(odd)
     assert line.isprintable()
-    assert len(line.encode()) <= 4 * text.LONGEST
-    assert len(line) <= text.LONGEST
+    assert len(line.encode()) <= 4 * text.MAX_LINE_CHARACTERS
+    assert len(line) <= text.MAX_LINE_CHARACTERS
 
 
 @given(anything)
@@ -41,7 +41,7 @@ def test_what_is_odd_becomes_a_question_mark_and_the_rest_stays(odd: str, plain:
 
 def test_a_long_text_keeps_its_beginning_and_its_end() -> None:
     line = text.line("begin" + "x" * 5_000_000 + "end")
-    assert len(line) == text.LONGEST
+    assert len(line) == text.MAX_LINE_CHARACTERS
     assert line.startswith("begin")
     assert line.endswith("end")
     assert "…" in line
@@ -59,12 +59,12 @@ class Mute(Exception):
         (KeyboardInterrupt(), "KeyboardInterrupt"),
         (Refused("busy", "try again"), "try again"),
         (Escaped("SystemExit: 3"), "SystemExit: 3"),
-        (Mute(), "Mute: (its text cannot be had: SystemExit)"),
+        (Mute(), "Mute: (no text: its __str__ raised SystemExit)"),
         (RuntimeError("\udcff"), "RuntimeError: ?"),
     ],
 )
 def test_an_exception_is_named_whatever_it_is(error: BaseException, line: str) -> None:
-    assert text.named(error) == line
+    assert text.describe_error(error) == line
 
 
 @pytest.mark.parametrize(

@@ -211,7 +211,7 @@ def test_a_save_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 def test_volts_count_as_newtons_until_a_matrix_was_found_whatever_was_tared() -> None:
-    assert ForceCalibration().untouched
-    assert ForceCalibration(x0=0.1, tared="2026-11-21", date="2026-11-21").untouched
-    assert not ForceCalibration(loads=5).untouched
-    assert not ForceCalibration(xx=2.0).untouched
+    assert ForceCalibration().is_unset
+    assert ForceCalibration(x0=0.1, tared="2026-11-21", date="2026-11-21").is_unset
+    assert not ForceCalibration(loads=5).is_unset
+    assert not ForceCalibration(xx=2.0).is_unset

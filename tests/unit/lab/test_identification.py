@@ -11,7 +11,7 @@ from msgspec.structs import asdict
 from rigs.harness import Rig
 
 from fishd.config import load
-from fishd.core.dataframes import frame
+from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
 from fishd.lab.identification import (
     DEFAULT,
@@ -155,7 +155,9 @@ def test_a_fish_of_another_kind_is_not_identified_and_the_first_line_says_so(
 def test_delay_and_backlash_are_known_to_10_percent_at_best_where_they_are() -> None:
     with VirtualSession(load(None, [*RIG_OVERRIDES, "simulation.noise=0.01"])) as rig:
         ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
-    identification = identify(frame(ticks), start=FISH, fit=("servo_delay", "backlash", "rotation"))
+    identification = identify(
+        ticks_to_frame(ticks), start=FISH, fit=("servo_delay", "backlash", "rotation")
+    )
     remark = next(
         each for each in identification.remarks if each.startswith("known to 10 % at best")
     )
@@ -256,7 +258,7 @@ def test_slots_that_were_skipped_are_part_of_a_longer_window() -> None:
     for _ in range(30):
         rig.run(1, missed=3)
         rig.run(29)
-    identification = identify(frame(rig.recorder.ticks), start=FISH, fit=NEARLY_KNOWN)
+    identification = identify(ticks_to_frame(rig.recorder.ticks), start=FISH, fit=NEARLY_KNOWN)
     assert identification.passages == 1
     assert identification.seconds == pytest.approx(30 * 33 * TICK, abs=0.2)
     assert identification["omega0"].value == pytest.approx(11.0, rel=0.01)
@@ -315,7 +317,7 @@ def test_data_that_cannot_tell_say_so() -> None:
     with VirtualSession(load(None, ["simulation.noise=0.003"])) as rig:
         ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
     identification = identify(
-        frame(ticks), fit=("xi", "coupling", "thrust_coefficient", "lateral_drag")
+        ticks_to_frame(ticks), fit=("xi", "coupling", "thrust_coefficient", "lateral_drag")
     )
     assert any("known to 10 % at best" in remark for remark in identification.remarks)
 

@@ -182,10 +182,10 @@ def test_the_socket_file_of_a_dead_virtual_pi_is_taken_over(path: Path) -> None:
 def test_a_path_that_is_no_good_is_one_line(tmp_path: Path) -> None:
     file = tmp_path / "notes"
     file.write_text("mine")
-    with pytest.raises(StartupError, match="notes is there already and is no socket"):
+    with pytest.raises(StartupError, match="notes exists and is not a socket"):
         LinkServer(virtual_pi(), file).start()
     assert file.read_text() == "mine"
-    with pytest.raises(StartupError, match="cannot be made: No such file or directory"):
+    with pytest.raises(StartupError, match="cannot be created: No such file or directory"):
         LinkServer(virtual_pi(), tmp_path / "nowhere" / "pi").start()
     with pytest.raises(StartupError, match="too long"):
         LinkServer(virtual_pi(), tmp_path / ("x" * 150)).start()

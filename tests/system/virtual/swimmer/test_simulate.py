@@ -214,7 +214,7 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
     [
         (("--save", "track.txt"), "track.txt: a name that ends in .csv or .npz is needed"),
         (("--save", "no-such/track.csv"), "there is no folder no-such"),
-        (("--checkpoint", "no-such/kept"), "no-such/kept: there is no folder to put it into"),
+        (("--checkpoint", "no-such/kept"), "no-such/kept: its folder does not exist; create it"),
         (("--seconds", "2", "--settle", "3"), "nothing is left to judge"),
         (("--checkpoint", "/dev/null"), "/dev/null: is a device; a regular file is needed"),
         (("--checkpoint", "kept.npz", "--save", "kept.npz"), "--save need different files"),
