@@ -177,7 +177,10 @@ def _convert(section: str, data: Any, elsewhere: Callable[[], list[str]]) -> Any
             return None
         data = {}
     if not isinstance(data, Mapping):
-        what = f"{format_excerpt(data)} is not valid: a section (a mapping of keys to values) is needed"
+        what = (
+            f"{format_excerpt(data)} is not valid: a section (a mapping of keys to values) is "
+            "needed"
+        )
         raise Problem((section,), what)
     name = data.get(key, default) or None
     if not isinstance(name, str):

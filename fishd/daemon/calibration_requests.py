@@ -134,7 +134,8 @@ class CalibrationRequests:
         if request.sample not in self._samples:
             raise Refused(
                 "no-samples",
-                f"sample {request.sample} does not exist or is older than {MAX_SAMPLE_AGE_S:g} s; take "
+                f"sample {request.sample} does not exist or is older than {MAX_SAMPLE_AGE_S:g} s; "
+                "take "
                 "another one with sample-force",
             )
         _, sample = self._samples[request.sample]

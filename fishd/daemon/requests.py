@@ -346,7 +346,8 @@ def _create_newly_installed(name: str, create: Callable[[], Controller[Any]]) ->
             name in registry.names()
         ):  # its package cannot be imported, for example from a new folder
             raise UnknownController(
-                f"{text.error_message(error)}; it was installed after fishd had started: restart fishd"
+                f"{text.error_message(error)}; it was installed after fishd had started: restart "
+                "fishd"
             ) from error
         raise
 
