@@ -4,7 +4,7 @@ import os
 import sys
 
 
-def _leave_working_directory_out() -> None:
+def _exclude_working_directory() -> None:
     """Import nothing from the working directory from now on, in this process or its children.
 
     `python -m fishd` puts that folder first. Only `python -P -m fishd` also protects the modules
@@ -19,7 +19,7 @@ def _leave_working_directory_out() -> None:
         del sys.path[0]
 
 
-_leave_working_directory_out()
+_exclude_working_directory()
 try:
     import gc
     import signal

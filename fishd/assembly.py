@@ -295,7 +295,7 @@ def assemble(
     if threaded:
         _await_first_sample(sensor.read, clock)
 
-    if permitted := pulses.cut(settings, config.amplitude_limit):
+    if permitted := pulses.format_reach(settings, config.amplitude_limit):
         log.info("servo.lowest and servo.highest permit %s, amplitude_limit", permitted)
     if line := _calibration_warning(config, servo):
         log.warning("%s", line)
@@ -380,7 +380,7 @@ def open_sensor(
 
 def _calibration_warning(config: Config, servo: CalibratedServo) -> str:
     """Return a line if the calibration of the servo does not permit ±Φ; empty if it does."""
-    permitted = servo.cut(config.amplitude_limit)
+    permitted = servo.format_reach(config.amplitude_limit)
     if not permitted or servo.calibration == config.servo.calibration:
         return ""
     return (

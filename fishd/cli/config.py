@@ -103,7 +103,7 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
         sys.exit(os.EX_CONFIG)
     loaded = load(file, overrides)
     echo(f"{file}: good")
-    permitted = pulses.cut(loaded.servo, loaded.amplitude_limit)
+    permitted = pulses.format_reach(loaded.servo, loaded.amplitude_limit)
     if permitted and loaded.has_hardware:
         echo(f"servo.lowest and servo.highest permit {permitted}, amplitude_limit")
 

@@ -84,4 +84,4 @@ def _end_pulses(no_answer: NoDaemon, path: Path | None, file: Path | None) -> st
             )
     except (StartupError, ImportError, OSError) as error:
         raise click.ClickException(f"{error}; {release_recipe.NOT_RELEASED}") from None
-    return release_recipe.outcome(result)
+    return release_recipe.describe_outcome(result)

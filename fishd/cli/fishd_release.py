@@ -52,7 +52,7 @@ def _release(recipe: dict[str, Any]) -> int:
             print(f"fishctl: {error}; {release_recipe.NOT_RELEASED}", file=sys.stderr)
         return 1
     with suppress(OSError):
-        print(prefix + release_recipe.outcome(done))
+        print(prefix + release_recipe.describe_outcome(done))
     return 0
 
 

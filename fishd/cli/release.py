@@ -17,7 +17,7 @@ from fishd.core import text
 from fishd.core.addresses import find_control_address
 from fishd.core.errors import ConfigError, FishError, NoDaemon, ServoError, StartupError
 from fishd.core.process.interruption import SIGNALS, handle_signals
-from fishd.hardware.release_recipe import NOT_RELEASED, outcome
+from fishd.hardware.release_recipe import NOT_RELEASED, describe_outcome
 
 _NO_FOLDER = "/proc/self/no-calibrations"
 """Folder that cannot exist, which stands for a machine without calibrations."""
@@ -89,7 +89,7 @@ def _release(config: Config) -> str:
             driver_pid = _find_driver(config)
             if driver_pid and (summary := _stop_fishd(config, driver_pid)):
                 return summary
-            done = outcome(_end_pulses(config))
+            done = describe_outcome(_end_pulses(config))
     except ServoError as error:
         raise ServoError(f"{error}; {NOT_RELEASED}") from None
     if not driver_pid:
@@ -103,10 +103,10 @@ def _release(config: Config) -> str:
 def _find_driver(config: Config) -> str:
     """Return the pid of a fishd that drives this servo; empty if there is none."""
     from fishd.assembly import parts_of
-    from fishd.hardware.ownership import owner_pid
+    from fishd.hardware.ownership import find_owner_pid
 
     with suppress(StartupError):  # invalid place of a virtual Pi: the release reports it
-        return owner_pid(parts_of(config))
+        return find_owner_pid(parts_of(config))
     return ""
 
 

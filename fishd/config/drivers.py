@@ -75,7 +75,7 @@ def convert_sections(
     return {name: _convert(name, data.get(name), elsewhere) for name in CHOICES}
 
 
-def driver_of(section: str, name: str) -> type[Any]:
+def find_driver(section: str, name: str) -> type[Any]:
     """Return the driver or plant of that name; raise `Problem`, which lists those installed."""
     plugins, key = CHOICES[section].plugins, CHOICES[section].key
     if not plugins.has(name):
@@ -120,7 +120,7 @@ def check_drivers(robot: str, tick: float, driver_settings: DriverSettings) -> N
     if robot in ("simulated", "swimmer"):  # their loop may be faster than the hardware permits
         tick = math.inf
     for section, settings in driver_settings.sections().items():
-        driver: type[Driver[Any]] = driver_of(section, settings.driver)
+        driver: type[Driver[Any]] = find_driver(section, settings.driver)
         if robot == "virtual-pi" and not driver.on_virtual_pi:
             raise Problem(
                 (section, "driver"),
@@ -134,7 +134,7 @@ def check_plant(plant: PlantParameters) -> None:
     """Check the parameters of a plant of another package with that plant."""
     if plant.model == TETHERED:
         return
-    _check("plant", plant.model, partial(driver_of("plant", plant.model).check, plant))
+    _check("plant", plant.model, partial(find_driver("plant", plant.model).check, plant))
     try:
         hash(plant)
     except TypeError:
@@ -156,7 +156,7 @@ def _check(section: str, name: str, check: Callable[[], None]) -> None:
 def claims_of(driver_settings: DriverSettings) -> dict[str, tuple[Claim, ...]]:
     """Return the claims of the drivers, by section."""
     return {
-        section: driver_of(section, settings.driver).claims(settings)
+        section: find_driver(section, settings.driver).claims(settings)
         for section, settings in driver_settings.sections().items()
     }
 
@@ -166,7 +166,7 @@ def _settings(section: str, name: str) -> type[Struct]:
     choice = CHOICES[section]
     if name == choice.default:  # do not load the default for this: plants import numpy
         return choice.settings
-    settings: type[Struct] = driver_of(section, name).Settings
+    settings: type[Struct] = find_driver(section, name).Settings
     return settings
 
 
@@ -191,8 +191,8 @@ def _convert(section: str, data: Any, elsewhere: Callable[[], list[str]]) -> Any
     except UnknownKey as problem:
         unknown = problem.path[-1]
         names = [
-            other
-            for other, struct in settings_of_drivers(section).items()
+            driver
+            for driver, struct in settings_of_drivers(section).items()
             if any(field.name == unknown for field in fields_of(struct))
         ]
         if not names:

@@ -35,12 +35,12 @@ def find(path: str | os.PathLike[str], overrides: Iterable[str] = ()) -> list[st
             sources |= apply_overrides(data, [override])
         except ConfigError as error:
             mistakes.append(str(error))
-    problems = _Repair(data).problems
+    problems = _MistakeSearch(data).problems
     mistakes += [problem.message_with_place(sources) for problem in problems]
     return sorted(mistakes, key=_line)[:MAX_MISTAKES]
 
 
-class _Repair:
+class _MistakeSearch:
     """Configuration whose mistakes are collected and left out."""
 
     def __init__(self, data: dict[str, Any]) -> None:

@@ -83,9 +83,9 @@ class CalibrationRequests:
 
     async def _calibrations(self, _: NoArguments) -> Calibrations:
         calibrated_parts(self._loop)
-        return self._used()
+        return self._current_calibrations()
 
-    def _used(self) -> Calibrations:
+    def _current_calibrations(self) -> Calibrations:
         robot = self._loop.robot
         return Calibrations(
             force=robot.tared.calibration if robot.tared else ForceCalibration(),
@@ -163,7 +163,7 @@ class CalibrationRequests:
                     f"{self._sensor.tare_limit:g} N; something pushes the fish, or the sensor "
                     "needs 'fishctl calibrate force'",
                 )
-            date = self._date().isoformat(timespec="seconds")
+            date = self._now().isoformat(timespec="seconds")
             return await self._adopt_force(
                 msgspec.structs.replace(before, x0=before.x0 - fx, y0=before.y0 - fy, tared=date)
             )
@@ -202,7 +202,7 @@ class CalibrationRequests:
         # Apply it in any case, since the next start will use the newest file.
         sensor.recalibrate(calibration)
         self._loop.forget_force(scale=_matrix(before) != _matrix(calibration))
-        return self._used()
+        return self._current_calibrations()
 
     async def _calibrate_servo(self, request: CalibrateServo) -> Calibrations:
         async with self._changing:
@@ -222,13 +222,13 @@ class CalibrationRequests:
             else:
                 assert request.lease
                 self._servo.try_out(calibration, request.lease)
-            return self._used()
+            return self._current_calibrations()
 
     async def _save(self, calibration: C) -> tuple[C, Path]:
         try:
             return await self._calls.call(
                 "the calibration has not been written",
-                partial(self._folder.save, calibration, self._date()),
+                partial(self._folder.save, calibration, self._now()),
                 late=lambda saved: saved[1].unlink(),  # the next start must not use it
                 interrupt=False,  # an interrupt could leave a file whose path is not returned
             )
@@ -243,7 +243,7 @@ class CalibrationRequests:
         newest = self._folder.newest(kind) if self._loop.robot.calibrated else None
         return str(newest[1]) if newest else None
 
-    def _date(self) -> datetime.datetime:
+    def _now(self) -> datetime.datetime:
         return datetime.datetime.fromtimestamp(self._clock.wall()).astimezone()
 
     def _announce(self, what: str, path: Path) -> None:

@@ -183,7 +183,7 @@ class Operations:
         self._calibrations.check_startable(request.name, request.lease)
         self._renew(request.lease)
         self._calls.check_busy()
-        arrival = self._arrive()
+        arrival = self._next_arrival()
         controller = await self._load(request)
         if arrival < self._carried_out:  # a slow request must not undo a newer one
             self._dispose(controller)
@@ -239,7 +239,7 @@ class Operations:
 
     async def _end_lease(self, request: protocol.HeldLease) -> State:
         self._loop.lease.renew(request.lease)
-        self._carried_out = self._arrive()
+        self._carried_out = self._next_arrival()
         former = self._loop.lease.end(RETURN_REASON)
         if self._loop.lease.drives:
             self._loop.stop()
@@ -275,12 +275,12 @@ class Operations:
                 "start one with 'fishctl set-controller'",
             )
         try:
-            loop.active.retune(call_foreign(self._retuned, request.parameters))
+            loop.active.retune(call_foreign(self._merge_parameters, request.parameters))
         except Exception as error:
             raise _refusal(loop.active.name, "refused", error) from error
         return self._state()
 
-    def _retuned(self, values: dict[str, Any]) -> Struct:
+    def _merge_parameters(self, values: dict[str, Any]) -> Struct:
         loop = self._loop
         for field in fields_of(loop.active.controller.Parameters):
             if field.file and field.name in values:  # a tick must not wait for a file
@@ -293,18 +293,18 @@ class Operations:
 
     async def _stop(self, request: protocol.Stop) -> State:
         self._renew(request.lease)
-        self._carried_out = self._arrive()
+        self._carried_out = self._next_arrival()
         former = self._end_unless(request.lease, "the fish was stopped by hand")
         self._loop.stop()
         return self._state(former)
 
     async def _estop(self, request: protocol.Estop) -> State:
-        self._carried_out = self._arrive()
+        self._carried_out = self._next_arrival()
         self._loop.estop(request.message)
         return self._state()
 
     async def _clear_fault(self, _: protocol.NoArguments) -> State:
-        self._carried_out = self._arrive()
+        self._carried_out = self._next_arrival()
         self._loop.clear_fault()
         return self._state()
 
@@ -320,7 +320,7 @@ class Operations:
         """Close a controller that was never active, in a thread."""
         self._calls.dispose(partial(_close, controller))
 
-    def _arrive(self) -> int:
+    def _next_arrival(self) -> int:
         """Return a number for a request that chooses the controller."""
         self._arrivals += 1
         return self._arrivals

@@ -91,7 +91,7 @@ def skipped(message: str) -> Result:
     return Result("skipped", message)
 
 
-def name_of(uid: int) -> str:
+def user_name(uid: int) -> str:
     """Return the name of a user, or `#` and the number of a user without a name."""
     import pwd
 

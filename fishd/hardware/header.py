@@ -15,7 +15,7 @@ _PROVIDERS = ("RPi.GPIO", "rpi-lgpio")
 _EXTRAS = "fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio] (Pi 4 and older)"
 
 
-def installed() -> list[str]:
+def installed_packages() -> list[str]:
     """Return which of the two packages are installed; exactly one should be."""
     from importlib import metadata  # takes long to load, and only a Pi needs it
 
@@ -32,7 +32,7 @@ def load() -> Any:
 
     Imported only here, because the import fails on any machine that is not a Raspberry Pi.
     """
-    if len(installed()) > 1:
+    if len(installed_packages()) > 1:
         raise StartupError(
             "RPi.GPIO and rpi-lgpio are both installed and overwrite each other: "
             f"uninstall both, then install {_EXTRAS}"
@@ -50,12 +50,14 @@ def load() -> Any:
             "start fishd in a folder that it may write to"
         ) from None
     except Exception as error:  # RuntimeError, NotImplementedError: not a Pi
-        raise StartupError(f"the pins of the header cannot be used: {one_line(error)}") from None
+        raise StartupError(
+            f"the pins of the header cannot be used: {format_error(error)}"
+        ) from None
     try:
         GPIO.setmode(GPIO.BCM)
     except Exception as error:  # lgpio.error is a bare Exception
         raise StartupError(
-            f"the pins of the header cannot be used: {one_line(error)}; "
+            f"the pins of the header cannot be used: {format_error(error)}; "
             "add the user of fishd to group gpio"
         ) from None
     return GPIO
@@ -74,6 +76,6 @@ def claim(gpio_module: Any, gpio: int, direction: int, **options: int) -> None:
         log.info("GPIO %d: %s", gpio, warning.message)
 
 
-def one_line(error: Exception) -> str:
+def format_error(error: Exception) -> str:
     """Return the text of an error in one line; lgpio puts it in quotes."""
     return " ".join(str(error).strip("'").split()).rstrip(".!") or type(error).__name__

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from fishd.hardware.checks import Check, Machine, Result, fail, name_of, ok, skipped, warning
+from fishd.hardware.checks import Check, Machine, Result, fail, ok, skipped, user_name, warning
 from fishd.hardware.driver import Claim
 
 log = logging.getLogger(__name__)
@@ -144,7 +144,7 @@ def _bus(machine: Machine, number: int, section: str) -> Result:
         status = device.stat()
         if status.st_gid == 0 or not status.st_mode & stat.S_IWGRP:
             return fail(
-                f"/dev/i2c-{number} may be used by user {name_of(status.st_uid)} only",
+                f"/dev/i2c-{number} may be used by user {user_name(status.st_uid)} only",
                 "sudo make install-pi, then restart: its udev rule gives the bus to group i2c",
             )
         group = device.group()

@@ -90,7 +90,7 @@ def claim_parts(parts: Iterable[Part]) -> Iterator[None]:
         yield
 
 
-def owner(parts: Iterable[Part]) -> str:
+def describe_owner(parts: Iterable[Part]) -> str:
     """Return a line that names the fishd that drives one of these parts; empty if none is known."""
     for part in parts:
         if pid := find_lock_holder(part.path):
@@ -98,7 +98,7 @@ def owner(parts: Iterable[Part]) -> str:
     return ""
 
 
-def owner_pid(parts: Iterable[Part]) -> str:
+def find_owner_pid(parts: Iterable[Part]) -> str:
     """Return the pid of a fishd that drives one of these parts; empty if none is known."""
     return next(filter(None, (find_lock_holder(part.path) for part in parts)), "")
 

@@ -54,7 +54,7 @@ class RpiGpioPanel:
             down = self._is_down()
         except Exception as error:  # lgpio.error is a bare Exception
             raise OSError(
-                f"E-stop button on GPIO {self._settings.estop_gpio}: {header.one_line(error)}"
+                f"E-stop button on GPIO {self._settings.estop_gpio}: {header.format_error(error)}"
             ) from None
         with self._lock:
             if down:
@@ -90,7 +90,7 @@ class RpiGpioPanel:
                     header.claim(gpio, pin, gpio.IN, pull_up_down=gpio.PUD_UP)
         except Exception as error:
             raise StartupError(
-                f"GPIO {pin} cannot be used for the panel: {header.one_line(error)}"
+                f"GPIO {pin} cannot be used for the panel: {header.format_error(error)}"
             ) from None
         if settings.estop_gpio is not None:
             clock.sleep(0.001)  # the pull-up has to charge the wire first
@@ -106,14 +106,14 @@ class RpiGpioPanel:
                 "E-stop button on GPIO %d is polled only, once a tick: %s; "
                 "rpi-lgpio instead of RPi.GPIO would report it at once",
                 pin,
-                header.one_line(error),
+                header.format_error(error),
             )
 
     def _on_edge(self, pin: int) -> None:
         try:
             down = self._is_down()  # a short spike has already gone
         except Exception as error:
-            log.warning("E-stop button on GPIO %d: %s", pin, header.one_line(error))
+            log.warning("E-stop button on GPIO %d: %s", pin, header.format_error(error))
             return
         with self._lock:
             new = down and not self._pressed
@@ -148,14 +148,14 @@ class RpiGpioPanel:
             log.warning(
                 "the status light on GPIO %d stays dark: %s",
                 self._settings.led_gpio,
-                header.one_line(error),
+                header.format_error(error),
             )
 
     def _attempt(self, what: str, step: Callable[..., object], pin: int | None, *more: int) -> None:
         try:
             step(pin, *more)
         except Exception as error:
-            log.warning("cannot %s GPIO %s: %s", what, pin, header.one_line(error))
+            log.warning("cannot %s GPIO %s: %s", what, pin, header.format_error(error))
 
 
 def _nothing() -> None:

@@ -39,7 +39,7 @@ def carry_out(function: str, neutral: float, arguments: dict[str, Any]) -> bool:
         raise ServoError(f"{function}: {type(error).__name__}: {error}") from error
 
 
-def outcome(done: bool) -> str:
+def describe_outcome(done: bool) -> str:
     """Return a phrase that describes the result of a release."""
     return "pulses were on: neutral, then off" if done else "there were no pulses"
 

@@ -24,7 +24,7 @@ from fishd.hardware.force_sensor.calibration_fit import (
     check,
     fit,
     missing_loads,
-    worst,
+    worst_load,
 )
 
 T = TypeVar("T")
@@ -173,7 +173,7 @@ def _fit_loads(names: list[str], loads: list[Load], load_error: float) -> Fit:
     if residual > _POOR_RESIDUAL * largest:
         echo(
             f"warning: the residual is {residual / largest:.0%} of the largest load; look at "
-            f"{worst(fitted, names)} first",
+            f"{worst_load(fitted, names)} first",
             err=True,
         )
     return fitted

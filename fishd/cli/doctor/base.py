@@ -151,7 +151,7 @@ class Context(Machine):
     def owner(self) -> str:
         """Description of the fishd that drives a part of this robot, at any endpoint, or empty."""
         try:
-            return ownership.owner(assembly.parts_of(self.config))
+            return ownership.describe_owner(assembly.parts_of(self.config))
         except StartupError:  # invalid place of a virtual Pi; its check reports that
             return ""
 

@@ -11,7 +11,7 @@ from fishd.cli.doctor.base import Context
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import ConfigError
 from fishd.hardware.calibration_files import CalibrationFolder
-from fishd.hardware.checks import Check, Result, fail, name_of, ok, skipped, warning
+from fishd.hardware.checks import Check, Result, fail, ok, skipped, user_name, warning
 
 LOW_DISK_BYTES, FULL_DISK_BYTES = 1e9, 50e6
 """Free space below which there is a warning, and below which the check fails [bytes]."""
@@ -136,9 +136,9 @@ def _suggest_permission(context: Context, folder: Path) -> str:
     uid = folder.stat().st_uid
     if uid == os.geteuid():
         return f"chmod u+wx {folder}, or set state_folder"
-    if uid == 0 or name_of(uid) == "fishd":
+    if uid == 0 or user_name(uid) == "fishd":
         return f"run this as the user of fishd ({context.as_fishd}), or set state_folder"
-    user = name_of(uid)
+    user = user_name(uid)
     return (
         f"it belongs to user {user}: run fishd and this as {user} ({context.as_user(user)}), or "
         "set state_folder to a folder that you own"

@@ -75,7 +75,7 @@ def gpio_package(context: Context) -> Result | None:
         header.PACKAGE in plugins.find(settings.driver).packages
         for _, plugins, settings in context.drivers
     )
-    installed = header.installed()
+    installed = header.installed_packages()
     pip = f"{sys.executable} -m pip"
     if len(installed) > 1:
         right = "rpi-lgpio" if "Raspberry Pi 5" in context.model else "the one for this Pi"

@@ -160,11 +160,11 @@ def check(fitted: Fit, loads: Sequence[Load], names: Sequence[str]) -> None:
         raise PoorLoads(
             f"the voltages do not follow the loads: the residual is {residual / size:.0%} of them "
             f"(rms), and may be {MAX_RESIDUAL_FRACTION:.0%} at most; measure "
-            f"{worst(fitted, names)} again first"
+            f"{worst_load(fitted, names)} again first"
         )
 
 
-def worst(fitted: Fit, names: Sequence[str]) -> str:
+def worst_load(fitted: Fit, names: Sequence[str]) -> str:
     """Return the name of the load with the largest error."""
     sizes = [math.hypot(*error) for error in fitted.errors]
     return names[sizes.index(max(sizes))]

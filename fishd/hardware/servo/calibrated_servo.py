@@ -43,9 +43,9 @@ class CalibratedServo:
         """Lowest and highest angle [rad] that soft limits and pulse widths permit."""
         return pulses.reach(self._settings)
 
-    def cut(self, amplitude: float) -> str:
+    def format_reach(self, amplitude: float) -> str:
         """Return the part of ±Φ [rad] within `reach` as a text; empty if it is all of ±Φ."""
-        return pulses.cut(self._settings, amplitude)
+        return pulses.format_reach(self._settings, amplitude)
 
     def recalibrate(self, calibration: ServoCalibration) -> None:
         """Use another calibration from the next write on.

@@ -101,13 +101,13 @@ class PigpioLink:
         connection, except for late answers, up to two in a row.
         """
         limit = ANSWER_TIMEOUT_S if last else self._settings.timeout
-        outlook = "" if last else "; reconnecting"
+        suffix = "" if last else "; reconnecting"
         real_limit = self._real_limit(limit)
         deadline = time.monotonic() + real_limit
         if not self._lock.acquire(timeout=real_limit):
             raise ServoError(f"{self._where}: busy for more than {limit * 1e3:g} ms")
         try:
-            client = self._current(outlook)
+            client = self._current(suffix)
             client.within(deadline - time.monotonic())
             try:
                 yield client
@@ -125,13 +125,13 @@ class PigpioLink:
                 elif may_be_late:
                     return
                 else:
-                    outlook = "; waiting for it"
-                raise ServoError(f"{self._where}: {why}{outlook}") from None
+                    suffix = "; waiting for it"
+                raise ServoError(f"{self._where}: {why}{suffix}") from None
             except BaseException as error:
                 self._drop(client, describe_error(error, limit))
                 if not isinstance(error, COMMAND_ERRORS):
                     raise
-                raise ServoError(f"{self._where}: {self._reason}{outlook}") from None
+                raise ServoError(f"{self._where}: {self._reason}{suffix}") from None
         finally:
             self._lock.release()
 
@@ -152,7 +152,7 @@ class PigpioLink:
         """Return the wait in real time for a step with a time limit [s]."""
         return VIRTUAL_TIMEOUT_S if self._standstill else limit
 
-    def _current(self, outlook: str) -> Client:
+    def _current(self, suffix: str) -> Client:
         if self._closed.is_set():
             raise ServoError(f"{self._where}: closed")
         now = self._clock.monotonic()
@@ -160,7 +160,7 @@ class PigpioLink:
             self._next_attempt = now + VIRTUAL_PAUSE_S
             self._connect(ANSWER_TIMEOUT_S, 2.0 * ANSWER_TIMEOUT_S)
         if not self._client:
-            raise ServoError(f"{self._where}: not connected: {self._reason}{outlook}")
+            raise ServoError(f"{self._where}: not connected: {self._reason}{suffix}")
         return self._client
 
     def _drop(self, client: Client, why: str) -> None:
@@ -171,7 +171,7 @@ class PigpioLink:
 
     def _connect(self, limit: float, preparation: float) -> bool:
         client = None
-        allowed = limit
+        time_limit = limit
         try:
             client = self._opening = Client(
                 self._settings.host, self._settings.port, self._real_limit(limit), self._standstill
@@ -179,11 +179,11 @@ class PigpioLink:
             if self._closed.is_set():  # `close` may have run before `_opening` was set
                 raise ConnectionError("closed")
             client.get_pigpio_version()
-            allowed = preparation
+            time_limit = preparation
             client.within(self._real_limit(preparation))
             self._prepare(client)
         except BaseException as error:
-            self._reason = describe_error(error, allowed)
+            self._reason = describe_error(error, time_limit)
             if client:
                 client.close()
             if isinstance(error, Exception):  # the next attempt may succeed

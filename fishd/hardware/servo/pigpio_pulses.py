@@ -96,12 +96,12 @@ def remove(client: Client, scripts: list[int]) -> None:
     """Delete countdowns that are no longer needed."""
     for script in scripts:
         client.within(ANSWER_TIMEOUT_S)  # a script in its hold at neutral ends the hold first
-        with _may_be_gone():
+        with _ignore_missing_script():
             client.delete_script(script)
 
 
 @contextmanager
-def _may_be_gone() -> Iterator[None]:
+def _ignore_missing_script() -> Iterator[None]:
     """Ignore the error that another program, such as another fishd, deleted a script."""
     try:
         yield
@@ -173,7 +173,7 @@ def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool
         remove(client, scripts)
         scripts = [guard]
         client.within(ANSWER_TIMEOUT_S)
-        with _may_be_gone():
+        with _ignore_missing_script():
             client.update_script(guard, armed_parameters(gpio, _GUARD_COUNTS, OFF))
         # This also takes the pin from the PWM peripheral.
         client.set_servo_pulsewidth(gpio, round(neutral))

@@ -53,7 +53,7 @@ def pulse_reach(servo: "ServoSettings") -> tuple[float, float]:
     return lowest, highest
 
 
-def cut(servo: "ServoSettings", amplitude: float) -> str:
+def format_reach(servo: "ServoSettings", amplitude: float) -> str:
     """Return the part of ±Φ within `reach` as a text; empty if it is all of ±Φ.
 
     amplitude: Φ [rad]

@@ -119,7 +119,7 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
 
     def _failure(self, error: Exception) -> ServoError:
         self._usable = False
-        return ServoError(f"servo on GPIO {self.settings.gpio}: {header.one_line(error)}")
+        return ServoError(f"servo on GPIO {self.settings.gpio}: {header.format_error(error)}")
 
     def _release_pin(self) -> None:
         """Release this pin only: cleanup() without an argument releases all pins."""
@@ -145,5 +145,5 @@ def pull_low(neutral: float, *, gpio: int) -> bool:
         header.claim(module, gpio, module.OUT, initial=module.LOW)
         module.output(gpio, module.LOW)
     except Exception as error:  # lgpio.error is a bare Exception
-        raise ServoError(f"servo on GPIO {gpio}: {header.one_line(error)}") from None
+        raise ServoError(f"servo on GPIO {gpio}: {header.format_error(error)}") from None
     return False

@@ -162,7 +162,7 @@ def test_the_kernel_names_the_holder_of_a_lock_whatever_is_written_into_it(tmp_p
     part = ownership.Part(tmp_path / "fishd-bus", "/dev/i2c-7", "force_sensor.bus")
     with ownership.claim_parts([part]):
         lock_path(part.path).write_text("1\n")
-        assert ownership.owner_pid([part]) == str(os.getpid())
+        assert ownership.find_owner_pid([part]) == str(os.getpid())
 
 
 def test_one_virtual_pi_takes_one_fishd_by_any_name_of_its_socket_even_one_that_hangs(
@@ -207,7 +207,7 @@ def test_without_a_place_for_lock_files_fishd_says_so_and_starts(
     part = ownership.Part(tmp_path / "nowhere" / "bus", "/dev/i2c-7", "force_sensor.bus")
     with ownership.claim_parts([part]):
         assert "nothing keeps a second fishd from driving /dev/i2c-7" in caplog.text
-    assert ownership.owner([part]) == ""
+    assert ownership.describe_owner([part]) == ""
 
 
 def test_a_symbolic_link_is_not_followed(tmp_path: Path) -> None:
