@@ -121,7 +121,7 @@ def test_a_calibration_whose_lease_ends_while_it_is_saved_is_not_used_at_the_nex
 
 
 def taken_back(rig: LockstepRig) -> list[str]:
-    return [event.level for event in rig.recorder.events if "of before" in event.message]
+    return [event.level for event in rig.recorder.events if "previous calibration" in event.message]
 
 
 def test_a_lease_that_nobody_renews_ends_at_neutral_with_the_calibration_of_before(

@@ -480,7 +480,7 @@ def test_only_heartbeats_that_are_left_unanswered_count(answers: bool) -> None:
     lost = []
 
     class Peer(_Peer):
-        def _lost(self, why: str) -> None:
+        def _handle_loss(self, why: str) -> None:
             lost.append(why)
             self._drop_link()
 
