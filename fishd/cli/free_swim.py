@@ -90,8 +90,8 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
         print_json(outcome.report)
     elif outcome.report:
         echo_rows(_report_rows(outcome.report))
-    if outcome.trouble:
-        raise FishdError(f"{outcome.trouble}; {_describe_checkpoint(outcome, options)}")
+    if outcome.error:
+        raise FishdError(f"{outcome.error}; {_describe_checkpoint(outcome, options)}")
     if not outcome.complete:
         echo(f"fishctl: interrupted; {_describe_checkpoint(outcome, options)}", err=True)
         return INTERRUPTED
@@ -101,7 +101,7 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
     if report and report.reason:
         echo(f"fishctl: the run ended in mode {report.mode}: {report.reason.message}", err=True)
         return 1
-    return 1 if is_unsaved or outcome.lost else 0
+    return 1 if is_unsaved or outcome.checkpoint_error else 0
 
 
 @contextmanager
@@ -118,8 +118,11 @@ def _open_film(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[
 
 def _describe_checkpoint(outcome: "SwimResult", options: SwimmerOptions) -> str:
     """Return a clause about the checkpoint from which the run can be resumed."""
-    if outcome.kept is not None:
-        return f"its last checkpoint is at {outcome.kept:.2f} s: --resume {options.checkpoint}"
+    if outcome.checkpoint_time is not None:
+        return (
+            f"its last checkpoint is at {outcome.checkpoint_time:.2f} s: "
+            f"--resume {options.checkpoint}"
+        )
     if options.resume:
         return f"its last checkpoint is {options.resume}"
     return "no checkpoint was written" + (

@@ -132,7 +132,7 @@ class _State(NamedTuple):
     """Logarithm of the probability without the factor of the residuals; m."""
     force: Array
     """Force that swimming adds [N]; m."""
-    unsure: Array
+    relative_variance: Array
     """Variance of `force` over that of a block; m."""
     used: tuple[tuple[Array, Array], ...]
     """Products with all candidates, and the weight, of each chosen candidate."""
@@ -141,7 +141,7 @@ class _State(NamedTuple):
 class Mixture(NamedTuple):
     """A set of fits, one for each drift or for each drift and candidate."""
 
-    likely: Array
+    log_probability: Array
     """Logarithm of the probability."""
     force: Array
     """Force that swimming adds [N]."""
@@ -172,14 +172,14 @@ class Search:
             degree of freedom [N²]
         """
         self._precision = precision
-        self._force, self._swims, self._known = force, swims, known
+        self._force, self._swims, self._candidates = force, swims, known
         self._variance = variance
         self._degrees = len(force) - 2
         self._limit = min(MAX_DISTURBANCES, (len(force) - MIN_BLOCKS) // BLOCKS_PER_DISTURBANCE)
-        pulled, swum = precision @ force, precision @ swims
+        pulled, pulled_swims = precision @ force, precision @ swims
         self._pulled = pulled
-        self._information = swum @ swims
-        self._crossed = swum @ known.columns
+        self._information = pulled_swims @ swims
+        self._crossed = pulled_swims @ known.columns
         of_swims = (pulled @ swims) / self._information
         share = self._crossed / self._information[:, np.newaxis]
         self._columns: dict[int, Array] = {}
@@ -191,7 +191,7 @@ class Search:
             left=np.maximum(pulled @ force - of_swims**2 * self._information, 0.0) + variance,
             evidence=evidence - 0.5 * np.log(self._information),
             force=of_swims,
-            unsure=1.0 / self._information,
+            relative_variance=1.0 / self._information,
             used=(),
         )
 
@@ -204,14 +204,14 @@ class Search:
         diagonal = np.diagonal(precision, axis1=1, axis2=2)
         beyond = (precision * np.tri(n, n, -1).T).sum(axis=2)
         steps = np.cumsum((diagonal + 2.0 * beyond)[:, ::-1], axis=1)[:, -2::-1]
-        responses = self._known.columns[:, 2 * n - 1 :]
+        responses = self._candidates.columns[:, 2 * n - 1 :]
         forms = ((precision @ responses) * responses).sum(axis=1)
         return np.concatenate((steps, diagonal, forms), axis=1)
 
     def _column(self, candidate: int) -> Array:
         """Return the products of a candidate with all candidates, swimming projected out; m×c."""
         if candidate not in self._columns:
-            columns = self._known.columns
+            columns = self._candidates.columns
             products = self._precision @ columns[:, candidate] @ columns
             share = self._crossed[:, candidate] / self._information
             self._columns[candidate] = products - self._crossed * share[:, np.newaxis]
@@ -232,9 +232,9 @@ class Search:
             left=np.maximum(state.left - state.pull[:, candidate] * size, self._variance),
             evidence=state.evidence
             - 0.5 * np.log(weight * PRIOR_SIZE**2)
-            + self._known.log_odds[candidate],
+            + self._candidates.log_odds[candidate],
             force=state.force - share * size,
-            unsure=state.unsure + share**2 / weight,
+            relative_variance=state.relative_variance + share**2 / weight,
             used=(*state.used, (column, weight)),
         )
 
@@ -247,44 +247,46 @@ class Search:
     def _mixture(self, state: _State) -> Mixture:
         """Return the fits with these disturbances, one for each drift."""
         scale = state.left / max(1, self._degrees - 2)
-        likely = state.evidence - 0.5 * self._degrees * np.log(state.left)
-        return Mixture(likely, state.force, scale * state.unsure)
+        log_probability = state.evidence - 0.5 * self._degrees * np.log(state.left)
+        return Mixture(log_probability, state.force, scale * state.relative_variance)
 
     def _additions(self, state: _State, barred: Sequence[int] = ()) -> Mixture:
         """Return the fits with one more disturbance, one for each drift and candidate.
 
         barred: candidates that are excluded, beside those of `state` and a second response
         """
-        kinds = self._known.kinds
+        kinds = self._candidates.kinds
         weight = np.maximum(state.weight, 0.0) + PRIOR_SIZE**-2
         left = np.maximum(state.left[:, np.newaxis] - state.pull**2 / weight, self._variance)
-        likely = (
+        log_probability = (
             state.evidence[:, np.newaxis]
             - 0.5 * np.log(weight * PRIOR_SIZE**2)
-            + self._known.log_odds
+            + self._candidates.log_odds
             - 0.5 * self._degrees * np.log(left)
         )
-        likely[:, [*state.chosen, *barred]] = -np.inf
+        log_probability[:, [*state.chosen, *barred]] = -np.inf
         if any(kinds[candidate] == Kind.RESPONSE for candidate in state.chosen):
-            likely[:, kinds == Kind.RESPONSE] = -np.inf
+            log_probability[:, kinds == Kind.RESPONSE] = -np.inf
         return Mixture(
-            likely,
+            log_probability,
             state.force[:, np.newaxis] - state.share * state.pull / weight,
             left
             / max(1, self._degrees - 2)
-            * (state.unsure[:, np.newaxis] + state.share**2 / weight),
+            * (state.relative_variance[:, np.newaxis] + state.share**2 / weight),
         )
 
     def find(self) -> tuple[int, ...]:
         """Return a set of candidates that no change of a single candidate makes more probable."""
         chosen: tuple[int, ...] = ()
-        best = _log_sum(self._mixture(self._empty).likely)
+        best = _log_sum(self._mixture(self._empty).log_probability)
         while True:
             sets = list(self._extended(chosen))
             if not sets or max(sets)[0] <= best:
                 for candidate in chosen:
                     fewer = tuple(index for index in chosen if index != candidate)
-                    sets.append((_log_sum(self._mixture(self._state(fewer)).likely), fewer))
+                    sets.append(
+                        (_log_sum(self._mixture(self._state(fewer)).log_probability), fewer)
+                    )
                     sets += self._extended(fewer)
             if not sets or max(sets)[0] <= best + 1e-6:
                 return chosen
@@ -293,15 +295,17 @@ class Search:
     def _extended(self, chosen: tuple[int, ...]) -> Iterator[tuple[float, tuple[int, ...]]]:
         """Yield the most probable set with one more candidate, after its log-probability."""
         if len(chosen) < self._limit:
-            likely = self._additions(self._state(chosen)).likely
-            candidate = int(likely.max(axis=0).argmax())
-            sums = _log_sum(likely[:, candidate])
+            log_probability = self._additions(self._state(chosen)).log_probability
+            candidate = int(log_probability.max(axis=0).argmax())
+            sums = _log_sum(log_probability[:, candidate])
             yield sums, (*chosen, candidate)
 
     def odds(self, chosen: Sequence[int], candidate: int) -> float:
         """Return the ratio of the probability of a set to that without one of its disturbances."""
         fewer = [item for item in chosen if item != candidate]
-        both = (_log_sum(self._mixture(self._state(item)).likely) for item in (chosen, fewer))
+        both = (
+            _log_sum(self._mixture(self._state(item)).log_probability) for item in (chosen, fewer)
+        )
         return float(np.exp(min(700.0, next(both) - next(both))))
 
     def is_full(self, chosen: Sequence[int]) -> bool:
@@ -317,23 +321,23 @@ class Search:
         for candidate in chosen:
             fewer = self._state([item for item in chosen if item != candidate])
             parts += [self._mixture(fewer), self._additions(fewer, [candidate])]
-        likely, force, variance = (
+        log_probability, force, variance = (
             np.concatenate([item.ravel() for item in arrays]) for arrays in zip(*parts, strict=True)
         )
-        weight = np.exp(likely - likely.max())
+        weight = np.exp(log_probability - log_probability.max())
         weight /= weight.sum()
         mean = float(weight @ force)
         return mean, float(weight @ (variance + (force - mean) ** 2))
 
     def explain(self, chosen: Sequence[int], noise: Array) -> tuple[Array, Array]:
-        """Return the size of each of these disturbances [N], and the force of each block without
-        thrust, noise and outliers [N].
+        """Return the sizes of disturbances, and the force of each block without thrust, noise and
+        outliers [N].
 
         noise: variance of each block over that of an average one
         """
-        known, index = self._known, list(chosen)
-        likely = self._mixture(self._state(chosen)).likely
-        weight = np.exp(likely - likely.max())
+        known, index = self._candidates, list(chosen)
+        log_probability = self._mixture(self._state(chosen)).log_probability
+        weight = np.exp(log_probability - log_probability.max())
         weight /= weight.sum()
         columns = np.column_stack((self._swims, known.columns[:, index]))
         crossed = self._precision @ columns
@@ -347,7 +351,7 @@ class Search:
         return mean[1:], self._force - columns[:, gone] @ mean[gone] - noise * residual
 
 
-def _log_sum(likely: Array) -> float:
+def _log_sum(log_probability: Array) -> float:
     """Return the logarithm of the sum of these probabilities."""
-    highest = float(likely.max())
-    return highest + float(np.log(np.exp(likely - highest).sum()))
+    highest = float(log_probability.max())
+    return highest + float(np.log(np.exp(log_probability - highest).sum()))

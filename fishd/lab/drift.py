@@ -78,16 +78,16 @@ def fit(blocks: Blocks) -> Fit:
         raise ValueError("blocks of swimming and of rest are needed, six at least")
     parts = math.ceil(n / MAX_BLOCKS_AT_ONCE)
     pieces = (np.array_split(array, parts) for array in blocks)
-    fits = [_fit(Blocks(*part)) for part in zip(*pieces, strict=True)]
+    fits = [_fit(Blocks(*fit_of_part)) for fit_of_part in zip(*pieces, strict=True)]
     if parts == 1:
         return fits[0]
-    weights = np.array([part.error**-2 for part in fits])
+    weights = np.array([fit_of_part.error**-2 for fit_of_part in fits])
     return Fit(
-        float(weights @ [part.force for part in fits] / weights.sum()),
+        float(weights @ [fit_of_part.force for fit_of_part in fits] / weights.sum()),
         float(weights.sum() ** -0.5),
-        np.concatenate([part.drift for part in fits]),
-        [disturbance for part in fits for disturbance in part.disturbances],
-        any(part.is_disturbed for part in fits),
+        np.concatenate([fit_of_part.drift for fit_of_part in fits]),
+        [disturbance for fit_of_part in fits for disturbance in fit_of_part.disturbances],
+        any(fit_of_part.is_disturbed for fit_of_part in fits),
     )
 
 

@@ -51,14 +51,14 @@ def budget(
     lateral: mean F_y that swimming adds [N]
     rotation: rotation of the sensor's axes, from `visible_rotation` [rad]
     """
-    gain = calibration.thrust_ci95(thrust, lateral)
-    if gain is None:
+    gain_ci95 = calibration.thrust_ci95(thrust, lateral)
+    if gain_ci95 is None:
         return Budget(None, None)
-    lost = (math.cos(rotation) - 1.0) * thrust
+    cosine_loss = (math.cos(rotation) - 1.0) * thrust
     # `lateral` contains the drift of F_y, which must not cancel the effect of the rotation.
-    hidden = max(abs(lost), abs(lost + math.sin(rotation) * lateral))
-    whole = None if statistical_ci95 is None else math.hypot(statistical_ci95, gain) + hidden
-    return Budget(gain + hidden, whole)
+    hidden = max(abs(cosine_loss), abs(cosine_loss + math.sin(rotation) * lateral))
+    total = None if statistical_ci95 is None else math.hypot(statistical_ci95, gain_ci95) + hidden
+    return Budget(gain_ci95 + hidden, total)
 
 
 def format_with_budget(
@@ -74,12 +74,12 @@ def format_with_budget(
     """
     if calibration_ci95 is None or total_ci95 is None:
         total_ci95 = statistical_ci95
-        part = "unknown" if unit.startswith("N") else "none"
+        calibration = "unknown" if unit.startswith("N") else "none"
     else:
-        part = text.format_half_width(calibration_ci95)
+        calibration = text.format_half_width(calibration_ci95)
     return (
         f"{text.format_measured(value, total_ci95, unit)} "
-        f"(statistical {text.format_half_width(statistical_ci95)}, calibration {part})"
+        f"(statistical {text.format_half_width(statistical_ci95)}, calibration {calibration})"
     )
 
 
@@ -90,11 +90,11 @@ def unknown_calibration(calibration_ci95: float | None, unit: str) -> str:
     if unit != "N":
         return (
             f"the force sensor is not calibrated: forces are in {text.quoted(unit)}, and no "
-            "interval covers its gain: fishctl calibrate force"
+            "interval includes the error of its gain; run 'fishctl calibrate force'"
         )
     return (
-        "nothing says how well the gains of the force sensor are known, so the interval is "
-        "statistical only: fishctl calibrate force"
+        "the uncertainty of the gains of the force sensor is unknown, so the interval is "
+        "statistical only; run 'fishctl calibrate force'"
     )
 
 
@@ -104,33 +104,33 @@ def rotation_remark(rotation: float) -> str:
         return ""
     hidden = 1.0 - math.cos(rotation)
     return (
-        f"F_x follows F_y as if the sensor were turned by {math.degrees(rotation):+.1f}° against "
-        f"the fish: that hides {hidden:.2%} of the thrust, which the interval covers"
+        f"F_x follows F_y as for a sensor that is rotated by {math.degrees(rotation):+.1f}° "
+        f"against the fish: this hides {hidden:.2%} of the thrust, which the interval includes"
     )
 
 
-def visible_rotation(ticks: Iterable[Tick], settles: float = SWIM_SETTLE_TIME_S) -> float:
+def visible_rotation(ticks: Iterable[Tick], settle: float = SWIM_SETTLE_TIME_S) -> float:
     """Return the angle by which F_x and F_y are rotated into each other while the fish swims [rad].
 
     Over whole beats of a symmetric gait the true F_x, at even harmonics, and the true F_y, at odd
     ones, are not correlated. 0 where the angle is below `MIN_ROTATION_RAD`, or its interval
     contains 0.
 
-    settles: time until a swim is steady [s]
+    settle: time until a swim is steady [s]
     """
-    steady = _steady_swims(ticks, settles)
+    steady = _steady_swims(ticks, settle)
     swims = [np.array([(tick.fx, tick.fy) for tick in swim]) for swim in steady]
     deviations = [swim - swim.mean(axis=0) for swim in swims]
     if not deviations:
         return 0.0
     forces = np.concatenate(deviations)
     (xx, xy), (_, yy) = forces.T @ forces
-    least, most = np.linalg.eigvalsh(forces.T @ forces)
-    if most < MIN_ELONGATION * least:
+    smallest, largest = np.linalg.eigvalsh(forces.T @ forces)
+    if largest < MIN_ELONGATION * smallest:
         return 0.0
     angle = 0.5 * math.atan2(-2.0 * xy, yy - xx)
     # The error of a principal axis: Anderson, Ann. Math. Stat. 34 (1963) 122.
-    angle_ci95 = Z95 * math.sqrt(least * most / len(forces)) / (most - least)
+    angle_ci95 = Z95 * math.sqrt(smallest * largest / len(forces)) / (largest - smallest)
     return angle if abs(angle) >= max(MIN_ROTATION_RAD, angle_ci95) else 0.0
 
 
@@ -145,10 +145,10 @@ def lateral_force(ticks: Iterable[Tick]) -> float:
     return sum(swimming) / len(swimming) - sum(resting) / len(resting)
 
 
-def _steady_swims(ticks: Iterable[Tick], settles: float) -> list[list[Tick]]:
+def _steady_swims(ticks: Iterable[Tick], settle: float) -> list[list[Tick]]:
     """Return the ticks of the whole beats of each steady swim."""
     beats = []
-    for swim in _settled_phases(ticks, settles, swims=True):
+    for swim in _settled_phases(ticks, settle, swims=True):
         ups = upward_reversals(tick.phi_c for tick in swim)
         if len(ups) > 1:
             # The force of a tick is the mean over the period before it; its angle applies after it.
@@ -156,10 +156,10 @@ def _steady_swims(ticks: Iterable[Tick], settles: float) -> list[list[Tick]]:
     return beats
 
 
-def _settled_phases(ticks: Iterable[Tick], settles: float, *, swims: bool) -> Iterator[list[Tick]]:
+def _settled_phases(ticks: Iterable[Tick], settle: float, *, swims: bool) -> Iterator[list[Tick]]:
     """Yield the ticks of each settled swim or rest, without suspect forces."""
     for running, group in groupby(ticks, lambda tick: tick.mode == "running"):
         phase = list(group)
-        start = phase[0].t + settles
+        start = phase[0].t + settle
         if running is swims:
             yield [tick for tick in phase if tick.t >= start and tick.suspect is UNSET]

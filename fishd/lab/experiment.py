@@ -97,9 +97,9 @@ class Experiment:
                     f"{path}: {_describe_difference(head, expected)}; {_OTHER_FOLDER}"
                 )
             rows = [row for row in rows if len(row) == len(head)]
-            whole = tables.lines([head, *rows])
-            if path.read_bytes() != whole.encode():
-                self.write(ROWS, whole)
+            complete = tables.lines([head, *rows])
+            if path.read_bytes() != complete.encode():
+                self.write(ROWS, complete)
         with self._os_errors_as_fishd_errors():
             self._table = Table(path, expected)
         return [dict(zip(expected, row, strict=True)) for row in rows]
@@ -117,13 +117,13 @@ class Experiment:
         )
 
     def make_folder(self, name: str) -> Path:
-        """Return a folder within that of the experiment; raises `FishdError`."""
+        """Create a subfolder and return its path; raises `FishdError`."""
         with self._os_errors_as_fishd_errors():
             (self.path / name).mkdir(exist_ok=True)
         return self.path / name
 
     def write(self, name: str, content: str | bytes) -> None:
-        """Write a file of the folder; raises `FishdError`."""
+        """Write a file into the folder; raises `FishdError`."""
         with self._os_errors_as_fishd_errors():
             write_atomically(self.path / name, content)
 
@@ -154,8 +154,8 @@ class Experiment:
             yield
         except OSError as error:
             raise FishdError(
-                f"{error.filename or self.path}: cannot be written: {error.strerror}; what was "
-                "measured before is kept"
+                f"{error.filename or self.path}: cannot be written: {error.strerror}; earlier "
+                "results are kept"
             ) from None
 
 
@@ -202,7 +202,7 @@ def _make_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be made a folder: {error.strerror}") from None
+        raise ConfigError(f"{path}: the folder cannot be created: {error.strerror}") from None
 
 
 def _with_start_time(header: Header) -> Header:
@@ -215,10 +215,12 @@ def check_free(path: Path) -> None:
     """Raise `ConfigError` where a folder exists and is not empty."""
     try:
         if path.exists() and any(not file.name.endswith(".lock") for file in path.iterdir()):
-            hint = f"--resume {path} goes on with it, " if (path / HEADER).exists() else ""
-            raise ConfigError(f"{path}: the folder is not empty; {hint}--folder names another")
+            hint = f"resume it with --resume {path}, or " if (path / HEADER).exists() else ""
+            raise ConfigError(
+                f"{path}: the folder is not empty; {hint}choose another with --folder"
+            )
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be made a folder: {error.strerror}") from None
+        raise ConfigError(f"{path}: the folder cannot be created: {error.strerror}") from None
 
 
 def read_header(path: Path) -> Header:
@@ -247,7 +249,7 @@ def count_rows(path: Path) -> int | None:
         return None
 
 
-_OTHER_FOLDER = "--folder names a new folder"
+_OTHER_FOLDER = "choose a new folder with --folder"
 
 
 def _describe_difference(head: Sequence[str], columns: Sequence[str]) -> str:
@@ -266,13 +268,14 @@ def _check_same(path: Path, before: Header, header: Header) -> None:
         if known and old.get(key) != new.get(key):
             raise ConfigError(
                 f"{path / HEADER}: this {before.kind} began with {key.removeprefix('settings.')} "
-                f"= {old.get(key)}, now it is {new.get(key)}; give the same, or {_OTHER_FOLDER}"
+                f"= {old.get(key)}, now it is {new.get(key)}; give the same value, or "
+                f"{_OTHER_FOLDER}"
             )
     if others := [key for key in (*old, *new) if not (key in old and key in new)]:
         has = "has" if others[0] in old else "has no"
         raise ConfigError(
             f"{path / HEADER}: this {before.kind} began with fishd {before.version}, whose "
-            f"configuration {has} {others[0]}, unlike that of now; {_OTHER_FOLDER}"
+            f"configuration {has} {others[0]}, unlike that of this fishd; {_OTHER_FOLDER}"
         )
 
 
@@ -305,7 +308,7 @@ def _read_struct(path: Path, kind: type[T]) -> T:
         raise ConfigError(f"{path}: {problem}") from None
     except msgspec.MsgspecError as error:
         raise ConfigError(
-            f"{path}: not as this fishd ({__version__}) writes it: {error}; {_OTHER_FOLDER}"
+            f"{path}: fishd {__version__} cannot read it: {error}; {_OTHER_FOLDER}"
         ) from None
 
 

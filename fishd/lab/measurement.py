@@ -1,4 +1,4 @@
-"""The thrust of a controller with its interval: the fish swims and rests in turn."""
+"""Measurement of the thrust of a controller, with its interval, by swimming and resting in turn."""
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -69,7 +69,7 @@ class ThrustMeasurement(NamedTuple):
     error: float
     """Half-width of the 95 % confidence interval of `thrust`, statistical only [N]."""
     frequency: float
-    """Tail beats per second; 0 where the tail does not beat [Hz]."""
+    """Frequency of the tail beat [Hz]; 0 where the tail does not beat."""
     power: float
     """Mean square of `fin_velocity` while the fish swims, in the square of that quantity's unit."""
     swims: int
@@ -261,8 +261,8 @@ def plan(
     both. Raises `ParameterError` where two swims do not fit.
     """
     frequency = parameters.get("frequency")
-    slow = 3.0 / frequency if isinstance(frequency, int | float) and frequency > 0.0 else 0.0
-    swim = settle + max(MEAN_SWIM_S - SWIM_SETTLE_TIME_S, slow)
+    slow_swim = 3.0 / frequency if isinstance(frequency, int | float) and frequency > 0.0 else 0.0
+    swim = settle + max(MEAN_SWIM_S - SWIM_SETTLE_TIME_S, slow_swim)
     rest = _rest_settle_time(settle) + MEAN_REST_S - REST_SETTLE_TIME_S
     if not 2 * swim + 3 * rest <= seconds <= MAX_MEASUREMENT_S:  # NaN is not
         raise ParameterError(
@@ -271,11 +271,15 @@ def plan(
             f"{MAX_MEASUREMENT_S:g} s"
         )
     count = math.floor((seconds - rest) / (swim + rest) + 1e-9)
-    least = rest - MEAN_REST_S + MIN_REST_S, settle + max(MIN_SWIM_S - SWIM_SETTLE_TIME_S, slow)
-    shares = [((GOLDEN_RATIO * (index + 1) / 2) % 1.0) ** 2 for index in range(2 * count + 1)]
-    spare = (seconds - count * sum(least) - least[False]) / sum(shares)
+    shortest = (
+        rest - MEAN_REST_S + MIN_REST_S,
+        settle + max(MIN_SWIM_S - SWIM_SETTLE_TIME_S, slow_swim),
+    )
+    weights = [((GOLDEN_RATIO * (index + 1) / 2) % 1.0) ** 2 for index in range(2 * count + 1)]
+    spare_time = (seconds - count * sum(shortest) - shortest[False]) / sum(weights)
     return [
-        (bool(index % 2), least[index % 2] + spare * share) for index, share in enumerate(shares)
+        (bool(index % 2), shortest[index % 2] + spare_time * weight)
+        for index, weight in enumerate(weights)
     ]
 
 
@@ -290,26 +294,26 @@ def _rest_settle_time(settle: float) -> float:
 def evaluate(
     samples: Sequence[Sample],
     tick: float,
-    settles: float = SWIM_SETTLE_TIME_S,
-    stills: float = REST_SETTLE_TIME_S,
-    alike: Sequence[Step] = (),
+    swim_settle: float = SWIM_SETTLE_TIME_S,
+    rest_settle: float = REST_SETTLE_TIME_S,
+    other_steps: Sequence[Step] = (),
 ) -> ThrustMeasurement:
     """Return the thrust of a fish that swam and rested in turn, without controller and ticks.
 
     Where the tail does not beat, swims are cut into pieces, as rests are.
 
     tick: period of the loop [s]
-    settles, stills: time until a swim is steady, and until a rest is still [s]
-    alike: steps between beats of other swims on this rig, used where there are few beats here
+    swim_settle, rest_settle: time until a swim is steady, and until a rest is still [s]
+    other_steps: steps between beats of other swims on this rig, used where there are few beats here
     Raises `ParameterError` where the samples are too few to separate thrust from drift.
     """
     first = samples[0].seq
     phases = list(_split_phases(samples))
-    kept = [
-        list(_cut_blocks(phase, tick, first, settles if phase[0].swims else stills))
+    blocks_of_phases = [
+        list(_cut_blocks(phase, tick, first, swim_settle if phase[0].swims else rest_settle))
         for phase in phases
     ]
-    merged_blocks = [block for blocks in _merge_blocks(kept) for block in blocks]
+    merged_blocks = [block for blocks in _merge_blocks(blocks_of_phases) for block in blocks]
     swimming = [block for block in merged_blocks if block.swims]
     if len(merged_blocks) < MIN_FIT_BLOCKS or len({block.swims for block in merged_blocks}) < 2:
         raise ParameterError(
@@ -318,36 +322,40 @@ def evaluate(
         )
     time, force = np.array([(block.time, block.force) for block in merged_blocks]).T
     swims = np.array([block.swims for block in merged_blocks])
-    lasts = np.array([block.lasts for block in merged_blocks])
-    single_blocks = [block for blocks in kept for block in blocks]
+    durations = np.array([block.duration for block in merged_blocks])
+    single_blocks = [block for blocks in blocks_of_phases for block in blocks]
     own_steps, rest_steps = (
         list(_iter_steps(single_blocks, True)),
         list(_iter_steps(single_blocks, False)),
     )
-    swim_steps = own_steps if len(own_steps) >= MIN_STEPS else [*own_steps, *alike]
+    swim_steps = own_steps if len(own_steps) >= MIN_STEPS else [*own_steps, *other_steps]
     swim_spread, rest_spread = (
         _mean_step(swim_steps if len(swim_steps) >= MIN_STEPS else [*swim_steps, *rest_steps]),
         _mean_step(rest_steps),
     )
     spread = np.where(swims, swim_spread.force, rest_spread.force)
     blocks = Blocks(
-        time, force, spread / lasts, swims, _response_columns(phases, time, tick, first, settles)
+        time,
+        force,
+        spread / durations,
+        swims,
+        _response_columns(phases, time, tick, first, swim_settle),
     )
     result = fit(blocks)
-    swimming_time = sum(block.lasts for block in swimming)
+    swimming_time = sum(block.duration for block in swimming)
     return ThrustMeasurement(
         controller="",
         parameters={},
         thrust=result.force,
         error=result.error,
         frequency=sum(block.beats for block in swimming) / swimming_time,
-        power=sum(block.power * block.lasts for block in swimming) / swimming_time,
+        power=sum(block.power * block.duration for block in swimming) / swimming_time,
         swims=sum(phase[0].swims for phase in phases),
         blocks=blocks,
         drift=result.drift,
         ticks=[],
         unit="N",
-        remark=_find_remark(kept) or (DISTURBED_REMARK if result.is_disturbed else ""),
+        remark=_find_remark(blocks_of_phases) or (DISTURBED_REMARK if result.is_disturbed else ""),
         steps=own_steps,
         disturbances=result.disturbances,
         **_mean_power(swimming, swim_spread.watts),
@@ -355,7 +363,7 @@ def evaluate(
 
 
 def _response_columns(
-    phases: Sequence[Sequence[Sample]], time: Array, tick: float, first: int, settles: float
+    phases: Sequence[Sequence[Sample]], time: Array, tick: float, first: int, settle: float
 ) -> Array:
     """Return first-order responses to swimming at these times, n×k; all are 0 at first.
 
@@ -366,7 +374,7 @@ def _response_columns(
     """
     several = sum(phase[0].swims for phase in phases) > 1
     constants = np.array(
-        [constant for constant in RESPONSE_TIMES_S if several and constant >= 2.0 * settles]
+        [constant for constant in RESPONSE_TIMES_S if several and constant >= 2.0 * settle]
     )
     begins = [(phase[0].seq - first) * tick for phase in phases]
     responses, level = np.empty((len(time), len(constants))), np.zeros(len(constants))
@@ -379,14 +387,14 @@ def _response_columns(
     return responses
 
 
-def average_phase(phase: Sequence[Sample], tick: float, settles: float) -> "Block | None":
+def average_phase(phase: Sequence[Sample], tick: float, settle: float) -> "Block | None":
     """Return the whole beats of a settled swim, or the pieces of a settled rest, as one block.
 
     tick: period of the loop [s]
-    settles: time until the swim or the rest has settled [s]
+    settle: time until the swim or the rest has settled [s]
     Returns None where nothing is left.
     """
-    blocks = list(_cut_blocks(phase, tick, 0, settles))
+    blocks = list(_cut_blocks(phase, tick, 0, settle))
     return _merge(blocks) if blocks else None
 
 
@@ -395,19 +403,19 @@ def _mean_power(swimming: Sequence["Block"], spread: float) -> dict[str, float]:
 
     spread: variance of the mean power over one second [W² s]
     """
-    duration = sum(block.lasts for block in swimming)
-    mean = sum(block.watts * block.lasts for block in swimming) / duration
+    duration = sum(block.duration for block in swimming)
+    mean = sum(block.watts * block.duration for block in swimming) / duration
     if not math.isfinite(mean):
         return {}
     return {"watts": mean, "watts_error": Z95 * math.sqrt(spread / duration)}
 
 
-def _merge_blocks(kept: Sequence[list["Block"]]) -> list[list["Block"]]:
+def _merge_blocks(blocks_of_phases: Sequence[list["Block"]]) -> list[list["Block"]]:
     """Merge neighbouring blocks of each swim and rest where there are more than `MAX_BLOCKS`."""
-    count = math.ceil(sum(map(len, kept)) / MAX_BLOCKS)
+    count = math.ceil(sum(map(len, blocks_of_phases)) / MAX_BLOCKS)
     return [
         [_merge(blocks[begin : begin + count]) for begin in range(0, len(blocks), count)]
-        for blocks in kept
+        for blocks in blocks_of_phases
     ]
 
 
@@ -415,20 +423,20 @@ def _merge(blocks: Sequence["Block"]) -> "Block":
     """Return one block in place of several neighbours, with means weighted by length."""
     if len(blocks) == 1:
         return blocks[0]
-    lasts = np.array([block.lasts for block in blocks])
+    durations = np.array([block.duration for block in blocks])
     time, force, power, watts = np.average(
         [(block.time, block.force, block.power, block.watts) for block in blocks],
         axis=0,
-        weights=lasts,
+        weights=durations,
     ).tolist()
     beats = sum(block.beats for block in blocks)
-    return Block(time, float(lasts.sum()), force, power, beats, blocks[0].swims, watts)
+    return Block(time, float(durations.sum()), force, power, beats, blocks[0].swims, watts)
 
 
-def _find_remark(kept: Sequence[Sequence["Block"]]) -> str:
+def _find_remark(blocks_of_phases: Sequence[Sequence["Block"]]) -> str:
     """Return why a measurement may be wrong, from its blocks by swim and rest; else empty."""
-    swims = [blocks for blocks in kept if len(blocks) > 1 and blocks[0].swims]
-    rests = [block.power for blocks in kept[1:] for block in blocks if not block.swims]
+    swims = [blocks for blocks in blocks_of_phases if len(blocks) > 1 and blocks[0].swims]
+    rests = [block.power for blocks in blocks_of_phases[1:] for block in blocks if not block.swims]
     begins = sum(block.power for blocks in swims for block in blocks[: len(blocks) // 2])
     ends = sum(block.power for blocks in swims for block in blocks[-(len(blocks) // 2) :])
     if begins and abs(ends / begins - 1.0) > MAX_POWER_CHANGE:
@@ -448,7 +456,7 @@ class Block(NamedTuple):
 
     time: float
     """Time of the middle [s]."""
-    lasts: float
+    duration: float
     """Length [s]."""
     force: float
     """Mean F_x [N]."""
@@ -468,16 +476,14 @@ def _split_phases(samples: Sequence[Sample]) -> Iterator[list[Sample]]:
         yield list(phase)
 
 
-def _cut_blocks(
-    phase: Sequence[Sample], tick: float, first: int, settles: float
-) -> Iterator[Block]:
+def _cut_blocks(phase: Sequence[Sample], tick: float, first: int, settle: float) -> Iterator[Block]:
     """Yield blocks of whole beats of a settled swim, or of pieces of a settled rest.
 
     first: index of the tick at time 0
-    settles: time until the swim or the rest has settled [s]
+    settle: time until the swim or the rest has settled [s]
     """
     swims = phase[0].swims
-    begin = round(settles / tick)
+    begin = round(settle / tick)
     ups = upward_reversals(sample.phi_c for sample in phase) if swims else []
     cuts = [up for up in ups if up >= begin]
     beats_found = len(cuts) > 1
@@ -498,7 +504,7 @@ def _cut_blocks(
             continue
         yield Block(
             time=(0.5 * (phase[start].seq + phase[end].seq) - first) * tick,
-            lasts=len(window) * tick,
+            duration=len(window) * tick,
             force=sum(sample.fx for sample in window) / len(window),
             power=sum(sample.fin_velocity**2 for sample in window) / len(window),
             beats=beat_count if beats_found else 0,
@@ -512,9 +518,9 @@ def _iter_steps(blocks: Sequence[Block], swims: bool) -> Iterator[Step]:
     for block, successor in pairwise(blocks):
         if (
             block.swims == successor.swims == swims
-            and successor.time - block.time < 2.0 * block.lasts
+            and successor.time - block.time < 2.0 * block.duration
         ):
-            weight = 1.0 / (1.0 / block.lasts + 1.0 / successor.lasts)
+            weight = 1.0 / (1.0 / block.duration + 1.0 / successor.duration)
             yield Step(
                 (successor.force - block.force) ** 2 * weight,
                 (successor.watts - block.watts) ** 2 * weight,

@@ -29,11 +29,11 @@ _MAX_ATTEMPTS = 3
 
 
 class Killed(FishdError):
-    """Processes were killed repeatedly; `left` are the indices of the unfinished tasks."""
+    """Processes were killed repeatedly; `unfinished` are the indices of the unfinished tasks."""
 
-    def __init__(self, left: Sequence[int]) -> None:
+    def __init__(self, unfinished: Sequence[int]) -> None:
         super().__init__("the worker processes were killed, most likely because memory ran out")
-        self.left = left
+        self.unfinished = unfinished
 
 
 class Stop(NamedTuple):
@@ -73,16 +73,16 @@ class Workers:
         On this machine, tasks are restarted after a process was killed. Raises `Killed`, and
         `FishdError` where the cluster is lost.
         """
-        left = dict(enumerate(tasks))
+        unfinished = dict(enumerate(tasks))
         for _ in range(_MAX_ATTEMPTS):
             try:
-                for index, result in self._run_attempt(function, left):
-                    del left[index]
+                for index, result in self._run_attempt(function, unfinished):
+                    del unfinished[index]
                     yield index, result
             except TerminatedWorkerError:
                 continue  # which process was killed is unknown: all unfinished tasks start again
             return
-        raise Killed(list(left))
+        raise Killed(list(unfinished))
 
     def _run_attempt(
         self, function: Callable[[T], R], tasks: dict[int, T]
@@ -130,7 +130,7 @@ def workers(stop: Path, jobs: int | None = None, cluster: str | None = None) -> 
     """
     if cluster is None and multiprocessing is None:
         raise FishdError(
-            "processes that compute need semaphores, which cannot be made here: /dev/shm is "
+            "parallel processes need semaphores, which cannot be created: /dev/shm is "
             "missing or not writable; mount it: sudo mount -t tmpfs shm /dev/shm"
         )
     with _connect(cluster) as event, SafeChildren():

@@ -131,7 +131,7 @@ def _events(axis: "Axes", traces: Traces, *, named: bool) -> None:
             )
 
 
-def _portrait(axis: "Axes", traces: Traces, part: slice) -> None:
+def _portrait(axis: "Axes", traces: Traces, samples: slice) -> None:
     if traces.alpha is not None and traces.alpha_rate is not None:
         x, y = traces.alpha, traces.alpha_rate
         axis.set_xlabel("true fin angle α (rad)")
@@ -142,7 +142,7 @@ def _portrait(axis: "Axes", traces: Traces, part: slice) -> None:
         axis.set_ylabel(f"$F_y$ ({traces.unit})")
     axis.axhline(0.0, color="0.85", linewidth=0.6)
     axis.axvline(0.0, color="0.85", linewidth=0.6)
-    axis.plot(x[part], y[part], color=GREEN, linewidth=0.7, marker=".")
+    axis.plot(x[samples], y[samples], color=GREEN, linewidth=0.7, marker=".")
     axis.set_title(f"phase portrait, last {PORTRAIT_S:g} s")
 
 

@@ -123,12 +123,12 @@ def _add_lines(figure: Figure, traces: Traces) -> None:
         figure.update_yaxes(range=limits(MIN_QUANTITY_SPAN, values), row=row, col=1)
     error = traces.thrust_error
     angles = [traces.phi_c] if traces.alpha is None else [traces.phi_c, traces.alpha]
-    ends = (
+    axes = (
         (traces.unit, limits(MIN_FORCE_SPAN, traces.fx, traces.fy)),
         ("rad", limits(MIN_ANGLE_SPAN, *angles)),
         (traces.unit, limits(MIN_FORCE_SPAN, *(traces.thrust + k * error for k in (-1, 0, 1)))),
     )
-    for row, (unit, span) in enumerate(ends, start=1):
+    for row, (unit, span) in enumerate(axes, start=1):
         figure.update_yaxes(title_text=unit, range=span, row=row, col=1)
 
 

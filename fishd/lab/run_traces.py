@@ -85,7 +85,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
     first = run.ticks[0].t if run.ticks else 0.0
     chosen = [tick for tick in run.ticks if begin <= tick.t - first <= end]
     if not chosen:
-        length = f"it is {run.summary.duration:.1f} s long"
+        length = f"the recording is {run.summary.duration:.1f} s long"
         raise RecordingError(f"{run.path}: no tick between these times; {length}")
     rows = _with_breaks(chosen)
 
@@ -173,35 +173,35 @@ def _units(controllers: Iterable[str]) -> dict[str, str]:
 
 
 def _label_events(events: Iterable[Event], first: float) -> Iterator[EventLabel]:
-    before: dict[str, Any] = {}
+    last_parameters: dict[str, Any] = {}
     for event in events:
         if event.kind not in SHOWN_EVENTS:
             continue
-        words, parameters = event.kind, event.data.get("parameters")
+        label, parameters = event.kind, event.data.get("parameters")
         if isinstance(parameters, dict):
             takes_over = event.kind != "parameters"
             changed = {
                 name: value
                 for name, value in parameters.items()
-                if (value is not None if takes_over else value != before.get(name))
+                if (value is not None if takes_over else value != last_parameters.get(name))
             }
             controller = str(event.data.get("controller", event.kind))
             settings = format_values(changed, registry.units(controller))
-            words = f"{controller} {settings}".rstrip() if takes_over else settings or event.kind
-            before = parameters
+            label = f"{controller} {settings}".rstrip() if takes_over else settings or event.kind
+            last_parameters = parameters
         elif event.kind == "mark":
-            words = event.message
+            label = event.message
         elif event.kind == "fault":
-            words = f"fault {event.data.get('code', '')}".strip()
-        yield EventLabel(event.t - first, event.kind, text.line(words, MAX_TEXT_CHARS))
+            label = f"fault {event.data.get('code', '')}".strip()
+        yield EventLabel(event.t - first, event.kind, text.line(label, MAX_TEXT_CHARS))
 
 
 def _with_breaks(ticks: list[Tick]) -> list[Tick | float]:
     """Return the ticks, with the time of a break at each gap between two of them."""
     rows: list[Tick | float] = []
-    for before, tick in zip((None, *ticks), ticks, strict=False):
-        if before is not None and tick.seq != before.seq + 1:
-            rows.append(before.t)
+    for previous, tick in zip((None, *ticks), ticks, strict=False):
+        if previous is not None and tick.seq != previous.seq + 1:
+            rows.append(previous.t)
         rows.append(tick)
     return rows
 

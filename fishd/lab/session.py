@@ -114,8 +114,8 @@ class Session(ABC):
         """Raise `FishdError` where its forces are not in newtons."""
         if self.unit != "N":
             raise FishdError(
-                "the force sensor is not calibrated, so no force is known in newtons: "
-                "fishctl calibrate force"
+                "the force sensor is not calibrated, so forces are not in newtons; "
+                "run 'fishctl calibrate force'"
             )
 
     @abstractmethod
@@ -332,7 +332,7 @@ class LiveSession(Session):
                         self._held.token
                     )  # raises the reason if the lease has ended
                     raise Disturbed(
-                        f"another client changed what swims: {text.line(tick.message)}: this "
+                        f"another client changed the controller: {text.line(tick.message)}: this "
                         "measurement is lost"
                     )
                 continue
@@ -411,7 +411,7 @@ def _check(
     """
     if _is_as_requested(tick, controller):
         return
-    request = f"told to let {controller} swim" if controller else "told to rest"
+    request = f"to swim {controller}" if controller else "to rest"
     cause = reason or fallback
     why = f" ({cause.message})" if cause else ""
     state = f"{tick.controller} swims" if tick.mode == "running" else f"it is in mode {tick.mode}"

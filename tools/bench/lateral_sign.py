@@ -63,7 +63,7 @@ def relative_thrust(case: Case) -> float:
     controller = "ppo" if case.contestant == "default-fish" else "swing"
     parameters = CONTROLLERS[case.contestant]
     config = load(None, overrides)
-    return simulate(config, controller, parameters, SECONDS, SETTLE, begun=rest).relative_thrust
+    return simulate(config, controller, parameters, SECONDS, SETTLE, on_start=rest).relative_thrust
 
 
 OPTIONS: Options = {

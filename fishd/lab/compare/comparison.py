@@ -117,13 +117,13 @@ def compare(
             noise = replace(config.simulation, seed=config.simulation.seed + run)
             fish = replace(config, simulation=noise)
             camera_of_run = replace(camera_settings, seed=camera_settings.seed + run)
-            end = _LatestTicks(config.tick)
-            report = swim(fish, contestant, seconds, settle, end, camera_of_run)
+            latest_ticks = _LatestTicks(config.tick)
+            report = swim(fish, contestant, seconds, settle, latest_ticks, camera_of_run)
             check_whole_beat(report, seconds, settle)
             reports.append(report)
             progress(next(run_count) * seconds)
         standings.append(_standing(contestant.label, reports))
-        traces.append(trace(end.ticks))
+        traces.append(trace(latest_ticks.ticks))
     return standings, traces
 
 
@@ -155,12 +155,12 @@ def _do_nothing(_: VirtualRun) -> None:
 def trace(ticks: Sequence[Tick]) -> Trace:
     """Return the end of a run as a trace for figures."""
     end = ticks[-1].t
-    shown = [tick for tick in ticks if tick.t >= end - TRACE_S - _MARGIN_S - 1e-6]
+    kept = [tick for tick in ticks if tick.t >= end - TRACE_S - _MARGIN_S - 1e-6]
     return Trace(
-        [tick.t - end for tick in shown],
-        [tick.phi_c for tick in shown],
-        [tick.fx for tick in shown],
-        [tick.alpha if isinstance(tick.alpha, float) else math.nan for tick in shown],
+        [tick.t - end for tick in kept],
+        [tick.phi_c for tick in kept],
+        [tick.fx for tick in kept],
+        [tick.alpha if isinstance(tick.alpha, float) else math.nan for tick in kept],
     )
 
 
@@ -220,8 +220,10 @@ def judge_standings(standings: Sequence[Standing], is_random: bool = True) -> Ve
     share = ratio(best.thrust, widths[0], following.thrust, widths[1])
     if share is None:
         return Verdict(f"{names[0]} wins: no other one has a thrust above zero", names)
-    shown = format_ratio(share) if any(widths) else f"exactly {percent(share[0])}"
-    return Verdict(f"{names[0]} wins: it thrusts {shown} of {following.name}, the next one", names)
+    share_text = format_ratio(share) if any(widths) else f"exactly {percent(share[0])}"
+    return Verdict(
+        f"{names[0]} wins: it thrusts {share_text} of {following.name}, the next one", names
+    )
 
 
 def _depends_on_seed(standing: Standing, is_random: bool) -> bool:

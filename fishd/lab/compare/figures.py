@@ -45,10 +45,10 @@ def draw(
         for (angle_axis, force_axis, bar_axis), standing, trace in zip(
             axes, standings, traces, strict=True
         ):
-            shown = _from_upward_reversal(trace)
+            excerpt = _from_upward_reversal(trace)
             angle_axis.set_title(plain(standing.contestant))
-            _draw_angles(angle_axis, shown, amplitude)
-            _draw_force(force_axis, standing, shown, limits, unit)
+            _draw_angles(angle_axis, excerpt, amplitude)
+            _draw_force(force_axis, standing, excerpt, limits, unit)
             if simulated:
                 _draw_relative_thrust(bar_axis, standing)
             else:
@@ -104,19 +104,19 @@ def _draw_force(
 
 
 def _draw_relative_thrust(axis: Any, standing: Standing) -> None:
-    shares = [100.0 * run.relative_thrust for run in standing.runs]
-    value = sum(shares) / len(shares)
+    percentages = [100.0 * run.relative_thrust for run in standing.runs]
+    value = sum(percentages) / len(percentages)
     label = "relative thrust" + _of_runs(", mean", standing)
     whisker = _of_runs("lowest to highest", standing)
-    _draw_bar(axis, label, value, value - min(shares), max(shares) - value, whisker)
-    axis.set_xlim(0.0, max(105.0, 1.02 * max(shares)))
+    _draw_bar(axis, label, value, value - min(percentages), max(percentages) - value, whisker)
+    axis.set_xlim(0.0, max(105.0, 1.02 * max(percentages)))
 
 
-def _draw_thrust(axis: Any, standing: Standing, most: float) -> None:
+def _draw_thrust(axis: Any, standing: Standing, largest: float) -> None:
     value, error = 1e3 * standing.thrust, 1e3 * (standing.error or 0.0)
     _draw_bar(axis, "thrust", value, error, error, "95 %, statistical")
     low = min(0.0, 1.05 * (value - error))
-    axis.set_xlim(low, 1.05e3 * max(most, 1e-9))
+    axis.set_xlim(low, 1.05e3 * max(largest, 1e-9))
 
 
 def _draw_bar(

@@ -100,16 +100,18 @@ def _power(runs: list[ThrustMeasurement]) -> dict[str, float]:
     results = [
         (run.watts, *per_watt(run.thrust, run.error, run.watts, run.watts_error)) for run in runs
     ]
-    known = [
+    complete = [
         (watts, thrust_per_watt, error)
         for watts, thrust_per_watt, error in results
         if watts and thrust_per_watt and error
     ]
-    if len(known) < len(runs):
+    if len(complete) < len(runs):
         return {}
-    mean, ci95 = weighted_mean([item for _, item, _ in known], [error for _, _, error in known])
+    mean, ci95 = weighted_mean(
+        [item for _, item, _ in complete], [error for _, _, error in complete]
+    )
     return {
-        "power": sum(watts for watts, _, _ in known) / len(known),
+        "power": sum(watts for watts, _, _ in complete) / len(complete),
         "thrust_per_watt": mean,
         "thrust_per_watt_error": ci95,
     }

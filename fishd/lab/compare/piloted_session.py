@@ -124,18 +124,18 @@ class _PilotThread:
     def _run(self) -> None:
         agent = self._agent
         while not self._stopping.is_set():
-            seen = agent.poll(_POLL_TIMEOUT_S)
+            observation = agent.poll(_POLL_TIMEOUT_S)
             try:
-                if seen is None:
+                if observation is None:
                     self._sight.listen()
                 elif self.problem:
                     agent.act(0.0)
                 else:
-                    agent.act(self._pilot.angle(seen, self._sight.look(seen.time)))
+                    agent.act(self._pilot.angle(observation, self._sight.look(observation.time)))
                     if self._pilot.blind > CAMERA_TIMEOUT_S:
                         agent.pause(_PAUSE_S)  # at neutral, as the diagnosis takes a while
                         self.problem = self._sight.lost()
             except FishdError as error:
                 self.problem = error
-                if seen:
+                if observation:
                     agent.act(0.0)

@@ -47,12 +47,12 @@ class ContestantSurvey(Struct, frozen=True, kw_only=True):
     @property
     def median(self) -> float:
         """Median of the relative thrusts."""
-        return median(swum.relative_thrust for swum in self.fish)
+        return median(result.relative_thrust for result in self.fish)
 
     @property
     def worst(self) -> FishResult:
         """Result on the fish of smallest relative thrust."""
-        return min(self.fish, key=lambda swum: swum.relative_thrust)
+        return min(self.fish, key=lambda result: result.relative_thrust)
 
 
 class ReversalTimes:
@@ -73,10 +73,10 @@ class ReversalTimes:
     def longest(self, apart: float) -> float:
         """Return the length of the longest series of reversals less than `apart` apart [s]."""
         longest = start = 0.0
-        for before, now in pairwise(self.times):
-            start = start or before
-            if now - before < apart:
-                longest = max(longest, now - start)
+        for previous, current in pairwise(self.times):
+            start = start or previous
+            if current - previous < apart:
+                longest = max(longest, current - start)
             else:
                 start = 0.0
         return longest

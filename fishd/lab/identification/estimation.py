@@ -126,8 +126,8 @@ def _to_frame(run: object) -> "DataFrame":
         if unit != "N":
             raise Unidentifiable(
                 f"{recorded.path}: its forces are in {text.quoted(unit)}, not in "
-                "newtons: the force sensor was not calibrated; calibrate it by 'fishctl calibrate "
-                "force', and record it again"
+                "newtons: the force sensor was not calibrated; run 'fishctl calibrate force' and "
+                "record the fish again"
             )
         return recorded.frame()
     return run  # type: ignore[return-value]

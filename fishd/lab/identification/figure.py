@@ -32,11 +32,11 @@ def draw(identification: Identification, path: str | os.PathLike[str]) -> None:
 def _draw_forces(axis: Any, fit: Fit, channel: int, symbol: str) -> None:
     """Plot an extract of measured forces, and of the fit with the drift of the sensor."""
     middle = np.nanmedian(fit.times)
-    shown = np.abs(fit.times - middle) <= 0.5 * _EXTRACT_S
-    times = fit.times[shown]
-    simulated = 1e3 * (fit.simulated + fit.drift)[channel, shown]
+    extract = np.abs(fit.times - middle) <= 0.5 * _EXTRACT_S
+    times = fit.times[extract]
+    simulated = 1e3 * (fit.simulated + fit.drift)[channel, extract]
     style = {"color": BLACK, "markersize": 3.0, "linestyle": "none"}
-    axis.plot(times, 1e3 * fit.measured[channel, shown], marker=".", label="measured", **style)
+    axis.plot(times, 1e3 * fit.measured[channel, extract], marker=".", label="measured", **style)
     axis.plot(times, simulated, color=BLUE, linewidth=0.9, label="identified fish + drift")
     axis.set_ylabel(f"${symbol}$ (mN)")
     axis.set_xlabel("time (s)")
@@ -65,14 +65,14 @@ def _draw_residual(
 
 def _draw_correlation(axis: Any, residual: Any) -> None:
     """Plot the correlation of the residual without drift, with the bounds for white noise."""
-    known = residual[np.isfinite(residual)]
-    known = known - known.mean()
-    lags = range(1, min(_MAX_LAG, len(known) - 1) + 1)
-    squares = float(known @ known)
-    correlations = [float(known[lag:] @ known[:-lag]) / squares for lag in lags]
+    finite = residual[np.isfinite(residual)]
+    finite = finite - finite.mean()
+    lags = range(1, min(_MAX_LAG, len(finite) - 1) + 1)
+    squares = float(finite @ finite)
+    correlations = [float(finite[lag:] @ finite[:-lag]) / squares for lag in lags]
     axis.vlines(lags, 0.0, correlations, color=BLUE, linewidth=1.5)
     for end in (-Z95, Z95):
-        axis.axhline(end / np.sqrt(len(known)), color=GREY, linewidth=0.8, linestyle="--")
+        axis.axhline(end / np.sqrt(len(finite)), color=GREY, linewidth=0.8, linestyle="--")
     axis.axhline(0.0, color=GREY, linewidth=0.6)
     axis.set_ylim(-0.3, 0.3)
     axis.set_xlabel("ticks between")

@@ -151,7 +151,7 @@ class Problem:
     def residuals(self, values: dict[str, float]) -> list[Array]:
         """Return measured minus simulated forces [N] by passage, each (2, windows)."""
         pairs = zip(self.measured, self.forces(values), strict=True)
-        return [measured - seen for measured, seen in pairs]
+        return [measured - simulated for measured, simulated in pairs]
 
     def whitened(self, residuals: Sequence[Array]) -> Array:
         """Return innovations of both channels in units of their rms, passages joined, (2, n)."""
@@ -257,11 +257,11 @@ def solve(
             max_nfev=steps,
         )
         values = problem.to_values(solution.x, fixed)
-        before = problem.noise
+        previous_noise = problem.noise
         problem.estimate_noise(problem.residuals(values))
         if round_index and all(
             abs(new.innovation / old.innovation - 1.0) < 1e-3
-            for new, old in zip(problem.noise, before, strict=True)
+            for new, old in zip(problem.noise, previous_noise, strict=True)
         ):
             break
     return values
@@ -285,16 +285,16 @@ def estimate_noise_model(residuals: Sequence[Array]) -> Noise:
     def noise(x: Array) -> Noise:
         # Gains of a steady Kalman filter: level in 0 … 1, slope up to level² / (2 − level).
         level = 1.0 / (1.0 + float(np.exp(-x[0])))
-        share = 1.0 / (1.0 + float(np.exp(-x[1])))
-        return Noise(1.0, level, share * level * level / (2.0 - level))
+        slope_share = 1.0 / (1.0 + float(np.exp(-x[1])))
+        return Noise(1.0, level, slope_share * level * level / (2.0 - level))
 
     def cost(x: Array) -> float:
-        parts = [_innovations(part, noise(x)) for part in residuals]
-        squares = sum(float(part @ part) for part, _ in parts)
-        return count * float(np.log(squares)) + sum(lost for _, lost in parts)
+        parts = [_innovations(residual, noise(x)) for residual in residuals]
+        squares = sum(float(residual @ residual) for residual, _ in parts)
+        return count * float(np.log(squares)) + sum(loss for _, loss in parts)
 
     best = noise(minimize(cost, [-3.0, -1.0], method="Nelder-Mead", options={"xatol": 0.02}).x)
-    squares = sum(float(np.sum(_innovations(part, best)[0] ** 2)) for part in residuals)
+    squares = sum(float(np.sum(_innovations(residual, best)[0] ** 2)) for residual in residuals)
     return replace(best, innovation=float(np.sqrt(squares / count)))
 
 
@@ -304,8 +304,8 @@ def _innovations(residual: Array, noise: Noise) -> tuple[Array, float]:
     The second result is twice the loss of log-likelihood by not knowing these two.
     """
     filtered = lfilter(*_filter_coefficients(noise), residual)
-    basis, lost = _initial_state_basis(noise, len(residual))
-    return filtered - basis @ (basis.T @ filtered), lost
+    basis, loss = _initial_state_basis(noise, len(residual))
+    return filtered - basis @ (basis.T @ filtered), loss
 
 
 def _filter_coefficients(noise: Noise) -> tuple[list[float], list[float]]:

@@ -158,9 +158,9 @@ def find_missing_parameters(
 
 def are_free(names: Sequence[str], values: dict[str, float]) -> NDArray[np.bool_]:
     """Return which fitted parameters are not at a bound."""
-    lows = [values[name] <= BOUNDS[name][0] + 1e-7 * BOUNDS[name][1] for name in names]
-    ends = [is_at_bound(name, values[name]) for name in names]
-    free: NDArray[np.bool_] = ~(np.array(lows) | np.array(ends))
+    at_lower_bounds = [values[name] <= BOUNDS[name][0] + 1e-7 * BOUNDS[name][1] for name in names]
+    at_bounds = [is_at_bound(name, values[name]) for name in names]
+    free: NDArray[np.bool_] = ~(np.array(at_lower_bounds) | np.array(at_bounds))
     return free
 
 

@@ -59,8 +59,8 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
         missing = [name for name in COLUMNS if name not in table]
         if missing:
             raise Unidentifiable(
-                f"no table of ticks: the column {missing[0]} is missing; {', '.join(COLUMNS)} are "
-                "needed"
+                f"not a table of ticks: the column {missing[0]} is missing; {', '.join(COLUMNS)} "
+                "are needed"
             )
         if len(table) < 2:
             continue

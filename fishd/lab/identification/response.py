@@ -101,39 +101,41 @@ def respond(
     stride = math.ceil(tick / (samples * _MAX_STEP_S))
     steps = stride * samples
     h = tick / steps
-    before = _SLOTS_BEFORE + math.ceil(drive.servo_delay / tick - 1e-9)
-    held = np.concatenate((np.full(before, commands[0]), commands))
+    slots_before = _SLOTS_BEFORE + math.ceil(drive.servo_delay / tick - 1e-9)
+    held_commands = np.concatenate((np.full(slots_before, commands[0]), commands))
     servo = (
         *(drive.servo_speed, drive.servo_lag, drive.backlash, drive.cable_slack),
-        *(drive.servo_dead_zone, float(before)),
+        *(drive.servo_dead_zone, float(slots_before)),
     )
     if near and near.servo == servo:
         pull, turned = near.pull, near.turned
     else:
-        pull, turned = _wheel_motion(drive, held, steps, tick)
+        pull, turned = _wheel_motion(drive, held_commands, steps, tick)
     similar = near.rate if near and near.pull.size == pull.size else None
     alpha, rate = _fin(drive, pull, h, similar)
     # Slot k of the commands begins at k·tick; its command applies from grid point
-    # (k + before)·steps on, which is servo_delay later. So its first sample is here:
-    position = before * steps - drive.servo_delay / h + 0.5 * stride
+    # (k + slots_before)·steps on, which is servo_delay later. So its first sample is here:
+    position = slots_before * steps - drive.servo_delay / h + 0.5 * stride
     first = math.floor(position)
-    part = position - first
+    fraction = position - first
     slots = int(ends[-1])
 
     def sample_grid(values: Array, later: int = 0, factor: int = 1) -> Array:
         return values[factor * first + later :: factor * stride][: slots * samples]
 
     acceleration = _acceleration(drive, alpha, rate, pull[::2])
-    here, there = sample_grid(rate), sample_grid(rate, 1)
-    a = _hermite(sample_grid(alpha), sample_grid(alpha, 1), here, there, part, h)
-    v = _hermite(here, there, sample_grid(acceleration), sample_grid(acceleration, 1), part, h)
+    rates, next_rates = sample_grid(rate), sample_grid(rate, 1)
+    a = _hermite(sample_grid(alpha), sample_grid(alpha, 1), rates, next_rates, fraction, h)
+    v = _hermite(
+        rates, next_rates, sample_grid(acceleration), sample_grid(acceleration, 1), fraction, h
+    )
     pulls = sample_grid(pull, 0, 2), sample_grid(pull, 1, 2), sample_grid(pull, 2, 2)
-    pulled = np.tensordot(_parabola(part), np.stack(pulls), 1)
+    pulled = np.tensordot(_parabola(fraction), np.stack(pulls), 1)
     minus = -_acceleration(drive, a, v, pulled)
     sums = np.stack((a * minus, minus, -v, -np.abs(v) * v))
     sums = sums.reshape(4, slots, samples).sum(axis=2)
     means: Array = np.add.reduceat(sums, ends[:-1], axis=1) / (samples * np.diff(ends))
-    edges = 2.0 * (before * steps - drive.servo_delay / h + ends * steps)
+    edges = 2.0 * (slots_before * steps - drive.servo_delay / h + ends * steps)
     mount_rates = np.interp(edges, np.arange(turned.size), _smoothed_speed(turned, 0.5 * h))
     reaction = -np.diff(mount_rates) / (tick * np.diff(ends))
     forces = np.vstack((means[:3], reaction, means[3]))
@@ -151,7 +153,7 @@ def _smoothed_speed(angles: Array, step: float) -> Array:
     return smoothed
 
 
-def _wheel_motion(drive: Drive, held: Array, steps: int, tick: float) -> tuple[Array, Array]:
+def _wheel_motion(drive: Drive, commands: Array, steps: int, tick: float) -> tuple[Array, Array]:
     """Return the wheel angle that drives the fin, and the angle of the wheel itself [rad].
 
     Both are at the grid points and half way between them.
@@ -161,8 +163,8 @@ def _wheel_motion(drive: Drive, held: Array, steps: int, tick: float) -> tuple[A
     decay = math.exp(-speed * tick / lag)
     sinh, asinh = math.sinh, math.asinh
     targets, sinhs, tails = [], [], []
-    phi = tail = float(held[0])
-    for command in held.tolist():
+    phi = tail = float(commands[0])
+    for command in commands.tolist():
         if dead:
             gap = command - phi
             command = phi if abs(gap) <= dead else command - math.copysign(dead, gap)
@@ -174,8 +176,8 @@ def _wheel_motion(drive: Drive, held: Array, steps: int, tick: float) -> tuple[A
         if play:
             tail = max(phi - play, min(phi + play, tail))
     times = np.arange(2 * steps) * (0.5 * tick / steps)
-    left = np.arcsinh(np.multiply.outer(np.array(sinhs), np.exp(times * (-speed / lag))))
-    wheel = np.array(targets)[:, None] - lag * left
+    lag_angle = np.arcsinh(np.multiply.outer(np.array(sinhs), np.exp(times * (-speed / lag))))
+    wheel = np.array(targets)[:, None] - lag * lag_angle
     turned = np.append(wheel.ravel(), phi)
     if play:  # within a slot the wheel turns one way only
         wheel = np.clip(np.array(tails)[:, None], wheel - play, wheel + play)
@@ -208,7 +210,7 @@ def _fin(drive: Drive, pull: Array, h: float, similar: Array | None) -> tuple[Ar
     rate = _linear_fin(drive.omega0, drive.xi, pull, h)[1] if similar is None else similar
     mean = 2.0 * float(np.abs(rate).mean())
     xi = drive.xi + drag * mean / drive.omega0
-    share = drag / drive.omega0**2
+    drag_ratio = drag / drive.omega0**2
     shrinks = min(1.0, 2.0 * drag * mean / (xi * drive.omega0))
     for _ in range(_MAX_ITERATIONS):
         rates = np.empty_like(pull)
@@ -217,10 +219,10 @@ def _fin(drive: Drive, pull: Array, h: float, similar: Array | None) -> tuple[Ar
         rates[1::2] = 0.5 * (rate[1:] + rate[:-1])
         bend = rate[3:] - rate[2:-1] - rate[1:-2] + rate[:-3]
         rates[3:-3:2] -= 0.0625 * bend
-        driven = pull - share * (np.abs(rates) - mean) * rates
-        before = rate
+        driven = pull - drag_ratio * (np.abs(rates) - mean) * rates
+        previous_rate = rate
         alpha, rate = _linear_fin(drive.omega0, xi, driven, h)
-        if shrinks * np.abs(rate - before).max() <= _TOLERANCE * np.abs(rate).max():
+        if shrinks * np.abs(rate - previous_rate).max() <= _TOLERANCE * np.abs(rate).max():
             break
     return alpha, rate
 
@@ -260,10 +262,10 @@ def _discretise(omega0: float, xi: float, h: float) -> tuple[Array, Array]:
 
 
 def _hermite(
-    values: Array, next_values: Array, slopes: Array, next_slopes: Array, part: float, h: float
+    values: Array, next_values: Array, slopes: Array, next_slopes: Array, fraction: float, h: float
 ) -> Array:
-    """Return cubic interpolations in cells of length h, at the fraction `part`, 0 ≤ part < 1."""
-    s, t = part, 1.0 - part
+    """Return cubic interpolations in cells of length h, at `fraction` of each, 0 ≤ fraction < 1."""
+    s, t = fraction, 1.0 - fraction
     return (
         (1.0 + 2.0 * s) * t * t * values
         + (1.0 + 2.0 * t) * s * s * next_values

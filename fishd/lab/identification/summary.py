@@ -51,7 +51,7 @@ _SINGULAR = 1e-10
 """Relative eigenvalue below which information counts as zero."""
 _SYMBOLS = {"fx": "F_x", "fy": "F_y"}
 _SIGNS = {
-    "white residual": "what is left of {} is more than noise",
+    "white residual": "the residual of {} is more than noise",
     "prediction": "data left out of the fit are predicted worse in {}",
 }
 """Clauses of the headline for failed assumptions about forces."""
@@ -149,15 +149,15 @@ def _failed_assumptions(
 ) -> list[str]:
     """Return the assumptions about residuals that do not hold."""
     failed = [f"white residual of {channel.name}" for channel in channels if not channel.white]
-    for channel, fitted, unseen in zip(channels, innovations, predicted, strict=True):
-        if unseen @ unseen > _MAX_PREDICTION_RATIO * (fitted @ fitted):
+    for channel, fitted, left_out in zip(channels, innovations, predicted, strict=True):
+        if left_out @ left_out > _MAX_PREDICTION_RATIO * (fitted @ fitted):
             failed.append(f"prediction of {channel.name}")
     return failed
 
 
-def _explained_share(left: Array, whole: Array) -> float:
+def _explained_share(residual: Array, measured: Array) -> float:
     """Return the share of the variance that is explained, from residual and measured forces."""
-    return float(1.0 - (left @ left) / (whole @ whole))
+    return float(1.0 - (residual @ residual) / (measured @ measured))
 
 
 def _with_free_scale(estimate: Estimate) -> Estimate:
@@ -210,22 +210,26 @@ def _headline(
         return f"identified: the model explains {explained}"
     causes = [assumption for assumption in failed if assumption.endswith(" = 0")]
     reasons = "; ".join(
-        words.format(" and ".join(symbols))
-        for sign, words in _SIGNS.items()
-        if (symbols := [s for name, s in _SYMBOLS.items() if f"{sign} of {name}" in failed])
+        clause.format(" and ".join(symbols))
+        for assumption_kind, clause in _SIGNS.items()
+        if (
+            symbols := [
+                s for name, s in _SYMBOLS.items() if f"{assumption_kind} of {name}" in failed
+            ]
+        )
     )
     if causes:
         reasons += f"; it looks as if {causes[0].replace(' = 0', ' is not 0')}"
     if not identified:
         return f"not identified: the model explains {explained}: {reasons}"
     widening = f"intervals are {inflation:.2g} times as wide as noise alone makes them"
-    return f"careful: the model lacks something and explains {explained}: {reasons}; {widening}"
+    return f"careful: the model is incomplete and explains {explained}: {reasons}; {widening}"
 
 
 def _percent(share: float) -> str:
     """Return a share with enough digits to differ from 100 %: 71 %, 99.63 %, 99.9950 %."""
-    rest = max(1.0 - share, 1e-6)
-    digits = min(4, max(0, -math.floor(math.log10(rest)) - 1))
+    unexplained = max(1.0 - share, 1e-6)
+    digits = min(4, max(0, -math.floor(math.log10(unexplained)) - 1))
     return f"{100.0 * max(share, 0.0):.{digits}f} %"
 
 
@@ -311,8 +315,8 @@ def _remarks(
             name for name, part in zip(names, unknown_direction, strict=True) if abs(part) > 0.3
         ]
         remarks.append(
-            f"these data do not tell {' and '.join(involved)}"
-            + (" apart" if len(involved) > 1 else "")
+            f"these data do not determine {' and '.join(involved)}"
+            + (" separately" if len(involved) > 1 else "")
             + "; fix one, or run fishctl identify --experiment"
         )
     imprecise = [e.name for e in estimates if e.name in names and _is_wide(e)]

@@ -117,7 +117,7 @@ def measure_trials(
         after = session.rest(MEAN_REST_S)
         ticks = [*rest, *swim, *after]
         refuse_lost(ticks, (MEAN_REST_S, length, MEAN_REST_S), session.tick)
-        evaluation = evaluate(to_samples(ticks), session.tick, settles, alike=steps)
+        evaluation = evaluate(to_samples(ticks), session.tick, settles, other_steps=steps)
         steps += evaluation.steps
         swum += len(swim)
         passed += length + MEAN_REST_S

@@ -60,11 +60,11 @@ class SwimResult(NamedTuple):
     track: Track
     report: SwimReport | None
     """Report of the swim; None where it ended before the gait had settled."""
-    trouble: Diverged | None
+    error: Diverged | None
     """Error of the simulation that ended the swim; None if there was none."""
-    kept: float | None
+    checkpoint_time: float | None
     """Time of the latest written checkpoint [s]."""
-    lost: OSError | None
+    checkpoint_error: OSError | None
     """Error of writing the latest checkpoint; None if it was written."""
     complete: bool
     """True where the swim has the requested length."""
@@ -77,7 +77,7 @@ def swim(
     seconds: float = 60.0,
     settle: float = 8.0,
     publisher: Publisher | None = None,
-    begun: Callable[[VirtualRun], None] = lambda run: None,
+    on_start: Callable[[VirtualRun], None] = lambda run: None,
     *,
     progress: Callable[[float, float], None] = lambda passed, speed: None,
     keeping: CheckpointSettings | None = None,
@@ -88,7 +88,7 @@ def swim(
 ) -> SwimResult:
     """Swim a free swimmer with a controller for `seconds`; report the gait after `settle` seconds.
 
-    publisher, begun: see `fishd.lab.simulation.simulate`
+    publisher, on_start: see `fishd.lab.simulation.simulate`
     progress: called after each tick with the time [s] and the mean speed since it settled [m/s]
     keeping: settings of checkpoints; the last one is written at the end
     resume: checkpoint to resume from; with the same controller the time before it counts
@@ -98,24 +98,24 @@ def swim(
     Raises `UnknownController`, `ParameterError`, `MissingPackage` and `CheckpointError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
-    given = msgspec.structs.asdict(controller.parameters)
+    parameter_values = msgspec.structs.asdict(controller.parameters)
     ticks, first = count_ticks(seconds, settle, config.tick)
     if first + 1 >= ticks:
         raise ParameterError(
-            f"a run of {seconds:g} s is too short: it has to be judged by two ticks of "
-            f"{config.tick:g} s or more after the {settle:g} s that it may take to settle"
+            f"a run of {seconds:g} s is too short: two ticks of {config.tick:g} s or more are "
+            f"needed after the settling time of {settle:g} s"
         )
     settings = settings_of(config)
     writer = _CheckpointWriter(keeping, lost)
-    kept_rows: Array | None = None
+    resumed_rows: Array | None = None
     if resume:
         resume.check(settings)
-        if (resume.controller, resume.parameters) == (name, msgspec.to_builtins(given)):
-            kept_rows = resume.track
-            if len(kept_rows) >= ticks:
+        if (resume.controller, resume.parameters) == (name, msgspec.to_builtins(parameter_values)):
+            resumed_rows = resume.track
+            if len(resumed_rows) >= ticks:
                 raise CheckpointError(
-                    f"{resume.path}: the checkpoint is of {resume.time:.2f} s already: nothing was "
-                    "swum; more --seconds are needed"
+                    f"{resume.path}: the checkpoint is of {resume.time:.2f} s already; give more "
+                    "--seconds"
                 )
     with VirtualRun(config, publisher or EncodingPublisher()) as run:
         fish = run.swimmer
@@ -124,18 +124,18 @@ def swim(
         if resume:
             resume.put_into(fish)
             run.loop.applied = fish.command  # the new controller starts from this angle
-            track = Track(kept_rows)
-        before = len(track)
+            track = Track(resumed_rows)
+        resumed_ticks = len(track)
         track.begin(fish)
         fish.compile()
-        begun(run)
+        on_start(run)
         run.loop.set_controller(name, controller)
-        next_kept = fish.fish.time + keeping.every if keeping else float("inf")
-        since = time.perf_counter()
-        mean_speed = _Speed(fish, first - before)
+        next_checkpoint = fish.fish.time + keeping.every if keeping else float("inf")
+        start_time = time.perf_counter()
+        mean_speed = _Speed(fish, first - resumed_ticks)
 
         def write_checkpoint() -> None:
-            writer.write(fish, track, settings, name, given)
+            writer.write(fish, track, settings, name, parameter_values)
 
         while len(track) < ticks:
             command = run.loop.applied
@@ -145,13 +145,13 @@ def swim(
             track.add(fish, command)
             watch(fish)
             progress(len(track) * config.tick, mean_speed.mean())
-            if fish.fish.time >= next_kept - 1e-9:
+            if fish.fish.time >= next_checkpoint - 1e-9:
                 write_checkpoint()
-                next_kept += keeping.every if keeping else 0.0
+                next_checkpoint += keeping.every if keeping else 0.0
             if ended():
                 break
-        elapsed = time.perf_counter() - since
-        if not fish.trouble and len(track) > before:
+        elapsed = time.perf_counter() - start_time
+        if not fish.trouble and len(track) > resumed_ticks:
             write_checkpoint()
         loop = run.loop
         report = None
@@ -160,17 +160,17 @@ def swim(
             report = SwimReport(
                 **msgspec.structs.asdict(gait(columns, config.swimmer)),
                 controller=name,
-                parameters=given,
+                parameters=parameter_values,
                 seconds=len(track) * config.tick,
                 resumed=resume.time if resume else None,
                 ticks=len(track),
                 mode=loop.supervisor.mode.value,
                 reason=loop.supervisor.reason,
                 fallback=loop.active.fallback,
-                real_time_factor=(len(track) - before) * config.tick / elapsed,
+                real_time_factor=(len(track) - resumed_ticks) * config.tick / elapsed,
             )
     return SwimResult(
-        track, report, fish.trouble, writer.kept, writer.trouble, complete=len(track) >= ticks
+        track, report, fish.trouble, writer.time, writer.error, complete=len(track) >= ticks
     )
 
 
@@ -191,9 +191,9 @@ class _CheckpointWriter:
     def __init__(self, keeping: CheckpointSettings | None, lost: Callable[[OSError], None]) -> None:
         self._keeping, self._lost = keeping, lost
         self._has_reported = False
-        self.kept: float | None = None
+        self.time: float | None = None
         """Time of the latest written checkpoint [s]."""
-        self.trouble: OSError | None = None
+        self.error: OSError | None = None
         """Error of writing the latest checkpoint; None if it was written."""
 
     def write(self, fish: Swimmer, *others: Any) -> None:
@@ -203,12 +203,12 @@ class _CheckpointWriter:
         try:
             checkpoint.save(self._keeping.path, fish, *others)
         except OSError as error:
-            self.trouble = error
+            self.error = error
             if not self._has_reported:
                 self._has_reported = True
                 self._lost(error)
         else:
-            self.kept, self.trouble = fish.fish.time, None
+            self.time, self.error = fish.fish.time, None
 
 
 class _Speed:

@@ -78,16 +78,16 @@ def simulate(
     seconds: float = 60.0,
     settle: float = 10.0,
     publisher: Publisher | None = None,
-    begun: Callable[[VirtualRun], None] = lambda run: None,
+    on_start: Callable[[VirtualRun], None] = lambda run: None,
 ) -> Report:
     """Swim a simulated fish with a controller for `seconds`; report on the time after `settle` [s].
 
     publisher: receiver of every tick and event; None to create no messages
-    begun: called before the first tick
+    on_start: called before the first tick
     Raises `UnknownController` and `ParameterError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
-    return judge(config, name, controller, seconds, settle, publisher, begun)
+    return judge(config, name, controller, seconds, settle, publisher, on_start)
 
 
 def count_ticks(seconds: float, settle: float, tick: float) -> tuple[int, int]:
@@ -101,8 +101,8 @@ def count_ticks(seconds: float, settle: float, tick: float) -> tuple[int, int]:
     first = math.ceil(settle / tick - 1e-9) + 1
     if first >= ticks:
         raise ParameterError(
-            f"nothing is left to judge: a run of {seconds:g} s must be longer than the "
-            f"{settle:g} s that it may take to settle"
+            f"a run of {seconds:g} s is too short: it must be longer than the settling time of "
+            f"{settle:g} s"
         )
     return ticks, first
 
@@ -126,12 +126,12 @@ def judge(
     seconds: float,
     settle: float,
     publisher: Publisher | None,
-    begun: Callable[[VirtualRun], None] = lambda run: None,
+    on_start: Callable[[VirtualRun], None] = lambda run: None,
 ) -> Report:
     """Swim a simulated fish with a controller object, and report as `simulate` does.
 
     publisher: receiver of every tick and event; None to create no messages
-    begun: called before the first tick
+    on_start: called before the first tick
     Raises `ParameterError` where `settle` is too long, and `ConfigError` for a free swimmer.
     """
     check_tethered(config.robot, "relative_thrust")
@@ -140,7 +140,7 @@ def judge(
     since = 0.0
     took_over: float | None = None
     with VirtualRun(config, publisher) as virtual:
-        begun(virtual)
+        on_start(virtual)
         virtual.loop.set_controller(name, controller)
         for index in range(ticks):
             if index == first:  # the first ticks are slower, as they fill caches

@@ -83,7 +83,7 @@ class Swims:
         self._rest()
         block = average_phase(phase, self._tick, SWIM_SETTLE_TIME_S)
         if block and block.beats:
-            frequency = block.beats / block.lasts  # over whole beats, which is more exact
+            frequency = block.beats / block.duration  # over whole beats, which is more exact
         thrust = None
         if block and before and self._zero and not stalled:
             share = (block.time - before.time) / (self._zero.time - before.time)

@@ -71,7 +71,7 @@ def train_seeds(
                     unpack(result[1], waiting[index].folder)
                 add_outcome(index, result[0])
         except Killed as killed:
-            for index in killed.left:
+            for index in killed.unfinished:
                 add_outcome(index, _make_failure(waiting[index], "its process was killed"))
     write_summary(folder / "seeds.csv", [job.folder for job in waiting])
     return [outcomes[index] for index in range(seeds)]

@@ -92,7 +92,7 @@ def test_a_misspelt_path_of_a_policy_is_reported_before_anything_swims() -> None
     ("arguments", "message", "status"),
     [
         (["swing:C=2"], "fishctl: swing: C: 2 is not valid: a number in [0, 1]", 1),
-        (["swing", "--seconds", "1"], "fishctl: nothing is left to judge", 1),
+        (["swing", "--seconds", "1"], "fishctl: a run of 1 s is too short", 1),
         (["swing", "--set", "tick=3"], "fishctl: --set tick=3: tick: 3 is not valid", 78),
     ],
 )

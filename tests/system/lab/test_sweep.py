@@ -98,7 +98,7 @@ def test_a_rig_that_drifts_is_measured_point_by_point_and_recorded(tmp_path: Pat
 class Taken(VirtualSession):
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         if parameters["frequency"] == 2.0:
-            raise Disturbed("the fish was told to let square swim, but sine swims")
+            raise Disturbed("the fish was to swim square, but sine swims")
         return super().swim(controller, parameters, seconds)
 
 
@@ -207,7 +207,7 @@ def test_a_table_that_cannot_be_written_says_that_the_points_before_are_kept(
 
     folder = opened(tmp_path)
     monkeypatch.setattr("fishd.lab.tables.Table.add", full)
-    with pytest.raises(FishdError, match="No space left on device; what was measured before is k"):
+    with pytest.raises(FishdError, match="No space left on device; earlier results are k"):
         folder.add_result(SQUARES[0], Result(), b"a recording")
 
 

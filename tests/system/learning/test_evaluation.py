@@ -72,7 +72,7 @@ def test_an_answer_that_is_no_number_ends_in_a_fault_with_its_reason() -> None:
 
 
 def test_lengths_that_leave_nothing_to_judge_are_refused() -> None:
-    with pytest.raises(ParameterError, match="nothing is left to judge"):
+    with pytest.raises(ParameterError, match="is too short"):
         judge(CONFIG, lambda *_: 0.0, 5.0, 5.0)
 
 

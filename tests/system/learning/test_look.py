@@ -51,7 +51,7 @@ def test_what_sees_no_pictures_or_does_not_swim_or_is_blind_is_refused(tmp_path:
     nothing[0, 0, 0] = 1e-6
     timid = of_pixels(nothing, seeing_card())
     assert "nothing moves in these pictures" in refused(timid, NoMotion, 25.0)
-    assert "nothing is left to judge" in refused(velocity_follower(), ParameterError, 4.0)
+    assert "is too short" in refused(velocity_follower(), ParameterError, 4.0)
 
 
 def test_the_verb_says_it_in_a_line_and_draws_it(tmp_path: Path) -> None:

@@ -217,7 +217,7 @@ def test_a_folder_that_is_in_use_is_left_alone(tmp_path: Path, name: str) -> Non
     kept.parent.mkdir(parents=True)
     kept.write_text("of last week")
     done = fishctl(*command(tmp_path, "--seeds", "2"))
-    assert "the folder is not empty; --folder names another" in done.stderr
+    assert "the folder is not empty; choose another with --folder" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (78, 1)
     assert kept.read_text() == "of last week"
 

@@ -60,7 +60,7 @@ def test_a_folder_that_cannot_be_made_is_reported_before_the_fish_swims(
     (tmp_path / "file").touch()
     done = invoke("--experiment", "--folder", str(tmp_path / "file/run"))
     assert isinstance(done.exception, ConfigError)
-    assert "file/run: cannot be made a folder: Not a directory" in str(done.exception)
+    assert "file/run: the folder cannot be created: Not a directory" in str(done.exception)
     assert swum == []
 
 

@@ -89,7 +89,7 @@ def test_without_a_known_calibration_no_total_is_claimed() -> None:
     assert format_with_budget(0.025, 1e-4, None, None, "V").endswith(
         "mV (statistical ± 0.10, calibration none)"
     )
-    assert "nothing says how well" in unknown_calibration(None, "N")
+    assert "the uncertainty of the gains" in unknown_calibration(None, "N")
     assert "not calibrated: forces are in V" in unknown_calibration(None, "V")
     assert not unknown_calibration(0.0, "N")
 

@@ -78,11 +78,11 @@ def test_a_header_that_is_none_is_one_line(tmp_path: Path, content: str | None, 
 
 def test_no_folder_is_used_twice(tmp_path: Path) -> None:
     begin(tmp_path / "run")
-    with pytest.raises(ConfigError, match=r"run: the folder is not empty; --resume \S+ goes on"):
+    with pytest.raises(ConfigError, match=r"run: the folder is not empty; resume it with --resume \S+, or"):
         begin(tmp_path / "run")
     (tmp_path / "file").touch()
     for name, named in (("file", "File exists"), ("file/run", "Not a directory")):
-        with pytest.raises(ConfigError, match=f"cannot be made a folder: {named}"):
+        with pytest.raises(ConfigError, match=f"the folder cannot be created: {named}"):
             begin(tmp_path / name)
     with (
         open_experiment(tmp_path / "run", HEADER, resume=True),
@@ -154,4 +154,4 @@ def test_a_measurement_keeps_header_recording_and_result_and_is_listed(tmp_path:
     (folder / "experiment.json").write_text("{}")
     done = fishctl("runs", "--folder", str(tmp_path))
     assert done.returncode == 1
-    assert f"fishctl: {folder}/experiment.json: not as this fishd" in done.stderr
+    assert f"fishctl: {folder}/experiment.json: fishd" in done.stderr

@@ -124,7 +124,7 @@ def test_what_the_forces_show_is_fitted_too_unless_that_is_fixed() -> None:
     assert identification["servo_reaction"].value == pytest.approx(-0.0003, rel=0.05)
     fixed = identify(table, start=FISH, fit=(*NEARLY_KNOWN, "xi", "servo_lag"))
     assert fixed.failed_assumptions[0] == "servo_reaction = 0"
-    assert fixed.headline.startswith("careful: the model lacks something")
+    assert fixed.headline.startswith("careful: the model is incomplete")
     assert "it looks as if servo_reaction is not 0" in fixed.headline
     assert fixed.inflation > 2.0
 
@@ -325,11 +325,11 @@ def test_data_that_cannot_tell_say_so() -> None:
 @pytest.mark.parametrize(
     ("spoil", "complaint"),
     [
-        (lambda t: t.drop(columns=["fy"]), "no table of ticks: the column fy is missing"),
+        (lambda t: t.drop(columns=["fy"]), "not a table of ticks: the column fy is missing"),
         (lambda t: t.iloc[:0], "there is no passage of 5 s without a gap"),
         (lambda t: t.iloc[:90], "there is no passage of 5 s without a gap"),
         (lambda t: t.assign(phi_c=0.0), "φ_c is zero all the time"),
-        (lambda t: t.assign(t=1.0), "the times of these ticks do not increase"),
+        (lambda t: t.assign(t=1.0), "the times of the ticks do not increase"),
         (lambda t: t.assign(servo_on=False), "there is no passage of 5 s without a gap"),
     ],
 )

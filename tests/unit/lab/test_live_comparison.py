@@ -99,7 +99,7 @@ class Disturbing(VirtualSession):
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         self.swims += 1
         if self.swims > 2:
-            raise Disturbed("the fish was told to let sine swim, but it is in mode idle")
+            raise Disturbed("the fish was to swim sine, but it is in mode idle")
         return super().swim(controller, parameters, seconds)
 
 

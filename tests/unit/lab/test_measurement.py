@@ -96,7 +96,7 @@ def test_swims_and_rests_differ_in_length_so_that_no_drift_keeps_time_with_them(
 
 @pytest.mark.parametrize("seconds", [10.0, float("nan"), float("inf"), -1.0, 1e9])
 def test_a_length_that_is_not_possible_is_told_with_what_is_needed(seconds: float) -> None:
-    with pytest.raises(ParameterError, match=r"two swims of 6 s .* need 20\.25 s, and 3600 s"):
+    with pytest.raises(ParameterError, match=r"two swims of 6 s .* need 20\.25 s, and the limit is 3600 s"):
         plan(seconds, {})
 
 
@@ -104,7 +104,7 @@ def test_a_fault_in_the_middle_ends_the_measurement_and_says_which() -> None:
     with VirtualSession(RIG) as rig:
         rig.rest(1.0)
         rig._run.loop.estop("emergency stop")
-        with pytest.raises(Disturbed, match=r"told to rest, but it is in mode estop \(emergency"):
+        with pytest.raises(Disturbed, match=r"was to rest, but it is in mode estop \(emergency"):
             rig.rest(1.0)
 
 
@@ -221,8 +221,8 @@ def test_where_a_swim_has_one_beat_those_of_others_say_how_sure_its_thrust_and_p
     alike: list[Step] = []
     thrust_missed = power_missed = 0
     for _ in range(60):
-        alike += evaluate(make_candidate(generator, 4), 0.05, 0.75, alike=alike).steps
-        evaluation = evaluate(make_candidate(generator, 6), 0.05, 0.75, alike=alike)
+        alike += evaluate(make_candidate(generator, 4), 0.05, 0.75, other_steps=alike).steps
+        evaluation = evaluate(make_candidate(generator, 6), 0.05, 0.75, other_steps=alike)
         assert not evaluation.steps  # of one beat
         assert evaluation.watts is not None
         assert evaluation.watts_error is not None

@@ -52,7 +52,7 @@ def test_a_recording_is_drawn_as_picture_and_as_page(path: Path, tmp_path: Path)
     refused = fishctl("plot", str(path), "--to", str(tmp_path))
     assert "is there already; --force replaces it" in one_line(refused)
     nothing = fishctl("plot", str(path), "--from", "9", "--to", str(tmp_path))
-    assert "no tick between these times; it is 3.0 s long" in one_line(nothing)
+    assert "no tick between these times; the recording is 3.0 s long" in one_line(nothing)
 
 
 @pytest.mark.slow

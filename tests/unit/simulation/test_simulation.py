@@ -62,7 +62,7 @@ def test_a_fish_that_does_not_beat_has_no_frequency_and_no_thrust() -> None:
     [
         (math.nan, 1, r"a number from 0 to 1e\+08 s is needed"),
         (9, -1, r"a number from 0 to 1e\+08 s is needed"),
-        (5, 10, "nothing is left to judge: a run of 5 s"),
+        (5, 10, "a run of 5 s is too short"),
     ],
 )
 def test_a_length_that_leaves_nothing_is_refused(seconds: float, settle: float, why: str) -> None:
@@ -132,7 +132,7 @@ def test_the_command_prints_json_with_the_documented_keys() -> None:
         (["swim"], "fishctl: no controller is named 'swim'; did you mean 'swing'?\n", 1),
         (["swing", "--C", "inf"], "'inf' is not valid: a number in [0, 1] (or auto) is needed", 2),
         (["swing", "--set", "tick=3"], "fishctl: --set tick=3: tick: 3 is not valid", 78),
-        (["swing", "--seconds", "1"], "fishctl: nothing is left to judge", 1),
+        (["swing", "--seconds", "1"], "fishctl: a run of 1 s is too short", 1),
         (["swing", "--seconds", "12", "--settle", "11.5"], "no whole tail beat in the 0.5 s", 1),
         (["swing", "--config", "no.yaml"], "fishctl: no.yaml: no such file", 78),
         (["remote", "--agent", "tcp://*:9"], "remote: agent: 'tcp://*:9' is not valid: ", 1),

@@ -105,7 +105,7 @@ def test_a_swim_that_is_as_long_already_leaves_its_files_alone(
     words = ("square", "--frequency", "2.5", "--seconds", "4", "--settle", "1")
     files = ("--resume", str(swum[1] / "end"), "--save", str(saved))
     line = one_line(simulated(*words, *files))
-    told = "the checkpoint is of 4.00 s already: nothing was swum; more --seconds are needed"
+    told = "the checkpoint is of 4.00 s already; give more --seconds"
     assert line == f"fishctl: {swum[1]}/end: {told}\n"
     assert saved.read_text() == "precious"
 
@@ -215,7 +215,7 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
         (("--save", "track.txt"), "track.txt: a name that ends in .csv or .npz is needed"),
         (("--save", "no-such/track.csv"), "there is no folder no-such"),
         (("--checkpoint", "no-such/kept"), "no-such/kept: its folder does not exist; create it"),
-        (("--seconds", "2", "--settle", "3"), "nothing is left to judge"),
+        (("--seconds", "2", "--settle", "3"), "a run of 2 s is too short"),
         (("--checkpoint", "/dev/null"), "/dev/null: is a device; a regular file is needed"),
         (("--checkpoint", "kept.npz", "--save", "kept.npz"), "--save need different files"),
     ],
