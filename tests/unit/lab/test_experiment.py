@@ -78,7 +78,9 @@ def test_a_header_that_is_none_is_one_line(tmp_path: Path, content: str | None, 
 
 def test_no_folder_is_used_twice(tmp_path: Path) -> None:
     begin(tmp_path / "run")
-    with pytest.raises(ConfigError, match=r"run: the folder is not empty; resume it with --resume \S+, or"):
+    with pytest.raises(
+        ConfigError, match=r"run: the folder is not empty; resume it with --resume \S+, or"
+    ):
         begin(tmp_path / "run")
     (tmp_path / "file").touch()
     for name, named in (("file", "File exists"), ("file/run", "Not a directory")):
