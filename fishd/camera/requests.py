@@ -10,7 +10,7 @@ import zmq
 
 from fishd.camera.messages import STATE, CameraState
 from fishd.camera.settings import CameraSettings, PublishSettings
-from fishd.client.connection import deadlines
+from fishd.client.connection import answer_deadlines
 from fishd.client.zmq_sockets import milliseconds_until
 from fishd.core import addresses, protocol, text
 from fishd.core.decoding import decoder
@@ -66,7 +66,7 @@ class CameraRequests:
         timeout_s = self.timeout if timeout is None else timeout
         event = zmq.POLLOUT
         single_attempt = timeout is not None  # a call within a tick has no time for retries
-        for deadline in deadlines(timeout_s, again=not single_attempt):
+        for deadline in answer_deadlines(timeout_s, again=not single_attempt):
             while self._socket.poll(milliseconds_until(deadline), event):
                 if event == zmq.POLLOUT:
                     self._socket.send(protocol.encode(request))

@@ -1,13 +1,13 @@
-"""The Python API to a running daemon, which `fishctl` is made of, too.
+"""Python API to a running daemon; `fishctl` uses it, too.
 
     with Fish() as fish:
         fish.set_controller("swing", C=0.6)
         for tick in fish.ticks():
             print(tick.t, tick.thrust)
 
-An experiment holds the fish, `with fish.lease("my experiment"):`, and fishd brings it to rest when
-the program dies. `AsyncFish` offers the same to asyncio. A socket belongs to one thread, and so
-does a `Fish`. `Agent` chooses the instruction angle itself, tick by tick.
+An experiment leases the fish, `with fish.lease("my experiment"):`, and fishd brings it to rest if
+the program dies. `AsyncFish` is the same for asyncio. A socket belongs to one thread, and so does a
+`Fish`. An `Agent` chooses the instruction angle itself, tick by tick.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ __all__ = ["Agent", "AsyncFish", "Fish", "FishError", "LeaseLost", "NoDaemon", "
 
 
 def __getattr__(name: str) -> Any:
-    """Import a client with its first use: zmq and asyncio take most of the time of a command."""
+    """Import a client at its first use: zmq and asyncio take most of the time of a command."""
     if name == "Agent":
         from fishd.client.agent import Agent
 

@@ -1,4 +1,4 @@
-"""`Agent`: what the controller `remote` of a fishd asks for angles; see docs/how-to/remote.md."""
+"""`Agent`: a program that supplies angles to the controller `remote`; see docs/how-to/remote.md."""
 
 import contextlib
 import math
@@ -26,43 +26,45 @@ from fishd.core.agent_messages import (
 )
 from fishd.core.errors import FishError, NoDaemon, ParameterError, StartupError
 
-PATIENCE = 10.0
-"""How long to wait for an observation [s]."""
+DEFAULT_TIMEOUT_S = 10.0
+"""Default time to wait for an observation [s]."""
 
 
 class Agent:
-    """Takes observations from a fishd and answers them; a context manager, for one thread.
+    """Receiver of observations of a fishd, which it answers; a context manager, for one thread.
 
     It binds an address, and fishd connects: `fish.set_controller("remote", agent=agent.address)`.
-    Whoever asks last is served: a fishd that ends and comes back begins a new session.
+    It serves the session that sent the latest observation: a restarted fishd begins a new one.
     """
 
     def __init__(
-        self, address: str = "tcp://127.0.0.1:*", *, timeout: float | None = PATIENCE
+        self, address: str = "tcp://127.0.0.1:*", *, timeout: float | None = DEFAULT_TIMEOUT_S
     ) -> None:
         """
-        address: where fishd can reach this program, tcp://HOST:PORT or ipc://PATH; port * is any
-        timeout: how long to wait for an observation [s]; None for ever
+        address: address at which fishd can reach this program, tcp://HOST:PORT or ipc://PATH; `*`
+            is any free port
+        timeout: time to wait for an observation [s]; None for no limit
 
-        Raises `FishError` when the address is none, or somebody is there already.
+        Raises `FishError` if the address is invalid or in use.
         """
         self.timeout = timeout
         self.latest: Observed | None = None
-        """What `act` answers."""
+        """The latest observation, which `act` answers."""
         self.active = False
-        """False before the first observation, and once fishd has said that it was the last."""
+        """False before the first observation, and after fishd has ended the session."""
         self.lost = 0
-        """Ticks without an action in time, between the latest two observations that were taken."""
+        """Number of ticks without an action in time, between the latest two received
+        observations."""
         self._peer = b""
         self._past: deque[str] = deque(maxlen=100)
-        """Sessions that are over, whatever may still come from them."""
+        """Ended sessions, whose late messages are ignored."""
         self._strange = ""
-        """What came last that was no message of a fishd."""
+        """Description of the latest message that was not one of a fishd."""
         with ExitStack() as stack:
-            self._socket = _bound(address, stack)
+            self._socket = _bind_socket(address, stack)
             self._stack = stack.pop_all()
         self.address = self._socket.get_string(zmq.LAST_ENDPOINT)
-        """What fishd has to be told."""
+        """Address to give to fishd."""
 
     def __enter__(self) -> Self:
         return self
@@ -75,38 +77,38 @@ class Agent:
         self._stack.close()
 
     def __iter__(self) -> Iterator[Observed]:
-        """Every observation, to be answered with `act`; raises `NoDaemon` when none comes."""
+        """Yield every observation, to be answered with `act`; raise `NoDaemon` if none comes."""
         while True:
             yield self.observe()
 
     def observe(self) -> Observed:
-        """The next observation, the newest where several have come; raises `NoDaemon`."""
+        """Return the next observation, the newest if several are waiting; raise `NoDaemon`."""
         deadline = None if self.timeout is None else time.monotonic() + self.timeout
         while True:
-            left = None if deadline is None else deadline - time.monotonic()
-            found = self.poll(left)
-            if found:
-                return found
-            if left is not None and left <= 0.0:
+            remaining = None if deadline is None else deadline - time.monotonic()
+            observation = self.poll(remaining)
+            if observation:
+                return observation
+            if remaining is not None and remaining <= 0.0:
                 raise self._nothing()
 
     def poll(self, seconds: float | None = 0.0) -> Observed | None:
-        """`observe`, or None after a while and as soon as fishd says that there will be no more."""
+        """Return the next observation; None after this time [s], or if fishd ends the session."""
         deadline = None if seconds is None else time.monotonic() + max(0.0, seconds)
         while self._socket.poll(None if deadline is None else milliseconds_until(deadline)):
-            before, self.lost, found = self.latest, 0, False
+            before, self.lost, is_new = self.latest, 0, False
             while self._socket.poll(0):
-                found = self._take() or found
-            if found and self.active:
+                is_new = self._take() or is_new
+            if is_new and self.active:
                 return self.latest
             if before and not self.active:
                 return None
         return None
 
     def act(self, angle: float) -> None:
-        """Answer the latest observation with an instruction angle [rad], and do not wait.
+        """Answer the latest observation with an instruction angle [rad], without waiting.
 
-        Raises `ParameterError` when it is no finite number, `NoDaemon` when nobody has asked.
+        Raise `ParameterError` if it is not a finite number, `NoDaemon` without an observation.
         """
         if not math.isfinite(angle):
             raise ParameterError(f"an instruction angle of {angle} is not a number")
@@ -114,17 +116,17 @@ class Agent:
         self._send(Action(session=asked.session, seq=asked.seq, phi_c=float(angle)))
 
     def pause(self, seconds: float) -> None:
-        """In place of an action: the fish waits at neutral, and nothing is observed, for a while.
+        """Pause instead of an action: the fish waits at neutral, and sends no observations.
 
-        seconds: when it is over without `resume`, the agent counts as silent; up to 3600
+        seconds: time after which an agent that has not called `resume` counts as silent; up to 3600
         """
         if not 0.0 < seconds <= 3600.0:
             raise ParameterError(f"a pause of {seconds:g} s is not valid: more than 0, up to 3600")
         self._send(Pause(session=self._asked().session, seconds=float(seconds)))
 
     def resume(self) -> None:
-        """End a pause; the next observation is one from after it."""
-        self.poll()  # what was on its way when the pause began
+        """End a pause; the next observation is one after the pause."""
+        self.poll()  # receive what was sent before the pause began
         self._send(Pause(session=self._asked().session, seconds=0.0))
 
     def _asked(self) -> Observed:
@@ -133,11 +135,11 @@ class Agent:
         return self.latest
 
     def _send(self, message: FromAgent) -> None:
-        with contextlib.suppress(zmq.Again):  # a fishd that does not read misses it
+        with contextlib.suppress(zmq.Again):  # a fishd that does not read loses the message
             self._socket.send_multipart((self._peer, encode(message)), zmq.DONTWAIT)
 
     def _take(self) -> bool:
-        """Receive one message; True when it is an observation to be answered."""
+        """Receive one message; return whether it is an observation to be answered."""
         peer, *frames = self._socket.recv_multipart()
         try:
             message = decode_from_fish(b"".join(frames))
@@ -158,7 +160,7 @@ class Agent:
             self._past.append(self.latest.session)
             self.lost = 0
         elif self.latest and message.seq == self.latest.seq:
-            return True  # once more, after a pause
+            return True  # sent again after a pause
         self.lost += message.lost
         self._peer, self.latest, self.active = peer, message, True
         return True
@@ -168,17 +170,16 @@ class Agent:
         if self.timeout is not None:
             why += f" within {self.timeout:g} s"
         if self._strange:
-            return NoDaemon(f"{why}, but what is none: {self._strange}")
+            return NoDaemon(f"{why}, but an invalid message: {self._strange}")
         if self.latest and not self.active:
             return NoDaemon(f"{why}: another controller is active, or none")
         return NoDaemon(
-            f"{why}: is a fishd running, and was it asked to "
-            f"'fishctl set-controller remote --agent {self.address}'?"
+            f"{why}; start fishd, and run 'fishctl set-controller remote --agent {self.address}'"
         )
 
 
-def _bound(address: str, stack: ExitStack) -> "zmq.Socket[bytes]":
-    """A socket that listens there until the stack is closed; raises `FishError`."""
+def _bind_socket(address: str, stack: ExitStack) -> "zmq.Socket[bytes]":
+    """Return a socket that listens at the address until the stack is closed; raise `FishError`."""
     try:
         parse(address)
         stack.enter_context(claim_address(address, "another program", "choose another address"))

@@ -10,16 +10,16 @@ from typing import Any, Self, TypeVar
 import zmq.asyncio
 
 from fishd.client.connection import (
-    ESTOP_WAIT_S,
-    IDLE_LIMIT,
-    SECOND_LOOK,
-    TIMEOUT,
+    ESTOP_FALLBACK_DELAY_S,
+    DEFAULT_IDLE_LIMIT_S,
+    LATE_ANSWER_WAIT_MS,
+    DEFAULT_TIMEOUT_S,
     Connection,
-    deadlines,
+    answer_deadlines,
 )
 from fishd.client.lease import LeaseRenewal, lease_arguments, report_unreturned
 from fishd.client.synchronous import Fish
-from fishd.client.zmq_sockets import dealer, milliseconds_until, subscriber
+from fishd.client.zmq_sockets import connect_dealer, milliseconds_until, connect_subscriber
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted
@@ -30,12 +30,16 @@ T = TypeVar("T")
 
 
 class AsyncFish(Connection):
-    """`Fish` for asyncio: the same requests, to be awaited; there is more about each."""
+    """`Fish` for asyncio: the same requests, to be awaited; `Fish` has more details on each."""
 
     def __init__(
-        self, endpoint: str | None = None, *, timeout: float = TIMEOUT, telemetry: str | None = None
+        self,
+        endpoint: str | None = None,
+        *,
+        timeout: float = DEFAULT_TIMEOUT_S,
+        telemetry: str | None = None,
     ) -> None:
-        """Takes the arguments of `Fish`."""
+        """The arguments are those of `Fish`."""
         super().__init__(endpoint, timeout, telemetry)
         self._context = zmq.asyncio.Context()
         self._socket: zmq.asyncio.Socket | None = None
@@ -53,29 +57,29 @@ class AsyncFish(Connection):
         self._context.destroy(linger=0)
 
     async def status(self) -> Status:
-        """The daemon in one snapshot."""
+        """Return a snapshot of the daemon."""
         return await self._call(Status, "status")
 
     async def controllers(self) -> list[ControllerInfo]:
-        """The controllers that the daemon knows, with their parameters."""
+        """Return the controllers of the daemon, with their parameters."""
         return await self._call(list[ControllerInfo], "controllers")
 
     async def policies(self) -> list[PolicyInfo]:
-        """The named policies that the daemon finds, with what their files say about themselves."""
+        """Return the named policies that the daemon finds, with the metadata of their files."""
         return await self._call(list[PolicyInfo], "policies", patience=LOADING_TIMEOUT_S)
 
     async def config(self) -> dict[str, Any]:
-        """The configuration that the daemon was started with, defaults included."""
+        """Return the configuration that the daemon was started with, defaults included."""
         return await self._call(dict[str, Any], "config")
 
     async def set_controller(self, name: str, /, **parameters: Any) -> State:
-        """Select another controller; parameters left out take their defaults."""
+        """Activate a controller; omitted parameters take their defaults."""
         return await self._call(
             State, "set-controller", patience=LOADING_TIMEOUT_S, name=name, parameters=parameters
         )
 
     async def set_parameters(self, **parameters: Any) -> State:
-        """Change parameters of the running controller, all at once or none."""
+        """Change parameters of the active controller, all at once or none."""
         return await self._call(State, "set-parameter", parameters=parameters)
 
     async def stop(self) -> State:
@@ -83,10 +87,10 @@ class AsyncFish(Connection):
         return await self._call(State, "stop")
 
     async def estop(self, message: str = "requested by a client") -> State:
-        """Stop the servo's pulses at once, as `Fish.estop`."""
+        """Stop the servo's pulses at once, like `Fish.estop`."""
         try:
             state = await self._call(
-                State, "estop", patience=ESTOP_WAIT_S - self.timeout, message=message
+                State, "estop", patience=ESTOP_FALLBACK_DELAY_S - self.timeout, message=message
             )
         except Untrusted:
             raise
@@ -106,32 +110,32 @@ class AsyncFish(Connection):
         return await self._call(State, "mark", text=text)
 
     async def calibrations(self) -> Calibrations:
-        """The calibrations of force sensor and servo that are used."""
+        """Return the active calibrations of force sensor and servo."""
         return await self._call(Calibrations, "calibrations")
 
     async def sample_force(self, seconds: float = 2.0) -> ForceSample:
-        """Measure for a while; refused while a controller other than `hold` is active."""
+        """Measure for this time [s]; refused while a controller other than `hold` is active."""
         return await self._call(ForceSample, "sample-force", patience=seconds, seconds=seconds)
 
     async def tare(self, seconds: float = 2.0) -> Calibrations:
-        """Measure for a while and call that zero force; refused unless all is still."""
+        """Measure for this time [s] and set the mean as zero force; refused unless all is still."""
         sample = await self.sample_force(seconds)
         return await self._call(
             Calibrations, "tare", patience=LOADING_TIMEOUT_S, sample=sample.number
         )
 
     async def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
-        """Apply another calibration of the force sensor, and save it."""
+        """Apply and save a calibration of the force sensor."""
         return await self._call(
             Calibrations, "calibrate-force", patience=LOADING_TIMEOUT_S, calibration=calibration
         )
 
     async def calibrate_thrust(self, factor: float, error: float) -> State:
-        """As `Fish.calibrate_thrust`."""
+        """Set the factor of the displayed thrust, like `Fish.calibrate_thrust`."""
         return await self._call(State, "calibrate-thrust", factor=factor, error=error)
 
     async def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
-        """Apply another calibration of the servo, and save it or not."""
+        """Apply a calibration of the servo, and save it if requested."""
         return await self._call(
             Calibrations,
             "calibrate-servo",
@@ -147,9 +151,9 @@ class AsyncFish(Connection):
         take: bool = False,
         *,
         seconds: float | None = None,
-        idle_limit: float | None = IDLE_LIMIT,
+        idle_limit: float | None = DEFAULT_IDLE_LIMIT_S,
     ) -> AsyncIterator[LeaseRenewal]:
-        """As `Fish.lease`."""
+        """Hold the lease of the fish, like `Fish.lease`."""
         grant = await self._call(Grant, "take-lease", **lease_arguments(name, take, seconds))
         self.held = renewal = LeaseRenewal(partial(Fish, self.endpoint), grant, idle_limit)
         try:
@@ -166,44 +170,44 @@ class AsyncFish(Connection):
                 report_unreturned(error, pending)
 
     def ticks(self) -> AsyncIterator[Tick]:
-        """Every tick from the first iteration on; raises `NoDaemon` when none comes in time."""
+        """Yield every tick from the first iteration on; raise `NoDaemon` if none comes in time."""
         return self._subscribe(b"tick", Tick)
 
     def events(self) -> AsyncIterator[Event]:
-        """Every event from the first iteration on, however long it takes."""
+        """Yield every event from the first iteration on; wait without limit."""
         return self._subscribe(b"event", Event)
 
     async def _call(self, kind: type[T], op: str, *, patience: float = 0.0, **args: Any) -> T:
-        """One request at a time: tasks that share this object must take turns.
+        """Send a request and return its result; tasks that share this object must take turns.
 
-        patience: how long the answer may take, beyond the time-out [s]
+        patience: time that the answer may take in addition to the timeout [s]
         """
         if self._socket is None:
             self.check_endpoint()
-            self._socket = dealer(self._context, self.endpoint)
+            self._socket = connect_dealer(self._context, self.endpoint)
         identity, request = self.request(op, args)
-        wanted = zmq.POLLOUT
-        for deadline in deadlines(self.timeout + patience, again=patience >= 0.0):
+        poll_event = zmq.POLLOUT
+        for deadline in answer_deadlines(self.timeout + patience, again=patience >= 0.0):
             while await self._socket.poll(
                 milliseconds_until(deadline),
-                wanted,  # type: ignore[call-arg]  # which the stubs forget
+                poll_event,  # type: ignore[call-arg]  # which the stubs forget
             ):
-                if wanted == zmq.POLLOUT:
+                if poll_event == zmq.POLLOUT:
                     await self._socket.send(request)
-                    wanted = zmq.POLLIN
+                    poll_event = zmq.POLLIN
                     continue
                 frames = await self._socket.recv_multipart()
                 result = self.result(frames, identity, kind)
                 if result is not None:
                     return result
-        raise self.silent(patience)
+        raise self.no_answer_error(patience)
 
     async def _subscribe(self, topic: bytes, kind: type[T]) -> AsyncIterator[T]:
         address = self.telemetry_address or (await self.status()).telemetry
         patience = -1 if kind is Event else int(self.timeout * 1e3)
         decode: Callable[[bytes], T] = decoder(kind)
-        with closing(subscriber(self._context, address, topic)) as socket:
-            while await socket.poll(patience) or await socket.poll(SECOND_LOOK):
+        with closing(connect_subscriber(self._context, address, topic)) as socket:
+            while await socket.poll(patience) or await socket.poll(LATE_ANSWER_WAIT_MS):
                 self.check_lease()
                 yield self.read(decode, await socket.recv_multipart())
-        raise self.telemetry_silent()
+        raise self.no_telemetry_error()

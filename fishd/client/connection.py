@@ -1,4 +1,4 @@
-"""What both clients share: sockets, the form of requests and replies, and complaints."""
+"""Common part of both clients: addresses, encoding of requests and replies, and errors."""
 
 import itertools
 import math
@@ -34,22 +34,21 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-TIMEOUT = 2.0
-"""How long to wait for an answer [s]."""
-IDLE_LIMIT = 30.0
-"""Time after which a program that does nothing while the fish swims counts as hung [s]."""
-SECOND_LOOK = 500
-"""What has not come in time is looked for once more, for so long: of a process that was itself held
-up, by SIGSTOP say, it has come, but no thread has read it yet [ms].
-"""
-ESTOP_WAIT_S = 0.1
-"""Time after which an emergency stop goes to fishd's own socket as well [s]."""
-ESTOP_SOCKET_WAIT_S = 0.4
-"""Longest time to wait for the answer from there [s]."""
+DEFAULT_TIMEOUT_S = 2.0
+"""Default time to wait for an answer [s]."""
+DEFAULT_IDLE_LIMIT_S = 30.0
+"""Default time after which a program that does nothing while the fish swims counts as hung [s]."""
+LATE_ANSWER_WAIT_MS = 500
+"""Additional time to read an answer that is late: if this process was itself suspended, such as by
+SIGSTOP, the answer has arrived, but no thread has read it yet [ms]."""
+ESTOP_FALLBACK_DELAY_S = 0.1
+"""Time after which an emergency stop is also sent to fishd's emergency socket [s]."""
+ESTOP_SOCKET_TIMEOUT_S = 0.4
+"""Maximum time to wait for the answer of the emergency socket [s]."""
 
 
 class Connection:
-    """What both clients share: addresses, the form of requests and replies, and complaints."""
+    """Base of both clients: addresses, encoding of requests and replies, and errors."""
 
     def __init__(self, endpoint: str | None, timeout: float, telemetry: str | None) -> None:
         self.endpoint = endpoint or find_control_address()
@@ -58,59 +57,62 @@ class Connection:
         self.timeout = timeout
         self.telemetry_address = telemetry
         self.held: LeaseRenewal | None = None
-        """The lease of the fish, inside `with fish.lease(...)`."""
+        """Lease of the fish, inside `with fish.lease(...)`."""
         self._ids = itertools.count(1)
         self.estop_taken_by = ""
-        """Which socket answered the latest emergency stop: `control` or `estop`."""
+        """Socket that answered the latest emergency stop: `control` or `estop`."""
 
     def check_endpoint(self) -> None:
-        """Spare the wait where it is certain that nobody will answer; raises `NoDaemon`.
+        """Raise `NoDaemon` at once if it is certain that no fishd will answer.
 
-        Raises `Untrusted` where a stranger would. An endpoint that the user named is trusted.
+        Raise `Untrusted` if the process of another user may answer. An endpoint that the user named
+        is trusted.
         """
         if self._path and is_deserted(self._path):
-            raise self._nobody("nobody listens there")
+            raise self._no_daemon("no process listens there")
         try:
             self._listener()
         except PermissionError:
             raise NoDaemon(
-                f"this user may not ask the fishd at {self.endpoint}: join the group of its socket "
+                f"this user may not connect to the fishd at {self.endpoint}: join the group of its "
+                "socket "
                 "('sudo usermod -aG fishd USER' for the service), log in again, then try again"
             ) from None
         if self._path and not self._was_named and (why := find_trust_problem(self._path)):
             raise Untrusted(
-                f"what listens at {self.endpoint} is not asked, it may be anybody: {why}; where "
+                f"the process that listens at {self.endpoint} is not trusted: {why}; if "
                 "you trust it, name it with --endpoint or $FISHD_ENDPOINT"
             )
 
-    def _nobody(self, why: str) -> NoDaemon:
+    def _no_daemon(self, why: str) -> NoDaemon:
         return NoDaemon(
             f"no fishd at {self.endpoint}: {why}; start one with 'fishd', or name another with "
             "--endpoint or $FISHD_ENDPOINT"
         )
 
-    def silent(self, patience: float = 0.0) -> NoDaemon:
-        """What to raise when no answer comes in time; patience: beyond the time-out [s]."""
+    def no_answer_error(self, patience: float = 0.0) -> NoDaemon:
+        """Return the error for a missing answer; patience: time beyond the timeout [s]."""
         why = f"no answer within {self.timeout + patience:g} s"
         try:
-            found = self._listener()
+            listener = self._listener()
         except PermissionError:
-            found = None
-        if found is None:
-            return self._nobody(why)
+            listener = None
+        if listener is None:
+            return self._no_daemon(why)
         return NoDaemon(
-            f"{why} from process {found.pid}, which serves {self.endpoint}: it hangs, is stopped "
+            f"{why} from process {listener.pid}, which serves {self.endpoint}: it hangs, is "
+            "stopped "
             "or is overloaded; 'fishctl release --config FILE' stops the servo without it"
         )
 
     def _listener(self) -> Listener | None:
-        """Who listens, where that can be told; raises PermissionError."""
+        """Return the listener of a Unix socket, None if unknown; raise PermissionError."""
         return find_listener(self._path) if self._path else None
 
     def request(self, op: str, args: Mapping[str, Any]) -> tuple[int, bytes]:
         """Return a new id, and the request as JSON.
 
-        Raises `ParameterError` for NaN, infinity and text that is not UTF-8.
+        Raise `ParameterError` for NaN, infinity and text that is not UTF-8.
         """
         identity = next(self._ids)
         arguments = protocol.OPERATIONS[op].arguments
@@ -133,15 +135,15 @@ class Connection:
         return identity, payload
 
     def estop_without_gateway(self, message: str) -> State | None:
-        """Ask for an emergency stop at fishd's own socket; None where nothing answers there."""
+        """Request an emergency stop at fishd's emergency socket; None if it does not answer."""
         path = estop_path(self.endpoint)
         identity, request = self.request("estop", {"message": message})
         if path is None:
             return None
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
-            client.settimeout(ESTOP_SOCKET_WAIT_S)
+            client.settimeout(ESTOP_SOCKET_TIMEOUT_S)
             try:
-                client.bind("")  # any free name: the answer needs one
+                client.bind("")  # any free name, as the address of the answer
                 client.connect(os.fspath(path))
                 client.send(request)
                 reply = client.recv(2**20)
@@ -151,7 +153,7 @@ class Connection:
         return self.result((reply,), identity, State)
 
     def result(self, frames: Sequence[bytes], identity: int, kind: type[T]) -> T | None:
-        """The result in a reply; None when it answers an earlier request that timed out."""
+        """Return the result in a reply; None if it answers an earlier request that timed out."""
         reply: protocol.Reply = self.read(protocol.decode_reply, frames)
         if reply.id != identity:
             return None
@@ -161,7 +163,7 @@ class Connection:
         return cast(T, self.read(decoder(kind), (reply.result or b"",)))
 
     def read(self, decode: Callable[[bytes], T], frames: Sequence[bytes]) -> T:
-        """What the last frame of a message says; raises `FishError` where that is nothing known."""
+        """Decode the last frame of a message; raise `FishError` if it is invalid."""
         if self.held:
             self.held.used = time.monotonic()
         try:
@@ -169,24 +171,24 @@ class Connection:
         except msgspec.DecodeError as error:
             why = text.line(str(error))
             raise FishError(
-                f"what answers at {self.endpoint} is no fishd of this version: {why}"
+                f"the program at {self.endpoint} is not a fishd of this version: {why}"
             ) from None
 
     def check_lease(self) -> None:
-        """Raise `LeaseLost` where the fish was leased, and is not any more."""
+        """Raise `LeaseLost` if the lease of the fish was lost."""
         if self.held and self.held.lost:
             raise self.held.lost
 
-    def telemetry_silent(self) -> NoDaemon:
-        """What to raise when no telemetry comes in time."""
-        return self._nobody(f"no telemetry within {self.timeout:g} s")
+    def no_telemetry_error(self) -> NoDaemon:
+        """Return the error for missing telemetry."""
+        return self._no_daemon(f"no telemetry within {self.timeout:g} s")
 
 
-def deadlines(seconds: float, *, again: bool) -> Iterator[float]:
-    """Until when to wait for an answer, `seconds` from now, then for a second look [s, monotonic].
+def answer_deadlines(seconds: float, *, again: bool) -> Iterator[float]:
+    """Yield the deadline of an answer, `seconds` from now, then that of a late one [s, monotonic].
 
-    again: whether there is a second look
+    again: whether to wait for a late answer
     """
     yield time.monotonic() + seconds
     if again:
-        yield time.monotonic() + SECOND_LOOK * 1e-3
+        yield time.monotonic() + LATE_ANSWER_WAIT_MS * 1e-3

@@ -1,4 +1,4 @@
-"""The renewal of a lease of the fish, in a thread: shared by `Fish`, `AsyncFish` and fishctl."""
+"""Renewal of a lease of the fish in a thread, for `Fish`, `AsyncFish` and fishctl."""
 
 import logging
 import os
@@ -17,36 +17,36 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-RENEWALS = 5
-"""Renewals in the time for which a lease lasts."""
-BUSY_FRACTION = 0.02
-"""A thread that takes more than this share of the time of a processor computes."""
+RENEWALS_PER_LEASE = 5
+"""Number of renewals during the duration of a lease."""
+MIN_BUSY_FRACTION = 0.02
+"""Fraction of the time of a processor above which a thread counts as computing."""
 
 
 class LeaseRenewal(threading.Thread):
-    """Renews a lease on a second connection until it is stopped, or the lease is lost.
+    """Thread that renews a lease on a second connection until it is stopped or the lease is lost.
 
-    A process that is killed, stopped by a signal or cut off from fishd renews nothing. One that
-    computes does, for as long as it lives; only while the fish swims does the thread that took the
-    lease count as hung when it neither computes nor uses the fish for `idle_limit` seconds.
+    A process that is killed, stopped by a signal or cut off from fishd does not renew. One that
+    computes does. While the fish swims, the thread that took the lease counts as hung if it neither
+    computes nor uses the fish for `idle_limit` seconds.
     """
 
     def __init__(
         self, connect: Callable[..., "Fish"], grant: Grant, idle_limit: float | None
     ) -> None:
-        """connect: makes a connection, given its time-out [s]; idle_limit: None for no limit"""
+        """connect: opens a connection with a timeout [s]; idle_limit: None for no limit [s]"""
         super().__init__(name="lease", daemon=True)
         self.token = grant.lease
         self.lost: LeaseLost | None = None
-        """Why the lease ended before the program gave it back."""
+        """Error with the reason why the lease ended before the program returned it."""
         self.when_lost: Callable[[], object] = lambda: None
-        """Called in this thread once `lost` is set."""
+        """Function called in this thread once `lost` is set."""
         self.returned = False
-        """Whether the lease was given back by other means than leaving its `with`."""
+        """Whether the lease was returned before the end of its `with` block."""
         self.used = time.monotonic()
-        """When the program last used the fish [s, monotonic]."""
+        """Time at which the program last used the fish [s, monotonic]."""
         self._connect = connect
-        self._every = grant.seconds / RENEWALS
+        self._every = grant.seconds / RENEWALS_PER_LEASE
         self._idle_limit = idle_limit
         self._stopping = threading.Event()
         self._owner = time.pthread_getcpuclockid(threading.get_ident())
@@ -61,20 +61,20 @@ class LeaseRenewal(threading.Thread):
                     self._judge(fish, fish.renew_lease(self.token))
                 except LeaseLost as error:
                     self.lost = error
-                except FishError:  # not in time, or fishd is away: the next one may get through
+                except FishError:  # no answer in time, or no fishd: the next renewal may succeed
                     continue
         if self.lost and not self._stopping.is_set():
             self.when_lost()
 
     def stop(self) -> None:
-        """Renew no more, and wait for a renewal that is on its way; may be called twice."""
+        """Stop the renewals, and wait for one in progress; may be called twice."""
         self._stopping.set()
         self.join()
 
     def _judge(self, fish: "Fish", state: State) -> None:
-        """Give the fish back where the program has it swim and does nothing."""
+        """Return the fish if it swims while the program is idle."""
         now, computed = time.monotonic(), self._cpu_seconds()
-        busy = computed - self._computed > BUSY_FRACTION * (now - self._looked)
+        busy = computed - self._computed > MIN_BUSY_FRACTION * (now - self._looked)
         self._computed, self._looked = computed, now
         if busy or state.mode != "running":
             self.used = now
@@ -83,7 +83,7 @@ class LeaseRenewal(threading.Thread):
             raise LeaseLost(
                 "no-lease",
                 f"this program did nothing with the fish for {self._idle_limit:g} s while it swam, "
-                "and gave it back; read ticks meanwhile, or set idle_limit",
+                "and returned it; read ticks while it swims, or set idle_limit",
             )
 
     def _cpu_seconds(self) -> float:
@@ -106,8 +106,8 @@ def lease_arguments(name: str, take: bool, seconds: float | None) -> dict[str, A
 
 
 def report_unreturned(error: FishError, exception: BaseException | None) -> None:
-    """Log that the fish could not be given back, unless `exception` says so already."""
+    """Log that the fish could not be returned, unless `exception` is about that already."""
     if not isinstance(exception, FishError):
         log.warning(
-            "the fish could not be given back, and rests once its lease has run out: %s", error
+            "the fish could not be returned, and rests once its lease has expired: %s", error
         )

@@ -1,47 +1,49 @@
-"""The socket through which `Fish` asks a daemon, without zmq, which most commands need not load."""
+"""Socket of the requests of `Fish`; it works without zmq, so that most commands start faster."""
 
 import time
 
 from fishd.core.errors import FishError, NoDaemon
 from fishd.core.zmtp import Dealer
 
-MAX_REPLY = 64 * 2**20
-"""Length of the longest reply [bytes]."""
+MAX_REPLY_BYTES = 64 * 2**20
+"""Maximum size of a reply [bytes]."""
 
 
 class RequestSocket(Dealer[bytes | FishError]):
-    """A connection to the control socket of a daemon."""
+    """Connection to the control socket of a daemon."""
 
     RETRY_S = 0.02
     HANDSHAKE_S = 30.0
 
     def __init__(self, endpoint: str) -> None:
-        """Raises `NoDaemon` where the endpoint is not an address."""
+        """Raises `NoDaemon` if the endpoint is not an address."""
         self._endpoint = endpoint
         try:
-            super().__init__(endpoint, MAX_REPLY)
+            super().__init__(endpoint, MAX_REPLY_BYTES)
         except ValueError as error:
             raise NoDaemon(
-                f"'{endpoint}' is no address: {error}; write ipc://PATH or tcp://HOST:PORT"
+                f"'{endpoint}' is not an address: {error}; write ipc://PATH or tcp://HOST:PORT"
             ) from None
 
     def send_by(self, deadline: float, request: bytes) -> bool:
-        """Send a request once the daemon takes one; False where it does not [s, monotonic]."""
-        while not (takes := self.state()[0]) and (left := deadline - time.monotonic()) > 0.0:
-            self.wait(left)
-        if takes:
+        """Send a request once the daemon accepts it; return False after the deadline [s]."""
+        while (
+            not (is_ready := self.state()[0]) and (remaining := deadline - time.monotonic()) > 0.0
+        ):
+            self.wait(remaining)
+        if is_ready:
             self.send(request)
-        return takes
+        return is_ready
 
     def receive_by(self, deadline: float) -> bytes:
-        """Return a reply; empty where none has come by then [s, monotonic].
+        """Return a reply; empty if none has come by `deadline` [s, monotonic].
 
-        Raises `FishError` where it is not one.
+        Raise `FishError` for an invalid message.
         """
         while not self.state()[1]:
-            if (left := deadline - time.monotonic()) <= 0.0:
+            if (remaining := deadline - time.monotonic()) <= 0.0:
                 return b""
-            self.wait(left)
+            self.wait(remaining)
         reply = self._inbox.popleft()
         if isinstance(reply, FishError):
             raise reply
@@ -51,4 +53,4 @@ class RequestSocket(Dealer[bytes | FishError]):
         return payload
 
     def _bad(self, what: str) -> FishError:
-        return FishError(f"what answers at {self._endpoint} is no fishd: it sent {what}")
+        return FishError(f"the program at {self._endpoint} is not a fishd: it sent {what}")

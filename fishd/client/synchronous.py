@@ -1,4 +1,4 @@
-"""`Fish`: the client for ordinary programs."""
+"""`Fish`: the client for synchronous programs."""
 
 import sys
 from collections.abc import Iterator
@@ -7,12 +7,12 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from fishd.client.connection import (
-    ESTOP_WAIT_S,
-    IDLE_LIMIT,
-    SECOND_LOOK,
-    TIMEOUT,
+    ESTOP_FALLBACK_DELAY_S,
+    DEFAULT_IDLE_LIMIT_S,
+    LATE_ANSWER_WAIT_MS,
+    DEFAULT_TIMEOUT_S,
     Connection,
-    deadlines,
+    answer_deadlines,
 )
 from fishd.client.request_socket import RequestSocket
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
@@ -30,24 +30,28 @@ T = TypeVar("T")
 
 
 class Fish(Connection):
-    """A connection to a daemon; use it as a context manager, from one thread.
+    """Connection to a daemon; use it as a context manager, from one thread.
 
-    Every request raises `NoDaemon` when nobody answers in time, and `Refused` when the daemon
-    answers with an error.
+    Every request raises `NoDaemon` if no answer comes in time, and `Refused` if the daemon answers
+    with an error.
     """
 
     def __init__(
-        self, endpoint: str | None = None, *, timeout: float = TIMEOUT, telemetry: str | None = None
+        self,
+        endpoint: str | None = None,
+        *,
+        timeout: float = DEFAULT_TIMEOUT_S,
+        telemetry: str | None = None,
     ) -> None:
         """
-        endpoint: address of the control socket; None looks for the daemon of this machine
-        timeout: how long to wait for an answer or a tick [s]
-        telemetry: address of the telemetry socket; None asks the daemon
+        endpoint: address of the control socket; None for the daemon of this machine
+        timeout: time to wait for an answer or a tick [s]
+        telemetry: address of the telemetry socket; None for the address that the daemon reports
         """
         super().__init__(endpoint, timeout, telemetry)
         self._socket: RequestSocket | None = None
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
-        """That of telemetry, with the first subscription."""
+        """ZeroMQ context of telemetry, created by the first subscription."""
 
     def __enter__(self) -> Self:
         return self
@@ -66,36 +70,36 @@ class Fish(Connection):
             self._context.destroy(linger=0)
 
     def status(self, timeout: float | None = None) -> Status:
-        """The daemon in one snapshot.
+        """Return a snapshot of the daemon.
 
-        timeout: how long to wait for it [s]; None: as for other requests
+        timeout: time to wait for it [s]; None for that of other requests
         """
         patience = 0.0 if timeout is None else timeout - self.timeout
         return self._call(Status, "status", patience=patience)
 
     def controllers(self) -> list[ControllerInfo]:
-        """The controllers that the daemon knows, with their parameters."""
+        """Return the controllers of the daemon, with their parameters."""
         return self._call(list[ControllerInfo], "controllers")
 
     def policies(self) -> list[PolicyInfo]:
-        """The named policies that the daemon finds, with what their files say about themselves."""
+        """Return the named policies that the daemon finds, with the metadata of their files."""
         return self._call(list[PolicyInfo], "policies", patience=LOADING_TIMEOUT_S)
 
     def config(self) -> dict[str, Any]:
-        """The configuration that the daemon was started with, defaults included."""
+        """Return the configuration that the daemon was started with, defaults included."""
         return self._call(dict[str, Any], "config")
 
     def set_controller(self, name: str, /, **parameters: Any) -> State:
-        """Select another controller; parameters left out take their defaults.
+        """Activate a controller; omitted parameters take their defaults.
 
-        It may take `protocol.LOADING_TIMEOUT_S` seconds to load, beyond the time-out.
+        It may take `protocol.LOADING_TIMEOUT_S` to load, in addition to the timeout.
         """
         return self._call(
             State, "set-controller", patience=LOADING_TIMEOUT_S, name=name, parameters=parameters
         )
 
     def set_parameters(self, **parameters: Any) -> State:
-        """Change parameters of the running controller, all at once or none."""
+        """Change parameters of the active controller, all at once or none."""
         return self._call(State, "set-parameter", parameters=parameters)
 
     def stop(self) -> State:
@@ -107,14 +111,15 @@ class Fish(Connection):
     ) -> State:
         """Stop the servo's pulses at once.
 
-        Where the control socket does not answer at once, fishd's own socket is asked as well.
+        If the control socket does not answer at once, the request goes to the emergency socket,
+        too.
 
-        timeout: how long to wait for an answer, up to 0.5 s for these two not counted [s]; None: as
-            for other requests
+        timeout: time to wait for an answer after these first attempts, which take up to 0.5 s [s];
+            None for that of other requests
         """
         try:
             state = self._call(
-                State, "estop", patience=ESTOP_WAIT_S - self.timeout, message=message
+                State, "estop", patience=ESTOP_FALLBACK_DELAY_S - self.timeout, message=message
             )
         except Untrusted:
             raise
@@ -131,35 +136,35 @@ class Fish(Connection):
         return self._call(State, "clear-fault")
 
     def mark(self, text: str) -> State:
-        """Publish a mark in the event stream, such as what you just changed on the rig."""
+        """Publish a mark in the event stream, such as a note on a change of the rig."""
         return self._call(State, "mark", text=text)
 
     def calibrations(self) -> Calibrations:
-        """The calibrations of force sensor and servo that are used."""
+        """Return the active calibrations of force sensor and servo."""
         return self._call(Calibrations, "calibrations")
 
     def sample_force(self, seconds: float = 2.0) -> ForceSample:
-        """Measure for a while; refused while a controller other than `hold` is active."""
+        """Measure for this time [s]; refused while a controller other than `hold` is active."""
         return self._call(ForceSample, "sample-force", patience=seconds, seconds=seconds)
 
     def tare(self, seconds: float = 2.0) -> Calibrations:
-        """Measure for a while and call that zero force; refused unless all is still.
+        """Measure for this time [s] and set the mean as zero force; refused unless all is still.
 
-        Nothing changes where that is given up while it measures.
+        Nothing changes if the program is interrupted during the measurement.
         """
         sample = self.sample_force(seconds)
         return self._call(Calibrations, "tare", patience=LOADING_TIMEOUT_S, sample=sample.number)
 
     def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
-        """Apply another calibration of the force sensor, and save it."""
+        """Apply and save a calibration of the force sensor."""
         return self._call(
             Calibrations, "calibrate-force", patience=LOADING_TIMEOUT_S, calibration=calibration
         )
 
     def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
-        """Apply another calibration of the servo, and save it or not.
+        """Apply a calibration of the servo, and save it if requested.
 
-        One that is not saved needs a `lease`, and is used until that ends.
+        A calibration that is not saved needs a `lease`, and is active until that ends.
         """
         return self._call(
             Calibrations,
@@ -176,17 +181,17 @@ class Fish(Connection):
         take: bool = False,
         *,
         seconds: float | None = None,
-        idle_limit: float | None = IDLE_LIMIT,
+        idle_limit: float | None = DEFAULT_IDLE_LIMIT_S,
     ) -> "Iterator[LeaseRenewal]":
-        """Hold the fish, as an experiment: nobody else drives it, and it rests when this ends.
+        """Hold the lease of the fish: no other client drives it, and it rests at the end.
 
-        Inside, requests of this object name the lease. fishd fades the fish to neutral when this
-        process is killed, hangs or loses its connection. `Refused` says who has the fish already;
-        `LeaseLost`, from a request or a tick, that another request has taken it meanwhile.
+        Inside, requests of this object name the lease. fishd fades the fish to neutral if this
+        process is killed, hangs or loses its connection. Raise `Refused` if another experiment
+        holds the fish; requests and ticks raise `LeaseLost` if another request has taken it since.
 
-        name: of the experiment, as `fishctl status` shows it
-        take: take the fish from an experiment that has it
-        seconds: time that the lease lasts without a renewal; None: `control.lease` of fishd
+        name: name of the experiment, as `fishctl status` shows it
+        take: take the fish from an experiment that holds it
+        seconds: duration of the lease without a renewal; None for `control.lease` of fishd
         idle_limit: time without a request or a tick, while the fish swims and this thread does not
             compute, after which the program counts as hung [s]; None for no limit
         """
@@ -204,79 +209,80 @@ class Fish(Connection):
                 if not renewal.returned:
                     self.end_lease(renewal.token)
             except LeaseLost:
-                pass  # another request has the fish, or it rests already
+                pass  # another request has taken the fish, or it rests already
             except FishError as error:
                 report_unreturned(error, pending)
 
     def renew_lease(self, lease: str) -> State:
-        """Let a lease last for its full time again, as `lease` does by itself."""
-        hurry = -1e-3  # no second look: the next renewal is soon
+        """Restart the full duration of a lease; `lease` does so automatically."""
+        hurry = -1e-3  # do not wait for a late answer: the next renewal is soon
         return self._call(State, "renew-lease", patience=hurry, lease=lease)
 
     def end_lease(self, lease: str) -> State:
-        """Give the fish back: it fades to neutral."""
+        """Return the fish, which fades to neutral."""
         return self._call(State, "end-lease", lease=lease)
 
     def calibrate_thrust(self, factor: float, error: float) -> State:
-        """Let the thrust be shown as this factor times the mean square of `fin_velocity`.
+        """Set the ratio of the displayed thrust to the mean square of `fin_velocity` [N].
 
-        error: half of its 95 % interval, in its unit
+        error: half-width of the 95 % confidence interval of `factor` [N]
         """
         return self._call(State, "calibrate-thrust", factor=factor, error=error)
 
     def ticks(self) -> Iterator[Tick]:
-        """Every tick from now on; raises `NoDaemon` when none comes in time."""
+        """Return an iterator of all ticks from now on; it raises `NoDaemon` after a silence."""
         return self._subscribe({b"tick": Tick})
 
     def events(self) -> Iterator[Event]:
-        """Every event from now on, however long it takes."""
+        """Return an iterator of all events from now on, which waits without limit."""
         return self._subscribe({b"event": Event}, forever=True)
 
     def ticks_and_events(self) -> Iterator[Tick | Event]:
-        """Every tick and event from now on, in the order in which they were published.
+        """Return an iterator of all ticks and events from now on, in the order of publication.
 
-        Raises `NoDaemon` when none comes in time.
+        It raises `NoDaemon` if none comes in time.
         """
         kinds: dict[bytes, type[Tick | Event]] = {b"tick": Tick, b"event": Event}
         return self._subscribe(kinds)
 
     def _call(self, kind: type[T], op: str, *, patience: float = 0.0, **args: Any) -> T:
-        """Ask; patience: how long the answer may take, beyond the time-out [s].
+        """Send a request and return its result.
 
-        Where it is negative, the caller is in a hurry, and there is no second look.
+        patience: time that the answer may take in addition to the timeout; negative to wait for no
+            late answer [s]
         """
         if self._socket is None:
             self.check_endpoint()
             self._socket = RequestSocket(self.endpoint)
         identity, request = self.request(op, args)
-        for deadline in deadlines(self.timeout + patience, again=patience >= 0.0):
+        for deadline in answer_deadlines(self.timeout + patience, again=patience >= 0.0):
             if request and self._socket.send_by(deadline, request):
                 request = b""
             while not request and (reply := self._socket.receive_by(deadline)):
                 result = self.result((reply,), identity, kind)
                 if result is not None:
                     return result
-        raise self.silent(patience)
+        raise self.no_answer_error(patience)
 
     def _subscribe(self, kinds: dict[bytes, type[T]], *, forever: bool = False) -> Iterator[T]:
-        """Messages of these topics; forever: however long they take."""
+        """Return an iterator of the messages of these topics; forever: wait without limit."""
         address = self.telemetry_address or self.status().telemetry
         patience = -1 if forever else int(self.timeout * 1e3)
         decoders = {topic: decoder(kind) for topic, kind in kinds.items()}
         import zmq
 
-        from fishd.client.zmq_sockets import subscriber
+        from fishd.client.zmq_sockets import connect_subscriber
 
         self._context = self._context or zmq.Context()
-        socket = subscriber(self._context, address, *kinds)
+        socket = connect_subscriber(self._context, address, *kinds)
 
         def messages() -> Iterator[T]:
             with closing(socket):
-                while socket.poll(patience) or socket.poll(SECOND_LOOK):
+                while socket.poll(patience) or socket.poll(LATE_ANSWER_WAIT_MS):
                     self.check_lease()
                     frames = socket.recv_multipart()
                     if decode := decoders.get(frames[0]):
                         yield self.read(decode, frames)
-            raise self.telemetry_silent()
+            raise self.no_telemetry_error()
 
         return messages()

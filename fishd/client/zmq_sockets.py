@@ -1,4 +1,4 @@
-"""The sockets of ZeroMQ that clients have: for telemetry, and for the requests of `AsyncFish`."""
+"""ZeroMQ sockets of clients: for telemetry, and for the requests of `AsyncFish`."""
 
 import math
 import time
@@ -10,23 +10,23 @@ from fishd.core.addresses import is_ipv6
 from fishd.core.errors import NoDaemon
 
 _RECONNECT_MS = 20
-"""Time after which a lost connection is made again, twice as long at most [ms]."""
+"""Time after which a lost connection is established again, at most twice as long [ms]."""
 
 S = TypeVar("S", bound="zmq.Socket[Any]")
 
 
-def dealer(context: "zmq.Context[S]", endpoint: str) -> S:
-    """A socket for requests; raises `NoDaemon` when the endpoint is no address."""
+def connect_dealer(context: "zmq.Context[S]", endpoint: str) -> S:
+    """Return a socket for requests; raise `NoDaemon` if the endpoint is not an address."""
     requests = context.socket(zmq.DEALER)
     requests.set(zmq.LINGER, 0)
     requests.set(zmq.RECONNECT_IVL, _RECONNECT_MS)
-    requests.set(zmq.IMMEDIATE, 1)  # do not queue for a daemon that is not there
+    requests.set(zmq.IMMEDIATE, 1)  # do not queue requests without a connection
     _connect(requests, endpoint)
     return requests
 
 
-def subscriber(context: "zmq.Context[S]", address: str, *topics: bytes) -> S:
-    """A socket for topics of telemetry; raises `NoDaemon` when the address is none."""
+def connect_subscriber(context: "zmq.Context[S]", address: str, *topics: bytes) -> S:
+    """Return a socket for topics of telemetry; raise `NoDaemon` if the address is invalid."""
     messages = context.socket(zmq.SUB)
     for topic in topics:
         messages.set(zmq.SUBSCRIBE, topic)
@@ -41,11 +41,11 @@ def _connect(client: "zmq.Socket[Any]", address: str) -> None:
     except zmq.ZMQError as error:
         client.close()
         raise NoDaemon(
-            f"'{address}' is no address: {zmq.strerror(error.errno or 0)}; "
+            f"'{address}' is not an address: {zmq.strerror(error.errno or 0)}; "
             "write ipc://PATH or tcp://HOST:PORT"
         ) from None
 
 
 def milliseconds_until(deadline: float) -> int:
-    """Time left until a deadline [s, monotonic], rounded up; 0 after it [ms]."""
+    """Return the time until a deadline [s, monotonic], rounded up; 0 after it [ms]."""
     return max(0, math.ceil((deadline - time.monotonic()) * 1e3))

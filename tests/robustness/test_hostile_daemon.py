@@ -160,7 +160,7 @@ def test_rubbish_is_one_line_that_says_its_origin(hostile: Hostile, rubbish: byt
     with Fish(hostile.endpoint, timeout=PATIENCE) as fish:
         telemetry = fish.status().telemetry
     hostile.rubbish = rubbish
-    where = f"what answers at {hostile.endpoint} is no fishd of this version: "
+    where = f"the program at {hostile.endpoint} is not a fishd of this version: "
     with Fish(hostile.endpoint, timeout=PATIENCE, telemetry=telemetry) as fish:
         with pytest.raises(FishError, match=f"^{re.escape(where)}[^\n]+$"):
             fish.status()

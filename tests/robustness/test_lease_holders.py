@@ -135,7 +135,7 @@ def test_a_fish_that_could_not_be_given_back_is_spoken_of_once(
         monkeypatch.setattr(Fish, "end_lease", silent)
         with pytest.raises(ended_by), fish.lease("a test", take=True):
             raise ended_by
-    said = "the fish could not be given back, and rests once its lease has run out: no answer"
+    said = "the fish could not be returned, and rests once its lease has expired: no answer"
     assert caplog.messages == [said] * lines
 
 

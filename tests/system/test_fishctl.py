@@ -163,7 +163,7 @@ def test_a_fish_has_a_name_which_tells_two_daemons_apart(tmp_path: Path) -> None
         (("set-parameter", "C"), "every NAME needs a VALUE, such as: C 0.7, or C=0.7"),
         (("set-parameter", "C=0.7", "x"), "every NAME needs a VALUE"),
         (("set-parameter", "C", "0.7", "C=0.3"), "C is given twice"),
-        (("status", "--endpoint", "nonsense"), "'nonsense' is no address"),
+        (("status", "--endpoint", "nonsense"), "'nonsense' is not an address"),
         (("stat",), "No such command 'stat'"),
         (("mark",), "Missing argument 'TEXT'"),
         (("mark", "a\nb\x1b[2J"), "a text of up to 1000 printable characters is needed"),

@@ -20,8 +20,8 @@ from fishd.camera.settings import SimulatedSettings
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.client import Fish
-from fishd.client.connection import SECOND_LOOK
-from fishd.client.zmq_sockets import subscriber
+from fishd.client.connection import LATE_ANSWER_WAIT_MS
+from fishd.client.zmq_sockets import connect_subscriber
 from fishd.core.addresses import find_control_address
 from fishd.core.camera_frames import TIME_TOLERANCE_S
 from fishd.core.decoding import decoder
@@ -137,7 +137,7 @@ class SimulatedSource:
         view = _View(self._settings, self._size, swimmer, sink)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
-            socket = subscriber(context, status.telemetry, b"tick")
+            socket = connect_subscriber(context, status.telemetry, b"tick")
             offset = ClockOffset(clock_of(fish))
             view.ahead = offset.update().seconds
             last_tick_time, last_seq = time.monotonic(), 0
@@ -156,7 +156,9 @@ class SimulatedSource:
                     last_tick_time = time.monotonic()
                     if fish.status().pid != status.pid:
                         return
-                    if not socket.poll(SECOND_LOOK):  # otherwise this process was delayed itself
+                    if not socket.poll(
+                        LATE_ANSWER_WAIT_MS
+                    ):  # otherwise this process was delayed itself
                         view.report_idle()
                 view.ahead = offset.update().seconds
         finally:

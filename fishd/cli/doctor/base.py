@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from fishd import assembly
 from fishd.client import Fish
-from fishd.client.connection import TIMEOUT
+from fishd.client.connection import DEFAULT_TIMEOUT_S
 from fishd.config import Config
 from fishd.config.drivers import CHOICES
 from fishd.core.addresses import find_control_address, socket_path
@@ -27,7 +27,7 @@ from fishd.hardware.checks import Machine, Result, skipped
 
 INSTALL = f"{sys.executable} -m pip install 'fishd[pi]'"
 """Command that installs missing drivers."""
-ANSWER_TIMEOUT_S = TIMEOUT
+ANSWER_TIMEOUT_S = DEFAULT_TIMEOUT_S
 """Longest wait for an answer of a daemon [s]."""
 
 

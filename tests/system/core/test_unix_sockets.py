@@ -93,8 +93,8 @@ def test_an_estop_is_not_sent_to_a_folder_that_another_user_planted(
             fish.estop()  # which is the user's own word
         wait_until(lambda: any(planted.told))
     assert str(caught.value) == (
-        f"what listens at ipc://{path} is not asked, it may be anybody: {path.parent} belongs to "
-        f"user {OTHER}; where you trust it, name it with --endpoint or $FISHD_ENDPOINT"
+        f"the process that listens at ipc://{path} is not trusted: {path.parent} belongs to "
+        f"user {OTHER}; if you trust it, name it with --endpoint or $FISHD_ENDPOINT"
     )
 
 

@@ -308,5 +308,5 @@ def test_an_address_that_no_agent_can_have_is_refused(daemon: Daemon) -> None:
 
 
 def test_without_a_fishd_it_says_so(tmp_path: Path) -> None:
-    with pytest.raises(NoDaemon, match="nobody listens there"):
+    with pytest.raises(NoDaemon, match="no process listens there"):
         FishdLink(f"ipc://{tmp_path}/nobody")

@@ -165,7 +165,7 @@ def test_what_is_no_message_of_a_fishd_is_left_aside(tmp_path: Path) -> None:
         stranger.send(b'{"kind":"ended","session":"\xff"}')
         stranger.send(b"hello")
         wait_until(lambda: agent.poll() is None and "malformed" in agent._strange)
-        with pytest.raises(NoDaemon, match="but what is none: JSON is malformed"):
+        with pytest.raises(NoDaemon, match="but an invalid message: JSON is malformed"):
             agent.observe()
     context.destroy(linger=0)
 
