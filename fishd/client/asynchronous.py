@@ -10,16 +10,16 @@ from typing import Any, Self, TypeVar
 import zmq.asyncio
 
 from fishd.client.connection import (
-    ESTOP_FALLBACK_DELAY_S,
     DEFAULT_IDLE_LIMIT_S,
-    LATE_ANSWER_WAIT_MS,
     DEFAULT_TIMEOUT_S,
+    ESTOP_FALLBACK_DELAY_S,
+    LATE_ANSWER_WAIT_MS,
     Connection,
     answer_deadlines,
 )
 from fishd.client.lease import LeaseRenewal, lease_arguments, report_unreturned
 from fishd.client.synchronous import Fish
-from fishd.client.zmq_sockets import connect_dealer, milliseconds_until, connect_subscriber
+from fishd.client.zmq_sockets import connect_dealer, connect_subscriber, milliseconds_until
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted

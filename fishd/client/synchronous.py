@@ -7,10 +7,10 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from fishd.client.connection import (
-    ESTOP_FALLBACK_DELAY_S,
     DEFAULT_IDLE_LIMIT_S,
-    LATE_ANSWER_WAIT_MS,
     DEFAULT_TIMEOUT_S,
+    ESTOP_FALLBACK_DELAY_S,
+    LATE_ANSWER_WAIT_MS,
     Connection,
     answer_deadlines,
 )
