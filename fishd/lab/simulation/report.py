@@ -64,7 +64,7 @@ class Report(Struct, frozen=True):
     quantities: dict[str, float]
     """Quantities of the controller at the end."""
     took_over: float | None
-    """Time when the fallback took over [s]; before settling ends, all figures are those of it."""
+    """Time when the fallback took over [s]; if before settling, the figures are its own."""
     microseconds_per_tick: float
     """Mean computing time of a tick on this machine, after settling [µs]."""
     real_time_factor: float
