@@ -1,7 +1,7 @@
 """The folder of an experiment: a header, a table of rows, recordings, and state for resuming.
 
 sweep, optimise and adapt write all results into such a folder; a training marks its folder with
-the same header. Files are written atomically, and each row as soon as it is known.
+the same header. Files are written atomically, and each row immediately.
 """
 
 import shlex
