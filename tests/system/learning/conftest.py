@@ -1,4 +1,4 @@
-"""Without the extra 'learn', only tests that do not need it are collected; and what they share."""
+"""Shared fixtures; without the extra 'learn', only tests that do not need it are collected."""
 
 from collections.abc import Iterator
 from importlib.util import find_spec
@@ -34,18 +34,18 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
 @pytest.fixture(scope="module")
 def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
     settings = sets("simulation.noise=0.001", "tick=0.05")
-    with running(tmp_path_factory.mktemp("daemon"), *settings) as found:
-        yield found
+    with running(tmp_path_factory.mktemp("daemon"), *settings) as process:
+        yield process
 
 
 @pytest.fixture
 def daemon(shared_daemon: Daemon) -> Daemon:
-    """One for all tests of a module, at rest whatever the test before has done with it."""
+    """A fishd shared by the tests of a module, at rest at the start of each."""
     return shared_daemon.at_rest()
 
 
 def trained_once(factory: pytest.TempPathFactory, name: str, **settings: Any) -> "Outcome":
-    """Train for seconds, in one of the test processes."""
+    """Return the outcome of a training of some seconds, which only one test process computes."""
     from rigs.swimming import brief_job
 
     from fishd.learning.settings import TrainingSettings
@@ -68,7 +68,7 @@ def by_force(tmp_path_factory: pytest.TempPathFactory) -> "Outcome":
 
 @pytest.fixture(scope="session")
 def by_sight(tmp_path_factory: pytest.TempPathFactory) -> "Outcome":
-    """One that has learned by sight; its folder must not be changed."""
+    """A run that has learned by sight; its folder must not be changed."""
     from fishd.learning.settings import EvaluationSettings
 
     evaluation = EvaluationSettings(seconds=6.0, settle=2.0)

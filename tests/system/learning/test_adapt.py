@@ -1,4 +1,4 @@
-"""`fishctl adapt`: what it draws, whom it lets win, and that nothing is measured twice."""
+"""`fishctl adapt`: the cloud of fish, the choice of the gait, and a resume without repeats."""
 
 import dataclasses
 from functools import partial
@@ -45,8 +45,8 @@ from fishd.virtual.plant.parameters import PlantParameters
 PHI = 0.42
 
 
-def found() -> Identification:
-    """ω₀ and ξ to 2 % and 4 %, with errors that go against each other."""
+def identification() -> Identification:
+    """Return an identification with ω₀ to 2 % and ξ to 4 %, and negatively correlated errors."""
     plain = msgspec.structs.asdict(PlantParameters())
     known = [
         Estimate("omega0", 12.5, 12.5 / 1.02, 12.5 * 1.02),
@@ -79,16 +79,16 @@ def found() -> Identification:
     )
 
 
-def test_a_cloud_has_the_errors_of_the_fit_and_how_they_go_together() -> None:
-    fish = cloud(found(), count=4000)
+def test_a_cloud_has_the_errors_of_the_fit_and_their_correlation() -> None:
+    fish = cloud(identification(), count=4000)
     assert (fish[0].omega0, fish[0].xi, fish[0].coupling) == (12.5, 1.2, 0.46)
-    logs = np.log([[each.omega0 / 12.5, each.xi / 1.2] for each in fish])
+    logs = np.log([[plant.omega0 / 12.5, plant.xi / 1.2] for plant in fish])
     assert logs.std(axis=0) == pytest.approx(np.log([1.02, 1.04]) / 1.96, rel=0.05)
     assert np.corrcoef(logs.T)[0, 1] == pytest.approx(-0.9, abs=0.02)
 
 
 def test_each_episode_of_a_training_swims_a_fish_of_the_cloud() -> None:
-    fish = cloud(found(), count=5)
+    fish = cloud(identification(), count=5)
     spread = Randomisation(fish=fish)
     assert {draw_fish(Config(), spread, seed).plant for seed in range(60)} == set(fish)
     assert [draw_edge_fish(Config(), spread, seed).plant for seed in range(5)] == list(fish)
@@ -106,7 +106,7 @@ def contender(name: str, thrust: float, error: float, *expected: float) -> Conte
     )  # fmt: skip
 
 
-def test_the_largest_thrust_wins_where_the_measurement_tells() -> None:
+def test_the_largest_thrust_wins_where_the_measurement_is_decisive() -> None:
     won = judge([contender("swing", 21e-3, 0.2e-3), contender("square", 20e-3, 0.2e-3)], GOOD)
     assert (won.chosen, won.decided, won.undecided) == ("swing", True, ["swing"])
     assert won.relative_thrust == pytest.approx(1.05)
@@ -115,7 +115,7 @@ def test_the_largest_thrust_wins_where_the_measurement_tells() -> None:
     assert "swing as --C auto has found it wins: it thrusts 105.0 %" in won.claim
 
 
-def test_where_it_does_not_the_simplest_is_chosen_and_nothing_wins() -> None:
+def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins() -> None:
     near = [contender("policy", 20.2e-3, 2e-4), contender("square", 20e-3, 2e-4)]
     swing = contender("swing", 20.1e-3, 2e-4)
     two, three = judge(near, GOOD), judge([swing, *near], USELESS)
@@ -140,7 +140,7 @@ def test_where_it_does_not_the_simplest_is_chosen_and_nothing_wins() -> None:
         (Model(explained=0.995, error=MODEL_ERROR, is_rejected=True), "square"),
     ],
 )
-def test_the_identified_fish_counts_by_how_well_it_explains(model: Model, chosen: str) -> None:
+def test_the_identified_fish_has_weight_by_how_well_it_explains(model: Model, chosen: str) -> None:
     # Measured to 7 %; on the fish of the cloud the policy has 15 % more.
     vague = [
         contender("policy", 20.5e-3, 1.4e-3, 23e-3, 24e-3),
@@ -152,7 +152,7 @@ def test_the_identified_fish_counts_by_how_well_it_explains(model: Model, chosen
     assert (reason in verdict.claim) == (chosen == "policy")
 
 
-def test_thrusts_that_contradict_the_identified_fish_are_believed_instead_of_it() -> None:
+def test_an_identified_fish_that_thrusts_contradict_is_not_used() -> None:
     measured = [
         contender("policy", 19.9e-3, 2e-4, 30e-3, 30e-3),
         contender("square", 20e-3, 2e-4, 20e-3, 20e-3),
@@ -163,11 +163,13 @@ def test_thrusts_that_contradict_the_identified_fish_are_believed_instead_of_it(
 def test_intervals_of_two_are_wider_than_that_of_one() -> None:
     square, swing = contender("square", 20e-3, 0.2e-3), contender("swing", 21e-3, 0.2e-3)
     policy = contender("policy", 1e-3, 0.2e-3)
-    one, two = judge([swing, square], GOOD), judge([policy, swing, square], GOOD)
-    assert two.high - two.low == pytest.approx(2.2414 / 1.96 * (one.high - one.low), rel=2e-3)
+    single, double = judge([swing, square], GOOD), judge([policy, swing, square], GOOD)
+    assert double.high - double.low == pytest.approx(
+        2.2414 / 1.96 * (single.high - single.low), rel=2e-3
+    )
 
 
-def test_a_square_wave_that_hardly_thrusts_is_no_measure() -> None:
+def test_a_square_wave_that_hardly_thrusts_is_refused_as_a_reference() -> None:
     with pytest.raises(FishdError, match="too little to differ clearly from zero"):
         judge([contender("swing", 1e-4, 2e-4), contender("square", 1e-4, 2e-4)], GOOD)
 
@@ -175,7 +177,7 @@ def test_a_square_wave_that_hardly_thrusts_is_no_measure() -> None:
 @pytest.mark.parametrize(
     ("failed", "explained", "error"),
     [
-        ((), 0.4, MODEL_ERROR),  # what is left is noise
+        ((), 0.4, MODEL_ERROR),  # the rest is noise
         (("white residual of fx",), 0.99, 0.1005),
         (("white residual of fx",), 0.61, None),
     ],
@@ -183,7 +185,7 @@ def test_a_square_wave_that_hardly_thrusts_is_no_measure() -> None:
 def test_the_weight_of_a_fit_follows_what_it_explains_out_of_sample(
     failed: tuple[str, ...], explained: float, error: float | None
 ) -> None:
-    fit = found()
+    fit = identification()
     vague = dataclasses.replace(fit.channels[0], explained_out_of_sample=explained)
     fit = dataclasses.replace(fit, channels=(fit.channels[0], vague), failed_assumptions=failed)
     model = model_of(fit)
@@ -215,11 +217,11 @@ def test_a_policy_is_not_one_tick_off_the_best_wave_of_a_weakly_damped_fish(tmp_
     [
         (GOOD, lambda f: 0.9, True),
         (GOOD, lambda f: f, False),  # the tank disagrees
-        (Model(explained=0.8, error=0.45), lambda f: f, True),  # so vague that the tank tells
+        (Model(explained=0.8, error=0.45), lambda f: f, True),  # so uncertain that the tank decides
         (USELESS, lambda f: f, False),
     ],
 )
-def test_the_fit_says_which_square_wave_is_best_by_how_well_it_explains(
+def test_the_fit_decides_on_the_best_square_wave_if_it_explains_well(
     model: Model, scale: Any, used: bool
 ) -> None:
     with VirtualSession(Config()) as rig:
@@ -229,7 +231,7 @@ def test_the_fit_says_which_square_wave_is_best_by_how_well_it_explains(
         thrust = scale(frequency) * square_wave(PlantParameters(), PHI, frequency).thrust
         tried.append(Tried(frequency, thrust, 0.2e-3, 0, 0.0))
         search.observe({"frequency": frequency}, thrust, 0.2e-3)
-    true = max(tried, key=lambda each: each.thrust).frequency
+    true = max(tried, key=lambda trial: trial.thrust).frequency
     frequency, is_used = steps.best_of(search, tried, fitted(model), PHI)
     assert is_used == used
     assert frequency == pytest.approx(true)
@@ -237,18 +239,21 @@ def test_the_fit_says_which_square_wave_is_best_by_how_well_it_explains(
     assert (fastest > 4.0) == (model.error is None)  # all frequencies are searched without a fit
 
 
-def test_few_waves_with_noise_leave_the_maximum_where_a_good_fit_has_it() -> None:
+def test_with_a_good_fit_few_noisy_waves_do_not_move_the_maximum() -> None:
     with VirtualSession(Config()) as rig:
         search = steps.square_waves(fitted(GOOD), rig, 0)
     for frequency, luck in ((10 / 8, 1.04), (10 / 6, 0.96), (2.0, 1.0)):
         thrust = luck * square_wave(PlantParameters(), PHI, frequency).thrust
         search.observe({"frequency": frequency}, thrust, 2e-3)
-    tried = [Tried(*each, 0, 0.0) for each in zip(*search.measured("frequency"), strict=True)]
+    tried = [
+        Tried(*measurement, 0, 0.0)
+        for measurement in zip(*search.measured("frequency"), strict=True)
+    ]
     assert steps.best_of(search, tried, fitted(GOOD), PHI) == (pytest.approx(10 / 6), True)
 
 
-class Quiet:
-    """Keeps the lines."""
+class StoringDisplay:
+    """A display that stores its lines."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -256,7 +261,7 @@ class Quiet:
     def done(self, line: str, amount: float) -> None:
         self.lines.append(line)
 
-    def at(self, amount: float, found: str = "") -> None:
+    def at(self, amount: float, text: str = "") -> None:
         pass
 
     def warn(self, line: str) -> None:
@@ -264,7 +269,7 @@ class Quiet:
 
 
 def no_policy(*_: Any) -> Trained:
-    return Trained(steps=0, refused="nobody trains in this test")
+    return Trained(steps=0, refused="this test trains no policy")
 
 
 def folder(path: Path) -> AdaptFolder:
@@ -274,22 +279,22 @@ def folder(path: Path) -> AdaptFolder:
 
 
 class Stopped(BaseException):
-    """As Ctrl-C."""
+    """The exception of Ctrl-C."""
 
 
 @pytest.mark.slow
-def test_what_was_measured_is_not_measured_again(
+def test_a_resume_does_not_repeat_measurements(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(adaptation, "practise", no_policy)
     monkeypatch.setattr(steps, "cloud", partial(cloud, count=2))  # each fish takes long to compute
     path, config = tmp_path / "run", load("config/simulated.yaml")
-    daemon, show = VirtualDaemon(config), Quiet()
+    daemon, show = VirtualDaemon(config), StoringDisplay()
 
-    def go_on() -> State:
+    def adapt() -> State:
         with LiveSession(cast(Fish, daemon)) as rig:
-            made = Adaptation(rig, folder(path), 160.0, 640, 0, show)
-            return made.run()
+            adapting = Adaptation(rig, folder(path), 160.0, 640, 0, show)
+            return adapting.run()
 
     def stop(*_: Any, **__: Any) -> None:
         raise Stopped
@@ -298,22 +303,22 @@ def test_what_was_measured_is_not_measured_again(
     with monkeypatch.context() as broken:
         broken.setattr(steps, "search_square_waves", stop)
         with pytest.raises(Stopped):
-            go_on()
-    kept = folder(path).state
+            adapt()
+    stored = folder(path).state
     assert daemon.status().mode == "idle"
-    assert kept.excitation == "excitation.mcap"
-    assert kept.fitted
-    assert kept.swing
-    assert kept.tank_time == pytest.approx(0.34 * 160.0, abs=0.2)
-    state = go_on()
+    assert stored.excitation == "excitation.mcap"
+    assert stored.fitted
+    assert stored.swing
+    assert stored.tank_time == pytest.approx(0.34 * 160.0, abs=0.2)
+    state = adapt()
     assert state.verdict
     assert state.tank_time == pytest.approx(160.0, abs=0.2)
     assert sum(line.startswith("excitation") for line in show.lines) == 1
-    assert any("nobody trains" in line for line in show.lines)
-    assert {one.name for one in state.contenders} == {"swing", "square"}
+    assert any("this test trains no policy" in line for line in show.lines)
+    assert {gait.name for gait in state.contenders} == {"swing", "square"}
     assert state.verdict.chosen == "square"
     assert state.verdict.undecided == ["square", "swing"]
-    assert all(len(one.expected) == 2 for one in state.contenders)
+    assert all(len(gait.expected) == 2 for gait in state.contenders)
     for name, (value, low, high) in state.verdict.others.items():
         assert 0.95 < value < 1.05, name
         assert low < 1.0 < high
@@ -330,15 +335,15 @@ def test_what_was_measured_is_not_measured_again(
 
 
 def test_no_policy_is_trained_on_a_fish_that_explains_too_little(tmp_path: Path) -> None:
-    run, show = folder(tmp_path / "run"), Quiet()
+    run, show = folder(tmp_path / "run"), StoringDisplay()
     run.state.fitted = fitted(USELESS)
     with VirtualSession(Config()) as rig:
-        made = Adaptation(rig, run, 150.0, 640, 0, show)
-        made._practise(run.state)
+        adapting = Adaptation(rig, run, 150.0, 640, 0, show)
+        adapting._practise(run.state)
     assert show.lines == ["no policy is trained: the fit explains too little"]
-    kept = folder(run.path).state
-    assert kept.trained
-    assert kept.trained.refused
+    stored = folder(run.path).state
+    assert stored.trained
+    assert stored.trained.refused
     assert not (run.path / TRAINING).exists()
 
 
@@ -350,7 +355,7 @@ def test_a_fish_that_is_only_noise_is_refused_in_one_line(tmp_path: Path) -> Non
         VirtualSession(config) as rig,
         pytest.raises(Unidentifiable, match=r"the best fit explains .* of F_x only"),
     ):
-        Adaptation(rig, run, 150.0, 640, 0, Quiet()).run()
+        Adaptation(rig, run, 150.0, 640, 0, StoringDisplay()).run()
     assert folder(run.path).state.excitation == "excitation.mcap"
 
 
@@ -361,30 +366,30 @@ def test_a_fish_that_is_only_noise_is_refused_in_one_line(tmp_path: Path) -> Non
         (ConfigError("run: of another"), "", 78),
     ],
 )
-def test_an_error_ends_it_in_one_line_that_says_how_to_go_on(
+def test_an_error_ends_an_adaptation_in_one_line_with_the_command_to_resume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: FishdError, code: str, status: int
 ) -> None:
     def run(_: Adaptation) -> State:
         raise error
 
-    said = str(error)
+    message = str(error)
     monkeypatch.setattr(Adaptation, "run", run)
     done = fishctl("adapt", "--folder", str(tmp_path / "run"))
-    again = f"fishctl adapt --resume {tmp_path / 'run'}"
-    assert done.stderr == f"fishctl: {said}; resume with: {again}{code}\n"
+    command = f"fishctl adapt --resume {tmp_path / 'run'}"
+    assert done.stderr == f"fishctl: {message}; resume with: {command}{code}\n"
     assert done.returncode == status
 
 
-def test_the_last_line_says_what_to_type() -> None:
-    one = msgspec.structs.replace(
+def test_the_last_line_is_the_command_to_type() -> None:
+    winner = msgspec.structs.replace(
         contender("square", 1.0, 0.1), controller="square", parameters={"frequency": 5.0 / 3.0}
     )
     live = ChosenFish("live", None, (), None)
-    assert format_command(one, live) == "fishctl set-controller square --frequency 1.66667"
-    there = format_command(one, live._replace(endpoint="ipc:///run/a"))
-    assert there.endswith(" --endpoint ipc:///run/a")
+    assert format_command(winner, live) == "fishctl set-controller square --frequency 1.66667"
+    command = format_command(winner, live._replace(endpoint="ipc:///run/a"))
+    assert command.endswith(" --endpoint ipc:///run/a")
     keys = ("plant.xi=0.9", "tick=0.05")
-    assert format_command(one, ChosenFish("simulation", Path("a fish.yaml"), keys, None)) == (
+    assert format_command(winner, ChosenFish("simulation", Path("a fish.yaml"), keys, None)) == (
         "fishctl simulate square --frequency 1.66667 --config 'a fish.yaml' --set plant.xi=0.9 "
         "--set tick=0.05"
     )

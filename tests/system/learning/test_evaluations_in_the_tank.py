@@ -1,4 +1,4 @@
-"""In the tank, policies swim shortly and in turn until it is clear which is the best."""
+"""Evaluations in the tank: short swims of several policies until the best one is clear."""
 
 import copy
 from collections.abc import Callable
@@ -49,7 +49,7 @@ def chatter(seen: Observation) -> float:
 
 
 def env_on(*settings: str, kind: type[SimulatedLink] = SimulatedLink) -> SwimEnv:
-    config = load(None, [f"simulation.{one}" for one in settings])
+    config = load(None, [f"simulation.{setting}" for setting in settings])
     env = SwimEnv(kind(config), config, EnvironmentSettings())
     env.reset(seed=1)
     return env
@@ -60,14 +60,14 @@ def swims(env: SwimEnv) -> Swims:
 
 
 @pytest.mark.parametrize("drift", DRIFTS)
-def test_whatever_the_sensor_drifts_a_short_swim_tells_the_thrust(drift: str) -> None:
+def test_a_short_swim_measures_the_thrust_with_any_drift_of_the_sensor(drift: str) -> None:
     env = env_on(drift, "noise=0.001", "seed=3")
-    begun, found = swims(env), []
+    measured_swims, results = swims(env), []
     for _ in range(3):
-        found.append(begun.swim(lambda seen, _: square(6)(seen)))
+        results.append(measured_swims.swim(lambda seen, _: square(6)(seen)))
     true = square_wave(env.config.plant, 0.42, 1 / 0.6).thrust
-    assert [swim.thrust for swim in found] == pytest.approx([true] * 3, rel=0.04)
-    assert [swim.frequency for swim in found] == pytest.approx([1 / 0.6] * 3)
+    assert [swim.thrust for swim in results] == pytest.approx([true] * 3, rel=0.04)
+    assert [swim.frequency for swim in results] == pytest.approx([1 / 0.6] * 3)
     assert env.tank_time == pytest.approx(3 * 3.5 + 4 * REST_TIME_S, abs=0.6)  # and the start
 
 
@@ -77,10 +77,10 @@ def test_whatever_the_sensor_drifts_a_short_swim_tells_the_thrust(drift: str) ->
     ids=["holds still", "reverses in every tick", "at neutral", "stays on one side"],
 )
 def test_a_policy_that_does_not_swim_is_stopped_after_two_seconds(decide: Policy) -> None:
-    found = swims(env_on()).swim(lambda seen, _: decide(seen))
-    assert found.stalled
-    assert found.thrust is None
-    assert found.seconds <= 2.0
+    swim = swims(env_on()).swim(lambda seen, _: decide(seen))
+    assert swim.stalled
+    assert swim.thrust is None
+    assert swim.seconds <= 2.0
 
 
 def test_a_slow_fish_swims_for_longer() -> None:
@@ -92,10 +92,10 @@ def test_a_slow_fish_swims_for_longer() -> None:
 
 
 class Tank:
-    """Evaluations of policies that are given, in the place of those that networks stand for.
+    """Evaluations with given policies in place of those of the networks.
 
-    Each is known by the exploration of the model, so that another is only asked where the model
-    has the parameters of its candidate.
+    The exploration of the model identifies its policy, so a policy swims only if the model has the
+    parameters of its candidate.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Tank:
         self.model = make_learner(TrainingSettings(), DummyVecEnv([lambda: self.env]))
         self.policies: list[Policy] = []
         self.asked: list[int] = []
-        """Which ones swam in the latest evaluation, in order."""
+        """Indices of the policies that swam in the latest evaluation, in order."""
         self.tank = TankEvaluations(self.model, self.env, None, lambda: False)
 
         def decides(policy: Any, *_: object) -> Callable[..., float]:
@@ -119,7 +119,7 @@ class Tank:
         monkeypatch.setattr(tank_evaluations, "DeterministicPolicy", decides)
 
     def evaluate(self, policy: Policy, seconds: float = 13.0) -> list[Evaluation]:
-        """Such a one is the newest."""
+        """Return the evaluations with `policy` as the newest candidate."""
         index = len(self.policies)
         self.policies.append(policy)
         self.asked = []
@@ -147,14 +147,14 @@ def test_with_a_drifting_sensor_the_better_of_two_policies_is_chosen(
 
 
 class Pushed(SimulatedLink):
-    """A fish that somebody pushes while it swims."""
+    """A fish that is pushed while it swims."""
 
     push = 0.0
 
     def step(self, angle: float) -> StepResult:
-        found = super().step(angle)
-        pushed = replace(found.observation, fx=found.observation.fx + (self.push if angle else 0.0))
-        return found._replace(observation=pushed)
+        step = super().step(angle)
+        pushed = replace(step.observation, fx=step.observation.fx + (self.push if angle else 0.0))
+        return step._replace(observation=pushed)
 
 
 def test_a_policy_that_was_pushed_once_does_not_stay_the_best(
@@ -189,21 +189,21 @@ def test_a_policy_that_stalls_costs_little_and_never_swims_again(
     assert tank.best in (1, 2)
 
 
-def test_where_the_best_stalls_the_next_best_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_the_best_stalls_the_next_best_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     tank = Tank(monkeypatch, "noise=0.001")
     tank.evaluate(square(5))
     tank.evaluate(square(6))
     assert tank.best == 1
     tank.policies[1] = still
-    found = tank.evaluate(square(6), 40.0)
-    assert {row.policy: (row.stalled, row.best) for row in found}[128] == (True, False)
+    results = tank.evaluate(square(6), 40.0)
+    assert {row.policy: (row.stalled, row.best) for row in results}[128] == (True, False)
     assert tank.best != 1
 
 
-def test_an_evaluation_takes_no_longer_than_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_evaluation_takes_no_longer_than_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     tank = Tank(monkeypatch, "noise=0.003")
     for seconds, swims in ((8.0, 1), (13.0, 2), (20.0, 3)):
-        tank.evaluate(square(6))  # so that there is more than one
+        tank.evaluate(square(6))  # so that there are several candidates
         before = tank.env.tank_time
         tank.evaluate(square(6), seconds)
         assert len(tank.asked) == swims
@@ -211,13 +211,13 @@ def test_an_evaluation_takes_no_longer_than_it_may(monkeypatch: pytest.MonkeyPat
 
 
 def on_robot(folder: Path, **changes: Any) -> Job:
-    """A training whose fish is in this process, but evaluated as in a tank."""
+    """Return a training with a fish in this process that is evaluated as in a tank."""
     return brief_job(folder, on="live", steps=changes.pop("steps", 192), **changes)
 
 
 @pytest.fixture
 def beating(monkeypatch: pytest.MonkeyPatch) -> list[Policy]:
-    """What swims in evaluations, in order; the last one from then on."""
+    """Policies that swim in evaluations, in order; the last one swims repeatedly."""
     policies = [square(6)]
 
     def decides(*_: object) -> Callable[..., float]:
@@ -228,8 +228,8 @@ def beating(monkeypatch: pytest.MonkeyPatch) -> list[Policy]:
     return policies
 
 
-class Remembering(Training):
-    """Remembers the networks of each candidate."""
+class StoringTraining(Training):
+    """A training that stores the networks of each candidate."""
 
     networks: dict[int, dict[str, torch.Tensor]]
 
@@ -239,15 +239,15 @@ class Remembering(Training):
         super()._evaluate()
 
 
-def remembered(job: Job, link: SimulatedLink) -> Remembering:
-    training = Remembering(job, link, Display(), lambda: False)
+def storing_training(job: Job, link: SimulatedLink) -> StoringTraining:
+    training = StoringTraining(job, link, Display(), lambda: False)
     training.networks = {}
     return training
 
 
 def same(checkpoint: Path, networks: dict[str, torch.Tensor]) -> bool:
-    found = checkpoints.load_policy(checkpoint)[0].state_dict()
-    return all(bool((found[name] == networks[name]).all()) for name in found)
+    stored = checkpoints.load_policy(checkpoint)[0].state_dict()
+    return all(bool((stored[name] == networks[name]).all()) for name in stored)
 
 
 def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
@@ -255,7 +255,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
 ) -> None:
     beating[:] = [square(6), square(5), square(6), still, square(5)]
     job = on_robot(tmp_path / "run")
-    training = remembered(job, Resting(job))
+    training = storing_training(job, Resting(job))
     outcome = training.run()
     best = outcome.best_evaluation
     assert best
@@ -265,10 +265,10 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     past = checkpoints.read_card(outcome.best).provenance
     assert (past.steps, past.relative_thrust, past.on) == (64, best.relative_thrust, "live")
     assert outcome.checkpoint
-    assert same(outcome.checkpoint, training.networks[192])  # what learned on is the newest
+    assert same(outcome.checkpoint, training.networks[192])  # the newest one has learned since
     table = rows(job.folder / "evaluations.csv")
-    told = [(row["steps"], row["policy"], row["stalled"], row["best"]) for row in table]
-    assert told == [
+    reported = [(row["steps"], row["policy"], row["stalled"], row["best"]) for row in table]
+    assert reported == [
         ("64", "64", "0", "1"),
         ("128", "128", "0", "0"),
         ("128", "64", "0", "1"),
@@ -277,32 +277,32 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     ]
     assert [row["swam"] for row in table] == ["3.5", "3.5", "7.0", "1.5", "7.0"]
     assert 0.0 < float(table[2]["error"]) < float(table[0]["error"])
-    monkeypatch.delattr(exporting, "evaluate_in_simulation")  # its figures are those of the tank
+    monkeypatch.delattr(exporting, "evaluate_in_simulation")  # the figures are those of the tank
     exported = exporting.export(outcome.best, tmp_path / "best.onnx")
     assert exported.evaluation == best
     assert exported.card.provenance.relative_thrust == best.relative_thrust
 
 
-def test_a_resumed_training_goes_on_with_the_best_and_the_swims_that_it_had(
+def test_a_resumed_training_keeps_the_best_policy_and_its_swims(
     tmp_path: Path, beating: list[Policy]
 ) -> None:
     beating[:] = [square(6), square(5), square(6), still, square(5)]
     job = on_robot(tmp_path / "run")
-    training = remembered(job, Resting(job))
+    training = storing_training(job, Resting(job))
     first = training.run().best_evaluation
     more = replace(job, resume=True, settings=replace(job.settings, steps=256))
-    again = remembered(more, Resting(more))
+    again = storing_training(more, Resting(more))
     former = again._recorder.winner
     assert first
     assert former
     assert (former.steps, former.swims, former.swam, former.thrust) == (64, 2, 7.0, first.thrust)
-    found = again.run()
-    assert found.best == job.folder / "best-000064"
-    assert same(found.best, training.networks[64])
+    second = again.run()
+    assert second.best == job.folder / "best-000064"
+    assert same(second.best, training.networks[64])
     assert rows(job.folder / "evaluations.csv")[-1]["steps"] == "256"
 
 
-def test_a_training_that_was_killed_goes_on_with_the_best_that_it_had_then(
+def test_a_killed_training_resumes_with_its_best_policy(
     tmp_path: Path, beating: list[Policy]
 ) -> None:
     job = on_robot(tmp_path / "run", steps=128, checkpoint_every=64)
@@ -320,7 +320,7 @@ def test_a_training_that_was_killed_goes_on_with_the_best_that_it_had_then(
     assert (recorder.winner.steps, recorder.winner.thrust) == (best.policy, best.thrust)
 
 
-def test_where_the_best_was_moved_away_a_training_goes_on_without(
+def test_a_training_resumes_without_its_best_policy_if_that_was_moved_away(
     tmp_path: Path, beating: list[Policy]
 ) -> None:
     job = on_robot(tmp_path / "run", steps=64)
@@ -332,7 +332,7 @@ def test_where_the_best_was_moved_away_a_training_goes_on_without(
     assert again.best == job.folder / "best-000128"
 
 
-def test_a_stop_in_an_evaluation_keeps_what_was_measured_before(
+def test_a_stop_in_an_evaluation_keeps_earlier_measurements(
     tmp_path: Path, beating: list[Policy]
 ) -> None:
     job = on_robot(tmp_path / "run", steps=6400)
@@ -351,7 +351,7 @@ def test_a_fish_that_is_lost_in_an_evaluation_loses_nothing(
     tmp_path: Path, beating: list[Policy]
 ) -> None:
     job = on_robot(tmp_path / "run")
-    lost = remembered(job, Failing(job, 64 + 150 + 64 + 190))
+    lost = storing_training(job, Failing(job, 64 + 150 + 64 + 190))
     outcome = lost.run()
     assert (outcome.ended, outcome.steps) == ("lost", 128)
     assert outcome.best
@@ -364,7 +364,7 @@ def test_a_fish_that_is_lost_in_an_evaluation_loses_nothing(
     assert (again.ended, again.steps) == ("finished", 192)
 
 
-def test_what_a_training_began_with_may_stay_the_best(
+def test_the_initial_policy_of_a_training_may_stay_the_best(
     tmp_path: Path, beating: list[Policy]
 ) -> None:
     job = on_robot(tmp_path / "parent", steps=64)
@@ -384,15 +384,19 @@ def test_export_finds_the_best_of_a_tank(tmp_path: Path, beating: list[Policy]) 
     assert checkpoints.find(job.folder) == outcome.best
 
 
-def test_in_lockstep_a_fishd_gives_the_evaluations_of_a_fish_in_process(tmp_path: Path) -> None:
+def test_a_fishd_in_lockstep_gives_the_same_evaluations_as_a_fish_in_process(
+    tmp_path: Path,
+) -> None:
     changes = {"steps": 256, "seed": 249, "ppo": PpoSettings()}
     here = on_robot(tmp_path / "here", **changes)
     Training(here, SimulatedLink(here.config), Display(), lambda: False).run()
     agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
-    with running(tmp_path, *sets("lockstep=true", "start.controller=remote", agent, *NOISY)) as one:
+    with running(
+        tmp_path, *sets("lockstep=true", "start.controller=remote", agent, *NOISY)
+    ) as daemon:
         there = on_robot(tmp_path / "there", **changes)
-        train(replace(there, endpoint=one.endpoint))
-        with Fish(one.endpoint) as fish:
+        train(replace(there, endpoint=daemon.endpoint))
+        with Fish(daemon.endpoint) as fish:
             assert fish.status().mode == "idle"
     assert any(row["error"] for row in rows(here.folder / "evaluations.csv"))
     for name in ("progress.csv", "evaluations.csv"):

@@ -1,4 +1,4 @@
-"""The link to a running fishd: the numbers of a simulated link, and why control was lost."""
+"""The link to a running fishd: equal results to a simulated link, and reasons of lost control."""
 
 import time
 from collections.abc import Iterator
@@ -21,15 +21,15 @@ from fishd.learning.settings import EnvironmentSettings
 
 FISH = ["simulation.noise=1e-3", "simulation.offset_y=5e-3", "simulation.seed=7"]
 HALF = np.full(1, 0.5, np.float32)
-FEW, MANY = 5, 100
-"""Ticks that an agent may miss: that is the default, and so many no busy machine loses."""
+DEFAULT_MISSES, MANY_MISSES = 5, 100
+"""Numbers of ticks that an agent may miss: the default, and more than a busy machine loses."""
 
 
 @pytest.fixture(scope="module")
 def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A fishd in real time, in which an agent on a busy machine may lose ticks but no training."""
-    with running(tmp_path_factory.mktemp("daemon"), *sets("tick=0.1")) as found:
-        yield found
+    """A fishd in real time: an agent on a busy machine may lose ticks, but not its control."""
+    with running(tmp_path_factory.mktemp("daemon"), *sets("tick=0.1")) as process:
+        yield process
 
 
 @pytest.fixture
@@ -40,10 +40,10 @@ def fish(daemon: Daemon) -> Iterator[Fish]:
 
 @pytest.fixture
 def link(daemon: Daemon, fish: Fish) -> Iterator[FishdLink]:
-    """Swims already, and may miss many ticks."""
+    """A link to a swimming fish that may miss many ticks."""
     link = FishdLink(daemon.endpoint)
     link.reset()
-    fish.set_parameters(misses=MANY)
+    fish.set_parameters(misses=MANY_MISSES)
     while link.step(0.3).lost:
         pass
     yield link
@@ -57,22 +57,22 @@ def env_on(daemon: Daemon) -> SwimEnv:
 
 @pytest.fixture
 def env(daemon: Daemon, fish: Fish) -> Iterator[SwimEnv]:
-    """Swims already, and may miss many ticks until its controller is made active once more."""
-    made = env_on(daemon)
-    made.reset()
-    fish.set_parameters(misses=MANY)
-    assert swims(made)
-    yield made
-    made.close()
+    """An environment of a swimming fish that may miss many ticks until control is reacquired."""
+    env = env_on(daemon)
+    env.reset()
+    fish.set_parameters(misses=MANY_MISSES)
+    assert swims(env)
+    yield env
+    env.close()
 
 
 def swims(env: SwimEnv) -> bool:
-    """Is what a step observes a consequence of its action?"""
+    """Return whether a step observes a consequence of its action."""
     return any(env.step(HALF)[4]["lost"] == 0 for _ in range(20))
 
 
 def swim_on(env: SwimEnv) -> None:
-    """A few steps: an observation may be there that was sent before control was lost."""
+    """Swim a few steps, since an observation may have been sent before control was lost."""
     for _ in range(5):
         env.step(HALF)
 
@@ -89,7 +89,7 @@ def losing(message: str) -> Iterator[None]:
 
 
 def course(link: Link, steps: int, pause_every: int, ticks: int) -> list[tuple[bytes, float, int]]:
-    """What an agent sees that acts at random, always in the same way."""
+    """Return observations, rewards and lost ticks of a random agent with a fixed seed."""
     env = SwimEnv(link, load(None, FISH), EnvironmentSettings(episode=100, history=ticks))
     draw = np.random.default_rng(4)
     seen = [(env.reset(seed=3)[0].tobytes(), 0.0, 0)]
@@ -108,7 +108,7 @@ def course(link: Link, steps: int, pause_every: int, ticks: int) -> list[tuple[b
 @pytest.mark.parametrize(
     ("pause_every", "ticks"), [(0, 8), (64, 1)], ids=["with a history", "with pauses"]
 )
-def test_a_fishd_in_lockstep_gives_the_numbers_of_a_fish_in_process(
+def test_a_fishd_in_lockstep_gives_the_same_results_as_a_fish_in_process(
     tmp_path: Path, pause_every: int, ticks: int
 ) -> None:
     agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
@@ -118,29 +118,31 @@ def test_a_fishd_in_lockstep_gives_the_numbers_of_a_fish_in_process(
     assert there == course(SimulatedLink(load(None, FISH)), 300, pause_every, ticks)
 
 
-def test_it_swims_a_fishd_in_real_time_and_leaves_it_at_rest(daemon: Daemon, fish: Fish) -> None:
+def test_a_link_swims_a_fishd_in_real_time_and_leaves_it_at_rest(
+    daemon: Daemon, fish: Fish
+) -> None:
     link = FishdLink(daemon.endpoint)
     with Subscriber(daemon.telemetry, b"tick") as telemetry:
         assert (link.tick, link.amplitude) == (0.1, 0.42)
-        telemetry.message()  # from here on none is missed
+        telemetry.message()  # from here on no message is missed
         before = link.reset()
-        fish.set_parameters(misses=MANY)
-        told: dict[float, float] = {}
+        fish.set_parameters(misses=MANY_MISSES)
+        sent: dict[float, float] = {}
         for n in range(20):
             angle = 0.02 * (n + 1)
-            found, lost, _ = link.step(angle)
+            after, lost, _ = link.step(angle)
             if not lost:
-                told[before.fx] = angle
-                assert found.time == pytest.approx(before.time + 0.1)
-                assert found.instruction_angle == pytest.approx(angle)
-            before = found
-        assert len(told) > 10
+                sent[before.fx] = angle
+                assert after.time == pytest.approx(before.time + 0.1)
+                assert after.instruction_angle == pytest.approx(angle)
+            before = after
+        assert len(sent) > 10
         applied: dict[float, float] = {}
         while before.fx not in applied:
             tick = telemetry.message()
             applied[tick["fx"]] = tick["phi_c"]
-    # What the agent was told did happen in the tick that it had observed, says telemetry.
-    assert told == {fx: applied[fx] for fx in told}
+    # According to telemetry, each action was applied in the tick that the agent had observed.
+    assert sent == {fx: applied[fx] for fx in sent}
     link.close()
     assert fish.status().mode == "idle"
 
@@ -153,14 +155,16 @@ def test_a_late_action_is_reported_as_lost(link: FishdLink) -> None:
         assert link.step(0.3).lost >= 1
 
 
-def test_a_pause_is_at_neutral_and_what_follows_is_fresh(link: FishdLink, fish: Fish) -> None:
+def test_a_pause_is_at_neutral_and_the_next_observation_is_fresh(
+    link: FishdLink, fish: Fish
+) -> None:
     before = link.step(0.3).observation
     link.pause(30.0)
-    fish.set_parameters(misses=FEW)
+    fish.set_parameters(misses=DEFAULT_MISSES)
     seq = fish.status().seq
-    while fish.status().seq < seq + 12:  # more ticks than it may miss
+    while fish.status().seq < seq + 12:  # more ticks than the agent may miss
         time.sleep(0.02)
-    fish.set_parameters(misses=MANY)
+    fish.set_parameters(misses=MANY_MISSES)
     after = link.resume()
     assert after.time >= before.time + 1.0
     assert after.instruction_angle == 0.0
@@ -181,7 +185,7 @@ def test_a_reset_in_control_swims_on_without_a_lost_tick(env: SwimEnv, fish: Fis
     assert fish.status().mode == "running"
 
 
-def test_a_stop_ends_it_and_a_reset_reacquires_control(env: SwimEnv, fish: Fish) -> None:
+def test_a_stop_ends_control_and_a_reset_reacquires_it(env: SwimEnv, fish: Fish) -> None:
     fish.stop()
     stopped = fish.status().seq
     with losing("fishd received a request to stop"):
@@ -197,21 +201,21 @@ def test_a_close_that_takes_long_leaves_no_fault(
 ) -> None:
     status = Fish.status
 
-    def slow(asked: Fish) -> Status:
-        fish.set_parameters(misses=FEW)
+    def slow(client: Fish) -> Status:
+        fish.set_parameters(misses=DEFAULT_MISSES)
         seq = status(fish).seq
         while status(fish).seq < seq + 12:  # more ticks than the agent may miss
             time.sleep(0.02)
-        return status(asked)
+        return status(client)
 
     with monkeypatch.context() as patch:
         patch.setattr(Fish, "status", slow)
         link.close()
-    found = fish.status()
-    assert (found.mode, found.reason) == ("idle", None)
+    final = fish.status()
+    assert (final.mode, final.reason) == ("idle", None)
 
 
-def test_another_controller_ends_it_and_a_reset_does_not_take_the_fish_from_it(
+def test_another_controller_ends_control_and_a_reset_does_not_replace_it(
     env: SwimEnv, fish: Fish
 ) -> None:
     fish.set_controller("swing")
@@ -230,18 +234,18 @@ def test_another_active_agent_is_named(env: SwimEnv, fish: Fish, tmp_path: Path)
     with Agent(f"ipc://{tmp_path}/other") as other:
         fish.set_controller("remote", agent=other.address)
         with losing(f"another agent has taken command: {other.address}"):
-            for _ in range(100):  # until it has been told
+            for _ in range(100):  # until the agent has received that
                 env.reset()
                 time.sleep(0.02)
 
 
 @pytest.mark.realtime
-def test_a_fault_ends_it_with_the_reason_of_fishd_until_it_is_cleared(
+def test_a_fault_ends_control_with_the_reason_of_fishd_until_it_is_cleared(
     env: SwimEnv, fish: Fish
 ) -> None:
-    fish.set_parameters(misses=FEW)
+    fish.set_parameters(misses=DEFAULT_MISSES)
     while fish.status().mode != "fault":
-        time.sleep(0.02)  # nobody answers
+        time.sleep(0.02)  # the agent does not answer
     with losing(r"fishd is in mode fault: .* has not answered within"):
         swim_on(env)
     with losing("fishd is in mode fault"):
@@ -253,7 +257,7 @@ def test_a_fault_ends_it_with_the_reason_of_fishd_until_it_is_cleared(
     assert swims(env)
 
 
-def test_an_emergency_stop_ends_it_with_its_message(env: SwimEnv, fish: Fish) -> None:
+def test_an_emergency_stop_ends_control_with_its_message(env: SwimEnv, fish: Fish) -> None:
     fish.estop("water on the floor")
     with losing("fishd is in mode estop: water on the floor"):
         swim_on(env)
@@ -264,13 +268,13 @@ def test_an_emergency_stop_ends_it_with_its_message(env: SwimEnv, fish: Fish) ->
     assert swims(env)
 
 
-def test_a_reset_in_a_pause_ends_it(env: SwimEnv) -> None:
+def test_a_reset_ends_a_pause(env: SwimEnv) -> None:
     env.pause(60.0)
     env.reset()
     assert swims(env)
 
 
-def test_a_fishd_that_is_gone_or_was_restarted_ends_it(tmp_path: Path) -> None:
+def test_a_fishd_that_is_gone_or_was_restarted_ends_control(tmp_path: Path) -> None:
     with running(tmp_path, *sets("tick=0.1")) as first:
         env = env_on(first)
         env.reset()
@@ -288,13 +292,13 @@ def test_a_fishd_that_is_gone_or_was_restarted_ends_it(tmp_path: Path) -> None:
         with losing(f"^fishd was restarted: {pids}$"):
             swim_for_ever(env.link)
         env.reset()
-        fish.set_parameters(misses=MANY)  # or it may be a fault before it is closed
+        fish.set_parameters(misses=MANY_MISSES)  # or there may be a fault before it is closed
         assert swims(env)
         env.close()
         assert fish.status().mode == "idle"
 
 
-def test_a_closed_link_says_so(link: FishdLink) -> None:
+def test_a_closed_link_raises_an_error(link: FishdLink) -> None:
     link.close()
     link.close()
     for use in (link.reset, link.resume, lambda: link.step(0.1), lambda: link.pause(1.0)):
@@ -307,6 +311,6 @@ def test_an_address_that_no_agent_can_have_is_refused(daemon: Daemon) -> None:
         FishdLink(daemon.endpoint, address="tcp://127.0.0.1:99999")
 
 
-def test_without_a_fishd_it_says_so(tmp_path: Path) -> None:
+def test_a_link_without_a_fishd_is_refused(tmp_path: Path) -> None:
     with pytest.raises(NoDaemon, match="no process listens there"):
         FishdLink(f"ipc://{tmp_path}/nobody")

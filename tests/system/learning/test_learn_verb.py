@@ -41,28 +41,28 @@ def learn(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def complaint(*arguments: str) -> tuple[int, str]:
-    """Exit status and the one line on standard error."""
+    """Return the exit status and the one line on standard error."""
     done = learn(*arguments)
     return done.returncode, one_line(done)
 
 
-def test_a_run_its_continuation_and_one_that_begins_with_its_networks(
+def test_a_run_a_resume_and_a_run_that_begins_with_its_networks(
     tmp_path: Path, settings: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    found = learn("ppo", "--settings", settings, "--steps", "65")
-    assert found.returncode == 0, found.stderr
-    assert "128 steps, in whole rollouts of 64 in simulation" in found.stdout
-    assert re.search("\n128 steps in 0:0. of tank time without evaluations\n", found.stdout)
+    result = learn("ppo", "--settings", settings, "--steps", "65")
+    assert result.returncode == 0, result.stderr
+    assert "128 steps, in whole rollouts of 64 in simulation" in result.stdout
+    assert re.search("\n128 steps in 0:0. of tank time without evaluations\n", result.stdout)
     (folder,) = Path("runs").iterdir()
     assert folder.name.startswith("ppo-20")
-    assert found.stdout.count(" in the tank without evaluations: ") >= 2  # one an evaluation
-    found = learn("ppo", "--resume", str(folder), "--steps", "192")
-    assert found.returncode == 0, found.stderr
-    assert f"resumed from {folder}/step-000128" in found.stdout
+    assert result.stdout.count(" in the tank without evaluations: ") >= 2  # one per evaluation
+    result = learn("ppo", "--resume", str(folder), "--steps", "192")
+    assert result.returncode == 0, result.stderr
+    assert f"resumed from {folder}/step-000128" in result.stdout
     assert [row["steps"] for row in rows(folder / "progress.csv")] == ["64", "128", "192"]
-    found = learn("ppo", "--from", str(folder), "--folder", "second", "--steps", "64")
-    assert found.returncode == 0, found.stderr
+    result = learn("ppo", "--from", str(folder), "--folder", "second", "--steps", "64")
+    assert result.returncode == 0, result.stderr
     assert runs.read(Path("second"))[1].ppo == runs.read(folder)[1].ppo
     note = checkpoints.read_card(checkpoints.newest(Path("second"))).provenance.note
     assert note.startswith("began with ppo-20")
@@ -79,7 +79,7 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     assert "--seed cannot be given with --resume" in line
     status, line = complaint("ppo", "--resume", str(tmp_path))
     assert status == 78
-    assert "it holds no settings.yaml" not in line  # there is one, but nothing else of a run
+    assert "it holds no settings.yaml" not in line  # only settings.yaml exists there
     (tmp_path / "several" / "seed-0").mkdir(parents=True)
     status, line = complaint("ppo", "--resume", str(tmp_path / "several"))
     assert status == 1
@@ -94,52 +94,52 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     assert "there is only one live fish" in line
 
 
-def test_it_says_that_it_learns_from_whole_rollouts(tmp_path: Path, settings: str) -> None:
-    found = learn("ppo", "--settings", settings, "--folder", str(tmp_path / "a"), "--steps", "65")
-    assert "128 steps, in whole rollouts of 64 in simulation" in found.stdout
-    assert "\n128 steps in " in found.stdout
+def test_steps_are_rounded_up_to_whole_rollouts(tmp_path: Path, settings: str) -> None:
+    result = learn("ppo", "--settings", settings, "--folder", str(tmp_path / "a"), "--steps", "65")
+    assert "128 steps, in whole rollouts of 64 in simulation" in result.stdout
+    assert "\n128 steps in " in result.stdout
 
 
-def test_a_policy_that_never_swam_is_not_for_a_file(tmp_path: Path) -> None:
+def test_no_export_is_advised_for_a_policy_that_never_swam(tmp_path: Path) -> None:
     idle = tmp_path / "idle.yaml"
     idle.write_text(
         SETTINGS.replace("n_epochs: 4", "n_epochs: 1, learning_rate: 1.0e-9"), encoding="utf-8"
     )
-    found = learn(
+    result = learn(
         "ppo", "--settings", str(idle), "--folder", str(tmp_path / "run"), "--steps", "64"
     )
-    assert found.returncode == 0, found.stderr
-    assert "it stalled in every evaluation; train it for longer" in found.stdout
-    assert "learn export" not in found.stdout
+    assert result.returncode == 0, result.stderr
+    assert "it stalled in every evaluation; train it for longer" in result.stdout
+    assert "learn export" not in result.stdout
 
 
 ENDLESS = ("--steps", "1000000")
 
 
 def updates(folder: Path) -> int:
-    """How many updates the run has."""
+    """Return the number of updates of a run."""
     table = folder / "progress.csv"
     return len(rows(table)) if table.exists() else 0
 
 
-def test_a_signal_leaves_a_checkpoint_to_go_on_from(tmp_path: Path, settings: str) -> None:
+def test_a_signal_leaves_a_checkpoint_to_resume_from(tmp_path: Path, settings: str) -> None:
     folder = tmp_path / "run"
-    found = while_it_trains(
+    result = while_it_trains(
         lambda: updates(folder) >= 2,
         lambda: os.kill(os.getpid(), signal.SIGHUP),
         *("learn", "ppo", "--folder", str(folder), *ENDLESS, "--settings", settings),
     )
-    assert found.returncode == 130, found.stderr
+    assert result.returncode == 130, result.stderr
     done = checkpoints.read_state(checkpoints.newest(folder)).steps
     dropped = r"(, \d+ of an unfinished rollout dropped)?"
     go_on = re.escape(f"resume with: fishctl learn ppo --resume {folder}\n")
-    assert re.fullmatch(f"fishctl: stopped after {done} steps{dropped}; {go_on}", found.stderr)
+    assert re.fullmatch(f"fishctl: stopped after {done} steps{dropped}; {go_on}", result.stderr)
     assert int(rows(folder / "progress.csv")[-1]["steps"]) == done
-    found = learn("ppo", "--resume", str(folder), "--steps", str(done + 64))
-    assert found.returncode == 0, found.stderr
+    result = learn("ppo", "--resume", str(folder), "--steps", str(done + 64))
+    assert result.returncode == 0, result.stderr
 
 
-def test_whatever_kills_it_the_checkpoints_are_whole(tmp_path: Path, settings: str) -> None:
+def test_after_a_kill_all_checkpoints_are_complete(tmp_path: Path, settings: str) -> None:
     text = SETTINGS.replace("steps: 128", "steps: 128\ncheckpoint_every: 64")
     Path(settings).write_text(text, encoding="utf-8")
     folder = tmp_path / "run"
@@ -160,14 +160,14 @@ def test_whatever_kills_it_the_checkpoints_are_whole(tmp_path: Path, settings: s
     assert steps == list(range(64, done + 65, 64))
 
 
-def test_on_a_terminal_it_shows_a_bar(
+def test_on_a_terminal_a_training_shows_a_bar(
     tmp_path: Path, settings: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
     ours, theirs = pty.openpty()
 
-    def shown() -> str:
+    def read_terminal() -> str:
         pieces = []
         with contextlib.suppress(OSError):  # the other end is closed
             while piece := os.read(ours, 4096):
@@ -177,7 +177,7 @@ def test_on_a_terminal_it_shows_a_bar(
 
     command = ["learn", "ppo", "--settings", settings, "--folder", str(tmp_path / "run")]
     with ThreadPoolExecutor(1) as reader:
-        text = reader.submit(shown)
+        text = reader.submit(read_terminal)
         with os.fdopen(theirs, "w") as terminal, contextlib.redirect_stderr(terminal):
             assert commands.main(command, standalone_mode=False) == 0
     assert "128 of 128 steps" in text.result()
@@ -187,7 +187,7 @@ def test_on_a_terminal_it_shows_a_bar(
 
 @pytest.fixture
 def hasty(settings: str) -> str:
-    """Settings with rollouts that take little time in the tank, and no evaluations."""
+    """Settings with short rollouts, and without evaluations."""
     text = SETTINGS.replace("every: 1, patience: null, seconds: 4.0, settle: 2.0", "every: 0")
     text = text.replace("n_steps: 64", "n_steps: 16, batch_size: 16").replace("128", "32")
     Path(settings).write_text(text, encoding="utf-8")
@@ -195,18 +195,21 @@ def hasty(settings: str) -> str:
 
 
 @pytest.mark.realtime
-def test_on_a_running_fishd_it_trains_at_its_tick_and_leaves_the_fish_at_rest(
+def test_a_training_on_a_running_fishd_uses_its_tick_and_leaves_the_fish_at_rest(
     tmp_path: Path, hasty: str, daemon: Daemon
 ) -> None:
     folder = tmp_path / "run"
-    found = learn(
+    result = learn(
         *("ppo", "--on", "live", "--endpoint", daemon.endpoint),
         *("--settings", hasty, "--folder", str(folder)),
     )
-    assert found.returncode == 0, found.stderr
+    assert result.returncode == 0, result.stderr
     config, _ = runs.read(folder)
-    assert (config.tick, config.simulation.noise) == (0.05, 0.001)  # all of it is that of fishd
-    assert found.stderr == ""
+    assert (config.tick, config.simulation.noise) == (
+        0.05,
+        0.001,
+    )  # the configuration is that of fishd
+    assert result.stderr == ""
     assert [row["steps"] for row in rows(folder / "progress.csv")] == ["16", "32"]
     card = checkpoints.read_card(checkpoints.newest(folder))
     assert (card.provenance.on, card.tick) == ("live", 0.05)
@@ -215,7 +218,7 @@ def test_on_a_running_fishd_it_trains_at_its_tick_and_leaves_the_fish_at_rest(
 
 
 @pytest.mark.realtime
-def test_an_estop_ends_it_with_the_reason_and_a_checkpoint_and_no_other_begins(
+def test_an_estop_ends_a_training_with_the_reason_and_a_checkpoint_and_no_other_begins(
     tmp_path: Path, hasty: str, daemon: Daemon
 ) -> None:
     folder = tmp_path / "run"
@@ -225,7 +228,7 @@ def test_an_estop_ends_it_with_the_reason_and_a_checkpoint_and_no_other_begins(
             fish.estop("the tail hit the glass")
 
     on = ("ppo", "--on", "live", "--endpoint", daemon.endpoint)
-    found = while_it_trains(
+    result = while_it_trains(
         lambda: updates(folder),
         press,
         *("learn", *on, *ENDLESS, "--settings", hasty, "--folder", str(folder)),
@@ -235,10 +238,10 @@ def test_an_estop_ends_it_with_the_reason_and_a_checkpoint_and_no_other_begins(
         "with 'fishctl clear-fault'"
     )
     go_on = f"; resume with: fishctl learn ppo --resume {folder} --endpoint {daemon.endpoint}\n"
-    assert (found.returncode, found.stderr) == (1, why + go_on)
+    assert (result.returncode, result.stderr) == (1, why + go_on)
     assert checkpoints.read_state(checkpoints.newest(folder)).steps >= 16
-    found = learn(*on, "--folder", str(tmp_path / "other"))
-    assert why in found.stderr
+    result = learn(*on, "--folder", str(tmp_path / "other"))
+    assert why in result.stderr
     assert not (tmp_path / "other").exists()
 
 
@@ -258,7 +261,7 @@ def test_a_configuration_that_is_not_that_of_the_fishd_is_explained(
     ("relative_thrust", "error", "careful"),
     [(1.01, None, False), (1.1, None, True), (1.1, 0.001, True), (1.1, 0.003, False)],
 )
-def test_more_thrust_than_is_possible_is_said_to_be_so(
+def test_more_thrust_than_is_possible_is_warned_of(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     relative_thrust: float,
@@ -286,25 +289,25 @@ def test_more_thrust_than_is_possible_is_said_to_be_so(
         best_evaluation=best,
     )
     assert print_outcome(outcome, brief_job(tmp_path / "tank")) == 0
-    said = capsys.readouterr().out
-    assert ("careful: that is more than the best square wave" in said) is careful
-    assert "learn export" in said
+    output = capsys.readouterr().out
+    assert ("careful: that is more than the best square wave" in output) is careful
+    assert "learn export" in output
 
 
 @pytest.mark.parametrize("changes", [(), ("--set", "plant.omega0=11")])
-def test_a_training_on_a_robot_asks_fishd_for_its_configuration_once(
+def test_a_training_on_a_robot_reads_the_configuration_of_fishd_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, changes: tuple[str, ...]
 ) -> None:
-    asked: list[str | None] = []
+    endpoints: list[str | None] = []
 
     def config_of(endpoint: str | None) -> dict[str, Any]:
-        asked.append(endpoint)
+        endpoints.append(endpoint)
         config: dict[str, Any] = msgspec.to_builtins(load())
         return config
 
     monkeypatch.setattr(fishd_link, "config_of", config_of)
     endpoint = f"ipc://{tmp_path}/nobody"
-    found = learn("ppo", "--on", "live", "--endpoint", endpoint, *changes)
-    assert "no process listens there" in found.stderr
-    assert asked == [endpoint]
-    assert ("plant.omega0 is 11.0 here, 12.5 there" in found.stderr) is bool(changes)
+    result = learn("ppo", "--on", "live", "--endpoint", endpoint, *changes)
+    assert "no process listens there" in result.stderr
+    assert endpoints == [endpoint]
+    assert ("plant.omega0 is 11.0 here, 12.5 there" in result.stderr) is bool(changes)
