@@ -29,7 +29,7 @@ def test_the_environment_in_process_passes_both_checkers() -> None:
     check_for_baselines(env.unwrapped, warn=True)
 
 
-def test_it_takes_the_files_of_fish_and_training(tmp_path: Path) -> None:
+def test_an_environment_is_made_from_the_files_of_fish_and_training(tmp_path: Path) -> None:
     (tmp_path / "fish.yaml").write_text("amplitude_limit: 0.2\n", encoding="utf-8")
     (tmp_path / "training.yaml").write_text(
         "environment:\n  observation: [fy]\n  episode: 3\n", encoding="utf-8"
@@ -65,15 +65,15 @@ def test_randomised_fish_differ_from_episode_to_episode(tmp_path: Path) -> None:
     (tmp_path / "training.yaml").write_text("randomisation:\n  omega0: 0.2\n", encoding="utf-8")
     env = gymnasium.make("fishd/Swim-v0", settings=tmp_path / "training.yaml")
     swim = env.unwrapped
-    found = []
+    frequencies = []
     for _ in range(5):
         env.reset()
-        found.append(swim.link.config.plant.omega0)  # type: ignore[attr-defined]
-    assert len(set(found)) == 5
-    assert all(12.5 / 1.2 <= omega0 <= 12.5 * 1.2 for omega0 in found)
+        frequencies.append(swim.link.config.plant.omega0)  # type: ignore[attr-defined]
+    assert len(set(frequencies)) == 5
+    assert all(12.5 / 1.2 <= omega0 <= 12.5 * 1.2 for omega0 in frequencies)
 
 
-def test_after_a_pause_the_agent_sees_the_fish_as_it_is_now(tmp_path: Path) -> None:
+def test_after_a_pause_the_agent_sees_the_present_state_of_the_fish(tmp_path: Path) -> None:
     job = brief_job(tmp_path)
     env = SwimEnv(Resting(job), load(None, STILL), BRIEF.environment)
     env.reset(seed=1)
@@ -101,7 +101,7 @@ def test_from_rest_a_tail_may_beat_to_either_side(tmp_path: Path, swims: bool) -
     for share in (1.0, 1.0, 1.0, 1.0, -1.0):
         env.step(np.array([share], np.float32))
     env.pause(60.0)
-    if swims:  # by itself, as in an evaluation in the tank
+    if swims:  # outside of an episode, as in an evaluation in the tank
         env.resume()
         for _ in range(20):
             env.advance(0.0)
@@ -146,9 +146,9 @@ def test_an_action_that_is_not_one_number_is_refused_and_one_beyond_its_space_cl
 
 
 def applied(settings: EnvironmentSettings, *overrides: str) -> tuple[str, float]:
-    """Which side was applied in each of twelve ticks in which the other one was wanted, and reward.
+    """Return the side applied in each of twelve ticks with a requested reversal, and the reward.
 
-    The reward is without that of thrust, for a fish that has none to speak of.
+    The reward of the thrust is negligible.
     """
     config = load(None, [*STILL, *overrides])
     env = SwimEnv(SimulatedLink(config), config, replace(settings, thrust_scale=1e9))
@@ -156,13 +156,13 @@ def applied(settings: EnvironmentSettings, *overrides: str) -> tuple[str, float]
     env.swim(0.42)
     sides, rewards = "", 0.0
     for _ in range(12):
-        wanted = -np.sign([env.latest.instruction_angle])
-        rewards += float(env.step(wanted)[1])
+        action = -np.sign([env.latest.instruction_angle])
+        rewards += float(env.step(action)[1])
         sides += "+" if env.latest.instruction_angle > 0 else "-"
     return sides, rewards
 
 
-def test_a_reversal_that_ppo_would_hold_back_is_held_back_and_costs() -> None:
+def test_a_reversal_that_ppo_would_delay_is_delayed_and_costs() -> None:
     settings = EnvironmentSettings(longest_start=0, reward_scale=2.0, held_cost=0.25)
     sides, reward = applied(settings)
     assert sides == "+++----++++-"
@@ -171,12 +171,12 @@ def test_a_reversal_that_ppo_would_hold_back_is_held_back_and_costs() -> None:
     assert applied(settings, "chatter.dwell=0")[0] == "-+-+-+-+-+-+"
 
 
-def test_a_training_may_do_without_the_shortest_dwell() -> None:
+def test_a_training_may_switch_the_shortest_dwell_off() -> None:
     sides, reward = applied(EnvironmentSettings(longest_start=0, dwell=False))
     assert (sides, reward) == ("-+-+-+-+-+-+", pytest.approx(0.0, abs=1e-6))
 
 
-def test_a_step_before_the_first_episode_and_after_the_end_says_what_is_wrong() -> None:
+def test_a_step_before_the_first_episode_or_after_the_end_is_an_error() -> None:
     env = gymnasium.make("fishd/Swim-v0").unwrapped
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset before step"):
         env.step(np.zeros(1))
@@ -189,31 +189,33 @@ def test_a_step_before_the_first_episode_and_after_the_end_says_what_is_wrong() 
     env.close()
 
 
-def test_the_pause_asked_for_follows_the_longest_so_far(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[float] = []
+def test_the_requested_pause_follows_the_longest_previous_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    requested: list[float] = []
     now = 1000.0
 
-    class Asked(SimulatedLink):
+    class PauseRecorder(SimulatedLink):
         def pause(self, seconds: float) -> None:
-            asked.append(seconds)
+            requested.append(seconds)
 
-    env = SwimEnv(Asked(load(None)), load(None), EnvironmentSettings())
+    env = SwimEnv(PauseRecorder(load(None)), load(None), EnvironmentSettings())
     env.reset(seed=1)
     monkeypatch.setattr(time, "monotonic", lambda: now)
-    for took in (0.5, 5.0, 1.0, 60.0, 0.0):
+    for duration in (0.5, 5.0, 1.0, 60.0, 0.0):
         env.pause()
-        now += took
+        now += duration
         env.resume()
-    assert asked == [120.0, 10.0, 20.0, 20.0, 120.0]
+    assert requested == [120.0, 10.0, 20.0, 20.0, 120.0]
     env.pause(300.0)
-    assert asked[-1] == 300.0
+    assert requested[-1] == 300.0
 
 
 def test_the_environment_on_a_running_fishd_passes_both_checkers(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     address = f"ipc://{tmp_path}/agent"
-    with Fish(daemon.endpoint) as fish:  # a busy machine may hold the checkers up for many ticks
+    with Fish(daemon.endpoint) as fish:  # a busy machine may delay the checkers by many ticks
         fish.set_controller("remote", agent=address, misses=100)
     env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, agent=address).unwrapped
     try:
@@ -223,9 +225,9 @@ def test_the_environment_on_a_running_fishd_passes_both_checkers(
         env.close()
 
 
-def test_the_environment_on_a_running_fishd_listens_where_it_is_told_to(tmp_path: Path) -> None:
+def test_the_environment_on_a_running_fishd_listens_at_the_given_address(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/agent"
-    with running(tmp_path, *sets("lockstep=true")) as daemon:  # it waits for its agent
+    with running(tmp_path, *sets("lockstep=true")) as daemon:  # fishd waits for its agent
         env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, agent=address)
         try:
             env.reset()
@@ -235,17 +237,17 @@ def test_the_environment_on_a_running_fishd_listens_where_it_is_told_to(tmp_path
             env.close()
 
 
-def test_without_a_fishd_it_says_where_it_looked(tmp_path: Path) -> None:
+def test_without_a_fishd_the_error_names_the_endpoint(tmp_path: Path) -> None:
     with pytest.raises(NoDaemon, match="control"):
         gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=f"ipc://{tmp_path}/control")
 
 
-def test_no_policy_learns_from_a_fin_velocity_that_it_will_not_be_shown() -> None:
+def test_no_policy_learns_from_a_fin_velocity_that_it_would_not_receive() -> None:
     with pytest.raises(ConfigError, match="observer is not possible with fin_velocity"):
         gymnasium.make("fishd/Swim-v0", overrides=("estimator.kind=observer",))
 
 
-def test_power_with_a_price_is_taken_off_the_reward() -> None:
+def test_power_with_a_price_is_subtracted_from_the_reward() -> None:
     config, rewards = load(None), []
     for price in (0.0, 0.01):
         link, settings = SimulatedLink(config), EnvironmentSettings(power_price=price)
@@ -259,7 +261,7 @@ def test_power_with_a_price_is_taken_off_the_reward() -> None:
 
 
 class Unmetered(SimulatedLink):
-    """A fish whose power nobody knows."""
+    """A fish whose power is not known."""
 
     def step(self, angle: float) -> StepResult:
         return super().step(angle)._replace(power=None)

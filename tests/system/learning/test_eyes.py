@@ -1,4 +1,4 @@
-"""Eyes: what they see of a tail that babbles, and what they do not."""
+"""Eyes that are fitted to a tail with random motion."""
 
 from collections.abc import Callable
 
@@ -32,10 +32,10 @@ def eye_of(kind: str, **settings: object) -> Eye:
     return eye
 
 
-def swum(
+def swim_with(
     rig: SimulatedCameraSettings, angles: NDArray[np.float64] | None = None
 ) -> tuple[list[Stack], NDArray[np.float64], NDArray[np.float64]]:
-    """Stacks and fin angles of a fish that babbles, and what it was told."""
+    """Return stacks, fin angles and commands of a fish with random motion."""
     if angles is None:
         angles = random_angles(0, TICKS, CONFIG.amplitude_limit)
     eye = eye_of("nature")
@@ -54,7 +54,7 @@ def swum(
 
 
 class Waiting(SimulatedLink):
-    """Knows whether it is in a pause."""
+    """A link that knows whether it is in a pause."""
 
     waits = False
 
@@ -66,22 +66,22 @@ class Waiting(SimulatedLink):
         self.waits = True
 
 
-def test_the_fish_waits_while_its_eye_finds_out_what_it_has_seen_and_afterwards(
+def test_the_fish_waits_while_its_eye_is_fitted_and_afterwards(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     eye = eye_of("nature")
     link = Waiting(CONFIG, camera=Camera(DEFAULT, StackSettings()))
     env = SwimEnv(link, CONFIG, EnvironmentSettings(longest_start=0), eye)
-    waited: list[bool] = []
-    monkeypatch.setattr(eye, "fit", lambda frames, angles: waited.append(link.waits))
+    waits: list[bool] = []
+    monkeypatch.setattr(eye, "fit", lambda frames, angles: waits.append(link.waits))
     env.reset(seed=0)
     assert env.babble(0, 4)
-    assert waited == [True]
+    assert waits == [True]
     assert link.waits
 
 
 def fitted(kind: str, rig: SimulatedCameraSettings = DEFAULT, **settings: object) -> Eye:
-    stacks, _, angles = swum(rig)
+    stacks, _, angles = swim_with(rig)
     eye = eye_of(kind, **settings)
     eye.fit(np.stack([stack[0] for stack in stacks]), angles)
     return eye
@@ -92,50 +92,52 @@ def mirrored(stack: Stack) -> Stack:
 
 
 @pytest.mark.parametrize("rig", [DEFAULT, WEB])
-def test_modes_tell_the_fin_angle_whatever_the_light(rig: SimulatedCameraSettings) -> None:
+def test_modes_contain_the_fin_angle_whatever_the_light(rig: SimulatedCameraSettings) -> None:
     eye = fitted("modes", rig)
-    told = random_angles(1, 300, CONFIG.amplitude_limit)
-    stacks, fins, _ = swum(replace(rig, seed=7, light_drift=0.2), told)
+    angles = random_angles(1, 300, CONFIG.amplitude_limit)
+    stacks, fins, _ = swim_with(replace(rig, seed=7, light_drift=0.2), angles)
     seen = np.stack([eye.see(stack) for stack in stacks])[:, :4]
     fit = np.linalg.lstsq(seen, fins, rcond=None)[0]
-    left = (fins - seen @ fit).std() / fins.std()
-    assert left < (0.35 if rig is DEFAULT else 0.75)  # the picture is 30, or 50 to 90 ms, old
+    unexplained = (fins - seen @ fit).std() / fins.std()
+    assert unexplained < (
+        0.35 if rig is DEFAULT else 0.75
+    )  # pictures are 30 ms, or 50 to 90 ms, old
 
 
 @pytest.mark.parametrize("kind", ["modes", "cnn"])
-def test_what_an_eye_gives_for_a_mirrored_picture_is_mirrored(kind: str) -> None:
+def test_the_output_of_an_eye_for_a_mirrored_picture_is_mirrored(kind: str) -> None:
     rig = replace(DEFAULT, noise=0.0)
     eye = fitted(kind, rig)
-    stack = swum(rig)[0][-1]
-    one, other = eye.see(stack), eye.see(mirrored(stack))
+    stack = swim_with(rig)[0][-1]
+    output, opposite = eye.see(stack), eye.see(mirrored(stack))
     if eye.shape:
-        image = other.reshape(eye.shape)[:, ::-1]
-        assert np.abs(one.reshape(eye.shape) - image).max() < 0.15 * np.abs(one).max()
+        image = opposite.reshape(eye.shape)[:, ::-1]
+        assert np.abs(output.reshape(eye.shape) - image).max() < 0.15 * np.abs(output).max()
     else:
-        assert np.abs(one + other).max() < 0.15 * np.abs(one).max()
+        assert np.abs(output + opposite).max() < 0.15 * np.abs(output).max()
 
 
-def test_an_eye_that_looks_for_the_axis_finds_it_where_the_camera_is_off() -> None:
+def test_an_eye_with_align_detects_the_axis_of_a_camera_off_centre() -> None:
     off = replace(DEFAULT, noise=0.0, off_axis=4.0)
-    stack = swum(off)[0][-1]
-    centred = swum(replace(off, off_axis=0.0))[0][-1]
-    wanted = fitted("cnn", replace(off, off_axis=0.0)).see(centred)
+    stack = swim_with(off)[0][-1]
+    centred = swim_with(replace(off, off_axis=0.0))[0][-1]
+    expected = fitted("cnn", replace(off, off_axis=0.0)).see(centred)
     aligned = fitted("cnn", off).see(stack)
-    blind = fitted("cnn", off, align=False).see(stack)
-    assert np.abs(aligned - wanted).mean() < 0.3 * np.abs(blind - wanted).mean()
+    unaligned = fitted("cnn", off, align=False).see(stack)
+    assert np.abs(aligned - expected).mean() < 0.3 * np.abs(unaligned - expected).mean()
 
 
 @pytest.mark.parametrize("kind", ["modes", "cnn"])
-def test_an_eye_does_not_see_how_bright_the_light_is(kind: str) -> None:
+def test_the_output_of_an_eye_does_not_depend_on_the_brightness(kind: str) -> None:
     eye = fitted(kind)
-    stack = swum(DEFAULT)[0][-1]
+    stack = swim_with(DEFAULT)[0][-1]
     darker = tuple((0.7 * frame).astype(np.uint8) for frame in stack)
     assert np.abs(eye.see(stack) - eye.see(darker)).max() < 0.2
 
 
 @pytest.mark.parametrize("kind", ["modes", "cnn"])
 def test_an_eye_cannot_be_fitted_to_a_fish_that_rests(kind: str) -> None:
-    stacks, _, angles = swum(DEFAULT, np.zeros(TICKS))
+    stacks, _, angles = swim_with(DEFAULT, np.zeros(TICKS))
     with pytest.raises(NoMotion, match="let the fish swim"):
         eye_of(kind).fit(np.stack([stack[0] for stack in stacks]), angles)
 
@@ -144,25 +146,28 @@ def test_an_eye_cannot_be_fitted_to_a_fish_that_rests(kind: str) -> None:
 def test_an_eye_with_the_constants_of_another_sees_the_same(kind: str) -> None:
     eye, other = fitted(kind), eye_of(kind)
     other.restore(eye.constants)
-    stack = swum(DEFAULT)[0][-1]
+    stack = swim_with(DEFAULT)[0][-1]
     assert np.array_equal(eye.see(stack), other.see(stack))
 
 
 @pytest.mark.parametrize(
     "change",
-    [lambda kept: kept.pop("zero"), lambda kept: kept.update(more=np.zeros(3))],
+    [
+        lambda constants: constants.pop("zero"),
+        lambda constants: constants.update(more=np.zeros(3)),
+    ],
 )
 def test_constants_of_another_kind_of_eye_are_refused(
     change: Callable[[dict[str, object]], None],
 ) -> None:
-    kept: dict[str, object] = {"patterns": np.zeros((4, 84 * 84)), "zero": np.zeros(4)}
-    change(kept)
+    constants: dict[str, object] = {"patterns": np.zeros((4, 84 * 84)), "zero": np.zeros(4)}
+    change(constants)
     with pytest.raises(ValueError, match="constants of shapes"):
-        eye_of("modes").restore(kept)
+        eye_of("modes").restore(constants)
 
 
 def test_the_babble_is_the_same_for_the_same_seed_and_within_the_limit() -> None:
-    one, other = (random_angles(3, 501, 0.42) for _ in range(2))
-    assert np.array_equal(one, other)
-    assert 0.3 < np.abs(one).max() <= 0.42
-    assert not np.array_equal(one, random_angles(4, 501, 0.42))
+    first, second = (random_angles(3, 501, 0.42) for _ in range(2))
+    assert np.array_equal(first, second)
+    assert 0.3 < np.abs(first).max() <= 0.42
+    assert not np.array_equal(first, random_angles(4, 501, 0.42))

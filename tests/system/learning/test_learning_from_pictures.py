@@ -1,4 +1,4 @@
-"""Training on what a simulated camera shows, instead of on forces."""
+"""Training on the pictures of a simulated camera instead of on forces."""
 
 import shutil
 from itertools import count
@@ -48,14 +48,14 @@ def job_of(
 
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory: pytest.TempPathFactory) -> tuple[Job, Outcome]:
-    """A babble and two updates; its folder must not be changed."""
+    """A training with a babble and two updates; its folder must not be changed."""
     job = job_of(tmp_path_factory.mktemp("pictures") / "first")
     return job, train(job)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rig", [DEFAULT, WEB])
-def test_a_thousand_steps_teach_it_to_swim_by_sight(
+def test_a_policy_swims_by_sight_after_a_thousand_steps(
     tmp_path: Path, by_sight: Outcome, rig: SimulatedCameraSettings
 ) -> None:
     job = job_of(tmp_path / "run", steps=1024, rig=rig)
@@ -82,7 +82,9 @@ def test_with_the_smallest_frames_each_eye_learns_from_whole_rollouts(
     assert outcome.latest_evaluation
 
 
-def test_the_same_seed_sees_the_same(tmp_path: Path, brief: tuple[Job, Outcome]) -> None:
+def test_the_same_seed_gives_the_same_training_by_sight(
+    tmp_path: Path, brief: tuple[Job, Outcome]
+) -> None:
     again = train(job_of(tmp_path / "again"))
     for table in ("progress.csv", "evaluations.csv"):
         assert (again.folder / table).read_bytes() == (brief[0].folder / table).read_bytes()
@@ -93,9 +95,7 @@ def test_the_babble_counts_as_steps(brief: tuple[Job, Outcome]) -> None:
     assert brief[1].tank_time > 384 * 0.05
 
 
-def test_a_run_goes_on_with_the_eye_that_it_began_with(
-    tmp_path: Path, brief: tuple[Job, Outcome]
-) -> None:
+def test_a_resumed_run_keeps_its_eye(tmp_path: Path, brief: tuple[Job, Outcome]) -> None:
     folder = shutil.copytree(brief[0].folder, tmp_path / "run")
     _, before = checkpoints.load_policy(folder / "step-000384")
     job = replace(brief[0], folder=folder, resume=True)
@@ -108,11 +108,11 @@ def test_a_run_goes_on_with_the_eye_that_it_began_with(
     assert np.array_equal(before.eye.constants["patterns"], after.eye.constants["patterns"])
 
 
-def test_a_run_keeps_the_camera_that_it_saw_with(tmp_path: Path) -> None:
+def test_a_run_folder_contains_the_settings_of_its_camera(tmp_path: Path) -> None:
     job = job_of(tmp_path / "run", steps=256, rig=replace(WEB, seed=3))
     train(replace(job, settings=replace(job.settings, steps=257)))
-    kept = runs.read_camera(job.folder)
-    assert all(getattr(kept, name) == value for name, value in fields(job.camera).items())
+    stored = runs.read_camera(job.folder)
+    assert all(getattr(stored, name) == value for name, value in fields(job.camera).items())
 
 
 def fields(rig: SimulatedCameraSettings) -> dict[str, object]:
@@ -144,8 +144,8 @@ def test_networks_are_not_given_to_another_eye(
 
 def packed(**constants: list[float]) -> bytes:
     arrays = {name: np.array(value, np.float32) for name, value in constants.items()}
-    kept = {name: checkpoints.Constant(a.shape, a.tobytes()) for name, a in arrays.items()}
-    return msgspec.msgpack.encode(kept)
+    stored = {name: checkpoints.Constant(a.shape, a.tobytes()) for name, a in arrays.items()}
+    return msgspec.msgpack.encode(stored)
 
 
 HOSTILE = msgspec.msgpack.encode({"zero": checkpoints.Constant((10**12,), b"1234")})
@@ -163,7 +163,7 @@ HOSTILE = msgspec.msgpack.encode({"zero": checkpoints.Constant((10**12,), b"1234
         packed(zero=[float("nan")] * 4, patterns=[[0.0] * 7056] * 4),
     ],
 )
-def test_an_eye_that_cannot_be_read_is_told(
+def test_an_eye_that_cannot_be_read_is_an_error_with_advice(
     tmp_path: Path, brief: tuple[Job, Outcome], content: bytes
 ) -> None:
     folder = shutil.copytree(brief[0].folder, tmp_path / "run")
@@ -173,7 +173,9 @@ def test_an_eye_that_cannot_be_read_is_told(
         checkpoints.load_policy(path.parent)
 
 
-def test_a_training_whose_camera_does_not_show_the_tail_ends_with_a_word(tmp_path: Path) -> None:
+def test_a_training_whose_camera_does_not_show_the_tail_ends_with_an_explanation(
+    tmp_path: Path,
+) -> None:
     blind = replace(DEFAULT, contrast=0.1)
     with pytest.raises(NoMotion, match="see that the camera looks at its tail"):
         train(job_of(tmp_path / "run", rig=blind))
@@ -190,13 +192,13 @@ def test_steps_without_a_frame_are_void() -> None:
     steps = [env.step(action) for _ in range(100)]
     blind = [info["blind"] for *_, info in steps]
     assert 0.3 < np.mean(blind) < 0.7
-    assert [truncated for *_, truncated, _ in steps] == [bool(one) for one in blind]
+    assert [truncated for *_, truncated, _ in steps] == [bool(is_blind) for is_blind in blind]
 
 
-def test_a_training_whose_camera_is_too_late_says_so(
+def test_a_training_whose_camera_is_too_late_ends_with_an_explanation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Real time is waited for as well: here it goes by as fast as that of the fish.
+    # The training waits in real time, too, which here runs as fast as that of the fish.
     monkeypatch.setattr(environment, "time", SimpleNamespace(monotonic=count(0.0, 0.05).__next__))
     job = job_of(tmp_path / "run", rig=replace(DEFAULT, rate=5.0))
     outcome = train(job)
@@ -205,7 +207,7 @@ def test_a_training_whose_camera_is_too_late_says_so(
     assert "give that a larger delay or oldest" in outcome.message
 
 
-def test_another_camera_is_looked_at_anew_with_the_networks_of_the_first(
+def test_with_another_camera_the_eye_is_fitted_again_and_the_networks_are_kept(
     tmp_path: Path, by_sight: Outcome
 ) -> None:
     again = job_of(tmp_path / "again", steps=512, rig=WEB)
@@ -214,7 +216,9 @@ def test_another_camera_is_looked_at_anew_with_the_networks_of_the_first(
     assert outcome.best_evaluation.relative_thrust > 0.9
     assert by_sight.best
     assert outcome.best
-    eyes = [checkpoints.load_policy(one)[1].eye for one in (by_sight.best, outcome.best)]
+    eyes = [
+        checkpoints.load_policy(checkpoint)[1].eye for checkpoint in (by_sight.best, outcome.best)
+    ]
     first, second = (eye.constants["patterns"] for eye in eyes if eye)
     assert not np.array_equal(first, second)
 

@@ -1,4 +1,4 @@
-"""A run folder through kills, full disks, damage, strange files and two trainings at once."""
+"""Run folders after kills, full disks and damage, with odd files and two trainings at once."""
 
 import os
 import shutil
@@ -29,13 +29,13 @@ from fishd.learning.train.jobs import Outcome
 from fishd.learning.train.progress import Display
 from fishd.learning.train.training import train
 
-PATIENCE = 60.0
+TIMEOUT_S = 60.0
 STEP = "step-000064"
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of 64 steps."""
+    """A finished run of 64 steps, which must not be changed."""
     folder = tmp_path_factory.mktemp("finished") / "run"
     train(brief_job(folder, steps=64))
     return folder
@@ -43,12 +43,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(finished: Path, tmp_path: Path) -> Path:
-    """A copy of it, to be damaged."""
+    """A copy of the finished run, to be damaged."""
     return Path(shutil.copytree(finished, tmp_path / "run"))
 
 
 def resumed(run: Path, **changes: Any) -> Outcome:
-    """Train it for another 64 steps."""
+    """Train a run for another 64 steps."""
     return train(brief_job(run, resume=True, **{"steps": 128, **changes}))
 
 
@@ -72,21 +72,21 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 def complaint(read: Callable[[Path], object], run: Path) -> str:
-    """What is said, in time."""
-    found: list[str] = []
+    """Return the message of the error that a reader must raise within `TIMEOUT_S`."""
+    messages: list[str] = []
 
-    def try_it() -> None:
+    def read_once() -> None:
         try:
             read(run)
         except FishdError as error:
-            found.append(str(error))
+            messages.append(str(error))
 
-    reader = threading.Thread(target=try_it, daemon=True)
+    reader = threading.Thread(target=read_once, daemon=True)
     reader.start()
-    reader.join(PATIENCE)
-    assert found, "it does not end, or accepts it"
-    assert "\n" not in found[0]
-    return found[0]
+    reader.join(TIMEOUT_S)
+    assert messages, "the reader does not end, or accepts the file"
+    assert "\n" not in messages[0]
+    return messages[0]
 
 
 @pytest.mark.parametrize("plant", [pipe, endless])
@@ -96,12 +96,12 @@ def test_a_pipe_or_a_device_in_place_of_a_file_is_one_line_at_once(
 ) -> None:
     (run / name).unlink()
     plant(run / name)
-    said = complaint(READERS[name], run)
-    if name == "progress.csv":  # whatever it is, a new one can be begun
-        assert "not a table of a training; move it away" in said
+    message = complaint(READERS[name], run)
+    if name == "progress.csv":  # it can be replaced by a new one
+        assert "not a table of a training; move it away" in message
     else:
         kind = "a named pipe" if plant is pipe else "a device"
-        assert said.startswith(f"{run / name}: is {kind}; a regular file is needed")
+        assert message.startswith(f"{run / name}: is {kind}; a regular file is needed")
 
 
 @pytest.mark.parametrize("key", ["on", "x"])
@@ -132,14 +132,14 @@ def test_a_checkpoint_with_a_strange_number_is_not_the_newest(run: Path) -> None
 
 
 def save_best(run: Path, state: checkpoints.State) -> None:
-    """Save the networks of the run once more, as those that swam best."""
+    """Save the networks of the run again, as the best ones."""
     content = (run / STEP / "model.zip").read_bytes()
     model: Any = SimpleNamespace(save=lambda archive: archive.write(content))
     checkpoints.save(run, "best", model, checkpoints.read_card(run / STEP), state)
 
 
 @pytest.mark.parametrize("steps", [64, 32], ids=["of the same name", "of another name"])
-def test_whenever_a_save_is_killed_the_best_is_the_new_one_or_the_old_one(
+def test_after_a_kill_at_any_call_of_a_save_the_best_is_the_new_or_the_old_one(
     finished: Path, tmp_path: Path, steps: int
 ) -> None:
     for call in count():
@@ -167,7 +167,7 @@ def test_a_table_of_another_kind_is_one_line(run: Path) -> None:
     )
 
 
-def test_a_resume_with_a_pipe_for_a_state_says_what_to_do(run: Path) -> None:
+def test_a_resume_with_a_pipe_for_a_state_advises_what_to_do(run: Path) -> None:
     (run / STEP / "state.json").unlink()
     pipe(run / STEP / "state.json")
     with pytest.raises(CheckpointError, match=r"is a named pipe; .* move this checkpoint away"):
@@ -175,7 +175,7 @@ def test_a_resume_with_a_pipe_for_a_state_says_what_to_do(run: Path) -> None:
 
 
 def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> None:
-    """Wherever a run is cut off, its newest checkpoint is no newer than its tables."""
+    """Where a run ends abruptly, its newest checkpoint is not newer than its tables."""
     job = brief_job(tmp_path / "run", steps=256)
 
     class Killed(Display):
@@ -190,7 +190,7 @@ def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> No
         assert [row["steps"] for row in rows(job.folder / name)] == ["64", "128", "192", "256"]
 
 
-def test_a_row_that_a_kill_cut_off_is_none_even_where_only_a_digit_is_missing(run: Path) -> None:
+def test_a_row_cut_off_by_a_kill_is_dropped_even_if_only_a_digit_is_missing(run: Path) -> None:
     table = Table(run / "table.csv", ("steps", "std"))
     for steps in (64, 128):
         table.add({"steps": steps, "std": 0.75})
@@ -199,21 +199,21 @@ def test_a_row_that_a_kill_cut_off_is_none_even_where_only_a_digit_is_missing(ru
     assert table.path.read_text() == "steps,std\n64,0.75\n"
     with (run / "evaluations.csv").open("a", encoding="utf-8") as file:
         file.write("128,0.")
-    assert [one.steps for one in read_evaluations(run)] == [64]
+    assert [evaluation.steps for evaluation in read_evaluations(run)] == [64]
 
 
 def test_a_run_in_progress_is_not_resumed_by_another(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", steps=256)
-    said = []
+    refusals = []
 
     def resume_too() -> bool:
         with pytest.raises(ConfigError, match=f"is being trained in, by process {os.getpid()}"):
             train(replace(job, resume=True))
-        said.append(True)
+        refusals.append(True)
         return True
 
     train(job, stop=resume_too)
-    assert said
+    assert refusals
     assert train(replace(job, resume=True)).ended == "finished"
     assert not list(job.folder.glob("*.lock"))
 
@@ -246,7 +246,9 @@ def test_a_resume_with_another_fish_or_other_networks_is_refused(run: Path) -> N
 
 
 @pytest.mark.parametrize("content", ["", "a,b\n1,2\n", "steps\nmany\n", "\xff\x00"])
-def test_a_table_that_is_none_is_one_line_and_can_be_moved_away(run: Path, content: str) -> None:
+def test_a_file_that_is_not_a_table_is_one_line_and_can_be_moved_away(
+    run: Path, content: str
+) -> None:
     table = run / "progress.csv"
     table.write_bytes(content.encode("latin-1"))
     with pytest.raises(CheckpointError, match="not a table of a training; move it away"):
@@ -267,12 +269,12 @@ def test_an_emptied_part_of_a_checkpoint_is_one_line(run: Path, part: str) -> No
         resumed(run)
     shutil.rmtree(file)
     shutil.rmtree(run / "best-000064", ignore_errors=True)
-    assert resumed(run).ended == "finished"  # from the one at the start
+    assert resumed(run).ended == "finished"  # from the checkpoint at the start
 
 
 @contextmanager
 def small_disk(folder: Path, size: str) -> Iterator[Callable[[str], None]]:
-    """A disk of its own in this folder; what it yields makes it larger."""
+    """Mount a small disk at this folder; yield a function that enlarges it."""
     if os.geteuid() != 0:
         pytest.skip("only root can mount")
     folder.mkdir()
@@ -289,7 +291,7 @@ def small_disk(folder: Path, size: str) -> Iterator[Callable[[str], None]]:
         subprocess.run(["umount", str(folder)], check=True)
 
 
-def test_a_full_disk_loses_nothing_and_says_how_to_go_on(tmp_path: Path) -> None:
+def test_a_full_disk_loses_nothing_and_advises_how_to_resume(tmp_path: Path) -> None:
     with small_disk(tmp_path / "disk", "600k") as enlarge:
         job = brief_job(
             tmp_path / "disk" / "run",

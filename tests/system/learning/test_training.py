@@ -31,7 +31,7 @@ from fishd.learning.train.training import Training, train
 
 @dataclass
 class Witness(Display):
-    """Is told how a training goes on, and remembers."""
+    """A display that stores the evaluations and counts the steps of a training."""
 
     evaluations: list[Evaluation] = field(default_factory=list)
     steps: int = 0
@@ -50,12 +50,14 @@ def parameters(checkpoint: Path) -> dict[str, Any]:
     return checkpoints.load_policy(checkpoint)[0].state_dict()
 
 
-def same(one: dict[str, Any], other: dict[str, Any]) -> bool:
-    return all(bool((one[name] == other[name]).all()) for name in one)
+def same(left: dict[str, Any], right: dict[str, Any]) -> bool:
+    return all(bool((left[name] == right[name]).all()) for name in left)
 
 
 @pytest.mark.parametrize("dwell", [False, True])
-def test_a_thousand_steps_teach_it_to_swim(tmp_path: Path, by_force: Outcome, dwell: bool) -> None:
+def test_a_policy_swims_after_a_thousand_steps(
+    tmp_path: Path, by_force: Outcome, dwell: bool
+) -> None:
     outcome = by_force
     if not dwell:
         config, settings = runs.read(by_force.folder)
@@ -65,7 +67,7 @@ def test_a_thousand_steps_teach_it_to_swim(tmp_path: Path, by_force: Outcome, dw
     assert outcome.best_evaluation
     assert outcome.best_evaluation.relative_thrust > 0.9
     untrained = rows(outcome.folder / "progress.csv")[0]
-    # Who moves at random, but not too fast, swims not that badly.
+    # With the shortest dwell, random motion swims rather well.
     better = 1.2 if dwell else 3.0
     assert outcome.best_evaluation.thrust > better * float(untrained["thrust"])
 
@@ -90,7 +92,7 @@ def brief(tmp_path_factory: pytest.TempPathFactory) -> tuple[Job, Outcome]:
 
 @pytest.fixture
 def copied(brief: tuple[Job, Outcome], tmp_path: Path) -> Job:
-    """A copy of it."""
+    """A copy of the finished training, which may be changed."""
     return replace(brief[0], folder=Path(shutil.copytree(brief[0].folder, tmp_path / "run")))
 
 
@@ -98,7 +100,7 @@ def resumed(job: Job, steps: int) -> Job:
     return replace(job, resume=True, settings=replace(job.settings, steps=steps))
 
 
-def test_a_run_folder_says_what_was_trained_and_how_it_went(brief: tuple[Job, Outcome]) -> None:
+def test_a_run_folder_contains_settings_and_progress(brief: tuple[Job, Outcome]) -> None:
     job, outcome = brief
     assert runs.read(job.folder) == (job.config, job.settings)
     table = rows(job.folder / "progress.csv")
@@ -109,10 +111,10 @@ def test_a_run_folder_says_what_was_trained_and_how_it_went(brief: tuple[Job, Ou
     assert list((job.folder / "tensorboard").glob("events.out.tfevents.*"))
     assert outcome.checkpoint == job.folder / "step-000128"
     assert outcome.tank_time == pytest.approx(float(table[-1]["tank_time"]))
-    assert pickle.loads(pickle.dumps(brief)) == brief  # they are sent to other processes
+    assert pickle.loads(pickle.dumps(brief)) == brief  # since they are sent to other processes
 
 
-def test_a_checkpoint_says_what_must_be_known_to_run_the_policy(brief: tuple[Job, Outcome]) -> None:
+def test_a_checkpoint_contains_what_is_needed_to_run_the_policy(brief: tuple[Job, Outcome]) -> None:
     job, outcome = brief
     assert outcome.checkpoint
     card = checkpoints.read_card(outcome.checkpoint)
@@ -127,18 +129,18 @@ def test_a_checkpoint_says_what_must_be_known_to_run_the_policy(brief: tuple[Job
     assert {"torch", "stable-baselines3", "gymnasium"} <= set(past.libraries)
 
 
-def test_checkpoints_come_when_they_are_due(tmp_path: Path) -> None:
+def test_checkpoints_are_written_when_they_are_due(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", steps=320, checkpoint_every=150, evaluation=never())
     train(job)
-    found = sorted(path.name for path in job.folder.glob("step-*"))
-    assert found == ["step-000000", "step-000192", "step-000320"]
+    names = sorted(path.name for path in job.folder.glob("step-*"))
+    assert names == ["step-000000", "step-000192", "step-000320"]
 
 
 def never() -> EvaluationSettings:
     return EvaluationSettings(every=0)
 
 
-def test_the_best_policy_is_kept_beside_the_newest(tmp_path: Path) -> None:
+def test_the_best_policy_is_stored_beside_the_newest(tmp_path: Path) -> None:
     witness = Witness()
     job = brief_job(tmp_path / "run", steps=448)
     outcome = train(job, witness)
@@ -170,8 +172,8 @@ def test_a_training_has_converged_where_a_good_policy_was_not_improved_for_long_
     recorder = Training(job, SimulatedLink(job.config), Display(), lambda: False)._recorder
     converged = []
     for merit in merits:
-        swum = {"thrust": 0.02, "frequency": 1.7, "fullness": 1.0, "stalled": False}
-        recorder.add(Evaluation(relative_thrust=merit, **swum))
+        figures = {"thrust": 0.02, "frequency": 1.7, "fullness": 1.0, "stalled": False}
+        recorder.add(Evaluation(relative_thrust=merit, **figures))
         converged.append(recorder.has_converged)
     recorder.close()
     assert converged == [number == ends_after for number in range(1, len(merits) + 1)]
@@ -194,13 +196,13 @@ def test_a_training_that_has_converged_ends_before_its_last_step(tmp_path: Path)
 
 def test_a_policy_that_holds_still_is_marked_and_never_the_best(tmp_path: Path) -> None:
     timid = PpoSettings(n_steps=64, n_epochs=1, learning_rate=1e-9, final_learning_rate=1e-9)
-    job = brief_job(tmp_path / "run", ppo=timid)  # learns nothing to speak of
+    job = brief_job(tmp_path / "run", ppo=timid)  # hardly learns
     outcome = train(job)
     assert [row["stalled"] for row in rows(job.folder / "evaluations.csv")] == ["1", "1"]
     assert outcome.best is None
 
 
-def test_a_resumed_run_goes_on_exactly_where_it_was(
+def test_a_resumed_run_continues_exactly_where_it_ended(
     copied: Job, brief: tuple[Job, Outcome]
 ) -> None:
     job, first = copied, brief[1]
@@ -230,9 +232,9 @@ def test_a_resumed_run_does_not_repeat_its_random_numbers(tmp_path: Path) -> Non
     assert float(first["fullness"]) != pytest.approx(float(second["fullness"]), abs=1e-4)
 
 
-def test_a_resume_goes_on_from_the_newest_complete_checkpoint(copied: Job) -> None:
+def test_a_resume_continues_from_the_newest_complete_checkpoint(copied: Job) -> None:
     job = copied
-    half = job.folder / ".step-000192.part"  # what a kill while one is written leaves
+    half = job.folder / ".step-000192.part"  # left by a kill during a write
     half.mkdir()
     (half / "model.zip").write_bytes(b"PK")
     with (job.folder / "progress.csv").open("a", encoding="utf-8") as file:
@@ -242,7 +244,7 @@ def test_a_resume_goes_on_from_the_newest_complete_checkpoint(copied: Job) -> No
     assert not half.exists()
 
 
-def test_a_run_that_was_killed_in_its_first_rollout_goes_on_as_if_it_had_not_been(
+def test_a_run_killed_in_its_first_rollout_resumes_as_if_it_was_not_killed(
     tmp_path: Path,
 ) -> None:
     job, whole = brief_job(tmp_path / "run"), brief_job(tmp_path / "whole")
@@ -260,7 +262,9 @@ def test_a_run_that_was_killed_in_its_first_rollout_goes_on_as_if_it_had_not_bee
     assert table == (whole.folder / "progress.csv").read_bytes()
 
 
-def test_a_run_that_has_all_its_steps_or_no_checkpoint_says_so(copied: Job, tmp_path: Path) -> None:
+def test_a_resume_of_a_finished_run_or_without_a_checkpoint_is_refused(
+    copied: Job, tmp_path: Path
+) -> None:
     job = copied
     with pytest.raises(ConfigError, match="is finished, with 128 steps; to train it for longer"):
         train(replace(job, resume=True))
@@ -276,7 +280,7 @@ def test_a_new_run_never_overwrites_another(tmp_path: Path) -> None:
         train(job)
 
 
-def test_when_told_to_stop_it_keeps_what_it_has_learned(tmp_path: Path) -> None:
+def test_a_stopped_training_keeps_what_it_has_learned(tmp_path: Path) -> None:
     witness = Witness()
     job = brief_job(tmp_path / "run", steps=10_000)
     outcome = train(job, witness, lambda: witness.after(64 + 20))
@@ -302,8 +306,8 @@ def test_a_fish_that_is_lost_ends_the_run_with_a_checkpoint_and_the_reason(tmp_p
     assert train(replace(job, resume=True)).ended == "finished"
 
 
-def test_a_pause_never_gets_into_a_transition(tmp_path: Path) -> None:
-    environment = EnvironmentSettings(held_cost=0.0)  # so that the reward is that of the thrust
+def test_a_pause_is_never_part_of_a_transition(tmp_path: Path) -> None:
+    environment = EnvironmentSettings(held_cost=0.0)  # so that only the thrust is rewarded
     as_measured = replace(BRIEF.ppo, clean_rewards=False)
     job = brief_job(tmp_path / "run", steps=192, environment=environment, ppo=as_measured)
     link = Resting(job)
@@ -325,7 +329,7 @@ def test_a_pause_never_gets_into_a_transition(tmp_path: Path) -> None:
     assert paused == pytest.approx([0.0, 3.0, 3.0])
 
 
-def test_a_rollout_holds_what_stable_baselines_would_have_computed_step_by_step(
+def test_a_rollout_equals_one_that_stable_baselines_computes_step_by_step(
     tmp_path: Path,
 ) -> None:
     environment = EnvironmentSettings(episode=25)
@@ -341,16 +345,18 @@ def test_a_rollout_holds_what_stable_baselines_would_have_computed_step_by_step(
     ends: list[np.ndarray] = []
 
     def watched_step(action: np.ndarray) -> Any:
-        found = step(action)
-        rewards.append(found[1])
-        if found[3]:
-            ends.append(found[0])
-        return found
+        result = step(action)
+        rewards.append(result[1])
+        if result[3]:
+            ends.append(result[0])
+        return result
 
     training._env.step = watched_step  # type: ignore[method-assign]
     training._rollouts.begin(reset(seed=1)[0])
     assert training._rollouts.collect()
-    seen, actions = (torch.from_numpy(each[:, 0]) for each in (buffer.observations, buffer.actions))
+    seen, actions = (
+        torch.from_numpy(array[:, 0]) for array in (buffer.observations, buffer.actions)
+    )
     with torch.no_grad():
         values, log_probabilities, _ = model.policy.evaluate_actions(seen, actions)
         of_ends = model.policy.predict_values(torch.from_numpy(np.array(ends)))[:, 0].numpy()
@@ -365,25 +371,27 @@ def test_a_rollout_holds_what_stable_baselines_would_have_computed_step_by_step(
     assert np.std(buffer.actions) == pytest.approx(np.exp(0.7), rel=0.3)
 
 
-def test_actions_that_came_too_late_are_counted_and_teach_nothing(tmp_path: Path) -> None:
+def test_late_actions_are_counted_and_not_learned_from(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run")
     training = Training(job, Losing(job), Display(), lambda: False)
     outcome = training.run()
     assert outcome.ended == "finished"
     lost = [int(row["lost"]) for row in rows(job.folder / "progress.csv")]
-    assert all(6 <= number <= 15 for number in lost)  # of 64 ticks, and those of fresh starts
+    assert all(
+        6 <= number <= 15 for number in lost
+    )  # of 64 ticks, and those at the starts of episodes
     void = int(training._model.rollout_buffer.void.sum())  # type: ignore[attr-defined]
     assert 3 <= void <= lost[-1]
 
 
-def test_an_agent_that_is_too_slow_for_the_tick_learns_nothing_and_says_so(tmp_path: Path) -> None:
+def test_an_agent_that_is_too_slow_for_the_tick_ends_with_an_explanation(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run")
     outcome = Training(job, Losing(job, every=1), Display(), lambda: False).run()
     assert (outcome.ended, outcome.steps) == ("lost", 0)
     assert outcome.message.startswith("in most of the last 64 steps the agent's action came too")
 
 
-def test_a_run_that_blows_up_says_so_and_keeps_no_broken_policy(tmp_path: Path) -> None:
+def test_a_run_that_diverges_stores_no_broken_policy(tmp_path: Path) -> None:
     wild = PpoSettings(n_steps=64, learning_rate=1.0, final_learning_rate=1.0, max_grad_norm=100.0)
     job = brief_job(tmp_path / "run", steps=6400, ppo=wild, evaluation=never())
     training = Training(job, Resting(job), Display(), lambda: False)
@@ -412,7 +420,7 @@ def test_another_run_can_begin_with_its_networks(
     assert note == "began with first/step-000128, 128 steps in simulation"
 
 
-def test_fishd_is_told_where_to_reach_the_agent(tmp_path: Path) -> None:
+def test_fishd_receives_the_address_of_the_agent(tmp_path: Path) -> None:
     elsewhere = f"ipc://{tmp_path}/elsewhere"
     settings = sets("lockstep=true", *NOISY)
     with running(tmp_path, *settings) as fishd, Subscriber(fishd.telemetry, b"event") as events:
@@ -423,9 +431,9 @@ def test_fishd_is_told_where_to_reach_the_agent(tmp_path: Path) -> None:
     assert (taken["controller"], taken["parameters"]["agent"]) == ("remote", elsewhere)
 
 
-def test_what_is_stopped_before_it_begins_leaves_the_fish_at_rest(
+def test_a_training_stopped_before_its_start_leaves_the_fish_at_rest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Training, "_reset", lambda _: pytest.fail("the fish swims"))
-    found = train(brief_job(tmp_path / "run"), stop=lambda: True)
-    assert (found.ended, found.steps) == ("interrupted", 0)
+    outcome = train(brief_job(tmp_path / "run"), stop=lambda: True)
+    assert (outcome.ended, outcome.steps) == ("interrupted", 0)
