@@ -1,4 +1,4 @@
-"""Adam without torch's compiler."""
+"""Adam without the compiler of torch."""
 
 import subprocess
 import sys
@@ -13,7 +13,7 @@ def parameters() -> list[torch.nn.Parameter]:
     return [torch.nn.Parameter(torch.randn(shape)) for shape in ((4, 3), (4,), (2,))]
 
 
-def test_it_computes_what_the_optimiser_of_torch_computes_also_from_its_state() -> None:
+def test_the_results_equal_those_of_the_optimiser_of_torch_also_from_its_state() -> None:
     ours, theirs = parameters(), parameters()
     optimiser = Adam(ours, lr=0.01)
     reference = torch.optim.Adam(theirs, lr=0.01, betas=BETAS, eps=EPSILON)

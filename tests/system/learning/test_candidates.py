@@ -1,4 +1,4 @@
-"""The best of several policies is found with few swims, each of which has an unknown error."""
+"""Selection of the best of several policies with few swims, each with an unknown error."""
 
 import itertools
 import math
@@ -10,7 +10,7 @@ import pytest
 from fishd.learning.env.swims import Swim
 from fishd.learning.train.candidates import MAX_CANDIDATES, Candidate, Candidates
 
-BEST = 0.025
+BEST_THRUST = 0.025
 
 
 def policy(steps: int) -> Candidate:
@@ -18,23 +18,23 @@ def policy(steps: int) -> Candidate:
 
 
 def swum(share: float | None) -> Swim:
-    """With this share of the best thrust; None: it stalled."""
-    thrust = None if share is None else share * BEST
+    """Return a swim with a share of the best thrust; None: it stalled."""
+    thrust = None if share is None else share * BEST_THRUST
     return Swim(thrust, 1.67, 1.0, share is None, 3.5)
 
 
 def swim(candidates: Candidates, most: int, share: Callable[[Candidate], float]) -> int:
-    """Let those swim that are to, so often at most; how often they did."""
+    """Make the requested swims, at most `most`; return their number."""
     for count in range(most):
-        one = candidates.next()
-        if one is None:
+        candidate = candidates.next()
+        if candidate is None:
             return count
-        candidates.count(one, swum(share(one)))
+        candidates.count(candidate, swum(share(candidate)))
     return most
 
 
-def test_the_newest_swims_first_and_one_alone_only_once() -> None:
-    candidates = Candidates(BEST)
+def test_the_newest_swims_first_and_a_single_one_only_once() -> None:
+    candidates = Candidates(BEST_THRUST)
     assert candidates.next() is candidates.best is None
     first = policy(64)
     candidates.add(first)
@@ -46,34 +46,34 @@ def test_the_newest_swims_first_and_one_alone_only_once() -> None:
     assert candidates.next() is second
 
 
-def test_where_it_is_clear_no_time_is_spent_on_the_rest() -> None:
-    candidates = Candidates(BEST)
+def test_no_time_is_spent_where_the_best_is_clear() -> None:
+    candidates = Candidates(BEST_THRUST)
     for steps in (64, 128):
         candidates.add(policy(steps))
-    assert swim(candidates, 10, lambda one: {64: 0.5, 128: 0.9}[one.steps]) == 2
+    assert swim(candidates, 10, lambda candidate: {64: 0.5, 128: 0.9}[candidate.steps]) == 2
     candidates.remove_unlikely()
-    assert [one.steps for one in candidates.remaining] == [128]
+    assert [candidate.steps for candidate in candidates.remaining] == [128]
 
 
 def test_a_lucky_swim_does_not_stay_the_best() -> None:
-    candidates = Candidates(BEST)
+    candidates = Candidates(BEST_THRUST)
     steady, lucky = policy(64), policy(128)
     candidates.add(steady)
     for _ in range(3):
         candidates.count(steady, swum(0.98))
     candidates.add(lucky)
     lucks = itertools.chain([1.02], itertools.repeat(0.94))
-    swims = swim(candidates, 20, lambda one: next(lucks) if one is lucky else 0.98)
+    swims = swim(candidates, 20, lambda candidate: next(lucks) if candidate is lucky else 0.98)
     assert swims < 15
     assert candidates.best is steady
     assert lucky.thrust < steady.thrust
 
 
-def test_what_has_swum_once_is_promised_less_than_what_has_swum_as_well_often() -> None:
-    candidates = Candidates(BEST)
+def test_a_policy_that_swam_often_is_preferred_to_one_that_swam_as_well_once() -> None:
+    candidates = Candidates(BEST_THRUST)
     often, once = policy(64), policy(128)
-    for one in (often, once):
-        candidates.add(one)
+    for candidate in (often, once):
+        candidates.add(candidate)
     for _ in range(5):
         candidates.count(often, swum(0.98))
     candidates.count(once, swum(0.985))
@@ -81,30 +81,30 @@ def test_what_has_swum_once_is_promised_less_than_what_has_swum_as_well_often() 
     assert candidates.error(once) == pytest.approx(math.sqrt(5) * candidates.error(often))
 
 
-def test_one_that_stalls_is_out_also_if_it_was_the_best() -> None:
-    candidates = Candidates(BEST)
+def test_a_policy_that_stalls_is_removed_also_if_it_was_the_best() -> None:
+    candidates = Candidates(BEST_THRUST)
     first, second = policy(64), policy(128)
-    for one, share in ((first, 0.9), (second, 0.95)):
-        candidates.add(one)
-        candidates.count(one, swum(share))
+    for candidate, share in ((first, 0.9), (second, 0.95)):
+        candidates.add(candidate)
+        candidates.count(candidate, swum(share))
     assert candidates.best is second
     candidates.count(second, swum(None))
     assert second.stalled
     assert candidates.best is first
 
 
-def test_a_swim_of_which_too_much_was_lost_is_done_again() -> None:
-    candidates = Candidates(BEST)
-    one = policy(64)
-    candidates.add(one)
-    candidates.count(one, Swim(None, 1.67, 1.0, False, 3.5))
+def test_a_swim_with_too_many_lost_ticks_is_repeated() -> None:
+    candidates = Candidates(BEST_THRUST)
+    candidate = policy(64)
+    candidates.add(candidate)
+    candidates.count(candidate, Swim(None, 1.67, 1.0, False, 3.5))
     assert candidates.best is None
-    assert candidates.next() is one
-    assert one.swam == 3.5
+    assert candidates.next() is candidate
+    assert candidate.swam == 3.5
 
 
-def test_no_more_are_kept_than_can_be_told_apart() -> None:
-    candidates = Candidates(BEST)
+def test_the_number_of_remaining_candidates_is_limited() -> None:
+    candidates = Candidates(BEST_THRUST)
     for steps in range(64, 64 * 40, 64):
         candidates.add(policy(steps))
         swim(candidates, 2, lambda _: 0.98)
@@ -115,26 +115,29 @@ def test_no_more_are_kept_than_can_be_told_apart() -> None:
 
 
 @pytest.mark.parametrize("off", [0.005, 0.015, 0.03])
-def test_intervals_hold_the_truth_and_the_best_is_hardly_below_the_true_best(off: float) -> None:
+def test_intervals_contain_the_truth_and_the_best_is_close_to_the_true_best(off: float) -> None:
     draw = np.random.default_rng(5)
     truth: dict[int, float] = {}
-    held, short = [], []
+    inside, shortfalls = [], []
 
-    def measured(one: Candidate) -> float:
-        return truth[one.steps] + draw.normal(0.0, off)
+    def measured(candidate: Candidate) -> float:
+        return truth[candidate.steps] + draw.normal(0.0, off)
 
     for _ in range(100):
-        candidates = Candidates(BEST)
+        candidates = Candidates(BEST_THRUST)
         truth |= {64 * n: float(draw.uniform(0.8, 1.0)) for n in range(1, 9)}
-        those = [policy(steps) for steps in truth]
-        for newest in those:
+        policies = [policy(steps) for steps in truth]
+        for newest in policies:
             candidates.add(newest)
             swim(candidates, 2, measured)
             candidates.remove_unlikely()
-        for one in those:
-            held.append(abs(one.thrust / BEST - truth[one.steps]) < candidates.error(one) / BEST)
+        for candidate in policies:
+            inside.append(
+                abs(candidate.thrust / BEST_THRUST - truth[candidate.steps])
+                < candidates.error(candidate) / BEST_THRUST
+            )
         best = candidates.best
         assert best
-        short.append(max(truth.values()) - truth[best.steps])
-    assert np.mean(held) >= 0.93
-    assert np.mean(short) < 0.2 * off + 0.001
+        shortfalls.append(max(truth.values()) - truth[best.steps])
+    assert np.mean(inside) >= 0.93
+    assert np.mean(shortfalls) < 0.2 * off + 0.001

@@ -1,4 +1,4 @@
-"""A policy is judged as any controller is, on the same loop and the same fish."""
+"""Evaluations of policies, which use the same loop and fish as those of controllers."""
 
 import csv
 import math
@@ -31,16 +31,16 @@ def square_of_six_ticks(observation: Observation, stack: Stack | None = None) ->
     return 0.42 if round(observation.time / 0.05) // 6 % 2 else -0.42
 
 
-def test_a_function_gets_the_report_that_a_controller_gets() -> None:
-    found = judge(CONFIG, square_of_six_ticks, 30.0, 10.0)
+def test_the_report_of_a_function_is_that_of_an_equal_controller() -> None:
+    report = judge(CONFIG, square_of_six_ticks, 30.0, 10.0)
     controller = simulate(CONFIG, "square", {"frequency": 1 / 0.6}, 30.0)
-    assert found.relative_thrust == pytest.approx(controller.relative_thrust, rel=1e-6)
-    assert found.frequency == pytest.approx(1 / 0.6)
-    assert (found.fullness, found.squareness) == pytest.approx((1.0, 1.0))
-    assert found.controller == "policy"
+    assert report.relative_thrust == pytest.approx(controller.relative_thrust, rel=1e-6)
+    assert report.frequency == pytest.approx(1 / 0.6)
+    assert (report.fullness, report.squareness) == pytest.approx((1.0, 1.0))
+    assert report.controller == "policy"
 
 
-def test_it_sees_what_the_sensor_sees() -> None:
+def test_a_policy_receives_the_forces_of_the_sensor() -> None:
     seen: list[Observation] = []
 
     def rest(observation: Observation, stack: Stack | None) -> float:
@@ -59,12 +59,12 @@ def test_half_the_amplitude_is_half_full() -> None:
     assert report.squareness == pytest.approx(1.0)
 
 
-def test_what_the_configuration_starts_with_is_not_asked() -> None:
+def test_robot_and_start_of_the_configuration_are_ignored() -> None:
     config = load(None, ["robot=virtual-pi", "start.controller=swing"])
     assert judge(config, lambda *_: 0.0, 5.0, 1.0).fullness == 0.0
 
 
-def test_an_answer_that_is_no_number_ends_in_a_fault_with_its_reason() -> None:
+def test_an_answer_that_is_not_a_number_is_a_fault() -> None:
     report = judge(CONFIG, lambda *_: math.nan, 5.0, 1.0)
     assert report.mode == "fault"
     assert report.reason
@@ -89,7 +89,7 @@ def test_no_square_wave_of_whole_ticks_beats_the_best_on_the_grid(amplitude: flo
     assert 0.98 * optimum.thrust < best.thrust < optimum.thrust
 
 
-def test_a_policy_is_worth_what_it_does_on_the_worst_of_other_fish() -> None:
+def test_the_worst_of_other_fish_is_that_with_the_lowest_thrust() -> None:
     weak = Randomisation(coupling=0.5)
     settings = TrainingSettings(randomisation=weak, evaluation=EvaluationSettings(others=6))
     others = [draw_edge_fish(CONFIG, weak, seed) for seed in range(6)]
@@ -98,15 +98,15 @@ def test_a_policy_is_worth_what_it_does_on_the_worst_of_other_fish() -> None:
     assert worst == pytest.approx(min(own), abs=1e-3)
 
 
-def test_a_policy_that_stays_in_rapid_reversals_once_it_is_there_is_worth_nothing() -> None:
+def test_a_policy_that_does_not_leave_rapid_reversals_has_no_worst_thrust() -> None:
     def stuck(observation: Observation, stack: Stack | None) -> float:
-        """Goes on with what it finds when it is first asked."""
-        found.append(observation.previous_angle * observation.instruction_angle < 0.0)
-        return -observation.instruction_angle if found[0] else square_of_six_ticks(observation)
+        """Continue with rapid reversals if the first observation is one."""
+        reversing.append(observation.previous_angle * observation.instruction_angle < 0.0)
+        return -observation.instruction_angle if reversing[0] else square_of_six_ticks(observation)
 
-    found: list[bool] = []
+    reversing: list[bool] = []
     assert judge(CONFIG, stuck, 20.0, 5.0).relative_thrust > 0.95
-    found.clear()
+    reversing.clear()
     settings = TrainingSettings(evaluation=EvaluationSettings(others=1))
     assert worst_on_others(CONFIG, stuck, settings) < 0.05
 
@@ -115,9 +115,9 @@ def test_fish_at_the_edge_have_every_parameter_at_an_end_of_its_range() -> None:
     spread = Randomisation(omega0=0.2, xi=0.2, servo_speed=0.2, coupling=0.2, offset=0.01)
     fish = [draw_edge_fish(CONFIG, spread, seed) for seed in range(40)]
     for name in ("omega0", "xi", "servo_speed", "coupling"):
-        shares = {getattr(one.plant, name) / getattr(CONFIG.plant, name) for one in fish}
+        shares = {getattr(config.plant, name) / getattr(CONFIG.plant, name) for config in fish}
         assert sorted(shares) == pytest.approx([1 / 1.2, 1.2])
-    assert sorted({one.simulation.offset_y for one in fish}) == pytest.approx([-0.005, 0.015])
+    assert sorted({config.simulation.offset_y for config in fish}) == pytest.approx([-0.005, 0.015])
     within = [
         draw_fish(CONFIG, spread, seed).plant.omega0 / CONFIG.plant.omega0 for seed in range(40)
     ]
@@ -128,7 +128,7 @@ def test_fish_at_the_edge_have_every_parameter_at_an_end_of_its_range() -> None:
 def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Path) -> None:
     settings = TrainingSettings(
         steps=384,
-        seed=3,  # with which another policy is the best on its own fish
+        seed=3,  # with this seed, another policy is the best on its own fish
         randomisation=Randomisation(omega0=0.2, coupling=0.2),
         evaluation=EvaluationSettings(seconds=8.0, settle=3.0, others=3),
     )
@@ -152,7 +152,7 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
     ],
     ids=["swims", "holds still", "hardly moves", "reverses in every tick"],
 )
-def test_a_policy_that_does_not_swim_is_told_from_one_that_does(
+def test_a_policy_that_does_not_swim_is_marked_as_stalled(
     decide: Callable[[Observation], float], stalls: bool
 ) -> None:
     assert evaluate_in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).stalled is stalls

@@ -34,12 +34,14 @@ def stalled(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     return train(brief_job(tmp_path_factory.mktemp("stalled") / "run", ppo=timid, steps=64))
 
 
-def test_the_file_answers_in_the_tick_as_the_trained_policy_does(
+def test_the_outputs_of_the_file_are_those_of_the_trained_policy(
     tmp_path: Path, by_force: Outcome
 ) -> None:
     assert by_force.best
-    found = export(by_force.best, tmp_path / "policy.onnx")
-    controller = registry.create("ppo", {"policy": str(found.path)}, Limits(0.42, 0.05, dwell=0.0))
+    exported = export(by_force.best, tmp_path / "policy.onnx")
+    controller = registry.create(
+        "ppo", {"policy": str(exported.path)}, Limits(0.42, 0.05, dwell=0.0)
+    )
     policy, perception = checkpoints.load_policy(by_force.best)
     decide = DeterministicPolicy(policy, perception, 0.42)
     draw = np.random.default_rng(1)
@@ -49,18 +51,20 @@ def test_the_file_answers_in_the_tick_as_the_trained_policy_does(
         assert controller.update(seen) == pytest.approx(decide(seen), abs=1e-5)
 
 
-def test_it_swims_on_the_loop_of_the_robot(tmp_path: Path, by_force: Outcome) -> None:
+def test_an_exported_policy_swims_in_the_loop_of_the_robot(
+    tmp_path: Path, by_force: Outcome
+) -> None:
     assert by_force.best
-    found = export(by_force.best, tmp_path / "policy.onnx")
+    exported = export(by_force.best, tmp_path / "policy.onnx")
     rig = Rig(*NOISY)
-    rig.start("ppo", policy=str(found.path))
+    rig.start("ppo", policy=str(exported.path))
     rig.run_for(5.0)
     thrust = float(np.mean([tick.fx for tick in rig.run_for(10.0)]))
     assert rig.mode == "running"
-    assert thrust == pytest.approx(found.evaluation.thrust, rel=0.05)
+    assert thrust == pytest.approx(exported.evaluation.thrust, rel=0.05)
 
 
-def test_the_card_says_how_it_swims_and_carries_the_note(tmp_path: Path, by_force: Outcome) -> None:
+def test_the_card_contains_the_evaluation_and_the_note(tmp_path: Path, by_force: Outcome) -> None:
     assert by_force.best
     assert by_force.best_evaluation
     past = export(by_force.best, tmp_path / "p.onnx", note="for the small tail").card.provenance
@@ -81,14 +85,14 @@ def test_a_policy_that_stalls_is_refused_and_leaves_no_file(
     assert target.exists()
 
 
-def test_a_file_that_would_say_something_else_is_never_put_in_place(
+def test_a_file_with_other_outputs_is_not_written(
     tmp_path: Path, by_force: Outcome, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from fishd.learning import export as exporting
 
-    whole = exporting.to_onnx
+    to_onnx = exporting.to_onnx
     monkeypatch.setattr(  # relu where the policy was trained with tanh
-        exporting, "to_onnx", lambda layers, _, card, sight: whole(layers, "relu", card, sight)
+        exporting, "to_onnx", lambda layers, _, card, sight: to_onnx(layers, "relu", card, sight)
     )
     assert by_force.best
     with pytest.raises(PolicyError, match="outputs of the file differ from those of the"):
@@ -116,18 +120,18 @@ def test_the_verb_takes_the_best_of_a_run_or_a_checkpoint(
     assert by_force.best
     assert by_force.checkpoint
 
-    def written(*arguments: str) -> str:
-        found = CliRunner().invoke(fishctl, ["learn", "export", *arguments])
-        assert found.exit_code == 0, found.output
-        return found.output
+    def run_export(*arguments: str) -> str:
+        result = CliRunner().invoke(fishctl, ["learn", "export", *arguments])
+        assert result.exit_code == 0, result.output
+        return result.output
 
-    output = written(str(by_force.folder))
+    output = run_export(str(by_force.folder))
     assert output.startswith("run.onnx: ")
     assert f"from {by_force.best}" in output
     assert "it swims with" in output
     assert "fishctl set-controller ppo --policy run.onnx" in output
-    assert f"from {by_force.checkpoint}" in written(str(by_force.folder), "--newest", "--force")
-    assert f"from {by_force.checkpoint}" in written(str(by_force.checkpoint), "--to", "a/b.onnx")
+    assert f"from {by_force.checkpoint}" in run_export(str(by_force.folder), "--newest", "--force")
+    assert f"from {by_force.checkpoint}" in run_export(str(by_force.checkpoint), "--to", "a/b.onnx")
     assert (tmp_path / "a" / "b.onnx").exists()
 
 
@@ -136,7 +140,7 @@ def own_env(**options: Any) -> Any:
 
 
 @pytest.mark.parametrize("kind", [PPO, A2C])
-def test_a_model_of_ones_own_becomes_a_policy_file(tmp_path: Path, kind: Any) -> None:
+def test_a_model_of_the_user_becomes_a_policy_file(tmp_path: Path, kind: Any) -> None:
     model = kind("MlpPolicy", own_env(), n_steps=64, seed=4, device="cpu")
     model.learn(64)
     path = export_model(model, str(tmp_path / "own.onnx"), note="tried on a whim")
@@ -154,7 +158,7 @@ def test_a_model_of_ones_own_becomes_a_policy_file(tmp_path: Path, kind: Any) ->
     assert set(past.settings) == {"environment"}
 
 
-def test_a_model_that_sees_more_than_a_policy_file_can_say_is_refused(tmp_path: Path) -> None:
+def test_a_model_that_a_policy_file_cannot_represent_is_refused(tmp_path: Path) -> None:
     normalised = PPO("MlpPolicy", VecNormalize(DummyVecEnv([own_env])), device="cpu")
     elsewhere = PPO("MlpPolicy", "Pendulum-v1", device="cpu")
     for model in (normalised, elsewhere):
@@ -177,7 +181,9 @@ def test_a_model_that_sees_more_than_a_policy_file_can_say_is_refused(tmp_path: 
         ("empty", "it contains no checkpoint"),
     ],
 )
-def test_what_is_no_run_is_told_apart(tmp_path: Path, name: str, message: str) -> None:
+def test_a_path_that_is_not_a_run_is_refused_with_the_reason(
+    tmp_path: Path, name: str, message: str
+) -> None:
     (tmp_path / "model.zip").write_bytes(b"PK")
     (tmp_path / "empty").mkdir()
     for seed in (0, 2, 10):
@@ -186,9 +192,7 @@ def test_what_is_no_run_is_told_apart(tmp_path: Path, name: str, message: str) -
         checkpoints.find(tmp_path / name)
 
 
-def test_a_file_that_ppo_would_not_take_for_a_policy_is_not_written(
-    tmp_path: Path, by_force: Outcome
-) -> None:
+def test_a_file_with_another_suffix_is_not_written(tmp_path: Path, by_force: Outcome) -> None:
     words = ["learn", "export", str(by_force.best), "--to", str(tmp_path / "mine.pt")]
     refused = CliRunner().invoke(fishctl, words)
     assert isinstance(refused.exception, PolicyError)
@@ -196,9 +200,7 @@ def test_a_file_that_ppo_would_not_take_for_a_policy_is_not_written(
     assert not list(tmp_path.iterdir())
 
 
-def test_the_command_overwrites_a_file_only_when_it_is_forced_to(
-    tmp_path: Path, by_force: Outcome
-) -> None:
+def test_the_command_overwrites_a_file_only_with_force(tmp_path: Path, by_force: Outcome) -> None:
     target = tmp_path / "mine.onnx"
     target.write_text("precious")
     words = ["learn", "export", str(by_force.best), "--to", str(target)]

@@ -1,4 +1,4 @@
-"""Policies that see are written to files with their eyes, and say there what they said before."""
+"""The export of policies that see pictures, together with their eyes."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -66,9 +66,11 @@ def network_of(settings: TrainingSettings) -> tuple[Network, Any]:
 
 
 @pytest.mark.parametrize(
-    "settings", CASES, ids=lambda one: f"{one.camera.eye}-{one.see}-{one.ppo.symmetric}"
+    "settings", CASES, ids=lambda case: f"{case.camera.eye}-{case.see}-{case.ppo.symmetric}"
 )
-def test_the_file_says_what_the_trained_policy_says(settings: TrainingSettings) -> None:
+def test_the_outputs_of_the_file_are_those_of_the_trained_policy(
+    settings: TrainingSettings,
+) -> None:
     network, perception = network_of(settings)  # raises where they differ
     assert network.frames.shape == settings.camera.stack.shape
     assert len(network.row) == len(perception.features)
@@ -95,49 +97,49 @@ def test_where_frames_are_missing_the_file_swims_as_the_policy_is_evaluated(
 @pytest.mark.parametrize("eye", ["cnn", "nature"])
 def test_a_mirrored_picture_gets_the_mirrored_action(eye: str) -> None:
     settings = settings_of(eye)
-    if eye == "cnn":  # which looks for the axis of the fish, unless that is the middle row
+    if eye == "cnn":  # without the axis of the fish: the picture is mirrored about the middle row
         settings = replace(settings, camera=replace(settings.camera, align=False))
     card, policy, perception = babbled(settings)
-    if perception.eye and eye == "cnn":  # and whose mean picture has noise of its own
+    if perception.eye and eye == "cnn":  # make its mean picture symmetric
         mean = perception.eye.constants["mean"]
         perception.eye.constants["mean"] = 0.5 * (mean + mean[::-1])
     sight = exporting._make_sight(policy, perception)
     content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
     network = Network(PolicyFile(Path("eye.onnx"), content, card))
     random = np.random.default_rng(2)
-    network.row[:] = 0.3, -0.8, 1.5  # φ_c, that before, and how long it has been there
+    network.row[:] = 0.3, -0.8, 1.5  # φ_c, the one before, and the side time
     actions = []
     for stack in random.integers(80, 120, (8, *network.frames.shape), np.uint8):
         network.frames[:] = stack
-        one = network.run()
+        action = network.run()
         network.frames[:] = stack[:, ::-1]
         network.row[:] *= -1.0
-        assert network.run() == pytest.approx(-one, abs=1e-4)
+        assert network.run() == pytest.approx(-action, abs=1e-4)
         network.row[:] *= -1.0
-        actions.append(one)
-    assert all(abs(one - other) > 1e-4 for one, other in pairwise(actions))
+        actions.append(action)
+    assert all(abs(action - following) > 1e-4 for action, following in pairwise(actions))
 
 
-def test_a_file_that_would_see_something_else_is_never_put_in_place(
+def test_a_file_with_another_eye_is_not_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     card, policy, perception = babbled(settings_of("cnn"))
-    whole = exporting._make_sight
+    make_sight = exporting._make_sight
 
-    def careless(*arguments: Any) -> Any:
-        sight = whole(*arguments)
+    def without_mean(*arguments: Any) -> Any:
+        sight = make_sight(*arguments)
         assert sight
         constants = dict(sight.constants)
         constants["mean"] = 0.0 * constants["mean"]
         return sight._replace(constants=constants)
 
-    monkeypatch.setattr(exporting, "_make_sight", careless)
+    monkeypatch.setattr(exporting, "_make_sight", without_mean)
     with pytest.raises(PolicyError, match="outputs of the file differ from those of the policy"):
         exporting._write(tmp_path / "eye.onnx", card, policy, perception)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_model_of_ones_own_that_sees_pictures_is_refused(tmp_path: Path) -> None:
+def test_a_model_of_the_user_that_sees_pictures_is_refused(tmp_path: Path) -> None:
     settings, config = settings_of("modes"), Config()
     link = SimulatedLink(config, camera=Camera(DEFAULT, settings.camera.stack))
     env = SwimEnv(link, config, settings.seen, babbled(settings)[2].eye)
@@ -147,29 +149,33 @@ def test_a_model_of_ones_own_that_sees_pictures_is_refused(tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-def test_what_was_learned_by_sight_swims_from_its_file(tmp_path: Path, by_sight: Outcome) -> None:
+def test_an_exported_policy_swims_by_sight(tmp_path: Path, by_sight: Outcome) -> None:
     assert by_sight.best
     assert by_sight.best_evaluation
-    found = export(by_sight.best, tmp_path / "eye.onnx")
-    past = found.card.provenance
+    exported = export(by_sight.best, tmp_path / "eye.onnx")
+    past = exported.card.provenance
     assert past.relative_thrust == pytest.approx(by_sight.best_evaluation.relative_thrust)
-    assert file.read(found.path).card.pictures == StackSettings()
-    standings, _ = compare(Config(), [str(found.path)], seconds=20.0, settle=5.0)
+    assert file.read(exported.path).card.pictures == StackSettings()
+    standings, _ = compare(Config(), [str(exported.path)], seconds=20.0, settle=5.0)
     assert standings[0].relative_thrust == pytest.approx(past.relative_thrust, abs=0.05)
 
 
 @pytest.mark.slow
-def test_what_was_learned_by_sight_looks_at_the_tail(tmp_path: Path, by_sight: Outcome) -> None:
+def test_a_policy_by_sight_is_sensitive_where_the_tail_moves(
+    tmp_path: Path, by_sight: Outcome
+) -> None:
     assert by_sight.best
     path = export(by_sight.best, tmp_path / "eye.onnx").path
-    found = look(str(path), Config(), DEFAULT, 10.0)  # by the camera that it has learned with
-    assert found.share > 2.0 * found.area
+    sensitivity = look(str(path), Config(), DEFAULT, 10.0)  # with the camera of its training
+    assert sensitivity.share > 2.0 * sensitivity.area
 
 
 @pytest.mark.slow
-def test_the_verb_says_who_lets_it_swim(tmp_path: Path, by_sight: Outcome) -> None:
+def test_the_verb_prints_the_command_that_lets_a_policy_by_sight_swim(
+    tmp_path: Path, by_sight: Outcome
+) -> None:
     path = tmp_path / "eye.onnx"
     words = ["learn", "export", str(by_sight.folder), "--to", str(path)]
-    found = CliRunner().invoke(fishctl, words)
-    assert found.exit_code == 0, found.output
-    assert found.output.endswith(f"it sees pictures; to let it swim: fishctl agent {path}\n")
+    result = CliRunner().invoke(fishctl, words)
+    assert result.exit_code == 0, result.output
+    assert result.output.endswith(f"it sees pictures; to let it swim: fishctl agent {path}\n")

@@ -27,27 +27,27 @@ from fishd.learning.train.progress import ShownDisplay
 from fishd.learning.train.training import train
 from fishd.virtual.plant.optimum import best_square_wave
 
-SEEING = EnvironmentSettings(
+ENVIRONMENT = EnvironmentSettings(
     observation=("fy", "instruction_angle", "fin_velocity", "side_time"), history=4
 )
-SHORT = ImitationSettings(rounds=2, fish=10, ticks=60, batch_size=128)
+SHORT_IMITATION = ImitationSettings(rounds=2, fish=10, ticks=60, batch_size=128)
 CHANGES = {
     "steps": 0,
-    "environment": SEEING,
+    "environment": ENVIRONMENT,
     "randomisation": Randomisation(omega0=0.3),
-    "imitation": SHORT,
+    "imitation": SHORT_IMITATION,
 }
 
 
 @pytest.fixture(scope="module")
 def imitated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Outcome, str]:
-    """A run that only imitates, which must not be changed, and what was said meanwhile."""
-    with redirect_stdout(StringIO()) as said:
+    """A run of imitation alone, which must not be changed, and its output."""
+    with redirect_stdout(StringIO()) as output:
         job = brief_job(tmp_path_factory.mktemp("imitated") / "run", **CHANGES)
-        return train(job, ShownDisplay(Lines(err=False))), said.getvalue()
+        return train(job, ShownDisplay(Lines(err=False))), output.getvalue()
 
 
-def test_half_beats_are_compared_by_their_thrust() -> None:
+def test_half_beats_have_their_relative_thrust() -> None:
     config = load(None, ["tick=0.02"])
     relative_thrust = half_beats(config)
     best = best_square_wave(config.plant, config.amplitude_limit)
@@ -64,29 +64,29 @@ def test_a_clean_rig_keeps_the_fish_and_has_less_delay_and_play() -> None:
     assert narrow(spread, 1.0) == spread
 
 
-def test_it_is_right_to_stay_until_the_best_half_beat_is_over() -> None:
+def test_the_advice_is_to_stay_until_the_best_half_beat_is_over() -> None:
     relative_thrust = np.array([0.0, 0.5, 1.0, 0.9, 0.3])
     sides, costs = zip(*(advice(relative_thrust, elapsed) for elapsed in range(6)), strict=True)
     assert sides == (1.0, 1.0, -1.0, -1.0, -1.0, -1.0)
     assert costs == pytest.approx((0.52, 0.52, 0.12, 0.62, 0.62, 0.62))
 
 
-def test_a_policy_that_only_imitated_swims_and_says_how_it_learned(
+def test_a_policy_of_imitation_alone_swims_and_its_card_says_so(
     tmp_path: Path, imitated: tuple[Outcome, str]
 ) -> None:
-    outcome, said = imitated
+    outcome, output = imitated
     assert outcome.ended == "finished"
     assert outcome.steps == 0
     assert outcome.best_evaluation
     assert outcome.best_evaluation.relative_thrust > 0.9
-    assert "imitation 2 of 2: 9" in said
+    assert "imitation 2 of 2: 9" in output
     assert outcome.best
     past = read(export(outcome.best, tmp_path / "policy.onnx").path).card.provenance
     assert past.algorithm == "imitation"
     assert past.settings["imitation"]["fish"] == 10
 
 
-def test_ppo_goes_on_with_what_was_imitated(tmp_path: Path) -> None:
+def test_ppo_continues_with_the_imitated_policy(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", **{**CHANGES, "steps": 64})
     train(job)
     first, *_ = rows(tmp_path / "run" / "evaluations.csv")
@@ -96,10 +96,10 @@ def test_ppo_goes_on_with_what_was_imitated(tmp_path: Path) -> None:
     )
 
 
-def test_a_training_that_was_stopped_meanwhile_imitates_anew(tmp_path: Path) -> None:
+def test_a_training_stopped_during_imitation_repeats_it(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", **CHANGES)
-    asked = iter([False] * 15 + [True] * 99)
-    assert train(job, stop=lambda: next(asked)).ended == "interrupted"
+    answers = iter([False] * 15 + [True] * 99)
+    assert train(job, stop=lambda: next(answers)).ended == "interrupted"
     assert not checkpoints.read_state(tmp_path / "run" / "step-000000").imitated
     resumed = train(replace(job, resume=True))
     assert resumed.best_evaluation
@@ -108,17 +108,17 @@ def test_a_training_that_was_stopped_meanwhile_imitates_anew(tmp_path: Path) -> 
         train(replace(job, resume=True))
 
 
-def test_who_begins_with_another_run_does_not_imitate_again(
+def test_a_training_with_a_parent_does_not_imitate_again(
     tmp_path: Path, imitated: tuple[Outcome, str]
 ) -> None:
     parent = imitated[0].best
-    found: list[Evaluation] = []
+    evaluations: list[Evaluation] = []
     display = ShownDisplay(Lines(err=False))
-    display.evaluated = found.append  # type: ignore[method-assign]
+    display.evaluated = evaluations.append  # type: ignore[method-assign]
     outcome = train(
         brief_job(tmp_path / "second", **{**CHANGES, "steps": 64}, parent=parent), display
     )
-    assert [one.steps for one in found] == [64]
+    assert [evaluation.steps for evaluation in evaluations] == [64]
     assert outcome.checkpoint
     assert checkpoints.read_state(outcome.checkpoint).imitated
 

@@ -32,7 +32,7 @@ def test_the_setting_of_the_paper_updates_every_768_steps() -> None:
     assert paper.environment.observation == ("fy", "fy_rate", "instruction_angle")
 
 
-def test_what_is_written_is_read_back(tmp_path: Path) -> None:
+def test_written_settings_can_be_read_back(tmp_path: Path) -> None:
     paper = load(CONFIG / "learning-paper.yaml")
     (tmp_path / "settings.yaml").write_text(to_yaml(paper), encoding="utf-8")
     assert load(tmp_path / "settings.yaml") == paper
@@ -103,6 +103,6 @@ def test_a_wrong_value_is_one_line_that_names_file_line_key_and_what_is_needed(
     assert message in complaint(tmp_path, text)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
         load(tmp_path / "none.yaml")

@@ -1,4 +1,4 @@
-"""Agents that see the latest ticks, and fish whose rig delays, plays and reacts."""
+"""Agents that see several ticks, and fish with a delay, play and reaction of the servo."""
 
 from pathlib import Path
 
@@ -67,17 +67,17 @@ def test_a_file_with_a_history_swims_as_the_policy_that_was_trained(tmp_path: Pa
     job = brief_job(tmp_path / "run", environment=REMEMBERING)
     outcome = train(job)
     assert outcome.checkpoint
-    found = export(outcome.checkpoint, tmp_path / "policy.onnx", force=True)
-    card = read(found.path).card
+    exported = export(outcome.checkpoint, tmp_path / "policy.onnx", force=True)
+    card = read(exported.path).card
     assert (card.history, card.numbers) == (4, 8)
-    seed = job.config.simulation.seed + 1  # as the evaluation at the export
+    seed = job.config.simulation.seed + 1  # as in the evaluation of the export
     free = replace(
         job.config,
         simulation=replace(job.config.simulation, seed=seed),
         chatter=replace(job.config.chatter, dwell=0.0),
     )
-    report = simulate(free, "ppo", {"policy": str(found.path)}, 4.0, 2.0)
-    assert report.relative_thrust == pytest.approx(found.evaluation.relative_thrust, abs=1e-3)
+    report = simulate(free, "ppo", {"policy": str(exported.path)}, 4.0, 2.0)
+    assert report.relative_thrust == pytest.approx(exported.evaluation.relative_thrust, abs=1e-3)
 
 
 def test_a_training_begins_only_with_a_policy_of_the_same_history(tmp_path: Path) -> None:
@@ -89,17 +89,17 @@ def test_a_training_begins_only_with_a_policy_of_the_same_history(tmp_path: Path
 
 def test_the_rigs_of_a_randomisation_are_anywhere_in_its_range() -> None:
     fish = [draw_fish(CONFIG, HARSH, seed) for seed in range(40)]
-    for name, most in (("servo_delay", 0.08), ("servo_dead_zone", 0.05), ("backlash", 0.1)):
-        values = [getattr(one.plant, name) for one in fish]
-        assert 0.0 < min(values) < 0.2 * most < 0.8 * most < max(values) < most
-    for name, most in (("servo_lag", 1.6), ("thrust_coefficient", 1.6), ("lateral_drag", 3.0)):
-        shares = [getattr(one.plant, name) / getattr(CONFIG.plant, name) for one in fish]
-        assert 1.0 / most < min(shares) < 0.9 < 1.1 < max(shares) < most
-    assert min(one.plant.servo_reaction for one in fish) < -1e-3
-    assert max(one.simulation.rotation for one in fish) > 0.1
+    for name, limit in (("servo_delay", 0.08), ("servo_dead_zone", 0.05), ("backlash", 0.1)):
+        values = [getattr(config.plant, name) for config in fish]
+        assert 0.0 < min(values) < 0.2 * limit < 0.8 * limit < max(values) < limit
+    for name, limit in (("servo_lag", 1.6), ("thrust_coefficient", 1.6), ("lateral_drag", 3.0)):
+        shares = [getattr(config.plant, name) / getattr(CONFIG.plant, name) for config in fish]
+        assert 1.0 / limit < min(shares) < 0.9 < 1.1 < max(shares) < limit
+    assert min(config.plant.servo_reaction for config in fish) < -1e-3
+    assert max(config.simulation.rotation for config in fish) > 0.1
 
 
-def test_the_fish_of_a_training_are_those_of_before_where_nothing_new_varies() -> None:
+def test_another_varied_parameter_does_not_change_the_others() -> None:
     spread = Randomisation(omega0=0.2, offset=0.01)
     before = draw_fish(CONFIG, spread, 3)
     after = draw_fish(CONFIG, replace(spread, backlash=0.1), 3)
@@ -107,7 +107,7 @@ def test_the_fish_of_a_training_are_those_of_before_where_nothing_new_varies() -
     assert after.simulation == before.simulation
 
 
-def test_a_weak_fish_is_rewarded_as_a_strong_one_for_its_own_best() -> None:
+def test_with_own_fish_a_weak_fish_gets_the_same_reward_as_a_strong_one() -> None:
     def reward(own: bool, coefficient: float) -> float:
         config = load(None, ["simulation.noise=0", f"plant.thrust_coefficient={coefficient}"])
         settings = replace(REMEMBERING, own_fish=own)
@@ -119,7 +119,7 @@ def test_a_weak_fish_is_rewarded_as_a_strong_one_for_its_own_best() -> None:
     assert reward(True, 5e-3) == pytest.approx(reward(True, 10e-3), rel=1e-3)
 
 
-def test_who_leans_on_the_shortest_dwell_is_worth_nothing_among_fish_of_the_range() -> None:
+def test_a_policy_that_violates_the_shortest_dwell_has_no_worst_thrust_in_the_range() -> None:
     def six_ticks(seen: Observation, stack: object) -> float:
         return 0.42 * (-1.0) ** (round(seen.time / 0.05) // 6)
 
@@ -145,9 +145,9 @@ def test_a_training_on_harsh_fish_records_its_worst(tmp_path: Path) -> None:
     assert latest.worst <= latest.relative_thrust
 
 
-def test_a_fish_of_its_own_is_held_back_by_its_own_shortest_dwell() -> None:
+def test_with_own_fish_reversals_are_delayed_by_its_own_shortest_dwell() -> None:
     def reversals(own: bool) -> int:
-        late = load(None, ["plant.servo_delay=0.08"])  # whose dwell is 0.25 s
+        late = load(None, ["plant.servo_delay=0.08"])  # its dwell is 0.25 s
         env = SwimEnv(SimulatedLink(late), CONFIG, replace(REMEMBERING, own_fish=own))
         env.reset(seed=1)
         sides = [act(env, -np.sign(env.latest.instruction_angle) or 1.0)[1] for _ in range(41)]

@@ -1,4 +1,4 @@
-"""What a policy looks at, found by hiding parts of the picture."""
+"""The sensitivity of a policy to parts of its pictures, computed by hiding them."""
 
 from pathlib import Path
 
@@ -15,30 +15,32 @@ from fishd.core.errors import FishdError, ParameterError, PolicyError
 from fishd.learning.look import look
 
 
-def test_what_follows_the_tail_looks_at_the_tail(tmp_path: Path) -> None:
-    found = look(str(write(tmp_path, velocity_follower())), Config(), DEFAULT, 12.0)
-    assert found.mean.shape == found.sensitivity.shape == found.moves.shape == (32, 32)
-    assert 0.05 < found.area < 0.3
-    assert found.share > 2.0 * found.area
-    row, column = np.unravel_index(found.sensitivity.argmax(), (32, 32))
+def test_a_policy_that_follows_the_tail_is_sensitive_where_the_tail_moves(tmp_path: Path) -> None:
+    result = look(str(write(tmp_path, velocity_follower())), Config(), DEFAULT, 12.0)
+    assert result.mean.shape == result.sensitivity.shape == result.moves.shape == (32, 32)
+    assert 0.05 < result.area < 0.3
+    assert result.share > 2.0 * result.area
+    row, column = np.unravel_index(result.sensitivity.argmax(), (32, 32))
     assert 8 <= row < 24
     assert column > 8
-    assert not found.moves[:4].any()
+    assert not result.moves[:4].any()
 
 
-def test_what_is_looked_at_beside_the_tail_is_found_there(tmp_path: Path) -> None:
+def test_a_sensitive_corner_is_found(tmp_path: Path) -> None:
     about = seeing_card()
     weights = np.zeros((2, 32, 32))
     halves = np.where(np.arange(32) < 16, 1.0, -1.0)[:, None] * np.full(32, 2.0 / 32**2)
     weights[:2] = 4.0 * halves, -4.0 * halves
-    weights[0, :4, 28:] += 0.03  # the noise of a corner disturbs it
+    weights[0, :4, 28:] += 0.03  # the noise of a corner influences the policy
     weights[1, :4, 28:] -= 0.03
     path = write(tmp_path, of_pixels(weights, about), "corner")
-    found = look(str(path), Config(), DEFAULT, 12.0)
-    assert found.sensitivity[1, 30] > 3.0 * found.sensitivity[1, 1]
+    result = look(str(path), Config(), DEFAULT, 12.0)
+    assert result.sensitivity[1, 30] > 3.0 * result.sensitivity[1, 1]
 
 
-def test_what_sees_no_pictures_or_does_not_swim_or_is_blind_is_refused(tmp_path: Path) -> None:
+def test_a_policy_that_sees_no_pictures_or_does_not_swim_or_react_is_refused(
+    tmp_path: Path,
+) -> None:
     def refused(content: bytes, error: type[FishdError], seconds: float = 8.0) -> str:
         with pytest.raises(error) as caught:
             look(str(write(tmp_path, content)), Config(), DEFAULT, seconds)
@@ -54,19 +56,19 @@ def test_what_sees_no_pictures_or_does_not_swim_or_is_blind_is_refused(tmp_path:
     assert "is too short" in refused(velocity_follower(), ParameterError, 4.0)
 
 
-def test_the_verb_says_it_in_a_line_and_draws_it(tmp_path: Path) -> None:
+def test_the_verb_prints_the_share_in_a_line_and_draws_the_sensitivity(tmp_path: Path) -> None:
     policy, picture = write(tmp_path, velocity_follower(), "eye"), tmp_path / "look.png"
     words = ["learn", "look", str(policy), "--plot", str(picture), "--seconds", "10"]
     done = CliRunner().invoke(fishctl, words)
     assert done.exit_code == 0, done.output
-    said, drawn = done.output.splitlines()
-    assert said.startswith(f"{policy}: ")
-    assert "% of the sensitivity lies where the tail moves, on " in said
+    result, drawn = done.output.splitlines()
+    assert result.startswith(f"{policy}: ")
+    assert "% of the sensitivity lies where the tail moves, on " in result
     assert drawn == f"drawn: {picture}"
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_figure_that_cannot_be_made_is_refused_before_it_swims(tmp_path: Path) -> None:
+def test_a_figure_with_an_unknown_format_is_refused_before_the_swim(tmp_path: Path) -> None:
     policy = str(write(tmp_path, velocity_follower(), "eye"))
     done = CliRunner().invoke(fishctl, ["learn", "look", policy, "--plot", "a.gif"])
     assert "a figure has no format .gif" in str(done.exception)

@@ -25,7 +25,7 @@ FEATURES = (Feature("fy", 0.4), Feature("instruction_angle", 0.42))
 
 
 def rollout(rewards: list[float], void: int | None = None) -> Rollout:
-    """A full rollout of one long episode, in which the step after a void one begins another."""
+    """Return a full rollout of one episode; the step after a void one begins another."""
     observation, action = spaces(2)
     buffer = Rollout(len(rewards), observation, action, "cpu", gae_lambda=0.95, gamma=0.9)
     starts = False
@@ -44,7 +44,7 @@ def rollout(rewards: list[float], void: int | None = None) -> Rollout:
     return buffer
 
 
-def test_what_came_of_a_void_step_changes_no_advantage() -> None:
+def test_the_outcome_of_a_void_step_changes_no_advantage() -> None:
     calm = rollout([0.3] * 12, void=5)
     wild = rollout([0.3] * 5 + [1e6] + [0.3] * 6, void=5)
     np.testing.assert_array_equal(calm.advantages, wild.advantages)
@@ -52,11 +52,11 @@ def test_what_came_of_a_void_step_changes_no_advantage() -> None:
 
 
 def test_a_void_step_is_in_no_minibatch() -> None:
-    def taught(buffer: Rollout) -> list[int]:
+    def steps_of_batches(buffer: Rollout) -> list[int]:
         return sorted(int(o) for batch in buffer.get(4) for o in batch.observations[:, 0])
 
-    assert taught(rollout([0.3] * 12)) == list(range(12))
-    assert taught(rollout([0.3] * 12, void=5)) == [*range(5), *range(6, 12)]
+    assert steps_of_batches(rollout([0.3] * 12)) == list(range(12))
+    assert steps_of_batches(rollout([0.3] * 12, void=5)) == [*range(5), *range(6, 12)]
 
 
 def test_the_learning_rate_falls_with_the_steps_since_the_beginning_and_then_stays() -> None:
@@ -77,13 +77,13 @@ def test_the_policy_in_numpy_is_that_of_stable_baselines(
         policy.action_net.weight *= 100.0  # so that some actions are clipped
     decide = DeterministicPolicy(policy, Perception(FEATURES), 0.42)
     layout = Layout(FEATURES)
-    found = []
+    angles = []
     for angle in np.linspace(-0.42, 0.42, 21):
         observation = observe(float(angle))
         action, _ = policy.predict(layout.vector(observation), deterministic=True)
-        found.append(decide(observation))
-        assert found[-1] == pytest.approx(0.42 * float(action[0]), abs=1e-5)
-    assert len(set(found)) > 2
+        angles.append(decide(observation))
+        assert angles[-1] == pytest.approx(0.42 * float(action[0]), abs=1e-5)
+    assert len(set(angles)) > 2
 
 
 def test_the_layers_are_those_from_the_inputs_to_the_mean_of_the_action() -> None:
@@ -96,12 +96,12 @@ def test_the_layers_are_those_from_the_inputs_to_the_mean_of_the_action() -> Non
 @pytest.fixture
 def policy() -> ActorCriticPolicy:
     torch.manual_seed(0)
-    made = make_policy(PpoSettings(hidden=(16, 8), symmetric=True), 4)
+    policy = make_policy(PpoSettings(hidden=(16, 8), symmetric=True), 4)
     with torch.no_grad():
-        for parameter in made.parameters():
-            if parameter.requires_grad:  # as if it had learned: biases too
+        for parameter in policy.parameters():
+            if parameter.requires_grad:  # as after learning, biases too
                 parameter.normal_(0.0, 0.7)
-    return made
+    return policy
 
 
 @pytest.fixture
@@ -112,23 +112,23 @@ def seen() -> NDArray[np.float32]:
 def test_a_mirrored_fish_gets_the_mirrored_action(
     policy: ActorCriticPolicy, seen: NDArray[np.float32]
 ) -> None:
-    there, _ = policy.predict(seen, deterministic=True)
+    actions, _ = policy.predict(seen, deterministic=True)
     mirrored, _ = policy.predict(-seen, deterministic=True)
-    assert np.ptp(there) > 0.5
-    assert mirrored == pytest.approx(-there)
+    assert np.ptp(actions) > 0.5
+    assert mirrored == pytest.approx(-actions)
 
 
 def test_a_state_and_its_mirror_image_are_worth_the_same(
     policy: ActorCriticPolicy, seen: NDArray[np.float32]
 ) -> None:
     with torch.no_grad():
-        there = policy.predict_values(torch.from_numpy(seen)).numpy()
+        values = policy.predict_values(torch.from_numpy(seen)).numpy()
         mirrored = policy.predict_values(torch.from_numpy(-seen)).numpy()
-    assert np.ptp(there) > 0.5
-    assert mirrored == pytest.approx(there, abs=1e-5)
+    assert np.ptp(values) > 0.5
+    assert mirrored == pytest.approx(values, abs=1e-5)
 
 
-def test_as_plain_layers_it_says_the_same(
+def test_plain_layers_give_the_same_outputs(
     policy: ActorCriticPolicy, seen: NDArray[np.float32]
 ) -> None:
     *hidden, (last, bias) = layers_of(policy)
@@ -136,7 +136,7 @@ def test_as_plain_layers_it_says_the_same(
     for weight, offset in hidden:
         values = np.tanh(values @ weight.T + offset)
     with torch.no_grad():
-        wanted = policy.get_distribution(torch.from_numpy(seen)).distribution.mean.numpy()
-    assert values @ last.T + bias == pytest.approx(wanted, abs=1e-4)
+        expected = policy.get_distribution(torch.from_numpy(seen)).distribution.mean.numpy()
+    assert values @ last.T + bias == pytest.approx(expected, abs=1e-4)
     assert [weight.shape for weight, _ in (*hidden, (last, bias))] == [(32, 4), (16, 32), (1, 16)]
     assert all(weight.dtype == np.float32 for weight, _ in hidden)

@@ -175,7 +175,7 @@ def test_a_resume_with_a_pipe_for_a_state_advises_what_to_do(run: Path) -> None:
 
 
 def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> None:
-    """Where a run ends abruptly, its newest checkpoint is not newer than its tables."""
+    """After an abrupt end of a run, its newest checkpoint is not newer than its tables."""
     job = brief_job(tmp_path / "run", steps=256)
 
     class Killed(Display):

@@ -1,6 +1,6 @@
-"""One training with several seeds: in parallel, on a cluster, and when something goes wrong.
+"""A training with several seeds: in parallel, on a cluster, and with failures.
 
-Processes that train take seconds to import torch: those of this process are left for the next test.
+Training processes take seconds to import torch, so those of this process stay for the next test.
 """
 
 import csv
@@ -27,14 +27,14 @@ checkpoint_every: 128
 ppo: {{n_steps: 64, n_epochs: 2, log_std_init: 0.7}}
 evaluation: {{every: 1, patience: null, seconds: 4.0, settle: 2.0}}
 """
-LONG = 1_000_000
+MANY_STEPS = 1_000_000
 
 
 def command(folder: Path, *arguments: str, steps: int = 128) -> list[str]:
     settings = folder / "settings.yaml"
     settings.write_text(SETTINGS.format(steps=steps), encoding="utf-8")
-    given = ["--settings", str(settings), "--folder", str(folder / "run")]
-    return ["learn", "ppo", *given, *arguments]
+    options = ["--settings", str(settings), "--folder", str(folder / "run")]
+    return ["learn", "ppo", *options, *arguments]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -45,7 +45,7 @@ def _no_trainer_stays() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Done]:
-    """Two seeds in two processes: the run folder, which must not be changed, and what was said."""
+    """The run folder, which must not be changed, and the output of two seeds in two processes."""
     folder = tmp_path_factory.mktemp("two")
     done = fishctl(*command(folder, "--seeds", "2", "--jobs", "2", "--seed", "5"))
     return folder / "run", done
@@ -56,16 +56,16 @@ def evaluated(folder: Path) -> bool:
 
 
 def processes(field: int, number: int) -> list[int]:
-    """The processes for which a field of /proc/PID/stat, after the name, is this number."""
-    found = []
+    """Return the processes with `number` in a field of /proc/PID/stat, counted after the name."""
+    pids = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             fields = (entry / "stat").read_text().rpartition(")")[2].split()
         except OSError:
             continue
         if int(fields[field]) == number and fields[0] != "Z":
-            found.append(int(entry.name))
-    return found
+            pids.append(int(entry.name))
+    return pids
 
 
 def members(session: int) -> list[int]:
@@ -73,7 +73,7 @@ def members(session: int) -> list[int]:
 
 
 def trainers(parent: int) -> list[int]:
-    """The processes of a parent that train."""
+    """Return the training processes of a parent."""
 
     def trains(process: int) -> bool:
         try:
@@ -86,7 +86,7 @@ def trainers(parent: int) -> list[int]:
 
 @contextmanager
 def started(folder: Path, *arguments: str, steps: int) -> Iterator[subprocess.Popen[str]]:
-    """In a session of its own, as from a terminal; nothing of it is left behind."""
+    """Run a training in a new session, as from a terminal, and kill its processes at the end."""
     process = subprocess.Popen(
         [FISHCTL, *command(folder, *arguments, steps=steps)],
         stdout=subprocess.PIPE,
@@ -102,7 +102,7 @@ def started(folder: Path, *arguments: str, steps: int) -> Iterator[subprocess.Po
         process.communicate(timeout=LONG_ENOUGH)
 
 
-def test_every_seed_has_a_folder_and_all_of_them_a_table(two: tuple[Path, Done]) -> None:
+def test_every_seed_has_a_folder_and_all_share_a_table(two: tuple[Path, Done]) -> None:
     run, done = two
     assert (done.returncode, done.stderr) == (0, "")
     assert "seed 5" in done.stdout
@@ -117,7 +117,7 @@ def test_every_seed_has_a_folder_and_all_of_them_a_table(two: tuple[Path, Done])
     assert float(rows[-1]["best_highest"]) == max(best_so_far(first)[-1], best_so_far(second)[-1])
 
 
-def test_a_seed_that_fails_is_reported_and_the_others_go_on(tmp_path: Path) -> None:
+def test_a_seed_that_fails_is_reported_and_the_others_continue(tmp_path: Path) -> None:
     from fishd.config import load
     from fishd.learning import settings as training
     from fishd.learning.train.jobs import Job, Outcome
@@ -128,27 +128,32 @@ def test_a_seed_that_fails_is_reported_and_the_others_go_on(tmp_path: Path) -> N
     folder = tmp_path / "run"
     job = Job(config=load(), settings=training.load(file), folder=folder)
 
-    def put_something_in_the_way(seed: int, outcome: Outcome) -> None:
+    def block_folder(seed: int, outcome: Outcome) -> None:
         if seed == 0:
-            (folder / "seed-2").write_text("in the way")
+            (folder / "seed-2").write_text("a file, not a folder")
 
-    found = train_seeds(job, 4, jobs=1, ended=put_something_in_the_way)
-    assert [outcome.ended for outcome in found] == ["finished", "finished", "failed", "finished"]
-    assert "seed-2" in found[2].message
+    outcomes = train_seeds(job, 4, jobs=1, ended=block_folder)
+    assert [outcome.ended for outcome in outcomes] == [
+        "finished",
+        "finished",
+        "failed",
+        "finished",
+    ]
+    assert "seed-2" in outcomes[2].message
     assert len((folder / "seeds.csv").read_text().splitlines()) == 3
 
 
-def test_ctrl_c_ends_all_of_them_with_a_checkpoint_each(tmp_path: Path) -> None:
+def test_ctrl_c_ends_all_seeds_with_a_checkpoint_each(tmp_path: Path) -> None:
     run = tmp_path / "run"
 
-    def press() -> None:  # a terminal tells parent and children
+    def press() -> None:  # a terminal sends the signal to parent and children
         for process in (*trainers(os.getpid()), os.getpid()):
             os.kill(process, signal.SIGINT)
 
     done = while_it_trains(
         lambda: evaluated(run / "seed-0") and evaluated(run / "seed-1"),
         press,
-        *command(tmp_path, "--seeds", "3", "--jobs", "2", steps=LONG),
+        *command(tmp_path, "--seeds", "3", "--jobs", "2", steps=MANY_STEPS),
     )
     assert done.returncode == 130
     assert "Traceback" not in done.stderr
@@ -158,29 +163,29 @@ def test_ctrl_c_ends_all_of_them_with_a_checkpoint_each(tmp_path: Path) -> None:
     assert (run / "seeds.csv").exists()
 
 
-STOPS_ITSELF = """\
+STOP_TRAINERS = """\
 import os, signal, sys
 if any("popen_loky" in word for word in sys.orig_argv):
     os.kill(os.getpid(), signal.SIGSTOP)
 """
-"""Run by every Python that starts: a trainer waits for SIGCONT before it has loaded anything."""
+"""Code run at the start of each Python process: a trainer waits for SIGCONT before it imports."""
 
 
 def is_stopped(process: int) -> bool:
     return "\nState:\tT" in Path(f"/proc/{process}/status").read_text()
 
 
-def test_ctrl_c_before_any_has_begun_is_heeded_as_well(
+def test_ctrl_c_before_any_training_has_begun_ends_all(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "sitecustomize.py").write_text(STOPS_ITSELF)
+    (tmp_path / "sitecustomize.py").write_text(STOP_TRAINERS)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    with started(tmp_path, "--seeds", "3", "--jobs", "2", steps=LONG) as process:
+    with started(tmp_path, "--seeds", "3", "--jobs", "2", steps=MANY_STEPS) as process:
         wait_for(lambda: sum(map(is_stopped, trainers(process.pid))) == 2)
-        held = trainers(process.pid)
+        waiting = trainers(process.pid)
         os.killpg(process.pid, signal.SIGINT)
         wait_for((tmp_path / "run" / "stop").exists)
-        for trainer in held:
+        for trainer in waiting:
             os.kill(trainer, signal.SIGCONT)
         _, errors = process.communicate(timeout=LONG_ENOUGH)
         assert process.returncode == 130
@@ -189,7 +194,7 @@ def test_ctrl_c_before_any_has_begun_is_heeded_as_well(
     assert errors.count("interrupted (it had not begun)") == 3
 
 
-def test_a_process_that_is_killed_costs_no_seed(tmp_path: Path) -> None:
+def test_the_seed_of_a_killed_process_is_resumed(tmp_path: Path) -> None:
     run = tmp_path / "run"
     done = while_it_trains(
         lambda: list((run / "seed-0").glob("step-*")),
@@ -198,11 +203,13 @@ def test_a_process_that_is_killed_costs_no_seed(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "latest policies of 2 seeds" in done.stdout
-    assert [one.steps for one in read_evaluations(run / "seed-0")] == list(range(64, 513, 64))
+    assert [evaluation.steps for evaluation in read_evaluations(run / "seed-0")] == list(
+        range(64, 513, 64)
+    )
 
 
 def test_a_finished_seed_whose_outcome_was_lost_is_finished(tmp_path: Path) -> None:
-    """Where one process is killed all are, and what another one had just done is asked for anew."""
+    """If one process is killed, all are, so a seed that has just finished is run again."""
     job = brief_job(tmp_path / "seed-0")
     first = _train(job, lambda: False)
     assert first.ended == "finished"
@@ -212,26 +219,26 @@ def test_a_finished_seed_whose_outcome_was_lost_is_finished(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("name", ["seed-0/policy", "stop"])
-def test_a_folder_that_is_in_use_is_left_alone(tmp_path: Path, name: str) -> None:
-    kept = tmp_path / "run" / name
-    kept.parent.mkdir(parents=True)
-    kept.write_text("of last week")
+def test_a_folder_that_is_in_use_is_not_changed(tmp_path: Path, name: str) -> None:
+    file = tmp_path / "run" / name
+    file.parent.mkdir(parents=True)
+    file.write_text("of last week")
     done = fishctl(*command(tmp_path, "--seeds", "2"))
     assert "the folder is not empty; choose another with --folder" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (78, 1)
-    assert kept.read_text() == "of last week"
+    assert file.read_text() == "of last week"
 
 
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[str]:
-    """A Dask scheduler and one worker, processes of their own on the loopback interface."""
+    """The address of a Dask scheduler with one worker, processes on the loopback interface."""
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     json_load_robust = distributed.utils.json_load_robust
     elsewhere, file = tmp_path / "worker", tmp_path / "scheduler.json"
     elsewhere.mkdir()
     here = ["--scheduler-file", str(file), "--host", "127.0.0.1", "--no-dashboard"]
-    one = ["--nworkers", "1", "--nthreads", "1", "--no-nanny", "--death-timeout", "60"]
-    commands = (["scheduler", "--port", "0", *here], ["worker", *one, *here])
+    single = ["--nworkers", "1", "--nthreads", "1", "--no-nanny", "--death-timeout", "60"]
+    commands = (["scheduler", "--port", "0", *here], ["worker", *single, *here])
     processes = [
         subprocess.Popen(
             [sys.executable, "-m", f"distributed.cli.dask_{kind}", *rest],
@@ -252,7 +259,7 @@ def cluster(tmp_path: Path) -> Iterator[str]:
             process.wait(LONG_ENOUGH)
 
 
-def test_a_cluster_trains_what_this_machine_would_and_sends_it_back(
+def test_a_cluster_sends_back_the_same_trainings_as_this_machine(
     tmp_path: Path, cluster: str, two: tuple[Path, Done]
 ) -> None:
     here, there = two[0], tmp_path / "run"
@@ -275,29 +282,29 @@ def test_a_cluster_that_does_not_answer_is_one_line(
     assert not (tmp_path / "run").exists()
 
 
-def test_in_a_summary_the_policies_of_a_seed_that_ended_early_stay_as_they_are(
+def test_in_a_summary_the_last_figures_of_a_seed_that_ended_early_are_repeated(
     tmp_path: Path,
 ) -> None:
     table = "steps,thrust,relative_thrust,frequency,fullness,stalled,best\n"
     rows = [f"{steps},0.02,0.{steps},1.7,1,0,1\n" for steps in (64, 72, 80)]
-    for name, swum in (("short", rows[:1]), ("long", rows)):
+    for name, lines in (("short", rows[:1]), ("long", rows)):
         (tmp_path / name).mkdir()
-        (tmp_path / name / "evaluations.csv").write_text(table + "".join(swum))
+        (tmp_path / name / "evaluations.csv").write_text(table + "".join(lines))
     write_summary(tmp_path / "seeds.csv", [tmp_path / "short", tmp_path / "long"])
-    found = csv.DictReader((tmp_path / "seeds.csv").read_text().splitlines())
-    assert [(row["seeds"], row["lowest"], row["best_highest"]) for row in found] == [
+    summary = csv.DictReader((tmp_path / "seeds.csv").read_text().splitlines())
+    assert [(row["seeds"], row["lowest"], row["best_highest"]) for row in summary] == [
         ("2", "0.64", "0.64"),
         ("2", "0.64", "0.72"),
         ("2", "0.64", "0.8"),
     ]
 
 
-def test_a_summary_of_seeds_that_got_nowhere_is_a_head(tmp_path: Path) -> None:
+def test_a_summary_of_seeds_without_evaluations_is_a_head(tmp_path: Path) -> None:
     write_summary(tmp_path / "seeds.csv", [tmp_path / "seed-0"])
     assert (tmp_path / "seeds.csv").read_text() == ",".join(SUMMARY) + "\n"
 
 
-def test_without_torch_nothing_is_begun(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_torch_no_training_begins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fishd.cli.learn.ppo.find_spec", lambda name: None)
     done = fishctl(*command(tmp_path, "--seeds", "2"))
     assert (done.returncode, done.stdout) == (1, "")

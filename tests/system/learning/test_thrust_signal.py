@@ -1,4 +1,4 @@
-"""What a force sensor adds to the thrust is taken off before a policy learns from it."""
+"""The removal of the errors of a force sensor from the thrust that a policy learns from."""
 
 from pathlib import Path
 
@@ -22,57 +22,57 @@ TURNED, CLEAN = "simulation.rotation=0.175", "simulation.noise=0"
 
 
 def swum(*overrides: str) -> tuple[Forces, Forces, float]:
-    """F_x and F_y of a fish that swims with half beats of five, six and seven ticks, and T."""
+    """Return F_x and F_y of a fish with half beats of five to seven ticks, and the best thrust."""
     config = load(None, [CLEAN, *overrides])
     env = SwimEnv(SimulatedLink(config), config, EnvironmentSettings(longest_start=0, dwell=False))
     env.reset(seed=0)
-    halves, draw, found, side = [], np.random.default_rng(0), [], 1.0
+    halves, draw, forces, side = [], np.random.default_rng(0), [], 1.0
     while len(halves) < 120:
         halves.append(int(draw.integers(5, 8)))
         for _ in range(halves[-1]):
             info = env.step(np.full(1, side, np.float32))[4]
-            found.append((info["thrust"], info["lateral_force"]))
+            forces.append((info["thrust"], info["lateral_force"]))
         side = -side
-    fx, fy = np.array(found).T
+    fx, fy = np.array(forces).T
     return fx, fy, env.best_thrust
 
 
 def cleaned(fx: Forces, fy: Forces, best: float) -> Forces:
-    """By rollouts of 64 ticks, the latest half of them."""
+    """Return the thrust from rollouts of 64 ticks, for the second half of them."""
     signal = ThrustSignal(best)
     parts = [signal.of(fx[k : k + 64], fy[k : k + 64]) for k in range(0, len(fx) - 63, 64)]
     return np.concatenate(parts[len(parts) // 2 :])
 
 
 def error(*overrides: str) -> float:
-    """Rms of what is learned from with an imperfection less that without, over T."""
+    """Return the rms error of the thrust with an imperfection, over the best thrust."""
     good, bad = swum(), swum(*overrides)
     return float(np.std(cleaned(*bad) - cleaned(*good))) / good[2]
 
 
-def test_of_a_good_sensor_only_the_level_is_lost() -> None:
+def test_with_a_good_sensor_only_the_mean_is_removed() -> None:
     fx, fy, best = swum()
-    found = ThrustSignal(best).of(fx[:64], fy[:64])
-    assert found.mean() == pytest.approx(0.0, abs=1e-12)
-    assert np.std(found - fx[:64]) < 0.2 * best
+    thrust = ThrustSignal(best).of(fx[:64], fy[:64])
+    assert thrust.mean() == pytest.approx(0.0, abs=1e-12)
+    assert np.std(thrust - fx[:64]) < 0.2 * best
 
 
-def test_the_share_of_the_lateral_force_in_a_turned_sensor_is_found() -> None:
+def test_the_share_of_the_lateral_force_in_a_turned_sensor_is_removed() -> None:
     fx, _, best = swum(TURNED)
     true, _, _ = swum()
     assert np.std(fx - true) > best
     assert error(TURNED) < 0.1
 
 
-def test_an_offset_and_its_drift_are_taken_off() -> None:
+def test_an_offset_and_its_drift_are_removed() -> None:
     assert error("simulation.offset_x=0.1", "simulation.drift=0.02") < 0.15
 
 
 def test_a_spike_counts_no_more_than_a_very_good_tick() -> None:
     fx, fy, best = swum()
     fx[20] += 40.0 * best
-    found = ThrustSignal(best).of(fx[:64], fy[:64])
-    assert found.max() < 6.0 * best
+    thrust = ThrustSignal(best).of(fx[:64], fy[:64])
+    assert thrust.max() < 6.0 * best
 
 
 def test_a_rollout_without_a_single_valid_step_is_no_error() -> None:
@@ -80,8 +80,8 @@ def test_a_rollout_without_a_single_valid_step_is_no_error() -> None:
     assert ThrustSignal(0.02).of(np.full(8, 0.3), np.zeros(8)).tolist() == [0.0] * 8
 
 
-def test_what_a_spike_is_does_not_follow_the_scale_of_the_reward(tmp_path: Path) -> None:
-    found = []
+def test_the_limit_of_a_spike_does_not_depend_on_the_scale_of_the_reward(tmp_path: Path) -> None:
+    largest = []
     for scale in (None, 0.5):
         environment = replace(BRIEF.environment, thrust_scale=scale)
         job = brief_job(tmp_path / f"run-{scale}", environment=environment)
@@ -92,11 +92,11 @@ def test_what_a_spike_is_does_not_follow_the_scale_of_the_reward(tmp_path: Path)
         assert rollout.signal
         fx = np.linspace(-0.001, 0.001, 64)
         fx[20] = 1.0
-        found.append(rollout.signal.of(fx, np.zeros(64)).max())
-    assert found[0] == found[1] < 0.01
+        largest.append(rollout.signal.of(fx, np.zeros(64)).max())
+    assert largest[0] == largest[1] < 0.01
 
 
-def test_one_fish_is_learned_from_without_it_and_a_new_one_in_each_episode_as_it_is(
+def test_the_errors_are_removed_unless_each_episode_has_another_fish(
     tmp_path: Path,
 ) -> None:
     def signal(name: str, **changes: object) -> ThrustSignal | None:
