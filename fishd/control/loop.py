@@ -177,7 +177,8 @@ class ControlLoop:
             self._notify(started)
 
     def warm_up(self) -> None:
-        """Warm the active controller up for the imminent tick."""
+        """Warm the active controller and the robot up for the imminent tick."""
+        self.robot.prepare()
         try:
             self.active.warm_up()
         except Exception as error:

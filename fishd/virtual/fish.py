@@ -64,6 +64,11 @@ class SimulatedFish:
         fx, fy = self.calibration.forces(fx, fy)
         return Measurement(time=now - 0.5 * duration / samples, fx=fx, fy=fy, samples=samples)
 
+    def prepare(self) -> None:
+        """Compute in advance what the next read needs, as far as that is possible."""
+        if self._time is not None:
+            self.fish.prepare(self._angle, self._duration, self._samples)
+
     def recalibrate(self, calibration: ForceCalibration) -> None:
         """Use another zero from the next read on; it is forgotten with this fish."""
         self.calibration = calibration
@@ -115,5 +120,6 @@ class SimulatedFish:
             servo=self,
             truth=self.truth,
             tared=self,
+            prepare=self.prepare,
             power=self.power if metered and self.fish.parameters.model == TETHERED else None,
         )

@@ -120,3 +120,9 @@ class Plant(ABC, Generic[P]):
         None means no pulses: the wheel then stays where it is. `samples` instants make the sampled
         means, as an ADC that is read evenly within the window does.
         """
+
+    def prepare(self, instruction_angle: float | None, duration: float, samples: int) -> None:
+        """Compute in advance what the next call of `advance` with these arguments may need.
+
+        Called between the ticks of a loop in real time, and only for the plant of fishd itself.
+        """

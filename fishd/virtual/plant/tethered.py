@@ -138,14 +138,8 @@ class TetheredFish(Plant[PlantParameters]):
         if not (duration > 0.0 and samples > 0):
             raise ValueError(f"a window needs time and samples, not {duration} s and {samples}")
         if self._is_plain and instruction_angle is not None:
-            held = self._held
-            if (
-                held is None
-                or held.taken == COUNT
-                or self.state is not self._expected
-                or self._request != (instruction_angle, duration, samples)
-            ):
-                held = self._hold(instruction_angle, duration, samples)
+            request = (instruction_angle, duration, samples)
+            held = self._held if self._is_known(request) else self._hold(*request)
             if held:
                 return self._take(held, instruction_angle, duration)
         if self._line is None:
@@ -165,6 +159,24 @@ class TetheredFish(Plant[PlantParameters]):
             [stretch for w in windows for stretch in w.course],
             self._motor,
             [drive for w in windows for drive in w.drives],
+        )
+
+    def prepare(self, instruction_angle: float | None, duration: float, samples: int) -> None:
+        """Compute the held windows of which the next one may be the first."""
+        if self._is_plain and instruction_angle is not None:
+            request = (instruction_angle, duration, samples)
+            counted = self._request, self._lasted, self._usual
+            if not self._is_known(request) and self._hold(*request) is None:
+                self._request, self._lasted, self._usual = counted
+
+    def _is_known(self, request: tuple[float, float, int]) -> bool:
+        """Return whether the next held window is that of a request from the present state."""
+        held = self._held
+        return (
+            held is not None
+            and held.taken < COUNT
+            and self.state is self._expected
+            and self._request == request
         )
 
     def _hold(self, angle: float, duration: float, samples: int) -> HeldWindows | None:
@@ -188,6 +200,7 @@ class TetheredFish(Plant[PlantParameters]):
         if len(segments) > 1 or duration > self._graded_from or abs(lag) > _LINEAR_LAG:
             return None
         self._held = held = self._ahead(segments[0], samples).swim(state, p.coupling * angle, lag)
+        self._expected = state
         if self._motor:
             held.jump = self._motor.jump(self._lag, lag)
         return held

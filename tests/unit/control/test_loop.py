@@ -342,6 +342,16 @@ def test_no_field_of_a_tick_keeps_a_value_of_the_controller(mode: str, may_stay:
     assert kept - ABSENT == may_stay
 
 
+def test_a_simulated_fish_prepares_in_the_warm_up_what_its_next_read_needs() -> None:
+    rig = Rig()
+    rig.start(Scripted(lambda _: 0.1))
+    rig.run(8)
+    requests = []
+    rig.fish.fish.prepare = lambda *request: requests.append(request)
+    rig.loop.warm_up()
+    assert requests == [(0.1, pytest.approx(0.05), rig.run()[-1].samples)]
+
+
 def test_only_the_active_controller_warms_up_and_the_angle_stays() -> None:
     rig, controller = Rig(), Scripted(lambda _: 0.1)
     ticks = []
