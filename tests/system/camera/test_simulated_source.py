@@ -49,7 +49,7 @@ def expected(ticks: list[Tick], camera: SimulatedCameraSettings) -> dict[float, 
 def test_from_another_machine_the_offset_is_estimated(
     tmp_path: Path, daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fishd.camera.clock_offset.boot_id", lambda: "of another machine")
+    monkeypatch.setattr("fishd.camera.clock_offset.read_boot_id", lambda: "of another machine")
     with (
         running_camera(tmp_path, *settings(daemon)) as camera,
         Fish(daemon.endpoint) as fish,

@@ -1,4 +1,4 @@
-"""Calls beside the loop: limited in number and in time, and never in anybody's way."""
+"""Calls in threads: limited in number and in time, without delays for the rest of fishd."""
 
 import asyncio
 import threading
@@ -11,11 +11,11 @@ from rigs.processes import wait_until
 from fishd.core.errors import Refused
 from fishd.daemon.background_calls import MAX_ABANDONED_CALLS, MAX_CALLS, BackgroundCalls
 
-PATIENCE = 60.0
+TIMEOUT_S = 60.0
 
 
 class Stuck:
-    """Calls that nothing ends until they are let go."""
+    """Function whose calls end only when `let_go` is called."""
 
     def __init__(self) -> None:
         self.entered = threading.Event()
@@ -26,15 +26,15 @@ class Stuck:
         self.threads.append(threading.current_thread())
         while not self._go.is_set():
             try:
-                self.entered.set()  # from here on nothing ends it
-                self._go.wait(PATIENCE)
+                self.entered.set()  # from here on no exception ends it
+                self._go.wait(TIMEOUT_S)
             except BaseException:
                 continue
 
     def let_go(self) -> None:
         self._go.set()
         for thread in self.threads:
-            thread.join(PATIENCE)
+            thread.join(TIMEOUT_S)
 
 
 async def refusal(background: BackgroundCalls, function: Callable[[], object]) -> Refused:
@@ -49,13 +49,13 @@ def test_one_that_takes_too_long_is_refused_in_time_and_others_go_on() -> None:
 
     async def run() -> None:
         background = BackgroundCalls(0.1)
-        begun = time.monotonic()
+        started = time.monotonic()
         answers = await asyncio.gather(*(refusal(background, stuck) for _ in range(MAX_CALLS)))
-        assert time.monotonic() - begun < 2.0
+        assert time.monotonic() - started < 2.0
         assert {answer.code for answer in answers} == {"too-slow"}
         assert str(answers[0]) == "it has not loaded within 0.1 s; the call is abandoned"
-        background.check_busy()  # those that are given up no longer count
-        background.timeout = PATIENCE
+        background.check_busy()  # abandoned calls do not count
+        background.timeout = TIMEOUT_S
         assert await background.call("", lambda: 42) == 42
 
     asyncio.run(run())
@@ -66,9 +66,9 @@ def test_four_at_once_are_all() -> None:
     stuck = Stuck()
 
     async def run() -> None:
-        background = BackgroundCalls(PATIENCE)
+        background = BackgroundCalls(TIMEOUT_S)
         pending = [asyncio.create_task(background.call("", stuck)) for _ in range(MAX_CALLS)]
-        await asyncio.sleep(0)  # all of them begin
+        await asyncio.sleep(0)  # starts all of them
         with pytest.raises(Refused, match="4 requests are reading files; try again"):
             background.check_busy()
         stuck.let_go()
@@ -82,12 +82,12 @@ def test_so_many_that_would_not_end_are_enough_until_one_ends() -> None:
     stuck = Stuck()
 
     async def run() -> None:
-        background = BackgroundCalls(PATIENCE)
+        background = BackgroundCalls(TIMEOUT_S)
         for _ in range(MAX_ABANDONED_CALLS):
             background.check_busy()
             stuck.entered.clear()
             call = asyncio.create_task(background.call("", stuck))
-            await asyncio.to_thread(stuck.entered.wait, PATIENCE)
+            await asyncio.to_thread(stuck.entered.wait, TIMEOUT_S)
             call.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await call
@@ -103,9 +103,9 @@ def test_so_many_that_would_not_end_are_enough_until_one_ends() -> None:
 
 @pytest.mark.realtime
 def test_a_process_does_not_wait_for_one_that_never_ends() -> None:
-    begun = time.monotonic()
+    started = time.monotonic()
     asyncio.run(refusal(BackgroundCalls(0.05), lambda: time.sleep(5.0)))
-    assert time.monotonic() - begun < 3.0
+    assert time.monotonic() - started < 3.0
 
 
 def test_a_call_whose_client_is_gone_is_given_up() -> None:
@@ -117,9 +117,9 @@ def test_a_call_whose_client_is_gone_is_given_up() -> None:
         return 42
 
     async def run() -> None:
-        background = BackgroundCalls(PATIENCE)
+        background = BackgroundCalls(TIMEOUT_S)
         call = asyncio.create_task(background.call("", load, late=late.append))
-        await asyncio.to_thread(stuck.entered.wait, PATIENCE)
+        await asyncio.to_thread(stuck.entered.wait, TIMEOUT_S)
         call.cancel()
         with pytest.raises(asyncio.CancelledError):
             await call

@@ -36,23 +36,24 @@ def rig(tmp_path: Path) -> Iterator[LockstepRig]:
 
 
 def on_trial(rig: LockstepRig, calibration: ServoCalibration) -> tuple[str, CalibrateServo]:
-    """The request of a client that tries a calibration under a lease which it has just taken."""
+    """Return a request to try a calibration under a new lease."""
     lease = rig.loop.lease.take("calibrate", "", 0, 60.0)
     return "calibrate-servo", CalibrateServo(calibration, lease=lease)
 
 
-def perform(rig: LockstepRig, asked: CalibrationRequests, *requests: tuple[str, Any]) -> list[Any]:
-    """Answers to requests that are made at the same time, while the loop ticks, five times as fast
-    as in real time at most.
+def perform(
+    rig: LockstepRig, handler: CalibrationRequests, *requests: tuple[str, Any]
+) -> list[Any]:
+    """Return the answers to simultaneous requests, while the loop ticks.
 
-    A tare is that of a sample that is taken first.
+    The loop is at most five times as fast as real time. A tare uses a sample that is taken first.
     """
 
     async def answer(name: str, arguments: Any) -> Any:
         if name == "tare" and isinstance(arguments, SampleForce):
-            sample = await asked.handlers["sample-force"](arguments)
+            sample = await handler.handlers["sample-force"](arguments)
             arguments = Tare(sample.number)
-        return await asked.handlers[name](arguments)
+        return await handler.handlers[name](arguments)
 
     async def run() -> list[Any]:
         answers: Awaitable[list[Any]] = asyncio.gather(*(answer(*request) for request in requests))
@@ -65,13 +66,13 @@ def perform(rig: LockstepRig, asked: CalibrationRequests, *requests: tuple[str, 
     return asyncio.run(run())
 
 
-def subject(rig: LockstepRig) -> CalibrationRequests:
+def calibration_requests(rig: LockstepRig) -> CalibrationRequests:
     return CalibrationRequests(rig.loop, rig.clock, rig.config, state_folder(rig.config))
 
 
 def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig) -> None:
-    asked = subject(rig)
-    (after,) = perform(rig, asked, ("tare", BRIEFLY))
+    handler = calibration_requests(rig)
+    (after,) = perform(rig, handler, ("tare", BRIEFLY))
     assert after.force.x0 == pytest.approx(-0.2, abs=1e-3)
     assert (after.force.xx, after.force.yy) == (1.0, 1.0)
     assert after.force.tared
@@ -88,8 +89,8 @@ def test_after_a_tare_swing_beats_as_if_the_zero_had_always_been_there(
         overrides = (f"virtual_pi.zero_y={zero}", f"estimator.kind={kind}")
         with lockstep_rig(tmp_path / f"{zero}", *FISH, *overrides) as rig:
             rig.run_for(1.0)
-            perform(rig, subject(rig), ("tare", BRIEFLY))
-            assert rig.run(220 - rig.index)  # swing begins at the same tick, however long it took
+            perform(rig, calibration_requests(rig), ("tare", BRIEFLY))
+            assert rig.run(220 - rig.index)  # so that swing always starts at the same tick
             rig.start("swing")
             angles = [tick.phi_c for tick in rig.run_for(6.0)]
         reversals = [k for k, (a, b) in enumerate(pairwise(angles)) if a * b < 0.0]
@@ -101,39 +102,39 @@ def test_after_a_tare_swing_beats_as_if_the_zero_had_always_been_there(
 
 def test_a_tare_alone_is_no_calibration(rig: LockstepRig, tmp_path: Path) -> None:
     not_calibrated = "the force is not calibrated, and shown in V: fishctl calibrate force"
-    asked = subject(rig)
-    perform(rig, asked, ("tare", BRIEFLY))
+    handler = calibration_requests(rig)
+    perform(rig, handler, ("tare", BRIEFLY))
     assert not_calibrated in rig.robot.degraded()
     assert rig.robot.force_unit == "V"
     with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
         assert not_calibrated in again.robot.degraded()
     fitted = ForceCalibration(x0=-0.2, loads=5)
-    perform(rig, asked, ("calibrate-force", CalibrateForce(fitted)))
+    perform(rig, handler, ("calibrate-force", CalibrateForce(fitted)))
     assert not_calibrated not in rig.robot.degraded()
     assert rig.robot.force_unit == "N"
 
 
 def test_two_tares_at_the_same_time_are_one(rig: LockstepRig) -> None:
-    asked = subject(rig)
-    perform(rig, asked, ("tare", BRIEFLY), ("tare", BRIEFLY), ("tare", SampleForce(seconds=0.3)))
+    handler = calibration_requests(rig)
+    perform(rig, handler, ("tare", BRIEFLY), ("tare", BRIEFLY), ("tare", SampleForce(seconds=0.3)))
     assert rig.run_for(0.5)[-1].fx == pytest.approx(0.0, abs=2e-3)
-    (found,) = perform(rig, asked, ("calibrations", NoArguments()))
-    assert found.force.x0 == pytest.approx(-0.2, abs=1e-3)
+    (present,) = perform(rig, handler, ("calibrations", NoArguments()))
+    assert present.force.x0 == pytest.approx(-0.2, abs=1e-3)
 
 
 def test_a_sample_alone_changes_nothing(rig: LockstepRig) -> None:
-    asked = subject(rig)
-    perform(rig, asked, ("sample-force", BRIEFLY))
-    (found,) = perform(rig, asked, ("calibrations", NoArguments()))
-    assert (found.force.x0, found.force_file) == (0.0, None)
+    handler = calibration_requests(rig)
+    perform(rig, handler, ("sample-force", BRIEFLY))
+    (present,) = perform(rig, handler, ("calibrations", NoArguments()))
+    assert (present.force.x0, present.force_file) == (0.0, None)
 
 
 def test_four_samples_at_once_are_all(rig: LockstepRig) -> None:
-    asked = subject(rig)
+    handler = calibration_requests(rig)
 
     async def ask(request: SampleForce) -> Any:
         try:
-            return await asked.handlers["sample-force"](request)
+            return await handler.handlers["sample-force"](request)
         except Refused as refusal:
             return refusal.code
 
@@ -147,16 +148,16 @@ def test_four_samples_at_once_are_all(rig: LockstepRig) -> None:
     answers = asyncio.run(run())
     assert answers.count("busy") == 3
     assert all(answer.pairs for answer in answers if answer != "busy")
-    (again,) = perform(rig, asked, ("sample-force", BRIEFLY))
+    (again,) = perform(rig, handler, ("sample-force", BRIEFLY))
     assert again.pairs
 
 
 def test_samples_that_are_under_way_end_as_soon_as_a_controller_starts(rig: LockstepRig) -> None:
-    asked = subject(rig)
+    handler = calibration_requests(rig)
 
     async def run() -> list[Any]:
         long = SampleForce(seconds=60.0)
-        request = asked.handlers["sample-force"]
+        request = handler.handlers["sample-force"]
         answers = asyncio.gather(
             *(request(long) for _ in range(MAX_CONCURRENT_SAMPLES)), return_exceptions=True
         )
@@ -170,14 +171,14 @@ def test_samples_that_are_under_way_end_as_soon_as_a_controller_starts(rig: Lock
 
 
 def test_a_sample_is_good_for_a_tare_only_while_it_is_fresh(rig: LockstepRig) -> None:
-    asked = subject(rig)
-    (sample,) = perform(rig, asked, ("sample-force", BRIEFLY))
+    handler = calibration_requests(rig)
+    (sample,) = perform(rig, handler, ("sample-force", BRIEFLY))
     rig.run_for(MAX_SAMPLE_AGE_S + 1.0)
     for number in (sample.number, sample.number + 1, 0):
         with pytest.raises(
             Refused, match=f"sample {number} does not exist or is older than 10 s"
         ) as refusal:
-            perform(rig, asked, ("tare", Tare(number)))
+            perform(rig, handler, ("tare", Tare(number)))
         assert refusal.value.code == "no-samples"
 
 
@@ -187,7 +188,7 @@ def test_what_was_saved_is_in_force_at_the_next_start(rig: LockstepRig, tmp_path
         ("calibrate-force", CalibrateForce(force)),
         ("calibrate-servo", CalibrateServo(servo, save=True)),
     )
-    perform(rig, subject(rig), *requests)
+    perform(rig, calibration_requests(rig), *requests)
     assert rig.run_for(0.5)[-1].fx == pytest.approx(0.4, abs=5e-3)
     assert rig.pulse == pytest.approx(1530.0)
     with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
@@ -200,7 +201,7 @@ def test_what_was_saved_is_in_force_at_the_next_start(rig: LockstepRig, tmp_path
 def test_a_servo_calibration_that_is_not_saved_is_gone_at_the_next_start(
     rig: LockstepRig, tmp_path: Path
 ) -> None:
-    perform(rig, subject(rig), on_trial(rig, ServoCalibration(trim=30.0)))
+    perform(rig, calibration_requests(rig), on_trial(rig, ServoCalibration(trim=30.0)))
     rig.run_for(0.2)
     assert rig.pulse == pytest.approx(1530.0)
     with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
@@ -210,7 +211,7 @@ def test_a_servo_calibration_that_is_not_saved_is_gone_at_the_next_start(
 
 def test_new_soft_limits_hold_for_the_next_command(rig: LockstepRig) -> None:
     calibration = ServoCalibration(lowest=-0.1, highest=0.2)
-    perform(rig, subject(rig), on_trial(rig, calibration))
+    perform(rig, calibration_requests(rig), on_trial(rig, calibration))
     rig.start("square")
     angles = [tick.phi_c for tick in rig.run_for(3.0)]
     assert (min(angles), max(angles)) == (-0.1, 0.2)
@@ -225,9 +226,9 @@ def test_a_calibration_that_would_make_the_tail_jump_is_refused(
 ) -> None:
     rig.start("hold", angle=0.3)
     rig.run_for(1.0)
-    wanted = on_trial(rig, replace(ServoCalibration(), **change))
+    request = on_trial(rig, replace(ServoCalibration(), **change))
     with pytest.raises(Refused) as refusal:
-        perform(rig, subject(rig), wanted)
+        perform(rig, calibration_requests(rig), request)
     assert refusal.value.code == "not-neutral"
     rig.run_for(0.5)
     assert rig.mode == "running"
@@ -235,7 +236,7 @@ def test_a_calibration_that_would_make_the_tail_jump_is_refused(
 
 
 def test_nothing_is_measured_or_calibrated_while_the_fish_swims(rig: LockstepRig) -> None:
-    asked = subject(rig)
+    handler = calibration_requests(rig)
     rig.start("swing")
     for request in (
         ("tare", BRIEFLY),
@@ -244,7 +245,7 @@ def test_nothing_is_measured_or_calibrated_while_the_fish_swims(rig: LockstepRig
         ("calibrate-servo", CalibrateServo(ServoCalibration())),
     ):
         with pytest.raises(Refused) as refusal:
-            perform(rig, asked, request)
+            perform(rig, handler, request)
         assert refusal.value.code == "running"
 
 
@@ -253,10 +254,10 @@ def test_a_calibration_that_cannot_be_written_is_not_in_force(
 ) -> None:
     folder = state_folder(rig.config)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    asked = subject(rig)
+    handler = calibration_requests(rig)
     folder.write_text("in the way")
     with pytest.raises(Refused) as refusal:
-        perform(rig, asked, ("calibrate-force", CalibrateForce(ForceCalibration(xx=5.0))))
+        perform(rig, handler, ("calibrate-force", CalibrateForce(ForceCalibration(xx=5.0))))
     assert refusal.value.code == "not-saved"
     assert rig.robot.calibrated is not None
     assert rig.robot.calibrated.sensor.calibration.xx == 1.0
@@ -278,34 +279,34 @@ def test_a_matrix_that_says_the_same_of_both_forces_is_refused(
 ) -> None:
     request = ("calibrate-force", CalibrateForce(ForceCalibration(**matrix)))
     with pytest.raises(Refused, match="xx xy, yx yy is singular"):
-        perform(rig, subject(rig), request)
+        perform(rig, calibration_requests(rig), request)
 
 
 @pytest.mark.parametrize("size", [1e-6, 1.0, 4.0])
 def test_a_matrix_is_judged_by_its_shape_and_not_by_its_size(rig: LockstepRig, size: float) -> None:
     matrix = ForceCalibration(xx=size, xy=0.1 * size, yx=-0.1 * size, yy=8.0 * size)
-    (after,) = perform(rig, subject(rig), ("calibrate-force", CalibrateForce(matrix)))
+    (after,) = perform(rig, calibration_requests(rig), ("calibrate-force", CalibrateForce(matrix)))
     assert after.force.yy == 8.0 * size
 
 
 def test_a_calibration_that_would_be_a_fault_at_once_is_refused_before_it_is_saved(
     rig: LockstepRig,
 ) -> None:
-    asked = subject(rig)
+    handler = calibration_requests(rig)
     with pytest.raises(Refused, match=r"beyond force_sensor.force_limit, 10 N.*grams") as refusal:
-        perform(rig, asked, ("calibrate-force", CalibrateForce(ForceCalibration(xx=100.0))))
+        perform(rig, handler, ("calibrate-force", CalibrateForce(ForceCalibration(xx=100.0))))
     assert refusal.value.code == "too-large"
-    (found,) = perform(rig, asked, ("calibrations", NoArguments()))
-    assert (found.force_file, found.force_limit) == (None, 10.0)
+    (present,) = perform(rig, handler, ("calibrations", NoArguments()))
+    assert (present.force_file, present.force_limit) == (None, 10.0)
     good = ForceCalibration(xx=100.0, x0=-20.0)
-    perform(rig, asked, ("calibrate-force", CalibrateForce(good)))
+    perform(rig, handler, ("calibrate-force", CalibrateForce(good)))
 
 
 def test_a_calibration_can_be_saved_while_the_sensor_says_nothing(rig: LockstepRig) -> None:
     rig.pi.faults.inject("unplugged")
     rig.run_until_fault(3.0)
     request = ("calibrate-force", CalibrateForce(ForceCalibration(xx=100.0)))
-    (after,) = perform(rig, subject(rig), request)
+    (after,) = perform(rig, calibration_requests(rig), request)
     assert after.force.xx == 100.0
 
 
@@ -321,18 +322,18 @@ def test_a_calibration_can_be_saved_while_the_sensor_says_nothing(rig: LockstepR
 def test_a_servo_calibration_is_saved_only_if_the_configuration_would_take_it(
     rig: LockstepRig, change: dict[str, Any], words: str
 ) -> None:
-    asked = subject(rig)
+    handler = calibration_requests(rig)
     calibration = replace(ServoCalibration(), **change)
     with pytest.raises(Refused, match=f"^{words}") as refusal:
-        perform(rig, asked, ("calibrate-servo", CalibrateServo(calibration, save=True)))
+        perform(rig, handler, ("calibrate-servo", CalibrateServo(calibration, save=True)))
     assert refusal.value.code == "bad-arguments"
-    (found,) = perform(rig, asked, ("calibrations", NoArguments()))
-    assert (found.servo, found.servo_file) == (ServoCalibration(), None)
-    within = replace(calibration, lowest=-0.1, highest=0.0)  # who wants less says so
-    perform(rig, asked, ("calibrate-servo", CalibrateServo(within, save=True)))
+    (present,) = perform(rig, handler, ("calibrations", NoArguments()))
+    assert (present.servo, present.servo_file) == (ServoCalibration(), None)
+    within = replace(calibration, lowest=-0.1, highest=0.0)  # smaller soft limits make it valid
+    perform(rig, handler, ("calibrate-servo", CalibrateServo(within, save=True)))
 
 
 def test_a_date_that_a_file_could_not_hold_is_refused(rig: LockstepRig) -> None:
     request = ("calibrate-force", CalibrateForce(ForceCalibration(tared="today")))
     with pytest.raises(Refused, match="tared: 'today' is not a date: one in ISO 8601 is needed"):
-        perform(rig, subject(rig), request)
+        perform(rig, calibration_requests(rig), request)

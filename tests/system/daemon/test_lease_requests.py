@@ -1,4 +1,4 @@
-"""Requests under a lease and by hand: who drives the fish after each of them."""
+"""Requests under a lease and by hand, and what drives the fish after each of them."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -14,7 +14,7 @@ from fishd.daemon.requests import Operations
 
 
 class Client:
-    """Sends requests to a daemon whose loop ticks only when the test lets it."""
+    """Client of a daemon whose loop ticks only when the test runs it."""
 
     def __init__(self, rig: Rig, folder: Path) -> None:
         self.rig = rig
@@ -37,7 +37,7 @@ class Client:
 Story = Callable[[Client], Awaitable[None]]
 
 
-def tell(folder: Path, story: Story, *overrides: str) -> Rig:
+def run_story(folder: Path, story: Story, *overrides: str) -> Rig:
     rig = Rig(*overrides)
     client = Client(rig, folder)
 
@@ -56,7 +56,7 @@ def test_a_lease_lasts_as_configured_or_as_asked_for_within_bounds(tmp_path: Pat
             refusal = await client.refused("take-lease", name="c", take=True, seconds=seconds)
             assert refusal.code == "bad-arguments"
 
-    tell(tmp_path, story, "control.lease=3.0")
+    run_story(tmp_path, story, "control.lease=3.0")
 
 
 def test_a_request_by_hand_takes_the_fish_and_the_answer_says_from_whom(tmp_path: Path) -> None:
@@ -71,14 +71,14 @@ def test_a_request_by_hand_takes_the_fish_and_the_answer_says_from_whom(tmp_path
             assert (holder.name, holder.host, holder.pid) == ("measure", "lab", 42)
             assert holder.age == pytest.approx(1.0, abs=0.1)
             for change in ("set-controller", "stop", "renew-lease", "end-lease"):
-                given = {"name": "swing"} if change == "set-controller" else {}
-                refusal = await client.refused(change, lease=lease, **given)
+                arguments = {"name": "swing"} if change == "set-controller" else {}
+                refusal = await client.refused(change, lease=lease, **arguments)
                 assert (refusal.code, "by hand" in str(refusal)) == ("no-lease", True)
             assert (await client.ask("status")).lease is None
         client.rig.run_for(10.0)
         assert client.rig.mode == "idle"
 
-    tell(tmp_path, story)
+    run_story(tmp_path, story)
 
 
 def test_by_hand_there_is_no_lease(tmp_path: Path) -> None:
@@ -87,7 +87,7 @@ def test_by_hand_there_is_no_lease(tmp_path: Path) -> None:
         assert state.took_from is None
         assert client.rig.run_for(20.0)[-1].controller == "sine"
 
-    tell(tmp_path, story)
+    run_story(tmp_path, story)
 
 
 def test_a_second_experiment_is_refused_unless_it_takes_the_fish(tmp_path: Path) -> None:
@@ -113,7 +113,7 @@ def test_a_second_experiment_is_refused_unless_it_takes_the_fish(tmp_path: Path)
         ]
         assert kinds == ["taken", "lost", "taken", "returned"]
 
-    tell(tmp_path, story)
+    run_story(tmp_path, story)
 
 
 def test_a_controller_that_was_loading_when_its_lease_ended_does_not_take_over(
@@ -122,12 +122,12 @@ def test_a_controller_that_was_loading_when_its_lease_ended_does_not_take_over(
     async def story(client: Client) -> None:
         lease = await client.take()
         loading = asyncio.create_task(client.ask("set-controller", name="swing", lease=lease))
-        await asyncio.sleep(0)  # it is being loaded, in a thread
+        await asyncio.sleep(0)  # starts loading it in a thread
         client.rig.loop.lease.end("a test")
         with pytest.raises(Refused, match="no longer holds the fish: a test"):
             await loading
 
-    assert tell(tmp_path, story).mode == "idle"
+    assert run_story(tmp_path, story).mode == "idle"
 
 
 def test_a_tare_by_hand_is_refused_in_an_experiment_and_possible_within_it(tmp_path: Path) -> None:
@@ -137,7 +137,7 @@ def test_a_tare_by_hand_is_refused_in_an_experiment_and_possible_within_it(tmp_p
         assert (await client.refused("tare", sample=1)).code == "leased"
         assert (await client.refused("tare", sample=1, lease=lease)).code == "no-samples"
 
-    tell(tmp_path, story)
+    run_story(tmp_path, story)
 
 
 def test_nothing_is_leased_while_a_fault_is_latched(tmp_path: Path) -> None:
@@ -145,4 +145,4 @@ def test_nothing_is_leased_while_a_fault_is_latched(tmp_path: Path) -> None:
         client.rig.loop.estop("enough")
         assert (await client.refused("take-lease", name="measure")).code == "estop"
 
-    tell(tmp_path, story)
+    run_story(tmp_path, story)

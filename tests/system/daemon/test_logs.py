@@ -1,4 +1,4 @@
-"""Logs: whatever is logged is safe to read, and nobody waits for a reader who is gone."""
+"""Logs: all lines are safe to read, and a reader that has ended delays no program."""
 
 import io
 import logging
@@ -49,16 +49,16 @@ def test_what_is_logged_can_be_encoded_and_says_nothing_to_a_terminal(
 
 def test_a_json_line_is_one_line_of_json() -> None:
     line = JsonFormatter().format(record("two\nlines", raised(RuntimeError("\udcff"))))
-    found = msgspec.json.decode(line)
-    assert found["message"] == "two lines"
-    assert found["traceback"].endswith("RuntimeError: ?")
+    entry = msgspec.json.decode(line)
+    assert entry["message"] == "two lines"
+    assert entry["traceback"].endswith("RuntimeError: ?")
 
 
 @contextmanager
 def writer(
-    monkeypatch: pytest.MonkeyPatch, stderr: io.TextIOBase, patience: float = PATIENCE
+    monkeypatch: pytest.MonkeyPatch, stderr: io.TextIOBase, timeout: float = PATIENCE
 ) -> Iterator[LogWriter]:
-    """A log writer, and after it everything as it was."""
+    """Return a log writer; restore the state of logging afterwards."""
     root = logging.getLogger()
     monkeypatch.setattr(sys, "stderr", stderr)
     monkeypatch.setattr(sys, "unraisablehook", sys.unraisablehook)
@@ -68,22 +68,22 @@ def writer(
     try:
         yield logs
     finally:
-        logs.close(patience)
+        logs.close(timeout)
         logging.captureWarnings(False)
         root.handlers = handlers
         root.setLevel(level)
 
 
 def test_what_was_logged_is_written_before_it_closes(monkeypatch: pytest.MonkeyPatch) -> None:
-    said = io.StringIO()
-    with writer(monkeypatch, said):
+    output = io.StringIO()
+    with writer(monkeypatch, output):
         for number in range(200):
             logging.error("line %d", number)
-    assert said.getvalue().count("error root: line ") == 200
+    assert output.getvalue().count("error root: line ") == 200
 
 
 class Stuck(io.StringIO):
-    """Standard error that nobody reads."""
+    """Standard error without a reader."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -97,31 +97,31 @@ class Stuck(io.StringIO):
 @pytest.mark.realtime
 def test_it_closes_soon_where_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     stuck = Stuck()
-    with writer(monkeypatch, stuck, patience=0.3) as logs:
-        begun = time.monotonic()
+    with writer(monkeypatch, stuck, timeout=0.3) as logs:
+        started = time.monotonic()
         for _ in range(2000):
             logging.error("a line")
         logs.close()
-        assert time.monotonic() - begun < 1.5
+        assert time.monotonic() - started < 1.5
         stuck.let_go.set()
 
 
-class Odd:
+class Unprintable:
     def __str__(self) -> str:
         raise RuntimeError("no text")
 
 
 def test_what_cannot_be_logged_is_no_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
-    said = io.StringIO()
-    with writer(monkeypatch, said):
-        logging.error("%s", Odd())
+    output = io.StringIO()
+    with writer(monkeypatch, output):
+        logging.error("%s", Unprintable())
         logging.error("%d apples", "three")
         logging.error("on")
-    assert said.getvalue().endswith("error root: on\n")
-    assert said.getvalue().count("\n") == 1
+    assert output.getvalue().endswith("error root: on\n")
+    assert output.getvalue().count("\n") == 1
 
 
-LATE = """
+PROGRAM_WITH_SLOW_STDERR = """
 import io, os, sys, time
 
 class Late(io.StringIO):
@@ -134,7 +134,7 @@ from {module} import main
 sys.argv = sys.argv[1:]
 main()
 """
-"""A program whose line takes a while to be written, as on a machine that is busy."""
+"""Program whose standard error is slow, as on a busy machine."""
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_what_cannot_start_says_why_however_late_its_line_is_written(
     tmp_path: Path, module: str, arguments: tuple[str, ...]
 ) -> None:
     words = [word.format(tmp_path) for word in arguments]
-    command = [sys.executable, "-c", LATE.format(module=module), *words]
+    command = [sys.executable, "-c", PROGRAM_WITH_SLOW_STDERR.format(module=module), *words]
     ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE)
     assert ended.returncode == 1
     assert f"{tmp_path}/no" in ended.stderr

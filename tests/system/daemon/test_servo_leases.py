@@ -1,4 +1,4 @@
-"""A servo calibration that is not saved needs a lease, and fishd undoes it when that ends."""
+"""Leases of servo calibrations that are not saved; fishd undoes them when the lease ends."""
 
 import asyncio
 import threading
@@ -20,14 +20,14 @@ from fishd.daemon.calibration_requests import CalibrationRequests
 from fishd.daemon.requests import Operations
 from fishd.hardware.calibration_files import CalibrationFolder
 
-WIDE = ServoCalibration(trim=30.0, lowest=-3.0, highest=3.0)
+WIDE_LIMITS = ServoCalibration(trim=30.0, lowest=-3.0, highest=3.0)
 
 
-NARROW = ServoCalibration(trim=30.0)
+NARROW_LIMITS = ServoCalibration(trim=30.0)
 
 
 class Client:
-    """Asks a daemon, whose loop ticks only when it is told to."""
+    """Client of a daemon whose loop ticks only when the test runs it."""
 
     def __init__(self, rig: LockstepRig) -> None:
         self.rig = rig
@@ -44,19 +44,19 @@ class Client:
         return await self.ask("calibrate-servo", calibration=values, save=save, lease=lease)
 
     async def begin_trial(self, calibration: ServoCalibration) -> str:
-        """Take the fish and try a calibration; the lease."""
+        """Take the fish and try a calibration; return the lease."""
         lease: str = (await self.ask("take-lease", name="calibrate")).lease
         await self.calibrate(calibration, lease=lease)
         return lease
 
     async def refused(self, op: str, **args: Any) -> str:
-        """The code with which a request is refused."""
+        """Return the code with which a request is refused."""
         with pytest.raises(Refused) as refusal:
             await self.ask(op, **args)
         return refusal.value.code
 
     async def until_over(self, limit: float = 20.0) -> None:
-        """Tick until no calibration is tried any more, for so long of virtual time [s]."""
+        """Tick until no calibration is on trial, for at most `limit` of virtual time [s]."""
         deadline = self.rig.now + limit
         while (await self.ask("calibrations")).on_trial:
             assert self.rig.now < deadline
@@ -64,8 +64,8 @@ class Client:
             await asyncio.sleep(0.005)
 
 
-async def watched() -> None:
-    """Time for fishd to look at its leases, in which nothing ticks."""
+async def wait_for_lease_check() -> None:
+    """Give fishd time to check its leases, without ticks."""
     await asyncio.sleep(0.3)
 
 
@@ -80,7 +80,7 @@ def rig(tmp_path: Path) -> Iterator[LockstepRig]:
 Story = Callable[[Client], Awaitable[None]]
 
 
-def tell(rig: LockstepRig, story: Story) -> None:
+def run_story(rig: LockstepRig, story: Story) -> None:
     async def run() -> None:
         await story(Client(rig))
 
@@ -91,36 +91,36 @@ def tell(rig: LockstepRig, story: Story) -> None:
 def test_a_calibration_whose_lease_ends_while_it_is_saved_is_not_used_at_the_next_start(
     rig: LockstepRig, monkeypatch: pytest.MonkeyPatch, ended: str
 ) -> None:
-    saving, going_on = threading.Event(), threading.Event()
+    saving, may_continue = threading.Event(), threading.Event()
 
     def save(*args: Any) -> Any:
         saving.set()
-        assert going_on.wait(PATIENCE)
-        return saved(*args)
+        assert may_continue.wait(PATIENCE)
+        return original_save(*args)
 
-    saved = CalibrationFolder.save
+    original_save = CalibrationFolder.save
     monkeypatch.setattr(CalibrationFolder, "save", save)
 
     async def story(client: Client) -> None:
         lease = None
         if ended == "end-lease":
-            lease = await client.begin_trial(NARROW)
-        task = asyncio.create_task(client.calibrate(NARROW, save=True, lease=lease))
+            lease = await client.begin_trial(NARROW_LIMITS)
+        task = asyncio.create_task(client.calibrate(NARROW_LIMITS, save=True, lease=lease))
         await asyncio.to_thread(saving.wait, PATIENCE)
         if lease:
             await client.ask("end-lease", lease=lease)
         else:
             rig.start("swing")
-        going_on.set()
+        may_continue.set()
         with pytest.raises(Refused, match=r"no longer holds the fish|is the active controller"):
             await task
         assert not list(state_folder(rig.config).glob("servo-*"))
         assert (await client.ask("calibrations")).servo_file is None
 
-    tell(rig, story)
+    run_story(rig, story)
 
 
-def taken_back(rig: LockstepRig) -> list[str]:
+def levels_of_undo_events(rig: LockstepRig) -> list[str]:
     return [event.level for event in rig.recorder.events if "previous calibration" in event.message]
 
 
@@ -129,7 +129,7 @@ def test_a_lease_that_nobody_renews_ends_at_neutral_with_the_calibration_of_befo
 ) -> None:
     async def story(client: Client) -> None:
         before = (await client.ask("calibrations")).servo
-        lease = await client.begin_trial(WIDE)
+        lease = await client.begin_trial(WIDE_LIMITS)
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(2.0)
         assert rig.pulse == pytest.approx(1530 + 240)
@@ -140,71 +140,71 @@ def test_a_lease_that_nobody_renews_ends_at_neutral_with_the_calibration_of_befo
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4})
         assert rig.run_for(2.0)[-1].phi_c == 0.2
 
-    tell(rig, story)
-    assert taken_back(rig) == ["warning"]
+    run_story(rig, story)
+    assert levels_of_undo_events(rig) == ["warning"]
     assert rig.mode == "running"
 
 
 def test_a_lease_lasts_as_long_as_it_is_renewed_or_changed(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        lease = await client.begin_trial(WIDE)
+        lease = await client.begin_trial(WIDE_LIMITS)
         rig.run_for(0.5 * DEFAULT_LEASE_S)
         await client.ask("renew-lease", lease=lease)
         rig.run_for(0.5 * DEFAULT_LEASE_S)
-        await client.calibrate(WIDE, lease=lease)
+        await client.calibrate(WIDE_LIMITS, lease=lease)
         rig.run_for(0.5 * DEFAULT_LEASE_S)
-        await watched()
+        await wait_for_lease_check()
         assert (await client.ask("calibrations")).on_trial
         rig.run_for(DEFAULT_LEASE_S)
-        await watched()
+        await wait_for_lease_check()
         assert not (await client.ask("calibrations")).on_trial
         for op in ("renew-lease", "end-lease"):
             assert await client.refused(op, lease=lease) == "no-lease"
         with pytest.raises(Refused, match="it was not renewed for 2 s"):
-            await client.calibrate(WIDE, lease=lease)
+            await client.calibrate(WIDE_LIMITS, lease=lease)
 
-    tell(rig, story)
+    run_story(rig, story)
 
 
 def test_status_tells_that_the_servo_is_leased(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         assert not (await client.ask("status")).calibrating
-        lease = await client.begin_trial(WIDE)
+        lease = await client.begin_trial(WIDE_LIMITS)
         assert (await client.ask("status")).calibrating
-        await client.calibrate(WIDE, save=True, lease=lease)
+        await client.calibrate(WIDE_LIMITS, save=True, lease=lease)
         assert not (await client.ask("status")).calibrating
 
-    tell(rig, story)
+    run_story(rig, story)
 
 
 def test_a_lease_that_is_given_back_ends_at_once_and_without_a_warning(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         before = (await client.ask("calibrations")).servo
-        lease = await client.begin_trial(WIDE)
+        lease = await client.begin_trial(WIDE_LIMITS)
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(1.0)
         await client.ask("end-lease", lease=lease)
         assert await client.refused("renew-lease", lease=lease) == "no-lease"
-        for name in ("swing", "hold"):  # the tail has to come to neutral first
+        for name in ("swing", "hold"):  # the tail has to reach neutral first
             assert await client.refused("set-controller", name=name) == "calibrating"
         await client.until_over(1.0)
         assert (await client.ask("calibrations")).servo == before
 
-    tell(rig, story)
-    assert taken_back(rig) == ["info"]
+    run_story(rig, story)
+    assert levels_of_undo_events(rig) == ["info"]
 
 
 def test_nothing_but_hold_takes_over_while_a_lease_lasts(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        lease = await client.begin_trial(WIDE)
-        for given in ({"name": "swing", "lease": lease}, {"name": "swing"}, {"name": "hold"}):
-            assert await client.refused("set-controller", **given) == "calibrating"
+        lease = await client.begin_trial(WIDE_LIMITS)
+        for arguments in ({"name": "swing", "lease": lease}, {"name": "swing"}, {"name": "hold"}):
+            assert await client.refused("set-controller", **arguments) == "calibrating"
         assert (await client.ask("set-controller", name="hold", lease=lease)).mode == "running"
         await client.ask("end-lease", lease=lease)
         await client.until_over()
         assert (await client.ask("set-controller", name="swing")).controller == "swing"
 
-    tell(rig, story)
+    run_story(rig, story)
 
 
 def test_a_controller_that_was_loading_when_a_lease_began_does_not_take_over(
@@ -212,13 +212,13 @@ def test_a_controller_that_was_loading_when_a_lease_began_does_not_take_over(
 ) -> None:
     async def story(client: Client) -> None:
         swimming = asyncio.create_task(client.ask("set-controller", name="swing"))
-        await asyncio.sleep(0)  # it is being loaded, in a thread
-        await client.begin_trial(WIDE)
+        await asyncio.sleep(0)  # starts loading it in a thread
+        await client.begin_trial(WIDE_LIMITS)
         with pytest.raises(Refused) as refusal:
             await swimming
         assert refusal.value.code == "calibrating"
 
-    tell(rig, story)
+    run_story(rig, story)
     assert rig.mode == "idle"
 
 
@@ -230,14 +230,14 @@ def test_a_controller_that_was_to_begin_after_a_rest_does_not_begin_in_a_lease_o
         square = registry.create("square", {}, rig.config.limits)
         rig.loop.set_controller_after(3.0, "square", square)
         rig.run_for(1.0)
-        lease = await client.begin_trial(WIDE)
+        lease = await client.begin_trial(WIDE_LIMITS)
         rig.run_for(0.1)
         if given_back:
             await client.ask("end-lease", lease=lease)
             await client.until_over()
         assert {tick.mode for tick in rig.run_for(4.0)} == {"idle"}
 
-    tell(rig, story)
+    run_story(rig, story)
     warnings = [event for event in rig.recorder.events if event.level == "warning"]
     assert [event.message for event in warnings if event.kind == "calibration"] == [
         "square does not begin by itself any more: the servo has another calibration"
@@ -246,7 +246,7 @@ def test_a_controller_that_was_to_begin_after_a_rest_does_not_begin_in_a_lease_o
 
 def test_only_who_has_the_lease_changes_or_saves_a_servo_calibration(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        lease = await client.begin_trial(WIDE)
+        lease = await client.begin_trial(WIDE_LIMITS)
         for save in (False, True):
             with pytest.raises(Refused) as refusal:
                 await client.calibrate(ServoCalibration(), save=save)
@@ -254,49 +254,49 @@ def test_only_who_has_the_lease_changes_or_saves_a_servo_calibration(rig: Lockst
             with pytest.raises(Refused) as refusal:
                 await client.calibrate(ServoCalibration(), save=save, lease="another")
             assert refusal.value.code == "no-lease"
-        saved = await client.calibrate(WIDE, save=True, lease=lease)
+        saved = await client.calibrate(WIDE_LIMITS, save=True, lease=lease)
         assert (saved.on_trial, saved.servo.trim) == (False, 30.0)
         rig.run_for(DEFAULT_LEASE_S + 1.0)
-        await watched()
-        found = await client.ask("calibrations")
-        assert (found.servo, found.servo_file) == (saved.servo, saved.servo_file)
+        await wait_for_lease_check()
+        present = await client.ask("calibrations")
+        assert (present.servo, present.servo_file) == (saved.servo, saved.servo_file)
 
-    tell(rig, story)
-    assert taken_back(rig) == []
+    run_story(rig, story)
+    assert levels_of_undo_events(rig) == []
 
 
 def test_after_an_emergency_stop_a_lease_ends_before_the_tail_is_driven_again(
     rig: LockstepRig,
 ) -> None:
     async def story(client: Client) -> None:
-        lease = await client.begin_trial(WIDE)
+        lease = await client.begin_trial(WIDE_LIMITS)
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(1.0)
         await client.ask("estop")
         assert await client.refused("end-lease", lease=lease) == "no-lease"
         rig.run_for(0.5)
-        await watched()
-        # The limits of before would not permit the angle that the pulses begin with again.
+        await wait_for_lease_check()
+        # The previous limits would not permit the angle at which the pulses start again.
         assert (await client.ask("calibrations")).on_trial
         await client.ask("clear-fault")
         assert await client.refused("set-controller", name="swing") == "calibrating"
         await client.until_over()
         assert (await client.ask("calibrations")).servo.highest == 0.2
 
-    tell(rig, story)
+    run_story(rig, story)
     assert rig.mode == "idle"
 
 
 def test_a_fault_meanwhile_does_not_keep_a_lease_from_ending(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
-        lease = await client.begin_trial(WIDE)
+        lease = await client.begin_trial(WIDE_LIMITS)
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(1.0)
         rig.pi.faults.inject("unplugged")
         rig.run_until_fault(3.0)
         await client.until_over()
         assert (await client.ask("calibrations")).servo.highest == 0.2
-        rig.run_for(1.0)  # a servo has time to arrive before its pulses end
+        rig.run_for(1.0)  # gives the servo time to arrive before its pulses end
 
-    tell(rig, story)
+    run_story(rig, story)
     assert (rig.mode, rig.pulse) == ("fault", 0.0)

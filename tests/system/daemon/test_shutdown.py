@@ -1,4 +1,4 @@
-"""A shutdown comes when it is asked for, however the process hangs."""
+"""Shutdown of a process that hangs in various ways."""
 
 import asyncio
 import dataclasses
@@ -22,7 +22,7 @@ from rigs.processes import PATIENCE, Daemon
 from fishd.config import Config
 from fishd.config.configuration import ControlSettings, TelemetrySettings
 from fishd.controllers.hold import Hold, HoldParameters
-from fishd.daemon.main import Daemon as Inside
+from fishd.daemon.main import Daemon as DaemonInProcess
 from fishd.hardware.base import Robot
 
 PROGRAM = """
@@ -44,43 +44,47 @@ print("up", flush=True)
 asked.wait()
 leave(7)
 """
-LIMIT = 3.0
-UNHURRIED = "module._MESSAGE_TIMEOUT_S = 10.0"
-"""For what the last resort says, and not how soon: what has come to its end is not waited for."""
+TIME_LIMIT_S = 3.0
+SLOW_LAST_WORDS = "module._MESSAGE_TIMEOUT_S = 10.0"
+"""Statement for tests of the message of the last resort, not of its time."""
 
 
 def ends(*hangs: Mapping[str, Any]) -> list[tuple[int, str]]:
-    """Exit status and output of processes that are asked to end within 3 s, each by itself and all
-    at the same time: what they do meanwhile is to wait.
+    """Return exit status and output of processes, each of which must end within 3 s of its signal.
+
+    They run at the same time, since each of them only waits.
     """
     with ExitStack() as stack:
-        processes = [stack.enter_context(started(**hang)) for hang in hangs]
+        processes = [stack.enter_context(start_process(**hang)) for hang in hangs]
         for process in processes:
             stack.callback(process.kill)
             assert process.stdout
             assert process.stdout.readline() == "up\n"
         time.sleep(0.1)
         pool = stack.enter_context(ThreadPoolExecutor(len(hangs)))
-        return list(pool.map(asked, processes, [hang.get("number", SIGTERM) for hang in hangs]))
+        return list(
+            pool.map(end_process, processes, [hang.get("number", SIGTERM) for hang in hangs])
+        )
 
 
-def started(
+def start_process(
     hang: str = "",
     release: str = "None",
     number: int = SIGTERM,
     limits: str = "",
     last: str = "",
 ) -> "subprocess.Popen[str]":
-    """limits, last: statements before and after the last resort is made"""
+    """Start a process. limits, last: statements before and after the last resort is set up"""
     program = PROGRAM.format(hang=hang, release=release, limits=limits, last=last)
     return subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
 
 
-def asked(process: "subprocess.Popen[str]", number: int) -> tuple[int, str]:
-    begun = time.monotonic()
+def end_process(process: "subprocess.Popen[str]", number: int) -> tuple[int, str]:
+    """Send a signal; return exit status and output."""
+    started = time.monotonic()
     process.send_signal(number)
     output = process.communicate(timeout=PATIENCE)[0]
-    assert time.monotonic() - begun <= LIMIT
+    assert time.monotonic() - started <= TIME_LIMIT_S
     return process.returncode, output
 
 
@@ -98,17 +102,17 @@ def test_a_process_that_hangs_lets_go_of_the_servo_and_ends() -> None:
         "threading.Lock().acquire(); import os; os.read(os.pipe()[0], 1)",
         "signal = __import__('signal'); signal.signal(15, lambda *_: None); time.sleep(60)",
     ]
-    limits = f"{UNHURRIED}; module._RELEASE_TIMEOUT_S = 10.0"
+    limits = f"{SLOW_LAST_WORDS}; module._RELEASE_TIMEOUT_S = 10.0"
     for status, output in ends(*({"hang": hang, "limits": limits} for hang in hangs)):
         assert (status, output.partition("\n")[0]) == (1, "released")
-        said = r"fishd hangs in .+: the servo is released and the process is ended"
-        assert re.search(said, output)
+        message = r"fishd hangs in .+: the servo is released and the process is ended"
+        assert re.search(message, output)
 
 
 @pytest.mark.realtime
 def test_a_servo_that_is_not_released_keeps_nobody_and_is_named() -> None:
     releases = ("time.sleep(60)", "1 / 0")
-    hang = {"hang": "time.sleep(60)", "limits": UNHURRIED}
+    hang = {"hang": "time.sleep(60)", "limits": SLOW_LAST_WORDS}
     for status, output in ends(*(hang | {"release": release} for release in releases)):
         assert (status, output.partition("\n")[0]) == (1, "released")
         assert "the servo may keep its pulses ('fishctl release' releases it)" in output
@@ -125,8 +129,8 @@ def test_a_busy_machine_has_time_for_the_last_line() -> None:
 @pytest.mark.realtime
 def test_last_words_that_hang_keep_nobody() -> None:
     hang = {"hang": "time.sleep(60)", "release": "time.sleep(60)"}
-    what = ("module.log.critical", "shutdown.last_words")
-    lasts = [f"{each} = lambda *arguments: time.sleep(60)" for each in what]
+    functions = ("module.log.critical", "shutdown.last_words")
+    lasts = [f"{name} = lambda *arguments: time.sleep(60)" for name in functions]
     assert [status for status, _ in ends(*(hang | {"last": last} for last in lasts))] == [1, 1]
 
 
@@ -155,7 +159,7 @@ def test_a_servo_without_a_countdown_comes_to_rest_before_it_is_released(countdo
     robot.log.clear()
 
     async def release() -> None:
-        daemon = Inside(Config(lockstep=True), print_status=False)
+        daemon = DaemonInProcess(Config(lockstep=True), print_status=False)
         daemon._loop = rig.loop
         daemon.release_at_once()
 
@@ -174,7 +178,7 @@ def test_an_answer_of_pigpiod_that_is_late_just_then_keeps_no_tail_from_neutral(
         widths: list[float] = []
 
         class Thawing:
-            """pigpiod answers again as soon as the first write has given up."""
+            """Servo whose pigpiod answers again after the first write has timed out."""
 
             def write(self, angle: float) -> None:
                 servo.write(angle)
@@ -187,12 +191,12 @@ def test_an_answer_of_pigpiod_that_is_late_just_then_keeps_no_tail_from_neutral(
             servo=SimpleNamespace(on=True), applied=0.5, robot=SimpleNamespace(servo=Thawing())
         )
 
-        async def come_to_rest() -> None:
-            daemon = Inside(Config(lockstep=True), print_status=False)
+        async def move_to_neutral() -> None:
+            daemon = DaemonInProcess(Config(lockstep=True), print_status=False)
             daemon._loop, daemon._clock = loop, SimpleNamespace(sleep=rest)  # type: ignore
             daemon._move_to_neutral()
 
-        asyncio.run(come_to_rest())
+        asyncio.run(move_to_neutral())
         assert servo.driver.counters()["servo_late_answers"] == 1
         assert widths == [1500]
 
@@ -204,13 +208,13 @@ def test_where_fishd_fails_the_servo_is_released_before_a_controller_is_closed(
 
     class Closing(Hold):
         def close(self) -> None:
-            done.append("closed")  # and it might never return
+            done.append("closed")  # a real `close` might never return
 
     async def fail() -> None:
         control = ControlSettings(address=f"ipc://{tmp_path}/control")
         telemetry = TelemetrySettings(address=f"ipc://{tmp_path}/telemetry")
         config = Config(lockstep=True, control=control, telemetry=telemetry)
-        with Inside(config, print_status=False) as daemon:
+        with DaemonInProcess(config, print_status=False) as daemon:
             loop = daemon._loop
             monkeypatch.setattr(loop.robot.servo, "release", lambda: done.append("released"))
             loop.set_controller("hold", Closing(HoldParameters(), loop.limits))

@@ -1,4 +1,4 @@
-"""The configuration: what is accepted, and what is said about what is not."""
+"""Configuration: accepted files, and the messages for refused files."""
 
 import json
 import time
@@ -16,10 +16,11 @@ from fishd.core.strict_yaml import YamlProblem, parse
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 7)
 )
-"""Each line nine times the one before."""
+"""YAML in which each line has nine times the values of the line before."""
 
 
-def complaint(text: str, tmp_path: Path) -> str:
+def error_message(text: str, tmp_path: Path) -> str:
+    """Return the message for a file with this text."""
     file = tmp_path / "fish.yaml"
     file.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
@@ -30,7 +31,7 @@ def complaint(text: str, tmp_path: Path) -> str:
     return message.replace(str(tmp_path) + "/", "")
 
 
-MANY = """\
+MANY_MISTAKES = """\
 tik: 0.05
 tick: 3
 plant:
@@ -55,17 +56,19 @@ KEYS = {
     11: "start.parameters.c", 12: "telemetry.address", 13: "control.address", 15: "lockstep",
     16: "panel.estop_gpio", 17: "tick", 18: "force_sensor.driver",
 }  # fmt: skip
-"""The key at fault in each wrong line."""
+"""Wrong key by line number."""
 
 
 def test_all_mistakes_of_a_file_are_found_in_the_order_of_its_lines(tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
-    file.write_text(MANY)
+    file.write_text(MANY_MISTAKES)
     listed = mistakes.find(file, ["plant.B=soft", "tick"])
     wrong = [mistake.removeprefix(f"{file}:") for mistake in listed if str(file) in mistake]
-    found = {int(line.partition(":")[0]): line.split(": ")[1] for line in reversed(wrong)}
-    assert found == KEYS
-    assert [int(line.partition(":")[0]) for line in wrong] == sorted([*KEYS, 16])  # both its pins
+    keys = {int(line.partition(":")[0]): line.split(": ")[1] for line in reversed(wrong)}
+    assert keys == KEYS
+    assert [int(line.partition(":")[0]) for line in wrong] == sorted(
+        [*KEYS, 16]
+    )  # both pins of line 16
     assert {mistake.partition(": ")[0] for mistake in listed[len(wrong) :]} == {
         "--set plant.B=soft",
         "--set tick",
@@ -176,7 +179,7 @@ start: {parameters: {C: 1}}
 telemetry: {address: localhost}
 => fish.yaml:1: telemetry.address: 'localhost' is not valid: tcp://HOST:PORT or ipc://PATH is needed
 """
-"""Each with what is said about it."""
+"""Bad files, each followed by its message."""
 
 
 @pytest.mark.parametrize(
@@ -194,7 +197,7 @@ telemetry: {address: localhost}
     ],
 )
 def test_a_bad_file_gets_a_line_with_a_remedy(text: str, message: str, tmp_path: Path) -> None:
-    assert message in complaint(text, tmp_path)
+    assert message in error_message(text, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -215,14 +218,14 @@ def test_a_bad_override_is_named_as_it_was_written(override: str, message: str) 
 
 
 def test_a_bomb_of_aliases_costs_milliseconds() -> None:
-    """Six levels of nine: half a million values from 300 letters."""
+    """The bomb has six levels of nine, half a million values in 300 characters."""
     costs = []
     for _ in range(3):
-        began = time.process_time()
+        started = time.process_time()
         with pytest.raises(YamlProblem):
             parse(BOMB)
-        costs.append(time.process_time() - began)
-    assert min(costs) < 0.2  # some 6 ms; all of it took half a minute
+        costs.append(time.process_time() - started)
+    assert min(costs) < 0.2  # takes 6 ms; reading all values took half a minute
 
 
 @given(st.text(max_size=60))
@@ -262,9 +265,9 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         (["robot=virtual-pi", "servo.driver=sysfs-pwm"], "servo.driver", "pigpiod"),
         (["virtual_pi.servo_scale=0"], "virtual_pi.servo_scale", "would not turn"),
         (
-            ["state_folder=~nobody-here/fish"],
+            ["state_folder=~no-such-user/fish"],
             "state_folder",
-            "this machine has no user 'nobody-here'",
+            "this machine has no user 'no-such-user'",
         ),
         (['state_folder="/var/\\0fish"'], "state_folder", "a path has no zero byte"),
     ],
@@ -289,7 +292,7 @@ def test_what_is_installed_on_a_pi_is_the_file_that_the_verbs_look_for() -> None
 
 @pytest.mark.parametrize("name", ["", " tank", "tank\n", "a\x1bb", "x" * 41])
 def test_a_name_is_short_printable_text(name: str, tmp_path: Path) -> None:
-    line = complaint(f"name: {json.dumps(name)}\n", tmp_path)
+    line = error_message(f"name: {json.dumps(name)}\n", tmp_path)
     assert line.startswith("fish.yaml:1: name: ")
     assert "a text of 1 to 40 printable characters (or null) is needed" in line
     assert load(None, ["name=Große Fische 2"]).name == "Große Fische 2"
@@ -297,7 +300,7 @@ def test_a_name_is_short_printable_text(name: str, tmp_path: Path) -> None:
 
 def test_an_observer_of_a_robot_needs_a_plant_of_its_own(tmp_path: Path) -> None:
     text = "robot: pi\nestimator:\n  kind: observer\n"
-    assert complaint(text, tmp_path) == (
+    assert error_message(text, tmp_path) == (
         "fish.yaml:3: estimator.kind: observer needs a model of this fish, but section plant is "
         "not set; run 'fishctl identify' to write it"
     )

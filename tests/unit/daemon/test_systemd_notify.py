@@ -1,4 +1,4 @@
-"""What systemd hears: ready with the first tick, the watchdog from ticks only, stopping."""
+"""Messages to systemd: ready with the first tick, the watchdog from ticks only, stopping."""
 
 import socket
 from collections.abc import Iterator
@@ -21,7 +21,8 @@ def systemd(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
         yield listener
 
 
-def heard(listener: socket.socket) -> list[str]:
+def read_messages(listener: socket.socket) -> list[str]:
+    """Return all messages that have arrived."""
     messages = []
     while True:
         try:
@@ -34,7 +35,7 @@ def test_the_first_tick_says_ready_and_later_ones_feed_the_watchdog(systemd: soc
     notifier = SystemdNotifier()
     for index in range(41):
         notifier.ticked(index * 0.05)
-    messages = heard(systemd)
+    messages = read_messages(systemd)
     assert messages[0] == "READY=1\nWATCHDOG=1"
     assert set(messages[1:]) == {"WATCHDOG=1"}
     assert 6 <= len(messages) <= 10  # several times in the two seconds that systemd waits
@@ -45,7 +46,7 @@ def test_without_ticks_the_watchdog_gets_nothing(systemd: socket.socket) -> None
     notifier = SystemdNotifier()
     notifier.status("swimming")
     notifier.stopping()
-    assert heard(systemd) == ["STATUS=swimming", "STOPPING=1"]
+    assert read_messages(systemd) == ["STATUS=swimming", "STOPPING=1"]
     notifier.close()
 
 
@@ -56,7 +57,7 @@ def test_a_watchdog_of_others_is_not_fed(
     notifier = SystemdNotifier()
     for index in range(1, 100):
         notifier.ticked(index * 0.05)
-    assert heard(systemd) == ["READY=1\nWATCHDOG=1"]
+    assert read_messages(systemd) == ["READY=1\nWATCHDOG=1"]
     notifier.close()
 
 
@@ -69,6 +70,6 @@ def test_a_deaf_systemd_stops_nothing(
     monkeypatch.delenv("NOTIFY_SOCKET")
     silent = SystemdNotifier()
     silent.ticked(1.0)
-    for each in (notifier, silent):
-        each.close()
-        each.close()
+    for closed_twice in (notifier, silent):
+        closed_twice.close()
+        closed_twice.close()

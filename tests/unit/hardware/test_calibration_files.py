@@ -1,4 +1,4 @@
-"""The dated files that calibrations are kept in: never overwritten, the newest is used."""
+"""Dated files of calibrations: never overwritten, and the newest is used."""
 
 import contextlib
 import datetime
@@ -36,9 +36,9 @@ def test_a_clock_gone_back_puts_no_older_one_in_force(
     folder = CalibrationFolder(tmp_path)
     for number in range(1, 5):
         folder.save(ForceCalibration(xx=float(number)), NOON - (number > 1) * step_back)
-        found = folder.newest(ForceCalibration)
-        assert found is not None
-        assert found[0].xx == number
+        newest = folder.newest(ForceCalibration)
+        assert newest is not None
+        assert newest[0].xx == number
     assert len(list(tmp_path.iterdir())) == 4
 
 
@@ -51,20 +51,20 @@ def test_a_time_zone_does_not_decide_which_is_newer(tmp_path: Path) -> None:
         ForceCalibration(xx=2.0), datetime.datetime(2026, 10, 25, 2, 10, tzinfo=winter)
     )
     assert "2026-10-25T011000" in later.name
-    found = folder.newest(ForceCalibration)
-    assert found is not None
-    assert found[1] == later
+    newest = folder.newest(ForceCalibration)
+    assert newest is not None
+    assert newest[1] == later
 
 
 FORCE = {"xx": 1.0, "xy": 0.0, "x0": 0.0, "yx": 0.0, "yy": 1.0, "y0": 0.0, "date": "2026-11-21"}
 SERVO = {"trim": 0.0, "direction": 1, "scale": 600.0, "lowest": -1.2, "highest": 1.2}
 
 
-def complaint(folder: Path, kind: type[ForceCalibration | ServoCalibration], text: str) -> str:
-    """What is said of a file with this text."""
+def error_message(folder: Path, kind: type[ForceCalibration | ServoCalibration], text: str) -> str:
+    """Return the message for a file with this text."""
     name = "force" if kind is ForceCalibration else "servo"
     path = folder / f"{name}-2027-01-01T000000.000000Z.yaml"
-    CalibrationFolder(folder).save(kind(), NOON)  # an older one, which does not stand in for it
+    CalibrationFolder(folder).save(kind(), NOON)  # an older file, which must not be used instead
     path.write_text(text)
     with pytest.raises(ConfigError) as refusal:
         CalibrationFolder(folder).newest(kind)
@@ -80,7 +80,7 @@ def complaint(folder: Path, kind: type[ForceCalibration | ServoCalibration], tex
 def test_a_file_without_one_of_its_keys_is_not_filled_in(tmp_path: Path, key: str) -> None:
     kind, whole = (ForceCalibration, FORCE) if key in FORCE else (ServoCalibration, SERVO)
     text = yaml.safe_dump({name: value for name, value in whole.items() if name != key})
-    assert f"{key} missing: " in complaint(tmp_path, kind, text)
+    assert f"{key} missing: " in error_message(tmp_path, kind, text)
 
 
 @pytest.mark.parametrize("length", range(0, 80, 20))
@@ -88,7 +88,7 @@ def test_a_torn_file_is_an_error(tmp_path: Path, length: int) -> None:
     _, path = CalibrationFolder(tmp_path).save(ForceCalibration(xx=1.5, xy=-0.25), NOON)
     text = path.read_text()
     assert length < text.index("loads:") - 1
-    assert complaint(tmp_path, ForceCalibration, text[:length])
+    assert error_message(tmp_path, ForceCalibration, text[:length])
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def test_a_torn_file_is_an_error(tmp_path: Path, length: int) -> None:
     ],
 )
 def test_a_file_that_is_no_calibration_is_an_error(tmp_path: Path, text: str, words: str) -> None:
-    assert words in complaint(tmp_path, ForceCalibration, text)
+    assert words in error_message(tmp_path, ForceCalibration, text)
 
 
 @pytest.mark.parametrize(
@@ -129,11 +129,11 @@ def test_a_file_that_makes_no_sense_is_an_error_that_says_where(
     changes: dict[str, object],
     words: str,
 ) -> None:
-    assert words in complaint(tmp_path, kind, yaml.safe_dump({**whole, **changes}))
+    assert words in error_message(tmp_path, kind, yaml.safe_dump({**whole, **changes}))
 
 
 def bounds(struct: type[Struct], name: str) -> object:
-    """What a field takes."""
+    """Return the type of a field, with its bounds."""
     info = inspect.type_info(struct)
     assert isinstance(info, inspect.StructType)
     kind = next(field.type for field in info.fields if field.name == name)
@@ -149,19 +149,19 @@ def test_a_file_of_before_uncertainties_were_kept_is_used_and_its_own_is_unknown
     tmp_path: Path,
 ) -> None:
     (tmp_path / "force-2026-11-21T120000.000000Z.yaml").write_text(yaml.safe_dump(FORCE))
-    found = CalibrationFolder(tmp_path).newest(ForceCalibration)
-    assert found is not None
-    assert found[0].thrust_ci95(0.025) is None
+    newest = CalibrationFolder(tmp_path).newest(ForceCalibration)
+    assert newest is not None
+    assert newest[0].thrust_ci95(0.025) is None
 
 
 def test_an_uncertainty_is_kept_with_its_calibration(tmp_path: Path) -> None:
     folder = CalibrationFolder(tmp_path)
-    known = ForceCalibration(covariance_x=(1e-4, -1e-5, 2e-4), covariance_y=(1e-4, 0.0, 1e-4))
-    folder.save(known, NOON)
-    found = folder.newest(ForceCalibration)
-    assert found is not None
-    assert found[0].covariance_x == known.covariance_x
-    assert found[0].thrust_ci95(0.025) == pytest.approx(1.96e-2 * 0.025)
+    calibration = ForceCalibration(covariance_x=(1e-4, -1e-5, 2e-4), covariance_y=(1e-4, 0.0, 1e-4))
+    folder.save(calibration, NOON)
+    newest = folder.newest(ForceCalibration)
+    assert newest is not None
+    assert newest[0].covariance_x == calibration.covariance_x
+    assert newest[0].thrust_ci95(0.025) == pytest.approx(1.96e-2 * 0.025)
 
 
 def test_a_folder_that_cannot_be_read_is_an_error_and_not_no_calibration(tmp_path: Path) -> None:
@@ -184,8 +184,8 @@ def test_a_file_without_a_date_in_its_name_is_ignored_and_told(tmp_path: Path, n
     servo, _ = folder.save(ServoCalibration(trim=3.0), NOON)
     assert folder.ignored() == []
     (tmp_path / name).write_text("xx: 7.0\n")
-    found = folder.newest(ForceCalibration), folder.newest(ServoCalibration)
-    assert [each and each[0] for each in found] == [force, servo]
+    newest = folder.newest(ForceCalibration), folder.newest(ServoCalibration)
+    assert [pair and pair[0] for pair in newest] == [force, servo]
     line = f"{tmp_path / name} is not a dated calibration file and is ignored"
     assert folder.ignored() == [line]
     _, path = folder.save(ForceCalibration(xx=3.0), NOON + HOUR)
@@ -194,7 +194,7 @@ def test_a_file_without_a_date_in_its_name_is_ignored_and_told(tmp_path: Path, n
 
 @contextlib.contextmanager
 def full_disk() -> Iterator[None]:
-    """No file can be given a byte, but made."""
+    """Limit the size of new files to 0 bytes."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, before[1]))
     try:

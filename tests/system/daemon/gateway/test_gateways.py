@@ -1,4 +1,4 @@
-"""The gateways of a real fishd: what happens to them does not happen to fishd."""
+"""Gateways of a real fishd, which survives all that happens to them."""
 
 import asyncio
 import contextlib
@@ -43,8 +43,8 @@ def daemon(tmp_path: Path) -> Iterator[Daemon]:
 
 
 @pytest.fixture(scope="module")
-def lasting(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """One that swims through several tests, whatever happens to its gateways."""
+def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    """Return a daemon that several tests share, and that swims through all of them."""
     with running(tmp_path_factory.mktemp("fishd"), *SWIMMING) as daemon:
         yield daemon
 
@@ -54,23 +54,25 @@ def restarts(daemon: Daemon, kind: str) -> float:
 
 
 @pytest.mark.realtime
-def test_a_gateway_that_dies_is_started_again_and_its_subscribers_go_on(lasting: Daemon) -> None:
-    before = restarts(lasting, "telemetry")
-    with Subscriber(lasting.telemetry) as subscriber:
+def test_a_gateway_that_dies_is_started_again_and_its_subscribers_go_on(
+    shared_daemon: Daemon,
+) -> None:
+    before = restarts(shared_daemon, "telemetry")
+    with Subscriber(shared_daemon.telemetry) as subscriber:
         missed = subscriber.until(mode="running")["missed"]
-        os.kill(both_gateways(lasting)["telemetry"], signal.SIGKILL)
+        os.kill(both_gateways(shared_daemon)["telemetry"], signal.SIGKILL)
         event = subscriber.until(kind="gateway")
         tick = subscriber.until(mode="running")
     assert event["message"] == (
         "the gateway of telemetry was started again: its process ended with status -9"
     )
     assert tick["missed"] == missed
-    assert restarts(lasting, "telemetry") == before + 1
+    assert restarts(shared_daemon, "telemetry") == before + 1
 
 
 @pytest.mark.realtime  # a subscriber has a second to come back
 def test_subscribers_hear_of_a_restart_however_long_the_new_gateway_takes(tmp_path: Path) -> None:
-    """It drops what waits for it when nobody has come back yet."""
+    """The gateway drops waiting messages if no subscriber has connected again."""
     slow = tmp_path / "slow"
     code = f"""
 import os, pathlib, sys, time
@@ -90,7 +92,7 @@ if "fishd.daemon.gateway" in sys.orig_argv:
         slow.touch()
         os.kill(both_gateways(daemon)["telemetry"], signal.SIGKILL)
         assert subscriber.message()["kind"] == "gateway"
-        # Its limit exceeded, it begins anew by itself; and says again that it serves.
+        # After exceeding a limit, the gateway is started again, and that is reported again.
         with attacking("idle-telemetry", daemon):
             wait_until(lambda: restarts(daemon, "telemetry") >= 2)
         assert "connections" in subscriber.message()["message"]
@@ -103,28 +105,30 @@ def test_while_the_gateway_of_telemetry_is_gone_requests_are_answered(daemon: Da
         assert fish.estop().mode == "estop"
 
 
-def test_a_client_of_a_gateway_that_died_is_answered_by_the_next_one(lasting: Daemon) -> None:
-    before = restarts(lasting, "control")
-    os.kill(both_gateways(lasting)["control"], signal.SIGKILL)
-    assert restarts(lasting, "control") == before + 1
+def test_a_client_of_a_gateway_that_died_is_answered_by_the_next_one(shared_daemon: Daemon) -> None:
+    before = restarts(shared_daemon, "control")
+    os.kill(both_gateways(shared_daemon)["control"], signal.SIGKILL)
+    assert restarts(shared_daemon, "control") == before + 1
 
 
 @pytest.mark.parametrize("kind", ["control", "telemetry"])
-def test_a_gateway_that_hangs_is_replaced_and_costs_no_tick(lasting: Daemon, kind: str) -> None:
-    before = lasting.status()
-    hung = both_gateways(lasting)[kind]
-    with Subscriber(lasting.telemetry, b"event") as subscriber:
+def test_a_gateway_that_hangs_is_replaced_and_costs_no_tick(
+    shared_daemon: Daemon, kind: str
+) -> None:
+    before = shared_daemon.status()
+    hung = both_gateways(shared_daemon)[kind]
+    with Subscriber(shared_daemon.telemetry, b"event") as subscriber:
         if kind == "control":
             subscriber.connected()
         os.kill(hung, signal.SIGSTOP)
-        wait_until(lambda: gateways(lasting).get(kind, hung) != hung)
+        wait_until(lambda: gateways(shared_daemon).get(kind, hung) != hung)
         event = subscriber.until(kind="gateway")
     number = MAX_UNANSWERED[kind]
     assert event["message"] == (
         f"the gateway of {kind} was started again: it left {number} heartbeats unanswered"
     )
     assert gone(hung)
-    after = lasting.status()
+    after = shared_daemon.status()
     assert after.counters[f"{kind}_restarts"] == before.counters.get(f"{kind}_restarts", 0) + 1
     assert after.mode == "running"
 
@@ -153,18 +157,20 @@ def test_an_estop_is_answered_while_every_gateway_is_stopped(daemon: Daemon) -> 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("what", ["control", "telemetry", "fork server"])
 def test_an_estop_is_answered_within_a_fifth_of_a_second_after_any_single_failure(
-    lasting: Daemon, what: str, number: signal.Signals, connected: bool
+    shared_daemon: Daemon, what: str, number: signal.Signals, connected: bool
 ) -> None:
-    pid = fork_server(lasting) if what == "fork server" else both_gateways(lasting)[what]
-    with Fish(lasting.endpoint) as fish:
+    pid = (
+        fork_server(shared_daemon) if what == "fork server" else both_gateways(shared_daemon)[what]
+    )
+    with Fish(shared_daemon.endpoint) as fish:
         if connected:
             fish.status()
         os.kill(pid, number)
-        begun = time.monotonic()
+        started = time.monotonic()
         fish.estop()
-        assert time.monotonic() - begun <= 0.2
+        assert time.monotonic() - started <= 0.2
     wait_until(lambda: gone(pid))
-    with Fish(lasting.endpoint, timeout=PATIENCE) as fish:
+    with Fish(shared_daemon.endpoint, timeout=PATIENCE) as fish:
         fish.clear_fault()
         fish.set_controller("swing")
 
@@ -179,10 +185,10 @@ def test_an_asyncio_client_has_its_estop_answered_then_too(daemon: Daemon) -> No
     assert asyncio.run(stop()) == "estop"
 
 
-def test_the_socket_for_an_estop_takes_nothing_else(lasting: Daemon) -> None:
-    path = Path(lasting.endpoint.removeprefix("ipc://") + ".estop")
+def test_the_socket_for_an_estop_takes_nothing_else(shared_daemon: Daemon) -> None:
+    path = Path(shared_daemon.endpoint.removeprefix("ipc://") + ".estop")
     assert path.stat().st_mode & 0o777 == 0o660
-    with lasting.estop_socket() as client:
+    with shared_daemon.estop_socket() as client:
         for request, error in (
             (b'{"v":1,"id":1,"op":"clear-fault"}', "unknown-op"),
             (b"estop", "bad-request"),
@@ -190,7 +196,7 @@ def test_the_socket_for_an_estop_takes_nothing_else(lasting: Daemon) -> None:
         ):
             client.send(request)
             assert json.loads(client.recv(2**16))["error"]["code"] == error
-    assert lasting.status().mode == "running"
+    assert shared_daemon.status().mode == "running"
 
 
 @pytest.mark.realtime
@@ -199,14 +205,14 @@ def test_a_fishd_whose_gateways_hang_ends_in_time(tmp_path: Path) -> None:
         hung = both_gateways(daemon)
         for pid in hung.values():
             os.kill(pid, signal.SIGSTOP)
-        begun = time.monotonic()
+        started = time.monotonic()
         assert daemon.end()[0] == 0
-        assert time.monotonic() - begun < 3.0
+        assert time.monotonic() - started < 3.0
         wait_until(lambda: all(gone(pid) for pid in hung.values()))
 
 
 def test_stopped_gateways_end_with_a_fishd_that_is_killed(tmp_path: Path) -> None:
-    """So that the next fishd can have their addresses."""
+    """The next fishd needs their addresses."""
     with running(tmp_path, *SWIMMING) as daemon:
         pids = [fork_server(daemon), *both_gateways(daemon).values()]
         for pid in pids:
@@ -225,7 +231,7 @@ def test_no_gateway_outlives_fishd(daemon: Daemon, number: int) -> None:
     wait_until(lambda: all(gone(pid) for pid in pids))
 
 
-@pytest.mark.realtime  # its limit to pass the last messages on is one of real time
+@pytest.mark.realtime  # the time for the last messages is limited in real time
 def test_a_signal_for_the_whole_group_leaves_the_gateways_to_fishd(daemon: Daemon) -> None:
     with Subscriber(daemon.telemetry) as subscriber:
         subscriber.until(mode="running")
@@ -237,7 +243,7 @@ def test_a_signal_for_the_whole_group_leaves_the_gateways_to_fishd(daemon: Daemo
 
 
 def attacker(name: str, daemon: Daemon, seconds: float) -> list[str]:
-    """The command that attacks a fishd for so long."""
+    """Return the command that attacks a fishd for `seconds`."""
     addresses = (daemon.telemetry, daemon.endpoint)
     return [sys.executable, str(ATTACKERS), name, *addresses, str(seconds)]
 
@@ -247,12 +253,12 @@ def attack(name: str, daemon: Daemon, seconds: float) -> None:
 
 
 def attacking(name: str, daemon: Daemon) -> Process:
-    """A context manager: an attack that lasts until what it brings about is seen."""
+    """Return a context manager: an attack that lasts until the context is left."""
     return Process(*attacker(name, daemon, PATIENCE))
 
 
 def memory(daemon: Daemon) -> float:
-    """Of fishd and its gateways, pages that they share counted once [MB]."""
+    """Return the memory of fishd and its gateways, with shared pages counted once [MB]."""
     total = 0
     for pid in (daemon.process.pid, fork_server(daemon), *both_gateways(daemon).values()):
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
@@ -261,18 +267,18 @@ def memory(daemon: Daemon) -> float:
 
 
 @pytest.mark.realtime
-def test_a_hundred_thousand_subscriptions_that_leave_cost_no_tick(lasting: Daemon) -> None:
-    before = lasting.status()
-    attack("subscriptions", lasting, 4.0)
-    after = lasting.status()
+def test_a_hundred_thousand_subscriptions_that_leave_cost_no_tick(shared_daemon: Daemon) -> None:
+    before = shared_daemon.status()
+    attack("subscriptions", shared_daemon, 4.0)
+    after = shared_daemon.status()
     assert (after.mode, after.missed) == ("running", before.missed)
-    assert memory(lasting) < 150.0
-    with Subscriber(lasting.telemetry, b"tick") as subscriber:
+    assert memory(shared_daemon) < 150.0
+    with Subscriber(shared_daemon.telemetry, b"tick") as subscriber:
         assert subscriber.message()["mode"] == "running"
 
 
-def test_a_frame_that_announces_8_gb_ends_its_connection(lasting: Daemon) -> None:
-    host, _, port = lasting.telemetry.removeprefix("tcp://").rpartition(":")
+def test_a_frame_that_announces_8_gb_ends_its_connection(shared_daemon: Daemon) -> None:
+    host, _, port = shared_daemon.telemetry.removeprefix("tcp://").rpartition(":")
     with socket.create_connection((host, int(port)), PATIENCE) as connection:
         greeting = b"\xff" + bytes(8) + b"\x7f\x03\x00NULL" + bytes(16) + b"\x00" + bytes(31)
         connection.sendall(greeting + b"\x04\x19\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB")
@@ -280,7 +286,7 @@ def test_a_frame_that_announces_8_gb_ends_its_connection(lasting: Daemon) -> Non
         with contextlib.suppress(ConnectionError):
             while connection.recv(4096):
                 pass
-    assert lasting.status().mode == "running"
+    assert shared_daemon.status().mode == "running"
 
 
 @pytest.mark.realtime
@@ -299,7 +305,7 @@ def test_an_estop_overtakes_the_requests_of_500_clients_that_never_read(daemon: 
     path = daemon.endpoint.removeprefix("ipc://")
     with attacking("silent-dealers", daemon) as clients:
         wait_until(lambda: Path("/proc/net/unix").read_text().count(path) > 500)
-        time.sleep(1.0)  # until each has sent all that there is room for
+        time.sleep(1.0)  # lets each fill its queue
         with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
             assert fish.estop().mode == "estop"
         assert clients.process.poll() is None
@@ -307,16 +313,16 @@ def test_an_estop_overtakes_the_requests_of_500_clients_that_never_read(daemon: 
 
 
 def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are_not(
-    lasting: Daemon,
+    shared_daemon: Daemon,
 ) -> None:
-    with lasting.socket() as hasty, Fish(lasting.endpoint, timeout=PATIENCE) as calm:
-        lasting.process.send_signal(signal.SIGSTOP)
+    with shared_daemon.socket() as hasty, Fish(shared_daemon.endpoint, timeout=PATIENCE) as calm:
+        shared_daemon.process.send_signal(signal.SIGSTOP)
         try:
             for number in range(1500):
                 hasty.send(b'{"v":1,"id":%d,"op":"config"}' % number)
             reply = json.loads(hasty.recv())  # while fishd answers nothing
         finally:
-            lasting.process.send_signal(signal.SIGCONT)
+            shared_daemon.process.send_signal(signal.SIGCONT)
         assert calm.status().mode == "running"
     assert reply["error"]["code"] == "busy"
     assert "of your requests are already waiting; slow down" in reply["error"]["message"]
@@ -324,18 +330,18 @@ def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are
 
 @pytest.mark.realtime
 def test_a_client_that_asks_again_as_soon_as_it_has_an_answer_is_never_refused(
-    lasting: Daemon,
+    shared_daemon: Daemon,
 ) -> None:
-    with Fish(lasting.endpoint, timeout=PATIENCE) as fish:
+    with Fish(shared_daemon.endpoint, timeout=PATIENCE) as fish:
         missed = fish.status().missed
         for _ in range(500):
             assert fish.status().missed == missed
 
 
 def test_a_long_name_of_an_operation_is_refused_before_anybody_looks_for_a_like_one(
-    lasting: Daemon,
+    shared_daemon: Daemon,
 ) -> None:
-    with lasting.socket() as client:
+    with shared_daemon.socket() as client:
         client.send(b'{"v":1,"id":1,"op":"%s"}' % (b"x" * 16_000))
         error = json.loads(client.recv())["error"]
     assert error["code"] == "bad-request"
@@ -354,8 +360,8 @@ def test_replies_longer_than_the_link_has_room_for_arrive_whole_and_hold_up_no_e
     variables = ("env", f"FISHD_POLICIES={folder}")
     with running(tmp_path, under=variables) as daemon, Fish(daemon.endpoint, timeout=60) as fish:
         for _ in range(2):
-            found = [policy.name for policy in fish.policies()]
-            assert len([name for name in found if name.startswith("copy")]) == 150
+            names = [policy.name for policy in fish.policies()]
+            assert len([name for name in names if name.startswith("copy")]) == 150
         assert fish.estop().mode == "estop"
 
 
@@ -385,11 +391,11 @@ def test_fishd_waits_for_the_end_of_its_gateways_without_a_real_time_priority(
     for pid in both_gateways(daemon).values():
         os.kill(pid, signal.SIGSTOP)
     daemon.process.send_signal(signal.SIGTERM)
-    seen = set()
+    policies = set()
     while daemon.process.poll() is None:
-        seen.add(policy())
+        policies.add(policy())
         time.sleep(0.02)
-    assert os.SCHED_OTHER in seen
+    assert os.SCHED_OTHER in policies
     assert daemon.process.returncode == 0
 
 
@@ -459,10 +465,10 @@ def test_gateways_that_hang_are_waited_for_together(
     async def begin_and_end() -> None:
         with contextlib.ExitStack() as stack:
             addresses = (f"ipc://{tmp_path}/control", f"ipc://{tmp_path}/telemetry")
-            made = Gateways(*addresses, stack)
-            while not (made.telemetry._serves and made._server.serves):
+            both = Gateways(*addresses, stack)
+            while not (both.telemetry._serves and both._server.serves):
                 await asyncio.sleep(0.01)
-            server = made._server._process.pid
+            server = both._server._process.pid
             hung.extend([server, *children(server)])
             for pid in hung[1:]:
                 os.kill(pid, signal.SIGSTOP)
@@ -489,7 +495,7 @@ def test_only_heartbeats_that_are_left_unanswered_count(answers: bool) -> None:
         ours, theirs = link.pair()
         with ours, theirs:
             peer._connect(ours)
-            for _ in range(6):  # it may take longer to start
+            for _ in range(6):  # its start may take longer
                 peer.beat()
             theirs.send(link.READY)
             await asyncio.sleep(0.001)
@@ -511,7 +517,7 @@ def test_a_gateway_that_ends_at_once_is_started_again_and_again_but_not_in_a_spi
     starts = 0
 
     class FailingServer:
-        """A fork server whose gateways end before they serve."""
+        """Fork server whose gateways end before they serve."""
 
         serves = True
 
@@ -523,15 +529,15 @@ def test_a_gateway_that_ends_at_once_is_started_again_and_again_but_not_in_a_spi
             starts += 1  # the other end of the link closes on return
 
     async def watch() -> tuple[float, int]:
-        begun = asyncio.get_running_loop().time()
+        started = asyncio.get_running_loop().time()
         gateway = Gateway(link.TELEMETRY, None, "", FailingServer())  # type: ignore[arg-type]
         while starts < 5:
             await asyncio.sleep(0.01)
-        took = asyncio.get_running_loop().time() - begun
+        duration = asyncio.get_running_loop().time() - started
         gateway.end()
         gateway.close()
-        return took, gateway.restarts
+        return duration, gateway.restarts
 
-    took, restarts = asyncio.run(watch())
-    assert took >= 4 * MIN_FAILED_PERIOD_S - 0.01
+    duration, restarts = asyncio.run(watch())
+    assert duration >= 4 * MIN_FAILED_PERIOD_S - 0.01
     assert restarts == 4

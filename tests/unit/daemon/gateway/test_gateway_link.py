@@ -1,4 +1,4 @@
-"""The messages between fishd and its gateways."""
+"""Messages between fishd and its gateways."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""An emulated ADS1115 behind an emulated /dev/i2c-N."""
+"""Emulated ADS1115 behind an emulated /dev/i2c-N."""
 
 from collections.abc import Iterator
 

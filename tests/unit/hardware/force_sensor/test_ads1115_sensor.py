@@ -1,4 +1,4 @@
-"""The force sensor on an emulated ADS1115, through the true driver: what each read says."""
+"""Force sensor on an emulated ADS1115, through the real driver: results of the reads."""
 
 import itertools
 
@@ -39,11 +39,11 @@ def test_every_range_gives_the_same_voltage(rig: ForceRig, full_scale: float) ->
 
 def test_a_window_of_50_ms_holds_at_least_eight_pairs() -> None:
     with ForceRig() as rig:
-        found = measurements(Ticks(rig.sensor()).run(5.0))
-    assert min(measured.samples for measured in found) >= 12
+        windows = measurements(Ticks(rig.sensor()).run(5.0))
+    assert min(measured.samples for measured in windows) >= 12
     with ForceRig(speed=100e3) as rig:
-        found = measurements(Ticks(rig.sensor()).run(5.0))
-    assert min(measured.samples for measured in found) >= 8
+        windows = measurements(Ticks(rig.sensor()).run(5.0))
+    assert min(measured.samples for measured in windows) >= 8
 
 
 def test_a_measurement_is_of_the_window_before_its_tick() -> None:
@@ -53,7 +53,7 @@ def test_a_measurement_is_of_the_window_before_its_tick() -> None:
         for index, measured in enumerate(measurements(ticks.run(5.0)), 1):
             now = index * TICK
             assert now - 0.01 < measured.time <= now
-            # The quiet time before a read, and a last conversion that would reach into it.
+            # The quiet time before a read, and a last conversion that would have reached into it.
             assert measured.fx == pytest.approx(0.1 * (now - TICK / 2), abs=0.1 * 5e-3)
 
 
@@ -81,8 +81,8 @@ def test_while_the_chip_is_away_reads_raise_and_soon_after_it_is_well(
 
 def test_a_slow_data_rate_repeats_the_last_measurement_with_its_own_time(rig: ForceRig) -> None:
     ticks = Ticks(rig.sensor(data_rate=16))
-    found = measurements(ticks.run(3.0)[4:])
-    repeated = [(a, b) for a, b in itertools.pairwise(found) if b.samples == 0]
+    windows = measurements(ticks.run(3.0)[4:])
+    repeated = [(a, b) for a, b in itertools.pairwise(windows) if b.samples == 0]
     assert repeated
     assert all((a.time, a.fx, a.fy) == (b.time, b.fx, b.fy) for a, b in repeated)
 
@@ -91,13 +91,15 @@ def test_a_slow_data_rate_repeats_the_last_measurement_with_its_own_time(rig: Fo
 def test_no_measurement_is_newer_than_its_tick_if_a_conversion_outlasts_it(data_rate: int) -> None:
     with ForceRig(noise=0.0) as rig:
         rig.volts["A0-A1"] = lambda t: 0.1 * t
-        found = Ticks(rig.sensor(data_rate=data_rate)).run(5.0)
+        results = Ticks(rig.sensor(data_rate=data_rate)).run(5.0)
     ages = [
-        index * TICK - item.time for index, item in enumerate(found, 1) if not isinstance(item, str)
+        index * TICK - item.time
+        for index, item in enumerate(results, 1)
+        if not isinstance(item, str)
     ]
     assert min(ages) >= 0.0
     assert len(ages) > 90
-    assert sum(item.samples for item in found if not isinstance(item, str)) >= 2 * data_rate
+    assert sum(item.samples for item in results if not isinstance(item, str)) >= 2 * data_rate
 
 
 def test_recalibrating_changes_the_next_read(rig: ForceRig) -> None:
@@ -113,14 +115,14 @@ def test_a_watch_adds_up_the_voltages_of_its_time(rig: ForceRig) -> None:
     sensor = rig.sensor(CALIBRATION)
     ticks = Ticks(sensor)
     ticks.run(0.5)
-    rig.volts["A0-A1"] = 0.6  # while the first sample of a pair is in already
+    rig.volts["A0-A1"] = 0.6  # after the first sample of a pair
     watch = sensor.watch()
-    found = measurements(ticks.run(2.0))
+    windows = measurements(ticks.run(2.0))
     sample = watch.close()
     rig.volts["A0-A1"] = 0.9
     ticks.run(0.5)
     assert watch.close() == sample
-    assert sample.pairs == sum(measured.samples for measured in found) - 1
+    assert sample.pairs == sum(measured.samples for measured in windows) - 1
     assert sample.seconds == pytest.approx(2.0, abs=0.01)
     assert (sample.vx, sample.vy) == pytest.approx((0.6, -0.25), abs=1e-5)
     assert (sample.fx, sample.fy) == pytest.approx(CALIBRATION.forces(0.6, -0.25), abs=1e-4)

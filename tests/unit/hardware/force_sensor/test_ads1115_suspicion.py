@@ -1,4 +1,4 @@
-"""When the force sensor says that its forces are not to be believed."""
+"""Conditions in which the force sensor marks its forces as suspect."""
 
 import pytest
 from rigs.force_rig import ForceRig, Ticks, measurements
@@ -69,8 +69,8 @@ def test_a_force_beyond_the_limit_is_suspected_though_the_mean_is_within(rig: Fo
 
 def test_a_suspicion_is_of_its_own_window_and_not_of_reads_without_a_sample(rig: ForceRig) -> None:
     rig.volts["A0-A1"] = lambda t: 3.0 if t < 0.1 else 0.5  # in the first conversion only
-    found = Ticks(rig.sensor(data_rate=8)).run(1.5)
-    read = [item for item in found if not isinstance(item, str)]
+    results = Ticks(rig.sensor(data_rate=8)).run(1.5)
+    read = [item for item in results if not isinstance(item, str)]
     assert "is clipped" in read[0].suspect
     assert [measured.samples for measured in read[1:4]] == [0, 0, 0]
     assert not any(measured.suspect or measured.extremes for measured in read[1:4])

@@ -1,4 +1,4 @@
-"""A force sensor of another package, whose driver may raise anything anywhere."""
+"""Force sensor of another package, whose driver may raise any exception in any method."""
 
 import itertools
 from typing import Any
@@ -16,7 +16,7 @@ GRAMS_PER_NEWTON = 102.0
 
 
 class Balance(ForceSensorDriver[ForceSensorSettings]):
-    """Weighs in grams, and raises `error` in the methods that `broken` names."""
+    """Driver that weighs in grams, and raises `error` in the methods that `broken` lists."""
 
     Settings = ForceSensorSettings
     raw_unit = "g"
@@ -25,29 +25,29 @@ class Balance(ForceSensorDriver[ForceSensorSettings]):
     error: BaseException = SystemExit(3)
     grams = 1.0
 
-    def _met(self, method: str) -> None:
+    def _fail_if_broken(self, method: str) -> None:
         if method in self.broken:
             raise self.error
 
     def open(self) -> None:
-        self._met("open")
+        self._fail_if_broken("open")
 
     def sample(self) -> Pair:
-        self._met("sample")
-        begun = self.clock.monotonic()
+        self._fail_if_broken("sample")
+        started = self.clock.monotonic()
         self.clock.sleep(0.002)
-        self.grams = -self.grams  # which no frozen code does
-        return Pair(begun, self.clock.monotonic(), self.grams, 0.5 * self.grams)
+        self.grams = -self.grams  # so that the code does not count as frozen
+        return Pair(started, self.clock.monotonic(), self.grams, 0.5 * self.grams)
 
     def close(self) -> None:
-        self._met("close")
+        self._fail_if_broken("close")
 
     def counters(self) -> dict[str, int]:
-        self._met("counters")
+        self._fail_if_broken("counters")
         return {"balance_taps": 3}
 
     def explain(self, error: Exception) -> str:
-        self._met("explain")
+        self._fail_if_broken("explain")
         return f"the balance says nothing: {error}"
 
     @classmethod
@@ -55,7 +55,7 @@ class Balance(ForceSensorDriver[ForceSensorSettings]):
         return 500.0
 
 
-def opened(**settings: Any) -> tuple[Balance, SampledSensor]:
+def open_balance(**settings: Any) -> tuple[Balance, SampledSensor]:
     clock = VirtualClock()
     balance = Balance(ForceSensorSettings(driver="balance", **settings), clock)
     sensor = SampledSensor(balance, ForceCalibration(), clock, threaded=False, tick=TICK)
@@ -69,18 +69,18 @@ def opened(**settings: Any) -> tuple[Balance, SampledSensor]:
 def test_whatever_it_raises_is_told_and_samples_come_again(
     broken: tuple[str, ...], error: BaseException
 ) -> None:
-    balance, sensor = opened()
+    balance, sensor = open_balance()
     times = (TICK * number for number in itertools.count(1))
     assert sensor.read(next(times)).samples
     balance.broken, balance.error = broken, error
-    said = set()
+    messages = set()
     for _ in range(10):
         try:
             sensor.read(next(times))
-        except SensorError as found:
-            said.add(str(found))
+        except SensorError as failure:
+            messages.add(str(failure))
     expected = "the balance says nothing" if "explain" not in broken else type(error).__name__
-    assert any(expected in line for line in said), said
+    assert any(expected in line for line in messages), messages
     balance.broken = ()
     assert any(sensor.read(next(times)).samples for _ in range(20))
     assert sensor.counters()["balance_taps"] == 3
@@ -90,7 +90,7 @@ def test_whatever_it_raises_is_told_and_samples_come_again(
 
 
 def test_until_it_is_calibrated_forces_are_in_its_own_unit() -> None:
-    balance, sensor = opened(force_limit=5.0)
+    balance, sensor = open_balance(force_limit=5.0)
     balance.grams = 60.0
     assert sensor.unit == "g"
     suspect = sensor.read(TICK).suspect

@@ -1,4 +1,4 @@
-"""The sampler and its sensor: no sample lies whatever goes wrong, and each has its right time."""
+"""Sampler and its sensor: after any error, samples have right values and times."""
 
 import math
 from typing import Any
@@ -18,28 +18,28 @@ from fishd.virtual.pi.i2c import Write
 CONFIG = 1
 
 
-def starts(rig: ForceRig) -> list[tuple[float, int]]:
-    """From now on: when each conversion is asked for, and the bits of the multiplexer."""
-    found: list[tuple[float, int]] = []
+def record_starts(rig: ForceRig) -> list[tuple[float, int]]:
+    """Return a list that gets the time and the multiplexer bits of each later conversion."""
+    starts: list[tuple[float, int]] = []
     transfer = rig.device.transfer
 
     def recorded(address: int, messages: Any) -> list[bytes]:
         for message in messages:
             data = message.data if isinstance(message, Write) else b""
             if len(data) == 3 and data[0] == CONFIG and data[1] & 0x80:
-                found.append((rig.clock.now, data[1] >> 4 & 7))
+                starts.append((rig.clock.now, data[1] >> 4 & 7))
         return transfer(address, messages)
 
     rig.device.transfer = recorded
-    return found
+    return starts
 
 
 def test_the_channels_are_read_in_the_order_x_y_y_x(rig: ForceRig) -> None:
     sampler = rig.sampler()
-    found = starts(rig)
+    starts = record_starts(rig)
     for _ in range(8):
         sampler.step()
-    assert [mux for _, mux in found] == [0, 3, 3, 0, 0, 3, 3, 0]
+    assert [mux for _, mux in starts] == [0, 3, 3, 0, 0, 3, 3, 0]
 
 
 @pytest.mark.parametrize("data_rate", [8, 128, 860])
@@ -52,15 +52,15 @@ def test_every_data_rate_gives_right_values(rig: ForceRig, data_rate: int) -> No
 def test_after_an_error_no_conversion_begins_before_the_last_one_has_ended() -> None:
     with ForceRig(seed=3) as rig:
         sampler = rig.sampler()
-        found = starts(rig)
+        starts = record_starts(rig)
         rig.faults.error_rate = 0.05
         last_error = -1.0
         for _ in range(3000):
             errors = sampler.errors
-            count = len(found)
+            count = len(starts)
             sampler.step()
-            if len(found) > count:
-                assert found[count][0] - last_error >= 1.25 / 860 + 1e-3
+            if len(starts) > count:
+                assert starts[count][0] - last_error >= 1.25 / 860 + 1e-3
             if sampler.errors > errors:
                 last_error = rig.clock.now
     assert sampler.errors > 100
@@ -90,7 +90,7 @@ def test_a_chip_that_is_still_busy_from_before_fishd_is_waited_for(rig: ForceRig
 
 
 def test_a_conversion_that_ends_when_a_stuck_chip_recovers_is_not_believed(rig: ForceRig) -> None:
-    """The start was ignored while it was stuck, so the code is an old one, of the other channel."""
+    """A stuck chip ignores the start, so its code is an old one of the other channel."""
     sampler = rig.sampler()
     for _ in range(200):
         rig.faults.inject("stuck-busy", 0.0047)
@@ -131,15 +131,15 @@ def test_each_measurement_is_right_none_is_of_the_future_and_it_recovers(
     with ForceRig(seed=seed) as rig:
         ticks = Ticks(rig.sensor())
         rig.faults.error_rate = error_rate
-        found: list[Measurement | str] = []
+        results: list[Measurement | str] = []
         for name, seconds, gap in faults:
             rig.faults.inject(name, seconds)
-            found += ticks.run(seconds + gap)
+            results += ticks.run(seconds + gap)
         rig.faults.clear()
-        found += ticks.run(0.7)
-    assert isinstance(found[-1], Measurement)
+        results += ticks.run(0.7)
+    assert isinstance(results[-1], Measurement)
     newest = -math.inf
-    for index, item in enumerate(found, 1):
+    for index, item in enumerate(results, 1):
         if isinstance(item, Measurement):
             assert newest <= item.time <= index * ticks.tick
             newest = item.time
@@ -189,6 +189,6 @@ def test_a_watch_finds_mean_and_deviation_of_all_pairs(parts: list[list[tuple[in
 def test_a_loop_of_any_tick_gets_most_of_the_possible_samples(rig: ForceRig, tick: float) -> None:
     ticks = Ticks(rig.sensor(tick=tick), tick)
     ticks.run(0.05)
-    found = ticks.run(2.0)
-    assert all(isinstance(item, Measurement) for item in found)
-    assert sum(item.samples for item in found if isinstance(item, Measurement)) >= 320
+    results = ticks.run(2.0)
+    assert all(isinstance(item, Measurement) for item in results)
+    assert sum(item.samples for item in results if isinstance(item, Measurement)) >= 320

@@ -1,4 +1,4 @@
-"""Errors of the bus and the chip: what the sampler says and does while they last, and after."""
+"""Errors of the bus and the chip: messages and behaviour of the sampler during and after them."""
 
 import gc
 import sys
@@ -18,13 +18,13 @@ from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 @pytest.mark.parametrize("delay", [0.0, 2e-3, 6e-3, 8.6e-3])
 def test_a_reset_amid_a_conversion_gives_an_error_and_no_value(rig: ForceRig, delay: float) -> None:
-    # These are the chip's own after a reset, so they do not show that there was one.
+    # These settings are those of the chip after a reset, so they do not reveal the reset.
     sampler = rig.sampler(data_rate=128, full_scale=2.048)
     take_pairs(sampler, rig, 0.1)
     sleep = rig.clock.sleep
 
     def break_down(seconds: float) -> None:
-        if seconds < 1 / 128:  # no conversion
+        if seconds < 1 / 128:  # not a conversion
             sleep(seconds)
             return
         sleep(delay)
@@ -44,7 +44,7 @@ def test_a_reset_amid_a_conversion_gives_an_error_and_no_value(rig: ForceRig, de
 def test_a_transfer_that_the_kernel_gave_up_without_an_exception_is_an_error(
     rig: ForceRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A raw file's write returns None for EAGAIN; the driver would take the start for done."""
+    """A raw file's write returns None for EAGAIN, which the driver would treat as success."""
     from Adafruit_PureIO import smbus
 
     emulated = smbus.open
@@ -136,17 +136,17 @@ def test_a_bus_that_is_missing_is_named_and_used_once_it_is_there() -> None:
         assert take_pairs(sampler, rig, 1.0)
 
 
-def leaves_garbage(act: Callable[[], object]) -> bool:
-    """Does an act leave objects to the collector every time that it is done?
+def leaves_garbage(function: Callable[[], object]) -> bool:
+    """Return whether every call of a function leaves objects to the garbage collector.
 
-    What another test has left behind, a thread for example, may leave some at any moment.
+    A single call may, because of something that another test left behind, such as a thread.
     """
 
     def leaves_some() -> bool:
         gc.collect()
         gc.disable()
         try:
-            act()
+            function()
             return gc.collect() > 0
         finally:
             gc.enable()
@@ -156,7 +156,7 @@ def leaves_garbage(act: Callable[[], object]) -> bool:
 
 @pytest.mark.parametrize("fault", ["stuck-busy", "nack"])
 def test_opening_the_bus_again_and_again_leaves_nothing_behind(rig: ForceRig, fault: str) -> None:
-    """Not even without the garbage collector, which the daemon keeps from running in a tick."""
+    """This holds without the garbage collector, which does not run in the daemon's ticks."""
     sampler = rig.sampler()
     take_pairs(sampler, rig, 0.1)
     rig.faults.inject(fault)
@@ -171,7 +171,7 @@ def test_opening_the_bus_again_and_again_leaves_nothing_behind(rig: ForceRig, fa
 
 
 def test_sampling_leaves_no_garbage(rig: ForceRig) -> None:
-    """The driver's own combined transfers do, thousands of objects per second."""
+    """The Adafruit driver's combined transfers leave thousands of objects per second."""
     sampler = rig.sampler()
     take_pairs(sampler, rig, 0.1)
     assert not leaves_garbage(lambda: take_pairs(sampler, rig, 1.0))
@@ -181,9 +181,9 @@ def test_a_hanging_bus_keeps_the_sampler_for_20_ms_not_the_kernels_second(rig: F
     sampler = rig.sampler()
     take_pairs(sampler, rig, 0.1)
     rig.faults.inject("timeout")
-    begun = rig.clock.now
+    started = rig.clock.now
     sampler.step()
-    assert rig.clock.now - begun < 0.03
+    assert rig.clock.now - started < 0.03
 
 
 def test_without_its_packages_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The INA219 through its true library and the INA226, on chips of registers on a virtual bus."""
+"""INA219 through its real library, and INA226, on emulated chips on a virtual bus."""
 
 import errno
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ TICK = 0.05
 
 
 class MeterRig(Board):
-    """A power meter beside the ADS1115, and a servo that takes what a test says."""
+    """Rig of a power meter next to an ADS1115, with a servo that takes `watts` of power."""
 
     def __init__(self, kind: str, shunt: float) -> None:
         super().__init__()
@@ -28,22 +28,22 @@ class MeterRig(Board):
         self.bus.attach(0x40, self.meter_chip)
         self.index = 0
 
-    def mean(self, begin: float, end: float) -> float:
-        """Of the power [W]."""
-        steps = [begin + (k + 0.5) / 200 * (end - begin) for k in range(200)]
+    def mean(self, start: float, end: float) -> float:
+        """Return the mean power between two times [W]."""
+        steps = [start + (k + 0.5) / 200 * (end - start) for k in range(200)]
         return sum(map(self.watts, steps)) / 200
 
     def driver(self, **settings: Any) -> Ina[Any]:  # type: ignore[override]
-        given = {"bus": ABSENT_BUS, "shunt": self.shunt, **settings}
+        values = {"bus": ABSENT_BUS, "shunt": self.shunt, **settings}
         if self.kind == "ina219":
-            return Ina219(Ina219Settings(**given), self.clock, sample_interval(TICK))
-        return Ina226(Ina226Settings(**given), self.clock, sample_interval(TICK))
+            return Ina219(Ina219Settings(**values), self.clock, sample_interval(TICK))
+        return Ina226(Ina226Settings(**values), self.clock, sample_interval(TICK))
 
     def meter(self) -> SampledPower:
         return SampledPower(self.driver(), self.clock, threaded=False, tick=TICK)
 
     def tick(self, meter: SampledPower) -> float:
-        """A tick as in virtual time: the meter is looked after all the time, then read."""
+        """Run a tick as in virtual time: let the meter sample until the tick, then read it."""
         self.index += 1
         while self.clock.monotonic() < self.index * TICK:
             meter.catch_up()
@@ -53,8 +53,8 @@ class MeterRig(Board):
 
 @pytest.fixture(params=[("ina219", 0.1), ("ina226", 0.01)], ids=["ina219", "ina226"])
 def rig(request: pytest.FixtureRequest) -> Iterator[MeterRig]:
-    with MeterRig(*request.param) as made:
-        yield made
+    with MeterRig(*request.param) as rig:
+        yield rig
 
 
 def test_it_tells_the_power_into_the_servo_to_a_step_of_its_own(rig: MeterRig) -> None:
@@ -73,7 +73,7 @@ def test_it_tells_what_flows_back_as_negative(rig: MeterRig) -> None:
 
 
 def test_short_bursts_go_unseen_in_no_part_of_a_tick(rig: MeterRig) -> None:
-    # 10 W for 2 ms in each 47 ms: nothing that is in step with the ticks.
+    # 10 W for 2 ms in each 47 ms, which is not in phase with the ticks.
     rig.watts = lambda time: 10.0 if time % 0.047 < 0.002 else 0.0
     meter = rig.meter()
     rig.tick(meter)
@@ -109,13 +109,13 @@ def test_a_short_loss_of_its_supply_costs_no_averaging_for_longer(
     rig.clock.sleep(4e-3)  # the next sample is due after 6.25 ms
     rig.faults.inject(fault, seconds)
     assert rig.meter_chip.config != averages
-    told = []
+    messages = []
     for _ in range(round(lasts / TICK)):
         try:
             power = rig.tick(meter)
         except SensorError as error:
-            told.append(str(error))
-    assert all("lost its settings: its supply was interrupted" in line for line in told)
+            messages.append(str(error))
+    assert all("lost its settings: its supply was interrupted" in line for line in messages)
     assert rig.meter_chip.config == averages
     assert power == pytest.approx(1.5, rel=0.01)
     assert meter.counters()["i2c_power_reconnects"] == 1

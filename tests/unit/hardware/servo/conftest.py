@@ -1,4 +1,4 @@
-"""An emulated pigpiod in virtual time."""
+"""Emulated pigpiod in virtual time."""
 
 from rigs.pigpio_rig import bench
 

@@ -1,4 +1,4 @@
-"""The pigpio servo on the emulated pigpiod, with the true client, in virtual time."""
+"""Servo on an emulated pigpiod, with the real client, in virtual time."""
 
 import pytest
 from msgspec.structs import replace
@@ -13,7 +13,7 @@ def test_a_write_makes_the_pulse_of_the_angle(bench: Bench) -> None:
     servo.write(0.5)
     assert bench.width == 1800
     bench.wait(TICK)
-    servo.write(-0.5001)  # 1199.94 µs: rounded, not cut off
+    servo.write(-0.5001)  # 1199.94 µs: rounded, not truncated
     assert bench.width == 1200
 
 

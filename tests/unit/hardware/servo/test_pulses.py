@@ -1,4 +1,4 @@
-"""From an angle to a pulse, as all servos have it: within limits, monotonic, calibrated."""
+"""Conversion of angles into pulses for all servos: within limits, monotonic, calibrated."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ from fishd.hardware.settings import ServoSettings
 
 
 class Recorder:
-    """A driver that keeps the pulses that it is told [µs]."""
+    """Driver that records its pulses [µs]."""
 
     def __init__(self, settings: ServoSettings, neutral: float, clock: Any, **_: Any) -> None:
         self.neutral = neutral
@@ -28,23 +28,23 @@ class Recorder:
 
 def servo(calibration: ServoCalibration | None = None, centre: float = 1500.0) -> Any:
     settings = ServoSettings(centre=centre)
-    given = calibration or ServoCalibration()
-    return CalibratedServo(Recorder, settings, given, VirtualClock(), threaded=False, tick=0.05)
+    applied = calibration or ServoCalibration()
+    return CalibratedServo(Recorder, settings, applied, VirtualClock(), threaded=False, tick=0.05)
 
 
 def raising(error: BaseException) -> Any:
-    """A servo whose driver raises that, whatever it is asked to do."""
+    """Return a servo whose driver raises this error in every method."""
 
     def fail(*_: float) -> None:
         raise error
 
-    made = servo()
-    made.driver.write = made.driver.off = made.driver.close = fail
-    return made
+    tested_servo = servo()
+    tested_servo.driver.write = tested_servo.driver.off = tested_servo.driver.close = fail
+    return tested_servo
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "message"),
     [
         (ServoError("the board is gone"), "the board is gone"),
         (OSError("device reports readiness"), "OSError: device reports readiness"),
@@ -53,11 +53,11 @@ def raising(error: BaseException) -> Any:
 )
 @pytest.mark.parametrize("method", ["release", "close"])
 def test_whatever_keeps_a_driver_from_ending_its_pulses_is_a_servo_error(
-    method: str, error: BaseException, told: str
+    method: str, error: BaseException, message: str
 ) -> None:
     with pytest.raises(ServoError) as caught:
         getattr(raising(error), method)()
-    assert str(caught.value) == told
+    assert str(caught.value) == message
 
 
 @pytest.mark.parametrize("method", ["release", "close"])
@@ -67,34 +67,34 @@ def test_a_true_ctrl_c_passes(method: str) -> None:
 
 
 def test_another_calibration_holds_from_the_next_write_on() -> None:
-    made = servo()
-    made.write(0.5)
-    made.recalibrate(ServoCalibration(trim=30, direction=-1, highest=0.3))
-    assert (made.driver.pulses, made.driver.neutral) == ([1800], 1530)
-    made.write(0.2)
-    assert made.driver.pulses == [1800, 1410]
-    assert made.calibration.direction == -1
+    tested_servo = servo()
+    tested_servo.write(0.5)
+    tested_servo.recalibrate(ServoCalibration(trim=30, direction=-1, highest=0.3))
+    assert (tested_servo.driver.pulses, tested_servo.driver.neutral) == ([1800], 1530)
+    tested_servo.write(0.2)
+    assert tested_servo.driver.pulses == [1800, 1410]
+    assert tested_servo.calibration.direction == -1
     with pytest.raises(ServoError, match="soft limits"):
-        made.write(0.4)
+        tested_servo.write(0.4)
 
 
 @pytest.mark.parametrize("angle", [math.nan, math.inf, -math.inf, 1.3, -1.3])
 def test_an_angle_that_is_not_finite_or_within_limits_never_reaches_a_driver(angle: float) -> None:
-    made = servo()
+    tested_servo = servo()
     with pytest.raises(ServoError, match="soft limits"):
-        made.write(angle)
-    made.write(0.2)
-    assert made.driver.pulses == [1620]
+        tested_servo.write(angle)
+    tested_servo.write(0.2)
+    assert tested_servo.driver.pulses == [1620]
 
 
 def test_a_calibration_whose_neutral_no_servo_takes_is_refused() -> None:
     too_far = ServoCalibration(trim=300)
     with pytest.raises(ServoError, match="needs a pulse of 2700 µs"):
         servo(too_far, centre=2400.0)
-    made = servo(centre=2400.0)
+    tested_servo = servo(centre=2400.0)
     with pytest.raises(ServoError, match="2700 µs"):
-        made.recalibrate(too_far)
-    assert (made.calibration, made.driver.neutral) == (ServoCalibration(), 2400)
+        tested_servo.recalibrate(too_far)
+    assert (tested_servo.calibration, tested_servo.driver.neutral) == (ServoCalibration(), 2400)
 
 
 servos = st.builds(
@@ -128,13 +128,13 @@ def test_an_angle_is_a_permitted_pulse_or_refused(servo: ServoSettings, angle: f
 
 @given(servos, st.floats(0, 1), st.floats(0, 1))
 def test_a_larger_angle_turns_further_that_way(
-    servo: ServoSettings, one: float, other: float
+    servo: ServoSettings, share_1: float, share_2: float
 ) -> None:
     lowest, highest = reach(servo)
-    if lowest > highest:  # centre and trim leave no pulse at all
+    if lowest > highest:  # centre and trim permit no pulse
         return
-    # Rounding could carry the very ends beyond 500 or 2500 µs.
-    inside = [lowest + (highest - lowest) * (0.001 + 0.998 * share) for share in (one, other)]
+    # Rounding could move the ends beyond 500 or 2500 µs.
+    inside = [lowest + (highest - lowest) * (0.001 + 0.998 * share) for share in (share_1, share_2)]
     first, second = sorted(inside)
     change = pulse_width(servo, second) - pulse_width(servo, first)
     assert servo.direction * change == pytest.approx(servo.scale * (second - first), abs=1e-6)

@@ -1,4 +1,4 @@
-"""The servo on software PWM: the true rpi-lgpio on emulated pins."""
+"""Servo on software PWM: the real rpi-lgpio on emulated pins."""
 
 import gc
 import sys
@@ -24,23 +24,23 @@ def pins() -> Iterator[Pins]:
     pins = Pins()
     with EmulatedLgpio(pins):
         yield pins
-        gc.collect()  # what a PWM does when it goes must not come later
+        gc.collect()  # the destructor of a PWM must not run later
 
 
 @pytest.fixture
 def servo(pins: Pins) -> Iterator[CalibratedServo]:
-    servo = opened()
+    servo = open_servo()
     yield servo
     servo.close()
 
 
-def opened(settings: RpiGpioSettings = SETTINGS, clock: Any = None) -> CalibratedServo:
+def open_servo(settings: RpiGpioSettings = SETTINGS, clock: Any = None) -> CalibratedServo:
     time = clock or VirtualClock()
     return CalibratedServo(RpiGpio, settings, ServoCalibration(), time, threaded=False, tick=0.05)
 
 
 def width(pins: Pins, gpio: int = 18) -> float:
-    """The pulse that a pin sends [µs]."""
+    """Return the pulse that a pin sends [µs]."""
     pwm = pins.pwm(gpio)
     return 0.0 if pwm is None else 1e4 * pwm[1] / pwm[0]
 
@@ -54,7 +54,7 @@ def test_an_angle_becomes_a_pulse(pins: Pins, servo: CalibratedServo) -> None:
 
 
 def test_at_a_higher_frequency_pulses_are_as_long(pins: Pins) -> None:
-    fast = opened(RpiGpioSettings(gpio=4, frequency=200.0))
+    fast = open_servo(RpiGpioSettings(gpio=4, frequency=200.0))
     fast.write(0.5)
     assert width(pins, 4) == pytest.approx(1800.0)
     assert pins.pwm(4) == (200.0, pytest.approx(36.0))
@@ -71,7 +71,7 @@ def test_a_release_ends_pulses_and_a_write_begins_again(pins: Pins, servo: Calib
     servo.write(0.5)
     servo.release()
     servo.release()
-    # Not stopped: RPi.GPIO would begin again at 1 kHz.
+    # Not stopped: RPi.GPIO would start again at 1 kHz.
     assert pins.pwm(18) == (50.0, 0.0)
     servo.write(0.5)
     assert width(pins) == pytest.approx(1800.0)
@@ -81,7 +81,7 @@ def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pin
     from RPi import GPIO
 
     clock = VirtualClock()
-    servo = opened(clock=clock)
+    servo = open_servo(clock=clock)
     GPIO.setup(23, GPIO.OUT, initial=GPIO.HIGH)
     servo.write(0.5)
     before = clock.now
@@ -96,7 +96,7 @@ def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pin
 
 def test_a_pin_that_another_process_holds_is_an_error_until_it_is_free(pins: Pins) -> None:
     pins.occupy(18)
-    servo = opened()
+    servo = open_servo()
     for _ in range(2):
         with pytest.raises(ServoError, match=r"^servo on GPIO 18: GPIO busy$"):
             servo.write(0.0)
@@ -132,20 +132,20 @@ def test_the_librarys_warnings_are_logged(pins: Pins, caplog: pytest.LogCaptureF
 
     caplog.set_level("INFO")
     gpio = header.load()
-    # A pull-up on a pin that has one already is what rpi-lgpio warns of.
+    # rpi-lgpio warns of a pull-up on a pin that already has one.
     header.claim(gpio, 2, gpio.IN, pull_up_down=gpio.PUD_UP)
     assert caplog.messages == ["GPIO 2: A physical pull up resistor is fitted on this channel!"]
-    with pytest.warns(Warning, match="physical pull up"):  # and is still on for everybody else
+    with pytest.warns(Warning, match="physical pull up"):  # it stays on for other code
         gpio.setup(3, gpio.IN, pull_up_down=gpio.PUD_UP)
     gpio.cleanup([2, 3])
 
 
 class TestALibraryThatCannotBeUsed:
-    """Each way of that is a line that says what to do."""
+    """Libraries that cannot be used: each case gives one line with the remedy."""
 
     def start(self) -> str:
         with pytest.raises(StartupError) as caught:
-            opened()
+            open_servo()
         assert "\n" not in str(caught.value)
         return str(caught.value)
 
@@ -174,7 +174,7 @@ class TestALibraryThatCannotBeUsed:
     def test_in_a_folder_that_lgpio_may_not_write_to(
         self, pins: Pins, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        # What lgpio does on import, where it cannot make its pipe.
+        # On import, lgpio does this if it cannot make its pipe.
         (tmp_path / "lgpio.py").write_text("open('/nowhere/.lgd-nfy-3', 'rb')\n")
         monkeypatch.delitem(sys.modules, "lgpio")
         monkeypatch.syspath_prepend(tmp_path)

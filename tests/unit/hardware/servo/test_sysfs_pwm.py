@@ -1,4 +1,4 @@
-"""The servo on the kernel's PWM: its pulses, what is left behind, calibrations, last resort."""
+"""Servo on the kernel's PWM: pulses, takeover of old pulses, release, last resort."""
 
 import contextlib
 from pathlib import Path
@@ -52,7 +52,7 @@ def test_close_switches_the_channel_off_and_gives_it_back(bench: Bench) -> None:
     bench.go_into_a_pulse()
     servo.close()
     servo.close()
-    assert bench.widths() == [1680.0, 0.0]  # and no shorter one between
+    assert bench.widths() == [1680.0, 0.0]  # and no shorter pulse in between
     assert bench.exported() == []
 
 
@@ -86,13 +86,13 @@ def test_a_channel_that_the_kernel_only_believes_to_be_on_gets_pulses(bench: Ben
 
 
 def test_the_last_resort_moves_to_neutral_then_stops(bench: Bench) -> None:
-    bench.write(bench.servo(), 0.5)  # of a fishd that was killed
+    bench.write(bench.servo(), 0.5)  # the pulses of a killed fishd
     bench.go_into_a_pulse()
-    begin = bench.clock.now
+    started = bench.clock.now
     assert bench.last_resort(1530.0) is True
     assert bench.widths() == [1800.0, 1530.0, 0.0]
     neutral, off = (time for time, _ in bench.kernel.pulses(PI5, 2).history[1:])
-    assert neutral - begin <= 0.02
+    assert neutral - started <= 0.02
     assert 0.28 <= off - neutral <= 0.32
 
 
@@ -113,7 +113,7 @@ def test_a_living_fishd_notices_the_last_resort(bench: Bench) -> None:
 
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
-    """A folder of plain files with a channel that is exported already."""
+    """Return a folder of plain files with an exported channel."""
     device = tmp_path / "devices" / PI5
     chip = device / "pwm" / "pwmchip3"
     channel = chip / "pwm2"
@@ -136,12 +136,12 @@ def on_true_files(settings: SysfsPwmSettings) -> CalibratedServo:
 
 
 def open_files(tree: Path) -> int:
-    """How many files of this tree are open here."""
-    found = 0
+    """Return the number of files of this tree that this process has open."""
+    count = 0
     for link in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(FileNotFoundError):  # that of the listing itself
-            found += link.readlink().is_relative_to(tree.parent.resolve())
-    return found
+        with contextlib.suppress(FileNotFoundError):  # the descriptor of the listing itself
+            count += link.readlink().is_relative_to(tree.parent.resolve())
+    return count
 
 
 def number(path: Path) -> int:

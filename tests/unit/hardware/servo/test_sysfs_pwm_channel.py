@@ -1,4 +1,4 @@
-"""How the servo's channel of the kernel's PWM is found, waited for, lost and found again."""
+"""Channel of the kernel's PWM for the servo: search, wait for udev, loss and return."""
 
 from typing import Any
 
@@ -59,7 +59,7 @@ def test_an_unexported_channel_is_an_error_and_then_opened_again(bench: Bench) -
         servo.write(0.2)
     assert servo.driver.counters() == {"servo_reconnects": 0}
     with pytest.raises(ServoError):
-        servo.write(0.2)  # exported again, but udev has not seen it yet
+        servo.write(0.2)  # exported again, but udev has not made it writable yet
     bench.clock.sleep(0.05)
     assert bench.write(servo, 0.2) == 1620.0
     assert servo.driver.counters() == {"servo_reconnects": 1}
@@ -140,13 +140,13 @@ def test_the_last_resort_brings_an_inverted_servo_to_neutral_too() -> None:
     bench = Bench()
     leave_inverted(bench)
     assert bench.last_resort() is True
-    assert max(bench.widths()) == 18_200  # and never high for good
+    assert max(bench.widths()) == 18_200  # and never high permanently
     assert bench.widths()[-2:] == [1500, 0]
     assert bench.last_resort() is False
 
 
 def leave_inverted(bench: Bench) -> int:
-    """Pulses of 18.2 ms, as another program's idea of 1.8 ms."""
+    """Make pulses of 18.2 ms, inverted pulses of 1.8 ms; return the number of the channel."""
     bench.shell("pwmchip1/export", 2)
     bench.clock.sleep(0.1)
     for name, value in (("period", 20_000_000), ("polarity", "inversed")):

@@ -1,4 +1,4 @@
-"""The servo on the kernel's PWM when single writes and reads fail: no step skips the next."""
+"""Servo on the kernel's PWM when single writes and reads fail: the other steps are done."""
 
 from typing import Any
 
@@ -18,14 +18,14 @@ def bench() -> Bench:
 
 @pytest.fixture(autouse=True)
 def servo(bench: Bench) -> CalibratedServo:
-    """Of a fishd that swims when something breaks."""
+    """Return the servo of a fishd that is swimming when a file breaks."""
     servo = bench.servo()
     assert bench.write(servo, 0.5) == 1800.0
     return servo
 
 
 def settled_width(bench: Bench) -> float:
-    """The pulse two periods from now [µs]."""
+    """Wait two periods; return the pulse then [µs]."""
     bench.clock.sleep(0.04)
     return bench.width()
 
