@@ -108,7 +108,9 @@ class CalibrationRequests:
             self._sampling -= 1
             sample = watch.close()
         if sample.pairs == 0:
-            raise Refused("no-samples", f"the force sensor gave nothing for {request.seconds:g} s")
+            raise Refused(
+                "no-samples", f"the force sensor delivered no sample for {request.seconds:g} s"
+            )
         self._forget_old_samples()
         self._sampled += 1
         sample = msgspec.structs.replace(sample, number=self._sampled)
@@ -116,7 +118,7 @@ class CalibrationRequests:
         return sample
 
     async def _rest_for(self, seconds: float) -> None:
-        """Wait; raises `Refused` as soon as a controller is active."""
+        """Wait; raise `Refused` as soon as a controller is active."""
         now = asyncio.get_running_loop().time
         end = now() + seconds
         while (remaining := end - now()) > 0.0:

@@ -18,29 +18,29 @@ Gpio = Annotated[int, Meta(ge=0, le=27)]
 class ForceSensorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The dual force sensor; its driver adds further keys."""
 
-    driver: Annotated[str, note("What reads the sensor: the name of a driver.")] = ""
+    driver: Annotated[str, note("Name of the driver of the sensor.")] = ""
     force_limit: Annotated[
-        float, unit("N", "A force beyond ± this is not believed.", gt=0, le=1e4, usual=100)
+        float, unit("N", "Largest force, ±; a larger one is not trusted.", gt=0, le=1e4, usual=100)
     ] = 10.0
     still: Annotated[
         float,
         unit(
             "N",
-            "Noise of single samples, rms, up to which a tare is permitted.",
+            "Largest noise of single samples, rms, with which a tare is permitted.",
             gt=0,
             le=1e3,
             usual=1,
         ),
     ] = 0.02
     tare_limit: Annotated[
-        float, unit("N", "Largest force that a tare takes away.", gt=0, le=1e4, usual=10)
+        float, unit("N", "Largest force that a tare may remove.", gt=0, le=1e4, usual=10)
     ] = 1.0
     frozen_after: Annotated[
         Annotated[float, Meta(ge=0.1, le=600)] | None,
         unit(
             "s",
-            "A channel whose code has not changed for this time is not trusted; null where the "
-            "signal is quieter than one step of the ADC.",
+            "Time after which a channel whose code has not changed is not trusted; null if the "
+            "signal has less noise than one step of the ADC.",
             usual=60,
         ),
     ] = 2.0
@@ -49,7 +49,7 @@ class ForceSensorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
 class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The tail servo: pulse = centre + trim + direction · scale · angle."""
 
-    driver: Annotated[str, note("What makes the pulses: the name of a driver.")] = ""
+    driver: Annotated[str, note("Name of the driver that makes the pulses.")] = ""
     centre: Annotated[float, unit("us", "Pulse of the servo's mid position.", ge=500, le=2500)] = (
         1500.0
     )
@@ -72,21 +72,21 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class PowerMeterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The power meter of the servo; its driver adds further keys."""
 
-    driver: Annotated[str, note("What reads the meter: the name of a driver.")] = ""
+    driver: Annotated[str, note("Name of the driver of the meter.")] = ""
 
 
 class PanelSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The operator's panel: an E-stop button and a status light."""
 
-    estop_gpio: Annotated[Gpio | None, note("Pin of the E-stop button; null without one.")] = None
+    estop_gpio: Annotated[Gpio | None, note("Pin of the E-stop button; null for none.")] = None
     estop_pressed: Annotated[
         Literal["low", "high"],
         note(
-            "Level of that pin while the button is pressed. With high, a button that opens a "
-            "contact to ground, a broken wire stops the fish too."
+            "Level of that pin while the button is pressed. high is for a button that opens a "
+            "contact to ground: then a broken wire also stops the fish."
         ),
     ] = "high"
-    led_gpio: Annotated[Gpio | None, note("Pin of the status light; null without one.")] = None
+    led_gpio: Annotated[Gpio | None, note("Pin of the status light; null for none.")] = None
 
 
 def _calibration_values(source: ServoSettings | ServoCalibration) -> dict[str, Any]:

@@ -52,16 +52,17 @@ class Ads1115Settings(ForceSensorSettings, frozen=True, forbid_unknown_fields=Tr
         Annotated[float, Meta(ge=-6.144, le=6.144)] | None,
         unit(
             "V",
-            "At or below, an amplifier is at the end of its supply: as if the ADC had clipped. "
-            "Between the pins of the input, so 0.1 for A0 alone; null for none.",
+            "Voltage of the input at or below which its amplifier counts as saturated, as if the "
+            "ADC had clipped; such as 0.1 for A0 alone; null for none.",
         ),
     ] = -3.2
     saturation_high: Annotated[
         Annotated[float, Meta(ge=-6.144, le=6.144)] | None,
         unit(
             "V",
-            "The same at or above. An amplifier at 3.3 V ends below a full_scale of 4.096 or "
-            "6.144, where the ADC itself does not clip; null for none.",
+            "Voltage of the input at or above which its amplifier counts as saturated; null for "
+            "none. With a full_scale of 4.096 or 6.144, an amplifier at 3.3 V saturates before "
+            "the ADC clips.",
         ),
     ] = 3.2
     data_rate: Annotated[

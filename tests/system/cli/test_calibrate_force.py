@@ -21,7 +21,7 @@ from rigs.processes import PATIENCE, Daemon
 from fishd.client import Fish
 
 GRAM = 9.80665e-3
-NOTHING = "not measured: the force sensor gave nothing"
+NOTHING = "not measured: the force sensor delivered no sample"
 PLAN = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.3), (0.0, -0.3)]
 
 
