@@ -46,21 +46,21 @@ class ActiveController:
         self.name, self.controller, self.fallback, self._is_new = name, controller, None, True
         self.wave = _wave_kind(name, controller, self.parameters)
         self.quantity_units = units
-        self.dispose(former, f"the controller before {name}")
+        self.close_controller(former, f"the controller before {name}")
 
     @property
     def quantities(self) -> dict[str, float]:
         """Quantities of the controller at its latest update; empty before its first one."""
         return {} if self._is_new else values_of(self.controller, self.quantity_units)
 
-    def dispose(self, controller: Controller[Any], what: str) -> None:
+    def close_controller(self, controller: Controller[Any], what: str) -> None:
         """Close a controller that will not be active again; what: its description for the log."""
         try:
             call_foreign(controller.close)
         except Exception as error:
             self._reporter.problem(f"{what} could not be closed", error)
 
-    def rest(self) -> None:
+    def activate_hold(self) -> None:
         """Make `hold` the active one, at neutral."""
         self.replace("hold", Hold(HoldParameters(), self._limits))
 

@@ -95,7 +95,7 @@ class Lease:
         if token == self._token:
             self._dormant = False
 
-    def run_out(self, moving: bool) -> LeaseHolder | None:
+    def end_if_expired(self, moving: bool) -> LeaseHolder | None:
         """End the active lease if its time is up, and return its holder; else return None.
 
         moving: whether a controller is active

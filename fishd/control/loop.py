@@ -172,7 +172,7 @@ class ControlLoop:
         late = self.statistics.add(self.seq, slot.now - slot.deadline, slot.missed, marks)
         if late:
             self.reporter.event("overrun", late, "warning", seq=self.seq, missed=slot.missed)
-            self.supervisor.overran(self.seq)
+            self.supervisor.note_overrun(self.seq)
         if self._notify:
             self._notify(started)
 
@@ -228,7 +228,7 @@ class ControlLoop:
     def expire_lease(self) -> None:
         """End the active lease if it has expired; fade to neutral if its holder drives the fish."""
         swims = self.supervisor.mode is Mode.RUNNING and self.lease.drives
-        former = self.lease.run_out(moving=swims)
+        former = self.lease.end_if_expired(moving=swims)
         if former and self.lease.expired:
             effect = "the fish fades to neutral" if swims else "none of its controllers is active"
             message = f"{self.lease.expired.message}: {effect}"
@@ -248,7 +248,7 @@ class ControlLoop:
     def close(self) -> None:
         """Close the active controller; no tick may follow."""
         self._cancel_pending()
-        self.active.rest()
+        self.active.activate_hold()
 
     @property
     def _servo_calibration(self) -> ServoCalibration | None:
@@ -259,20 +259,20 @@ class ControlLoop:
     ) -> None:
         if self._servo_calibration is not servo:
             self._cancel_pending()
-            message = f"{name} does not begin by itself any more: the servo has another calibration"
+            message = f"{name} will not start by itself: the servo has another calibration now"
             self.reporter.event("calibration", message, "warning")
         elif self.seq > rest:
             self._pending = None
             try:
                 self.set_controller(name, controller)
             except Exception as error:
-                self._fail("controller-error", f"controller {name} cannot begin", error)
+                self._fail("controller-error", f"controller {name} cannot be started", error)
 
     def _cancel_pending(self) -> None:
         if self._pending:
             _, name, controller, _ = self._pending
             self._pending = None
-            self.active.dispose(controller, f"{name}, which was to begin,")
+            self.active.close_controller(controller, f"the pending controller {name}")
 
     def _mode_changed(self, before: Mode) -> None:
         """Handle a change of mode, whatever caused it."""
@@ -283,7 +283,7 @@ class ControlLoop:
         if reason := self.supervisor.reason:
             self.lease.end(f"{mode}: {reason.message}")
         if mode is not Mode.RUNNING:
-            self.active.rest()
+            self.active.activate_hold()
             self._estimator.rest()
         self.reporter.mode(before, mode, self.supervisor.reason)
 

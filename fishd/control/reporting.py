@@ -63,8 +63,8 @@ class Reporter:
 
         units: unit of each parameter, by name
         """
-        does = "goes on with" if kind == "parameters" else "takes over with"
-        message = f"{name} {does} {_format_parameters(parameters, units)}"
+        verb = "continues with" if kind == "parameters" else "takes over with"
+        message = f"{name} {verb} {_format_parameters(parameters, units)}"
         self.event(kind, message, controller=name, parameters=parameters)
 
     def fallback(

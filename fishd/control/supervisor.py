@@ -110,7 +110,7 @@ class Supervisor:
             for code in ("sensor-stale", "sensor-range")
         )
 
-    def overran(self, seq: int) -> None:
+    def note_overrun(self, seq: int) -> None:
         """Note that a tick overran; too many among the latest ticks latch the fault."""
         self._overruns.append(seq)
         while self._overruns[0] <= seq - OVERRUN_WINDOW:

@@ -62,13 +62,15 @@ def narrow(spread: Randomisation, share: float, rig_share: float = 1.0) -> Rando
     return replace(spread, **ranges | {name: rig_share * ranges[name] for name in RIG_RANGES})
 
 
-def half_beats(config: Config) -> NDArray[np.float64]:
+def half_beat_thrusts(config: Config) -> NDArray[np.float64]:
     """Return the relative thrust of square waves by ticks of half a beat; that of 0 ticks is 0."""
-    return _half_beats(config.plant, config.amplitude_limit, config.tick)
+    return _half_beat_thrusts(config.plant, config.amplitude_limit, config.tick)
 
 
 @lru_cache(maxsize=64)  # a fish of a list is drawn again and again
-def _half_beats(plant: PlantParameters, amplitude: float, tick: float) -> NDArray[np.float64]:
+def _half_beat_thrusts(
+    plant: PlantParameters, amplitude: float, tick: float
+) -> NDArray[np.float64]:
     ticks = range(1, math.ceil(MAX_HALF_BEAT_S / tick) + 1)
     thrusts = [square_wave(plant, amplitude, 0.5 / (n * tick)).thrust for n in ticks]
     return np.array([0.0, *thrusts]) / max(thrusts)
@@ -117,7 +119,7 @@ class Imitation:
         env = SwimEnv(SimulatedLink(fish), config, self._environment)
         seen, _ = env.reset(seed=int(draw.integers(2**31)))
         learner = DeterministicPolicy(self._policy, env.perception, env.link.amplitude)
-        relative_thrust = half_beats(fish)
+        relative_thrust = half_beat_thrusts(fish)
         at_random = int(draw.integers(ticks // RANDOM_START_RATIO + 1)) if self._rounds else ticks
         longest = 2 * int(relative_thrust.argmax())
         half = int(draw.integers(2, longest + 2))
@@ -125,7 +127,7 @@ class Imitation:
         for tick in range(ticks):
             side = math.copysign(1.0, env.latest.side_time)
             elapsed = round(abs(env.latest.side_time) / config.tick)
-            right, weight = advice(relative_thrust, elapsed)
+            right, weight = advise_side(relative_thrust, elapsed)
             rows.append(seen)
             sides.append(right * side)
             weights.append(weight)
@@ -156,10 +158,10 @@ class Imitation:
         return float((weights * right).mean())
 
 
-def advice(relative_thrust: NDArray[np.float64], elapsed: int) -> tuple[float, float]:
+def advise_side(relative_thrust: NDArray[np.float64], elapsed: int) -> tuple[float, float]:
     """Return 1 to stay or -1 to reverse, and the cost of the other choice.
 
-    relative_thrust: as returned by `half_beats`
+    relative_thrust: as returned by `half_beat_thrusts`
     elapsed: ticks since the last reversal
     """
     now = min(elapsed, len(relative_thrust) - 2)

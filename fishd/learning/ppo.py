@@ -114,7 +114,7 @@ class Rollout(RolloutBuffer):
         """Compute them as in PPO; a void step has its value as outcome, and ends its episode."""
         if self.signal:
             fx, fy = self.forces[~self.void].T
-            cleaned = self.signal.of(fx, fy) - fx
+            cleaned = self.signal.estimate(fx, fy) - fx
             self.rewards[~self.void, 0] += self.reward_per_newton * cleaned
         self.rewards[self.void] = self.values[self.void]
         super().compute_returns_and_advantage(last_values, dones)

@@ -32,7 +32,7 @@ class ThrustSignal:
         self._ordinary = ORDINARY_THRUSTS * best
         self._past: deque[tuple[float, float]] = deque(maxlen=MEMORY_TICKS)
 
-    def of(self, fx: Forces, fy: Forces) -> Forces:
+    def estimate(self, fx: Forces, fy: Forces) -> Forces:
         """Return the thrust of each tick of a rollout, up to a constant [N], shape (ticks,).
 
         fx, fy: mean measured forces of each tick [N], shape (ticks,)

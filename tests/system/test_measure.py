@@ -65,7 +65,7 @@ def test_another_parameter_in_the_middle_ends_it_too(daemon: Daemon) -> None:
     assert daemon.fishctl("set-parameter", "C=0.1").returncode == 0
     status, _, err = measuring.finish()
     assert status == 1
-    assert "another client changed the controller: swing goes on with C=0.1" in err
+    assert "another client changed the controller: swing continues with C=0.1" in err
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

@@ -15,7 +15,7 @@ from common.report import progress, spread, table
 from fishd.config import Config
 from fishd.learning.env.environment import SwimEnv, best_thrust
 from fishd.learning.env.simulated_link import SimulatedLink
-from fishd.learning.run_folder.checkpoints import all_in, load_policy
+from fishd.learning.run_folder.checkpoints import list_all, load_policy
 from fishd.learning.run_folder.tables import best_so_far, read_evaluations
 from fishd.learning.train.jobs import Job
 from fishd.learning.train.training import train
@@ -83,7 +83,7 @@ def exploration(options: Namespace) -> str:
         points = read_evaluations(job.folder)
         shares = {point.steps: point.relative_thrust for point in points}
         best = best_so_far(points)[-1]
-        folders = [each for each in all_in(job.folder) if each.name.startswith("step-")]
+        folders = [each for each in list_all(job.folder) if each.name.startswith("step-")]
         found = [checkpoint(fish, each) for each in folders[1:]]
     rows = []
     for each in (found[0], *found[1:4:2], *found[7::8]):

@@ -30,7 +30,7 @@ def export(
     from fishd.controllers.policy.library import SUFFIX
     from fishd.learning.export import export as write
     from fishd.learning.run_folder import checkpoints
-    from fishd.learning.train.progress import summary
+    from fishd.learning.train.progress import format_summary
 
     if target and target.suffix != SUFFIX:
         raise PolicyError(f"{target}: the name of a policy file must end in {SUFFIX}")
@@ -52,7 +52,7 @@ def export(
     if exported.evaluation.stalled:
         click.echo("careful: it stalls without exploration")
     else:
-        click.echo(f"it swims with {summary(exported.evaluation)}")
+        click.echo(f"it swims with {format_summary(exported.evaluation)}")
     path = shlex.quote(str(exported.path))
     if exported.card.pictures:
         click.echo(f"it sees {exported.card.sees}; to let it swim: fishctl agent {path}")

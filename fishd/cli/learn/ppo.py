@@ -241,7 +241,7 @@ def _train(job: "Job", as_json: bool) -> int:
 
 def print_outcome(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
     """Print how a training ended; return the exit status."""
-    from fishd.learning.train.progress import NOT_COUNTED, describe_evaluation, minutes
+    from fishd.learning.train.progress import NOT_COUNTED, format_evaluation, format_minutes
 
     resume_command = f"fishctl learn ppo --resume {outcome.folder}"
     for option, address in (
@@ -272,11 +272,12 @@ def print_outcome(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
     remark = NOT_COUNTED if job.on == "simulation" else ""
     reason = f"; {outcome.message}" if outcome.message else ""
     echo(
-        f"{outcome.steps} steps in {minutes(outcome.tank_time)} of tank time{remark}{reason}",
+        f"{outcome.steps} steps in {format_minutes(outcome.tank_time)} of tank time"
+        f"{remark}{reason}",
         err=as_json,
     )
     if evaluation := outcome.best_evaluation:
-        echo(f"best: {describe_evaluation(evaluation).strip()}", err=as_json)
+        echo(f"best: {format_evaluation(evaluation).strip()}", err=as_json)
         relative_error = evaluation.error / evaluation.thrust if evaluation.error else 0.0
         if evaluation.relative_thrust * (1.0 - relative_error) > MAX_RELATIVE_THRUST:
             echo(
@@ -334,10 +335,10 @@ def _train_seeds(
 
 
 def _print_seed(seed: int, outcome: "Outcome", err: bool) -> None:
-    from fishd.learning.train.progress import describe_evaluation
+    from fishd.learning.train.progress import format_evaluation
 
     latest = outcome.latest_evaluation
-    result = f": {describe_evaluation(latest).strip()}" if latest else ""
+    result = f": {format_evaluation(latest).strip()}" if latest else ""
     is_finished = outcome.ended == "finished"
     ended = "" if is_finished else f" {outcome.ended}"
     reason = f" ({outcome.message})" if outcome.message else ""

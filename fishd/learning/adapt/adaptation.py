@@ -15,7 +15,7 @@ from fishd.lab.measurement import MEAN_REST_S, measure
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import simulate
 from fishd.learning.adapt import steps as do
-from fishd.learning.adapt.practice import MAX_TRAININGS, practise, simulated
+from fishd.learning.adapt.practice import MAX_TRAININGS, simulated_config, train_policy
 from fishd.learning.adapt.state import (
     FISH,
     POLICY,
@@ -83,7 +83,7 @@ class Adaptation:
         if state.square is None:
             self._search(state)
         if state.trained is None:
-            self._practise(state)
+            self._train(state)
         if state.verdict is None:
             self._compare(state)
             state.verdict = judge(state.contenders, self._model(state))
@@ -96,17 +96,17 @@ class Adaptation:
         with self._count_tank_time("excitation", "excitation"), self._session.recorded(path, _NOTE):
             experiment(self._session, seconds)
         state.excitation = path.name
-        self._done(f"excitation: {seconds:.0f} s of it are in {path.name}")
+        self._done(f"excitation: {seconds:.0f} s, recorded in {path.name}")
 
     def _fit(self, state: State) -> None:
         assert state.excitation
-        self._show.at(self._session.used, "fitting a fish to it; the fish rests")
+        self._show.at(self._session.used, "fitting a model of the fish, which rests")
         path = self._run.path / state.excitation
         identification, state.fitted = do.fit(path, self._session.amplitude, self._seed)
         self._run.experiment.write(FISH, identification.to_yaml("fishctl adapt"))
         explained = " and ".join(f"{channel.explained:.1%}" for channel in identification.channels)
         unused = "" if state.fitted.model.error is not None else ": too little to be used"
-        self._done(f"fit: it explains {explained} of F_x and F_y{unused}")
+        self._done(f"fit: explains {explained} of F_x and F_y{unused}")
         for remark in identification.remarks:
             self._show.warn(f"fishctl: careful: {remark}")
 
@@ -117,7 +117,7 @@ class Adaptation:
             state.swing = do.settle_swing(self._session, seconds)
         rung = state.swing
         lead = f", {rung.lead * 1e3:.0f} ms ahead" if rung.lead else ""
-        unsure = "" if rung.settled else "; its search was not over"
+        unsure = "" if rung.settled else "; its search was not finished"
         self._done(f"swing --C auto: C = {rung.C:g}{lead}{unsure}")
 
     def _search(self, state: State) -> None:
@@ -141,16 +141,16 @@ class Adaptation:
         state.square, used = do.best_of(search, state.trials, state.fitted, self._session.amplitude)
         state.disagrees = not used and state.fitted.model.error is not None
         tried = f"{len(state.trials)} square waves tried"
-        by = "they agree with the fit" if used else "by these alone"
-        by = "they disagree with the fit, which is not used" if state.disagrees else by
-        self._done(f"search: {tried}; best at {state.square:.4g} Hz, {by}")
+        basis = "in agreement with the fit" if used else "from these waves alone"
+        basis = "they contradict the fit, which is not used" if state.disagrees else basis
+        self._done(f"search: {tried}; best at {state.square:.4g} Hz, {basis}")
 
     def _model(self, state: State) -> Model:
         """Return the model of the fit, marked as rejected where the square waves disagree."""
         assert state.fitted
         return replace(state.fitted.model, is_rejected=state.disagrees)
 
-    def _practise(self, state: State) -> None:
+    def _train(self, state: State) -> None:
         assert state.fitted
         if state.fitted.model.error is None:
             state.trained = Trained(steps=0, refused="the fit explains too little to train on it")
@@ -163,7 +163,7 @@ class Adaptation:
             doing = f"training, {step + 1} of {self._steps} steps{more}; the fish rests"
             self._show.at(self._session.used, doing)
 
-        state.trained = trained = practise(
+        state.trained = trained = train_policy(
             self._config, state.fitted, self._run.path, self._steps, self._seed, progress
         )
         if trained.refused:
@@ -171,7 +171,7 @@ class Adaptation:
             self._show.warn(f"fishctl: careful: no policy takes part: {trained.refused}")
             return
         worst = "" if trained.worst is None else f", {trained.worst:.1%} on the worst tried"
-        cloud = f"{len(state.fitted.cloud)} fish of the fit's errors"
+        cloud = f"{len(state.fitted.cloud)} fish within the errors of the fit"
         self._done(f"training on {cloud}: {trained.relative_thrust:.1%} in simulation{worst}")
 
     def gaits(self, state: State) -> list[Gait]:
@@ -251,7 +251,7 @@ class Adaptation:
         assert state.fitted
         if state.fitted.model.error is None:
             return []
-        identified = simulated(self._config, state.fitted)
+        identified = simulated_config(self._config, state.fitted)
         return [
             simulate(replace(identified, plant=plant), gait.controller, gait.parameters).mean_thrust
             for plant in state.fitted.cloud[:_SIMULATED_FISH]

@@ -13,7 +13,7 @@ CLOUD_SIZE = 32
 """Number of fish in the cloud."""
 
 
-def cloud(
+def draw_cloud(
     identification: Identification, seed: int = 0, count: int = CLOUD_SIZE
 ) -> tuple[PlantParameters, ...]:
     """Return fish that agree with the data; the first is the identified one itself.
@@ -27,11 +27,11 @@ def cloud(
     draws = np.random.default_rng(seed).multivariate_normal(
         centre, identification.covariance, count - 1, method="eigh", check_valid="ignore"
     )
-    fitted = identified(identification)
+    fitted = identified_fish(identification)
     return (fitted, *(_fish(fitted, identification.names, z.tolist()) for z in draws))
 
 
-def identified(identification: Identification) -> PlantParameters:
+def identified_fish(identification: Identification) -> PlantParameters:
     """Return the identified fish."""
     return msgspec.convert(identification.plant, PlantParameters)
 

@@ -38,7 +38,7 @@ EVALUATION_INTERVAL, OTHER_FISH = 5, 3
 """Updates per evaluation, and number of fish of the cloud evaluated beside the identified one."""
 
 
-def settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
+def training_settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
     """Return the settings of the training."""
     return TrainingSettings(
         steps=steps,
@@ -52,14 +52,14 @@ def settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
     )
 
 
-def simulated(config: Config, fitted: Fitted) -> Config:
+def simulated_config(config: Config, fitted: Fitted) -> Config:
     """Return the configuration of the identified fish on its rig, with the real fish's loop."""
     best = best_square_wave(fitted.plant, config.amplitude_limit).thrust
     rig = replace(fitted.rig, noise=min(fitted.rig.noise, MAX_NOISE * best))
     return replace(config, robot="simulated", plant=fitted.plant, simulation=rig, start=Start())
 
 
-def practise(
+def train_policy(
     config: Config,
     fitted: Fitted,
     folder: Path,
@@ -78,20 +78,22 @@ def practise(
     """
     best: Outcome | None = None
     display = _Steps(progress)
-    message = "in no evaluation did it swim"
+    message = "it swam in no evaluation"
     for index in range(MAX_TRAININGS):
         place = folder / (TRAINING if index == 0 else f"{TRAINING}-{index + 1}")
         if place.exists():
             shutil.rmtree(place)
-        task = settings(fitted, steps, (seed + index) % 2**32)
-        outcome = train(Job(config=simulated(config, fitted), settings=task, folder=place), display)
+        task = training_settings(fitted, steps, (seed + index) % 2**32)
+        outcome = train(
+            Job(config=simulated_config(config, fitted), settings=task, folder=place), display
+        )
         message = outcome.message or message
         if outcome.best and (best is None or _merit(outcome) > _merit(best)):
             best = outcome
         if best and _merit(best) >= GOOD_MERIT:
             break
     if best is None or best.best is None or best.best_evaluation is None:
-        return Trained(steps=display.steps, refused=f"nothing came of the training: {message}")
+        return Trained(steps=display.steps, refused=f"the training gave no policy: {message}")
     try:
         export(best.best, folder / POLICY, note="of fishctl adapt")
     except PolicyError as error:

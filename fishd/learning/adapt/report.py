@@ -160,7 +160,7 @@ def page(state: State, picture: bytes, again: str) -> str:
         "<h1>A fish and its best gait</h1>",
         f'<p class="claim">{escape(_sentence(state.verdict.claim))}</p>',
         f"<p>{state.tank_time:.0f} s of tank time: {escape(minutes)}.</p>",
-        f"<p>To have it again: <code>{escape(again)}</code></p>",
+        f"<p>Command for this gait: <code>{escape(again)}</code></p>",
         f'<img alt="fit, search, training, comparison" src="data:image/png;base64,{image}">',
         "<h2>In the tank</h2>",
         _table(*_contenders(state)),

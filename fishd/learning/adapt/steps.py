@@ -21,7 +21,7 @@ from fishd.lab.optimise.trials import (
     trial_durations,
 )
 from fishd.lab.session import Session
-from fishd.learning.adapt.cloud import cloud, identified
+from fishd.learning.adapt.cloud import draw_cloud, identified_fish
 from fishd.learning.adapt.prior import (
     combine,
     correlation_of_waves,
@@ -61,7 +61,7 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
                 "forces are mostly noise, or do not follow the commands; see "
                 "fishctl plot and fishctl identify with --plot"
             )
-    plant = identified(identification)
+    plant = identified_fish(identification)
     model = model_of(identification)
     if not best_square_wave(plant, amplitude).thrust > 0.0:
         model = replace(model, error=None)
@@ -70,7 +70,7 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
         plant=plant,
         rig=msgspec.convert(identification.simulation, SimulationSettings),
         offset=max(offset.high - offset.value, 0.5 * drift),
-        cloud=cloud(identification, seed),
+        cloud=draw_cloud(identification, seed),
         model=model,
         found=identification.to_builtins(),
     )

@@ -184,7 +184,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             self.advance(angle) for _ in range(int(draw.integers(self.settings.longest_start + 1)))
         )
         self._dwell.activate(self.latest.instruction_angle)
-        return self._seen(), self._info(lost)
+        return self._agent_inputs(), self._info(lost)
 
     def _adapt_to(self, fish: Config) -> None:
         """Use the scale of the thrust, and the shortest dwell, of the fish that swims now."""
@@ -208,7 +208,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         info = self._info(lost)
         truncated = self._steps >= self.settings.episode or lost + info["blind"] > 0
         self._paused = 0.0
-        return self._seen(), reward, False, truncated, info
+        return self._agent_inputs(), reward, False, truncated, info
 
     def swim(self, angle: float) -> int:
         """Swim one tick at an angle [rad], or at the previous one if it would reverse too soon.
@@ -289,7 +289,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         waited = self.latest.time - before
         self._paused += waited
         self.tank_time += waited
-        return self._seen()
+        return self._agent_inputs()
 
     def close(self) -> None:
         """Leave the fish at neutral."""
@@ -320,7 +320,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             "the camera a higher rate"
         )
 
-    def _seen(self) -> Vector:
+    def _agent_inputs(self) -> Vector:
         return self.perception.vector(self.latest, self._shown)
 
     def _check_open(self) -> None:

@@ -116,7 +116,7 @@ def save(
     return final
 
 
-def all_in(folder: Path) -> list[Path]:
+def list_all(folder: Path) -> list[Path]:
     """Return the checkpoints of a run by steps; a `best` is before a `step` of the same steps."""
     named = [(_NAME.fullmatch(path.name), path) for path in folder.glob("*-*")]
     checkpoints = [(int(name[2]), name[1] == "step", path) for name, path in named if name]
@@ -125,7 +125,7 @@ def all_in(folder: Path) -> list[Path]:
 
 def newest(folder: Path) -> Path:
     """Return the checkpoint with most steps of a run folder; raises `CheckpointError`."""
-    checkpoints = all_in(folder)
+    checkpoints = list_all(folder)
     if not checkpoints:
         raise CheckpointError(
             f"{folder}: it contains no checkpoint: the training ended before the first one, or "
@@ -136,7 +136,7 @@ def newest(folder: Path) -> Path:
 
 def best(folder: Path) -> Path | None:
     """Return the checkpoint that swam best; None where no policy of the run has swum."""
-    checkpoints = [path for path in all_in(folder) if path.name.startswith("best")]
+    checkpoints = [path for path in list_all(folder) if path.name.startswith("best")]
     # After a kill, the previous best may remain.
     return max(checkpoints, key=_write_time, default=None)
 
@@ -167,7 +167,7 @@ def refuse_several(folder: Path) -> None:
         )
 
 
-def sweep(folder: Path) -> None:
+def remove_partial(folder: Path) -> None:
     """Remove half-written and half-removed files of a killed writer; nothing complete is lost."""
     for replaced in folder.glob(".*.replaced"):
         final = folder / replaced.name.removeprefix(".").removesuffix(".replaced")

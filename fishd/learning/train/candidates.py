@@ -64,7 +64,7 @@ class Candidates:
         """Add a candidate, which may have swum before."""
         self.remaining.append(candidate)
 
-    def count(self, candidate: Candidate, swim: Swim) -> None:
+    def add_swim(self, candidate: Candidate, swim: Swim) -> None:
         """Add a swim to the figures of a candidate; remove the candidate if it stalls."""
         candidate.frequency, candidate.fullness, candidate.stalled = (
             swim.frequency,
@@ -83,7 +83,7 @@ class Candidates:
             candidate.swims += 1
             candidate.thrust += (swim.thrust - candidate.thrust) / candidate.swims
 
-    def error(self, candidate: Candidate) -> float:
+    def ci95(self, candidate: Candidate) -> float:
         """Return the half-width of the 95 % interval of its thrust, infinite before a swim [N].
 
         The errors of all swims are assumed to have the same standard deviation, which is estimated
@@ -130,7 +130,7 @@ class Candidates:
         return [candidate for candidate in self.remaining if candidate.swims]
 
     def _lower(self, candidate: Candidate) -> float:
-        return candidate.thrust - self.error(candidate)
+        return candidate.thrust - self.ci95(candidate)
 
     def _upper(self, candidate: Candidate) -> float:
-        return candidate.thrust + self.error(candidate)
+        return candidate.thrust + self.ci95(candidate)

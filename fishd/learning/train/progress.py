@@ -49,17 +49,17 @@ class ShownDisplay(Display):
 
     def imitated(self, number: int, rounds: int, right: float) -> None:
         """Print one line."""
-        self._show.done(imitation(number, rounds, right), self._steps)
+        self._show.done(format_imitation(number, rounds, right), self._steps)
 
     def step(self, tank_time: float) -> None:
         """Advance the bar by one step."""
         self._steps += 1
-        self._show.at(self._steps, f"{self._figures}  tank {minutes(tank_time)}")
+        self._show.at(self._steps, f"{self._figures}  tank {format_minutes(tank_time)}")
 
     def explored(self, thrust: float, relative_thrust: float, frequency: float) -> None:
         """Show how the fish swam with exploration, until the first evaluation."""
         if not self._was_evaluated:
-            self._figures = figures(thrust, relative_thrust, frequency)
+            self._figures = format_figures(thrust, relative_thrust, frequency)
 
     def evaluated(self, evaluation: "Evaluation") -> None:
         """Print one line.
@@ -67,39 +67,41 @@ class ShownDisplay(Display):
         In simulation the policy is called the best only if the figure shown is higher, too.
         """
         self._was_evaluated = True
-        self._figures = summary(evaluation)
+        self._figures = format_summary(evaluation)
         merit = round(evaluation.merit, 3)
         better = evaluation.best and (evaluation.error is not None or merit > self._best)
         self._best = merit if better else self._best
-        line = describe_evaluation(evaluation) + (", the best so far" if better else "")
+        line = format_evaluation(evaluation) + (", the best so far" if better else "")
         self._show.done(line, self._steps)
 
 
-def imitation(number: int, rounds: int, right: float) -> str:
+def format_imitation(number: int, rounds: int, right: float) -> str:
     """Format a round of imitation: `imitation 3 of 8: 92.1% right`."""
     return f"imitation {number} of {rounds}: {right:.1%} right"
 
 
-def describe_evaluation(evaluation: "Evaluation") -> str:
+def format_evaluation(evaluation: "Evaluation") -> str:
     """Format an evaluation in one line."""
-    when = f"{evaluation.steps:7d} steps, {minutes(evaluation.tank_time):>8} in the tank"
+    when = f"{evaluation.steps:7d} steps, {format_minutes(evaluation.tank_time):>8} in the tank"
     if evaluation.swam is None:
         when += NOT_COUNTED
     if evaluation.swam is not None and evaluation.policy != evaluation.steps:
         when += f", policy of {evaluation.policy} steps"
     others = f", worst of other fish {evaluation.worst:.1%}" if evaluation.worst is not None else ""
-    return f"{when}: {summary(evaluation)}{others}"
+    return f"{when}: {format_summary(evaluation)}{others}"
 
 
-def summary(evaluation: "Evaluation") -> str:
+def format_summary(evaluation: "Evaluation") -> str:
     """Format the figures of an evaluation, or state that the policy does not swim."""
     if evaluation.stalled:
         return "stalled: it does not swim"
     error = evaluation.error
-    return figures(evaluation.thrust, evaluation.relative_thrust, evaluation.frequency, error)
+    return format_figures(
+        evaluation.thrust, evaluation.relative_thrust, evaluation.frequency, error
+    )
 
 
-def figures(
+def format_figures(
     thrust: float, relative_thrust: float, frequency: float, error: float | None = None
 ) -> str:
     """Format figures: `25.1 mN  97.8%  1.67 Hz`, or `25.1 ± 0.3 mN  97.8%  1.67 Hz`."""
@@ -107,7 +109,7 @@ def figures(
     return f"{thrust * 1e3:.1f}{known} mN  {relative_thrust:.1%}  {frequency:.2f} Hz"
 
 
-def minutes(seconds: float) -> str:
+def format_minutes(seconds: float) -> str:
     """Format a time: `6:40`, or `1:06:40`."""
     whole = round(seconds)
     hours, rest = divmod(whole, 3600)

@@ -230,7 +230,7 @@ class RunRecorder:
     def _resume(self) -> None:
         """Continue from the newest checkpoint; raises `ConfigError` and `CheckpointError`."""
         job, model = self._job, self._model
-        checkpoints.sweep(job.folder)
+        checkpoints.remove_partial(job.folder)
         self.checkpoint = checkpoints.newest(job.folder)
         state = checkpoints.read_state(self.checkpoint)
         if state.on != job.on:

@@ -116,7 +116,7 @@ def _train(job: Job, stop: Callable[[], bool]) -> Outcome:
     from fishd.learning.train.training import train
 
     try:
-        if checkpoints.all_in(job.folder):
+        if checkpoints.list_all(job.folder):
             finished = _read_finished(job)
             if finished:
                 return finished
@@ -133,7 +133,7 @@ def _read_finished(job: Job) -> Outcome | None:
     """Return the outcome of a finished seed whose process was killed; None if not finished."""
     from fishd.learning.run_folder import checkpoints
 
-    checkpoints.sweep(job.folder)
+    checkpoints.remove_partial(job.folder)
     newest = checkpoints.newest(job.folder)
     state = checkpoints.read_state(newest)
     if not state.is_finished(job.settings.steps):

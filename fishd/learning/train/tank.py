@@ -62,7 +62,7 @@ class TankEvaluations:
                 policy.load_state_dict(candidate.parameters["policy"])
                 swim = swims.swim(self._policy())
                 self._swum.append(candidate)
-                self._candidates.count(candidate, swim)
+                self._candidates.add_swim(candidate, swim)
         except Stopped:
             pass
         finally:
@@ -100,7 +100,7 @@ class TankEvaluations:
             tank_time=self._env.tank_time,
             swam=candidate.swam,
             thrust=thrust,
-            error=None if candidate.stalled else self._candidates.error(candidate),
+            error=None if candidate.stalled else self._candidates.ci95(candidate),
             relative_thrust=thrust / self._env.best_thrust,
             frequency=candidate.frequency,
             fullness=candidate.fullness,

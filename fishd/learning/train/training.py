@@ -38,7 +38,7 @@ from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.thrust_signal import ThrustSignal
 from fishd.learning.train.jobs import Ended, Job, Outcome
-from fishd.learning.train.progress import NOT_COUNTED, Display, minutes
+from fishd.learning.train.progress import NOT_COUNTED, Display, format_minutes
 from fishd.learning.train.recorder import RunRecorder
 from fishd.learning.train.rollouts import Rollouts
 from fishd.learning.train.tank import TankEvaluations
@@ -166,7 +166,7 @@ class Training:
             fish = job.settings.imitation.rounds * job.settings.imitation.fish
             text += f", after an imitation of the best beats of {fish} fish"
         if job.resume:
-            tank = minutes(self._env.tank_time)
+            tank = format_minutes(self._env.tank_time)
             text += f", resumed from {recorder.checkpoint}, {tank} in the tank"
         if job.on == "simulation" and job.settings.evaluation.every:
             text += f"; tank times are{NOT_COUNTED}"
@@ -280,7 +280,7 @@ def _enable_cleaning(rollout: Rollout, env: SwimEnv) -> None:
 def _format_advice(job: Job) -> str:
     """Return advice for the user after the run folder could not be written."""
     folder = shlex.quote(str(job.folder))
-    if checkpoints.all_in(job.folder):
+    if checkpoints.list_all(job.folder):
         return f"go on from the newest checkpoint with --resume {folder}"
     robot = " --on live" if job.on == "live" else ""
     return (

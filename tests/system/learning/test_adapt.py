@@ -22,8 +22,8 @@ from fishd.lab.ranking import format_ratio
 from fishd.lab.session import LiveSession, VirtualSession
 from fishd.learning.adapt import adaptation, report, steps
 from fishd.learning.adapt.adaptation import Adaptation
-from fishd.learning.adapt.cloud import cloud
-from fishd.learning.adapt.practice import practise
+from fishd.learning.adapt.cloud import draw_cloud
+from fishd.learning.adapt.practice import train_policy
 from fishd.learning.adapt.prior import MODEL_ERROR, model_of
 from fishd.learning.adapt.state import (
     TRAINING,
@@ -80,7 +80,7 @@ def identification() -> Identification:
 
 
 def test_a_cloud_has_the_errors_of_the_fit_and_their_correlation() -> None:
-    fish = cloud(identification(), count=4000)
+    fish = draw_cloud(identification(), count=4000)
     assert (fish[0].omega0, fish[0].xi, fish[0].coupling) == (12.5, 1.2, 0.46)
     logs = np.log([[plant.omega0 / 12.5, plant.xi / 1.2] for plant in fish])
     assert logs.std(axis=0) == pytest.approx(np.log([1.02, 1.04]) / 1.96, rel=0.05)
@@ -88,7 +88,7 @@ def test_a_cloud_has_the_errors_of_the_fit_and_their_correlation() -> None:
 
 
 def test_each_episode_of_a_training_swims_a_fish_of_the_cloud() -> None:
-    fish = cloud(identification(), count=5)
+    fish = draw_cloud(identification(), count=5)
     spread = Randomisation(fish=fish)
     assert {draw_fish(Config(), spread, seed).plant for seed in range(60)} == set(fish)
     assert [draw_edge_fish(Config(), spread, seed).plant for seed in range(5)] == list(fish)
@@ -207,7 +207,7 @@ def test_a_policy_is_not_one_tick_off_the_best_wave_of_a_weakly_damped_fish(tmp_
         PlantParameters(), omega0=9.14, xi=0.66, coupling=0.4, servo_speed=4.83, servo_lag=0.335
     )
     fish = msgspec.structs.replace(fitted(GOOD), plant=plant, cloud=(plant,))
-    trained = practise(Config(), fish, tmp_path, 64, 0, lambda steps: None)
+    trained = train_policy(Config(), fish, tmp_path, 64, 0, lambda steps: None)
     assert trained.worst
     assert trained.worst > 0.98
 
@@ -286,8 +286,10 @@ class Stopped(BaseException):
 def test_a_resume_does_not_repeat_measurements(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(adaptation, "practise", no_policy)
-    monkeypatch.setattr(steps, "cloud", partial(cloud, count=2))  # each fish takes long to compute
+    monkeypatch.setattr(adaptation, "train_policy", no_policy)
+    monkeypatch.setattr(
+        steps, "draw_cloud", partial(draw_cloud, count=2)
+    )  # each fish takes long to compute
     path, config = tmp_path / "run", load("config/simulated.yaml")
     daemon, show = VirtualDaemon(config), StoringDisplay()
 
@@ -339,7 +341,7 @@ def test_no_policy_is_trained_on_a_fish_that_explains_too_little(tmp_path: Path)
     run.state.fitted = fitted(USELESS)
     with VirtualSession(Config()) as rig:
         adapting = Adaptation(rig, run, 150.0, 640, 0, show)
-        adapting._practise(run.state)
+        adapting._train(run.state)
     assert show.lines == ["no policy is trained: the fit explains too little"]
     stored = folder(run.path).state
     assert stored.trained

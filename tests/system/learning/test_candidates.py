@@ -29,7 +29,7 @@ def swim(candidates: Candidates, most: int, share: Callable[[Candidate], float])
         candidate = candidates.next()
         if candidate is None:
             return count
-        candidates.count(candidate, swum(share(candidate)))
+        candidates.add_swim(candidate, swum(share(candidate)))
     return most
 
 
@@ -38,7 +38,7 @@ def test_the_newest_swims_first_and_a_single_one_only_once() -> None:
     assert candidates.next() is candidates.best is None
     first = policy(64)
     candidates.add(first)
-    assert candidates.error(first) == math.inf
+    assert candidates.ci95(first) == math.inf
     assert swim(candidates, 10, lambda _: 0.9) == 1
     assert candidates.best is first
     second = policy(128)
@@ -60,7 +60,7 @@ def test_a_lucky_swim_does_not_stay_the_best() -> None:
     steady, lucky = policy(64), policy(128)
     candidates.add(steady)
     for _ in range(3):
-        candidates.count(steady, swum(0.98))
+        candidates.add_swim(steady, swum(0.98))
     candidates.add(lucky)
     lucks = itertools.chain([1.02], itertools.repeat(0.94))
     swims = swim(candidates, 20, lambda candidate: next(lucks) if candidate is lucky else 0.98)
@@ -75,10 +75,10 @@ def test_a_policy_that_swam_often_is_preferred_to_one_that_swam_as_well_once() -
     for candidate in (often, once):
         candidates.add(candidate)
     for _ in range(5):
-        candidates.count(often, swum(0.98))
-    candidates.count(once, swum(0.985))
+        candidates.add_swim(often, swum(0.98))
+    candidates.add_swim(once, swum(0.985))
     assert candidates.best is often
-    assert candidates.error(once) == pytest.approx(math.sqrt(5) * candidates.error(often))
+    assert candidates.ci95(once) == pytest.approx(math.sqrt(5) * candidates.ci95(often))
 
 
 def test_a_policy_that_stalls_is_removed_also_if_it_was_the_best() -> None:
@@ -86,9 +86,9 @@ def test_a_policy_that_stalls_is_removed_also_if_it_was_the_best() -> None:
     first, second = policy(64), policy(128)
     for candidate, share in ((first, 0.9), (second, 0.95)):
         candidates.add(candidate)
-        candidates.count(candidate, swum(share))
+        candidates.add_swim(candidate, swum(share))
     assert candidates.best is second
-    candidates.count(second, swum(None))
+    candidates.add_swim(second, swum(None))
     assert second.stalled
     assert candidates.best is first
 
@@ -97,7 +97,7 @@ def test_a_swim_with_too_many_lost_ticks_is_repeated() -> None:
     candidates = Candidates(BEST_THRUST)
     candidate = policy(64)
     candidates.add(candidate)
-    candidates.count(candidate, Swim(None, 1.67, 1.0, False, 3.5))
+    candidates.add_swim(candidate, Swim(None, 1.67, 1.0, False, 3.5))
     assert candidates.best is None
     assert candidates.next() is candidate
     assert candidate.swam == 3.5
@@ -134,7 +134,7 @@ def test_intervals_contain_the_truth_and_the_best_is_close_to_the_true_best(off:
         for candidate in policies:
             inside.append(
                 abs(candidate.thrust / BEST_THRUST - truth[candidate.steps])
-                < candidates.error(candidate) / BEST_THRUST
+                < candidates.ci95(candidate) / BEST_THRUST
             )
         best = candidates.best
         assert best

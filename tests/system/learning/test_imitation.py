@@ -15,7 +15,7 @@ from fishd.controllers.policy.file import read
 from fishd.core.errors import ConfigError
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.export import export
-from fishd.learning.imitation import advice, half_beats, narrow
+from fishd.learning.imitation import advise_side, half_beat_thrusts, narrow
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.settings import (
     EnvironmentSettings,
@@ -49,7 +49,7 @@ def imitated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Outcome, str]:
 
 def test_half_beats_have_their_relative_thrust() -> None:
     config = load(None, ["tick=0.02"])
-    relative_thrust = half_beats(config)
+    relative_thrust = half_beat_thrusts(config)
     best = best_square_wave(config.plant, config.amplitude_limit)
     assert relative_thrust[0] == 0.0
     assert relative_thrust.max() == 1.0
@@ -66,7 +66,9 @@ def test_a_clean_rig_keeps_the_fish_and_has_less_delay_and_play() -> None:
 
 def test_the_advice_is_to_stay_until_the_best_half_beat_is_over() -> None:
     relative_thrust = np.array([0.0, 0.5, 1.0, 0.9, 0.3])
-    sides, costs = zip(*(advice(relative_thrust, elapsed) for elapsed in range(6)), strict=True)
+    sides, costs = zip(
+        *(advise_side(relative_thrust, elapsed) for elapsed in range(6)), strict=True
+    )
     assert sides == (1.0, 1.0, -1.0, -1.0, -1.0, -1.0)
     assert costs == pytest.approx((0.52, 0.52, 0.12, 0.62, 0.62, 0.62))
 

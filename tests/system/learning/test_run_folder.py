@@ -148,7 +148,7 @@ def test_after_a_kill_at_any_call_of_a_save_the_best_is_the_new_or_the_old_one(
         save_best(run, before)
         after = replace(before, steps=steps, tank_time=9.0)
         ended = ends_before(call, partial(save_best, run, after))
-        checkpoints.sweep(run)
+        checkpoints.remove_partial(run)
         best = checkpoints.best(run)
         assert best
         state = checkpoints.read_state(best)

@@ -40,7 +40,7 @@ def swum(*overrides: str) -> tuple[Forces, Forces, float]:
 def cleaned(fx: Forces, fy: Forces, best: float) -> Forces:
     """Return the thrust from rollouts of 64 ticks, for the second half of them."""
     signal = ThrustSignal(best)
-    parts = [signal.of(fx[k : k + 64], fy[k : k + 64]) for k in range(0, len(fx) - 63, 64)]
+    parts = [signal.estimate(fx[k : k + 64], fy[k : k + 64]) for k in range(0, len(fx) - 63, 64)]
     return np.concatenate(parts[len(parts) // 2 :])
 
 
@@ -52,7 +52,7 @@ def error(*overrides: str) -> float:
 
 def test_with_a_good_sensor_only_the_mean_is_removed() -> None:
     fx, fy, best = swum()
-    thrust = ThrustSignal(best).of(fx[:64], fy[:64])
+    thrust = ThrustSignal(best).estimate(fx[:64], fy[:64])
     assert thrust.mean() == pytest.approx(0.0, abs=1e-12)
     assert np.std(thrust - fx[:64]) < 0.2 * best
 
@@ -71,13 +71,13 @@ def test_an_offset_and_its_drift_are_removed() -> None:
 def test_a_spike_counts_no_more_than_a_very_good_tick() -> None:
     fx, fy, best = swum()
     fx[20] += 40.0 * best
-    thrust = ThrustSignal(best).of(fx[:64], fy[:64])
+    thrust = ThrustSignal(best).estimate(fx[:64], fy[:64])
     assert thrust.max() < 6.0 * best
 
 
 def test_a_rollout_without_a_single_valid_step_is_no_error() -> None:
-    assert ThrustSignal(0.02).of(np.zeros(0), np.zeros(0)).shape == (0,)
-    assert ThrustSignal(0.02).of(np.full(8, 0.3), np.zeros(8)).tolist() == [0.0] * 8
+    assert ThrustSignal(0.02).estimate(np.zeros(0), np.zeros(0)).shape == (0,)
+    assert ThrustSignal(0.02).estimate(np.full(8, 0.3), np.zeros(8)).tolist() == [0.0] * 8
 
 
 def test_the_limit_of_a_spike_does_not_depend_on_the_scale_of_the_reward(tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_the_limit_of_a_spike_does_not_depend_on_the_scale_of_the_reward(tmp_pat
         assert rollout.signal
         fx = np.linspace(-0.001, 0.001, 64)
         fx[20] = 1.0
-        largest.append(rollout.signal.of(fx, np.zeros(64)).max())
+        largest.append(rollout.signal.estimate(fx, np.zeros(64)).max())
     assert largest[0] == largest[1] < 0.01
 
 

@@ -103,10 +103,10 @@ def test_clearing_resets_all_counts() -> None:
 def test_up_to_twenty_overruns_in_a_hundred_ticks_are_tolerated_more_are_a_fault() -> None:
     supervisor = Supervisor()
     for seq in range(0, 1000, 5):
-        supervisor.overran(seq)
+        supervisor.note_overrun(seq)
     assert supervisor.reason is None
-    supervisor.overran(1000)
-    supervisor.overran(1001)
+    supervisor.note_overrun(1000)
+    supervisor.note_overrun(1001)
     assert supervisor.reason is not None
     assert supervisor.reason.code == "overrun"
 
