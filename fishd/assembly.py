@@ -94,7 +94,7 @@ def open_robot(
 
 
 def simulated_fish(config: Config) -> SimulatedFish:
-    """Return a simulated fish on its rod; it needs no hardware and has not to be closed."""
+    """Return a simulated fish on its rod; it needs no hardware and need not be closed."""
     return SimulatedFish(config.plant, config.simulation, config.tick)
 
 

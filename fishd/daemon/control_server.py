@@ -57,7 +57,7 @@ class ControlServer:
 
     async def _answer(self, number: int, payload: bytes) -> None:
         for part in link.reply(number, await self._reply(1e-9 * number, payload)):
-            while not self.send(part):  # the gateway counts a request as open until its whole reply
+            while not self.send(part):  # an incomplete reply keeps its request open
                 await asyncio.sleep(_SEND_RETRY_S)
 
     async def reply_to_estop(self, payload: bytes) -> bytes:

@@ -24,7 +24,11 @@ class SlowMotion:
     """Pace of ticks like that of a `Ticker`, but without skipped ticks."""
 
     def __init__(self, period: float, factor: float) -> None:
-        """period: period of the loop in the fish's time [s]; factor: seconds per second of that"""
+        """Start the pace.
+
+        period: period of the loop in the fish's time [s]
+        factor: real time per time of the fish
+        """
         self._period, self._factor = period, factor
         self.stopping = asyncio.Event()
         """Event that ends the wait for a tick."""

@@ -78,7 +78,7 @@ def fit(loads: Sequence[Load], load_error: float = 0.0) -> Fit:
     condition = _condition(voltages)
     if condition > MAX_CONDITION:
         raise PoorLoads(
-            f"the voltages hardly tell x from y (condition number {condition:.3g}, at most "
+            f"the voltages hardly distinguish x from y (condition number {condition:.3g}, at most "
             f"{MAX_CONDITION:g}): {_describe_still_channel(voltages)}"
         )
     # Fitting about the means keeps the digits of a large voltage without a force.
