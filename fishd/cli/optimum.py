@@ -9,7 +9,7 @@ from fishd.cli.config import fish_options
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, echo_rows, print_json, warn_of_fin
 from fishd.config import check_tethered, load
-from fishd.virtual.plant.parameters import PlantParameters, of_the_paper
+from fishd.virtual.plant.parameters import PlantParameters, without_extensions
 
 if TYPE_CHECKING:
     from fishd.lab.optimum import Optima, OptimalControl
@@ -125,7 +125,7 @@ def _control_rows(control: "OptimalControl") -> list[tuple[str, str]]:
 
 
 def _print_ignored(plant: PlantParameters, control: bool) -> None:
-    ideal = of_the_paper(plant)
+    ideal = without_extensions(plant)
     left_out = [
         f"plant.{name}"
         for name in _IGNORED_PARAMETERS

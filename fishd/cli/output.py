@@ -113,11 +113,12 @@ def warn_of_fin(amplitude: float, where: str = "") -> None:
 
     amplitude: largest fin angle [rad]; where: place of that amplitude, in words
     """
-    from fishd.virtual.plant.parameters import LARGEST_FIN
+    from fishd.virtual.plant.parameters import MAX_FIN_ANGLE_RAD
 
-    if amplitude > LARGEST_FIN:
+    if amplitude > MAX_FIN_ANGLE_RAD:
         echo(
-            f"fishctl: the fin swings by ±{amplitude:.2f} rad{where}: beyond {LARGEST_FIN:g} rad "
+            f"fishctl: the fin swings by ±{amplitude:.2f} rad{where}: beyond "
+            f"{MAX_FIN_ANGLE_RAD:g} rad "
             "the equations of the fish do not hold, nor does this thrust",
             err=True,
         )

@@ -1,1 +1,1 @@
-"""What stands in for the world: simulated fish, on a rod or free, and a virtual Raspberry Pi."""
+"""Simulated fish, on a rod or swimming freely, and a virtual Raspberry Pi."""

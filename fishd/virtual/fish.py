@@ -1,7 +1,7 @@
-"""The simulated fish behind the protocols of real hardware.
+"""Simulated fish behind the protocols of real hardware.
 
-It advances when it is read, by the time since the previous read, under the instruction angle that
-was last written. So it knows no clock and runs as well in real time as in virtual time.
+It advances at each read, by the time since the previous read, under the latest instruction angle.
+It does not use a clock, and therefore runs in real time and in virtual time.
 """
 
 from fishd.core.calibration import ForceCalibration
@@ -16,15 +16,15 @@ from fishd.virtual.plant.registry import open_plant
 
 
 class SimulatedFish:
-    """A force sensor and a servo with a tethered fish between them."""
+    """Force sensor and servo of a simulated tethered fish."""
 
     def __init__(self, plant: PlantParameters, settings: SimulationSettings, tick: float) -> None:
         """`tick` is the period of the loop [s]; the first read covers one period."""
         self.fish = open_plant(plant, settings.motor)
         self.window: Window = PlantWindow(tick, 0.0, 0.0, 0.0, 0.0, 0.0)
-        """The latest window with its true mean forces; nothing happens before the first read."""
+        """Latest window with its true mean forces; zero before the first read."""
         self._power: float | None = None
-        """Mean power in that window [W]; None until it is read."""
+        """Mean power in the latest window [W]; None until it is read."""
         self._imperfections = Imperfections(settings, tick)
         self._sample_rate = settings.sample_rate
         self._tick = tick
@@ -35,12 +35,12 @@ class SimulatedFish:
         self._angle: float | None = None
         self._fin_speed = 0.0
         self.calibration = ForceCalibration()
-        """What turns forces as the rig shows them into those that are told: a tare's doing."""
+        """Calibration between the forces of the rig and those of measurements; a tare sets it."""
         self.unit = "N"
         self._watches: list[VoltageWatch] = []
 
     def read(self, now: float) -> Measurement:
-        """Swim until `now` [s] and measure the forces on the way."""
+        """Advance to `now` [s] and return the forces of this window."""
         if self._time is None:
             self._start = self._time = now - self._tick
         duration = round(now - self._time, 9)
@@ -70,27 +70,27 @@ class SimulatedFish:
             self.fish.prepare(self._angle, self._duration, self._samples)
 
     def recalibrate(self, calibration: ForceCalibration) -> None:
-        """Use another zero from the next read on; it is forgotten with this fish."""
+        """Use another zero from the next read on, for the lifetime of this object."""
         self.calibration = calibration
 
     def watch(self) -> VoltageWatch:
-        """Begin to add up the forces of every window that begins from now on."""
+        """Return a watch that adds up the forces of every window from now on."""
         watch = VoltageWatch(self._time or 0.0, self.calibration)
         self._watches.append(watch)
         return watch
 
     def take_window(self) -> TrueWindow:
-        """What truly happened between the latest two reads."""
+        """Return the true motion and forces between the latest two reads."""
         window, state = self.window, self.fish.state
         turned = self._fin_speed * state.alpha_rate <= 0.0
         self._fin_speed = state.alpha_rate
-        # Where the fin has not turned, it is at the end that it has gone furthest.
+        # A fin that has not reversed has its largest angle at the end of the window.
         peak = window.fin_peak if turned else abs(state.alpha)
-        # It is mostly known: the loop has read it.
+        # The loop has usually read the power already.
         return TrueWindow(window.duration, window.thrust, peak, self._power or self.power())
 
     def power(self, now: float = 0.0) -> float:
-        """Mean electrical power of the servo over the latest window, which ended `now` [W]."""
+        """Return the mean electrical power of the servo over the latest window [W]."""
         if self._power is None:
             self._power = self.window.power
         return self._power
@@ -100,7 +100,7 @@ class SimulatedFish:
         self._angle = angle
 
     def release(self) -> None:
-        """Stop the pulses: the wheel stays where it is."""
+        """Stop the pulses; the wheel keeps its angle."""
         self._angle = None
 
     def close(self) -> None:
@@ -108,12 +108,12 @@ class SimulatedFish:
         self.release()
 
     def truth(self) -> Truth:
-        """The true state at the latest read."""
+        """Return the true state at the latest read."""
         state = self.fish.state
         return Truth(alpha=state.alpha, alpha_rate=state.alpha_rate, phi=state.phi)
 
     def robot(self, *, metered: bool = True) -> Robot:
-        """Return this fish as the loop sees it; metered: with a power meter, if it has a motor."""
+        """Return the robot of the loop; metered: with a power meter, if the fish has a motor."""
         return Robot(
             name="simulated",
             sensor=self,

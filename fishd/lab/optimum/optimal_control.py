@@ -20,7 +20,7 @@ from fishd.core.errors import ParameterError
 from fishd.virtual.plant.base import PlantState
 from fishd.virtual.plant.drive_train import relax
 from fishd.virtual.plant.optimum import SteadyState, best_square_wave
-from fishd.virtual.plant.parameters import PlantParameters, of_the_paper
+from fishd.virtual.plant.parameters import PlantParameters, without_extensions
 from fishd.virtual.plant.tethered import TetheredFish
 
 Array = NDArray[np.float64]
@@ -93,7 +93,7 @@ def optimal_control(
         raise ParameterError(
             "plant.xi: 0 is not possible here: without damping, thrust at ω₀ has no bound"
         )
-    p = of_the_paper(parameters)
+    p = without_extensions(parameters)
     best_square = best_square_wave(p, amplitude)
     problem = _Problem(p, amplitude, intervals)
     random = np.random.default_rng(seed)

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from numpy.typing import ArrayLike, NDArray
 
 from fishd.virtual.plant.optimum import SteadyState, best_square_wave, fast_servo_thrust
-from fishd.virtual.plant.parameters import PlantParameters, of_the_paper
+from fishd.virtual.plant.parameters import PlantParameters, without_extensions
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,7 @@ def slow_servo(parameters: PlantParameters, amplitudes: ArrayLike) -> Optima:
 def _with_fast_servo(parameters: PlantParameters) -> PlantParameters:
     """Return the parameters with a servo that follows at once an amplitude of 1 rad."""
     return replace(
-        of_the_paper(parameters),
+        without_extensions(parameters),
         servo_speed=_FAST_SERVO_SPEED * parameters.omega0,
         servo_lag=_FAST_SERVO_LAG,
     )

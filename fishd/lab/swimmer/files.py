@@ -13,7 +13,7 @@ from fishd.lab.swimmer.envelope import Array
 from fishd.virtual.swimmer.checkpoint import Checkpoint, CheckpointError
 from fishd.virtual.swimmer.fish import Fish
 from fishd.virtual.swimmer.settings import SwimmerSettings
-from fishd.virtual.swimmer.track import LONGEST
+from fishd.virtual.swimmer.track import MAX_FILE_BYTES
 
 
 def restore_fish(checkpoint: Checkpoint) -> Fish:
@@ -38,7 +38,7 @@ def read_midlines(path: Path) -> tuple[Array, Array]:
     """
     needed = "a swim that fishctl simulate --save FILE.npz has written"
     try:
-        content = files.read(path, LONGEST, "a swim")
+        content = files.read(path, MAX_FILE_BYTES, "a swim")
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             time, lines = (
                 np.asarray(arrays[name], np.float64) for name in ("midline_time", "midlines")

@@ -17,7 +17,7 @@ QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
 UNITS = {"vorticity": "1/s", "speed": "m/s", "pressure": "Pa"}
 SIGNED_QUANTITIES = ("vorticity", "pressure")
 """Quantities whose colours are symmetric about 0."""
-AHEAD, BEHIND, BESIDE = 0.9, 2.1, 0.55
+MAX_LEAD_LENGTHS, BEHIND, BESIDE = 0.9, 2.1, 0.55
 """Distances from the centre of the grid to the edges of the window [body lengths]."""
 _ROUND_DIGITS = (1, 2, 3, 5, 10)
 
@@ -53,7 +53,7 @@ def window_around(settings: SwimmerSettings) -> Window:
     """Return the window of the fish and the wake behind it, within the tank."""
     length, water = settings.body.length, settings.water
     return Window(
-        max(-AHEAD * length, -0.5 * water.length),
+        max(-MAX_LEAD_LENGTHS * length, -0.5 * water.length),
         min(BEHIND * length, 0.5 * water.length),
         max(-BESIDE * length, -0.5 * water.width),
         min(BESIDE * length, 0.5 * water.width),

@@ -1,7 +1,7 @@
-"""An ADS1115 at the level of its registers, on which the real driver runs unchanged.
+"""ADS1115 emulated at the level of its registers, on which the real driver runs unchanged.
 
-Nothing ticks: at each access the chip works out what it has converted since the last one. Only
-single-shot mode is emulated, and no comparator: the ALERT pin is not connected.
+The chip has no thread: at each access it computes the conversions since the previous one. Only the
+single-shot mode is emulated. The comparator is not: the ALERT pin is not connected.
 """
 
 import errno
@@ -18,16 +18,16 @@ from fishd.virtual.pi.i2c import kernel_error
 log = logging.getLogger(__name__)
 
 CONVERSION, CONFIG, LOW_THRESHOLD, HIGH_THRESHOLD = range(4)
-"""What the pointer points at."""
+"""Registers, as numbered by the pointer."""
 
 RESET_CONFIG = 0x0583
-"""Config register after a reset, less its OS bit."""
+"""Config register after a reset, without its OS bit."""
 
 FULL_SCALE = (6.144, 4.096, 2.048, 1.024, 0.512, 0.256, 0.256, 0.256)
-"""Range by gain bits [V]."""
+"""Full scale for each value of the gain bits [V]."""
 
 DATA_RATES = (8, 16, 32, 64, 128, 250, 475, 860)
-"""Conversions per second by rate bits, nominal."""
+"""Nominal data rate for each value of the rate bits [1/s]."""
 
 POWER_UP = 25e-6
 """Time to wake up before a conversion [s]."""
@@ -36,7 +36,7 @@ _IDLE_BIT, _SINGLE_SHOT, _COMPARATOR_OFF = 0x8000, 0x0100, 0x0003
 
 
 class _Conversion(NamedTuple):
-    """A conversion under way, with the config that held when it began."""
+    """Running conversion, with the config at its start."""
 
     start: float
     end: float
@@ -44,7 +44,7 @@ class _Conversion(NamedTuple):
 
 
 class Ads1115Chip:
-    """The chip; put it on an `I2cBus`."""
+    """Emulated chip; attach it to an `I2cBus`."""
 
     def __init__(
         self,
@@ -54,11 +54,11 @@ class Ads1115Chip:
         noise: float = 1.0,
         seed: int = 0,
     ) -> None:
-        """What the chip is and what it measures.
-
-        volts: (mux bits 0..7, start, end [s]) to the mean voltage of that input in that time [V]
-        noise: of a conversion, rms, in steps of the ADC
-        seed: of the noise, and of how far this chip's data rate is off, within ±10 %
+        """
+        volts: returns the mean voltage [V] of an input, given its mux bits (0 to 7), start and
+            end [s]
+        noise: rms noise of a conversion, in steps of the ADC
+        seed: seed of the noise, and of the error of the data rate, within ±10 %
         """
         self._clock = clock
         self._volts = volts
@@ -68,21 +68,21 @@ class Ads1115Chip:
         self.rate_factor = self._random.uniform(0.9, 1.1)
         self._lock = threading.RLock()
         self._last_codes: dict[int, int] = {}
-        self._told: set[str] = set()
+        self._logged: set[str] = set()
         self.reset()
         faults.listen("brown-out", self.reset)
         faults.listen("unplugged", self.reset)
 
     def reset(self) -> None:
-        """Go back to the state after power-up; a conversion under way is lost."""
+        """Return to the state after power-up; a running conversion is lost."""
         with self._lock:
             self._pointer = CONVERSION
             self._registers = [0, RESET_CONFIG, 0x8000, 0x7FFF]
             self._conversion: _Conversion | None = None
 
     def write(self, data: bytes) -> None:
-        """Take [pointer] or [pointer, high byte, low byte]; OSError EREMOTEIO: no ack."""
-        self._need_power()
+        """Receive [pointer] or [pointer, high byte, low byte]; OSError EREMOTEIO without power."""
+        self._check_power()
         if not data:
             return
         with self._lock:
@@ -92,8 +92,8 @@ class Ads1115Chip:
                 self._store(int.from_bytes(data[1:3], "big"), now)
 
     def read(self, length: int) -> bytes:
-        """The register that the pointer points at, high byte first; more bytes read as FF."""
-        self._need_power()
+        """Return the register of the pointer, high byte first; further bytes are FF."""
+        self._check_power()
         with self._lock:
             self._catch_up()
             word = self._registers[self._pointer]
@@ -102,7 +102,7 @@ class Ads1115Chip:
                 word |= _IDLE_BIT
             return (word.to_bytes(2, "big") + b"\xff" * length)[:length]
 
-    def _need_power(self) -> None:
+    def _check_power(self) -> None:
         if self._faults.active("unplugged"):
             raise kernel_error(errno.EREMOTEIO)
 
@@ -112,23 +112,23 @@ class Ads1115Chip:
             return
         self._registers[CONFIG] = config = word & ~_IDLE_BIT
         if not config & _SINGLE_SHOT:
-            self._tell("continuous mode is not emulated: it converts nothing")
+            self._warn_once("continuous mode is not emulated: it converts nothing")
         elif config & _COMPARATOR_OFF != _COMPARATOR_OFF:
-            self._tell("the comparator is not emulated: ALERT stays silent")
-        # A chip that is busy ignores the start, but keeps the new config for the next one.
+            self._warn_once("the comparator is not emulated: ALERT stays silent")
+        # A busy chip ignores the start, but stores the config for the next conversion.
         idle = self._conversion is None and not self._faults.active("stuck-busy")
         if word & _IDLE_BIT and config & _SINGLE_SHOT and idle:
             start = now + POWER_UP
             rate = DATA_RATES[config >> 5 & 7] * self.rate_factor
             self._conversion = _Conversion(start, start + 1.0 / rate, config)
 
-    def _tell(self, what: str) -> None:
-        if what not in self._told:
-            self._told.add(what)
-            log.warning("emulated ADS1115: %s", what)
+    def _warn_once(self, message: str) -> None:
+        if message not in self._logged:
+            self._logged.add(message)
+            log.warning("emulated ADS1115: %s", message)
 
     def _catch_up(self) -> float:
-        """Complete what should be complete by now; the time [s]."""
+        """Complete a conversion that has ended by now; return the time [s]."""
         now = self._clock.monotonic()
         current = self._conversion
         if current and current.end <= now and not self._faults.active("stuck-busy"):
@@ -137,7 +137,7 @@ class Ads1115Chip:
         return now
 
     def _code(self, conversion: _Conversion) -> int:
-        """The result of a conversion."""
+        """Return the result of a conversion."""
         start, end, config = conversion
         mux = config >> 12 & 7
         if self._faults.active("clipped"):

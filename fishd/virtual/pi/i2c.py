@@ -1,6 +1,6 @@
-"""An I2C bus: carries transfers to the emulated chips, takes as long as a real one, and fails.
+"""Emulated I2C bus with chips, with the duration and the failures of a real one.
 
-What drivers do with its device file, `linux_i2c`, ends in `I2cBus.transfer`.
+The operations of drivers on its device file, see `linux_i2c`, result in `I2cBus.transfer`.
 """
 
 import errno
@@ -13,17 +13,17 @@ from fishd.core.clock import Clock
 from fishd.virtual.pi.faults import TRANSFER_ERRORS, Faults
 
 KERNEL_TIMEOUT = 1.0
-"""How long the kernel waits for a hanging bus, until told otherwise [s]."""
+"""Default time after which the kernel gives up on a hanging bus [s]."""
 
 
 class Write(NamedTuple):
-    """Bytes to a device; none at all is a probe."""
+    """Bytes to a device; an empty message is a probe."""
 
     data: bytes
 
 
 class Read(NamedTuple):
-    """So many bytes from a device."""
+    """Request for a number of bytes from a device."""
 
     length: int
 
@@ -32,36 +32,36 @@ Message = Write | Read
 
 
 class I2cDevice(Protocol):
-    """A chip on the bus. Each method raises OSError EREMOTEIO to withhold the acknowledge."""
+    """Chip on the bus. Each method raises OSError EREMOTEIO where it does not acknowledge."""
 
     def write(self, data: bytes) -> None:
-        """Take what a master writes."""
+        """Receive bytes from the master."""
 
     def read(self, length: int) -> bytes:
-        """Give `length` bytes."""
+        """Return `length` bytes."""
 
 
 def kernel_error(number: int) -> OSError:
-    """An error as the kernel gives it; EREMOTEIO is a missing acknowledge."""
+    """Return an error of the kernel; EREMOTEIO is a missing acknowledge."""
     return OSError(number, os.strerror(number))
 
 
 class I2cBus:
-    """One master and its chips; transfers from several threads queue.
+    """Master and its chips; transfers from several threads wait for one another.
 
-    Lets time pass on its clock: nine bits per byte, addresses included, start and stop, and the
-    kernel's own time. The chips see the messages at the end of the transfer.
+    A transfer takes the time of nine bits per byte, including addresses, of start and stop, and of
+    the kernel. The chips receive the messages at the end of the transfer.
     """
 
     OVERHEAD = 50e-6
-    """Time that the kernel adds to each transfer [s]."""
+    """Time of the kernel in each transfer [s]."""
     WAY_BACK = 50e-6
-    """Time that an answer takes to reach another process [s]."""
+    """Time of an answer on its way to another process [s]."""
 
     def __init__(self, clock: Clock, speed: float, faults: Faults) -> None:
-        """`speed` in bit/s."""
+        """`speed`: bit rate [bit/s]."""
         self.timeout = KERNEL_TIMEOUT
-        """How long the kernel waits for a hanging bus [s]."""
+        """Time after which the kernel gives up on a hanging bus [s]."""
         self._clock = clock
         self._speed = speed
         self._faults = faults
@@ -69,7 +69,7 @@ class I2cBus:
         self._lock = threading.Lock()
 
     def attach(self, address: int, device: I2cDevice) -> None:
-        """Put a chip on the bus; ValueError if the address is taken."""
+        """Attach a chip to the bus; raises ValueError if the address is taken."""
         if address in self._devices:
             raise ValueError(f"address {address:#04x} is taken by another chip on the bus")
         self._devices[address] = device
@@ -77,36 +77,38 @@ class I2cBus:
     def transfer(
         self, address: int, messages: Sequence[Message], asked: float | None = None
     ) -> list[bytes]:
-        """Carry out one transfer; the bytes of each `Read`.
+        """Perform one transfer, and return the bytes of each `Read`.
 
-        asked: when another process asked for it [s, on a clock that both share]; what has passed
-            since, and the way back, then counts as time on the bus
+        asked: time of the request of another process [s, on a clock that both share]; the time
+            since then, and the way back, count as time on the bus
 
         Raises OSError as the kernel does: 121 no acknowledge, 110 (TimeoutError) after `timeout`,
-        5 clock held too long, 16 bus owned, 11 (BlockingIOError) arbitration lost. A transfer that
-        fails may have reached the chip in part or in full.
+        5 clock held too long, 16 bus owned, 11 (BlockingIOError) arbitration lost. A failed
+        transfer may have reached the chip in part or in full.
         """
         with self._lock:
             error = self._faults.transfer_error()
-            reached = messages[: self._reach(error, len(messages))] if error else messages
-            duration = self.OVERHEAD + self._time_on_wire(reached)
-            if asked is not None and 0.0 <= (spent := self._clock.monotonic() - asked) < duration:
-                duration -= spent + self.WAY_BACK
+            delivered = (
+                messages[: self._count_delivered(error, len(messages))] if error else messages
+            )
+            duration = self.OVERHEAD + self._time_on_wire(delivered)
+            if asked is not None and 0.0 <= (elapsed := self._clock.monotonic() - asked) < duration:
+                duration -= elapsed + self.WAY_BACK
             self._clock.sleep(max(0.0, duration))
-            replies = [self._carry_out(address, message) for message in reached]
+            replies = [self._deliver(address, message) for message in delivered]
             if error is None:
                 return [reply for reply in replies if reply is not None]
             if error == "timeout":
                 self._clock.sleep(self.timeout)
             raise kernel_error(TRANSFER_ERRORS[error])
 
-    def _reach(self, error: str | None, count: int) -> int:
-        """How many of the messages get through to the chip."""
+    def _count_delivered(self, error: str | None, count: int) -> int:
+        """Return the number of messages that reach the chip."""
         if error is None:
             return count
         if error == "bus-owned":
             return 0
-        if error == "nack":  # The message that nobody acknowledged did not get through.
+        if error == "nack":  # The unacknowledged message did not arrive.
             return self._faults.random.randint(0, max(0, count - 1))
         return self._faults.random.randint(0, count)
 
@@ -117,7 +119,7 @@ class I2cBus:
             bits += 1 + 9 * (1 + length)
         return bits / self._speed
 
-    def _carry_out(self, address: int, message: Message) -> bytes | None:
+    def _deliver(self, address: int, message: Message) -> bytes | None:
         if address not in self._devices:
             raise kernel_error(errno.EREMOTEIO)
         if isinstance(message, Read):

@@ -1,7 +1,7 @@
-"""A stand-in for the C module lgpio: pins in memory, on which rpi-lgpio's RPi.GPIO runs unchanged.
+"""Replacement of the C module lgpio with emulated pins; rpi-lgpio's RPi.GPIO runs on it unchanged.
 
-Its error numbers, modes and what it refuses are those of lgpio 0.2.2 on a chip that belongs to
-one process: a line that somebody else holds is busy.
+Its error numbers, modes and checks are those of lgpio 0.2.2; a line that another process holds is
+busy.
 """
 
 import os
@@ -24,7 +24,7 @@ from fishd.virtual.pi.pins import (
 )
 
 REVISION = "c03114"
-"""What rpi-lgpio takes for the Pi's revision: a Pi 4 B."""
+"""Revision that rpi-lgpio reads: a Pi 4 B."""
 
 _KERNEL_OUTPUT = 2
 _EDGE_SHIFT = 17
@@ -42,7 +42,7 @@ _ERRORS = {
 
 
 class Error(Exception):
-    """As lgpio.error: no kind of OSError, and its text in quotes."""
+    """Error like lgpio.error, which is not an OSError and has its text in quotes."""
 
     def __init__(self, number: int) -> None:
         super().__init__(_ERRORS[number])
@@ -52,7 +52,7 @@ class Error(Exception):
 
 
 class EmulatedLgpio:
-    """A context manager, while which an import of RPi.GPIO finds these pins, and a Pi 4 B."""
+    """Context manager in which an import of RPi.GPIO uses these pins and a Pi 4 B."""
 
     def __init__(self, pins: Pins) -> None:
         self._pins = pins
@@ -76,7 +76,7 @@ class EmulatedLgpio:
 
 
 class _Lgpio(ModuleType):
-    """The module, with what RPi.GPIO uses of it."""
+    """Replacement module with the functions that RPi.GPIO uses."""
 
     SET_PULL_UP, SET_PULL_DOWN, SET_PULL_NONE = PULL_UP, PULL_DOWN, PULL_NONE
     RISING_EDGE, FALLING_EDGE, BOTH_EDGES = 1, 2, 3
@@ -105,8 +105,8 @@ class _Lgpio(ModuleType):
 
     def gpio_get_mode(self, handle: int, gpio: int) -> int:
         line = self._line(handle, gpio)
-        kernel = _KERNEL_OUTPUT if line.mode & OUTPUT else 0
-        return line.mode | kernel | line.pull | line.edges << _EDGE_SHIFT
+        kernel_flag = _KERNEL_OUTPUT if line.mode & OUTPUT else 0
+        return line.mode | kernel_flag | line.pull | line.edges << _EDGE_SHIFT
 
     def gpio_claim_input(self, handle: int, gpio: int, flags: int = 0) -> int:
         self._claim(self._line(handle, gpio), INPUT).pull = flags
@@ -114,7 +114,7 @@ class _Lgpio(ModuleType):
 
     def gpio_claim_output(self, handle: int, gpio: int, level: int = 0, flags: int = 0) -> int:
         line = self._line(handle, gpio)
-        if not line.mode & OUTPUT:  # one that is an output already keeps its level
+        if not line.mode & OUTPUT:  # an existing output keeps its level
             self._claim(line, OUTPUT).pull = flags
             self._drive(line, level)
         return 0
@@ -164,7 +164,7 @@ class _Lgpio(ModuleType):
         if not line.mode & OUTPUT:
             self._claim(line, OUTPUT)
         line.pwm = (frequency, duty_cycle)
-        return 9  # entries left in its queue
+        return 9  # free entries in its queue
 
     def callback(self, _handle: int, gpio: int, func: EdgeFunction) -> Callback:
         return Callback(self._pins, gpio, func)
@@ -194,6 +194,6 @@ class _Lgpio(ModuleType):
 
 
 def _forget_modules() -> dict[str, ModuleType]:
-    """Take lgpio and RPi.GPIO out of the imported modules; what was there."""
+    """Remove lgpio and RPi.GPIO from the imported modules; return the removed modules."""
     names = [name for name in sys.modules if name.partition(".")[0] in ("lgpio", "RPi")]
     return {name: sys.modules.pop(name) for name in names}

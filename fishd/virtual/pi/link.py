@@ -1,6 +1,6 @@
-"""The link to a virtual Pi in another process: the messages on its socket, and the client.
+"""Link to a virtual Pi in another process: the messages on its socket, and the client.
 
-Each message is one packet of a Unix socket, msgpack inside; each request gets one reply.
+Each message is one packet of a Unix socket, encoded as msgpack; each request gets one reply.
 """
 
 import contextlib
@@ -19,72 +19,72 @@ from fishd.core.errors import StartupError
 from fishd.virtual.pi.i2c import KERNEL_TIMEOUT, Message, Write
 from fishd.virtual.pi.virtual_pi import PiState
 
-LONG_POLL = 0.5
-"""How long a request for a change waits for one [s]."""
-PACKET = 65536
-"""Longest message [bytes]; an I2C transfer of the kernel is shorter."""
-PATIENCE = 1.0
-"""How much longer than the bus may take the client waits for an answer [s]."""
+LONG_POLL_TIMEOUT_S = 0.5
+"""Longest time that a request for changed levels waits [s]."""
+MAX_PACKET_BYTES = 65536
+"""Largest message [bytes]; an I2C transfer of the kernel is shorter."""
+ANSWER_MARGIN_S = 1.0
+"""Time that the client waits for an answer beyond the timeout of the bus [s]."""
 
 
 class Request(Struct, frozen=True, tag=True, array_like=True):
-    """Root of what can be asked."""
+    """Base class of requests."""
 
 
 class Transfer(Request, frozen=True):
-    """One I2C transfer; answered with the bytes of each read."""
+    """Request for one I2C transfer; the reply contains the bytes of each read."""
 
     address: int
     messages: tuple[bytes | int, ...]
     """Bytes to write, or the number of bytes to read."""
     asked: float
-    """When [s, monotonic]."""
+    """Time of the request [s, monotonic clock]."""
 
 
 class SetTimeout(Request, frozen=True):
-    """How long the kernel waits for a bus that hangs [s]."""
+    """Request that sets the time after which the kernel gives up on a hanging bus [s]."""
 
     seconds: float
 
 
 class Inject(Request, frozen=True):
-    """Let a fault begin."""
+    """Request that starts a fault."""
 
     name: str
     seconds: float | None
 
 
 class Clear(Request, frozen=True):
-    """End a fault; None: all."""
+    """Request that ends a fault; None: all faults."""
 
     name: str | None
 
 
 class SetLevel(Request, frozen=True):
-    """What is wired to an input pin drives it low or high; None: nothing does."""
+    """Request that drives an input pin low or high from outside; None: not driven."""
 
     gpio: int
     level: int | None
 
 
 class AwaitLevels(Request, frozen=True):
-    """Answered with the pins driven from outside, as soon as they are other than `known`."""
+    """Request for the pins driven from outside, answered when they differ from `known`."""
 
     known: dict[int, int]
 
 
 class GetState(Request, frozen=True):
-    """Answered with a `PiState`."""
+    """Request for a `PiState`."""
 
 
 class Done(Struct, frozen=True, tag=True, array_like=True):
-    """The reply to a request that was carried out."""
+    """Reply to a successful request."""
 
     value: Any = None
 
 
 class Failed(Struct, frozen=True, tag=True, array_like=True):
-    """The reply to a request that failed: an error of the kernel, or 0 for a bad request."""
+    """Reply to a failed request: an error number of the kernel, or 0 for an invalid request."""
 
     errno: int
     message: str
@@ -94,14 +94,14 @@ AnyRequest = Transfer | SetTimeout | Inject | Clear | SetLevel | AwaitLevels | G
 
 
 class RemotePi:
-    """A virtual Pi in another process; safe for use from several threads.
+    """Client of a virtual Pi in another process; safe for use from several threads.
 
-    Where the other process ends, requests raise OSError ENODEV until there is one again, and
-    ETIMEDOUT where it hangs; unlike an error of the bus, these say so in words of their own.
+    Requests raise OSError ENODEV while the other process is not running, and ETIMEDOUT while it
+    hangs. The messages of these errors differ from those of errors of the bus.
     """
 
     def __init__(self, path: Path) -> None:
-        """Raises `StartupError` when no virtual Pi listens at `path`."""
+        """Connect; raises `StartupError` when no virtual Pi listens at `path`."""
         self._path = path
         self._timeout: float | None = None
         self._socket: socket.socket | None = None
@@ -112,48 +112,49 @@ class RemotePi:
             self._connect()
         except OSError as error:
             absent = isinstance(error, FileNotFoundError | ConnectionRefusedError)
-            why = "" if absent else f" ({error.strerror or error})"
+            detail = "" if absent else f" ({error.strerror or error})"
             raise StartupError(
-                f"no virtual Pi is running at {path}{why}; start one with 'fishctl virtual-pi run'"
+                f"no virtual Pi is running at {path}{detail}; start one with "
+                "'fishctl virtual-pi run'"
             ) from None
 
     def transfer(self, address: int, messages: Sequence[Message]) -> list[bytes]:
-        """Carry out one I2C transfer; the bytes of each read. Raises OSError as the kernel does."""
-        spoken = tuple(m.data if isinstance(m, Write) else m.length for m in messages)
-        replies: list[bytes] = self._ask(Transfer(address, spoken, time.monotonic()))
+        """Perform one I2C transfer, and return the bytes of each read; raises OSError."""
+        encoded = tuple(m.data if isinstance(m, Write) else m.length for m in messages)
+        replies: list[bytes] = self._request(Transfer(address, encoded, time.monotonic()))
         return replies
 
     def set_timeout(self, seconds: float) -> None:
-        """How long the kernel waits for a bus that hangs [s]; holds for later processes too."""
+        """Set the kernel's timeout for a hanging bus [s], also after a reconnect."""
         self._timeout = seconds
-        self._ask(SetTimeout(seconds))
+        self._request(SetTimeout(seconds))
 
     def inject(self, name: str, seconds: float | None = None) -> None:
-        """Let a fault begin, for a while [s] or until it is cleared; ValueError if unknown."""
-        self._ask(Inject(name, seconds))
+        """Start a fault, for a time [s] or until it is cleared; raises ValueError if unknown."""
+        self._request(Inject(name, seconds))
 
     def clear(self, name: str | None = None) -> None:
-        """End a fault, or all of them; ValueError if unknown."""
-        self._ask(Clear(name))
+        """End a fault, or all faults; raises ValueError if unknown."""
+        self._request(Clear(name))
 
     def set_level(self, gpio: int, level: int | None) -> None:
-        """Drive an input pin low or high from outside; None lets go of it."""
-        self._ask(SetLevel(gpio, level))
+        """Drive an input pin low or high from outside; None stops driving it."""
+        self._request(SetLevel(gpio, level))
 
     def await_levels(self, known: dict[int, int]) -> dict[int, int]:
-        """The pins driven from outside, once they are other than `known`, or after a while."""
-        levels: dict[int, int] = self._ask(AwaitLevels(known))
+        """Return the pins driven from outside when they differ from `known`, or after a timeout."""
+        levels: dict[int, int] = self._request(AwaitLevels(known))
         return levels
 
     def state(self) -> PiState:
-        """What the virtual Pi is doing."""
-        return msgspec.convert(self._ask(GetState()), PiState)
+        """Return the state of the virtual Pi."""
+        return msgspec.convert(self._request(GetState()), PiState)
 
     def close(self) -> None:
-        """Hang up, whatever another thread is waiting for; may be called twice."""
+        """Disconnect, even while another thread waits; may be called twice."""
         connection = self._socket
         if connection:
-            with contextlib.suppress(OSError):  # it has gone by itself
+            with contextlib.suppress(OSError):  # already disconnected
                 connection.shutdown(socket.SHUT_RDWR)
         with self._lock:
             self._hang_up()
@@ -164,7 +165,7 @@ class RemotePi:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _ask(self, request: Request) -> Any:
+    def _request(self, request: Request) -> Any:
         with self._lock:
             reply = self._exchange(request)
         if isinstance(reply, Failed):
@@ -176,31 +177,33 @@ class RemotePi:
     def _exchange(self, request: Request) -> Done | Failed:
         try:
             connection = self._socket or self._connect()
-            connection.settimeout((self._timeout or KERNEL_TIMEOUT) + PATIENCE)
+            connection.settimeout((self._timeout or KERNEL_TIMEOUT) + ANSWER_MARGIN_S)
             connection.send(self._encode(request))
-            reply = connection.recv(PACKET)
+            reply = connection.recv(MAX_PACKET_BYTES)
             if reply:
                 answer: Done | Failed = self._decode(reply)
                 return answer
-        except TimeoutError:  # its reply, if it comes late, must not answer the next request
+        except TimeoutError:  # a late reply must not answer the next request
             self._hang_up()
-            raise TimeoutError(errno.ETIMEDOUT, self._words("does not answer")) from None
+            raise TimeoutError(errno.ETIMEDOUT, self._describe_failure("does not answer")) from None
         except OSError:
             pass
         self._hang_up()
-        raise OSError(errno.ENODEV, self._words("is gone"))
+        raise OSError(errno.ENODEV, self._describe_failure("is gone"))
 
-    def _words(self, what: str) -> str:
-        return f"the virtual Pi at {self._path} {what}: is 'fishctl virtual-pi run' still running?"
+    def _describe_failure(self, symptom: str) -> str:
+        return (
+            f"the virtual Pi at {self._path} {symptom}: is 'fishctl virtual-pi run' still running?"
+        )
 
     def _connect(self) -> socket.socket:
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         try:
-            connection.settimeout(PATIENCE)
+            connection.settimeout(ANSWER_MARGIN_S)
             connection.connect(str(self._path))
             if self._timeout is not None:
                 connection.send(self._encode(SetTimeout(self._timeout)))
-                connection.recv(PACKET)
+                connection.recv(MAX_PACKET_BYTES)
         except OSError:
             connection.close()
             raise

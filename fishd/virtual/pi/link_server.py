@@ -1,4 +1,4 @@
-"""Offers a virtual Pi to other processes on a Unix socket; `fishctl virtual-pi run` runs it."""
+"""Server of a virtual Pi for other processes on a Unix socket, run by `fishctl virtual-pi run`."""
 
 import contextlib
 import errno
@@ -15,8 +15,8 @@ from fishd.core.errors import StartupError
 from fishd.core.process.unix_sockets import bind, claim_socket
 from fishd.virtual.pi.i2c import Message, Read, Write
 from fishd.virtual.pi.link import (
-    LONG_POLL,
-    PACKET,
+    LONG_POLL_TIMEOUT_S,
+    MAX_PACKET_BYTES,
     AnyRequest,
     AwaitLevels,
     Clear,
@@ -31,7 +31,7 @@ from fishd.virtual.pi.virtual_pi import VirtualPi
 
 
 class LinkServer:
-    """Runs a virtual Pi and serves it, a thread per connection; use it as a context manager."""
+    """Virtual Pi with a server, one thread per connection; a context manager."""
 
     def __init__(self, pi: VirtualPi, path: Path) -> None:
         self._pi = pi
@@ -45,14 +45,14 @@ class LinkServer:
 
         Raises `StartupError` when another virtual Pi listens there or the place cannot be used.
         """
-        path = self._path.resolve()  # a symbolic link leads to the same virtual Pi
+        path = self._path.resolve()  # a symbolic link names the same virtual Pi
         advice = "end it, or give this one another virtual_pi.socket"
         with ExitStack() as stack:
             stack.enter_context(claim_socket(path, str(path), "another virtual Pi", advice))
             stack.enter_context(self._pi)
             listener = stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
             try:
-                bind(listener, path, 0o177)  # for this user alone, from the first moment
+                bind(listener, path, 0o177)  # accessible to this user only
                 listener.listen()
             except OSError as error:
                 raise StartupError(
@@ -63,11 +63,11 @@ class LinkServer:
             acceptor.start()
             stack.callback(self._hang_up)
             stack.callback(acceptor.join)
-            stack.callback(_shut, listener)
+            stack.callback(_shut_down, listener)
             self._stack = stack.pop_all()
 
     def close(self) -> None:
-        """Hang up and stop the virtual Pi; may be called twice."""
+        """Close all connections and stop the virtual Pi; may be called twice."""
         self._stack.close()
 
     def __enter__(self) -> "LinkServer":
@@ -92,7 +92,7 @@ class LinkServer:
         with self._lock:
             connections = dict(self._connections)
         for connection, thread in connections.items():
-            _shut(connection)
+            _shut_down(connection)
             thread.join()
 
     def _serve(self, connection: socket.socket) -> None:
@@ -100,11 +100,11 @@ class LinkServer:
         encode = msgspec.msgpack.Encoder().encode
         with connection:
             try:
-                while packet := connection.recv(PACKET):
-                    if _has_hung_up(connection):  # it has given this request up
+                while packet := connection.recv(MAX_PACKET_BYTES):
+                    if _has_hung_up(connection):  # the client has abandoned this request
                         break
                     connection.send(encode(self._answer(decode, packet)))
-            except OSError:  # the client went away before it had its reply
+            except OSError:  # the client disconnected before the reply
                 pass
             finally:
                 with self._lock:
@@ -123,7 +123,7 @@ class LinkServer:
         pi = self._pi
         match request:
             case Transfer(address, messages, asked):
-                return pi.bus.transfer(address, [_message(spoken) for spoken in messages], asked)
+                return pi.bus.transfer(address, [_message(encoded) for encoded in messages], asked)
             case SetTimeout(seconds):
                 pi.bus.timeout = seconds
             case Inject(name, seconds):
@@ -133,14 +133,14 @@ class LinkServer:
             case SetLevel(gpio, level):
                 pi.set_level(gpio, level)
             case AwaitLevels(known):
-                return pi.levels(known, LONG_POLL)
+                return pi.levels(known, LONG_POLL_TIMEOUT_S)
             case _:
                 return pi.state()
         return None
 
 
-def _message(spoken: bytes | int) -> Message:
-    return Read(spoken) if isinstance(spoken, int) else Write(spoken)
+def _message(encoded: bytes | int) -> Message:
+    return Read(encoded) if isinstance(encoded, int) else Write(encoded)
 
 
 def _has_hung_up(connection: socket.socket) -> bool:
@@ -150,7 +150,7 @@ def _has_hung_up(connection: socket.socket) -> bool:
         return False
 
 
-def _shut(connection: socket.socket) -> None:
-    """Wake up the thread that waits on a socket."""
-    with contextlib.suppress(OSError):  # not connected any more
+def _shut_down(connection: socket.socket) -> None:
+    """Shut down a socket, which wakes up the thread that waits for it."""
+    with contextlib.suppress(OSError):  # already disconnected
         connection.shutdown(socket.SHUT_RDWR)

@@ -1,6 +1,6 @@
-"""A stand-in for /dev/i2c-N in this process, below Adafruit_PureIO.
+"""Replacement of /dev/i2c-N in this process, below Adafruit_PureIO.
 
-`ExtendedI2C`, Blinka and PureIO run on it unchanged. Buses that are not emulated stay real.
+`ExtendedI2C`, Blinka and PureIO run on it unchanged. Other buses remain real.
 """
 
 import ctypes
@@ -19,10 +19,10 @@ I2C_TIMEOUT = 0x0702
 I2C_SLAVE = 0x0703
 I2C_RDWR = 0x0707
 I2C_M_RD = 0x0001
-"""Requests and the flag of linux/i2c-dev.h that drivers use."""
+"""Requests and flag of linux/i2c-dev.h that drivers use."""
 
-MESSAGES_MAX = 42
-"""Messages that the kernel takes in one transfer."""
+MAX_MESSAGES = 42
+"""Largest number of messages in one transfer of the kernel."""
 
 _FOLDER = "/dev/i2c-"
 _emulated: dict[str, "LinuxI2c"] = {}
@@ -31,7 +31,7 @@ _lock = threading.Lock()
 
 
 class LinuxI2c:
-    """The device files of some emulated buses; also a context manager.
+    """Device files of emulated buses; also a context manager.
 
     While one is installed, the names `open` and `ioctl` of Adafruit_PureIO.smbus and `path` of
     adafruit_extended_bus are replaced in this process.
@@ -43,18 +43,17 @@ class LinuxI2c:
         buses: set[int],
         set_timeout: Callable[[float], None],
     ) -> None:
-        """What is behind the device files.
-
-        transfer: (address, messages) to the bytes of each read; raises OSError
+        """
+        transfer: returns the bytes of each read, given address and messages; raises OSError
         buses: N of each /dev/i2c-N
-        set_timeout: takes the time after which a hanging bus is given up [s]
+        set_timeout: sets the time after which the kernel gives up on a hanging bus [s]
         """
         self.transfer = transfer
         self.set_timeout = set_timeout
         self._paths = {f"{_FOLDER}{bus}" for bus in buses}
 
     def install(self) -> None:
-        """Make the device files appear; ValueError if a bus is emulated already."""
+        """Install the device files; raises ValueError if a bus is already emulated."""
         with _lock:
             for path in sorted(self._paths & _emulated.keys()):
                 raise ValueError(f"{path} is emulated already: remove the other one first")
@@ -63,12 +62,12 @@ class LinuxI2c:
             _emulated.update(dict.fromkeys(self._paths, self))
 
     def remove(self) -> None:
-        """Make them vanish, as when an adapter is pulled out; may be called twice."""
+        """Remove the device files, like an unplugged adapter; may be called twice."""
         with _lock:
-            mine = [path for path, owner in _emulated.items() if owner is self]
-            for path in mine:
+            own_paths = [path for path, owner in _emulated.items() if owner is self]
+            for path in own_paths:
                 del _emulated[path]
-            if mine and not _emulated:
+            if own_paths and not _emulated:
                 _restore_names()
 
     def __enter__(self) -> "LinuxI2c":
@@ -80,7 +79,7 @@ class LinuxI2c:
 
 
 class _Device(io.FileIO):
-    """An open /dev/i2c-N. It is a file of its own on /dev/null, so that its number is real."""
+    """Open /dev/i2c-N. It opens /dev/null, so that its file descriptor is real."""
 
     def __init__(self, path: str, owner: LinuxI2c) -> None:
         super().__init__(os.devnull, "r+b")
@@ -103,7 +102,7 @@ class _Device(io.FileIO):
         super().close()
 
     def control(self, request: int, argument: Any) -> int:
-        """Carry out an ioctl."""
+        """Perform an ioctl."""
         if request == I2C_SLAVE:
             if not 0 <= argument <= 0x7F:
                 raise kernel_error(errno.EINVAL)
@@ -111,44 +110,48 @@ class _Device(io.FileIO):
         elif request == I2C_TIMEOUT:
             self._owner.set_timeout(argument * 0.01)
         elif request == I2C_RDWR:
-            self._combined(argument)
+            self._transfer_combined(argument)
         else:
             raise kernel_error(errno.ENOTTY)
         return 0
 
-    def _combined(self, request: Any) -> None:
-        """Carry out an i2c_rdwr_ioctl_data and fill the buffers of its reads."""
+    def _transfer_combined(self, request: Any) -> None:
+        """Perform the transfer of an i2c_rdwr_ioctl_data, and fill the buffers of its reads."""
         count = request.nmsgs
-        if not 0 < count <= MESSAGES_MAX:
+        if not 0 < count <= MAX_MESSAGES:
             raise kernel_error(errno.EINVAL)
-        wanted = [request.msgs[index] for index in range(count)]
-        if any(message.flags & ~I2C_M_RD or message.addr != wanted[0].addr for message in wanted):
+        requested = [request.msgs[index] for index in range(count)]
+        if any(
+            message.flags & ~I2C_M_RD or message.addr != requested[0].addr for message in requested
+        ):
             raise kernel_error(errno.EOPNOTSUPP)
-        replies = iter(self._transfer(wanted[0].addr, [_decoded(message) for message in wanted]))
-        for message in wanted:
+        replies = iter(
+            self._transfer(requested[0].addr, [_decode(message) for message in requested])
+        )
+        for message in requested:
             if message.flags & I2C_M_RD:
                 reply = next(replies)
                 ctypes.memmove(message.buf, reply, min(message.len, len(reply)))
 
     def _transfer(self, address: int, messages: Sequence[Message]) -> list[bytes]:
-        self.fileno()  # ValueError if it is closed, as for any file
+        self.fileno()  # raises ValueError if closed, as for any file
         if _emulated.get(self._path) is not self._owner:
             raise kernel_error(errno.ENODEV)
         return self._owner.transfer(address, messages)
 
 
 class _Path:
-    """os.path, in which the emulated device files exist."""
+    """Replacement of os.path in which the emulated device files exist."""
 
     @staticmethod
     def exists(path: str) -> bool:
-        return path in _emulated or os.path.exists(path)  # noqa: PTH110, it stands in for this
+        return path in _emulated or os.path.exists(path)  # noqa: PTH110, it replaces this
 
     def __getattr__(self, name: str) -> Any:
         return getattr(os.path, name)
 
 
-def _decoded(message: Any) -> Message:
+def _decode(message: Any) -> Message:
     if message.flags & I2C_M_RD:
         return Read(message.len)
     return Write(ctypes.string_at(message.buf, message.len) if message.len else b"")
@@ -158,7 +161,7 @@ def _open(path: Any, *arguments: Any, **options: Any) -> Any:
     owner = _emulated.get(path)
     if owner is not None:
         return _Device(path, owner)
-    return open(path, *arguments, **options)  # noqa: PTH123, it stands in for this
+    return open(path, *arguments, **options)  # noqa: PTH123, it replaces this
 
 
 def _ioctl(file: Any, request: int, argument: Any = 0, mutate: bool = True) -> Any:
@@ -170,7 +173,7 @@ def _ioctl(file: Any, request: int, argument: Any = 0, mutate: bool = True) -> A
 
 
 def _replace_names() -> None:
-    # Here and not above: a machine without the driver libraries may import this module.
+    # Imported here, so that a machine without the driver libraries can import this module.
     import adafruit_extended_bus
     from Adafruit_PureIO import smbus
 

@@ -1,23 +1,23 @@
-"""The pins of a header in memory: what is wired to them, and what the Pi does with them."""
+"""Emulated pins of a header, driven by the Pi or from outside."""
 
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 LINES = 54
-"""GPIOs of the emulated chip."""
+"""Number of GPIOs of the emulated chip."""
 
 INPUT, OUTPUT, ALERT = 0x100, 0x200, 0x400
-"""How a pin is claimed; an alert is an input whose edges are reported."""
+"""Modes of a claimed pin; ALERT is an input that reports its edges."""
 PULL_UP, PULL_DOWN, PULL_NONE = 32, 64, 128
 
 EdgeFunction = Callable[[int, int, int, int], None]
-"""Called with chip, GPIO, level and time."""
+"""Function called with chip, GPIO, level and time."""
 
 
 @dataclass
 class Line:
-    """One pin: how it is claimed, and what drives it."""
+    """One pin: its mode, and the levels that drive it."""
 
     mode: int = 0
     pull: int = PULL_NONE
@@ -29,7 +29,7 @@ class Line:
     writes: list[int] = field(default_factory=list)
 
     def level(self) -> int:
-        """The level, from whichever side it is driven."""
+        """Return the level, from the side that drives the pin."""
         if self.mode & OUTPUT:
             return self.driven
         if self.outside is not None:
@@ -38,20 +38,20 @@ class Line:
 
 
 class Pins:
-    """What is wired to the header, and what the Pi does with it."""
+    """Pins of the header."""
 
     def __init__(self) -> None:
         self.lines = [Line() for _ in range(LINES)]
         self.callbacks: list[Callback] = []
         self.present = True
-        """False: there is no chip to open."""
+        """Whether the GPIO chip exists."""
         self.reports_edges = True
-        """False: as old libraries on kernels from 6.6 on, pins can be read but not listened to."""
+        """Whether edges can be reported; false as with old libraries on kernels from 6.6 on."""
 
     def set_level(self, gpio: int, level: int | None) -> None:
-        """Drive a pin from outside, as a button does; None lets go of it.
+        """Drive a pin from outside, as a button does; None stops driving it.
 
-        Returns when the callbacks of its edges are done, which run in a thread of their own.
+        Returns after the callbacks of its edges, which run in a separate thread.
         """
         line = self.lines[gpio]
         before = line.level()
@@ -60,38 +60,38 @@ class Pins:
         edge = 1 if after > before else 2 if after < before else 0
         if not (line.mode & ALERT and line.edges & edge):
             return
-        for callback in [c for c in self.callbacks if c.gpio == gpio]:
+        for callback in [item for item in self.callbacks if item.gpio == gpio]:
             thread = threading.Thread(target=callback.function, args=(0, gpio, after, 0))
             thread.start()
             thread.join()
 
     def level(self, gpio: int) -> int:
-        """Level of a pin, from whichever side it is driven; 0 where nothing drives it."""
+        """Return the level of a pin; 0 where nothing drives it."""
         return self.lines[gpio].level()
 
     def is_output(self, gpio: int) -> bool:
-        """Whether the Pi drives a pin."""
+        """Return whether the Pi drives a pin."""
         return bool(self.lines[gpio].mode & OUTPUT)
 
     def pull(self, gpio: int) -> str:
-        """The resistor at a pin: up, down or none."""
+        """Return the resistor at a pin: up, down or none."""
         return {PULL_UP: "up", PULL_DOWN: "down"}.get(self.lines[gpio].pull, "none")
 
     def writes(self, gpio: int) -> list[int]:
-        """Every level that was written to a pin, oldest first."""
+        """Return all levels written to a pin, oldest first."""
         return list(self.lines[gpio].writes)
 
     def pwm(self, gpio: int) -> tuple[float, float] | None:
-        """Frequency [Hz] and duty cycle [%] of the PWM on a pin; None without."""
+        """Return frequency [Hz] and duty cycle [%] of the PWM on a pin; None without PWM."""
         return self.lines[gpio].pwm
 
     def occupy(self, gpio: int, busy: bool = True) -> None:
-        """Let another process hold a pin, or let go of it."""
+        """Mark a pin as held by another process, or as free."""
         self.lines[gpio].busy = busy
 
 
 class Callback:
-    """As the object that lgpio.callback returns."""
+    """Registered callback, like the object that lgpio.callback returns."""
 
     def __init__(self, pins: Pins, gpio: int, function: EdgeFunction) -> None:
         self.gpio = gpio
@@ -100,6 +100,6 @@ class Callback:
         pins.callbacks.append(self)
 
     def cancel(self) -> None:
-        """Hear no more of the pin's edges."""
+        """Stop the reports of the pin's edges."""
         if self in self._pins.callbacks:
             self._pins.callbacks.remove(self)

@@ -1,6 +1,6 @@
-"""The fish on its force sensor, between the pulses of a pigpiod and the inputs of an ADS1115.
+"""Fish on its force sensor, between the pulses of a pigpiod and the inputs of an ADS1115.
 
-It swims lazily: it catches up with the time when the chip converts, or when someone asks.
+The simulation is lazy: it advances to the current time when the chip converts, or on request.
 """
 
 import math
@@ -16,18 +16,24 @@ from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.registry import open_plant
 
 STEP = 1e-4
-"""Time moves in whole multiples of this [s], so that few different lengths of time occur: the fish
-remembers what it computed for each."""
-_REMEMBERED = 1000  # windows; the force sensor makes some 1000 in a second
-_LATE = 0.02  # by how much the fish may lag behind who asks for its power, s
-_PIECE = 200  # longest stretch swum at once, in steps: one servo frame
-_WARMED_UP = 40  # stretches up to this many steps are met all the time
-_ROUNDING = 1e-7  # a frame that begins with a step has begun by then [s]
-_INPUTS = ("A0-A1", "A0-A3", "A1-A3", "A2-A3", "A0", "A1", "A2", "A3")  # by MUX code
+"""Time step [s]. All durations are whole multiples of it, so that few different ones occur; the
+fish caches its coefficients for each."""
+_MAX_HISTORY = 1000
+"""Number of windows in the history of the energy; there are about 1000 per second."""
+_MAX_POWER_LAG_S = 0.02
+"""Largest lag of the fish behind a request for its power [s]."""
+_MAX_PIECE_STEPS = 200
+"""Longest duration of one advance [steps], one servo frame."""
+_CACHED_STEPS = 40
+"""Longest duration whose coefficients are computed at the start [steps]; these occur often."""
+_ROUNDING_S = 1e-7
+"""Tolerance for rounding errors of the begin of a frame [s]."""
+_INPUTS = ("A0-A1", "A0-A3", "A1-A3", "A2-A3", "A0", "A1", "A2", "A3")
+"""Inputs by MUX code."""
 
 
 class Tank:
-    """Turns pulses into voltages; safe for use from several threads."""
+    """Simulation that converts pulses to voltages; safe for use from several threads."""
 
     def __init__(
         self,
@@ -38,37 +44,37 @@ class Tank:
         pulse: Callable[[float], float],
         start: float,
     ) -> None:
-        """The fish is at rest at `start` [s].
+        """Create a fish at rest at `start` [s].
 
-        tick: period that the noise of `imperfections` refers to [s]
-        pulse: the servo pulse at a time [s], past or present [µs]; 0 for none
+        tick: period to which the noise of `imperfections` refers [s]
+        pulse: returns the servo pulse [µs] at a past or present time [s]; 0 without pulses
         """
         self._settings = settings
         self._pulse = pulse
         self._imperfections = Imperfections(imperfections, tick)
         self._weights = tuple(_weights(name, settings) for name in _INPUTS)
         self._fish = open_plant(plant, imperfections.motor)
-        for steps in range(1, _WARMED_UP + 1):
+        for steps in range(1, _CACHED_STEPS + 1):
             self._fish.advance(None, steps * STEP, 1)
         self._start = start
         self._now = _steps(start)
         self._conversion = (0.0, 0.0)
         self._steps = 0
         self._impulse = 0.0
-        self._energy = self._spent = 0.0
-        self._past: deque[tuple[int, float]] = deque([(self._now, 0.0)], _REMEMBERED)
-        """Steps, and what the servo had taken from the start until then [J]."""
+        self._energy = self._total_energy = 0.0
+        self._energy_history: deque[tuple[int, float]] = deque([(self._now, 0.0)], _MAX_HISTORY)
+        """Steps, and the energy of the servo from the start until each [J]."""
         self._fin_peak = 0.0
         self._lock = threading.Lock()
 
     def volts(self, mux: int, begin: float, end: float) -> float:
-        """Mean voltage at the inputs that `mux`, 0 to 7, selects, from `begin` to `end` [s]."""
-        along, across = self._weights[mux]
+        """Return the mean voltage at the inputs of `mux`, 0 to 7, from `begin` to `end` [s]."""
+        weight_x, weight_y = self._weights[mux]
         with self._lock:
-            self._swim(_steps(begin))
+            self._advance(_steps(begin))
             first, last = self._now, max(_steps(end), _steps(begin) + 1)
-            if last > first:  # else someone asked for a later state meanwhile
-                x, y = self._swim(last)
+            if last > first:  # otherwise a later state was requested meanwhile
+                x, y = self._advance(last)
                 span = (last - first) * STEP
                 self._conversion = (x / span, y / span)
             fx, fy = self._imperfections.apply(
@@ -77,50 +83,50 @@ class Tank:
         settings = self._settings
         vx = settings.sensitivity * (fx + settings.crosstalk * fy) + settings.zero_x
         vy = settings.sensitivity * (fy + settings.crosstalk * fx) + settings.zero_y
-        return along * vx + across * vy
+        return weight_x * vx + weight_y * vy
 
     def catch_up(self, time: float) -> None:
-        """Swim until `time` [s], where that is later than the state."""
+        """Advance to `time` [s], if that is later than the state."""
         with self._lock:
-            self._swim(_steps(time))
+            self._advance(_steps(time))
 
     def power(self, begin: float, end: float) -> float:
-        """Mean electrical power of the servo from `begin` to `end` [s], recently [W].
+        """Return the mean electrical power of the servo between two recent times [s] [W].
 
-        A conversion of the force sensor may be under way, for which the fish has yet to swim: the
-        power is then that of a time as long, up to where the fish is.
+        While a conversion of the force sensor is running, the fish lags behind. The power is then
+        that of an interval of the same length that ends at the state of the fish.
         """
         with self._lock:
-            self._swim(_steps(end - _LATE))
+            self._advance(_steps(end - _MAX_POWER_LAG_S))
             last = min(self._now, _steps(end))
             first = min(last - 1, last - (_steps(end) - _steps(begin)))
-            taken = self._taken(last) - self._taken(first)
-        return taken / ((last - first) * STEP)
+            energy = self._energy_until(last) - self._energy_until(first)
+        return energy / ((last - first) * STEP)
 
-    def _taken(self, step: int) -> float:
-        """What the servo had taken until a step of late [J]."""
-        after = self._past[-1]
-        for before in reversed(self._past):
+    def _energy_until(self, step: int) -> float:
+        """Return the energy of the servo up to a recent step [J]."""
+        after = self._energy_history[-1]
+        for before in reversed(self._energy_history):
             if before[0] <= step:
                 length = after[0] - before[0]
-                share = (step - before[0]) / length if length else 0.0
-                return before[1] + share * (after[1] - before[1])
+                weight = (step - before[0]) / length if length else 0.0
+                return before[1] + weight * (after[1] - before[1])
             after = before
         return after[1]
 
     def truth(self) -> Truth:
-        """The true state at the end of the latest conversion."""
+        """Return the true state at the end of the latest conversion."""
         with self._lock:
             state = self._fish.state
         return Truth(alpha=state.alpha, alpha_rate=state.alpha_rate, phi=state.phi)
 
     def angle(self, time: float) -> float | None:
-        """The instruction angle [rad] that the pulse at a time [s] means; None without pulses."""
+        """Return the instruction angle [rad] of the pulse at a time [s]; None without pulses."""
         width = self._pulse(time)
         return (width - self._settings.servo_centre) / self._settings.servo_scale if width else None
 
     def take_window(self) -> TrueWindow:
-        """What the fish truly did since the previous call, or since the start."""
+        """Return the true motion and forces since the previous call, or since the start."""
         with self._lock:
             duration = self._steps * STEP
             thrust = self._impulse / duration if duration else 0.0
@@ -130,26 +136,26 @@ class Tank:
             self._fin_peak = abs(self._fish.state.alpha)
         return window
 
-    def _swim(self, until: int) -> tuple[float, float]:
-        """Swim until a step; the impulses of F_x and F_y on the way [N s]."""
+    def _advance(self, until: int) -> tuple[float, float]:
+        """Advance to a step, and return the impulses of F_x and F_y [N s]."""
         impulse_x = impulse_y = 0.0
         fish = self._fish
         while self._now < until:
             now = self._now
             angle = self._angle_at(now)
-            end = self._change(angle, min(until, now + _PIECE))
+            end = self._next_change(angle, min(until, now + _MAX_PIECE_STEPS))
             rate = fish.state.alpha_rate
             window = fish.advance(angle, (end - now) * STEP, 1)
             duration = window.duration
             self._steps += end - now
             self._now = end
             self._energy += (energy := window.power * duration)
-            self._spent += energy
-            self._past.append((end, self._spent))
+            self._total_energy += energy
+            self._energy_history.append((end, self._total_energy))
             impulse_x += window.thrust * duration
             impulse_y += window.lateral_force * duration
             state = fish.state
-            turned = rate * state.alpha_rate < 0.0  # only then is the peak within the window
+            turned = rate * state.alpha_rate < 0.0  # otherwise the peak is at the end of the window
             peak = window.fin_peak if turned else abs(state.alpha)
             if peak > self._fin_peak:
                 self._fin_peak = peak
@@ -157,31 +163,31 @@ class Tank:
         return impulse_x, impulse_y
 
     def _angle_at(self, step: int) -> float | None:
-        return self.angle(step * STEP + _ROUNDING)
+        return self.angle(step * STEP + _ROUNDING_S)
 
-    def _change(self, angle: float | None, until: int) -> int:
-        """The step, `until` at the latest, up to which the pulses still mean this angle."""
+    def _next_change(self, angle: float | None, until: int) -> int:
+        """Return the step, at most `until`, up to which the pulses command this angle."""
         if self._angle_at(until) == angle:
             return until
-        same, other = self._now, until
-        while other - same > 1:
-            middle = (same + other) // 2
+        unchanged, changed = self._now, until
+        while changed - unchanged > 1:
+            middle = (unchanged + changed) // 2
             if self._angle_at(middle) == angle:
-                same = middle
+                unchanged = middle
             else:
-                other = middle
-        return other
+                changed = middle
+        return changed
 
 
 def _steps(time: float) -> int:
-    """Whole steps until a time, rounded down: nobody knows yet which pulses come later."""
-    return math.floor((time + _ROUNDING) / STEP)
+    """Return the whole steps up to a time, rounded down, because later pulses are unknown."""
+    return math.floor((time + _ROUNDING_S) / STEP)
 
 
 def _weights(name: str, settings: VirtualPiSettings) -> tuple[float, float]:
-    """Shares of the two channels' voltages at an input.
+    """Return the weights of the two channels' voltages at an input.
 
-    The first pin of a channel carries its voltage, pins that no channel uses are grounded.
+    The first pin of a channel carries its voltage; pins without a channel are grounded.
     """
     if name == settings.channel_x:
         return 1.0, 0.0
@@ -189,7 +195,7 @@ def _weights(name: str, settings: VirtualPiSettings) -> tuple[float, float]:
         return 0.0, 1.0
     plus, _, minus = name.partition("-")
 
-    def share(channel: str) -> float:
+    def weight(channel: str) -> float:
         return float(channel[:2] == plus) - float(channel[:2] == minus)
 
-    return share(settings.channel_x), share(settings.channel_y)
+    return weight(settings.channel_x), weight(settings.channel_y)

@@ -1,4 +1,4 @@
-"""A Raspberry Pi with its sensor, servo and fish, put together from the emulated parts."""
+"""Virtual Raspberry Pi with sensor, servo and fish, composed of the emulated parts."""
 
 import threading
 import time
@@ -21,15 +21,16 @@ from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.tank import Tank
 from fishd.virtual.plant.parameters import PlantParameters
 
-POWER_METER = 0x40
-"""Address of the power meter."""
-_LONGEST_CONVERSION = 0.2  # of the slowest data rate, and a little more [s]
+POWER_METER_ADDRESS = 0x40
+"""I2C address of the power meter."""
+_MAX_CONVERSION_S = 0.2
+"""Upper bound of the time of a conversion at the slowest data rate [s]."""
 
 
 class PunctualClock:
-    """The machine's clock, with sleeps that are right on average, even very short ones.
+    """Clock of the machine whose sleeps have the right length on average, even very short ones.
 
-    It wakes up early by as much as the machine lately woke it up late, tens of microseconds.
+    It shortens each sleep by the recent mean delay of the wake-up, tens of microseconds.
     """
 
     monotonic = staticmethod(time.monotonic)
@@ -39,33 +40,33 @@ class PunctualClock:
         self._lateness = 0.0
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass."""
-        asked = max(0.0, seconds - self._lateness)
-        begun = time.monotonic()
-        time.sleep(asked)
-        late = min(time.monotonic() - begun - asked, 2e-4)
-        self._lateness += 0.05 * (late - self._lateness)
+        """Sleep for a time [s]."""
+        duration = max(0.0, seconds - self._lateness)
+        start_time = time.monotonic()
+        time.sleep(duration)
+        lateness = min(time.monotonic() - start_time - duration, 2e-4)
+        self._lateness += 0.05 * (lateness - self._lateness)
 
 
 class PiState(Struct, frozen=True):
-    """What a virtual Pi is doing."""
+    """State of a virtual Pi."""
 
     pigpio_port: int
     """TCP port of its pigpiod."""
     pulse: float
-    """Servo pulse [µs]; 0 while there are none."""
+    """Servo pulse [µs]; 0 without pulses."""
     angle: float | None
-    """What that pulse means [rad]; None while there are none."""
+    """Instruction angle of the pulse [rad]; None without pulses."""
     truth: Truth
-    """The true state of the fish at the end of the latest conversion."""
+    """True state of the fish at the end of the latest conversion."""
     faults: dict[str, float | None]
-    """Active faults, and how long each still lasts [s]; None: until it is cleared."""
+    """Active faults and their remaining times [s]; None: until cleared."""
     levels: dict[int, int]
-    """GPIOs that something outside, such as a button, drives low or high."""
+    """Levels of the GPIOs that are driven from outside, for example by a button."""
 
 
 class VirtualPi:
-    """Everything on one clock, virtual or real; use it as a context manager."""
+    """Virtual Pi on one clock, virtual or real; a context manager."""
 
     def __init__(
         self,
@@ -75,8 +76,8 @@ class VirtualPi:
         tick: float,
         clock: Clock,
     ) -> None:
-        """`tick`: period that the noise of `imperfections` refers to [s]."""
-        seed = 3 * imperfections.seed  # three sources of chance must not repeat one another
+        """`tick`: period to which the noise of `imperfections` refers [s]."""
+        seed = 3 * imperfections.seed  # the three random sequences must differ
         self.settings = settings
         self.faults = Faults(clock, seed + 1)
         self.bus = I2cBus(clock, settings.bus_speed, self.faults)
@@ -97,24 +98,26 @@ class VirtualPi:
             supply = imperfections.motor.voltage
             meter = CHIPS[settings.power_meter]
             self.bus.attach(
-                POWER_METER, meter(clock, self.tank.power, self.faults, supply, settings.shunt)
+                POWER_METER_ADDRESS,
+                meter(clock, self.tank.power, self.faults, supply, settings.shunt),
             )
         self.pins = Pins()
-        """The header as rpi-lgpio sees it."""
+        """Pins of the header, as used by rpi-lgpio."""
         self._clock = clock
         self._levels: dict[int, int] = {}
-        self._rewired = threading.Condition()
+        self._levels_changed = threading.Condition()
         self._started = False
 
     def start(self) -> None:
-        """Let pigpiod listen; raises `StartupError` when it cannot."""
+        """Start pigpiod; raises `StartupError` when it cannot listen."""
         try:
             self.pigpiod.start()
             self._started = True
         except OSError as error:
             raise StartupError(
                 f"virtual_pi.pigpio_port: cannot listen on port {self.settings.pigpio_port}: "
-                f"{error.strerror}; stop what uses it, pigpiod perhaps, or choose another port"
+                f"{error.strerror}; stop the program that uses it, "
+                "perhaps pigpiod, or choose another port"
             ) from None
 
     def close(self) -> None:
@@ -130,26 +133,26 @@ class VirtualPi:
         self.close()
 
     def set_level(self, gpio: int, level: int | None) -> None:
-        """Drive a pin of the header from outside; None lets go of it. ValueError: no such pin."""
+        """Drive a pin of the header from outside, None: stop; raises ValueError for another pin."""
         if not 0 <= gpio <= 27:
             raise ValueError(f"GPIO {gpio} is not valid: 0 to 27 is needed")
-        with self._rewired:
+        with self._levels_changed:
             self._levels.pop(gpio, None)
             if level is not None:
                 self._levels[gpio] = level
-            self._rewired.notify_all()
+            self._levels_changed.notify_all()
         self.pins.set_level(gpio, level)
 
     def levels(self, other_than: Mapping[int, int], patience: float) -> dict[int, int]:
-        """The pins driven from outside, once they are other than these or patience [s] ends."""
-        with self._rewired:
-            self._rewired.wait_for(lambda: self._levels != other_than, patience)
+        """Return the pins driven from outside when they differ, or after `patience` [s]."""
+        with self._levels_changed:
+            self._levels_changed.wait_for(lambda: self._levels != other_than, patience)
             return dict(self._levels)
 
     def state(self) -> PiState:
-        """What it is doing now; the fish swims on where nobody reads the sensor."""
+        """Return the current state; this advances the fish even if the sensor is not read."""
         now = self._clock.monotonic()
-        self.tank.catch_up(now - _LONGEST_CONVERSION)
+        self.tank.catch_up(now - _MAX_CONVERSION_S)
         return PiState(
             pigpio_port=self.pigpiod.port,
             pulse=self.pigpiod.width(self.settings.servo_gpio, now),

@@ -1,4 +1,4 @@
-"""Carries what is wired to the pins of a virtual Pi, such as a button, into another process."""
+"""Transfer of the levels of a virtual Pi's pins, for example of a button, to this process."""
 
 import threading
 from collections.abc import Callable
@@ -7,15 +7,15 @@ from pathlib import Path
 from fishd.core.errors import StartupError
 from fishd.virtual.pi.link import RemotePi
 
-_PAUSE = 0.2
-"""Between attempts to find the virtual Pi again [s]."""
+_RETRY_PERIOD_S = 0.2
+"""Time between two attempts to connect to the virtual Pi again [s]."""
 
 
 class Wires:
-    """Keeps the levels of the pins of this process as they are at the virtual Pi."""
+    """Copy of the levels of the virtual Pi's pins to the pins of this process."""
 
     def __init__(self, path: Path, set_level: Callable[[int, int | None], None]) -> None:
-        """set_level: takes GPIO and level, None where nothing drives the pin any more.
+        """set_level: sets the level of a GPIO, None where nothing drives the pin.
 
         Raises `StartupError` when no virtual Pi listens at `path`, or it does not answer.
         """
@@ -32,7 +32,7 @@ class Wires:
         self._thread.start()
 
     def close(self) -> None:
-        """Leave the pins as they are; may be called twice."""
+        """Stop the copy; the pins keep their levels. May be called twice."""
         self._closing.set()
         self._remote.close()
         self._thread.join()
@@ -41,11 +41,11 @@ class Wires:
         while not self._closing.is_set():
             try:
                 levels = self._remote.await_levels(self._levels)
-            except OSError:  # gone, or closing
-                self._closing.wait(_PAUSE)
+            except OSError:  # not running, or closing
+                self._closing.wait(_RETRY_PERIOD_S)
             else:
                 self._adopt(levels)
-        self._remote.close()  # a connection made while closing
+        self._remote.close()  # a connection that was opened during `close`
 
     def _adopt(self, levels: dict[int, int]) -> None:
         for gpio in self._levels.keys() | levels.keys():

@@ -1,4 +1,4 @@
-"""The tethered robotic fish as equations, for the simulated hardware and the theory.
+"""Equations of the tethered robotic fish, for the simulated hardware and the theory.
 
-Nothing is imported here, so reading the parameters costs no numpy.
+Nothing is imported here, so that parameters can be read without NumPy.
 """

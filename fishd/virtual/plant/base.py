@@ -26,7 +26,7 @@ P = TypeVar("P", bound=PlantParameters)
 
 
 class PlantState(NamedTuple):
-    """Where the fish is; all that the equations of the tethered fish remember."""
+    """State of the equations of the tethered fish."""
 
     phi: float = 0.0  # servo wheel angle, rad
     alpha: float = 0.0  # fin angle, rad
@@ -37,11 +37,11 @@ REST = PlantState()
 
 
 class Window(Protocol):
-    """What the force sensor feels during one window; a `PlantWindow` is one."""
+    """Forces and motion during one window, as a protocol; `PlantWindow` implements it."""
 
     @property
     def duration(self) -> float:
-        """[s]"""
+        """Length of the window [s]."""
 
     @property
     def thrust(self) -> float:
@@ -57,7 +57,7 @@ class Window(Protocol):
 
     @property
     def sampled_lateral_force(self) -> float:
-        """Mean of F_y at the same instants [N]."""
+        """Mean of F_y at the midpoints of equal parts of the window [N]."""
 
     @property
     def fin_peak(self) -> float:
@@ -69,7 +69,7 @@ class Window(Protocol):
 
 
 class PlantWindow(Struct, frozen=True):
-    """A window whose numbers are all known at once."""
+    """Window with fixed values."""
 
     duration: float
     thrust: float
@@ -81,10 +81,10 @@ class PlantWindow(Struct, frozen=True):
 
 
 class TrueWindow(Struct, frozen=True, gc=False):
-    """What truly happened during a window, for those who judge a run."""
+    """True values of a window, for the evaluation of a run."""
 
     duration: float
-    """[s]"""
+    """Length of the window [s]."""
     thrust: float
     """Mean F_x [N]."""
     fin_peak: float
@@ -94,31 +94,31 @@ class TrueWindow(Struct, frozen=True, gc=False):
 
 
 class Plant(ABC, Generic[P]):
-    """A fish in still water that cannot swim away, at rest at first; knows no clock, no chance."""
+    """Tethered fish in still water, initially at rest; deterministic and without a clock."""
 
     Settings: ClassVar[type[Any]]
-    """Its keys in section `plant`: a frozen msgspec struct, a subclass of `PlantParameters`."""
+    """Struct of its keys in section `plant`: frozen, a subclass of `PlantParameters`."""
 
     state: PlantState
-    """Where it is now."""
+    """Current state."""
 
     def __init__(self, parameters: P) -> None:
-        """parameters: of this fish"""
+        """parameters: constants of this fish"""
         self.parameters = parameters
 
     @classmethod
     def check(cls, parameters: P) -> None:
-        """Refuse parameters that are valid one by one but not together.
+        """Refuse parameters that are valid on their own but not together.
 
         Raises `Problem((key,), message)`.
         """
 
     @abstractmethod
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> Window:
-        """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
+        """Hold the instruction angle (rad) for `duration` s, and return the window.
 
-        None means no pulses: the wheel then stays where it is. `samples` instants make the sampled
-        means, as an ADC that is read evenly within the window does.
+        None means no pulses: the wheel then keeps its angle. The sampled means are those of
+        `samples` equally spaced instants, at which an ADC would be read.
         """
 
     def prepare(self, instruction_angle: float | None, duration: float, samples: int) -> None:

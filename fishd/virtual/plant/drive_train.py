@@ -1,8 +1,8 @@
-"""From an instruction to the tail: the servo's delay, its wheel, and the cables with their play.
+"""Drive train from the instruction to the tail: the servo's delay, its wheel, and the cables.
 
 The wheel follows φ̇ = Ω tanh((φ_c − φ)/Δ) of Fu et al., solved exactly for a constant φ_c. With the
 lag x = (φ_c − φ)/Δ and the time t in units of Δ/Ω, sinh x(t) = sinh x(0) · exp(−t). Lags and times
-of the wheel are in those units here, and in logarithms, because sinh overflows at a lag of 710.
+of the wheel have those units here. Logarithms are used, because sinh overflows at a lag of 710.
 """
 
 import math
@@ -10,11 +10,12 @@ from collections import deque
 from typing import NamedTuple
 
 _LN2 = math.log(2.0)
-_ENGAGED = 1e-12  # rad; play that is smaller is none
+_MIN_PLAY_RAD = 1e-12
+"""Smallest play that is not treated as zero [rad]."""
 
 
 class Part(NamedTuple):
-    """A part of a window in which the servo knows one instruction."""
+    """Part of a window with one instruction at the servo."""
 
     angle: float | None  # rad; None for no pulses
     begin: float  # s, from the start of the window
@@ -22,30 +23,30 @@ class Part(NamedTuple):
 
 
 class DelayLine:
-    """Instructions on their way to the servo; before the first one arrives, it has no pulses."""
+    """Delay of instructions to the servo, which has no pulses before the first one arrives."""
 
     def __init__(self, delay: float) -> None:
-        """`delay` in s."""
+        """`delay`: time from an instruction to the servo [s]."""
         self._delay = delay
-        self._given: float | None = None
-        self._known: float | None = None
-        self._under_way: deque[tuple[float, float | None]] = deque()
-        """Each with the time until it arrives [s]."""
+        self._last_angle: float | None = None
+        self._servo_angle: float | None = None
+        self._delayed: deque[tuple[float, float | None]] = deque()
+        """Times until arrival [s], and angles of the delayed instructions."""
 
-    def passed(self, angle: float | None, duration: float) -> list[Part]:
-        """Give an instruction [rad] for `duration` s; what the servo knows meanwhile."""
-        if angle != self._given:
-            self._given = angle
-            self._under_way.append((self._delay, angle))
+    def advance(self, angle: float | None, duration: float) -> list[Part]:
+        """Hold an instruction [rad] for `duration` s, and return the instructions at the servo."""
+        if angle != self._last_angle:
+            self._last_angle = angle
+            self._delayed.append((self._delay, angle))
         parts, begin = [], 0.0
-        while self._under_way and self._under_way[0][0] < duration:
-            arrives, angle = self._under_way.popleft()
+        while self._delayed and self._delayed[0][0] < duration:
+            arrives, angle = self._delayed.popleft()
             if arrives > begin:
-                parts.append(Part(self._known, begin, arrives))
-            self._known, begin = angle, arrives
-        parts.append(Part(self._known, begin, duration))
-        # Rounded, so that the same few lengths of time come again and again.
-        self._under_way = deque((round(t - duration, 9), angle) for t, angle in self._under_way)
+                parts.append(Part(self._servo_angle, begin, arrives))
+            self._servo_angle, begin = angle, arrives
+        parts.append(Part(self._servo_angle, begin, duration))
+        # Rounded, so that only few different lengths of time occur.
+        self._delayed = deque((round(t - duration, 9), angle) for t, angle in self._delayed)
         return parts
 
 
@@ -56,7 +57,7 @@ def log_sinh(lag: float) -> float:
 
 
 def relax(lag: float, time: float) -> float:
-    """Return the lag that is left of `lag` after `time`."""
+    """Return the lag to which `lag` has decreased after `time`."""
     exponent = log_sinh(lag) - time
     # Above 20, asinh(exp(y)) and y + ln 2 are the same double.
     size = math.asinh(math.exp(exponent)) if exponent < 20.0 else exponent + _LN2
@@ -64,15 +65,15 @@ def relax(lag: float, time: float) -> float:
 
 
 def time_between(lag: float, later: float) -> float:
-    """Return the time in which `lag` shrinks to `later`, a smaller lag of the same sign."""
+    """Return the time in which `lag` decreases to `later`, a smaller lag of the same sign."""
     return log_sinh(lag) - log_sinh(later)
 
 
 def lag_after_reversal(step: float, half_period: float) -> float:
     """Return the lag right after a reversal of a periodic square wave.
 
-    `step` is the full swing 2Φ/Δ. The lag left at the end of a half period, sinh x · exp(−t), is
-    what the next step starts from, sinh(step − x), by antisymmetry; solved here for x.
+    `step` is the full swing 2Φ/Δ. By antisymmetry, the lag at the end of a half period,
+    sinh x · exp(−t), equals sinh(step − x), from which the next step starts; solved for x.
     """
     return 0.5 * (_log_add_exp(step, -half_period) - _log_add_exp(-step, -half_period))
 
@@ -82,35 +83,36 @@ def _log_add_exp(a: float, b: float) -> float:
 
 
 class Pull(NamedTuple):
-    """How the wheel drives the fin during a part of its motion."""
+    """Coupling between wheel and fin during a part of the motion."""
 
     moves: bool
+    """Whether the wheel moves the tail."""
     angle: float
-    """Where it moves, how far it is behind the wheel, else where it stands [rad]."""
+    """Lag of the tail behind the wheel while it moves, otherwise the angle of the tail [rad]."""
 
 
 class Cables:
-    """Remembers where the tail is within its play, and how the wheel drives it."""
+    """Cables between wheel and tail, with slack and backlash."""
 
     def __init__(self, slack: float, play: float, phi: float) -> None:
-        """The tail follows the wheel, at `phi`; all in rad."""
+        """slack, play: of the cables [rad]; phi: initial angle of wheel and tail [rad]"""
         self.taut = not (slack or play)
         self.tail = phi
-        """The wheel angle that the tail follows; only with backlash another than φ [rad]."""
+        """Wheel angle that the tail follows; without backlash it equals φ [rad]."""
         self._slack = slack
         self._play = play
 
     def edges(self, phi: float, direction: float) -> list[float]:
-        """Wheel angles (rad) at which a wheel that turns on from `phi` begins or ceases to pull."""
+        """Return the wheel angles (rad) after `phi` at which the wheel starts or stops to pull."""
         slack, play = self._slack, math.copysign(self._play, direction)
         edges = [play - slack, play + slack] if slack else []
         self.tail = self._followed(phi)
-        if play and abs(self.tail + play - phi) > _ENGAGED:
+        if play and abs(self.tail + play - phi) > _MIN_PLAY_RAD:
             edges.append(self.tail + play)
         return edges
 
     def pull(self, halfway: float, end: float) -> Pull:
-        """Let the wheel turn to `end` (rad), with no edge on its way."""
+        """Turn the wheel to `end` (rad) without an edge in between, and return the coupling."""
         before, tail = self.tail, self._followed(halfway)
         self.tail = self._followed(end)
         if abs(tail) <= self._slack:

@@ -1,10 +1,10 @@
-"""What the simulated servo draws from its supply: a DC motor, known by its data sheet.
+"""Electrical power of the simulated servo: a DC motor with the values of its data sheet.
 
-Its current is i = i₀ ω/Ω + τ/k_t, for the friction of its gears at the wheel's speed ω and for the
-torque τ that turns tail and rotor; the supply gives (R i + k_e ω) i, copper loss and the rest
+Its current is i = i₀ ω/Ω + τ/k_t, for the friction of the gears at the wheel's speed ω and for the
+torque τ on tail and rotor. The supply provides (R i + k_e ω) i, of which R i² is copper loss
 (Hughes and Drury, Electric Motors and Drives, 5th edition, chapter 3). From the data sheet,
-R = U/i_stall, k_e = (U − R i₀)/Ω and k_t = τ_stall/i_stall. The supply gets nothing back from a
-motor that brakes.
+R = U/i_stall, k_e = (U − R i₀)/Ω and k_t = τ_stall/i_stall. A braking motor does not return energy
+to the supply.
 """
 
 import math
@@ -18,23 +18,23 @@ from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 
 
 class Stretch(Struct, frozen=True, eq=False):
-    """A segment of a window, with what the wheel and the fin do in it."""
+    """Segment of a window, with the motion of wheel and fin."""
 
     segment: Segment
     response: Vector
-    """Motion of the fin, as `Segment.response` gives it."""
+    """Motion of the fin, the result of `Segment.response`."""
     lags: Vector
-    """(N,), lag/Δ of the wheel at the nodes; of n alike segments, (n, N)."""
+    """lag/Δ of the wheel at the nodes, shape (N,), or (n, N) for n segments of equal length."""
     pulls: bool
     """Whether the wheel moves the tail."""
 
 
 class Motor:
-    """The motor of one servo, as the energy that a motion of its wheel takes.
+    """Motor of one servo, which computes the energy of a motion of its wheel.
 
     A change of the instruction makes the wheel's speed jump in the equations of the servo. The
-    energy of a jump from ω₁ to ω₂ is what a voltage that steps to k_e ω₂ gives until the rotor has
-    followed: J ω₂ (ω₂ − ω₁) k_e/k_t, whatever the resistance.
+    energy of a jump from ω₁ to ω₂ is that of a voltage step to k_e ω₂ until the rotor has followed,
+    J ω₂ (ω₂ − ω₁) k_e/k_t, independent of the resistance.
     """
 
     def __init__(self, settings: MotorSettings, plant: PlantParameters) -> None:
@@ -43,7 +43,7 @@ class Motor:
         back_emf = max(0.0, settings.voltage - resistance * settings.no_load_current) / speed
         torque_constant = settings.stall_torque / settings.stall_current
         self.idle = settings.voltage * settings.idle_current
-        """Power that is drawn all the time [W]."""
+        """Constant power of the electronics [W]."""
         self._speed = speed
         self._resistance = resistance
         braking = settings.rotor_inertia * speed**2 / lag / torque_constant  # A
@@ -57,15 +57,15 @@ class Motor:
     def jump(self, before: float, after: float) -> float:
         """Return the energy of a jump of the wheel's speed at an instruction [J].
 
-        before, after: lag/Δ just before the instruction, and just after it
+        before, after: lag/Δ immediately before and after the instruction
         """
         rate = self._speed * math.tanh(after)
         return max(0.0, self._jump * rate * (rate - self._speed * math.tanh(before)))
 
     def energy(self, stretch: Stretch) -> NDArray[np.float64]:
-        """Return the energy of a motion, or of each of some, without the idle current [J]."""
+        """Return the energy of a motion, or of each of several, without the idle current [J]."""
         response = stretch.response
-        speeds = np.tanh(stretch.lags)  # over the highest
+        speeds = np.tanh(stretch.lags)  # relative to the highest speed
         current = speeds * speeds
         current *= self._braking
         current += self._moving
@@ -75,6 +75,6 @@ class Motor:
             current += self._drag * response[..., N : 2 * N]
         speeds *= self._emf
         speeds += current
-        current *= speeds  # which is the power over the resistance
+        current *= speeds  # now the power over the resistance
         energy: NDArray[np.float64] = np.maximum(current, 0.0).dot(WEIGHTS)
         return energy * (self._resistance * stretch.segment.length)

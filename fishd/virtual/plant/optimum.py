@@ -1,7 +1,7 @@
-"""The best periodic square wave, from the equations: the yardstick of every controller.
+"""Best periodic square wave from the equations, the reference for every controller.
 
-The periodic state of the tethered fish is solved for directly, without simulating a transient. A
-fin with quadratic drag, and a plant of another package, swim until each beat is like the last.
+The periodic state of the tethered fish is computed directly, without the simulation of a transient.
+A fin with quadratic drag, and a plant of another package, are simulated until the beats are equal.
 """
 
 import cmath
@@ -20,21 +20,25 @@ from fishd.virtual.plant.registry import open_plant
 from fishd.virtual.plant.tethered import AnyWindow, TetheredFish
 
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0
-_PRECISION = 1e-4  # of the best frequency, relative; the thrust is flat there
+_FREQUENCY_TOLERANCE = 1e-4
+"""Relative error of the best frequency; the thrust is flat there."""
 
-# Far below ω₀ and the frequency Ω/4Φ at which the servo saturates, thrust grows as the frequency;
-# above ω₀ it falls. The heaviest damping allowed puts the best at 0.18 of the lower of the two.
-_SCAN_BELOW = 8.0
-_SCAN_ABOVE = 1.5
-_SCANNED = 32
+# Far below ω₀ and the frequency Ω/4Φ at which the servo saturates, thrust is proportional to the
+# frequency; above ω₀ it falls. With the heaviest allowed damping, the best frequency is 0.18 of the
+# lower of the two.
+_SCAN_FACTOR_BELOW = 8.0
+_SCAN_FACTOR_ABOVE = 1.5
+_SCAN_POINTS = 32
 
-_SETTLED = 1e-7  # of the thrust of a fish that swims, relative
-_ROUGHLY = 1e-3  # while it is only to be seen which frequencies are worth a closer look
-_MOST_BEATS = 200
+_THRUST_TOLERANCE = 1e-7
+"""Relative error of the thrust of a simulated fish."""
+_SCAN_TOLERANCE = 1e-3
+"""Relative error of the thrust during the scan of frequencies."""
+_MAX_BEATS = 200
 
 
 class SteadyState(NamedTuple):
-    """What a periodic command amounts to once transients have died out."""
+    """Result of a periodic command after the decay of transients."""
 
     frequency: float  # Hz
     thrust: float  # mean of F_x over a period, N
@@ -44,9 +48,9 @@ class SteadyState(NamedTuple):
 def fast_servo_thrust(parameters: PlantParameters, amplitude: float, frequency: float) -> float:
     """Return the mean thrust (N) of a square wave that the wheel follows at once, φ = φ_c.
 
-    The closed form of Fu et al., for an amplitude in rad and a frequency in Hz, with numerator and
-    denominator both divided by exp(ξx) so that low frequencies do not overflow. Slack, backlash
-    and dead zone are left out.
+    This is the closed form of Fu et al., for an amplitude in rad and a frequency in Hz. Numerator
+    and denominator are divided by exp(ξx), so that low frequencies do not overflow. Slack, backlash
+    and dead zone are ignored.
     """
     p = parameters
     x = p.omega0 / (4.0 * frequency)
@@ -66,72 +70,79 @@ def fast_servo_thrust(parameters: PlantParameters, amplitude: float, frequency: 
 
 def square_wave(parameters: PlantParameters, amplitude: float, frequency: float) -> SteadyState:
     """Return the periodic regime of φ_c = ±amplitude (rad) reversed twice per period (Hz)."""
-    if not _linear(parameters):
-        return _Swimming(parameters, amplitude).settled(frequency, _SETTLED)
+    if not _is_linear(parameters):
+        return _SimulatedFish(parameters, amplitude).simulate(frequency, _THRUST_TOLERANCE)
     window = _half_period(parameters, amplitude, frequency)
     return SteadyState(frequency, window.thrust, window.fin_peak)
 
 
 @lru_cache(maxsize=256)
 def best_square_wave(parameters: PlantParameters, amplitude: float) -> SteadyState:
-    """Return the square wave of this amplitude (rad) that thrusts most, over all frequencies.
+    """Return the square wave of this amplitude (rad) with the largest thrust over all frequencies.
 
-    Weak damping brings local maxima at odd fractions of ω₀/2π, hence a scan before the refinement,
-    and a maximum at ω₀/2π too narrow for a scan to meet by chance. Without any damping the thrust
-    there has no bound, and the answer is only as large as rounding lets it be.
+    With weak damping there are local maxima at odd fractions of ω₀/2π, hence the scan before the
+    refinement. The maximum at ω₀/2π is narrow, hence that frequency is one point of the scan.
+    Without damping, the thrust there is unbounded, and rounding limits the result.
     """
     p = parameters
     resonance = p.omega0 / (2.0 * math.pi)
     saturated = p.servo_speed / (4.0 * amplitude)
-    lowest = min(resonance, saturated) / _SCAN_BELOW
-    scan = sorted([resonance, *np.geomspace(lowest, _SCAN_ABOVE * resonance, _SCANNED).tolist()])
+    lowest = min(resonance, saturated) / _SCAN_FACTOR_BELOW
+    scan = sorted(
+        [resonance, *np.geomspace(lowest, _SCAN_FACTOR_ABOVE * resonance, _SCAN_POINTS).tolist()]
+    )
 
-    swimming = None if _linear(p) else _Swimming(p, amplitude)
+    simulated_fish = None if _is_linear(p) else _SimulatedFish(p, amplitude)
 
-    def thrust(log_frequency: float, precision: float = _SETTLED) -> float:
+    def thrust(log_frequency: float, precision: float = _THRUST_TOLERANCE) -> float:
         frequency = math.exp(log_frequency)
-        if swimming:
-            return swimming.settled(frequency, precision).thrust
+        if simulated_fish:
+            return simulated_fish.simulate(frequency, precision).thrust
         return _half_period(p, amplitude, frequency).thrust
 
     logs = [math.log(frequency) for frequency in scan]
-    thrusts = [thrust(x, _ROUGHLY) for x in logs]
+    thrusts = [thrust(x, _SCAN_TOLERANCE) for x in logs]
     best = min(max(thrusts.index(max(thrusts)), 1), len(logs) - 2)
-    return square_wave(p, amplitude, math.exp(_maximum(thrust, logs[best - 1], logs[best + 1])))
+    return square_wave(
+        p, amplitude, math.exp(_find_maximum(thrust, logs[best - 1], logs[best + 1]))
+    )
 
 
-def _linear(parameters: PlantParameters) -> bool:
-    """Is the fin's state after half a period an affine map of that before?"""
+def _is_linear(parameters: PlantParameters) -> bool:
+    """Return whether half a period is an affine map of the fin's state."""
     return parameters.model == TETHERED and not parameters.quadratic_drag
 
 
-class _Swimming:
-    """A fish that swims square waves of one amplitude (rad), one after the other."""
+class _SimulatedFish:
+    """Simulated fish under square waves of one amplitude (rad)."""
 
     def __init__(self, parameters: PlantParameters, amplitude: float) -> None:
-        # As for a linear fin, what shifts all in time or is no thrust is left out.
+        # The delay only shifts the motion, and the reaction does not change the thrust.
         self._fish = open_plant(replace(parameters, servo_delay=0.0, servo_reaction=0.0))
         self._amplitude = amplitude
 
-    def settled(self, frequency: float, precision: float) -> SteadyState:
-        """Swim until what is left of the transient is within a precision of the thrust.
+    def simulate(self, frequency: float, precision: float) -> SteadyState:
+        """Simulate beats until the rest of the transient is below a precision of the thrust.
 
-        The change from beat to beat shrinks by some factor r, so r/(1 − r) of it is still to come.
-        It may also change its sign, and be small once for that alone.
+        The change from beat to beat decreases by a factor r, so the remaining change is r/(1 − r)
+        of it. Two small changes in a row are required, because one may be small where it changes
+        its sign.
         """
         half_period = 0.5 / frequency
         thrust = change = math.inf
-        peak, good = 0.0, 0
-        for _ in range(_MOST_BEATS):
-            there = self._fish.advance(self._amplitude, half_period, samples=1)
+        peak, good_beats = 0.0, 0
+        for _ in range(_MAX_BEATS):
+            forth = self._fish.advance(self._amplitude, half_period, samples=1)
             back = self._fish.advance(-self._amplitude, half_period, samples=1)
-            before, thrust = thrust, 0.5 * (there.thrust + back.thrust)
+            before, thrust = thrust, 0.5 * (forth.thrust + back.thrust)
             earlier, change = change, abs(thrust - before)
-            peak = max(there.fin_peak, back.fin_peak)
-            shrinks = change / earlier if earlier else 0.0
-            left = change * shrinks / (1.0 - shrinks) if shrinks < 1.0 else math.inf
-            good = good + 1 if earlier < math.inf and left <= precision * abs(thrust) else 0
-            if good == 2:
+            peak = max(forth.fin_peak, back.fin_peak)
+            ratio = change / earlier if earlier else 0.0
+            left = change * ratio / (1.0 - ratio) if ratio < 1.0 else math.inf
+            good_beats = (
+                good_beats + 1 if earlier < math.inf and left <= precision * abs(thrust) else 0
+            )
+            if good_beats == 2:
                 break
         return SteadyState(frequency, thrust, peak)
 
@@ -139,12 +150,13 @@ class _Swimming:
 def _half_period(parameters: PlantParameters, amplitude: float, frequency: float) -> AnyWindow:
     """Return the half period after a reversal to +amplitude, in the periodic regime.
 
-    Half a period is an affine map of (α, α̇); by antisymmetry the regime is what it negates. The
-    servo's delay shifts it in time, its reaction is no thrust: both are left out.
+    Half a period is an affine map of (α, α̇); by antisymmetry, it negates the state of the periodic
+    regime. The servo's delay only shifts the motion, and its reaction does not change the thrust:
+    both are set to zero.
     """
     p = replace(parameters, servo_delay=0.0, servo_reaction=0.0)
     half_period = 0.5 / frequency
-    swing = max(0.0, amplitude - p.servo_dead_zone)  # as far as the wheel goes
+    swing = max(0.0, amplitude - p.servo_dead_zone)  # angle that the wheel reaches
     lag = p.servo_lag * lag_after_reversal(
         2.0 * swing / p.servo_lag, half_period * p.servo_speed / p.servo_lag
     )
@@ -161,11 +173,11 @@ def _half_period(parameters: PlantParameters, amplitude: float, frequency: float
     return fish.advance(amplitude, half_period, samples=1)
 
 
-def _maximum(function: Callable[[float], float], low: float, high: float) -> float:
-    """Return where a function with one maximum in low … high has it, by golden sections."""
+def _find_maximum(function: Callable[[float], float], low: float, high: float) -> float:
+    """Return the position of the only maximum of a function in low … high, by golden sections."""
     left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
     at_left, at_right = function(left), function(right)
-    while high - low > _PRECISION:
+    while high - low > _FREQUENCY_TOLERANCE:
         if at_left > at_right:
             high, right, at_right = right, left, at_left
             left = high - _GOLDEN * (high - low)

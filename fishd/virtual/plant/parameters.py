@@ -1,4 +1,4 @@
-"""The numbers that make one fish differ from another, shared by the configuration and the plant."""
+"""Parameters of a fish, shared by the configuration and the plant."""
 
 from typing import Annotated
 
@@ -7,15 +7,17 @@ from msgspec import Struct
 from fishd.core.schema import note, unit
 
 TETHERED = "tethered"
-"""The model of fishd itself."""
-LARGEST_FIN = 1.0
-"""The equations are of small fin angles, with α for sin α, which is 19 % more here [rad]."""
+"""Name of fishd's built-in model."""
+MAX_FIN_ANGLE_RAD = 1.0
+"""Largest fin angle of the equations, which replace sin α by α; the error is 19 % here [rad]."""
 
 
 class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Constants of the servo, the fin and the forces; the defaults are those of Fu et al."""
 
-    model: Annotated[str, note("Equations of the simulated fish: the name of a plant.")] = TETHERED
+    model: Annotated[str, note("Name of the plant, the equations of the simulated fish.")] = (
+        TETHERED
+    )
     omega0: Annotated[
         float,
         unit(
@@ -80,7 +82,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "rad",
-            "Wheel angle either side of centre that only takes up slack in the cables.",
+            "Wheel angle on either side of the centre that only takes up slack in the cables.",
             ge=0.0,
             le=1.0,
         ),
@@ -89,8 +91,8 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "rad",
-            "Play of the tail against the wheel, either way: after a reversal the wheel turns by "
-            "twice as much before the tail follows.",
+            "Play of the tail relative to the wheel, in either direction: after a reversal, the "
+            "wheel turns by twice the play before the tail follows.",
             ge=0.0,
             le=1.0,
         ),
@@ -102,7 +104,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "rad",
-            "The servo leaves a wheel alone that is this near to its instruction.",
+            "Difference between wheel and instruction up to which the servo does not move.",
             ge=0.0,
             le=1.0,
         ),
@@ -111,8 +113,8 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "N s^2/rad",
-            "Reaction J to the wheel's acceleration that the force sensor feels: −J φ̈ is added "
-            "to F_y, smoothed over 10 ms.",
+            "Reaction J to the wheel's acceleration on the force sensor: −J φ̈ is added to F_y, "
+            "smoothed over 10 ms.",
             ge=-0.1,
             le=0.1,
         ),
@@ -124,8 +126,8 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         return self.lateral_inertia_ratio * self.thrust_coefficient
 
 
-def of_the_paper(parameters: PlantParameters) -> PlantParameters:
-    """The fish that has no more than the equations of Fu et al. know."""
+def without_extensions(parameters: PlantParameters) -> PlantParameters:
+    """Return the fish with only the parameters of the equations of Fu et al."""
     p = parameters
     return PlantParameters(
         omega0=p.omega0,
@@ -139,34 +141,33 @@ def of_the_paper(parameters: PlantParameters) -> PlantParameters:
 
 
 class MotorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The motor in the simulated servo; the defaults are round figures of a standard servo."""
+    """Motor of the simulated servo; the defaults are typical values of a standard servo."""
 
-    voltage: Annotated[float, unit("V", "Supply of the servo, U.", gt=0.0, le=60.0)] = 6.0
+    voltage: Annotated[float, unit("V", "Supply voltage of the servo, U.", gt=0.0, le=60.0)] = 6.0
     idle_current: Annotated[
-        float, unit("A", "What its electronics draw, with pulses and without.", ge=0.0, le=10.0)
+        float, unit("A", "Current of the electronics, with and without pulses.", ge=0.0, le=10.0)
     ] = 0.01
     no_load_current: Annotated[
         float,
         unit(
             "A",
-            "What it draws beside that at its highest speed without a load, i₀; in proportion at "
-            "lower ones.",
+            "Additional current at the highest speed without a load, i₀; proportional to speed.",
             ge=0.0,
             le=10.0,
         ),
     ] = 0.2
     stall_current: Annotated[
-        float, unit("A", "What it draws when it is held fast.", gt=0.0, le=100.0)
+        float, unit("A", "Current of the blocked motor.", gt=0.0, le=100.0)
     ] = 2.0
     stall_torque: Annotated[
-        float, unit("N m", "Torque at the wheel when it is held fast.", gt=0.0, le=100.0)
+        float, unit("N m", "Torque at the blocked wheel.", gt=0.0, le=100.0)
     ] = 1.0
     rotor_inertia: Annotated[
         float,
         unit(
             "kg m^2",
-            "Moment of inertia of rotor and gears, at the wheel: that of the rotor times the "
-            "square of the gears' ratio.",
+            "Moment of inertia of rotor and gears at the wheel: that of the rotor times the "
+            "square of the gear ratio.",
             ge=0.0,
             le=1.0,
         ),
@@ -175,8 +176,8 @@ class MotorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         float,
         unit(
             "kg m^2",
-            "Moment of inertia I of the tail about its hinge, with the water that it moves; its "
-            "torque on the wheel is λ I ω₀² (λφ − α), that is λ I (α̈ + ξω₀α̇).",
+            "Moment of inertia I of the tail about its hinge, with added mass of the water; its "
+            "torque on the wheel is λ I ω₀² (λφ − α) = λ I (α̈ + ξω₀α̇).",
             ge=0.0,
             le=10.0,
         ),

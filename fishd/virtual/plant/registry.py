@@ -1,4 +1,4 @@
-"""Finds the plant that `plant.model` names: fishd's own, or that of another package."""
+"""Registry of plants by `plant.model`: the built-in one, and those of other packages."""
 
 import math
 from typing import Any
@@ -22,20 +22,20 @@ PLANTS: Plugins[Plant[Any]] = Plugins(
 
 
 def open_plant(parameters: PlantParameters, motor: MotorSettings | None = None) -> Plant[Any]:
-    """A fish with these parameters, at rest.
+    """Return a fish with these parameters, at rest.
 
-    motor: of the servo, where its power is of interest; plants of other packages have none
-    Raises `UnknownPlant`, and `StartupError` where that of another package cannot begin.
+    motor: motor of the servo, if its power is needed; plants of other packages have none
+    Raises `UnknownPlant`, and `StartupError` where a plant of another package cannot start.
     """
     kind: Any = PLANTS.find(parameters.model)
     if parameters.model == TETHERED:
         fish: Plant[Any] = kind(parameters, motor=motor)
         return fish
-    return _Contained(kind, parameters)
+    return _ForeignPlant(kind, parameters)
 
 
-class _Contained(Plant[PlantParameters]):
-    """A plant of another package: whatever it raises or returns, fishd says so in one line."""
+class _ForeignPlant(Plant[PlantParameters]):
+    """Plant of another package, whose exceptions become errors of fishd with one line."""
 
     Settings = PlantParameters
 
@@ -45,11 +45,11 @@ class _Contained(Plant[PlantParameters]):
             self._plant = call_foreign(kind, parameters)
             self.state = self._plant.state
         except Exception as error:
-            what = f"plant '{parameters.model}' cannot begin: {text.describe_error(error)}"
-            raise StartupError(what) from error
+            message = f"plant '{parameters.model}' cannot begin: {text.describe_error(error)}"
+            raise StartupError(message) from error
 
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> Window:
-        """As `Plant.advance`; raises `FishLost`, then and ever after."""
+        """Advance the plant; raises `FishLost` when it fails."""
         try:
             window = call_foreign(self._plant.advance, instruction_angle, duration, samples)
             self.state = self._plant.state
@@ -60,6 +60,6 @@ class _Contained(Plant[PlantParameters]):
             if not all(map(math.isfinite, numbers)):
                 raise ArithmeticError("its forces or its state are not finite")
         except Exception as error:
-            what = f"plant '{self.parameters.model}' cannot go on: {text.describe_error(error)}"
-            raise FishLost(what) from error
+            message = f"plant '{self.parameters.model}' cannot go on: {text.describe_error(error)}"
+            raise FishLost(message) from error
         return window

@@ -1,7 +1,7 @@
-"""The fish on its force sensor, advanced by whole windows of constant instruction angle.
+"""Fish on its force sensor, advanced by whole windows of constant instruction angle.
 
-The simulated hardware and the theory of optimum controls both drive it. A window is integrated to
-about 1e-9 in one step: the servo in closed form, the fin by collocation on a few segments.
+It is used by the simulated hardware and by the theory of optimal controls. A window is integrated
+to about 1e-9 in one step: the servo in closed form, the fin by collocation on a few segments.
 """
 
 import math
@@ -17,30 +17,36 @@ from msgspec import Struct
 from fishd.virtual.plant.base import REST, Plant, PlantState
 from fishd.virtual.plant.collocation import NODES, WEIGHTS, N, Segment, Vector
 from fishd.virtual.plant.drive_train import Cables, DelayLine, log_sinh, relax, time_between
-from fishd.virtual.plant.held import COUNT, Ahead, HeldWindow, HeldWindows
+from fishd.virtual.plant.held import WINDOW_COUNT, HeldWindow, HeldWindowMatrices, HeldWindows
 from fishd.virtual.plant.motor import Motor, Stretch
 from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 
-# Times around |sinh(lag/Δ)| = 1, in units of Δ/Ω. Before the first the wheel runs at Ω and after
+# Times around |sinh(lag/Δ)| = 1, in units of Δ/Ω. Before the first, the wheel runs at Ω, and after
 # the last it stands, both to the last digit; in between, segments shorten towards the transition.
 _TRANSITION = (-20, -10, -6, -4, -2.5, -1.5, -0.5, 0.5, 1.5, 3, 5, 8, 12, 20, 37)
-_GRADED_FROM = 16.0  # windows longer than this many Δ/Ω need fewer segments graded than equal
-_FIN_REACH = 3.0  # segment length, in units of the fin's shortest time, that N nodes resolve
-_LINEAR_LAG = 300.0  # in Δ; sinh is safe below, and above the wheel runs at Ω all segment long
-_ROUNDING = 1e-9  # a window of exactly one servo time constant stays one segment
-_HELD = 4  # an instruction that lasts so many windows makes it worth while to look ahead
-_DRAG_STEP = 0.05  # longest segment with quadratic drag, s
+_GRADED_FROM = 16.0
+"""Length of a window from which graded segments are fewer than equal ones [Δ/Ω]."""
+_MAX_FIN_SEGMENT = 3.0
+"""Longest segment that N nodes resolve, in units of the fin's shortest time."""
+_MAX_SINH_LAG = 300.0
+"""Largest lag for sinh [Δ]; above it, the wheel runs at Ω during the whole segment."""
+_ROUNDING = 1e-9
+"""Tolerance that keeps a window of exactly one servo time constant as one segment."""
+_MIN_HELD_WINDOWS = 4
+"""Duration of an instruction from which several windows are computed at once [windows]."""
+_MAX_DRAG_SEGMENT_S = 0.05
+"""Longest segment with quadratic drag [s]."""
 REACTION_TIME = 0.01
-"""Of the mount that passes the servo's reaction on to the sensor [s]."""
+"""Time constant of the mount that transmits the servo's reaction to the sensor [s]."""
 
 
 class FinWindow(Struct, frozen=True, eq=False):
-    """A `Window` whose peak and power are worked out when they are read.
+    """`Window` whose peak and power are computed when they are read.
 
     Attributes:
-        course: the segments of the window, with the motion of wheel and fin in each.
-        motor: of the servo; None where its power is of no interest.
-        drives: lag/Δ before and after the instruction, and the course, of each part of the window
+        course: segments of the window, with the motion of wheel and fin.
+        motor: motor of the servo; None if its power is not needed.
+        drives: lag/Δ before and after the instruction, and the course, for each part of the window
             with pulses.
     """
 
@@ -76,12 +82,12 @@ AnyWindow: TypeAlias = FinWindow | HeldWindow
 
 
 class TetheredFish(Plant[PlantParameters]):
-    """The equations of Fu et al., and what a real rig adds; not safe for use from several threads.
+    """Equations of Fu et al. with the effects of a real rig; not safe for use from several threads.
 
     Attributes:
         parameters: constants of this fish.
-        state: where it is now; assign to it to put the fish elsewhere.
-        cables: between wheel and tail.
+        state: current state; may be assigned.
+        cables: cables between wheel and tail.
     """
 
     Settings = PlantParameters
@@ -92,12 +98,12 @@ class TetheredFish(Plant[PlantParameters]):
         state: PlantState = REST,
         motor: MotorSettings | None = None,
     ) -> None:
-        """motor: of the servo, where its power is of interest"""
+        """motor: motor of the servo, if its power is needed"""
         super().__init__(parameters)
         self.state = state
         self.cables = Cables(parameters.cable_slack, parameters.backlash, state.phi)
         self._servo_time = parameters.servo_lag / parameters.servo_speed
-        self._fin_segment = _FIN_REACH / (parameters.omega0 * max(1.0, parameters.xi))
+        self._fin_segment = _MAX_FIN_SEGMENT / (parameters.omega0 * max(1.0, parameters.xi))
         self._segment = lru_cache(maxsize=512)(lambda *key: Segment(parameters, *key))
         self._equal_segments = lru_cache(maxsize=64)(self._segments)
         self._cause: Vector = np.zeros(N + 3)
@@ -106,31 +112,31 @@ class TetheredFish(Plant[PlantParameters]):
         self._side_drag = parameters.lateral_quadratic_drag
         self._brakes = bool(self._drag or self._side_drag)
         self._momentum = 0.0
-        """What the servo's reaction has passed on to the sensor, −J φ̇ smoothed [N s]."""
+        """Momentum that the servo's reaction has transmitted to the sensor, −J φ̇ smoothed [N s]."""
         self._motor = Motor(motor, parameters) if motor else None
         self._lag = 0.0
         """lag/Δ at the end of the latest window; 0 where the servo had no pulses."""
         self._pulls = True
-        """Did the wheel move the tail in the latest segment?"""
+        """Whether the wheel moved the tail in the latest segment."""
         self._graded_from = _GRADED_FROM * self._servo_time
         self._is_plain = self.cables.taut and not (
             self._line or self._brakes or parameters.servo_dead_zone or parameters.servo_reaction
         )
         self._request: tuple[float | None, float, int] = (None, 0.0, 0)
-        self._lasted, self._usual = 0, 0.0
-        """Number of windows of this request so far, and what it was of late on average."""
+        self._request_windows, self._mean_request_windows = 0, 0.0
+        """Number of windows of the current request, and a moving average over previous requests."""
         self._held: HeldWindows | None = None
-        """Windows of this request that were worked out at once."""
+        """Windows of this request that were computed at once."""
         self._expected: PlantState | None = None
-        """The state at the start of the next one of these."""
-        self._ahead = lru_cache(maxsize=8)(partial(Ahead, parameters))
+        """State at the start of the next one of `_held`."""
+        self._matrices_for = lru_cache(maxsize=8)(partial(HeldWindowMatrices, parameters))
 
     def advance(self, instruction_angle: float | None, duration: float, samples: int) -> AnyWindow:
-        """Hold the instruction angle (rad) for `duration` s and return the forces meanwhile.
+        """Hold the instruction angle (rad) for `duration` s, and return the window.
 
-        None means no pulses: the servo then holds the wheel where it is. `samples` instants make
-        the sampled means, as an ADC that is read evenly within the window does; the reaction of the
-        servo is the same in all of them. The servo acts on an instruction after its delay.
+        None means no pulses: the servo then holds the wheel at its angle. The sampled means are
+        those of `samples` equally spaced instants, at which an ADC would be read; the reaction of
+        the servo is the same in all of them. The servo acts on an instruction after its delay.
 
         Raises:
             ValueError: `duration` or `samples` is not positive.
@@ -141,14 +147,15 @@ class TetheredFish(Plant[PlantParameters]):
             request = (instruction_angle, duration, samples)
             held = self._held if self._is_known(request) else self._hold(*request)
             if held:
-                return self._take(held, instruction_angle, duration)
+                return self._next_held_window(held, instruction_angle, duration)
         if self._line is None:
-            return self._swim(instruction_angle, duration, samples, (0.0, duration))
-        parts = self._line.passed(instruction_angle, duration)
+            return self._advance_part(instruction_angle, duration, samples, (0.0, duration))
+        parts = self._line.advance(instruction_angle, duration)
         if len(parts) == 1:
-            return self._swim(parts[0].angle, duration, samples, (0.0, duration))
+            return self._advance_part(parts[0].angle, duration, samples, (0.0, duration))
         windows = [
-            self._swim(part.angle, duration, samples, (part.begin, part.end)) for part in parts
+            self._advance_part(part.angle, duration, samples, (part.begin, part.end))
+            for part in parts
         ]
         return FinWindow(
             duration,
@@ -165,52 +172,60 @@ class TetheredFish(Plant[PlantParameters]):
         """Compute the held windows of which the next one may be the first."""
         if self._is_plain and instruction_angle is not None:
             request = (instruction_angle, duration, samples)
-            counted = self._request, self._lasted, self._usual
+            counted = self._request, self._request_windows, self._mean_request_windows
             if not self._is_known(request) and self._hold(*request) is None:
-                self._request, self._lasted, self._usual = counted
+                self._request, self._request_windows, self._mean_request_windows = counted
 
     def _is_known(self, request: tuple[float, float, int]) -> bool:
         """Return whether the next held window is that of a request from the present state."""
         held = self._held
         return (
             held is not None
-            and held.taken < COUNT
+            and held.taken < WINDOW_COUNT
             and self.state is self._expected
             and self._request == request
         )
 
     def _hold(self, angle: float, duration: float, samples: int) -> HeldWindows | None:
-        """Return windows to come; None where the instruction may soon change.
+        """Return the next windows; None where the instruction may soon change.
 
-        It is expected to last as long as others of late, or as long again as it has lasted.
+        An instruction is expected to last as long as recent ones, or twice its current duration.
         """
         self._held = None
         request = (angle, duration, samples)
         if request == self._request:
-            self._lasted += 1
+            self._request_windows += 1
         else:
-            lasted = self._lasted
-            self._usual = 0.5 * (self._usual + (lasted if lasted < COUNT else COUNT))
-            self._request, self._lasted = request, 1
-        if self._lasted < _HELD and self._usual < _HELD:
+            request_windows = self._request_windows
+            self._mean_request_windows = 0.5 * (
+                self._mean_request_windows
+                + (request_windows if request_windows < WINDOW_COUNT else WINDOW_COUNT)
+            )
+            self._request, self._request_windows = request, 1
+        if (
+            self._request_windows < _MIN_HELD_WINDOWS
+            and self._mean_request_windows < _MIN_HELD_WINDOWS
+        ):
             return None
         p, state = self.parameters, self.state
         lag = (angle - state.phi) / p.servo_lag
         segments = self._equal_segments(duration, samples, (0.0, duration))
-        if len(segments) > 1 or duration > self._graded_from or abs(lag) > _LINEAR_LAG:
+        if len(segments) > 1 or duration > self._graded_from or abs(lag) > _MAX_SINH_LAG:
             return None
-        self._held = held = self._ahead(segments[0], samples).swim(state, p.coupling * angle, lag)
+        self._held = held = self._matrices_for(segments[0], samples).swim(
+            state, p.coupling * angle, lag
+        )
         self._expected = state
         if self._motor:
             held.jump = self._motor.jump(self._lag, lag)
         return held
 
-    def _take(self, held: HeldWindows, angle: float, duration: float) -> HeldWindow:
-        """Swim the next one of the windows of an instruction that is held."""
+    def _next_held_window(self, held: HeldWindows, angle: float, duration: float) -> HeldWindow:
+        """Return the next window of a constant instruction."""
         p, k = self.parameters, held.taken
         held.taken += 1
-        if k:  # the first one is counted
-            self._lasted += 1
+        if k:  # the first one is counted already
+            self._request_windows += 1
         alpha, rate, side_force, sampled_side_force = held.ends[k]
         thrust, sampled_thrust = held.thrusts[k]
         lag = math.sinh((angle - self.state.phi) / p.servo_lag)
@@ -220,28 +235,28 @@ class TetheredFish(Plant[PlantParameters]):
             duration, thrust, side_force, sampled_thrust, sampled_side_force, held, k, self._motor
         )
 
-    def _swim(
-        self, angle: float | None, whole: float, samples: int, part: tuple[float, float]
+    def _advance_part(
+        self, angle: float | None, window_length: float, samples: int, part: tuple[float, float]
     ) -> FinWindow:
-        """Swim a part of a window in which the servo knows one instruction.
+        """Advance by a part of a window with one instruction at the servo.
 
-        part: when in the window it begins and ends (s); sampled means are those of the window, as
-            far as the part adds to them
+        part: begin and end of the part in the window (s); sampled means are the contribution of the
+            part to those of the window
         """
         p = self.parameters
         duration = part[1] - part[0]
         phi, alpha, rate = start = self.state
         command = phi if angle is None else angle
         if p.servo_dead_zone:
-            command = self._reached(command, phi)
+            command = self._apply_dead_zone(command, phi)
         begin = lag = (command - phi) / p.servo_lag
         cuts: Sequence[float] = ()
         if lag and (duration > self._graded_from or not self.cables.taut):
             cuts = self._cuts(command, phi, lag, duration)
         segments: Sequence[Segment] = (
-            self._segments(whole, samples, part, cuts)
+            self._segments(window_length, samples, part, cuts)
             if cuts
-            else self._equal_segments(whole, samples, part)
+            else self._equal_segments(window_length, samples, part)
         )
 
         responses: Sequence[Vector] = ()
@@ -255,7 +270,7 @@ class TetheredFish(Plant[PlantParameters]):
         for segment in segments:
             cause[0], cause[1] = alpha, rate
             lags, lag = self._drive(segment, command, lag)
-            # Half the overhead of @:
+            # dot() has half the overhead of @.
             response = responses[len(course)] if responses else segment.response.dot(cause)
             course.append(Stretch(segment, response, lags, self._pulls))
             integral, total = segment.sums.dot(response[:N] * response[2 * N : 3 * N]).tolist()
@@ -290,7 +305,7 @@ class TetheredFish(Plant[PlantParameters]):
             / duration,
             inertia * sampled_thrust / samples,
             -(side_inertia * sampled_acceleration + drag * sampled_rate + sampled_braking) / samples
-            + reaction / whole,
+            + reaction / window_length,
             course,
             self._motor,
             drives,
@@ -299,9 +314,9 @@ class TetheredFish(Plant[PlantParameters]):
     def _cut_at_turns(
         self, segments: Sequence[Segment], command: float, lag: float
     ) -> tuple[Sequence[Segment], Sequence[Vector]]:
-        """Cut where the fin turns, and return the parts with what the fin does in each.
+        """Cut segments at reversals of the fin, and return the parts with their responses.
 
-        Quadratic drag has a kink there that no polynomial follows.
+        Quadratic drag has a kink there, which a polynomial cannot follow.
         """
         cause, before = self._cause, (self.cables.tail, self._momentum)
         _, alpha, rate = self.state
@@ -318,8 +333,8 @@ class TetheredFish(Plant[PlantParameters]):
             )
             if turn := segment.turn(response):
                 self.cables.tail = tail
-                rest = tuple(t - turn for t in segment.instants if t >= turn)
-                to_do.append(self._segment(segment.length - turn, rest))
+                later_instants = tuple(t - turn for t in segment.instants if t >= turn)
+                to_do.append(self._segment(segment.length - turn, later_instants))
                 to_do.append(self._segment(turn, tuple(t for t in segment.instants if t < turn)))
             else:
                 pieces.append(segment)
@@ -329,16 +344,16 @@ class TetheredFish(Plant[PlantParameters]):
         self.cables.tail, self._momentum = before
         return pieces, responses
 
-    def _reached(self, angle: float, phi: float) -> float:
-        """Return where the wheel goes [rad]: the edge of its dead zone."""
+    def _apply_dead_zone(self, angle: float, phi: float) -> float:
+        """Return the angle that the wheel approaches [rad]: the edge of its dead zone."""
         dead = self.parameters.servo_dead_zone
         return phi if abs(angle - phi) <= dead else angle - math.copysign(dead, angle - phi)
 
     def _drive(self, segment: Segment, command: float, lag: float) -> tuple[Vector, float]:
-        """Put what drives the fin into the cause; return lag/Δ at the nodes and at the end."""
+        """Write the drive of the fin into the cause; return lag/Δ at the nodes and at the end."""
         p = self.parameters
         cause = self._cause
-        if -_LINEAR_LAG < lag < _LINEAR_LAG:
+        if -_MAX_SINH_LAG < lag < _MAX_SINH_LAG:
             sinh = math.sinh(lag)
             lags = np.arcsinh(segment.node_decay * sinh)
             later = math.asinh(segment.decay * sinh)
@@ -357,7 +372,7 @@ class TetheredFish(Plant[PlantParameters]):
     def _pull(
         self, segment: Segment, command: float, lag: float, lags: Vector, later: float
     ) -> None:
-        """Take backlash and slack off what the wheel does to the fin during the segment."""
+        """Apply backlash and slack to the drive of the fin during the segment."""
         p, cause = self.parameters, self._cause
         halfway = relax(lag, 0.5 * segment.length / self._servo_time)
         moves, angle = self.cables.pull(
@@ -370,15 +385,15 @@ class TetheredFish(Plant[PlantParameters]):
             cause[2], cause[3:] = p.coupling * angle, 0.0
 
     def _react(self, segment: Segment, lags: Vector) -> None:
-        """Add what the wheel's acceleration passes on during the segment; lags: at its nodes."""
+        """Add the reaction to the wheel's acceleration in a segment; lags: lag/Δ at its nodes."""
         p = self.parameters
-        left = np.exp((NODES - 1.0) * (segment.length / REACTION_TIME))
-        pushed = float((WEIGHTS * left).dot(np.tanh(lags))) * segment.length / REACTION_TIME
+        weights = np.exp((NODES - 1.0) * (segment.length / REACTION_TIME))
+        pushed = float((WEIGHTS * weights).dot(np.tanh(lags))) * segment.length / REACTION_TIME
         self._momentum *= math.exp(-segment.length / REACTION_TIME)
         self._momentum -= p.servo_reaction * p.servo_speed * pushed
 
     def _cuts(self, command: float, phi: float, lag: float, duration: float) -> list[float]:
-        """Return the times (s) within the part at which no segment may go on."""
+        """Return the times (s) within the part at which segments must end."""
         p, unit = self.parameters, self._servo_time
         cuts = []
         if duration > self._graded_from:
@@ -391,9 +406,13 @@ class TetheredFish(Plant[PlantParameters]):
         return sorted({cut for cut in cuts if 0.0 < cut < duration}) if cuts else cuts
 
     def _segments(
-        self, whole: float, samples: int, part: tuple[float, float], cuts: Sequence[float] = ()
+        self,
+        window_length: float,
+        samples: int,
+        part: tuple[float, float],
+        cuts: Sequence[float] = (),
     ) -> tuple[Segment, ...]:
-        """Return the segments of a part of a window, each with the sample instants in it."""
+        """Return the segments of a part of a window, each with its sample instants."""
         duration = part[1] - part[0]
         longest = self._fin_segment
         if duration <= self._graded_from:
@@ -401,16 +420,18 @@ class TetheredFish(Plant[PlantParameters]):
         if self.parameters.servo_reaction:
             longest = min(longest, 5.0 * REACTION_TIME)
         if self._brakes:
-            longest = min(longest, _DRAG_STEP)
-        instants = [(i + 0.5) * whole / samples - part[0] for i in range(samples)]
+            longest = min(longest, _MAX_DRAG_SEGMENT_S)
+        instants = [(i + 0.5) * window_length / samples - part[0] for i in range(samples)]
         segments: list[Segment] = []
-        taken = bisect_left(instants, 0.0)
+        first_index = bisect_left(instants, 0.0)
         for start, end in pairwise((0.0, *cuts, duration)):
             count = max(1, math.ceil((end - start) / longest - _ROUNDING))
             length = (end - start) / count
             for k in range(count):
-                upto = bisect_left(instants, start + (k + 1) * length if k + 1 < count else end)
-                inside = tuple(t - (start + k * length) for t in instants[taken:upto])
+                next_index = bisect_left(
+                    instants, start + (k + 1) * length if k + 1 < count else end
+                )
+                inside = tuple(t - (start + k * length) for t in instants[first_index:next_index])
                 segments.append(self._segment(length, inside))
-                taken = upto
+                first_index = next_index
         return tuple(segments)

@@ -1,9 +1,9 @@
-"""An inextensible beam that bends as far as it likes, and bends itself: the body of the fish.
+"""Inextensible beam with large bends and muscles, the body of the fish.
 
-Geometrically exact: the shape is the angle θ of the midline, piecewise linear along the arc, and
-the place of the head (Antman, Nonlinear Problems of Elasticity, chapter IV, without stretch and
-shear). Bending energy ½∫EI (θ′ − κ)² dX, with the curvature κ that the muscles ask for; with θ as
-unknown it is quadratic, so that the stiffness never changes.
+It is geometrically exact: the shape is the angle θ of the midline, piecewise linear along the arc,
+and the position of the head (Antman, Nonlinear Problems of Elasticity, chapter IV, without stretch
+and shear). The bending energy is ½∫EI (θ′ − κ)² dX with the curvature κ that the muscles command.
+With θ as the unknown it is quadratic, so that the stiffness is constant.
 """
 
 from collections.abc import Callable
@@ -13,14 +13,14 @@ import numpy as np
 from fishd.virtual.swimmer.grid import Array
 
 Profile = Callable[[Array], Array]
-"""A quantity along the body, of the distance X from the head [m]."""
+"""Quantity along the body as a function of the distance X from the head [m]."""
 
 
 class Beam:
-    """Unknowns q = (x, y of the head, θ at `segments` + 1 points); slices that move as rigid ones.
+    """Beam with the unknowns q = (x, y of the head, θ at `segments` + 1 points) and rigid slices.
 
-    Slices are short pieces of the body between two cross-sections: `slices` of them, of length
-    `spacing`. Forces, moments and masses are those of a body one metre deep.
+    The body consists of `slices` short pieces between two cross-sections, of length `spacing`.
+    Forces, moments and masses are those of a body one metre deep.
     """
 
     def __init__(
@@ -35,27 +35,27 @@ class Beam:
         viscous_time: float = 0.0,
         clamped: bool = False,
     ) -> None:
-        """length: of the midline [m]
+        """length: length of the midline [m]
 
-        half_thickness: at X [m]; stiffness: EI at X [N m²]
-        spacing: of the slices, at most [m]
-        density: by which the body is heavier than water [kg/m³]
-        viscous_time: viscosity over Young's modulus, of a Kelvin–Voigt body [s]
-        clamped: does the head neither move nor turn?
+        half_thickness: half thickness at X [m]; stiffness: EI at X [N m²]
+        spacing: largest length of a slice [m]
+        density: density of the body minus that of the water [kg/m³]
+        viscous_time: viscosity over Young's modulus of a Kelvin–Voigt body [s]
+        clamped: whether the head is fixed in place and angle
         """
         per_segment = int(np.ceil(length / segments / spacing - 1e-9))
         self.length, self.segments, self.slices = length, segments, per_segment * segments
         self.spacing = length / self.slices
         self.X: Array = np.asarray((np.arange(self.slices) + 0.5) * self.spacing, np.float64)
-        """Middle of each slice, from the head [m]."""
+        """Distance of the middle of each slice from the head [m]."""
         self.half_thickness = half_thickness(self.X)
         self.taper = np.gradient(self.half_thickness, self.X)
-        """How the half thickness grows with X."""
+        """Derivative of the half thickness with respect to X."""
         self.clamped = clamped
         self.size = segments + 3
-        """How many unknowns there are."""
+        """Number of unknowns."""
         self.free = np.arange(3 if clamped else 0, self.size)
-        """Which of the unknowns may change."""
+        """Indices of the unknowns that may change."""
         cell = length / segments
         self._weights = np.clip(
             1.0 - np.abs(self.X[:, None] / cell - np.arange(segments + 1)[None]), 0.0, None
@@ -71,30 +71,30 @@ class Beam:
         """Damping of the material [N m s]."""
         area = 2.0 * self.half_thickness * self.spacing
         self.area = float(area.sum())
-        """Of the body [m²]."""
+        """Area of the body [m²]."""
         self.share = area / self.area
-        """Share of the body that each slice is."""
+        """Fraction of the body's area in each slice."""
         inertia = area * ((2.0 * self.half_thickness) ** 2 + self.spacing**2) / 12.0
         self.excess = density * np.stack([area, area, inertia], axis=1)
-        """Mass and moment of inertia of each slice beyond those of the water; shape (slices, 3)."""
+        """Mass and moment of inertia of each slice minus those of the water, shape (slices, 3)."""
         self.q = np.zeros(self.size)
         self.rate = np.zeros(self.size)
 
     def drive(self, curvature: Profile) -> Array:
-        """Forces on the unknowns by muscles that ask for this curvature [1/m]; shape (size,)."""
-        asked = curvature(self.X).reshape(self.segments, -1)
-        moment = (self._EI * asked).mean(axis=1)
+        """Return the forces on the unknowns of muscles with this curvature [1/m], shape (size,)."""
+        commanded = curvature(self.X).reshape(self.segments, -1)
+        moment = (self._EI * commanded).mean(axis=1)
         forces = np.zeros(self.size)
         forces[3:] += moment
         forces[2:-1] -= moment
         return forces
 
     def couple(self) -> Array:
-        """Forces on the unknowns by a torque of 1 N m, spread over the body: no net force."""
+        """Return the forces on the unknowns of a distributed torque of 1 N m, without net force."""
         return np.concatenate([np.zeros(2), self.share @ self._weights])
 
     def shape(self, q: Array) -> tuple[Array, Array]:
-        """Places of the slices, shape (slices, 2) [m], and their angles, shape (slices,) [rad]."""
+        """Return the positions (slices, 2) [m] and angles (slices,) [rad] of the slices."""
         angle = self._weights @ q[2:]
         steps = np.empty((self.slices, 2))
         np.cos(angle, out=steps[:, 0])
@@ -106,7 +106,7 @@ class Beam:
         return places, angle
 
     def motion(self, angle: Array) -> Array:
-        """How the slices move with the unknowns: shape (slices, 3, size), for vx, vy and θ̇."""
+        """Return the Jacobian of vx, vy and θ̇ of the slices, shape (slices, 3, size)."""
         moves = np.zeros((self.slices, 3, self.size))
         moves[:, 0, 0] = moves[:, 1, 1] = 1.0
         for row, lever in ((0, -np.sin(angle)), (1, np.cos(angle))):
@@ -116,5 +116,5 @@ class Beam:
         return moves
 
     def bending_energy(self, q: Array) -> float:
-        """Stored in the shape, without any muscle [J]."""
+        """Return the elastic energy of a shape with relaxed muscles [J]."""
         return float(0.5 * q @ self.K @ q)

@@ -1,4 +1,4 @@
-"""The body as a beam: how thick it is, how stiff, and how its muscles bend it."""
+"""Body as a beam: its thickness, its stiffness, and the bend by its muscles."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from fishd.virtual.swimmer.settings import Body, SwimmerSettings
 
 
 def half_thickness(body: Body, X: Array) -> Array:
-    """Half thickness at X [m]."""
+    """Return the half thickness at X [m]."""
     share = X / body.length
     if body.profile is None:
         return np.asarray(body.thickness * share * (1.0 - share) * np.exp(-share))
@@ -17,13 +17,13 @@ def half_thickness(body: Body, X: Array) -> Array:
 
 
 def curvature(settings: SwimmerSettings, X: Array) -> Array:
-    """Curvature that the muscles ask for at full activation, at X [1/m]."""
+    """Return the curvature that the muscles command at full activation, at X [1/m]."""
     body, muscle = settings.body, settings.muscle
     return np.asarray(muscle.strain * (X / body.length) ** muscle.exponent / body.thickness)
 
 
 def build_beam(settings: SwimmerSettings) -> Beam:
-    """The body in plane strain, its head at the origin."""
+    """Return the body in plane strain, with its head at the origin."""
     body, numerics = settings.body, settings.numerics
     plane = body.young / (1.0 - body.poisson**2)
     return Beam(

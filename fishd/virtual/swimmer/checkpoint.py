@@ -1,7 +1,7 @@
-"""Checkpoints: all that a swim needs to go on later, in one NPZ file.
+"""Checkpoints, which store the complete state of a swim in one NPZ file.
 
-Body, water, time, track and command go on to the last bit. The controller is not in it: it begins
-anew, from the present command.
+Body, water, time, track and command continue exactly. The controller is not stored: it restarts
+from the current command.
 """
 
 import io
@@ -18,7 +18,7 @@ from fishd.core import files
 from fishd.core.errors import FishdError
 from fishd.virtual.swimmer.grid import Array
 from fishd.virtual.swimmer.robot import Swimmer
-from fishd.virtual.swimmer.track import COLUMNS, LONGEST, Track
+from fishd.virtual.swimmer.track import COLUMNS, MAX_FILE_BYTES, Track
 
 FORMAT = 2
 _STATE = "state."
@@ -31,38 +31,38 @@ class _About(Struct):
 
 
 class CheckpointError(FishdError):
-    """A file is no checkpoint, or not one of this fish."""
+    """A file is not a checkpoint, or not one of this fish."""
 
 
 class Checkpoint(NamedTuple):
-    """What a file holds."""
+    """Content of a checkpoint file."""
 
     path: Path
     settings: dict[str, Any]
-    """Everything that the motion depends on, as in the configuration."""
+    """Settings that the motion depends on, as in the configuration."""
     controller: str
     parameters: dict[str, Any]
     state: dict[str, Array]
     track: Array
-    """The rows so far, of shape (ticks, columns)."""
+    """Rows up to the checkpoint, shape (ticks, columns)."""
 
     @property
     def time(self) -> float:
-        """Of the fish [s]."""
+        """Time of the fish [s]."""
         return float(self.track[-1, 0])
 
     def check(self, settings: Mapping[str, Any]) -> None:
-        """Raises `CheckpointError` where it is of a fish with other settings than these."""
-        here, there = dict(_flat(settings)), dict(_flat(self.settings))
-        for key in here | there:
-            if here.get(key) != there.get(key):
+        """Raise `CheckpointError` where the settings of its fish differ from these."""
+        own_values, stored_values = dict(_flatten(settings)), dict(_flatten(self.settings))
+        for key in own_values | stored_values:
+            if own_values.get(key) != stored_values.get(key):
                 raise CheckpointError(
-                    f"{self.path}: it is of a swim with {key} {_spelled(there.get(key))}, and here "
-                    f"it is {_spelled(here.get(key))}; the same is needed"
+                    f"{self.path}: it is of a swim with {key} {_to_json(stored_values.get(key))}, "
+                    f"and here it is {_to_json(own_values.get(key))}; the same value is needed"
                 )
 
     def put_into(self, swimmer: Swimmer) -> None:
-        """Let the fish go on from here; raises `CheckpointError`, and the fish is as it was."""
+        """Restore the fish from the checkpoint; on `CheckpointError` the fish is unchanged."""
         self.check_state(swimmer.state())
         step = swimmer.settings.numerics.step
         time, end = int(self.state["steps"]) * step, self.track[-1, 0]
@@ -73,24 +73,24 @@ class Checkpoint(NamedTuple):
         swimmer.restore(self.state)
 
     def check_state(self, fresh: Mapping[str, Array]) -> None:
-        """Raises `CheckpointError` where an array does not fit, or is not finite.
+        """Raise `CheckpointError` where an array has another shape or type, or is not finite.
 
-        fresh: the state of such a fish at its start, or a part of it
+        fresh: state of such a fish at its start, or a part of it
         """
         for name, model in fresh.items():
-            found = self.state.get(name)
-            if found is None:
+            array = self.state.get(name)
+            if array is None:
                 raise CheckpointError(
                     f"{self.path}: it is of another version of fishd, and does not fit ({name!r})"
                 )
-            if (found.shape, found.dtype) != (model.shape, model.dtype):
+            if (array.shape, array.dtype) != (model.shape, model.dtype):
                 raise _damaged(
                     self.path,
                     name,
-                    f"is of shape {found.shape} and type {found.dtype}, and needs to be of shape "
+                    f"is of shape {array.shape} and type {array.dtype}, and needs to be of shape "
                     f"{model.shape} and type {model.dtype}",
                 )
-            if not np.isfinite(found[np.isfinite(model)]).all() or np.isinf(found).any():
+            if not np.isfinite(array[np.isfinite(model)]).all() or np.isinf(array).any():
                 raise _damaged(self.path, name, "has values that are not finite")
         if int(self.state["steps"]) < 0:
             raise _damaged(self.path, "steps", "is negative")
@@ -104,7 +104,7 @@ def save(
     controller: str,
     parameters: Mapping[str, Any],
 ) -> None:
-    """Write a checkpoint; a kill meanwhile leaves the one before. Raises OSError."""
+    """Write a checkpoint atomically; raises OSError."""
     about = {
         "format": FORMAT,
         "columns": list(COLUMNS),
@@ -122,16 +122,18 @@ def save(
 def load(path: Path) -> Checkpoint:
     """Read a checkpoint; raises `CheckpointError`."""
     try:
-        content = files.read(path, LONGEST, "a checkpoint")
+        content = files.read(path, MAX_FILE_BYTES, "a checkpoint")
     except files.FileProblem as problem:
         raise CheckpointError(f"{path}: {problem}") from None
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             size = sum(member.file_size for member in archive.infolist())
-        if size > LONGEST:
-            raise _damaged(path, "it", f"would be longer than {LONGEST / 2**20:g} MB unpacked")
-        with np.load(io.BytesIO(content), allow_pickle=False) as found:
-            arrays = {name: found[name] for name in found.files}
+        if size > MAX_FILE_BYTES:
+            raise _damaged(
+                path, "it", f"would be longer than {MAX_FILE_BYTES / 2**20:g} MB unpacked"
+            )
+        with np.load(io.BytesIO(content), allow_pickle=False) as npz:
+            arrays = {name: npz[name] for name in npz.files}
         about = msgspec.json.decode(str(arrays.pop("about")))
         if about["format"] != FORMAT:
             raise CheckpointError(
@@ -146,8 +148,8 @@ def load(path: Path) -> Checkpoint:
         track = arrays.pop("track")
     except CheckpointError:
         raise
-    except Exception:  # NumPy and zipfile raise of all kinds for what is no archive of arrays
-        raise CheckpointError(f"{path}: it is no checkpoint of a swimmer") from None
+    except Exception:  # NumPy and zipfile raise many kinds of errors for other files
+        raise CheckpointError(f"{path}: it is not a checkpoint of a swimmer") from None
     if track.ndim != 2 or track.shape[1] != len(COLUMNS) or not len(track):
         raise _damaged(path, "track", f"is of shape {track.shape}, not a row for each tick")
     if track.dtype != np.float64 or not np.isfinite(track).all():
@@ -162,18 +164,18 @@ def load(path: Path) -> Checkpoint:
     )
 
 
-def _damaged(path: Path, name: str, how: str) -> CheckpointError:
-    return CheckpointError(f"{path}: it is damaged: {name} {how}")
+def _damaged(path: Path, name: str, problem: str) -> CheckpointError:
+    return CheckpointError(f"{path}: it is damaged: {name} {problem}")
 
 
-def _flat(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value, by its key in dotted form."""
+def _flatten(settings: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every value with its dotted key."""
     if not isinstance(settings, Mapping):
         yield prefix, settings
         return
     for key, value in settings.items():
-        yield from _flat(value, f"{prefix}.{key}" if prefix else key)
+        yield from _flatten(value, f"{prefix}.{key}" if prefix else key)
 
 
-def _spelled(value: Any) -> str:
+def _to_json(value: Any) -> str:
     return msgspec.json.encode(value).decode()

@@ -1,13 +1,13 @@
-"""Which faces of the grid a body covers, and what it does to the water there.
+"""Faces of the grid that a body covers, and the effect of the body on the water there.
 
-A face that a body covers in part is a mixture of body and water. The velocity of the mixture is
-that of both, averaged over a cell around the face (Maertens and Weymouth, Comput. Methods Appl.
-Mech. Eng. 283, 2015, doi:10.1016/j.cma.2014.09.007; here with a kernel one cell wide):
+A face that a body covers in part is a mixture of body and water. The velocity of the mixture is the
+average of both over a cell around the face (Maertens and Weymouth, Comput. Methods Appl. Mech. Eng.
+283, 2015, doi:10.1016/j.cma.2014.09.007; here with a kernel one cell wide):
 
     share · body + (1 − share) · water + moment · ∇(water − body)
 
-The moment is that of the part of the cell which is water. Without it, which is of first order, the
-water next to a body moves with it, and the boundary layer is too thick by about half a cell.
+The moment is that of the part of the cell that is water. Without it, the method has first order:
+the water next to a body moves with it, and the boundary layer is too thick by about half a cell.
 """
 
 from typing import NamedTuple
@@ -20,32 +20,33 @@ from fishd.virtual.swimmer.grid import Array
 
 
 class Covered(NamedTuple):
-    """Of each face, shape (nx, ny)."""
+    """Coverage of each face by a body, arrays of shape (nx, ny)."""
 
     share: Array
-    """Of the cell around it that is body."""
+    """Fraction of the cell around a face that is body."""
     owner: NDArray[np.int64]
-    """The nearest slice of the body; −1 where nothing is covered."""
+    """Index of the nearest slice of the body; −1 where nothing is covered."""
     moment_x: Array
-    """Mean distance along x of the water in that cell, in cells: how far a surface is off."""
+    """First moment along x of the water in that cell, in cells."""
     moment_y: Array
-    """The same along y."""
+    """First moment along y of the water in that cell, in cells."""
 
 
 def circle(px: Array, py: Array, radius: float, h: float) -> Covered:
-    """What a circle covers.
+    """Return the coverage by a circle.
 
-    px, py: places of the faces from its centre, shapes (nx, 1) and (1, ny) [m]; h: of a cell [m]
+    px, py: positions of the faces relative to its centre, shapes (nx, 1) and (1, ny) [m]
+    h: size of a cell [m]
     """
-    away = np.hypot(px, py)
-    reach = (away - radius) / h
-    moment = 0.5 * np.clip(0.25 - reach**2, 0.0, None) / np.maximum(away, 0.5 * h)
+    distance_from_centre = np.hypot(px, py)
+    reach = (distance_from_centre - radius) / h
+    moment = 0.5 * np.clip(0.25 - reach**2, 0.0, None) / np.maximum(distance_from_centre, 0.5 * h)
     share = np.clip(0.5 - reach, 0.0, 1.0)
     return Covered(share, np.where(share > 0.0, 0, -1), moment * px, moment * py)
 
 
 def slip(values: Array, covered: Covered) -> Array:
-    """What the water beside surfaces adds to each face: moment · ∇water."""
+    """Return the contribution of the water beside surfaces to each face, moment · ∇water."""
     out = np.zeros(values.shape)
     out[1:-1] = covered.moment_x[1:-1] * (values[2:] - values[:-2])
     out[:, 1:-1] += covered.moment_y[:, 1:-1] * (values[:, 2:] - values[:, :-2])
@@ -54,9 +55,10 @@ def slip(values: Array, covered: Covered) -> Array:
 
 @njit(inline="always")
 def _beside(reach: float, h: float) -> float:  # pragma: no cover
-    """First moment of the water beyond a surface that is `reach` away, in a cell around a face.
+    """Return the first moment of the water beyond a surface at the distance `reach` from a face.
 
-    Over the size of the cell; 0 where the surface is not in the cell.
+    It refers to the cell around the face, and is relative to the size of the cell; 0 where the
+    surface is outside the cell.
     """
     share = reach / h
     return 0.5 * max(0.25 - share * share, 0.0)
@@ -74,9 +76,10 @@ def paint(  # pragma: no cover
     py: Array,
     clamped: bool,
 ) -> Covered:
-    """What slices cover of the faces at px, py; between two ends of the body, or from a clamp on.
+    """Return the coverage of the faces at px, py by the slices of a body.
 
-    places, angle, half_thickness, taper, spacing: of the slices
+    places, angle, half_thickness, taper, spacing: those of the slices
+    h: size of a cell [m]; clamped: whether the body continues beyond its first slice
     """
     nx, ny = px.size, py.size
     cover, owner = np.zeros((nx, ny)), np.full((nx, ny), -1)
@@ -125,7 +128,10 @@ def paint(  # pragma: no cover
 def _slip(  # pragma: no cover
     values: Array, moment_x: Array, moment_y: Array, i: int, j: int
 ) -> float:
-    """What the water beside a surface adds to a face; the values reach a face further."""
+    """Return the contribution of the water beside a surface to a face.
+
+    The values include one more face on each side.
+    """
     along: float = moment_x[i, j] * (values[i + 2, j + 1] - values[i, j + 1])
     across: float = moment_y[i, j] * (values[i + 1, j + 2] - values[i + 1, j])
     return 0.5 * (along + across)
@@ -139,15 +145,15 @@ def gather(  # pragma: no cover
     mass: float,
     h: float,
 ) -> tuple[Array, Array]:
-    """Mass matrix, shape (slices, 3, 3), and momentum, (slices, 3), of the water in each slice.
+    """Return the mass matrices (slices, 3, 3) and momenta (slices, 3) of the water in the slices.
 
-    They say what `impose` will change, so that the momentum of water and body together is kept.
-    The matrix is not symmetric: a body that turns moves the water of a cell as at the moment of
-    that cell (the column), but what the cell gets acts on the body at its face (the row). So
-    energy is kept only as closely as the grid is fine.
+    They describe the change by `impose`, so that the momentum of water and body together is
+    conserved. The matrix is not symmetric: a rotating body moves the water of a cell at the moment
+    of that cell (the column), but the reaction of the cell acts on the body at its face (the row).
+    Energy is therefore conserved only up to the resolution of the grid.
 
-    on_u, on_v: what is covered, velocities there and a face further, places
-    mass: of a cell, one metre deep [kg]
+    on_u, on_v: coverage, velocities of these faces and one more on each side, positions
+    mass: mass of the water in a cell, one metre deep [kg]
     """
     matrix, momentum = np.zeros((places.shape[0], 3, 3)), np.zeros((places.shape[0], 3))
     (cover, owner, moment_x, moment_y), speed, px, py = on_u
@@ -190,13 +196,14 @@ def impose(  # pragma: no cover
     covered: Covered,
     before: Array,
     ahead: Array,
-    other: Array,
+    cross_positions: Array,
     h: float,
     is_u: bool,
 ) -> None:
-    """Give the covered faces the velocity of their slice.
+    """Set the velocity of the covered faces to that of their slice, in place in `ahead`.
 
-    before: `ahead` until now, and a face further; other: y of the faces for u, x of them for v [m]
+    before: previous `ahead`, with one more face on each side
+    other: y of the faces for u, x of the faces for v [m]
     """
     cover, owner, moment_x, moment_y = covered
     for i in range(owner.shape[0]):
@@ -206,10 +213,10 @@ def impose(  # pragma: no cover
                 continue
             turn = velocity[s, 2]
             if is_u:
-                wanted = velocity[s, 0] + turn * (places[s, 1] - other[j])
+                slice_velocity = velocity[s, 0] + turn * (places[s, 1] - cross_positions[j])
                 bend = turn * moment_y[i, j] * h
             else:
-                wanted = velocity[s, 1] + turn * (other[i] - places[s, 0])
+                slice_velocity = velocity[s, 1] + turn * (cross_positions[i] - places[s, 0])
                 bend = -turn * moment_x[i, j] * h
             slip = _slip(before, moment_x, moment_y, i, j) + bend
-            ahead[i, j] += cover[i, j] * (wanted - before[i + 1, j + 1]) + slip
+            ahead[i, j] += cover[i, j] * (slice_velocity - before[i + 1, j + 1]) + slip

@@ -1,4 +1,4 @@
-"""Can this fish be computed, on this grid, with this step? Said before it swims."""
+"""Check before a swim whether this fish can be computed with this grid and step."""
 
 import math
 from itertools import pairwise
@@ -9,50 +9,51 @@ import numpy as np
 from fishd.core.schema import Problem
 from fishd.virtual.swimmer.body import build_beam, curvature, half_thickness
 from fishd.virtual.swimmer.settings import (
-    LARGEST_COURANT,
-    LEAST_CELLS_LONG,
-    LEAST_CELLS_THICK,
+    MAX_COURANT,
+    MIN_CELLS_PER_LENGTH,
+    MIN_CELLS_PER_THICKNESS,
     Body,
     SwimmerSettings,
 )
 
-SHARPEST = 0.9
-"""Curvature times half thickness, at most: with 1 the inner side of the bend is folded."""
-FURTHEST = 2.5
-"""The tail turns against the head by at most so much [rad]."""
-MOST_CELLS = 1_000_000
-"""Of the grid; a step of so many takes seconds, and a GB of memory."""
-MOST_VISCOUS = 0.125
-"""ν Δt/h² at most: explicit diffusion by Adams–Bashforth is stable to this in two dimensions. What
-is carried along uses up the same limit, that of waves of two cells."""
-_CARRIED = 4.0 / 3.0 * 1.4
-"""Of that limit, for each cell that the tail is expected to pass in a step: 4/3 by fluxes of third
-order, in water that is up to 1.4 times as fast."""
-LEAST_SEGMENT = 1.5
-"""A piece of the beam is at least so many cells long: shorter ones move too little water."""
-THINNEST = 0.05
-"""Thickness of the body, ends left out, over its largest."""
-AHEAD = 0.05
-"""A fish that speeds up gets ahead of the middle of the grid by up to so many of its lengths."""
-_MARGIN = 1.2
+MAX_BEND = 0.9
+"""Largest product of curvature and half thickness; at 1 the inner side of the bend is folded."""
+MAX_TAIL_TURN_RAD = 2.5
+"""Largest angle of the tail to the head [rad]."""
+MAX_CELLS = 1_000_000
+"""Largest number of cells; a step then takes seconds, and 1 GB of memory."""
+MAX_DIFFUSION_NUMBER = 0.125
+"""Largest ν Δt/h²: the limit of stability of explicit diffusion by Adams–Bashforth in two
+dimensions. Advection uses up the same limit, that of waves of two cells."""
+_ADVECTION_FRACTION = 4.0 / 3.0 * 1.4
+"""Fraction of that limit for each cell that the tail is expected to pass in a step: 4/3 by fluxes
+of third order, in water that is up to 1.4 times as fast."""
+MIN_SEGMENT_CELLS = 1.5
+"""Smallest length of a segment of the beam [cells]; shorter ones move too little water."""
+MIN_THICKNESS_FRACTION = 0.05
+"""Smallest thickness of the body without its ends, relative to the largest."""
+MAX_LEAD_LENGTHS = 0.05
+"""Largest lead of an accelerating fish over the middle of the grid [body lengths]."""
+_TANK_MARGIN = 1.2
+"""Smallest size of the tank relative to that of the part with small cells."""
 
 
 class Estimate(NamedTuple):
-    """What is known of a swimmer before it swims."""
+    """Estimates for a swimmer before it swims."""
 
     deflection: float
-    """Of the tail at rest with full activation [m]."""
+    """Deflection of the tail at rest with full activation [m]."""
     frequency: float
-    """Natural frequency in still water, to some 20 % [Hz]."""
+    """Natural frequency in still water, accurate to about 20 % [Hz]."""
     courant_number: float
-    """Share of a cell that the fastest water passes in a step, to some 30 %."""
+    """Fraction of a cell that the fastest water passes in a step, accurate to about 30 %."""
 
 
 def estimate(settings: SwimmerSettings) -> Estimate:
-    """Deflection, frequency and Courant number, from the beam and the water that it takes along.
+    """Return deflection, frequency and Courant number, from the beam and its added mass.
 
-    A plate from −b to b that moves normally with Σ aₙ Uₙ(x/b), Uₙ the Chebyshev polynomials of the
-    second kind, gives the water around it the energy ½ρπb² Σ aₙ²/(n + 1): thin aerofoil theory
+    A plate from −b to b with the normal velocity Σ aₙ Uₙ(x/b), Uₙ the Chebyshev polynomials of the
+    second kind, gives the water around it the energy ½ρπb² Σ aₙ²/(n + 1), by thin aerofoil theory
     without circulation (Katz and Plotkin, Low-Speed Aerodynamics, chapter 5).
     """
     beam = build_beam(settings)
@@ -72,41 +73,41 @@ def estimate(settings: SwimmerSettings) -> Estimate:
         share = 2.0 / math.pi * beam.spacing / half * np.sin(n * angle) @ moves
         M += water.density * math.pi * half**2 / n * np.outer(share, share)
     squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, beam.K[1:, 1:])).real)
-    omega = math.sqrt(max(float(squares[2]), 0.0))  # after two motions without any bending
+    omega = math.sqrt(max(float(squares[2]), 0.0))  # the first two modes are rigid motions
     fastest = 1.5 * omega * deflection
     courant = fastest * settings.numerics.step / settings.numerics.cell
     return Estimate(deflection, omega / (2.0 * math.pi), courant)
 
 
 def check(settings: SwimmerSettings) -> None:
-    """Raises `Problem` with the key at fault, what is wrong and what would be right."""
+    """Raise `Problem` with the wrong key, its error and a valid value."""
     body, numerics = settings.body, settings.numerics
     _check_profile(body)
     _check_cells(settings)
     thickest = 2.0 * float(half_thickness(body, np.linspace(0.0, body.length, 201)).max())
-    most = min(body.length / LEAST_CELLS_LONG, thickest / LEAST_CELLS_THICK)
-    if numerics.cell > most:
+    max_cell = min(body.length / MIN_CELLS_PER_LENGTH, thickest / MIN_CELLS_PER_THICKNESS)
+    if numerics.cell > max_cell:
         raise Problem(
             ("swimmer", "numerics", "cell"),
             f"{numerics.cell:g} m is too coarse for a fish {body.length:g} m long and "
-            f"{thickest:.3g} m thick: at most {most:.3g} m",
+            f"{thickest:.3g} m thick: at most {max_cell:.3g} m",
         )
-    most_segments = int(body.length / (LEAST_SEGMENT * numerics.cell))
-    if numerics.segments > most_segments:
+    max_segments = int(body.length / (MIN_SEGMENT_CELLS * numerics.cell))
+    if numerics.segments > max_segments:
         raise Problem(
             ("swimmer", "numerics", "segments"),
             f"{numerics.segments} are too many for cells of {numerics.cell:g} m: at most "
-            f"{most_segments}",
+            f"{max_segments}",
         )
     _check_tank(settings)
     _check_bend(settings)
     try:
-        found = estimate(settings)
+        estimates = estimate(settings)
     except (np.linalg.LinAlgError, FloatingPointError, OverflowError):
         raise Problem(
             ("swimmer", "body"), "its stiffness and the water's density are too far apart"
         ) from None
-    _check_step(settings, found.courant_number)
+    _check_step(settings, estimates.courant_number)
 
 
 def _check_profile(body: Body) -> None:
@@ -126,11 +127,11 @@ def _check_profile(body: Body) -> None:
     if min(s for _, s in points) < 0.0 or max(s for _, s in points) <= 0.0:
         raise Problem(("swimmer", "body", "profile"), "s must be 0 or more, and somewhere above")
     inside = half_thickness(body, np.linspace(0.05, 0.95, 181) * body.length)
-    if inside.min() < THINNEST * inside.max():
+    if inside.min() < MIN_THICKNESS_FRACTION * inside.max():
         raise Problem(
             ("swimmer", "body", "profile"),
-            f"between X/L = 0.05 and 0.95 the body must be at least {THINNEST:g} times as thick as "
-            "where it is thickest",
+            f"between X/L = 0.05 and 0.95 the body must be at least {MIN_THICKNESS_FRACTION:g} "
+            "times as thick as where it is thickest",
         )
 
 
@@ -138,7 +139,7 @@ def _check_tank(settings: SwimmerSettings) -> None:
     body, water, numerics = settings.body, settings.water, settings.numerics
     beam = build_beam(settings)
     centre = float(beam.share @ beam.X)
-    longer = max(centre + AHEAD * body.length, body.length - centre)
+    longer = max(centre + MAX_LEAD_LENGTHS * body.length, body.length - centre)
     around = float(beam.half_thickness.max()) + 2.0 * numerics.cell
     fine = 2.0 * (longer + around) / body.length
     if numerics.fine_length < fine:
@@ -152,7 +153,7 @@ def _check_tank(settings: SwimmerSettings) -> None:
         ("length", water.length, numerics.fine_length),
         ("width", water.width, numerics.fine_width),
     ):
-        needed = share * body.length * _MARGIN
+        needed = share * body.length * _TANK_MARGIN
         if size < needed:
             raise Problem(
                 ("swimmer", "water", key),
@@ -162,7 +163,7 @@ def _check_tank(settings: SwimmerSettings) -> None:
 
 
 def _check_cells(settings: SwimmerSettings) -> None:
-    """The grid and the slices of the body fit into memory."""
+    """Check that the grid and the slices of the body fit into memory."""
     body, water, numerics = settings.body, settings.water, settings.numerics
     cells = 1.0
     for size, share, ratio in (
@@ -174,38 +175,38 @@ def _check_cells(settings: SwimmerSettings) -> None:
         if ratio > 1.0:
             outside = 2.0 * math.log1p(0.5 * outside * (ratio - 1.0)) / math.log(ratio)
         cells *= fine + outside
-    if cells > MOST_CELLS:
+    if cells > MAX_CELLS:
         raise Problem(
             ("swimmer", "numerics", "cell"),
-            f"{numerics.cell:g} m would need {cells:.2g} cells, and at most {MOST_CELLS:.2g} are "
-            "possible: larger cells, a smaller tank or a stretched grid are needed",
+            f"{numerics.cell:g} m would need {cells:.2g} cells, and at most {MAX_CELLS:.2g} are "
+            "possible: use larger cells, a smaller tank or a stretched grid",
         )
 
 
 def _check_step(settings: SwimmerSettings, courant: float) -> None:
     numerics, viscosity = settings.numerics, settings.water.viscosity
-    viscous = viscosity * numerics.step / numerics.cell**2 / MOST_VISCOUS
-    used = max(courant / LARGEST_COURANT, viscous + _CARRIED * courant)
-    if used > 1.0:
-        longest = numerics.step / used
-        digit = 10.0 ** (math.floor(math.log10(longest)) - 1)
+    viscous = viscosity * numerics.step / numerics.cell**2 / MAX_DIFFUSION_NUMBER
+    limit_use = max(courant / MAX_COURANT, viscous + _ADVECTION_FRACTION * courant)
+    if limit_use > 1.0:
+        max_step = numerics.step / limit_use
+        digit = 10.0 ** (math.floor(math.log10(max_step)) - 1)
         raise Problem(
             ("swimmer", "numerics", "step"),
             f"{numerics.step:g} s is beyond the limit of stability in water of {viscosity:g} m²/s: "
             f"the tail would pass {courant:.2g} cells in a step; at most "
-            f"{math.floor(longest / digit) * digit:.2g} s",
+            f"{math.floor(max_step / digit) * digit:.2g} s",
         )
 
 
 def _check_bend(settings: SwimmerSettings) -> None:
     body, muscle = settings.body, settings.muscle
     X = np.linspace(0.0, body.length, 401)
-    asked = curvature(settings, X)
-    folding = float((asked * half_thickness(body, X)).max()) / SHARPEST
-    turning = float(np.trapezoid(asked, X)) / FURTHEST
-    if max(folding, turning) > 1.0:
+    commanded = curvature(settings, X)
+    bend_ratio = float((commanded * half_thickness(body, X)).max()) / MAX_BEND
+    turn_ratio = float(np.trapezoid(commanded, X)) / MAX_TAIL_TURN_RAD
+    if max(bend_ratio, turn_ratio) > 1.0:
         raise Problem(
             ("swimmer", "muscle", "strain"),
             f"{muscle.strain:g} folds the body upon itself: at most "
-            f"{muscle.strain / max(folding, turning):.3g}",
+            f"{muscle.strain / max(bend_ratio, turn_ratio):.3g}",
         )

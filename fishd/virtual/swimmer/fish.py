@@ -1,4 +1,4 @@
-"""The free swimmer: a body that bends itself in still water, a step at a time."""
+"""Free swimmer: a body with muscles in still water, advanced step by step."""
 
 import math
 from typing import NamedTuple
@@ -12,55 +12,57 @@ from fishd.virtual.swimmer.grid import Array, Grid, edges
 from fishd.virtual.swimmer.immersed import Immersed, LeftTheGrid
 from fishd.virtual.swimmer.settings import SwimmerSettings
 
-FRONT = 0.4
-"""The front body: this share of the length, which hardly bends; heading and tail refer to it."""
-REAR = 0.8
-"""The rear body begins here. The angle of the tail is that of its middle: the tip, which is thin,
-flutters."""
+FRONT_FRACTION = 0.4
+"""Length of the front body, which hardly bends, as a fraction of the body; heading and angle of the
+tail refer to it."""
+REAR_FRACTION = 0.8
+"""Begin of the rear body, as a fraction of the length. The angle of the tail is that of the middle
+of the rear body, because the thin tip flutters."""
 FOLLOW_TIME = 0.05
-"""The grid takes on the speed of the fish with this time constant [s]."""
-RECENTRE = 2.0
-"""So much of the way back to the middle of the grid in a second [1/s]."""
-UNSTABLE = 1.0
-"""A Courant number beyond which nothing that is computed is to be believed."""
-_FASTEST = 0.05
-"""No body moves by so many of its lengths in a step."""
-_CHECKED_EVERY = 20
+"""Time constant with which the grid takes on the speed of the fish [s]."""
+RECENTRE_RATE = 2.0
+"""Rate at which the grid recentres on the fish [1/s]."""
+MAX_COURANT_NUMBER = 1.0
+"""Courant number above which the computation is invalid."""
+_MAX_STEP_LENGTHS = 0.05
+"""Motion in a step above which the computation has diverged [body lengths]."""
+_CHECK_PERIOD_STEPS = 20
 _STEER_TIME = 0.4
-"""Heading and place are averaged over about so long, for how the fish is steered [s]."""
+"""Time constant of the averages of heading and position for the steering [s]."""
 _STEER_RATE = 2.0
-"""So fast the heading is corrected [1/s]; below 1/_STEER_TIME, or a gliding fish would swing."""
+"""Rate of the correction of the heading [1/s]; a gliding fish oscillates above 1/_STEER_TIME."""
 _STEER_REACH = 10.0
-"""Heading that is wanted for each metre off the middle [rad/m], and the largest one [rad]."""
-_STEER_MOST = 0.3
+"""Target heading per distance from the middle [rad/m]."""
+_MAX_STEER_RAD = 0.3
+"""Largest target heading [rad]."""
 
 
 class Diverged(FishdError):
-    """The computation cannot go on; the message says when and why."""
+    """The computation has diverged; the message says when and why."""
 
 
 class Motion(NamedTuple):
-    """How the fish moves at an instant; it swims towards −x, and y is to the right of it.
+    """Motion of the fish at an instant; it swims towards −x, and y points to its right.
 
     Forces are those on a body one metre deep.
     """
 
     time: float
-    """[s]"""
+    """Time of the fish [s]."""
     x: float
-    """Centre of mass in the laboratory [m]."""
+    """x of the centre of mass in the laboratory [m]."""
     y: float
-    """[m]"""
+    """y of the centre of mass in the laboratory [m]."""
     speed: float
-    """Forwards: along −x [m/s]."""
+    """Speed forwards, along −x [m/s]."""
     heading: float
-    """Of the front body against −x [rad]."""
+    """Angle of the front body to −x [rad]."""
     tail_angle: float
-    """Of the rear body, seen from the middle of the front body [rad]."""
+    """Angle of the rear body, seen from the middle of the front body [rad]."""
     tail_rate: float
-    """Its rate [rad/s]."""
+    """Rate of `tail_angle` [rad/s]."""
     tail_y: float
-    """Of the tip of the tail, in the laboratory [m]."""
+    """y of the tip of the tail in the laboratory [m]."""
     thrust: float
     """Force of the water on the body along −x [N]."""
     side_force: float
@@ -68,27 +70,27 @@ class Motion(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What was done since the start, by a body one metre deep [J]."""
+    """Work since the start, of a body one metre deep [J]."""
 
     muscles: float
-    """By the muscles: on the body, and through it on the water; less what they take up while
-    stretched."""
+    """Work of the muscles on the body, and through it on the water, minus the work that they absorb
+    while stretched."""
     water: float
-    """By the body on the water."""
+    """Work of the body on the water."""
     forwards: float
-    """By those slices that pushed the fish forwards: their force times its speed, at each
+    """Work of the slices that push the fish forwards: their force times its speed, at each
     instant."""
     sideways: float
-    """By the body on the water across the swimming direction."""
+    """Work of the body on the water across the swimming direction."""
     steering: float
-    """By the torque that keeps the fish on the middle; negative where it brakes."""
+    """Work of the torque that keeps the fish in the middle; negative where it brakes."""
 
 
 class Fish:
-    """A fish in its tank; `step` moves it by `settings.numerics.step`."""
+    """Fish in its tank; `step` advances it by `settings.numerics.step`."""
 
     def __init__(self, settings: SwimmerSettings) -> None:
-        """Settings that `feasibility.check` accepts."""
+        """settings: as accepted by `feasibility.check`"""
         self.settings = settings
         body, water, numerics = settings.body, settings.water, settings.numerics
         self.dt = numerics.step
@@ -114,13 +116,13 @@ class Fish:
         self.flow = Flow(grid, water.viscosity, "slip")
         self.body = Immersed(self.flow, water.density, self.beam)
         self.activation = 0.0
-        """a, from −1 to 1, during the latest step."""
+        """Activation a, −1 to 1, during the latest step."""
         self._steps = 0
         self._travelled = 0.0
         self._drive = self.beam.drive(lambda X: curvature(settings, X))
         self._couple = self.beam.couple()
-        # Of a rod as long and heavy as the fish, and of the water that a plate as long turns with
-        # it, π/8 ρ (L/2)⁴ (Newman, Marine Hydrodynamics, 1977, table 4.3) [kg m²/m].
+        # Moment of inertia of a rod with length and mass of the fish, and added one of a plate of
+        # this length, π/8 ρ (L/2)⁴ (Newman, Marine Hydrodynamics, 1977, table 4.3) [kg m²/m].
         self._inertia = water.density * (
             self.beam.area * body.length**2 / 12.0 + math.pi / 8.0 * (0.5 * body.length) ** 4
         )
@@ -128,25 +130,25 @@ class Fish:
         self._torque = 0.0
         self._work = np.zeros(5)
         self._hydrodynamic = np.zeros((self.beam.slices, 2))
-        self._front = self.beam.share * (FRONT * body.length > self.beam.X)
+        self._front = self.beam.share * (FRONT_FRACTION * body.length > self.beam.X)
         self._front /= self._front.sum()
-        self._rear = self.beam.share * (REAR * body.length < self.beam.X)
+        self._rear = self.beam.share * (REAR_FRACTION * body.length < self.beam.X)
         self._rear /= self._rear.sum()
 
     @property
     def time(self) -> float:
-        """Since the start [s]."""
+        """Time since the start [s]."""
         return self._steps * self.dt
 
     @property
     def work(self) -> Work:
-        """Since the start [J]."""
+        """Work since the start [J]."""
         return Work(*map(float, self._work))
 
     def step(self, activation: float) -> None:
-        """Go on by one step with the activation a, cut to −1 … 1.
+        """Advance by one step with the activation a, clipped to −1 … 1.
 
-        Raises `Diverged` where what comes out cannot be a fish that swims.
+        Raises `Diverged` where the result is not a swimming fish.
         """
         self.activation = min(1.0, max(-1.0, activation))
         beam, body, dt = self.beam, self.body, self.dt
@@ -157,7 +159,7 @@ class Fish:
             body.step(dt, forces)
         except LeftTheGrid as error:
             fastest = float(np.abs(body.velocity[:, :2]).max())
-            if fastest * dt < _FASTEST * self.settings.body.length:
+            if fastest * dt < _MAX_STEP_LENGTHS * self.settings.body.length:
                 raise self._diverged(f"{error}; swimmer.steering keeps it there") from None
             raise self._diverged(
                 "the motion grew without bounds; a shorter swimmer.numerics.step may help"
@@ -169,28 +171,28 @@ class Fish:
         speed = float(beam.share @ body.velocity[:, 0])
         place = float(beam.share @ beam.shape(beam.q)[0][:, 0])
         self._travelled += dt * self.flow.grid_velocity
-        wanted = speed + RECENTRE * place
-        self.flow.grid_velocity += dt / FOLLOW_TIME * (wanted - self.flow.grid_velocity)
-        if self._steps % _CHECKED_EVERY == 0:
+        target = speed + RECENTRE_RATE * place
+        self.flow.grid_velocity += dt / FOLLOW_TIME * (target - self.flow.grid_velocity)
+        if self._steps % _CHECK_PERIOD_STEPS == 0:
             courant = self.flow.courant_number(dt)
-            if not courant < UNSTABLE:
+            if not courant < MAX_COURANT_NUMBER:
                 raise self._diverged(
                     f"the water passes {courant:.2g} cells in a step; a shorter "
                     "swimmer.numerics.step may help"
                 )
 
-    def _diverged(self, why: str) -> Diverged:
-        return Diverged(f"the swimmer cannot go on at {self.time:.3f} s: {why}")
+    def _diverged(self, reason: str) -> Diverged:
+        return Diverged(f"the swimmer cannot go on at {self.time:.3f} s: {reason}")
 
     def _steer(self) -> float:
-        """A torque that turns the fish back to the middle, without any net force [N m].
+        """Return a torque without a net force that turns the fish back to the middle [N m].
 
-        It goes by heading h and place as averaged over `_STEER_TIME`, T, and by how that heading
-        changes: from h it makes −(s + 2)/(T s + 1) h, with s = iω. For slow turns that is −2 h,
-        within a beat nearly −h/T = −2.5 h. So it is a spring that holds the yaw, of stiffness
-        5 gain I with the inertia I, and not a damper, but for some degrees of phase: it takes next
-        to no power from the swimming, which `Work.steering` counts. It is not small: with gain 1 as
-        much as 5/ω² of the inertia, 13 % at 1 Hz and 1.4 % at 3 Hz.
+        It uses heading h and position, averaged over `_STEER_TIME`, T, and the rate of change of
+        that heading. Its transfer function from h is −(s + 2)/(T s + 1), s = iω. For slow turns
+        this is −2, within a beat nearly −1/T = −2.5. It is therefore a spring against the yaw, of
+        stiffness 5 gain I with the inertia I. Except for some degrees of phase it does not damp,
+        and takes almost no power from the swimming, see `Work.steering`. It is not small: with gain
+        1 it equals 5/ω² of the inertia, 13 % at 1 Hz and 1.4 % at 3 Hz.
         """
         gain = self.settings.steering
         if not gain:
@@ -198,19 +200,19 @@ class Fish:
         places, angle = self.beam.shape(self.beam.q)
         heading = float(self.beam.share @ angle)
         share = self.dt / _STEER_TIME
-        changes = (heading - self._averaged_heading) / _STEER_TIME
+        heading_rate = (heading - self._averaged_heading) / _STEER_TIME
         self._averaged_heading += share * (heading - self._averaged_heading)
         self._averaged_y += share * (float(self.beam.share @ places[:, 1]) - self._averaged_y)
-        wanted = min(_STEER_MOST, max(-_STEER_MOST, _STEER_REACH * self._averaged_y))
-        pull = _STEER_RATE * (wanted - self._averaged_heading) - changes
+        target = min(_MAX_STEER_RAD, max(-_MAX_STEER_RAD, _STEER_REACH * self._averaged_y))
+        pull = _STEER_RATE * (target - self._averaged_heading) - heading_rate
         return gain * _STEER_RATE * self._inertia * pull
 
     def _account(self, before: Array) -> None:
-        """Add up the work of the latest step; before: velocities of the slices before it."""
+        """Add the work of the latest step; before: velocities of the slices before it."""
         body, beam, dt = self.body, self.beam, self.dt
         velocity = body.velocity
         change = (body.mass @ (velocity - before)[:, :, None])[:, :, 0] / dt
-        water = change - body.force  # of the water around on each slice
+        water = change - body.force  # force of the surrounding water on each slice
         self._hydrodynamic = water[:, :2]
         speed = -float(beam.share @ velocity[:, 0])
         self._work += dt * np.array(
@@ -224,7 +226,7 @@ class Fish:
         )
 
     def motion(self) -> Motion:
-        """How it moves now."""
+        """Return the current motion."""
         beam, velocity = self.beam, self.body.velocity
         places, angle = beam.shape(beam.q)
         centre, mean = beam.share @ places, beam.share @ velocity
@@ -233,41 +235,42 @@ class Fish:
         across = np.array([-math.sin(heading), math.cos(heading)])
         along = np.array([math.cos(heading), math.sin(heading)])
         arm = self._rear @ places - front
-        off, reach = float(arm @ across), float(arm @ along)
+        lateral, forward = float(arm @ across), float(arm @ along)
         relative = (self._rear @ velocity - front_rate)[:2]
-        off_rate = float(relative @ across) - front_rate[2] * reach
-        reach_rate = float(relative @ along) + front_rate[2] * off
+        lateral_rate = float(relative @ across) - front_rate[2] * forward
+        forward_rate = float(relative @ along) + front_rate[2] * lateral
         return Motion(
             time=self.time,
             x=self._travelled + float(centre[0]),
             y=float(centre[1]),
             speed=-float(mean[0]),
             heading=heading,
-            tail_angle=math.atan2(off, reach),
-            tail_rate=float(off_rate * reach - reach_rate * off) / (reach**2 + off**2),
+            tail_angle=math.atan2(lateral, forward),
+            tail_rate=float(lateral_rate * forward - forward_rate * lateral)
+            / (forward**2 + lateral**2),
             tail_y=float(places[-1, 1]),
             thrust=-float(self._hydrodynamic[:, 0].sum()),
             side_force=float(self._hydrodynamic[:, 1].sum()),
         )
 
     def outline(self) -> Array:
-        """The surface of the body on the grid, shape (2 slices, 2) [m]."""
+        """Return the outline of the body on the grid, shape (2 slices, 2) [m]."""
         places, angle = self.beam.shape(self.beam.q)
         normal = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
         offset = self.beam.half_thickness[:, None] * normal
         return np.concatenate([places + offset, (places - offset)[::-1]])
 
     def midline(self) -> Array:
-        """Places of the slices on the grid, shape (slices, 2) [m]."""
+        """Return the positions of the slices on the grid, shape (slices, 2) [m]."""
         return self.beam.shape(self.beam.q)[0]
 
     @property
     def travelled(self) -> float:
-        """How far the grid went along x, in the laboratory [m]."""
+        """Distance that the grid has moved along x in the laboratory [m]."""
         return self._travelled
 
     def state(self) -> dict[str, Array]:
-        """Everything that the next step depends on, by name."""
+        """Return the complete state by name."""
         return self.body.state() | {
             "steps": np.array(self._steps),
             "travelled": np.array(self._travelled),
@@ -278,7 +281,7 @@ class Fish:
         }
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Go on from what `state` gave, to the last bit."""
+        """Restore a result of `state` exactly."""
         self.body.restore(state)
         self._steps = int(state["steps"])
         self._travelled = float(state["travelled"])

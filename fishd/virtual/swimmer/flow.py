@@ -1,15 +1,15 @@
 """Incompressible flow on a staggered grid that may travel: predict, then project.
 
-Momentum in conservative form, u_t + ∇·((u − w) u) = −∇p/ρ + ν ∇²u, with the velocities u of the
-laboratory and w that of the grid. Advection and diffusion by the second-order Adams–Bashforth
-scheme; fluxes by the upwind-biased scheme of third order (κ = 1/3 in: van Leer, Upwind-difference
+Momentum is in conservative form, u_t + ∇·((u − w) u) = −∇p/ρ + ν ∇²u, with the velocity u in the
+laboratory and w of the grid. Advection and diffusion use the second-order Adams–Bashforth scheme;
+fluxes use the upwind-biased scheme of third order (κ = 1/3 in: van Leer, Upwind-difference
 methods for aerodynamic problems governed by the Euler equations, Lectures in Applied Mathematics
 22, 1985, pp. 327–336); incremental pressure projection (Van Kan, SIAM J. Sci. Stat. Comput. 7,
 1986, doi:10.1137/0907059).
 
-The fluxes have no limiter. Velocities need not stay within bounds as densities do, and a limiter
-takes every crest for an overshoot: with Koren's a vortex that a stream carries along is wrong by
-two to eight times as much, and the error falls with the second power of the cells, not the third.
+The fluxes have no limiter. Velocities, unlike densities, need not stay within bounds, and a limiter
+treats every crest as an overshoot: with Koren's limiter, the error of a vortex in a stream is two
+to eight times as large, and decreases with the second power of the cell size, not the third.
 """
 
 from typing import Literal
@@ -21,13 +21,13 @@ from fishd.virtual.swimmer.grid import Array, Grid
 from fishd.virtual.swimmer.poisson import Poisson
 
 PAD = 2
-"""Layers of ghost values around the velocities, as wide as the stencil of the fluxes."""
+"""Number of layers of ghost values around the velocities, the width of the stencil."""
 
 
 class Flow:
-    """Velocity and pressure on a grid, between two walls, an inlet on the left and an outlet.
+    """Velocity and pressure on a grid between two walls, with an inlet on the left and an outlet.
 
-    u of shape (nx + 1, ny) and v of shape (nx, ny + 1) [m/s], p of shape (nx, ny): pressure over
+    u has shape (nx + 1, ny) and v shape (nx, ny + 1) [m/s]; p, shape (nx, ny), is pressure over
     density [m²/s²].
     """
 
@@ -40,13 +40,13 @@ class Flow:
     ) -> None:
         """viscosity: kinematic [m²/s]; inlet: u at the left side, shape (ny,); None for still water
 
-        The flow starts at rest but for the inlet: set `inlet` to ramp it up.
+        The flow starts at rest except at the inlet; change `inlet` over time to ramp it up.
         """
         self.grid = grid
         self.viscosity = viscosity
         self.inlet = np.zeros(grid.ny) if inlet is None else inlet
         self.grid_velocity = 0.0
-        """w: of the grid along x [m/s]."""
+        """Velocity w of the grid along x [m/s]."""
         self._slip = walls == "slip"
         self._poisson = Poisson(grid)
         self._u = np.zeros((grid.nx + 1 + 2 * PAD, grid.ny + 2 * PAD))
@@ -54,17 +54,17 @@ class Flow:
         self.u, self.v = self._u[PAD:-PAD, PAD:-PAD], self._v[PAD:-PAD, PAD:-PAD]
         self.p = np.zeros((grid.nx, grid.ny))
         self.ahead_u, self.ahead_v = np.zeros(self.u.shape), np.zeros(self.v.shape)
-        """Velocities predicted for the end of the step; a body may force them before `project`."""
+        """Predicted velocities at the end of the step; a body may change them before `project`."""
         self._rate_u, self._rate_v = np.zeros(self.u.shape), np.zeros(self.v.shape)
         self._started = False
         self._between_x = np.concatenate([grid.dx[:1], np.diff(grid.xc), grid.dx[-1:]])
         self._between_y = np.concatenate([grid.dy[:1], np.diff(grid.yc), grid.dy[-1:]])
         self._even_weight, self._source = np.ones(self.p.shape), np.empty(self.p.shape)
         self.boundary_impulse = 0.0
-        """What crossed the boundaries in the latest step: along x, over density [m³/s]."""
+        """Momentum along x over density that crossed the boundaries in the latest step [m³/s]."""
 
     def predict(self, dt: float) -> None:
-        """Velocities at the end of a step of `dt` [s], before the new pressure: `ahead_u`, `_v`."""
+        """Compute `ahead_u` and `ahead_v`, the velocities after `dt` [s] without new pressure."""
         grid = self.grid
         self.u[0] = self.inlet
         _fill_ghosts(self._u, self._v, 1.0 if self._slip else -1.0)
@@ -98,12 +98,12 @@ class Flow:
         self.boundary_impulse = dt * crossed
         self.ahead_u[0] = self.inlet
         self.ahead_v[:, 0] = self.ahead_v[:, -1] = 0.0
-        self._flow_out(dt)
+        self._update_outlet(dt)
 
-    def _flow_out(self, dt: float) -> None:
-        """The outlet carries off what arrives there, with the speed of the tank.
+    def _update_outlet(self, dt: float) -> None:
+        """Set the velocities at the outlet, which are advected out with the speed of the tank.
 
-        Simplified from Orlanski, doi:10.1016/0021-9991(76)90023-1, who finds a speed of each wave.
+        This simplifies Orlanski, doi:10.1016/0021-9991(76)90023-1, with a speed for each wave.
         """
         speed = max(0.0, float(self.grid.dy @ self.inlet) / float(self.grid.dy.sum()))
         speed = max(speed, -self.grid_velocity)
@@ -111,10 +111,10 @@ class Flow:
         self.ahead_u[-1] = self.u[-1] - share * (self.u[-1] - self.u[-2])
 
     def project(self, dt: float, divergence_weight: Array | None = None) -> None:
-        """Make the predicted velocities free of divergence, and take them over.
+        """Make the predicted velocities free of divergence, and store them in `u` and `v`.
 
-        divergence_weight: shape (nx, ny), how much of its divergence each cell loses: 1 in water,
-        0 in cells that are all body, where the motion of the body decides
+        divergence_weight: shape (nx, ny), fraction of its divergence that each cell loses: 1 in
+            water, 0 in cells inside a body, where the motion of the body applies
         """
         grid = self.grid
         weight = self._even_weight if divergence_weight is None else divergence_weight
@@ -136,21 +136,21 @@ class Flow:
         self.boundary_impulse -= dt * (before + float(grid.dy @ (change[-1] - change[0])))
 
     def momentum(self) -> float:
-        """Along x, over density, of all faces but those at the two ends [m³/s]."""
+        """Return the momentum along x over density of all faces except those at the ends [m³/s]."""
         return float(self._between_x[1:-1] @ (self.u[1:-1] @ self.grid.dy))
 
     def courant_number(self, dt: float) -> float:
-        """The largest (|u| / dx + |v| / dy) dt, relative to the grid; NaN where velocities are."""
+        """Return the largest (|u| / dx + |v| / dy) dt relative to the grid; NaN for NaN values."""
         return float(_courant(self.u, self.v, self.grid.dx, self.grid.dy, self.grid_velocity) * dt)
 
     def vorticity(self) -> Array:
-        """∂v/∂x − ∂u/∂y at the inner corners of cells [1/s]; shape (nx − 1, ny − 1)."""
+        """Return ∂v/∂x − ∂u/∂y at the inner corners of cells [1/s], shape (nx − 1, ny − 1)."""
         dv = np.diff(self.v[:, 1:-1], axis=0) / self._between_x[1:-1, None]
         du = np.diff(self.u[1:-1], axis=1) / self._between_y[None, 1:-1]
         return np.asarray(dv - du)
 
     def state(self) -> dict[str, Array]:
-        """Everything that the next step depends on, by name."""
+        """Return the complete state by name."""
         return {
             "u": self.u.copy(),
             "v": self.v.copy(),
@@ -162,7 +162,7 @@ class Flow:
         }
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Go on from what `state` gave."""
+        """Restore a result of `state`."""
         self.u[:], self.v[:], self.p[:] = state["u"], state["v"], state["p"]
         self._rate_u[:], self._rate_v[:] = state["rate_u"], state["rate_v"]
         self.grid_velocity = float(state["grid_velocity"])
@@ -171,7 +171,7 @@ class Flow:
 
 @njit(cache=True)
 def _fill_ghosts(u: Array, v: Array, mirror: float) -> None:  # pragma: no cover
-    """mirror: +1 where the walls let the water slip, −1 where it sticks to them."""
+    """Fill the ghost values; mirror: +1 for walls with slip, −1 without."""
     nx, ny = u.shape[0], v.shape[1]
     for k in range(PAD):
         inner, outer = PAD + k, PAD - 1 - k
@@ -190,12 +190,12 @@ def _fill_ghosts(u: Array, v: Array, mirror: float) -> None:  # pragma: no cover
 
 
 @njit(inline="always")
-def _carried(  # pragma: no cover
+def _advective_flux(  # pragma: no cover
     speed: float, before2: float, before: float, after: float, after2: float
 ) -> float:
-    """Flux of a quantity through a face between two values on either side of it.
+    """Return the flux of a quantity through a face between two values on each side.
 
-    Upwind-biased, of third order where cells are of one size.
+    The scheme is upwind-biased, and has third order where cells have equal sizes.
     """
     forward = speed > 0.0
     step = after - before if forward else before - after
@@ -220,7 +220,7 @@ def _advance_u(  # pragma: no cover
     dt: float,
     new: float,
 ) -> float:
-    """Predict u on inner faces; returns what crosses the boundaries along x, over density."""
+    """Predict u on inner faces; return the momentum along x over density through boundaries."""
     nx, ny = dx.size, dy.size
     west, east, south = np.empty(ny), np.empty(ny), np.empty(ny + 1)
     old = 1.0 - new
@@ -231,7 +231,7 @@ def _advance_u(  # pragma: no cover
             b = j + PAD
             speed = 0.5 * (u[a, b] + u[a + 1, b]) - w
             east[j] = (
-                _carried(speed, u[a - 1, b], u[a, b], u[a + 1, b], u[a + 2, b])
+                _advective_flux(speed, u[a - 1, b], u[a, b], u[a + 1, b], u[a + 2, b])
                 - nu * (u[a + 1, b] - u[a, b]) / dx[i]
             )
         if i == 0:
@@ -244,7 +244,7 @@ def _advance_u(  # pragma: no cover
             b = j + PAD
             speed = share * v[a - 1, b] + (1.0 - share) * v[a, b]
             south[j] = (
-                _carried(speed, u[a, b - 2], u[a, b - 1], u[a, b], u[a, b + 1])
+                _advective_flux(speed, u[a, b - 2], u[a, b - 1], u[a, b], u[a, b + 1])
                 - nu * (u[a, b] - u[a, b - 1]) / between_y[j]
             )
         crossed -= (south[ny] - south[0]) * between_x[i]
@@ -284,12 +284,12 @@ def _advance_v(  # pragma: no cover
     old = 1.0 - new
     for i in range(-1, nx):
         a = i + PAD
-        for j in range(1, ny):  # through the face to the right of cell i
+        for j in range(1, ny):  # flux through the face to the right of cell i
             b = j + PAD
             share = dy[j - 1] / (dy[j - 1] + dy[j])
             speed = share * u[a + 1, b - 1] + (1.0 - share) * u[a + 1, b] - w
             east[j] = (
-                _carried(speed, v[a - 1, b], v[a, b], v[a + 1, b], v[a + 2, b])
+                _advective_flux(speed, v[a - 1, b], v[a, b], v[a + 1, b], v[a + 2, b])
                 - nu * (v[a + 1, b] - v[a, b]) / between_x[i + 1]
             )
         if i < 0:
@@ -300,7 +300,7 @@ def _advance_v(  # pragma: no cover
             b = j + PAD
             speed = 0.5 * (v[a, b] + v[a, b + 1])
             south[j] = (
-                _carried(speed, v[a, b - 1], v[a, b], v[a, b + 1], v[a, b + 2])
+                _advective_flux(speed, v[a, b - 1], v[a, b], v[a, b + 1], v[a, b + 2])
                 - nu * (v[a, b + 1] - v[a, b]) / dy[j]
             )
         inverse = 1.0 / dx[i]

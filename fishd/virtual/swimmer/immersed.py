@@ -1,11 +1,11 @@
-"""Bodies in the flow: the water moves as they do where they are, and no momentum is lost.
+"""Bodies in the flow, which impose their motion on the water and conserve momentum.
 
-Direct forcing on a fixed grid (Fadlun et al., J. Comput. Phys. 161, 2000,
-doi:10.1006/jcph.2000.6484), by the share of the cell around a face that the body covers (Kajishima
-and Takiguchi, Int. J. Heat Fluid Flow 23, 2002, doi:10.1016/S0142-727X(02)00159-5), of second order
-(see `covers`). Where the body is, the water of the grid is its mass: the momentum that it has
-there, projected on the motions that the beam can make, gives the motion of the beam. So no force is
-exchanged between two solvers, and light bodies are no harder than heavy ones.
+The method is direct forcing on a fixed grid (Fadlun et al., J. Comput. Phys. 161, 2000,
+doi:10.1006/jcph.2000.6484), with the fraction of the cell around a face that the body covers
+(Kajishima and Takiguchi, Int. J. Heat Fluid Flow 23, 2002, doi:10.1016/S0142-727X(02)00159-5), of
+second order (see `covers`). Inside the body, the water of the grid represents its mass: the
+momentum there, projected on the motions of the beam, gives the motion of the beam. No forces are
+exchanged between two solvers, so that light bodies are as stable as heavy ones.
 """
 
 import numpy as np
@@ -14,44 +14,44 @@ from fishd.core.errors import FishdError
 from fishd.virtual.swimmer.beam import Beam
 from fishd.virtual.swimmer.covers import Covered, circle, gather, impose, paint, slip
 from fishd.virtual.swimmer.flow import Flow
-from fishd.virtual.swimmer.grid import SAME, Array
+from fishd.virtual.swimmer.grid import MAX_SIZE_RATIO, Array
 
 IMPLICIT = 0.55
-"""Share of the new shape in the elastic forces of a step; 0.5 would let the shortest waves of the
-beam ring for ever."""
+"""Fraction of the new shape in the elastic forces of a step; with 0.5, the shortest waves of the
+beam would not decay."""
 _DIAGONAL = np.arange(3)
 
 
 class LeftTheGrid(FishdError):
-    """The body is where cells are coarse."""
+    """The body has reached the coarse cells of the grid."""
 
 
 class Immersed:
-    """A beam in a flow, a rigid circle, or both."""
+    """Beam, rigid circle, or both, in a flow."""
 
     def __init__(self, flow: Flow, density: float, beam: Beam | None = None) -> None:
-        """density: of the water [kg/m³]"""
+        """density: density of the water [kg/m³]"""
         self.flow, self.density, self.beam = flow, density, beam
         grid = flow.grid
         self._fixed: tuple[Covered, Covered] | None = None
         self._fixed_weight = np.ones((grid.nx, grid.ny))
         self._divergence_weight = self._fixed_weight.copy()
-        self._touched = slice(0, 0), slice(0, 0)
+        self._last_box = slice(0, 0), slice(0, 0)
         self._cell_mass = density * grid.h**2
         self.fixed_impulse = np.zeros(2)
-        """What the circle took from the water in the latest step [N s]."""
+        """Impulse that the circle took from the water in the latest step [N s]."""
         if beam:
             self.velocity = np.zeros((beam.slices, 3))
-            """Of the slices: vx, vy [m/s] and θ̇ [rad/s], at the latest step."""
+            """vx, vy [m/s] and θ̇ [rad/s] of the slices at the latest step."""
             self.force = np.zeros((beam.slices, 3))
-            """Of the slices on the water where they are: force and torque [N, N m] of a body one
-            metre deep, over the latest step."""
+            """Force and torque of the slices on the water inside them, for a body one metre deep,
+            over the latest step [N, N m]."""
             self.mass = np.zeros((beam.slices, 3, 3))
-            """Of the water where each slice is."""
+            """Mass matrices of the water inside each slice."""
             self._before = np.zeros(beam.size)
 
     def add_circle(self, x: float, y: float, radius: float) -> None:
-        """Put a rigid circle there, where cells are small; lengths in m."""
+        """Add a rigid circle in the fine part of the grid; lengths in m."""
         grid = self.flow.grid
         on_u = circle(grid.x[:, None] - x, grid.yc[None] - y, radius, grid.h)
         on_v = circle(grid.xc[:, None] - x, grid.y[None] - y, radius, grid.h)
@@ -60,7 +60,7 @@ class Immersed:
         self._divergence_weight = self._fixed_weight.copy()
 
     def step(self, dt: float, forces: Array | None = None) -> None:
-        """One step of `dt` [s]; forces: on the unknowns of the beam, at the middle of the step."""
+        """Advance by `dt` [s]; forces: those on the beam's unknowns in the middle of the step."""
         self.flow.predict(dt)
         if self._fixed:
             self._hold(*self._fixed)
@@ -69,16 +69,16 @@ class Immersed:
         self.flow.project(dt, self._divergence_weight)
 
     def _hold(self, on_u: Covered, on_v: Covered) -> None:
-        """Bring the water to rest where the circle is."""
+        """Bring the water inside the circle to rest."""
         flow = self.flow
-        taken_u = on_u.share * flow.ahead_u - slip(flow.ahead_u, on_u)
-        taken_v = on_v.share * flow.ahead_v - slip(flow.ahead_v, on_v)
-        self.fixed_impulse = self._cell_mass * np.array([taken_u.sum(), taken_v.sum()])
-        flow.ahead_u -= taken_u
-        flow.ahead_v -= taken_v
+        removed_u = on_u.share * flow.ahead_u - slip(flow.ahead_u, on_u)
+        removed_v = on_v.share * flow.ahead_v - slip(flow.ahead_v, on_v)
+        self.fixed_impulse = self._cell_mass * np.array([removed_u.sum(), removed_v.sum()])
+        flow.ahead_u -= removed_u
+        flow.ahead_v -= removed_v
 
     def _move(self, beam: Beam, dt: float, forces: Array | None) -> None:
-        """Find the new motion, and let the water where the beam is have it."""
+        """Compute the new motion of the beam, and impose it on the water inside the beam."""
         flow, grid, h = self.flow, self.flow.grid, self.flow.grid.h
         travel = np.zeros(beam.size)
         travel[0] = flow.grid_velocity
@@ -90,9 +90,12 @@ class Immersed:
         on_u = paint(*body, grid.x[faces_u[0]], grid.yc[j], beam.clamped)
         on_v = paint(*body, grid.xc[i], grid.y[faces_v[1]], beam.clamped)
         if self._fixed:
-            _leave_to(on_u, self._fixed[0], faces_u)
-            _leave_to(on_v, self._fixed[1], faces_v)
-        around_u, around_v = _around(flow.ahead_u, faces_u), _around(flow.ahead_v, faces_v)
+            _exclude_fixed(on_u, self._fixed[0], faces_u)
+            _exclude_fixed(on_v, self._fixed[1], faces_v)
+        around_u, around_v = (
+            _copy_with_margin(flow.ahead_u, faces_u),
+            _copy_with_margin(flow.ahead_v, faces_v),
+        )
         self.mass, momentum = gather(
             places,
             (on_u, around_u, grid.x[faces_u[0]], grid.yc[j]),
@@ -113,31 +116,31 @@ class Immersed:
         if self._fixed:
             share_u = share_u + self._fixed[0].share[faces_u]
             share_v = share_v + self._fixed[1].share[faces_v]
-        self._divergence_weight[self._touched] = self._fixed_weight[self._touched]
+        self._divergence_weight[self._last_box] = self._fixed_weight[self._last_box]
         self._divergence_weight[i, j] = _divergence_weight(share_u, share_v)
-        self._touched = i, j
+        self._last_box = i, j
 
     def _solve(
         self, beam: Beam, dt: float, moves: Array, momentum: Array, forces: Array | None
     ) -> Array:
-        """Rates of the unknowns at the end of the step, from the momentum of all that moves."""
+        """Return the rates of the unknowns at the end of the step, from the total momentum."""
         flat = moves.reshape(-1, beam.size)
-        heavy = self.mass.copy()
-        heavy[:, _DIAGONAL, _DIAGONAL] += beam.excess
-        M = flat.T @ (heavy @ moves).reshape(-1, beam.size)
-        driven = flat.T @ (momentum + beam.excess * self.velocity).ravel()
+        total_mass = self.mass.copy()
+        total_mass[:, _DIAGONAL, _DIAGONAL] += beam.excess
+        M = flat.T @ (total_mass @ moves).reshape(-1, beam.size)
+        momenta = flat.T @ (momentum + beam.excess * self.velocity).ravel()
         reach = 0.5 * IMPLICIT * dt
-        driven -= dt * (beam.K @ (beam.q + reach * beam.rate))
+        momenta -= dt * (beam.K @ (beam.q + reach * beam.rate))
         if forces is not None:
-            driven += dt * forces
+            momenta += dt * forces
         system = M + dt * (reach * beam.K + beam.D)
         rate = np.zeros(beam.size)
         first = beam.free[0]
-        rate[first:] = np.linalg.solve(system[first:, first:], driven[first:])
+        rate[first:] = np.linalg.solve(system[first:, first:], momenta[first:])
         return rate
 
     def _box(self, places: Array, half_thickness: float) -> tuple[slice, slice]:
-        """The cells around the body; raises `LeftTheGrid` where they are not all small."""
+        """Return the cells around the body; raises `LeftTheGrid` where some are coarse."""
         grid = self.flow.grid
         ranges = []
         for axis, edges, all_sizes in ((0, grid.x, grid.dx), (1, grid.y, grid.dy)):
@@ -147,12 +150,12 @@ class Immersed:
                 raise LeftTheGrid("the body left the water")
             first, last = np.searchsorted(edges, [low, high])
             ranges.append(slice(int(first) - 1, int(last)))
-            if all_sizes[ranges[-1]].max() > SAME * grid.h:
+            if all_sizes[ranges[-1]].max() > MAX_SIZE_RATIO * grid.h:
                 raise LeftTheGrid("the body left the part of the grid with small cells")
         return ranges[0], ranges[1]
 
     def state(self) -> dict[str, Array]:
-        """Everything that the next step depends on, by name."""
+        """Return the complete state by name."""
         state = self.flow.state()
         if self.beam:
             state |= {
@@ -164,31 +167,31 @@ class Immersed:
         return state
 
     def restore(self, state: dict[str, Array]) -> None:
-        """Go on from what `state` gave."""
+        """Restore a result of `state`."""
         self.flow.restore(state)
         if self.beam:
             self.beam.q, self.beam.rate = state["q"].copy(), state["rate"].copy()
             self._before, self.velocity = state["rate_before"].copy(), state["velocity"].copy()
 
 
-def _around(values: Array, faces: tuple[slice, slice]) -> Array:
-    """A copy of these faces and of one more on every side."""
+def _copy_with_margin(values: Array, faces: tuple[slice, slice]) -> Array:
+    """Return a copy of these faces with one more on every side."""
     i, j = faces
     return values[i.start - 1 : i.stop + 1, j.start - 1 : j.stop + 1].copy()
 
 
-def _leave_to(covered: Covered, fixed: Covered, faces: tuple[slice, slice]) -> None:
-    """Take from what the beam covers that which a fixed body covers."""
+def _exclude_fixed(covered: Covered, fixed: Covered, faces: tuple[slice, slice]) -> None:
+    """Remove from the coverage of the beam the part that a fixed body covers."""
     np.minimum(covered.share, 1.0 - fixed.share[faces], out=covered.share)
-    loose = fixed.share[faces] == 0.0
-    np.multiply(covered.moment_x, loose, out=covered.moment_x)
-    np.multiply(covered.moment_y, loose, out=covered.moment_y)
+    is_free = fixed.share[faces] == 0.0
+    np.multiply(covered.moment_x, is_free, out=covered.moment_x)
+    np.multiply(covered.moment_y, is_free, out=covered.moment_y)
 
 
 def _divergence_weight(cover_u: Array, cover_v: Array) -> Array:
-    """0 in cells that are all body.
+    """Return weights of the divergence: 0 in cells inside a body.
 
-    A body that bends is longer on one side and shorter on the other: were its inner cells made free
-    of divergence, it could bend the less the shorter the steps are.
+    A bent body is longer on one side and shorter on the other. If its inner cells were free of
+    divergence, short steps would prevent it from bending.
     """
     return np.asarray(1.0 - cover_u[1:] * cover_u[:-1] * cover_v[:, 1:] * cover_v[:, :-1])

@@ -1,4 +1,4 @@
-"""Where the body was during a swim: its midline at the end of each tick."""
+"""Midlines of the body during a swim, at the end of each tick."""
 
 import io
 import math
@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from fishd.core import files
 from fishd.virtual.swimmer.grid import Array
 from fishd.virtual.swimmer.robot import Swimmer
-from fishd.virtual.swimmer.track import COLUMNS, LONGEST
+from fishd.virtual.swimmer.track import COLUMNS, MAX_FILE_BYTES
 
-PLACES = 81
-"""Along the body, evenly from head to tail."""
+POINT_COUNT = 81
+"""Number of equally spaced points of a midline, from head to tail."""
 
 
 class Midlines:
@@ -28,41 +28,41 @@ class Midlines:
 
     @property
     def start(self) -> float:
-        """Time of the first one; infinite while there are none [s]."""
+        """Time of the first midline [s]; infinite without midlines."""
         return self._time[0] if self._time else math.inf
 
     def add(self, swimmer: Swimmer) -> None:
-        """Add that of now."""
+        """Add the current midline."""
         fish = swimmer.fish
         line = fish.midline()
-        wanted = np.linspace(0, len(line) - 1, PLACES)
-        sparse = [np.interp(wanted, np.arange(len(line)), part) for part in line.T]
+        indices = np.linspace(0, len(line) - 1, POINT_COUNT)
+        sparse = [np.interp(indices, np.arange(len(line)), part) for part in line.T]
         self._time.append(fish.time)
         self._lines.append(
             np.stack([sparse[0] + fish.travelled, sparse[1]], axis=1).astype(np.float32)
         )
 
     def put_before(self, path: Path, track: Array) -> None:
-        """Put those before that a file has of the beginning of this swim, if it is of this swim.
+        """Prepend the midlines in a file, if it contains the beginning of this swim.
 
-        path: as `track.save` writes it; track: rows of the whole swim
+        path: file that `track.save` has written; track: rows of the whole swim
         """
         rows = track[track[:, 0] < self.start]
         try:
-            content = files.read(path, LONGEST, "a swim")
-            with np.load(io.BytesIO(content), allow_pickle=False) as found:
-                there = np.stack([found[name] for name in COLUMNS], axis=1)[: len(rows)]
-                time, lines = found["midline_time"], found["midlines"]
-        except Exception:  # NumPy and zipfile raise of all kinds for what is no archive of arrays
+            content = files.read(path, MAX_FILE_BYTES, "a swim")
+            with np.load(io.BytesIO(content), allow_pickle=False) as npz:
+                stored_rows = np.stack([npz[name] for name in COLUMNS], axis=1)[: len(rows)]
+                time, lines = npz["midline_time"], npz["midlines"]
+        except Exception:  # NumPy and zipfile raise many kinds of errors for other files
             return
-        same = len(rows) and np.array_equal(there, rows)
-        if same and lines.shape == (*time.shape, PLACES, 2):
+        same = len(rows) and np.array_equal(stored_rows, rows)
+        if same and lines.shape == (*time.shape, POINT_COUNT, 2):
             earlier = time < self.start
             self._time[:0] = time[earlier].tolist()
             self._lines[:0] = list(lines[earlier])
 
     def arrays(self) -> dict[str, NDArray[np.floating]]:
-        """`midline_time`, of shape (n,) [s], and `midlines`, of shape (n, PLACES, 2) [m]."""
+        """Return `midline_time`, shape (n,) [s], and `midlines`, shape (n, POINT_COUNT, 2) [m]."""
         time: Array = np.array(self._time, np.float64)
-        lines = np.array(self._lines, np.float32).reshape(len(time), PLACES, 2)
+        lines = np.array(self._lines, np.float32).reshape(len(time), POINT_COUNT, 2)
         return {"midline_time": time, "midlines": lines}

@@ -1,8 +1,8 @@
-"""The pressure equation, solved directly: eigenvectors across, one sweep along for each of them.
+"""Direct solver of the pressure equation: eigenvectors across, one sweep along for each of them.
 
-The fast method for separable equations (Lynch, Rice and Thomas, Numerische Mathematik 6, 1964,
-doi:10.1007/BF01386067; Swarztrauber, SIAM Review 19, 1977, doi:10.1137/1019071): exact to rounding
-on a stretched grid, at the price of two matrix products, which are halved where the grid is even.
+This is the fast method for separable equations (Lynch, Rice and Thomas, Numerische Mathematik 6,
+1964, doi:10.1007/BF01386067; Swarztrauber, SIAM Review 19, 1977, doi:10.1137/1019071): exact up to
+rounding on a stretched grid, at the cost of two matrix products, which are halved on an even grid.
 """
 
 import numpy as np
@@ -14,46 +14,46 @@ from fishd.virtual.swimmer.grid import Array, Grid
 
 
 class Poisson:
-    """Solves ∇²φ = f on the cells of a grid: dφ/dn = 0 at three sides, φ = 0 at the right one."""
+    """Solver of ∇²φ = f on the cells of a grid: dφ/dn = 0 at three sides, φ = 0 at the right."""
 
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
-        # For the whole process, and on purpose: these matrices are too small for several threads,
-        # which on a busy machine wait for each other, and made a step ten times longer.
+        # Applies to the whole process, intentionally: these matrices are too small for several
+        # threads, which wait for each other on a busy machine; a step took ten times as long.
         threadpool_limits(1, "blas")
         across = np.diff(grid.yc)
         upper = 1.0 / across
         diagonal = np.zeros(grid.ny)
         diagonal[:-1] -= upper
         diagonal[1:] -= upper
-        # Symmetric after a scaling with the root of the cells' widths.
+        # The matrix is symmetric after a scaling with the root of the cells' widths.
         root = np.sqrt(grid.dy)
         values, vectors = eigh_tridiagonal(diagonal / grid.dy, upper / (root[1:] * root[:-1]))
         to_modes, from_modes = root[:, None] * vectors, vectors.T / root[None, :]
         self._half = 0
         if np.allclose(grid.dy, grid.dy[::-1], rtol=1e-9, atol=0.0):
-            # The modes of an even grid are even and odd by turns: products of half the size do.
+            # The modes of an even grid alternate between even and odd: the products are halved.
             self._half = half = (grid.ny + 1) // 2
             order = np.concatenate([np.arange(grid.ny - 1, -1, -2), np.arange(grid.ny - 2, -1, -2)])
             values, to_modes, from_modes = values[order], to_modes[:, order], from_modes[order]
-            # The row in the middle, where there is one, is added to itself by the fold.
+            # The fold adds the middle row, where there is one, to itself.
             to_modes[half - 1] *= 1.0 if grid.ny % 2 == 0 else 0.5
             to_modes, from_modes = to_modes[:half], from_modes[:, :half]
         self._to_modes = np.ascontiguousarray(to_modes[:, : self._half or None])
         self._from_modes = np.ascontiguousarray(from_modes[: self._half or None])
         self._to_odd = np.ascontiguousarray(to_modes[:, self._half :])
         self._from_odd = np.ascontiguousarray(from_modes[self._half :])
-        # Used again and again: what is taken anew costs as much as one of the products.
+        # Reused, because a new allocation costs as much as one of the products.
         self._even, self._odd = (np.empty((grid.nx, self._half)) for _ in range(2))
-        self._modes, self._found = (np.empty((grid.nx, grid.ny)) for _ in range(2))
+        self._modes, self._solution = (np.empty((grid.nx, grid.ny)) for _ in range(2))
         along = np.diff(grid.xc)
         lower = np.zeros(grid.nx)
         higher = np.zeros(grid.nx)
         lower[1:] = 1.0 / along
         higher[:-1] = 1.0 / along
         middle = -(lower + higher)
-        middle[-1] -= 2.0 / grid.dx[-1]  # φ = 0 half a cell further on
-        # A factorisation for each mode, of the matrix that is symmetric before the division by dx.
+        middle[-1] -= 2.0 / grid.dx[-1]  # φ = 0 half a cell beyond the last centre
+        # Factorisation for each mode of the matrix, which is symmetric before the division by dx.
         pivots = np.empty((grid.nx, grid.ny))
         pivots[0] = middle[0] + values * grid.dx[0]
         for i in range(1, grid.nx):
@@ -62,7 +62,7 @@ class Poisson:
         self._coupling = lower
 
     def solve(self, f: Array) -> Array:
-        """φ [m² times the unit of f], which the next call may overwrite; f: shape (nx, ny)."""
+        """Return φ [m² times the unit of f], overwritten by the next call; f: shape (nx, ny)."""
         grid, half = self._grid, self._half
         if not half:
             modes = (f * grid.dx[:, None]) @ self._to_modes
@@ -75,13 +75,13 @@ class Poisson:
         _sweep(modes, self._coupling, self._inverse_pivots)
         np.matmul(modes[:, :half], self._from_modes, out=even)
         np.matmul(modes[:, half:], self._from_odd, out=odd)
-        _unfold(even, odd, self._found)
-        return self._found
+        _unfold(even, odd, self._solution)
+        return self._solution
 
 
 @njit(cache=True)
 def _fold(f: Array, dx: Array, even: Array, odd: Array) -> None:  # pragma: no cover
-    """What is even and what is odd across, times the width of the cells."""
+    """Compute the even and the odd part across, times the width of the cells."""
     nx, ny = f.shape
     for i in range(nx):
         for j in range(even.shape[1]):
@@ -90,12 +90,12 @@ def _fold(f: Array, dx: Array, even: Array, odd: Array) -> None:  # pragma: no c
 
 
 @njit(cache=True)
-def _unfold(even: Array, odd: Array, found: Array) -> None:  # pragma: no cover
-    nx, ny = found.shape
+def _unfold(even: Array, odd: Array, solution: Array) -> None:  # pragma: no cover
+    nx, ny = solution.shape
     for i in range(nx):
         for j in range(even.shape[1]):
-            found[i, ny - 1 - j] = even[i, j] - odd[i, j]
-            found[i, j] = even[i, j] + odd[i, j]
+            solution[i, ny - 1 - j] = even[i, j] - odd[i, j]
+            solution[i, j] = even[i, j] + odd[i, j]
 
 
 @njit(cache=True, fastmath=True)

@@ -1,8 +1,7 @@
-"""The free swimmer behind the protocols of real hardware: a sensor, a servo, and its truth.
+"""Free swimmer behind the protocols of real hardware: a sensor, a servo, and its true state.
 
-It advances when it is read, by the time since the previous read, with the activation that the
-instruction angle asks for: a = φ_c/Φ, at once or as the servo's wheel follows. So it knows no
-clock.
+It advances at each read, by the time since the previous read, with the activation a = φ_c/Φ, either
+at once or with the delay of the servo's wheel. It does not use a clock.
 """
 
 import math
@@ -22,41 +21,41 @@ from fishd.virtual.swimmer.settings import SwimmerSettings
 
 
 class Window(NamedTuple):
-    """What truly happened between two reads; forces are of the water, on a fish one metre deep."""
+    """True values between two reads; forces are those of the water on a fish one metre deep."""
 
     duration: float
-    """[s]"""
+    """Length of the window [s]."""
     thrust: float
     """Mean force along −x [N]."""
     side_force: float
     """Mean force along y [N]."""
     tail_peak: float
-    """Largest angle of the tail against the front body [rad]."""
+    """Largest angle of the tail to the front body [rad]."""
 
 
 class Swimmer:
-    """A force sensor, a sensor of the tail, and muscles, with a free swimmer between them."""
+    """Force sensor, tail sensor and muscles of a free swimmer."""
 
     def __init__(
         self, settings: SwimmerSettings, plant: PlantParameters, amplitude: float, tick: float
     ) -> None:
-        """Settings that `feasibility.check` accepts.
+        """settings: as accepted by `feasibility.check`
 
-        plant: of which the servo counts, where the muscles follow one
+        plant: parameters of the servo, if the muscles follow one
         amplitude: Φ, the instruction angle of full activation [rad]
-        tick: period of the loop, a whole number of steps; the first read covers one [s]
+        tick: period of the loop, a whole number of steps; the first read covers one period [s]
         """
         self.settings = settings
         self.fish = Fish(settings)
         self.amplitude = amplitude
         self.trouble: Diverged | None = None
-        """Why it cannot go on."""
+        """Error that has ended the simulation."""
         self.motion = self.fish.motion()
-        """At the latest read."""
+        """Motion at the latest read."""
         self.tail_reach = (self.motion.tail_y, self.motion.tail_y)
-        """Least and greatest y of the tip of the tail between the latest two reads [m]."""
+        """Smallest and largest y of the tip of the tail between the latest two reads [m]."""
         self.window = Window(tick, 0.0, 0.0, 0.0)
-        """What truly happened between the latest two reads; nothing before the first."""
+        """True values between the latest two reads; zero before the first."""
         self._plant = plant
         self._tick = tick
         self._start: float | None = None
@@ -68,42 +67,44 @@ class Swimmer:
         self._share = -math.expm1(-1.0 / smoothing) if smoothing else 1.0
 
     def compile(self) -> None:
-        """Do what takes long when it is done for the first time, as in the first step."""
+        """Run one step, which compiles the functions, and restore the state."""
         state = self.fish.state()
         self.fish.step(0.0)
         self.fish.restore(state)
 
     def read(self, now: float) -> Measurement:
-        """Swim until `now` [s]; forces are means over the way, on a fish one metre deep.
+        """Advance to `now` [s]; return mean forces on a fish one metre deep.
 
-        Raises `FishLost` where the fish cannot go on, then and ever after.
+        Raises `FishLost` where the simulation has diverged, now or earlier.
         """
         if self.trouble:
             raise FishLost(str(self.trouble))
         if self._start is None:
             self._start = now - self._tick
-        due = max(1, round((now - self._start) / self.fish.dt) - self._steps)
-        self._steps += due
-        thrust = side = peak = 0.0
+        step_count = max(1, round((now - self._start) / self.fish.dt) - self._steps)
+        self._steps += step_count
+        thrust = side_force = peak = 0.0
         lowest, highest = math.inf, -math.inf
-        for _ in range(due):
+        for _ in range(step_count):
             motion = self._advance()
             thrust += motion.thrust
-            side += motion.side_force
+            side_force += motion.side_force
             peak = max(peak, abs(motion.tail_angle))
             lowest, highest = min(lowest, motion.tail_y), max(highest, motion.tail_y)
         self.motion, self.tail_reach = motion, (lowest, highest)
-        self.window = Window(due * self.fish.dt, thrust / due, side / due, peak)
+        self.window = Window(
+            step_count * self.fish.dt, thrust / step_count, side_force / step_count, peak
+        )
         return Measurement(
             time=now,
-            fx=thrust / due,
-            fy=side / due,
-            samples=due,
+            fx=thrust / step_count,
+            fy=side_force / step_count,
+            samples=step_count,
             fin_velocity=self._sensed_rate,
         )
 
     def _advance(self) -> Motion:
-        """One step of the fish."""
+        """Advance the fish by one step, and return its motion."""
         try:
             self.fish.step(self._activation())
         except Diverged as error:
@@ -114,35 +115,35 @@ class Swimmer:
         return motion
 
     def _activation(self) -> float:
-        """In the next step; without pulses the muscles are relaxed."""
+        """Return the activation of the next step; without pulses the muscles are relaxed."""
         if self._angle is None:
             self._phi = 0.0
         elif not self.settings.muscle.servo:
             self._phi = self._angle
-        else:  # as in the middle of the step
-            middle = self._followed(self._phi, 0.5 * self.fish.dt)
-            self._phi = self._followed(self._phi, self.fish.dt)
+        else:  # value in the middle of the step
+            middle = self._wheel_after(self._phi, 0.5 * self.fish.dt)
+            self._phi = self._wheel_after(self._phi, self.fish.dt)
             return middle / self.amplitude
         return self._phi / self.amplitude
 
-    def _followed(self, phi: float, duration: float) -> float:
-        """Where the wheel at `phi` is after `duration` s [rad]."""
+    def _wheel_after(self, phi: float, duration: float) -> float:
+        """Return the angle of the wheel at `phi` after `duration` s [rad]."""
         plant, angle = self._plant, self._angle or 0.0
         lag = (angle - phi) / plant.servo_lag
         return angle - plant.servo_lag * relax(lag, duration * plant.servo_speed / plant.servo_lag)
 
     def take_window(self) -> TrueWindow:
-        """The same for those who judge runs of every robot."""
+        """Return the values of `window` that all robots have."""
         return TrueWindow(self.window.duration, self.window.thrust, self.window.tail_peak)
 
     @property
     def work(self) -> Work:
-        """What was done since the start, by a fish one metre deep [J]."""
+        """Work since the start, of a fish one metre deep [J]."""
         return self.fish.work
 
     @property
     def command(self) -> float:
-        """The instruction angle now; 0 where the muscles are relaxed [rad]."""
+        """Current instruction angle; 0 where the muscles are relaxed [rad]."""
         return self._angle or 0.0
 
     def write(self, angle: float) -> None:
@@ -150,15 +151,15 @@ class Swimmer:
         self._angle = angle
 
     def release(self) -> None:
-        """Let the muscles relax."""
+        """Relax the muscles."""
         self._angle = None
 
     def close(self) -> None:
-        """The same."""
+        """Relax the muscles."""
         self.release()
 
     def truth(self) -> Truth:
-        """The true state at the latest read; the tail is that against the front body."""
+        """Return the true state at the latest read; the tail angle refers to the front body."""
         motion = self.motion
         return Truth(
             alpha=motion.tail_angle,
@@ -168,20 +169,20 @@ class Swimmer:
         )
 
     def degraded(self) -> tuple[str, ...]:
-        """Why it does not swim any more, where it does not."""
+        """Return why the simulation has ended, if it has."""
         return (f"{self.trouble}; restart fishd",) if self.trouble else ()
 
     def robot(self) -> Robot:
-        """This fish as the loop sees it."""
+        """Return the robot of the loop."""
         return Robot("swimmer", self, self, truth=self.truth, degraded=self.degraded)
 
     def state(self) -> dict[str, Array]:
-        """Everything that the next read depends on, by name."""
+        """Return the complete state by name."""
         angle = math.nan if self._angle is None else self._angle
         return self.fish.state() | {"robot": np.array([angle, self._phi, self._sensed_rate])}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from what `state` gave, to the last bit."""
+        """Restore a result of `state` exactly."""
         self.fish.restore(state)
         angle, self._phi, self._sensed_rate = map(float, state["robot"])
         self._angle = None if math.isnan(angle) else angle

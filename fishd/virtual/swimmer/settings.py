@@ -1,4 +1,4 @@
-"""Section `swimmer` of the configuration: the body, its muscles, the water and the grid."""
+"""Settings of section `swimmer`: the body, its muscles, the water and the grid."""
 
 from typing import Annotated
 
@@ -6,25 +6,25 @@ from msgspec import Meta, Struct
 
 from fishd.core.schema import unit
 
-LARGEST_COURANT = 0.42
-"""The step is short enough where the tail is expected to pass no more than this share of a cell in
-it. Adams–Bashforth with fluxes of third order is stable to 0.585 for what is carried along, and the
-water around the tail is up to 1.4 times as fast."""
-LEAST_CELLS_LONG = 40
-LEAST_CELLS_THICK = 6
+MAX_COURANT = 0.42
+"""Largest fraction of a cell that the tail is expected to pass in a step. Advection by
+Adams–Bashforth with fluxes of third order is stable up to 0.585, and the water around the tail is
+up to 1.4 times as fast."""
+MIN_CELLS_PER_LENGTH = 40
+MIN_CELLS_PER_THICKNESS = 6
 
 
 class Body(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The body: 2-D, and one metre deep where a mass, a force or a power is told."""
+    """Settings of the 2-D body; masses, forces and powers are those of one metre of depth."""
 
-    length: Annotated[float, unit("m", "L, from head to tail.", ge=0.005, le=2.0)] = 0.1
+    length: Annotated[float, unit("m", "Length L from head to tail.", ge=0.005, le=2.0)] = 0.1
     thickness: Annotated[
         float,
         unit(
             "m",
-            "H: half of the body's thickness at X is H·s(X/L); in the paper's formula t(X) it has "
-            "to be the half one. It also sets the bend that the muscles ask for, κ = ε₀ (X/L)ⁿ/H: "
-            "with another thickness muscle.strain is another, too.",
+            "H: half of the body's thickness at X is H·s(X/L); t(X) in the paper's formula must be "
+            "half of the thickness, too. H also sets the curvature that the muscles command, "
+            "κ = ε₀ (X/L)ⁿ/H: change muscle.strain together with it.",
             gt=0.0,
             le=2.0,
         ),
@@ -42,43 +42,43 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         float, unit("Pa s", "Viscosity of the material (Kelvin–Voigt).", ge=0.0, le=1e9)
     ] = 1e-4
     excess_density: Annotated[
-        float, unit("kg/m^3", "By which the body is heavier than the water.", ge=0.0, le=2e4)
+        float, unit("kg/m^3", "Density of the body minus that of the water.", ge=0.0, le=2e4)
     ] = 0.0
 
 
 class Muscle(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Active strain ε₀ (X/L)ⁿ (Y/H) a, with the activation a from −1 to 1."""
+    """Settings of the active strain ε₀ (X/L)ⁿ (Y/H) a, with the activation a from −1 to 1."""
 
     strain: Annotated[
         float,
         unit(
             "1",
-            "ε₀: the tail bends by ε₀L²/12H, 0.21 L with 1; the paper prints 0.01.",
+            "Strain ε₀: the tail bends by ε₀L²/12H, which is 0.21 L with 1; the paper prints 0.01.",
             gt=0.0,
             le=100.0,
         ),
     ] = 1.0
-    exponent: Annotated[float, unit("1", "n.", ge=0.0, le=10.0)] = 2.0
+    exponent: Annotated[float, unit("1", "Exponent n of the strain.", ge=0.0, le=10.0)] = 2.0
     servo: Annotated[
         bool,
         Meta(
-            description="Does the activation follow the command as the servo of section plant "
-            "would, with plant.servo_speed and servo_lag? Otherwise at once, as in the paper."
+            description="Whether the activation follows the command like the servo of section "
+            "plant, with plant.servo_speed and servo_lag; otherwise at once, as in the paper."
         ),
     ] = False
 
 
 class Water(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The water and its tank, which travels with the fish: long walls with slip, open ends."""
+    """Settings of the water and its tank, which travels with the fish and has open ends."""
 
-    density: Annotated[float, unit("kg/m^3", "ρ.", gt=0.0, le=1e5)] = 1000.0
+    density: Annotated[float, unit("kg/m^3", "Density ρ.", gt=0.0, le=1e5)] = 1000.0
     viscosity: Annotated[float, unit("m^2/s", "Kinematic viscosity ν.", ge=0.0, le=1.0)] = 1e-6
-    length: Annotated[float, unit("m", "Of the tank.", gt=0.0, le=100.0, usual=20)] = 1.0
-    width: Annotated[float, unit("m", "Of the tank.", gt=0.0, le=100.0, usual=20)] = 0.2
+    length: Annotated[float, unit("m", "Length of the tank.", gt=0.0, le=100.0, usual=20)] = 1.0
+    width: Annotated[float, unit("m", "Width of the tank.", gt=0.0, le=100.0, usual=20)] = 0.2
 
 
 class Numerics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The grid and the step."""
+    """Settings of the grid and the step."""
 
     cell: Annotated[float, unit("m", "Size of the cells around the fish.", gt=0.0, le=0.1)] = 1e-3
     step: Annotated[float, unit("s", "Time step.", gt=0.0, le=0.1)] = 1e-3
@@ -87,48 +87,50 @@ class Numerics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         Meta(
             ge=5,
             le=200,
-            description="Pieces of the beam, each bent evenly, and at least 1.5 cells long.",
+            description="Segments of the beam, each of constant curvature and 1.5 cells or longer.",
         ),
     ] = 25
     fine_length: Annotated[
         float, unit("1", "Length of the part with small cells, in lengths of the fish.", ge=1.4)
     ] = 2.0
     fine_width: Annotated[
-        float, unit("1", "Width of that part, in lengths of the fish.", ge=0.5)
+        float, unit("1", "Width of the part with small cells, in lengths of the fish.", ge=0.5)
     ] = 1.1
     stretch_along: Annotated[
-        float, unit("1", "Growth from cell to cell outside, along the tank.", ge=1.0, le=1.2)
+        float, unit("1", "Ratio of adjacent cells outside, along the tank.", ge=1.0, le=1.2)
     ] = 1.04
-    stretch_across: Annotated[float, unit("1", "The same across it.", ge=1.0, le=1.2)] = 1.06
+    stretch_across: Annotated[
+        float, unit("1", "Ratio of adjacent cells outside, across the tank.", ge=1.0, le=1.2)
+    ] = 1.06
 
 
 class SwimmerSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The free swimmer."""
+    """Settings of the free swimmer."""
 
     body: Annotated[Body, Meta(description="The body.")] = Body()
-    muscle: Annotated[Muscle, Meta(description="What bends it.")] = Muscle()
-    water: Annotated[Water, Meta(description="Where it swims.")] = Water()
-    numerics: Annotated[Numerics, Meta(description="How it is computed.")] = Numerics()
+    muscle: Annotated[Muscle, Meta(description="The muscles.")] = Muscle()
+    water: Annotated[Water, Meta(description="The water and its tank.")] = Water()
+    numerics: Annotated[Numerics, Meta(description="The grid and the time step.")] = Numerics()
     steering: Annotated[
         float,
         unit(
             "1",
-            "How firmly a torque, without a net force, keeps the fish on the middle of the "
-            "tank; 0: it goes where it goes, and the run ends where cells are coarse.",
+            "Gain of a torque without a net force that keeps the fish in the middle of the tank; "
+            "0: none, and the run ends when the fish reaches the coarse cells.",
             ge=0.0,
             le=10.0,
         ),
     ] = 1.0
     sensor_time: Annotated[
         float,
-        unit("s", "Time constant of the filters of what the fish senses.", ge=0.0, le=1.0),
+        unit("s", "Time constant of the filters of the fish's sensors.", ge=0.0, le=1.0),
     ] = 0.005
     slow_motion: Annotated[
         float,
         unit(
             "1",
-            "Live, a second of the fish takes this number of seconds, or as many more as this "
-            "machine needs. Runs in virtual time are as fast as they can be.",
+            "Seconds that a second of the fish takes in a live run, or more on a slow machine. "
+            "Runs in virtual time are as fast as possible.",
             ge=1.0,
             le=1000.0,
         ),

@@ -1,4 +1,4 @@
-"""The track of a swim: a row of numbers for each tick, and files of it."""
+"""Track of a swim, with a row of numbers for each tick, and its files."""
 
 import io
 from collections.abc import Mapping
@@ -17,36 +17,39 @@ if TYPE_CHECKING:  # the columns are documented where numba is not installed
     from fishd.virtual.swimmer.robot import Swimmer
 
 COLUMNS = {
-    "time": ("s", "of the fish, at the end of the tick"),
+    "time": ("s", "time of the fish at the end of the tick"),
     "x": ("m", "centre of mass, in the laboratory; it swims to −x"),
     "y": ("m", "centre of mass, in the laboratory"),
-    "speed": ("m/s", "forwards, along −x"),
-    "heading": ("rad", "of the front body against −x"),
-    "tail_angle": ("rad", "of the rear body (last fifth), seen from the middle of the front body"),
-    "tail_rate": ("rad/s", "its rate, not filtered"),
-    "tail_lowest": ("m", "least y of the tip of the tail during the tick, in the laboratory"),
-    "tail_highest": ("m", "the greatest"),
+    "speed": ("m/s", "speed forwards, along −x"),
+    "heading": ("rad", "angle of the front body to −x"),
+    "tail_angle": (
+        "rad",
+        "angle of the rear body (last fifth), seen from the middle of the front body",
+    ),
+    "tail_rate": ("rad/s", "rate of tail_angle, not filtered"),
+    "tail_lowest": ("m", "smallest y of the tip of the tail during the tick, in the laboratory"),
+    "tail_highest": ("m", "largest y of the tip of the tail during the tick, in the laboratory"),
     "command": ("rad", "instruction angle φ_c during the tick"),
-    "activation": ("1", "a, in the last step of the tick"),
+    "activation": ("1", "activation a in the last step of the tick"),
     "thrust": ("N/m", "mean force of the water along −x"),
     "side_force": ("N/m", "mean force of the water along y"),
-    "muscle_power": ("W/m", "of the muscles, mean; below 0 while they are stretched"),
-    "water_power": ("W/m", "of the body on the water, mean"),
-    "steering_power": ("W/m", "of the torque that keeps the fish on its way, mean"),
-    "thrust_power": ("W/m", "of those slices that push the fish forwards, mean"),
-    "lateral_power": ("W/m", "of the body on the water along y, mean"),
+    "muscle_power": ("W/m", "mean power of the muscles; negative while they are stretched"),
+    "water_power": ("W/m", "mean power of the body on the water"),
+    "steering_power": ("W/m", "mean power of the steering torque"),
+    "thrust_power": ("W/m", "mean power of the slices that push the fish forwards"),
+    "lateral_power": ("W/m", "mean power of the body on the water along y"),
 }
 """Unit and meaning of each column; forces and powers per metre of depth."""
-LONGEST = 2**30
-"""Of a file of a swim that is read [bytes]."""
+MAX_FILE_BYTES = 2**30
+"""Largest size of the file of a swim [bytes]."""
 SUFFIXES = (".csv", ".npz")
 
 
 class Track:
-    """Rows of a swim, one a tick, all ticks of the same length."""
+    """Rows of a swim, one per tick; all ticks have the same length."""
 
     def __init__(self, rows: "Array | None" = None) -> None:
-        """rows: those there are already, of shape (ticks, columns)"""
+        """rows: existing rows, shape (ticks, columns)"""
         self._rows: list[tuple[float, ...]] = [] if rows is None else list(map(tuple, rows))
         self._before: Work | None = None
 
@@ -54,18 +57,18 @@ class Track:
         return len(self._rows)
 
     def begin(self, swimmer: "Swimmer") -> None:
-        """Powers are those of what is done from now on."""
+        """Start the powers with the work from now on."""
         self._before = swimmer.work
 
     def add(self, swimmer: "Swimmer", command: float) -> None:
-        """Add the tick that has just ended; command: φ_c meanwhile [rad]."""
+        """Add the latest tick; command: φ_c during the tick [rad]."""
         motion, window, work = swimmer.motion, swimmer.window, swimmer.work
         before = self._before or work
         self._before = work
         lowest, highest = swimmer.tail_reach
 
-        def power(now: float, then: float) -> float:
-            return (now - then) / window.duration
+        def power(current: float, earlier: float) -> float:
+            return (current - earlier) / window.duration
 
         row = {
             "time": motion.time,
@@ -90,16 +93,16 @@ class Track:
         self._rows.append(tuple(row[name] for name in COLUMNS))
 
     def rows(self) -> "Array":
-        """All of them, of shape (ticks, columns)."""
+        """Return all rows, shape (ticks, columns)."""
         return np.array(self._rows, np.float64).reshape(len(self._rows), len(COLUMNS))
 
     def columns(self) -> "dict[str, Array]":
-        """The same by name, each of shape (ticks,)."""
+        """Return all columns by name, each of shape (ticks,)."""
         return dict(zip(COLUMNS, self.rows().T, strict=True))
 
 
 def check_name(path: Path) -> None:
-    """Raises `ParameterError` where no file of that name can be written."""
+    """Raise `ParameterError` where no file of that name can be written."""
     if path.suffix not in SUFFIXES:
         raise ParameterError(f"{path}: a name that ends in {' or '.join(SUFFIXES)} is needed")
     if not path.parent.is_dir():
@@ -111,7 +114,7 @@ def save(
 ) -> None:
     """Write a CSV file with a header, or an NPZ file with an array for each column.
 
-    others: arrays that go into an NPZ file, too
+    others: additional arrays for an NPZ file
     Raises OSError.
     """
     if path.suffix == ".csv":

@@ -119,7 +119,7 @@ def test_a_camera_that_stalls_is_opened_anew(good: V4l2Rig) -> None:
     ("fault", "problem", "remedy"),
     [
         ({"denied": True}, "this user may not open it", "usermod -aG video"),
-        ({"busy": True}, "another program uses it", "end that"),
+        ({"busy": True}, "another program uses it", "close that program"),
         ({"formats": ("YUYV",)}, "does not send MJPG", "that it sends: YUYV"),
         ({"no_video": True}, "", "second device takes no pictures"),
     ],

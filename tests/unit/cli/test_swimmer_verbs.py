@@ -52,7 +52,7 @@ def test_midlines_are_drawn_from_a_saved_swim(swum: Path, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["wake", "swim.npz"], "it is no checkpoint of a swimmer"),
+        (["wake", "swim.npz"], "it is not a checkpoint of a swimmer"),
         (["wake", "none.npz"], "no such file"),
         (["wake", "end.npz", "--limit", "5"], "--limit applies to one field"),
         (["midlines", "end.npz"], "it contains no midlines"),

@@ -89,7 +89,7 @@ def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
 def test_a_fish_that_is_lost_is_a_point_without_a_speed(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fishd.virtual.swimmer.fish.UNSTABLE", 1e-6)
+    monkeypatch.setattr("fishd.virtual.swimmer.fish.MAX_COURANT_NUMBER", 1e-6)
     result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
     assert result
     assert result.speed is None

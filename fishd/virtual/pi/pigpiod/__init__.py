@@ -1,1 +1,1 @@
-"""The pigpiod of the virtual Pi: the protocol of the real one, its pins and its scripts."""
+"""Emulated pigpiod of the virtual Pi: its protocol, pins and scripts."""

@@ -1,7 +1,7 @@
-"""What pigpiod does with a command, whoever gave it; without any sockets.
+"""Commands of the emulated pigpiod, without its sockets.
 
-It has the commands of fishd and of people who move a servo with `pigs`. All others are answered
-with −88, unknown command, and named in the log.
+They are those of fishd, and those that move a servo with `pigs`. All others are answered with −88,
+unknown command, and logged.
 """
 
 import logging
@@ -12,15 +12,16 @@ from itertools import count
 from fishd.virtual.pi.pigpiod import errors
 from fishd.virtual.pi.pigpiod.errors import PigpioError, check
 from fishd.virtual.pi.pigpiod.pins import Pins
-from fishd.virtual.pi.pigpiod.script import PARAMETERS, Script
+from fishd.virtual.pi.pigpiod.script import PARAMETER_COUNT, Script
 
 log = logging.getLogger(__name__)
 
 VERSION = 79
-"""The library's last release, which Raspberry Pi OS ships and whose Python module is 1.78."""
+"""Version of the library in Raspberry Pi OS, whose Python module is 1.78."""
 HARDWARE_REVISION = 0xC03112
-"""A Raspberry Pi 4B with 4 GB."""
-SCRIPTS = 32
+"""Revision of a Raspberry Pi 4B with 4 GB."""
+MAX_SCRIPTS = 32
+"""Largest number of stored scripts."""
 
 _NAMES = """
 MODES MODEG PUD READ WRITE PWM PRS PFS SERVO WDOG BR1 BR2 BC1 BC2 BS1 BS2 TICK HWVER NO NB NP NC
@@ -34,20 +35,20 @@ WVCAP
 NAMES = _NAMES.split()
 """All commands of pigpio, by number."""
 
-_STATUS = struct.Struct(f"<{PARAMETERS + 1}i")
+_STATUS = struct.Struct(f"<{PARAMETER_COUNT + 1}i")
 
 
 class Commands:
-    """GPIOs and scripts of one pigpiod; not safe to use from several threads.
+    """GPIOs and scripts of one pigpiod; not safe for use from several threads.
 
-    Times are seconds of its clock and must not go back from call to call.
+    Times are seconds of its clock and must not decrease from call to call.
     """
 
     def __init__(self) -> None:
         self.pins = pins = Pins()
         self._scripts: dict[int, Script] = {}
-        self._told: set[int] = set()
-        """Commands that the log has named."""
+        self._logged: set[int] = set()
+        """Unknown commands that were logged."""
         self._handlers: dict[str, Callable[[float, int, int, bytes], int]] = {
             "MODES": lambda time, gpio, mode, _: pins.set_mode(time, gpio, mode),
             "MODEG": lambda time, gpio, _, __: pins.mode(gpio),
@@ -70,38 +71,38 @@ class Commands:
             "PROCU": lambda time, script, _, extension: self._script(script).update(
                 _parameters(extension)
             ),
-            # Whose answers a client takes for a number, never for an error.
+            # Clients read these answers as numbers, never as errors.
             "BR1": lambda time, _, __, ___: pins.levels(time),
             "BR2": lambda _, __, ___, ____: 0,
             "TICK": lambda time, _, __, ___: int(time * 1e6),
             "HWVER": lambda _, __, ___, ____: HARDWARE_REVISION,
-            # What pigpio.pi() says to connect and to stop: it opens a handle for notifications.
+            # pigpio.pi() sends these to open and close a handle for notifications.
             "NOIB": lambda _, __, ___, ____: 0,
             "NC": lambda _, __, ___, ____: 0,
         }
 
     def restart(self, time: float) -> None:
-        """Die and come back: no pulses, no scripts."""
+        """Reset as after a restart: without pulses and scripts."""
         self.pins.reset(time)
         self._scripts.clear()
 
     def resume(self, time: float) -> None:
-        """Go on at a time [s] after having stood still."""
+        """Continue at a time [s] after a pause."""
         for script in self._scripts.values():
             script.time = max(script.time, time)
 
     def advance(self, time: float) -> None:
-        """Let the scripts do all that is due up to a time [s], in the order of time."""
+        """Run the scripts up to a time [s], in the order of time."""
         while due := sorted((s.time, n) for n, s in self._scripts.items() if s.time <= time):
-            others = due[1][0] if len(due) > 1 else time
-            self._scripts[due[0][1]].run(others)
+            next_due = due[1][0] if len(due) > 1 else time
+            self._scripts[due[0][1]].run(next_due)
 
     def execute(
         self, time: float, number: int, p1: int, p2: int, extension: bytes
     ) -> tuple[int, bytes]:
-        """Carry out a command at a time [s] up to which everything has happened.
+        """Execute a command at a time [s] up to which the scripts have run.
 
-        Gives the result, negative for an error, and the bytes that follow it.
+        Return the result, negative for an error, and the bytes that follow it.
         """
         name = NAMES[number] if number < len(NAMES) else "?"
         try:
@@ -112,8 +113,8 @@ class Commands:
                 return self._handlers[name](time, p1, p2, extension), b""
         except PigpioError as error:
             return error.number, b""
-        if number not in self._told and len(self._told) < len(NAMES):
-            self._told.add(number)
+        if number not in self._logged and len(self._logged) < len(NAMES):
+            self._logged.add(number)
             log.warning(
                 "emulated pigpiod: command %s (%d) is not emulated; "
                 "docs/how-to/virtual-pi.md has a table",
@@ -124,7 +125,7 @@ class Commands:
     def _store(self, time: float, text: bytes) -> int:
         script = Script(text.partition(b"\0")[0].decode("latin-1"), self._servo, time)
         number = next(number for number in count() if number not in self._scripts)
-        check(number < SCRIPTS, errors.NO_SCRIPT_ROOM)
+        check(number < MAX_SCRIPTS, errors.NO_SCRIPT_ROOM)
         self._scripts[number] = script
         return number
 
@@ -145,5 +146,5 @@ class Commands:
 
 
 def _parameters(extension: bytes) -> tuple[int, ...]:
-    check(len(extension) // 4 <= PARAMETERS, errors.TOO_MANY_PARAM)
+    check(len(extension) // 4 <= PARAMETER_COUNT, errors.TOO_MANY_PARAM)
     return struct.unpack(f"<{len(extension) // 4}i", extension[: len(extension) // 4 * 4])

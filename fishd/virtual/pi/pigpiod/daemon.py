@@ -1,7 +1,7 @@
-"""An emulated pigpiod: a TCP server that the true pigpio client and `pigs` drive unchanged.
+"""Emulated pigpiod: a TCP server for the real pigpio client and `pigs`, which run unchanged.
 
-The emulated tank asks it which pulses a pin sends. Nothing in it moves by itself: scripts and
-frames catch up with the clock whenever a client or the tank wants to know something.
+The emulated tank reads the pulses of a pin from it. Scripts and frames are evaluated lazily: they
+advance to the current time at each request of a client or the tank.
 """
 
 import contextlib
@@ -17,15 +17,15 @@ from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.pigpiod.commands import Commands
 from fishd.virtual.pi.pigpiod.connection import Connection
 
-POLL = 5e-3
-"""How often the server looks at the clock while something is due, and at faults that last [s]."""
+POLL_PERIOD_S = 5e-3
+"""Time between two checks of the clock while a delay or a fault is active [s]."""
 
 
 class Pigpiod:
-    """One daemon; `start` before use, `close` after. Its methods may be called from any thread."""
+    """Emulated daemon; call `start` before use and `close` after. Safe for use from any thread."""
 
     def __init__(self, clock: Clock, faults: Faults, port: int = 0) -> None:
-        """`port`: 0 takes a free one."""
+        """`port`: 0 for any free port."""
         self._clock = clock
         self._faults = faults
         self._address = ("127.0.0.1", port)
@@ -40,12 +40,12 @@ class Pigpiod:
 
     @property
     def port(self) -> int:
-        """Where it listens; known once it has started."""
+        """TCP port of the server, after `start`."""
         return self._address[1]
 
     def start(self) -> None:
-        """Listen; OSError when the port is taken."""
-        self._listener = self._bound()
+        """Listen; raises OSError when the port is taken."""
+        self._listener = self._bind_listener()
         self._address = self._listener.getsockname()[:2]
         self._epoll = select.epoll()
         self._waker = os.eventfd(0)
@@ -56,7 +56,7 @@ class Pigpiod:
         self._thread.start()
 
     def close(self) -> None:
-        """Close all connections and end the thread; pulses are left as they are."""
+        """Close all connections and end the thread; pulses continue."""
         with self._lock:
             if not self._running:
                 return
@@ -70,40 +70,42 @@ class Pigpiod:
         os.close(self._waker)
 
     def width(self, gpio: int, time: float) -> float:
-        """The pulse at a time up to now [s], in µs; 0 for no pulses."""
+        """Return the pulse width [µs] at a time up to now [s]; 0 without pulses."""
         with self._lock:
-            self._observe()
+            self._catch_up()
             return self._commands.pins.pins[gpio].train.width(time)
 
     def history(self, gpio: int) -> list[tuple[float, float]]:
-        """The last changes of the pulses: when each took effect [s], and the width [µs]."""
+        """Return the latest changes of the pulses: time of the effect [s] and width [µs]."""
         with self._lock:
-            self._observe()
+            self._catch_up()
             return self._commands.pins.pins[gpio].train.history
 
     def stands_still(self) -> bool:
-        """Is it frozen? Then it answers nothing before the clock moves on."""
+        """Return whether it is frozen; then it does not answer until the clock advances."""
         with self._lock:
-            self._observe()
+            self._catch_up()
             return self._frozen
 
     def _begin_fault(self) -> None:
         with self._lock:
-            left = self._faults.listing().get("pigpiod-frozen")
-            self._frozen_until = math.inf if left is None else self._clock.monotonic() + left
-            self._observe()
+            remaining = self._faults.listing().get("pigpiod-frozen")
+            self._frozen_until = (
+                math.inf if remaining is None else self._clock.monotonic() + remaining
+            )
+            self._catch_up()
         self._wake()
 
     def _restart(self) -> None:
         with self._lock:
-            now = self._observe()
+            now = self._catch_up()
             if self._running and not self._gone:
                 self._die(now)
                 self._listen()
         self._wake()
 
-    def _observe(self) -> float:
-        """Catch up with the clock and the faults; gives the time [s]."""
+    def _catch_up(self) -> float:
+        """Advance to the current time and check the faults; return the time [s]."""
         now = self._clock.monotonic()
         if not self._running:
             return now
@@ -132,29 +134,29 @@ class Pigpiod:
         return now
 
     def _serve(self) -> None:
-        time_out: float | None = 0.0
+        timeout: float | None = 0.0
         while True:
-            events = self._epoll.poll(time_out)
+            events = self._epoll.poll(timeout)
             with self._lock:
                 if not self._running:
                     return
-                now = self._observe()
+                now = self._catch_up()
                 if not self._frozen:
                     for descriptor, _ in events:
-                        self._attend(descriptor, now)
-                time_out = self._time_out(now)
+                        self._handle_event(descriptor, now)
+                timeout = self._poll_timeout(now)
             if self._frozen:
-                # What clients send meanwhile stays in the kernel, as with a stopped process.
-                time.sleep(POLL)
+                # Data from clients stays in the kernel, as with a stopped process.
+                time.sleep(POLL_PERIOD_S)
 
-    def _time_out(self, now: float) -> float | None:
+    def _poll_timeout(self, now: float) -> float | None:
         if self._gone or self._frozen:
-            return POLL
-        due = min((each.due for each in self._connections.values()), default=math.inf)
-        # Polled, since a virtual clock may move at any speed.
-        return None if due == math.inf else min(POLL, max(0.0, due - now))
+            return POLL_PERIOD_S
+        due = min((connection.due for connection in self._connections.values()), default=math.inf)
+        # Polled, because a virtual clock may advance at any speed.
+        return None if due == math.inf else min(POLL_PERIOD_S, max(0.0, due - now))
 
-    def _attend(self, descriptor: int, now: float) -> None:
+    def _handle_event(self, descriptor: int, now: float) -> None:
         connection = self._connections.get(descriptor)
         if connection:
             if not connection.receive(now):
@@ -162,7 +164,7 @@ class Pigpiod:
         elif descriptor == self._waker:
             os.eventfd_read(self._waker)
         elif descriptor == self._listener.fileno():
-            # A client may have changed its mind, and a fault may have closed this in between.
+            # The client may have disconnected, or a fault may have closed the listener.
             with contextlib.suppress(OSError):
                 client, _ = self._listener.accept()
                 self._connections[client.fileno()] = Connection(client, self._commands)
@@ -178,10 +180,10 @@ class Pigpiod:
             self._drop(connection)
         self._commands.restart(now)
         self._listener.close()
-        # Bound but not listening: nobody gets through, and nobody else can take the port.
-        self._listener = self._bound()
+        # Bound but not listening: connections are refused, and the port stays reserved.
+        self._listener = self._bind_listener()
 
-    def _bound(self) -> socket.socket:
+    def _bind_listener(self) -> socket.socket:
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

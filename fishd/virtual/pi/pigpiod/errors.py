@@ -1,4 +1,4 @@
-"""The error numbers of pigpio that the emulated pigpiod answers with."""
+"""Error numbers of pigpio that the emulated pigpiod returns."""
 
 BAD_USER_GPIO = -2
 BAD_MODE = -4
@@ -23,7 +23,7 @@ BAD_HPWM_DUTY = -97
 
 
 class PigpioError(Exception):
-    """Ends a command; `number` is what the client is told."""
+    """Error of a command; `number` is the result that the client receives."""
 
     def __init__(self, number: int) -> None:
         super().__init__(f"pigpio error {number}")
@@ -31,6 +31,6 @@ class PigpioError(Exception):
 
 
 def check(good: bool, error: int) -> None:
-    """Raise the `PigpioError` unless all is good."""
+    """Raise a `PigpioError` unless `good`."""
     if not good:
         raise PigpioError(error)

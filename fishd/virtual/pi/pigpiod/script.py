@@ -1,7 +1,7 @@
-"""The scripts of the emulated pigpiod: small programs that run inside of it.
+"""Scripts of the emulated pigpiod: small programs that run inside it.
 
-It has the instructions of fishd's countdown and no others. Scripts do not run by themselves:
-whoever wants to know something lets them catch up with the clock first.
+Only the instructions of fishd's countdown are emulated. Scripts have no thread: each access to
+their effects first runs them up to the current time.
 """
 
 import logging
@@ -16,24 +16,25 @@ from fishd.virtual.pi.pigpiod.errors import PigpioError, check
 
 log = logging.getLogger(__name__)
 
-PARAMETERS = 10
+PARAMETER_COUNT = 10
+"""Number of parameters of a script."""
 INSTRUCTION_TIME = 1e-6
-"""Time that an instruction takes [s]; pigpiod on a Pi 4 is of that order."""
+"""Duration of an instruction [s]; it has the same order of magnitude on a Pi 4."""
 INITIALISING_TIME = 1e-3
-"""Time from storing a script until it can be run [s]."""
-LONGEST_DELAY = 60_000
-"""Of the command and the instruction `mils` [ms]."""
-BURST = 5000
-"""Most instructions without a pause; of a script that wants more, the rest of the time is lost."""
+"""Time from the storage of a script until it can run [s]."""
+MAX_DELAY_MS = 60_000
+"""Longest delay of the command and the instruction `mils` [ms]."""
+MAX_BURST = 5000
+"""Largest number of instructions without a delay; then a script skips the remaining time."""
 
-# Operands by instruction: n a number, v a number or a parameter, p a parameter.
+# Kinds of operands by instruction: n: number, v: number or parameter, p: parameter.
 _OPERANDS = {"tag": "n", "jmp": "n", "jz": "n", "jnz": "n"}
 _OPERANDS |= {"mils": "v", "lda": "v", "cmp": "v", "dcr": "p", "s": "vv"}
 _WORDS = {"n": re.compile(r"()(\d+)"), "v": re.compile(r"(p?)(\d+)"), "p": re.compile(r"(p)(\d+)")}
 
 
 class State(IntEnum):
-    """What `script_status` says; a script in a delay is running."""
+    """Result of `script_status`; a script in a delay is running."""
 
     INITIALISING = 0
     HALTED = 1
@@ -41,123 +42,123 @@ class State(IntEnum):
 
 
 class Operand(NamedTuple):
-    """A number, or that of a parameter."""
+    """Number, or number of a parameter."""
 
     parameter: bool
     number: int
 
 
 class Instruction(NamedTuple):
-    """One step of a script; jumps have the place they go to."""
+    """One step of a script; the operand of a jump is its target position."""
 
     name: str
     operands: tuple[Operand, ...]
 
 
 def parse(text: str) -> tuple[Instruction, ...]:
-    """The instructions of a script.
+    """Return the instructions of a script.
 
-    Raises `PigpioError`: BAD_SCRIPT_CMD for an instruction that is not emulated or a bad operand,
-    DUP_TAG, and BAD_TAG for a jump to nowhere.
+    Raises `PigpioError`: BAD_SCRIPT_CMD for an instruction that is not emulated or an invalid
+    operand, DUP_TAG, and BAD_TAG for a jump to an unknown tag.
     """
     words = text.lower().split()
     program: list[Instruction] = []
-    places: dict[int, int] = {}
+    tag_positions: dict[int, int] = {}
     while words:
         name = words.pop(0)
         if name not in _OPERANDS:
-            known = ", ".join(_OPERANDS)
+            emulated = ", ".join(_OPERANDS)
             log.warning(
-                "emulated pigpiod: script refused: '%s' is none of the instructions that are "
-                "emulated: %s",
-                *(name, known),
+                "emulated pigpiod: script refused: '%s' is not one of the emulated instructions: "
+                "%s",
+                *(name, emulated),
             )
             raise PigpioError(errors.BAD_SCRIPT_CMD)
         operands = tuple(_operand(words.pop(0) if words else "", k) for k in _OPERANDS[name])
         if name == "tag":
-            check(operands[0].number not in places, errors.DUP_TAG)
-            places[operands[0].number] = len(program)
+            check(operands[0].number not in tag_positions, errors.DUP_TAG)
+            tag_positions[operands[0].number] = len(program)
         else:
             program.append(Instruction(name, operands))
     for position, (name, operands) in enumerate(program):
         if name.startswith("j"):
-            check(operands[0].number in places, errors.BAD_TAG)
-            place = Operand(False, places[operands[0].number])
-            program[position] = Instruction(name, (place,))
+            check(operands[0].number in tag_positions, errors.BAD_TAG)
+            target = Operand(False, tag_positions[operands[0].number])
+            program[position] = Instruction(name, (target,))
     return tuple(program)
 
 
 def _operand(word: str, kind: str) -> Operand:
     match = _WORDS[kind].fullmatch(word)
-    if not match or int(match[2]) >= (PARAMETERS if match[1] else 2**31):
+    if not match or int(match[2]) >= (PARAMETER_COUNT if match[1] else 2**31):
         raise PigpioError(errors.BAD_SCRIPT_CMD)
     return Operand(bool(match[1]), int(match[2]))
 
 
 class Script:
-    """One stored script: its program, its parameters and how far it has come.
+    """Stored script: its program, its parameters and its position.
 
-    Times are seconds of the daemon's clock and must not go back from call to call.
+    Times are seconds of the daemon's clock and must not decrease from call to call.
     """
 
     def __init__(self, text: str, servo: Callable[[float, int, int], int], time: float) -> None:
-        """`servo`: carries out the instruction `s`: time [s], GPIO, width [µs]; gives its result.
+        """`servo`: executes the instruction `s` with time [s], GPIO and width [µs].
 
         Raises `PigpioError` as `parse` does.
         """
         self._program = parse(text)
         self._servo = servo
         self._ready = time + INITIALISING_TIME
-        self._wanted = False
+        self._is_requested = False
         self._accumulator = self._flag = self._position = self._burst = 0
-        self.parameters = [0] * PARAMETERS
+        self.parameters = [0] * PARAMETER_COUNT
         self.time = math.inf
-        """When its next instruction is due [s]; infinity while it is halted."""
+        """Time of the next instruction [s]; infinity while halted."""
 
     def state(self, time: float) -> State:
-        """What it is doing at a time [s] up to which it has run."""
+        """Return the state at a time [s] up to which the script has run."""
         if time < self._ready:
             return State.INITIALISING
         return State.HALTED if self.time == math.inf else State.RUNNING
 
     def update(self, parameters: tuple[int, ...]) -> int:
-        """Overwrite the first parameters, whether it runs or not."""
+        """Overwrite the first parameters, also while the script runs."""
         self.parameters[: len(parameters)] = parameters
         return 0
 
     def start(self, time: float, parameters: tuple[int, ...]) -> int:
-        """Run from the top; one that is running just gets its parameters.
+        """Start from the beginning; a running script only gets the parameters.
 
-        Raises `PigpioError` SCRIPT_NOT_READY while it is initialising.
+        Raises `PigpioError` SCRIPT_NOT_READY while the script is initialising.
         """
         state = self.state(time)
         check(state is not State.INITIALISING, errors.SCRIPT_NOT_READY)
         self.update(parameters)
-        self._wanted = True
+        self._is_requested = True
         if state is State.HALTED:
             self._accumulator = self._flag = self._position = self._burst = 0
             self.time = time
         return 0
 
     def stop(self) -> int:
-        """Ask it to halt, which it does at the end of a delay."""
-        self._wanted = False
+        """Request a halt, which takes effect at the end of a delay."""
+        self._is_requested = False
         return 0
 
     def run(self, until: float) -> None:
-        """Carry out what is due at or before a time [s]."""
+        """Execute the instructions that are due at or before a time [s]."""
         while self.time <= until:
-            if self._burst >= BURST:
+            if self._burst >= MAX_BURST:
                 self._burst = 0
                 self.time = math.nextafter(until, math.inf)
-            elif self._wanted and self._position < len(self._program):
+            elif self._is_requested and self._position < len(self._program):
                 self._step()
             else:
                 self.time = math.inf
 
     def _step(self) -> None:
         name, operands = self._program[self._position]
-        first, *more = (self.parameters[n] if parameter else n for parameter, n in operands)
+        first, *other_values = (self.parameters[n] if parameter else n for parameter, n in operands)
         now = self.time
         self.time += INSTRUCTION_TIME
         self._burst += 1
@@ -167,16 +168,16 @@ class Script:
         elif name == "cmp":
             self._flag = self._accumulator - first
         elif name == "dcr":
-            left = first - 1 if first > -(2**31) else 2**31 - 1  # as a C int does
-            self._flag = self.parameters[operands[0].number] = left
+            decremented = first - 1 if first > -(2**31) else 2**31 - 1  # wraps around like a C int
+            self._flag = self.parameters[operands[0].number] = decremented
         elif name == "mils":
-            in_range = 0 <= first <= LONGEST_DELAY
+            in_range = 0 <= first <= MAX_DELAY_MS
             self._accumulator = self._flag = 0 if in_range else errors.BAD_MILS_DELAY
             if in_range and first:
                 self.time += first * 1e-3
                 self._burst = 0
         elif name == "s":
-            width = more[0]
+            width = other_values[0]
             self._accumulator = self._flag = self._servo(now, first & 0xFFFFFFFF, width)
         elif name == "jmp" or (self._flag == 0) == (name == "jz"):
             self._position = first

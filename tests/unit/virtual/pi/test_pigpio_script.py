@@ -8,9 +8,9 @@ from fishd.hardware.servo.pigpio_pulses import COUNTDOWN
 from fishd.virtual.pi.pigpiod import errors
 from fishd.virtual.pi.pigpiod.errors import PigpioError
 from fishd.virtual.pi.pigpiod.script import (
-    BURST,
     INITIALISING_TIME,
     INSTRUCTION_TIME,
+    MAX_BURST,
     Script,
     State,
 )
@@ -94,7 +94,7 @@ def test_started_again_while_it_runs_it_only_gets_its_parameters() -> None:
 
 def test_an_endless_loop_without_pauses_costs_a_bounded_effort() -> None:
     rig = Rig("tag 0 s 18 1500 jmp 0").run(3600.0)
-    assert len(rig.pulses) <= BURST
+    assert len(rig.pulses) <= MAX_BURST
     assert rig.state is State.RUNNING
 
 

@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from fishd.virtual.plant.base import REST, PlantState
-from fishd.virtual.plant.held import Ahead, HeldWindows
+from fishd.virtual.plant.held import HeldWindowMatrices, HeldWindows
 from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
 from fishd.virtual.plant.tethered import AnyWindow, FinWindow, TetheredFish
 
@@ -224,13 +224,15 @@ def test_windows_that_are_prepared_between_ticks_are_the_same_and_cost_the_tick_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     computed: list[float] = []
-    swim = Ahead.swim
+    swim = HeldWindowMatrices.swim
 
-    def counted(self: Ahead, state: PlantState, target: float, lag: float) -> HeldWindows:
+    def counted(
+        self: HeldWindowMatrices, state: PlantState, target: float, lag: float
+    ) -> HeldWindows:
         computed.append(target)
         return swim(self, state, target, lag)
 
-    monkeypatch.setattr(Ahead, "swim", counted)
+    monkeypatch.setattr(HeldWindowMatrices, "swim", counted)
     prepared, plain = TetheredFish(PlantParameters()), TetheredFish(PlantParameters())
     for tick in range(100):
         request = (0.4 if tick // 6 % 2 else -0.3, 0.05, 10)

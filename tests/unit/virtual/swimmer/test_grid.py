@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fishd.virtual.swimmer.grid import SAME, Grid, edges
+from fishd.virtual.swimmer.grid import MAX_SIZE_RATIO, Grid, edges
 
 
 def test_cells_are_small_where_asked_and_grow_by_the_ratio_at_most() -> None:
@@ -28,6 +28,6 @@ def test_no_cell_outside_is_smaller_than_those_around_the_body(ratio: float) -> 
     for outside in np.arange(1.0, 15.01, 0.1):
         sizes = np.diff(edges(0.0, 2.0 + outside, (0.0, 2.0), 1.0, ratio))
         assert sizes.sum() == pytest.approx(2.0 + outside)
-        assert sizes.min() >= 1.0 / SAME
+        assert sizes.min() >= 1.0 / MAX_SIZE_RATIO
         if len(sizes) - 2 < int(outside + 1e-9):  # with one more they would not be smaller
             assert (sizes[1:] / sizes[:-1]).max() <= ratio + 1e-9

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rigs.coarse_swimmer import swimmer
 
-from fishd.virtual.swimmer.midlines import PLACES, Midlines
+from fishd.virtual.swimmer.midlines import POINT_COUNT, Midlines
 from fishd.virtual.swimmer.track import Track, save
 
 
@@ -20,7 +20,7 @@ def test_midlines_are_where_the_body_was_in_the_laboratory() -> None:
     found = kept.arrays()
     time, lines = found["midline_time"], found["midlines"]
     assert time == pytest.approx(0.01 * np.arange(1, 31))
-    assert lines.shape == (30, PLACES, 2)
+    assert lines.shape == (30, POINT_COUNT, 2)
     fish = robot.fish
     assert lines[-1, 0] == pytest.approx(fish.midline()[0] + (fish.travelled, 0.0), abs=1e-6)
     assert lines[-1, -1] == pytest.approx(fish.midline()[-1] + (fish.travelled, 0.0), abs=1e-6)
