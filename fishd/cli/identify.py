@@ -22,7 +22,7 @@ from fishd.core import files
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
 from fishd.core.process.interruption import raise_on_first_signal
-from fishd.recording.folder import find
+from fishd.recording.folder import find_recording
 
 if TYPE_CHECKING:
     from fishd.lab.identification import Identification
@@ -112,7 +112,7 @@ def identify(
             return INTERRUPTED
         origin = f"an experiment with {fish}"
     else:
-        config, tables = load(fish.file, fish.overrides), [find(run) for run in runs]
+        config, tables = load(fish.file, fish.overrides), [find_recording(run) for run in runs]
         check_tethered(config.robot, "identify")
         origin = ", ".join(path.name for path in tables)
     identification = lab.identify(

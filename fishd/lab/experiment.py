@@ -22,7 +22,7 @@ from fishd.core.process.lockfile import LockHeld, NotALock, locked
 from fishd.lab import tables
 from fishd.lab.tables import Table
 from fishd.recording.folder import runs_folder
-from fishd.recording.part_file import PART, SUFFIX
+from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 
 HEADER, ROWS = "experiment.json", "rows.csv"
 MAX_TABLE_BYTES = 256 * 2**20
@@ -142,7 +142,7 @@ class Experiment:
     def recording(self, stem: str) -> Path:
         """Return an unused path for a recording; an incomplete recording keeps its name."""
         number, path = 1, self.path / f"{stem}{SUFFIX}"
-        while path.exists() or path.with_name(path.name + PART).exists():
+        while path.exists() or path.with_name(path.name + PART_SUFFIX).exists():
             number += 1
             path = self.path / f"{stem}-{number}{SUFFIX}"
         return path

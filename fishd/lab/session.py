@@ -297,9 +297,9 @@ class LiveSession(Session):
 
     def describe(self, writer: "RunWriter") -> None:
         """Write the facts about fishd to a recording; raises also `NoDaemon`."""
-        from fishd.recording.recorder import description
+        from fishd.recording.recorder import describe_daemon
 
-        description(self.fish).write(writer)
+        describe_daemon(self.fish).write(writer)
 
     def __enter__(self) -> Self:
         """Take the lease; raises `Refused` while another experiment holds the fish."""

@@ -1,6 +1,6 @@
-"""Recordings of a fish: MCAP files, written, read, exported and replayed (extra: record).
+"""Recordings of a fish in MCAP files: writing, reading, export and replay (extra: record).
 
-ticks = fishd.recording.read("run.mcap")      # a pandas DataFrame, one row a tick
+ticks = fishd.recording.read("run.mcap")      # a pandas DataFrame, one row per tick
 run = fishd.recording.open_run("run.mcap")    # its ticks, events, gaps, frames, configuration
 """
 

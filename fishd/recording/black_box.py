@@ -1,4 +1,4 @@
-"""The black box: recordings that follow one another, of which the oldest make room for new ones."""
+"""The black box: a rotation of recordings, in which new ones replace the oldest."""
 
 import time
 from collections.abc import Callable
@@ -6,61 +6,63 @@ from contextlib import suppress
 from pathlib import Path
 
 from fishd.core.errors import RecordingError
-from fishd.recording.folder import new_path, paths
-from fishd.recording.part_file import PART, is_being_written
-from fishd.recording.recorder import RESERVE
-from fishd.recording.recover import RECOVERING, recover
+from fishd.recording.folder import list_recordings, new_path
+from fishd.recording.part_file import PART_SUFFIX, is_being_written
+from fishd.recording.recorder import MIN_FREE_BYTES
+from fishd.recording.recover import RECOVERING_SUFFIX, recover
 from fishd.recording.writer import RunWriter
 
-PREFIX = "blackbox-"
-"""Begins the name of its files; no others are ever removed."""
-LONGEST = 3600.0
-"""Length of a file [s]."""
-SHARE = 1 / 8
-"""A file is closed when it has this share of the room, so that little is lost with the oldest."""
+FILE_PREFIX = "blackbox-"
+"""Prefix of the names of its files; no other files are ever removed."""
+MAX_FILE_AGE_S = 3600.0
+"""Maximum duration of a file [s]."""
+MAX_FILE_FRACTION = 1 / 8
+"""Maximum size of a file, as a fraction of the total, so that little is lost with the oldest."""
 
 
 class BlackBox:
-    """Opens one file after another in a folder, and keeps all of them below a size."""
+    """Rotation of recordings in a folder, whose total size is limited."""
 
     def __init__(self, folder: Path, keep: int, open_writer: Callable[[Path], RunWriter]) -> None:
         """
-        keep: size of all its files together, the present one included [bytes]
+        keep: maximum total size of its files, the current one included [bytes]
         open_writer: begins a recording with this path
         """
         self._folder, self._keep, self._open_writer = folder, keep, open_writer
         self._opened = 0.0
 
     def open(self) -> RunWriter:
-        """Begin a file; those that were cut off, by a power cut say, are finished first."""
-        for copy in self._folder.glob(f"{PREFIX}*{RECOVERING}"):
+        """Begin a file; recover first those that were interrupted, for example by a power cut."""
+        for copy in self._folder.glob(f"{FILE_PREFIX}*{RECOVERING_SUFFIX}"):
             if not is_being_written(copy):  # left by a kill
                 with suppress(OSError):
                     copy.unlink()
         self._make_room(0)
-        for path in self._own():
-            if path.name.endswith(PART) and not is_being_written(path):
-                with suppress(RecordingError):  # what cannot be finished goes when it is the oldest
+        for path in self._list_own_files():
+            if path.name.endswith(PART_SUFFIX) and not is_being_written(path):
+                with suppress(
+                    RecordingError
+                ):  # a file that cannot be recovered is removed as the oldest
                     recover(path)
         self._opened = time.monotonic()
-        return self._open_writer(new_path(self._folder, PREFIX))
+        return self._open_writer(new_path(self._folder, FILE_PREFIX))
 
     def due(self, writer: RunWriter) -> bool:
-        """Is it time for the next file?"""
-        self._make_room(2 * RESERVE - writer.free())
-        old = time.monotonic() - self._opened >= LONGEST
-        return old or writer.size >= self._keep * SHARE
+        """Return whether to begin the next file."""
+        self._make_room(2 * MIN_FREE_BYTES - writer.free())
+        is_too_long = time.monotonic() - self._opened >= MAX_FILE_AGE_S
+        return is_too_long or writer.size >= self._keep * MAX_FILE_FRACTION
 
     def _make_room(self, missing: int) -> None:
-        """Remove its oldest files where all together are too long, or the disk is almost full.
+        """Remove the oldest files if the total is too large, or the disk is almost full.
 
-        missing: how much more room the disk needs [bytes]
+        missing: space that the disk lacks [bytes]
         """
         sizes = {}
-        for path in self._own():
+        for path in self._list_own_files():
             with suppress(OSError):
                 sizes[path] = path.stat().st_size
-        excess = max(missing, sum(sizes.values()) - round(self._keep * (1 - SHARE)))
+        excess = max(missing, sum(sizes.values()) - round(self._keep * (1 - MAX_FILE_FRACTION)))
         for path, size in sizes.items():
             if excess <= 0:
                 return
@@ -69,5 +71,5 @@ class BlackBox:
                     path.unlink()
                     excess -= size
 
-    def _own(self) -> list[Path]:
-        return [path for path in paths(self._folder) if path.name.startswith(PREFIX)]
+    def _list_own_files(self) -> list[Path]:
+        return [path for path in list_recordings(self._folder) if path.name.startswith(FILE_PREFIX)]

@@ -1,4 +1,4 @@
-"""Brings the frames of a running camera into a recording, and says when they stop and come back."""
+"""Source of the frames of a running camera for a recording; reports when they stop and return."""
 
 import time
 from typing import NamedTuple, Self
@@ -11,27 +11,27 @@ from fishd.core.camera_frames import Frame, Pixels
 from fishd.core.errors import FishError
 from fishd.recording.images import FrameHead
 
-SILENCE = 2.0
-"""Without a frame for so long, the camera counts as lost [s]."""
-_WAITING = 1000
-"""Frames that may wait for the first tick; older ones are dropped."""
+CAMERA_TIMEOUT_S = 2.0
+"""Time without a frame after which the camera counts as lost [s]."""
+_MAX_WAITING_FRAMES = 1000
+"""Maximum number of frames that wait for the first tick; older ones are dropped."""
 
 
-class Taken(NamedTuple):
-    """What has come since the last time."""
+class TapOutput(NamedTuple):
+    """News and frames since the previous call."""
 
     news: list[str]
-    """A line for each thing that its reader should know."""
+    """One line for the user per change of the camera's state."""
     frames: list[tuple[FrameHead, Pixels]]
 
 
 class CameraTap:
-    """A camera whose frames are recorded; whatever becomes of it ends nothing."""
+    """A camera whose frames are recorded; its errors never end the recording."""
 
     def __init__(self, address: str | None, endpoint: str | None) -> None:
         """
-        address: where the camera takes requests; None as `CameraClient` finds it
-        endpoint: control socket of the fishd on whose clock times are wanted
+        address: address of the camera's request socket; None for the one that `CameraClient` finds
+        endpoint: control socket of the fishd whose clock gives the times
 
         Raises `CameraLost`, `NoDaemon` and `Refused`.
         """
@@ -45,7 +45,7 @@ class CameraTap:
         self._lost = False
         self._session = ""
         self._ahead: float | None = None
-        """Unix time less that of fishd's clock [s]."""
+        """Unix time minus the time of fishd's clock [s]."""
         self._waiting: list[tuple[FrameHeader, Frame]] = []
 
     def __enter__(self) -> Self:
@@ -59,35 +59,35 @@ class CameraTap:
         self._client.close()
         self._fish.close()
 
-    def heard(self, t: float, monotonic: float) -> None:
-        """A tick says what time it is: unix, and on fishd's clock [s]."""
+    def set_time(self, t: float, monotonic: float) -> None:
+        """Set the clock offset from the times of a tick: unix, and on fishd's clock [s]."""
         if monotonic:
             self._ahead = t - monotonic
 
-    def take(self) -> Taken:
-        """What has come since the last time; raises nothing of the camera's."""
+    def take(self) -> TapOutput:
+        """Return the news and frames since the previous call; raise no error of the camera."""
         news: list[str] = []
-        while found := self._poll():
-            self._waiting += found
+        while frames := self._poll():
+            self._waiting += frames
         if self._waiting:
             self._heard = time.monotonic()
             session = self._waiting[-1][0].session
             if self._lost or (self._session and session != self._session):
-                news.append("the camera is there again: its frames are recorded")
+                news.append("the camera is back: its frames are recorded")
             self._lost, self._session = False, session
-        elif time.monotonic() - self._heard > SILENCE and not self._lost:
+        elif time.monotonic() - self._heard > CAMERA_TIMEOUT_S and not self._lost:
             self._lost = True
-            news.append(f"no frames come from the camera: {self._why()}; the recording goes on")
+            news.append(f"no frames come from the camera: {self._why()}; the recording continues")
         if self._ahead is None:
-            self._waiting = self._waiting[-_WAITING:]
-            return Taken(news, [])
+            self._waiting = self._waiting[-_MAX_WAITING_FRAMES:]
+            return TapOutput(news, [])
         waiting, self._waiting = self._waiting, []
-        return Taken(news, [(self._head(*each), each[1].pixels) for each in waiting])
+        return TapOutput(news, [(self._head(*pair), pair[1].pixels) for pair in waiting])
 
     def _poll(self) -> list[tuple[FrameHeader, Frame]]:
         try:
             return self._client.poll_with_headers()
-        except FishError:  # a fishd that has just ended cannot tell its clock
+        except FishError:  # a fishd that has just ended cannot give its time
             return []
 
     def _why(self) -> str:
@@ -95,8 +95,8 @@ class CameraTap:
             state = self._client.status()
         except FishError:
             return "it does not answer"
-        said = "; ".join(filter(None, (state.problem, state.remedy)))
-        return text.line(f"it is {state.state}" + (f": {said}" if said else ""))
+        explanation = "; ".join(filter(None, (state.problem, state.remedy)))
+        return text.line(f"it is {state.state}" + (f": {explanation}" if explanation else ""))
 
     def _head(self, header: FrameHeader, frame: Frame) -> FrameHead:
         assert self._ahead is not None

@@ -1,4 +1,4 @@
-"""Writes a recording as tables for other programs: CSV or Parquet, ticks and events."""
+"""Export of a recording as tables of ticks and events for other programs: CSV or Parquet."""
 
 import itertools
 import math
@@ -16,7 +16,7 @@ from pandas.api.types import is_numeric_dtype
 from fishd.core import text
 from fishd.core.errors import RecordingError
 from fishd.core.files import write_atomically
-from fishd.recording.folder import check_new
+from fishd.recording.folder import check_new_files
 from fishd.recording.images import RecordedFrame
 from fishd.recording.reader import Run
 
@@ -24,35 +24,35 @@ Format = Literal["csv", "parquet"]
 
 
 def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> list[Path]:
-    """Write `NAME.csv` and `NAME-events.csv`, or the same as Parquet; their paths.
+    """Write `NAME.csv` and `NAME-events.csv`, or the same as Parquet, and return their paths.
 
-    Where a camera was recorded, also `NAME-frames.npy`, all its frames as one array of shape
-    (number, height, width), and `NAME-frames.csv`, a row for each.
+    With frames of a camera, also `NAME-frames.npy`, all frames as one array of shape (number,
+    height, width), and `NAME-frames.csv`, one row per frame.
 
-    Ticks have a column a field, in its unit, and every bit of its value. In CSV, which terminals
-    and spreadsheets show, control characters are escaped, and a `'` stands before a text that a
-    spreadsheet would compute. The Parquet files have all texts unchanged, and carry configuration
-    and provenance as the metadata `fishd` of their schema, in JSON.
+    Ticks have one column per field, in its unit, at full precision. In CSV, which terminals and
+    spreadsheets show, control characters are escaped, and a `'` precedes a text that a spreadsheet
+    would evaluate. The Parquet files have all texts unchanged, and contain configuration and
+    provenance as the metadata `fishd` of their schema, in JSON.
 
-    replace: may there be files of these names?
-    Raises `RecordingError`.
+    replace: whether to replace existing files
+    Raise `RecordingError`.
     """
     if not run.entries and not run.frame_heads:
         why = f" ({run.damage_reason})" if run.damage_reason else ""
-        raise RecordingError(f"{run.path}: there is nothing in it to export{why}")
+        raise RecordingError(f"{run.path} contains nothing to export{why}")
     tables = {folder / f"{run.name}.{form}": run.frame()}
-    tables[folder / f"{run.name}-events.{form}"] = _events(run)
+    tables[folder / f"{run.name}-events.{form}"] = _event_table(run)
     pictures = folder / f"{run.name}-frames.npy"
     if run.frame_heads:
-        tables[folder / f"{run.name}-frames.{form}"] = _frames(run)
-    check_new([*tables, *([pictures] if run.frame_heads else [])], replace=replace)
+        tables[folder / f"{run.name}-frames.{form}"] = _frame_table(run)
+    check_new_files([*tables, *([pictures] if run.frame_heads else [])], replace=replace)
     about = b""
     if form == "parquet":
         about = msgspec.json.encode({"about": run.about, "configs": run.configs})
     for path, table in tables.items():
         try:
             if form == "csv":
-                write_atomically(path, _harmless(table).to_csv(index=False))
+                write_atomically(path, _escape_texts(table).to_csv(index=False))
             else:
                 _write_parquet(path, table, about, run)
         except OSError as error:
@@ -63,18 +63,18 @@ def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> li
     return list(tables)
 
 
-def _harmless(table: pandas.DataFrame) -> pandas.DataFrame:
-    """Return the table with texts that neither a terminal nor a spreadsheet takes for commands."""
-    shown = table.copy(deep=False)
+def _escape_texts(table: pandas.DataFrame) -> pandas.DataFrame:
+    """Return the table with escaped texts, so that no terminal or spreadsheet executes them."""
+    escaped = table.copy(deep=False)
     for name in table.columns[[not is_numeric_dtype(kind) for kind in table.dtypes]]:
-        shown[name] = shown[name].map(
+        escaped[name] = escaped[name].map(
             lambda value: text.for_spreadsheet(value) if isinstance(value, str) else value
         )
-    shown.columns = pandas.Index([text.for_spreadsheet(name) for name in table.columns])
-    return shown
+    escaped.columns = pandas.Index([text.for_spreadsheet(name) for name in table.columns])
+    return escaped
 
 
-def _events(run: Run) -> pandas.DataFrame:
+def _event_table(run: Run) -> pandas.DataFrame:
     rows = [
         (event.t, event.level, event.kind, event.message, msgspec.json.encode(event.data).decode())
         for event in run.events
@@ -82,12 +82,12 @@ def _events(run: Run) -> pandas.DataFrame:
     return pandas.DataFrame(rows, columns=["t", "level", "kind", "message", "data"])
 
 
-def _frames(run: Run) -> pandas.DataFrame:
+def _frame_table(run: Run) -> pandas.DataFrame:
     return pandas.DataFrame([msgspec.structs.asdict(head) for head in run.frame_heads])
 
 
 def _write_pictures(path: Path, run: Run) -> None:
-    """One after the other, as hours of them may be longer than the memory of this machine."""
+    """Write the frames one by one, since hours of them may exceed the memory of this machine."""
     frames = run.frames()
     first = next(frames)
     shape = (len(run.frame_heads), *first.pixels.shape)
@@ -98,7 +98,8 @@ def _write_pictures(path: Path, run: Run) -> None:
         for number, frame in enumerate(itertools.chain([first], frames)):
             if frame.pixels.shape != first.pixels.shape:
                 raise RecordingError(
-                    f"{run.path}: frames of {_size(first)} and of {_size(frame)}: one array cannot "
+                    f"{run.path}: frames of {_format_size(first)} and of {_format_size(frame)}: "
+                    "one array cannot "
                     "hold both; in Python, fishd.recording.open_run(...).frames() gives them"
                 )
             array[number] = frame.pixels
@@ -113,15 +114,15 @@ def _write_pictures(path: Path, run: Run) -> None:
 
 
 def _check_room(path: Path, size: int) -> None:
-    """Raise `RecordingError` without room for so many bytes: a full disk would kill the writer."""
+    """Raise `RecordingError` if the disk lacks space, since a full disk would kill the process."""
     free = shutil.disk_usage(path.parent).free
     if size > free:
         raise RecordingError(
-            f"{path} would take {size / 1e9:.1f} GB: there is room for {free / 1e9:.1f} GB"
+            f"{path} would take {size / 1e9:.1f} GB: only {free / 1e9:.1f} GB are free"
         )
 
 
-def _size(frame: RecordedFrame) -> str:
+def _format_size(frame: RecordedFrame) -> str:
     height, width = frame.pixels.shape
     return f"{width} x {height} px"
 

@@ -1,4 +1,4 @@
-"""The folder of recordings: where it is, what is in it, and which recording a name means."""
+"""The folder of recordings: its place, its content, and the recordings that names refer to."""
 
 import os
 from collections.abc import Iterable, Iterator
@@ -9,29 +9,29 @@ from typing import NamedTuple
 from fishd.core import files
 from fishd.core.errors import RecordingError
 from fishd.core.schema import suggest
-from fishd.recording.mcap_file import metadata
-from fishd.recording.part_file import PART, SUFFIX, is_being_written
+from fishd.recording.mcap_file import read_metadata
+from fishd.recording.part_file import PART_SUFFIX, SUFFIX, is_being_written
 from fishd.recording.reader import open_run
 from fishd.recording.summary import Summary, from_metadata
 
 FOLDER_VARIABLE = "FISHD_RUNS"
 LATEST = "latest"
-"""Stands for the newest recording."""
+"""Name that refers to the newest recording."""
 
 
-class Glance(NamedTuple):
-    """A recording in short."""
+class Overview(NamedTuple):
+    """Overview of a recording."""
 
     name: str
     path: Path
     about: dict[str, str]
-    """As `Run.about`."""
+    """Metadata, as in `Run.about`."""
     summary: Summary
     finished: bool
     writing: bool
-    """True while some process still writes it."""
+    """True while a process writes it."""
     damaged: int | None = None
-    """How many ticks cannot be read; None where nothing is damaged."""
+    """Number of ticks that cannot be read; None if the file is undamaged."""
 
 
 def runs_folder() -> Path:
@@ -39,107 +39,116 @@ def runs_folder() -> Path:
 
     $FISHD_RUNS, else the state folder of a service, else `runs` in the current folder.
     """
-    given = (
+    configured = (
         os.environ.get(FOLDER_VARIABLE) or os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
     )
-    return Path(given or "runs")
+    return Path(configured or "runs")
 
 
-def made(folder: Path) -> Path:
-    """The folder, once it is there; raises `RecordingError`."""
+def ensure_folder(folder: Path) -> Path:
+    """Create the folder if it does not exist, and return it; raise `RecordingError`."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RecordingError(f"{folder} cannot be made: {error.strerror}") from None
+        raise RecordingError(f"{folder} cannot be created: {error.strerror}") from None
     return folder
 
 
-def check_new(paths: Iterable[Path], *, replace: bool) -> None:
-    """Raise `RecordingError` where one of these is there already, unless it may be replaced."""
+def check_new_files(paths: Iterable[Path], *, replace: bool) -> None:
+    """Raise `RecordingError` if one of these exists, unless it may be replaced."""
     for path in paths:
         if path.exists() and not replace:
-            raise RecordingError(f"{path} is there already; --force replaces it")
+            raise RecordingError(f"{path} already exists; use --force to replace it")
 
 
 def new_path(folder: Path, prefix: str = "") -> Path:
-    """A path for a recording that begins now, named after the date and time of this place."""
+    """Return a path for a recording that begins now, named after the local date and time."""
     name = f"{prefix}{datetime.now():%Y-%m-%d-%H%M%S}"
     path, number = folder / (name + SUFFIX), 1
-    while os.path.lexists(path) or os.path.lexists(f"{path}{PART}"):
+    while os.path.lexists(path) or os.path.lexists(f"{path}{PART_SUFFIX}"):
         number += 1
         path = folder / f"{name}-{number}{SUFFIX}"
     return path
 
 
-def named(run: str, folder: Path | None = None) -> Path:
-    """The path of a new recording: as given where it has a `/`, else in the folder of recordings.
+def recording_path(run: str, folder: Path | None = None) -> Path:
+    """Return the path of a new recording: as given if it has a `/`, else in the runs folder.
 
-    `.mcap` is added where it is missing, and that folder is made; raises `RecordingError`.
+    Add `.mcap` if it is missing, and create that folder; raise `RecordingError`.
     """
-    if Path(run).name in ("", ".."):  # "/", "." and their like
-        raise RecordingError(f"'{run}' is no name of a recording")
-    path = files.expand_user(run) if "/" in run else made(folder or runs_folder()) / run
+    if Path(run).name in ("", ".."):  # such as "/" or "."
+        raise RecordingError(f"'{run}' is not a valid name of a recording")
+    path = files.expand_user(run) if "/" in run else ensure_folder(folder or runs_folder()) / run
     return path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
 
 
-def paths(folder: Path) -> list[Path]:
-    """All recordings of a folder, finished or not, the oldest first."""
+def list_recordings(folder: Path) -> list[Path]:
+    """Return all recordings of a folder, finished or not, the oldest first."""
     try:
-        ending = (path for path in folder.iterdir() if path.name.endswith((SUFFIX, SUFFIX + PART)))
-        found = [path for path in ending if path.is_file()]  # a pipe would never be read to its end
+        ending = (
+            path for path in folder.iterdir() if path.name.endswith((SUFFIX, SUFFIX + PART_SUFFIX))
+        )
+        files_found = [path for path in ending if path.is_file()]  # reading a pipe would never end
     except FileNotFoundError:
         return []
     except OSError as error:
         raise RecordingError(f"{folder} cannot be read: {error.strerror}") from None
-    return [path for _, path in sorted((_modified(path), path) for path in found)]
+    return [path for _, path in sorted((_modified(path), path) for path in files_found)]
 
 
-def find(run: str, folder: Path | None = None) -> Path:
-    """The file that a name means: a path, a name in the folder of recordings, or `latest`.
+def find_recording(run: str, folder: Path | None = None) -> Path:
+    """Return the file of a path, of a name in the folder of recordings, or of `latest`.
 
-    Raises `RecordingError`.
+    Raise `RecordingError`.
     """
     path = files.expand_user(run)
     if path.is_file():
         return path
     folder = folder or runs_folder()
-    known = paths(folder)
+    known = list_recordings(folder)
     if run == LATEST:
         if not known:
-            raise RecordingError(f"there is no recording in {folder} yet; see 'fishctl record'")
+            raise RecordingError(f"{folder} contains no recording; make one with 'fishctl record'")
         return known[-1]
-    for suffix in ("", SUFFIX, SUFFIX + PART):
-        if "/" not in run and (found := folder / (run + suffix)).is_file():
-            return found
-    names = [name_of(path) for path in known]
-    hint = suggest(run, names[-10:], listed="there are") if names else "there is none yet"
+    for suffix in ("", SUFFIX, SUFFIX + PART_SUFFIX):
+        if "/" not in run and (candidate := folder / (run + suffix)).is_file():
+            return candidate
+    names = [run_name(path) for path in known]
+    hint = (
+        suggest(run, names[-10:], listed="recordings there")
+        if names
+        else "that folder contains none"
+    )
     raise RecordingError(f"no recording '{run}', neither a file nor a name in {folder}; {hint}")
 
 
-def name_of(path: Path) -> str:
-    """The name of a recording, without suffix."""
-    return path.name.removesuffix(PART).removesuffix(SUFFIX)
+def run_name(path: Path) -> str:
+    """Return the name of a recording, without suffix."""
+    return path.name.removesuffix(PART_SUFFIX).removesuffix(SUFFIX)
 
 
-def glances(folder: Path) -> Iterator[Glance | RecordingError]:
-    """All recordings of a folder in short, the oldest first; or what is wrong with one."""
-    for path in paths(folder):
+def read_overviews(folder: Path) -> Iterator[Overview | RecordingError]:
+    """Yield an overview of each recording of a folder, the oldest first, or its error."""
+    for path in list_recordings(folder):
         try:
-            yield glance(path)
+            yield read_overview(path)
         except RecordingError as error:
             yield error
 
 
-def glance(path: Path) -> Glance:
-    """A recording in short; soon where it is finished and whole. Raises `RecordingError`."""
-    said = metadata(path) or {}
-    summary = from_metadata(said.get("fishd.end", {}))
-    if summary is not None and "fishd.run" in said:
-        return Glance(name_of(path), path, said["fishd.run"], summary, True, False)
+def read_overview(path: Path) -> Overview:
+    """Return an overview of a recording, quickly if it is finished and undamaged.
+
+    Raise `RecordingError`.
+    """
+    entries = read_metadata(path) or {}
+    summary = from_metadata(entries.get("fishd.end", {}))
+    if summary is not None and "fishd.run" in entries:
+        return Overview(run_name(path), path, entries["fishd.run"], summary, True, False)
     run = open_run(path)
     writing = is_being_written(path)
     damaged = run.damaged if run.is_damaged else None
-    return Glance(run.name, path, run.about, run.summary, run.finished, writing, damaged)
+    return Overview(run.name, path, run.about, run.summary, run.finished, writing, damaged)
 
 
 def _modified(path: Path) -> float:

@@ -1,7 +1,7 @@
-"""Frames of a camera in a recording: PNG in the message that Foxglove and Lichtblick show.
+"""Frames of a camera in a recording: PNG in a message that Foxglove and Lichtblick show.
 
-The schema is foxglove.CompressedImage, as JSON; beside its fields stand those of fishd, which
-viewers pass over. PNG loses nothing, so that what was recorded can be learned from.
+The schema is foxglove.CompressedImage, as JSON, with additional fields of fishd, which viewers
+ignore. PNG is lossless, so that policies can be trained with recorded frames.
 """
 
 import struct
@@ -21,45 +21,49 @@ from fishd.core.schema import fields_of, note, unit
 TOPIC = "camera"
 SCHEMA = "foxglove.CompressedImage"
 _TYPES = {"number": "number", "integer": "integer", "text": "string", "boolean": "boolean"}
-"""Viewers know no type that permits null: what is not known is left out of a message."""
+"""JSON types of fields. Viewers do not support null: unknown values are omitted in a message."""
 MAX_PIXELS = 2**24
-"""Largest picture that is read; a few bytes can claim 4 GB."""
+"""Maximum number of pixels of a picture that is read; a few bytes can claim 4 GB."""
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
-_PNG_PART = struct.Struct(">I4s")
-"""Length and type, which every part of a PNG begins with."""
-_GREY = [8, 0, 0, 0, 0]
-"""Bit depth, colour type, compression, filter and interlace of the pictures of `encoded`."""
-_LAST_FILTER = 4
-"""Number of the last filter that a row of a PNG may begin with."""
-_COMPRESSION = 1
-"""Of PNG: noise cannot be compressed further, however long one tries."""
+_PNG_CHUNK_HEAD = struct.Struct(">I4s")
+"""Length and type, at the beginning of every chunk of a PNG."""
+_GREY_FORMAT = [8, 0, 0, 0, 0]
+"""Bit depth, colour type, compression, filter and interlace of pictures by `encode_frame`."""
+_MAX_FILTER = 4
+"""Largest number of a filter at the beginning of a row of a PNG."""
+_COMPRESSION_LEVEL = 1
+"""Compression level of PNG: higher levels take longer, but do not compress noise further."""
 
 
 class Timestamp(Struct, frozen=True, gc=False):
-    """Unix time, as Foxglove has it."""
+    """Unix time in Foxglove's representation."""
 
     sec: int
     nsec: int
 
 
 class FrameHead(Struct, frozen=True, gc=False):
-    """A recorded frame without its picture."""
+    """Metadata of a recorded frame, without its picture."""
 
     t: Annotated[float, unit("s", "Middle of the exposure, unix.")]
-    time: Annotated[float, unit("s", "The same on fishd's monotonic clock, as `time` of a tick.")]
-    available: Annotated[float, unit("s", "When it could first be had, on that clock.")]
+    time: Annotated[
+        float, unit("s", "Middle of the exposure on fishd's monotonic clock, as `time` of a tick.")
+    ]
+    available: Annotated[float, unit("s", "Time of arrival of the frame, on that clock.")]
     seq: Annotated[int, note("Number of the frame in its session, from 1.")]
-    session: Annotated[str, note("Names one run of the camera on one clock.")]
-    exposure: Annotated[float | None, unit("s", "Its length; left out where it is not known.")] = (
-        None
-    )
-    dropped: Annotated[int, note("Frames that the camera took but nobody got, so far.")] = 0
+    session: Annotated[str, note("Identifier of one run of the camera on one clock.")]
+    exposure: Annotated[
+        float | None, unit("s", "Duration of the exposure; omitted if unknown.")
+    ] = None
+    dropped: Annotated[
+        int, note("Number of frames that the camera took but did not deliver, since its start.")
+    ] = 0
 
 
 class ImageMessage(FrameHead, frozen=True, kw_only=True, gc=False):
-    """A message of the channel: foxglove.CompressedImage, and the fields of `FrameHead`."""
+    """Message of the channel: foxglove.CompressedImage with the fields of `FrameHead`."""
 
-    timestamp: Annotated[Timestamp, note("`t`.")]
+    timestamp: Annotated[Timestamp, note("Same as `t`.")]
     frame_id: Annotated[str, note("`camera`.")] = TOPIC
     data: Annotated[bytes, note("The picture, PNG in base64.")]
     format: Annotated[str, note("`png`.")] = "png"
@@ -69,21 +73,21 @@ class RecordedFrame(NamedTuple):
     """A frame of a recording."""
 
     t: float
-    """Middle of its exposure [s, unix]."""
+    """Middle of the exposure [s, unix]."""
     time: float
-    """The same on the monotonic clock of fishd, as `time` of a tick [s]."""
+    """Middle of the exposure on the monotonic clock of fishd, as `time` of a tick [s]."""
     available: float
-    """When it could first be had, on that clock [s]."""
+    """Time of arrival of the frame, on that clock [s]."""
     seq: int
     session: str
     exposure: float | None
-    """[s]"""
+    """Duration of the exposure [s]; None if unknown."""
     pixels: NDArray[np.uint8]
     """Grey levels, shape (height, width)."""
 
 
 def json_schema() -> bytes:
-    """The JSON Schema of the channel, as Foxglove publishes it, with the fields of fishd."""
+    """Return the JSON Schema of the channel: Foxglove's, with additional fields of fishd."""
     properties: dict[str, Any] = {
         "timestamp": {
             "type": "object",
@@ -98,17 +102,17 @@ def json_schema() -> bytes:
         "format": {"type": "string"},
     }
     for field in fields_of(FrameHead):
-        described = f"{field.description} [{field.unit}]" if field.unit else field.description
-        properties[field.name] = {"type": _TYPES[field.kind], "description": described}
+        description = f"{field.description} [{field.unit}]" if field.unit else field.description
+        properties[field.name] = {"type": _TYPES[field.kind], "description": description}
     return msgspec.json.encode({"title": SCHEMA, "type": "object", "properties": properties})
 
 
-def encoded(head: FrameHead, pixels: NDArray[np.uint8]) -> bytes:
-    """The message of a frame; raises `MissingPackage` without OpenCV (extra: camera)."""
-    _, png = _cv2().imencode(".png", pixels, [_cv2().IMWRITE_PNG_COMPRESSION, _COMPRESSION])
+def encode_frame(head: FrameHead, pixels: NDArray[np.uint8]) -> bytes:
+    """Return the message of a frame; raise `MissingPackage` without OpenCV (extra: camera)."""
+    _, png = _cv2().imencode(".png", pixels, [_cv2().IMWRITE_PNG_COMPRESSION, _COMPRESSION_LEVEL])
     nanoseconds = max(0, round(head.t * 1e9))
     fields = structs.asdict(head).items()
-    known: dict[str, Any] = {name: UNSET if it is None else it for name, it in fields}
+    known: dict[str, Any] = {name: UNSET if value is None else value for name, value in fields}
     message = ImageMessage(
         **known,
         timestamp=Timestamp(*divmod(nanoseconds, 10**9)),
@@ -118,22 +122,22 @@ def encoded(head: FrameHead, pixels: NDArray[np.uint8]) -> bytes:
 
 
 decode_head: Callable[[bytes], FrameHead] = decoder(FrameHead)
-"""A message without its picture; raises `msgspec.DecodeError`."""
+"""Decoder of a message without its picture; raises `msgspec.DecodeError`."""
 
 _decode: Callable[[bytes], ImageMessage] = decoder(ImageMessage)
 
 
-def decoded(payload: bytes) -> RecordedFrame:
-    """The frame in a message; raises `RecordingError`, and `MissingPackage` without OpenCV."""
+def decode_frame(payload: bytes) -> RecordedFrame:
+    """Return the frame in a message; raise `RecordingError`, or `MissingPackage` without OpenCV."""
     cv2 = _cv2()
     try:
         message = _decode(payload)
     except msgspec.DecodeError as error:
         raise RecordingError(f"a frame that cannot be read: {error}") from None
     try:
-        png = _intact_png(message.data)
+        png = _check_png(message.data)
     except (ValueError, struct.error, zlib.error) as error:
-        why = str(error) if isinstance(error, _NoPicture) else "is damaged"
+        why = str(error) if isinstance(error, _InvalidPicture) else "is damaged"
         raise RecordingError(f"the picture of frame {message.seq} {why}") from None
     pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
     if pixels is None:
@@ -149,34 +153,34 @@ def decoded(payload: bytes) -> RecordedFrame:
     )
 
 
-class _NoPicture(ValueError):
-    """Reason why a picture is refused, in words."""
+class _InvalidPicture(ValueError):
+    """A picture is refused; the message is the reason."""
 
 
-def _intact_png(data: bytes) -> bytes:
-    """The parts of a grey PNG that its pixels are made of; raises ValueError and others.
+def _check_png(data: bytes) -> bytes:
+    """Return the essential chunks of a valid grey PNG; raise ValueError and others.
 
-    For what is damaged, libpng would write to standard error, and what claims to be large it would
-    allocate.
+    libpng itself would write to standard error for damaged data, and allocate whatever size the
+    data claim.
     """
     if not data.startswith(_SIGNATURE):
-        raise _NoPicture("is no PNG" if data else "is empty")
+        raise _InvalidPicture("is not a PNG" if data else "is empty")
     kept, compressed, offset, kind = [_SIGNATURE], [], len(_SIGNATURE), b""
     height = width = 0
     while kind != b"IEND":
-        length, kind = _PNG_PART.unpack_from(data, offset)
-        end = offset + _PNG_PART.size + length
-        body = data[offset + _PNG_PART.size : end]
+        length, kind = _PNG_CHUNK_HEAD.unpack_from(data, offset)
+        end = offset + _PNG_CHUNK_HEAD.size + length
+        body = data[offset + _PNG_CHUNK_HEAD.size : end]
         if zlib.crc32(data[offset + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
             raise ValueError("checksum")
         if (kind == b"IHDR") != (len(kept) == 1):
             raise ValueError("order")
         if kind == b"IHDR":
             width, height, *form = struct.unpack(">II5B", body)
-            if form != _GREY:
-                raise _NoPicture("is a PNG that is not of 8-bit grey levels")
+            if form != _GREY_FORMAT:
+                raise _InvalidPicture("is not a PNG of 8-bit grey levels")
             if not 0 < width * height <= MAX_PIXELS:
-                raise _NoPicture(f"claims {width} x {height} px, {MAX_PIXELS} pixels at most")
+                raise _InvalidPicture(f"claims {width} x {height} px, {MAX_PIXELS} pixels at most")
         if kind == b"IDAT":
             compressed.append(body)
         if kind in (b"IHDR", b"IDAT", b"IEND"):
@@ -185,7 +189,7 @@ def _intact_png(data: bytes) -> bytes:
     size = height * (1 + width)
     inflater = zlib.decompressobj()
     rows = inflater.decompress(b"".join(compressed), size + 1)
-    if len(rows) != size or not inflater.eof or max(rows[:: 1 + width]) > _LAST_FILTER:
+    if len(rows) != size or not inflater.eof or max(rows[:: 1 + width]) > _MAX_FILTER:
         raise ValueError("content")
     return b"".join(kept)
 

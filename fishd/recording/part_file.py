@@ -1,4 +1,4 @@
-"""The file while it is written: `<run>.mcap.part`, whole chunks only, renamed when it is whole."""
+"""File of a recording in progress: `<run>.mcap.part`, complete chunks only, renamed at the end."""
 
 import errno
 import fcntl
@@ -10,36 +10,36 @@ from pathlib import Path
 from fishd.core import files
 from fishd.core.errors import RecordingError
 
-PART = ".part"
+PART_SUFFIX = ".part"
 SUFFIX = ".mcap"
-MOST_WAITING = 2**18
-"""What a run in virtual time, which nobody flushes, keeps in memory at most [bytes]."""
+MAX_BUFFERED_BYTES = 2**18
+"""Maximum amount of data in memory, for runs in virtual time, which are not flushed [bytes]."""
 
 
 class PartFile:
-    """Writes whole flushes or nothing: a full disk leaves what was flushed before, whole.
+    """File that writes each flush completely or not at all, so that a full disk does not damage it.
 
-    It has as much of a Python file as the MCAP writer needs. It is locked while it is open, so that
-    nobody mistakes it for one that was left behind.
+    It has the methods of a Python file that the MCAP writer needs. It is locked while it is open,
+    which distinguishes it from an abandoned one.
     """
 
     def __init__(self, path: Path, part: Path | None = None) -> None:
         """
-        path: of the finished file
-        part: its name until then; by default `.part` is added
+        path: path of the finished file
+        part: path until then; by default with `.part` added
 
-        Raises `RecordingError` where either exists or cannot be made.
+        Raises `RecordingError` if either exists or cannot be created.
         """
         self.final = path
-        self.path = part or path.with_name(path.name + PART)
+        self.path = part or path.with_name(path.name + PART_SUFFIX)
         if os.path.lexists(path):
-            raise RecordingError(f"{path} is there already; choose another name")
+            raise RecordingError(f"{path} already exists; choose another name")
         try:
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
             self._fd = os.open(self.path, flags, 0o666)
         except FileExistsError:
             raise RecordingError(
-                f"{self.path} is there already, of a recording that runs or was not finished; "
+                f"{self.path} already exists, from a recording in progress or not finished; "
                 f"choose another name, or see 'fishctl recover {self.path}'"
             ) from None
         except OSError as error:
@@ -49,18 +49,18 @@ class PartFile:
         self._written = 0
 
     def write(self, data: bytes) -> int:
-        """Take whole records for the next flush; raises OSError where that is due at once."""
+        """Store complete records for the next flush, or flush at once; then raise OSError."""
         self._waiting += data
-        if len(self._waiting) > MOST_WAITING:
+        if len(self._waiting) > MAX_BUFFERED_BYTES:
             self.flush()
         return len(data)
 
     def tell(self) -> int:
-        """How long the file is, with what waits [bytes]."""
+        """Return the size of the file, unflushed data included [bytes]."""
         return self._written + len(self._waiting)
 
     def flush(self) -> None:
-        """Hand all that waits to the kernel, or none of it; raises OSError."""
+        """Write all unflushed data to the kernel, or none of it; raise OSError."""
         view, done = memoryview(bytes(self._waiting)), 0
         try:
             while done < len(view):
@@ -74,34 +74,34 @@ class PartFile:
         self._waiting.clear()
 
     def sync(self) -> None:
-        """Wait until what was flushed survives a power cut, too; raises OSError."""
+        """Wait until flushed data are safe against a power cut, too; raise OSError."""
         os.fdatasync(self._fd)
 
     def free(self) -> int:
-        """Room left on the disk, for this user [bytes]."""
-        found = os.fstatvfs(self._fd)
-        return found.f_bavail * found.f_frsize
+        """Return the free space on the disk for this user [bytes]."""
+        file_system = os.fstatvfs(self._fd)
+        return file_system.f_bavail * file_system.f_frsize
 
     def finish(self) -> None:
-        """Give the file its final name; raises OSError, and leaves the part where it is then."""
+        """Give the file its final name; raise OSError, and then keep the part."""
         self.sync()
-        give_name(self.path, self.final)
+        rename_to_final(self.path, self.final)
 
     def remove(self) -> None:
-        """Take the part away."""
+        """Remove the part."""
         self.path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Close it; may be called twice."""
+        """Close the file; may be called twice."""
         if self._fd >= 0:
             os.close(self._fd)
             self._fd = -1
 
 
-def give_name(part: Path, final: Path) -> None:
-    """Rename what is whole, never onto another file; raises OSError, and leaves it as it was then.
+def rename_to_final(part: Path, final: Path) -> None:
+    """Rename a complete file, never onto another file; raise OSError, and then change nothing.
 
-    A kill in the midst of it may leave both names, of the same file.
+    A kill during the rename may leave both names for the same file.
     """
     try:
         final.hardlink_to(part)  # unlike a rename, never onto another file
@@ -115,8 +115,8 @@ def give_name(part: Path, final: Path) -> None:
 
 
 @contextmanager
-def held(path: Path) -> Iterator[None]:
-    """Lock a recording as one that is being written, where its file system can; raises OSError."""
+def lock_recording(path: Path) -> Iterator[None]:
+    """Lock a recording as one in progress, if its file system can do so; raise OSError."""
     with path.open("rb") as file:
         with suppress(OSError):
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -124,7 +124,7 @@ def held(path: Path) -> Iterator[None]:
 
 
 def is_being_written(path: Path) -> bool:
-    """Does some process still write this part, or recover it?"""
+    """Return whether a process writes or recovers this part."""
     try:
         with path.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -1,4 +1,4 @@
-"""Where a recording comes from: versions, machine and people, as its first record says."""
+"""Provenance of a recording, its first record: versions, machine and people."""
 
 import getpass
 import platform
@@ -16,13 +16,13 @@ FORMAT = "1"
 """Version of the layout of a recording."""
 
 Source = Literal["fishd", "simulation"]
-"""What made the ticks: a running fishd, whatever its robot is, or a run in virtual time."""
+"""Origin of the ticks: a running fishd, whatever its robot, or a run in virtual time."""
 
 
 def provenance(
     run: str, source: Source, operator: str, subject: str, note: str, extra: Mapping[str, str]
 ) -> dict[str, str]:
-    """The metadata `fishd.run` of a recording that begins now."""
+    """Return the metadata `fishd.run` of a recording that begins now."""
     return {
         **extra,
         "run": run,
@@ -42,7 +42,7 @@ def provenance(
 
 @cache
 def git_commit() -> str:
-    """The commit of fishd's sources, with `-dirty` where they are changed; empty outside of git."""
+    """Return the commit of fishd's sources, with `-dirty` for changed ones; empty without git."""
     folder = Path(__file__).resolve().parents[2]
     if not (folder / ".git").exists():
         return ""

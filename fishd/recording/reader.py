@@ -1,4 +1,4 @@
-"""Reads recordings, also one that was never finished: a kill leaves whole chunks."""
+"""Reader of recordings, also of unfinished ones: a kill leaves complete chunks."""
 
 import copy
 import os
@@ -20,11 +20,11 @@ from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording import images
 from fishd.recording.images import FrameHead, RecordedFrame
-from fishd.recording.mcap_file import Damaged, records
-from fishd.recording.part_file import PART, SUFFIX
+from fishd.recording.mcap_file import Damaged, read_records
+from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 from fishd.recording.schemas import CHANNELS
 from fishd.recording.summary import Gap, Summary, Tally, from_metadata
-from fishd.recording.writer import CALIBRATIONS, CONFIG
+from fishd.recording.writer import CALIBRATIONS_ATTACHMENT, CONFIG_ATTACHMENT
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 TOPICS = dict(enumerate((*CHANNELS, images.TOPIC), start=1))
-"""Topics of channels as `RunWriter` numbers them, for a file in which that part is damaged."""
+"""Topics by the channel numbers of `RunWriter`, for a file whose channel records are damaged."""
 
 MAX_DIGITS = 9
-"""Digits of the number of a fishd in a recording."""
+"""Maximum number of digits of the number of a fishd in a recording."""
 MAX_COLUMNS = 100
-"""Quantities of controllers in one table; each takes a number a tick."""
+"""Maximum number of quantities of controllers in one table; each takes one number per tick."""
 
 
 class Entry(NamedTuple):
@@ -46,78 +46,78 @@ class Entry(NamedTuple):
     topic: str
     """`tick`, `event` or `status`."""
     payload: bytes
-    """JSON, to the byte what fishd sent."""
+    """JSON, exactly as fishd sent it."""
 
 
 class Run:
-    """A recording, as `open_run` reads it; its messages are decoded when they are asked for."""
+    """A recording, as `open_run` reads it; its messages are decoded on demand."""
 
     def __init__(self, path: Path) -> None:
-        """Raises `RecordingError` where the file cannot be read, or is no recording."""
+        """Raises `RecordingError` if the file cannot be read, or is not a recording."""
         self.path = path
         self.about: dict[str, str] = {}
-        """Run, version, git commit, host, Python, operator, subject, note, and more."""
+        """Metadata: run, version, git commit, host, Python, operator, subject, note, and more."""
         self.daemons: list[dict[str, str]] = []
-        """Each fishd that was recorded: version, process, robot."""
+        """Metadata of each recorded fishd: version, process, robot."""
         self._yaml: dict[int, bytes] = {}
-        """The configuration of each, by its number, as it stands in the file."""
+        """YAML of the configuration of each fishd, by its number."""
         self._settings: dict[int, dict[str, Any]] = {}
-        """Configurations that were decoded already, by number."""
+        """Decoded configurations, by number of the fishd."""
         self.calibrations: list[Calibrations] = []
-        """The calibrations that were in use, one after the other."""
+        """Calibrations that were active, one after the other."""
         self.finished = False
-        """False where the recording was not ended, or is still being written."""
+        """False if the recording was not finished, or is in progress."""
         self.reason = ""
-        """Why it ended; empty unless it is finished."""
+        """Reason of the end; empty unless the recording is finished."""
         self._ended: Summary | None = None
-        """As it was when the recording ended."""
+        """Summary at the end of the recording."""
         self._damages: list[int] = []
-        """How many ticks come before each damaged part that was skipped."""
+        """Number of ticks before each damaged part that was skipped."""
         self.damage_reason = ""
-        """Reason of the first damage, in words; empty where it is not known."""
+        """Description of the first damage; empty if unknown."""
         self.entries: list[Entry] = []
-        """All messages of fishd in the order in which they came."""
+        """All messages of fishd, in the order of arrival."""
         self.frame_heads: list[FrameHead] = []
-        """The frames of a camera without their pictures, in the order in which they came."""
+        """Metadata of the frames of a camera, in the order of arrival."""
         self._scan()
 
     @property
     def name(self) -> str:
         """Name of the run."""
-        return self.path.name.removesuffix(PART).removesuffix(SUFFIX)
+        return self.path.name.removesuffix(PART_SUFFIX).removesuffix(SUFFIX)
 
     @property
     def config(self) -> Config:
-        """The configuration of the first fishd; raises `RecordingError` without any."""
+        """Configuration of the first fishd; raises `RecordingError` if it was not recorded."""
         return self.config_of(0)
 
     def config_of(self, number: int) -> Config:
-        """The configuration of the fishd of this number; raises `RecordingError`."""
+        """Return the configuration of the fishd of this number; raise `RecordingError`."""
         try:
             return adopt(self.settings_of(number))
         except RecordingError:
             raise
         except FishdError as error:
-            made = self.about.get("version", "unknown")
+            version = self.about.get("version", "unknown")
             raise RecordingError(
-                f"{self.path}: the configuration of fishd {made} cannot be read by this one: "
+                f"{self.path}: the configuration of fishd {version} cannot be read by this one: "
                 f"{error}"
             ) from None
 
     def has_settings(self, number: int) -> bool:
-        """Is the configuration of this fishd in the recording?"""
+        """Return whether the recording contains the configuration of this fishd."""
         return number in self._yaml
 
     def settings_of(self, number: int) -> dict[str, Any]:
-        """The same as plain data, which the caller may change; raises `RecordingError`."""
+        """Return the configuration as plain data, which may be changed; raise `RecordingError`."""
         if not self.has_settings(number):
-            raise RecordingError(f"{self.path}: the configuration of its fishd was not recorded")
+            raise RecordingError(f"{self.path} does not contain the configuration of its fishd")
         if number not in self._settings:
             self._settings[number] = self._parsed(number)
         return copy.deepcopy(self._settings[number])
 
     def _parsed(self, number: int) -> dict[str, Any]:
-        name = f"{self.path}: {CONFIG} of fishd {number}"
+        name = f"{self.path}: {CONFIG_ATTACHMENT} of fishd {number}"
         try:
             data = strict_yaml.parse(self._yaml[number].decode()).data
         except UnicodeDecodeError as error:
@@ -130,70 +130,70 @@ class Run:
 
     @cached_property
     def configs(self) -> dict[int, dict[str, Any]]:
-        """The configuration of each fishd, by its number in the recording, from 0.
+        """Configuration of each fishd, by its number in the recording, from 0.
 
-        One that ended before it could be asked has no entry. Raises `RecordingError`.
+        A fishd that ended before it was asked has no entry. Raises `RecordingError`.
         """
         return {number: self.settings_of(number) for number in self._yaml}
 
     @cached_property
     def ticks(self) -> list[Tick]:
-        """All ticks, in the order in which they came; raises `RecordingError`."""
+        """All ticks, in the order of arrival; raises `RecordingError`."""
         return self._decoded("tick", Tick)
 
     @cached_property
     def events(self) -> list[Event]:
-        """All events, marks and changes of parameters among them; raises `RecordingError`."""
+        """All events, including marks and changes of parameters; raises `RecordingError`."""
         return self._decoded("event", Event)
 
     @cached_property
     def statuses(self) -> list[Status]:
-        """All statuses, one a second; none of a run in virtual time. Raises `RecordingError`."""
+        """All statuses, one per second; none for a run in virtual time. Raises `RecordingError`."""
         return self._decoded("status", Status)
 
     def messages(self) -> Iterator[Tick | Event | Status]:
-        """All messages in the order in which they came; raises `RecordingError`."""
-        of: dict[str, Iterator[Tick | Event | Status]] = {
+        """Yield all messages in the order of arrival; raise `RecordingError`."""
+        iterators: dict[str, Iterator[Tick | Event | Status]] = {
             "tick": iter(self.ticks),
             "event": iter(self.events),
             "status": iter(self.statuses),
         }
         for entry in self.entries:
-            yield next(of[entry.topic])
+            yield next(iterators[entry.topic])
 
     @property
     def gaps(self) -> list[Gap]:
-        """Where ticks are missing."""
+        """Gaps, in which ticks are missing."""
         return self._tally.gaps
 
     @property
     def summary(self) -> Summary:
-        """The recording in numbers."""
+        """Summary of the recording."""
         return self._tally.summary
 
     @property
     def is_damaged(self) -> bool:
-        """Are there parts that cannot be read?"""
+        """Whether there are parts that cannot be read."""
         return bool(self._damages)
 
     @cached_property
     def damaged(self) -> int:
-        """How many ticks were in them, as far as anything tells; raises `RecordingError`.
+        """Known number of ticks in unreadable parts; raises `RecordingError`.
 
-        Between two ticks they are in `gaps`, too.
+        Those between two ticks are in `gaps`, too.
         """
         if not self._damages:
             return 0
         if self._ended is not None:
             return max(0, self._ended.ticks - len(self.ticks))
-        around = [self.ticks[at - 1 : at + 1] for at in set(self._damages) if at]
-        return sum(max(0, pair[1].seq - pair[0].seq - 1) for pair in around if len(pair) == 2)
+        neighbours = [self.ticks[index - 1 : index + 1] for index in set(self._damages) if index]
+        return sum(max(0, pair[1].seq - pair[0].seq - 1) for pair in neighbours if len(pair) == 2)
 
     @cached_property
     def _tally(self) -> Tally:
         tally = Tally()
         for about in self.daemons:
-            tally.measures_in(about.get("force_unit", "N"))
+            tally.set_force_unit(about.get("force_unit", "N"))
         for message in self.messages():
             tally.add(message)
         for head in self.frame_heads:
@@ -201,28 +201,27 @@ class Run:
         return tally
 
     def frames(self) -> Iterator[RecordedFrame]:
-        """The frames of a camera, in the order in which they came, read as they are asked for.
+        """Yield the frames of a camera, in the order of arrival, read on demand.
 
-        Those of `frame_heads`: what is being recorded may have more by now.
-
-        Raises `RecordingError`, and `MissingPackage` without OpenCV (extra: camera).
+        These are the frames of `frame_heads`, even if a recording in progress has more by now.
+        Raise `RecordingError`, and `MissingPackage` without OpenCV (extra: camera).
         """
         for payload in islice(self._images(), len(self.frame_heads)):
             try:
-                yield images.decoded(payload)
+                yield images.decode_frame(payload)
             except RecordingError as error:
                 raise RecordingError(f"{self.path}: {error}") from None
 
     def _images(self) -> Iterator[bytes]:
         topics = dict(TOPICS)
-        for record in records(self.path):
+        for record in read_records(self.path):
             if isinstance(record, Channel):
                 topics[record.id] = record.topic
             elif isinstance(record, Message) and topics.get(record.channel_id) == images.TOPIC:
                 yield record.data
 
     def frame(self) -> "DataFrame":
-        """The ticks as a table: `fishd.core.dataframes.ticks_to_frame`; raises `RecordingError`."""
+        """Return the ticks as a table: see `ticks_to_frame`; raise `RecordingError`."""
         names: set[str] = set()
         for tick in self.ticks:
             names.update(tick.quantities or ())
@@ -236,7 +235,7 @@ class Run:
     def _scan(self) -> None:
         topics = dict(TOPICS)
         ticks = 0
-        for record in records(self.path):
+        for record in read_records(self.path):
             self.finished = isinstance(record, Footer)
             if isinstance(record, Message):
                 topic = topics.get(record.channel_id, "")
@@ -261,7 +260,7 @@ class Run:
                     self.damage_reason = self.damage_reason or why
         if not self.about and not (self.is_damaged and self.entries):
             why = f": {self.damage_reason}" if self.damage_reason else ""
-            raise RecordingError(f"{self.path} is an MCAP file, but no recording of fishd{why}")
+            raise RecordingError(f"{self.path} is an MCAP file, but not a recording of fishd{why}")
 
     def _take_frame(self, payload: bytes) -> None:
         try:
@@ -280,34 +279,37 @@ class Run:
             self.reason, self._ended = data.get("reason", ""), from_metadata(data)
 
     def _take_attachment(self, name: str, data: bytes) -> None:
-        if name == CONFIG:
+        if name == CONFIG_ATTACHMENT:
             number = self.daemons[-1].get("number", "") if self.daemons else ""
             if not (number.isdecimal() and len(number) <= MAX_DIGITS):
-                raise ValueError("the number of its fishd is not known")
+                raise ValueError("the number of its fishd is unknown")
             self._yaml[int(number)] = data
-        elif name == CALIBRATIONS:
+        elif name == CALIBRATIONS_ATTACHMENT:
             self.calibrations.append(decoder(Calibrations)(data))
 
     def _decoded(self, topic: str, kind: type[T]) -> list[T]:
         decode = decoder(kind)
         try:
-            return [decode(payload) for found, payload in self.entries if found == topic]
+            return [
+                decode(payload) for entry_topic, payload in self.entries if entry_topic == topic
+            ]
         except msgspec.DecodeError as error:
-            made = self.about.get("version", "unknown")
+            version = self.about.get("version", "unknown")
             raise RecordingError(
-                f"{self.path}: a message '{topic}' of fishd {made} cannot be read by this one: "
+                f"{self.path}: a message '{topic}' of fishd {version} cannot be read by this one: "
                 f"{error}"
             ) from None
 
 
 def read(path: str | os.PathLike[str]) -> "DataFrame":
-    """The ticks of a recording as a table: one row a tick, one column a field of `Tick`, SI units.
+    """Return the ticks of a recording as a table: a row per tick, a column per field of `Tick`.
 
-    Raises `RecordingError`, and `MissingPackage` without pandas (extra: lab).
+    All values are in SI units. Raise `RecordingError`, and `MissingPackage` without pandas (extra:
+    lab).
     """
     return open_run(path).frame()
 
 
 def open_run(path: str | os.PathLike[str]) -> Run:
-    """A recording, finished or not; raises `RecordingError`."""
+    """Open a recording, finished or not; raise `RecordingError`."""
     return Run(Path(path))

@@ -1,4 +1,4 @@
-"""Records a running fishd: a process of its own that subscribes to telemetry."""
+"""Recorder of a running fishd: a separate process that subscribes to telemetry."""
 
 import time
 from collections import deque
@@ -21,17 +21,17 @@ from fishd.recording.writer import RunWriter
 if TYPE_CHECKING:
     from fishd.recording.camera_tap import CameraTap
 
-DRAIN = 0.2
-"""Messages are taken from their queue this often, so as to wake up seldom [s]."""
-FLUSH = 0.5
-"""All is handed to the kernel this often: a kill loses at most so much, and `DRAIN` [s]."""
-SYNC = 10.0
-"""A power cut loses at most so much [s]."""
-SILENCE = 1.0
-"""Without a message for so long, fishd is looked for again [s]."""
-RESERVE = 16 * 2**20
-"""Recordings end before the disk has less room than this [bytes]."""
-ABOUT = (
+DRAIN_INTERVAL_S = 0.2
+"""Interval at which messages are read from their queue, to wake up rarely [s]."""
+FLUSH_INTERVAL_S = 0.5
+"""Interval of writes to the kernel: a kill loses at most this time and `DRAIN_INTERVAL_S` [s]."""
+SYNC_INTERVAL_S = 10.0
+"""Interval of writes to the disk: a power cut loses at most this time [s]."""
+FISHD_TIMEOUT_S = 1.0
+"""Time without a message after which the recorder looks for fishd again [s]."""
+MIN_FREE_BYTES = 16 * 2**20
+"""Free space on the disk below which recordings end [bytes]."""
+STATUS_FIELDS = (
     "version",
     "pid",
     "name",
@@ -43,16 +43,16 @@ ABOUT = (
     "force_unit",
     "realtime",
 )
-"""What is kept of the status of each fishd."""
-UNTOLD = 100
-"""Lines that fishd has not been told yet: older ones are forgotten."""
-WAITING = 20000
-"""Messages that may wait for a recorder that is held up: a quarter of an hour."""
-TAKEN_OVER = "another fishd has taken over: the recording goes on with it"
+"""Fields of the status of each fishd that are recorded."""
+MAX_UNSENT_LINES = 100
+"""Maximum number of lines that wait to be sent to fishd; older ones are dropped."""
+MAX_WAITING_MESSAGES = 20000
+"""Maximum number of messages that wait for a delayed recorder: a quarter of an hour."""
+TAKEOVER_MESSAGE = "another fishd has taken over: the recording continues with it"
 
 
 class Recorder:
-    """Writes all that a fishd says until it is told to stop, through any restart of fishd."""
+    """Recorder of all telemetry of a fishd until it is stopped, across restarts of fishd."""
 
     def __init__(
         self,
@@ -65,12 +65,12 @@ class Recorder:
         camera: "CameraTap | None" = None,
     ) -> None:
         """
-        endpoint: control socket of fishd; None looks for that of this machine
+        endpoint: control socket of fishd; None for that of this machine
         open_writer: begins a recording
-        tell: gets a line where something happens that its reader should know
+        tell: called with a line for the user about an incident
         progress: called once a second
-        due: is it time to close this recording and begin the next one?
-        camera: what brings the frames of a camera; it is closed with the recorder
+        due: returns whether to close this recording and begin the next one
+        camera: source of the frames of a camera; it is closed with the recorder
         """
         self._endpoint = endpoint
         self._open_writer = open_writer
@@ -80,16 +80,16 @@ class Recorder:
         self._writer: RunWriter | None = None
         self._described: Description | None = None
         self._seq = 0
-        self._untold: deque[str] = deque(maxlen=UNTOLD)
-        """What fishd could not be told, as it did not answer in time."""
+        self._unsent: deque[str] = deque(maxlen=MAX_UNSENT_LINES)
+        """Lines that could not be sent to fishd yet, since it did not answer in time."""
         self._gone = False
         self._refused = 0
-        """Messages that are none of fishd's."""
+        """Number of messages that are not fishd's."""
         self.reason = "stopped"
-        """Why the recording ended, as the file says."""
+        """Reason of the end, for the file."""
 
     def __enter__(self) -> Self:
-        """Begin, where there is a fishd: raises `NoDaemon`, `Refused`, `RecordingError`."""
+        """Begin the recording; raise `NoDaemon`, `Refused`, `RecordingError`."""
         try:
             self._described = self._ask()
             self._telemetry.connect(self._described.status.telemetry)
@@ -100,77 +100,77 @@ class Recorder:
         return self
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
-        """Finish the file, also after an error; raises `RecordingError`."""
+        """Finish the file, also after an error; raise `RecordingError`."""
         self._close()
         if self._refused > 1:
-            self._tell(f"messages that are none of fishd's, left out: {self._refused}")
+            self._tell(f"messages that are not fishd's, ignored: {self._refused}")
         self.writer.close(self.reason if error is None else text.describe_error(error))
 
     @property
     def began(self) -> bool:
-        """Was a file opened?"""
+        """Whether a file was opened."""
         return self._writer is not None
 
     @property
     def status(self) -> Status:
-        """What fishd said of itself when it was asked last."""
+        """Latest status that the recorder has requested from fishd."""
         assert self._described
         return self._described.status
 
     @property
     def writer(self) -> RunWriter:
-        """The recording that is being written."""
+        """Writer of the current recording."""
         assert self._writer is not None
         return self._writer
 
     def run(self, stopping: Callable[[], bool], seconds: float | None = None) -> None:
-        """Record until `stopping`, or for so long [s]; raises `RecordingError`."""
-        heard = flushed = synced = told = began = time.monotonic()
+        """Record until `stopping`, or for this time [s]; raise `RecordingError`."""
+        received = flushed = synced = progressed = start = time.monotonic()
         while not stopping():
             now = time.monotonic()
-            if seconds is not None and now - began >= seconds:
-                self.reason = f"after {seconds:g} s, as asked"
+            if seconds is not None and now - start >= seconds:
+                self.reason = f"after {seconds:g} s, as requested"
                 break
-            time.sleep(DRAIN)
+            time.sleep(DRAIN_INTERVAL_S)
             for topic, payload in self._telemetry.messages():
                 self._take(topic, payload)
-                heard = now
+                received = now
             if self._camera:
                 self._take_frames(self._camera)
-            if now - flushed >= FLUSH - DRAIN / 2:
+            if now - flushed >= FLUSH_INTERVAL_S - DRAIN_INTERVAL_S / 2:
                 flushed = now
-                sync = now - synced >= SYNC
+                sync = now - synced >= SYNC_INTERVAL_S
                 synced = now if sync else synced
                 self.writer.flush(sync=sync)
                 self._check_room()
-            if now - told >= 1.0:
-                told = now
+            if now - progressed >= 1.0:
+                progressed = now
                 self._progress(self.writer)
                 if self._due(self.writer):
                     self.writer.close("continued in the next file")
                     self._open()
-            if now - heard >= SILENCE:
-                heard = now
+            if now - received >= FISHD_TIMEOUT_S:
+                received = now
                 self._look_for_fishd()
 
     def _take_frames(self, camera: "CameraTap") -> None:
         news, frames = camera.take()
         for line in news:
             self._tell(line)
-            self._untold.append(text.line(line))
-        if self._untold and not self._gone:
-            self._mark_untold()
+            self._unsent.append(text.line(line))
+        if self._unsent and not self._gone:
+            self._send_lines()
         for head, pixels in frames:
             if lost := self.writer.frame(head, pixels):
                 self._tell(f"just before frame {head.seq}, frames were lost: {lost}")
 
-    def _mark_untold(self) -> None:
-        """Put it into the events; what a fishd that does not answer misses is tried again."""
+    def _send_lines(self) -> None:
+        """Send waiting lines to fishd as events; keep those that it does not answer for later."""
         with suppress(FishError), Fish(self._endpoint, timeout=0.5) as fish:
-            while self._untold:
+            while self._unsent:
                 with suppress(Refused):
-                    fish.mark(self._untold[0])
-                self._untold.popleft()
+                    fish.mark(self._unsent[0])
+                self._unsent.popleft()
 
     def _close(self) -> None:
         self._telemetry.close()
@@ -188,76 +188,76 @@ class Recorder:
             message = self.writer.message(topic, payload)
         except msgspec.DecodeError:
             self._refused += 1
-            if self._refused == 1:  # a flood of them is told when all is over
-                self._tell(f"a message of topic {topic} is none of fishd's: left out")
+            if self._refused == 1:  # the total is reported at the end
+                self._tell(f"a message of topic {topic} is not fishd's: ignored")
             return
         if isinstance(message, TickHead):
             if message.seq <= self._seq:
-                self._tell(TAKEN_OVER)
+                self._tell(TAKEOVER_MESSAGE)
             elif self._gone:
-                self._tell("fishd is heard again: the recording goes on")
+                self._tell("fishd sends again: the recording continues")
             self._gone = False
             self._seq = message.seq
             if self._camera:
-                self._camera.heard(message.t, message.time)
+                self._camera.set_time(message.t, message.time)
             for gap in self.writer.gaps[known:]:
                 self._tell(f"just before tick {message.seq}, ticks were lost: {gap.lost}")
         elif isinstance(message, Status):
             if self.writer.tally.restarts > restarts:  # its ticks had higher numbers
-                self._tell(TAKEN_OVER)
-            # Once its ticks come, so that the file says whose they are.
+                self._tell(TAKEOVER_MESSAGE)
+            # After its first ticks, so that the file assigns the ticks to the right fishd.
             if message.pid != self.status.pid and self._seq <= message.seq:
                 self._ask_again()
         elif message.kind == "calibration":
             self._ask_again()
 
     def _ask(self) -> "Description":
-        """What fishd says of itself; raises `FishError`."""
+        """Return the description of fishd; raise `FishError`."""
         with Fish(self._endpoint) as fish:
-            return description(fish)
+            return describe_daemon(fish)
 
     def _ask_again(self) -> None:
-        """A fishd that does not answer is asked again at its next status."""
+        """Update the description of fishd; without an answer, retry at its next status."""
         with suppress(FishError):
             self._described = self._ask()
             self._described.write(self.writer)
 
     def _look_for_fishd(self) -> None:
-        """Telemetry comes back by itself, unless fishd has another address now."""
+        """Reconnect telemetry if fishd has another address now; otherwise it reconnects itself."""
         try:
             with Fish(self._endpoint, timeout=0.5) as fish:
                 self._telemetry.connect(fish.status().telemetry)
         except FishError:
             if not self._gone:
-                self._tell("fishd is gone: the recording waits for it")
+                self._tell("fishd does not answer: the recording waits for it")
             self._gone = True
 
     def _check_room(self) -> None:
         free = self.writer.free()
-        if free < RESERVE:
+        if free < MIN_FREE_BYTES:
             raise OutOfRoom(
                 f"{self.writer.path}: the recording ends after {self.writer.tally.seconds:.0f} s: "
-                f"only {free / 2**20:.0f} MB are left on this disk"
+                f"only {free / 2**20:.0f} MB are free on this disk"
             )
 
 
 class Description(NamedTuple):
-    """What a fishd says of itself when it is asked."""
+    """Description of a fishd: status, configuration and calibrations."""
 
     status: Status
     config: dict[str, Any]
     calibrations: Calibrations | None
 
     def write(self, writer: RunWriter) -> None:
-        """Put it into a recording; raises `RecordingError`."""
-        about = {name: str(getattr(self.status, name)) for name in ABOUT}
+        """Write the description to a recording; raise `RecordingError`."""
+        about = {name: str(getattr(self.status, name)) for name in STATUS_FIELDS}
         writer.describe(self.config, about)
         if self.calibrations is not None:
             writer.calibrated(self.calibrations)
 
 
-def description(fish: Fish) -> Description:
-    """What the fishd of a fish says of itself; raises `FishError`."""
+def describe_daemon(fish: Fish) -> Description:
+    """Return the description of the fishd of a connection; raise `FishError`."""
     status, config = fish.status(), fish.config()
     try:
         return Description(status, config, fish.calibrations())
@@ -266,23 +266,23 @@ def description(fish: Fish) -> Description:
 
 
 class OutOfRoom(RecordingError):
-    """A recording ended since the disk is almost full; the file is finished."""
+    """The disk is almost full, and the recording has ended; the file is finished."""
 
 
 class Telemetry:
-    """All topics of telemetry, with room for many messages to wait."""
+    """Subscription to all topics of telemetry, with a long queue."""
 
     def __init__(self) -> None:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
-        self._socket.set(zmq.RCVHWM, WAITING)
+        self._socket.set(zmq.RCVHWM, MAX_WAITING_MESSAGES)
         self._socket.set(zmq.RECONNECT_IVL, 10)
         for topic in CHANNELS:
             self._socket.subscribe(topic.encode())
         self._address = ""
 
     def connect(self, address: str) -> None:
-        """Listen to this address alone."""
+        """Subscribe to this address only."""
         if address != self._address:
             if self._address:
                 self._socket.disconnect(self._address)
@@ -291,8 +291,8 @@ class Telemetry:
             self._address = address
 
     def messages(self) -> Iterator[tuple[str, bytes]]:
-        """Topics and payloads that wait."""
-        for _ in range(WAITING):
+        """Yield topic and payload of each waiting message."""
+        for _ in range(MAX_WAITING_MESSAGES):
             try:
                 frames = self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:

@@ -1,4 +1,4 @@
-"""Finishes a recording that was cut off, by a kill or a power cut say."""
+"""Recovery of a recording that was interrupted, for example by a kill or a power cut."""
 
 from pathlib import Path
 
@@ -7,45 +7,47 @@ from mcap.writer import CompressionType, Writer
 
 from fishd.core.errors import RecordingError
 from fishd.recording import images
-from fishd.recording.mcap_file import records
+from fishd.recording.mcap_file import read_records
 from fishd.recording.part_file import (
-    PART,
+    PART_SUFFIX,
     SUFFIX,
     PartFile,
-    give_name,
-    held,
     is_being_written,
+    lock_recording,
+    rename_to_final,
 )
 from fishd.recording.reader import TOPICS, Run, open_run
 from fishd.recording.schemas import CHANNELS, json_schema, schema_name
 from fishd.recording.summary import to_metadata
-from fishd.recording.writer import CHUNK
+from fishd.recording.writer import CHUNK_BYTES
 
-RECOVERING = ".recovering"
-"""Is added to the name of the copy until it is whole."""
-UNFINISHED = "recovered: the recording was not finished"
-DAMAGED = "recovered: the recording was damaged, ticks that could not be read: {}"
+RECOVERING_SUFFIX = ".recovering"
+"""Suffix of the name of the copy until it is complete."""
+UNFINISHED_REASON = "recovered: the recording was not finished"
+DAMAGED_REASON = "recovered: the recording was damaged, ticks that could not be read: {}"
 
 
 def recover(path: Path) -> Run:
-    """Write what can be read of a recording into a finished one, and open that.
+    """Copy the readable part of a recording to a finished one, and open that.
 
-    `RUN.mcap.part` becomes `RUN.mcap`; what has another name stays, beside `NAME-recovered.mcap`.
-    A kill costs nothing: the next call finishes what this one began.
-    Raises `RecordingError` where there is nothing to recover, or no room to do so.
+    `RUN.mcap.part` becomes `RUN.mcap`; a file of another name is kept next to
+    `NAME-recovered.mcap`. After a kill, the next call completes the recovery.
+    Raise `RecordingError` if there is nothing to recover, or not enough space.
     """
     if is_being_written(path):
-        raise RecordingError(f"{path} is being recorded now, or recovered; end that first")
+        raise RecordingError(f"{path} is being recorded or recovered; end that process first")
     run = open_run(path)
-    is_part = path.name.endswith(SUFFIX + PART)
+    is_part = path.name.endswith(SUFFIX + PART_SUFFIX)
     if not is_part and run.finished and not run.is_damaged:
-        raise RecordingError(f"{path} is finished and whole: there is nothing to recover")
+        raise RecordingError(f"{path} is finished and undamaged: there is nothing to recover")
     final = path.with_name(run.name + ("" if is_part else "-recovered") + SUFFIX)
     try:
-        with held(path):
-            final.with_name(final.name + RECOVERING).unlink(missing_ok=True)  # left by a kill
+        with lock_recording(path):
+            final.with_name(final.name + RECOVERING_SUFFIX).unlink(
+                missing_ok=True
+            )  # left by a kill
             if is_part and run.finished and not run.is_damaged and not final.exists():
-                give_name(path, final)  # it was killed just before
+                rename_to_final(path, final)  # the recorder was killed just before
             elif not (is_part and _is_copy(final, run)):
                 _write(run, final)
             if is_part:
@@ -56,7 +58,7 @@ def recover(path: Path) -> Run:
 
 
 def _is_copy(final: Path, part: Run) -> bool:
-    """Is there a whole recording of this run already, when a kill came before the end?"""
+    """Return whether `final` is a complete copy of this run, left by a kill before the end."""
     if not final.exists():
         return False
     run = open_run(final)
@@ -65,8 +67,8 @@ def _is_copy(final: Path, part: Run) -> bool:
 
 def _write(run: Run, final: Path) -> None:
     if final.exists():
-        raise RecordingError(f"{final} is there already; move it away first")
-    file = PartFile(final, final.with_name(final.name + RECOVERING))
+        raise RecordingError(f"{final} already exists; move it away first")
+    file = PartFile(final, final.with_name(final.name + RECOVERING_SUFFIX))
     try:
         _copy(run, file)
         file.finish()
@@ -78,25 +80,25 @@ def _write(run: Run, final: Path) -> None:
 
 
 def _copy(run: Run, file: PartFile) -> None:
-    writer = Writer(file, CHUNK, CompressionType.ZSTD)  # type: ignore[arg-type]
+    writer = Writer(file, CHUNK_BYTES, CompressionType.ZSTD)  # type: ignore[arg-type]
     writer.start(profile="", library="fishd")
-    if not run.about:  # that part is damaged
+    if not run.about:  # its metadata are damaged
         writer.add_metadata("fishd.run", {"run": run.name})
     schemas: dict[int, int] = {0: 0}
     channels: dict[int, int] = {}
 
     def channel_of(number: int) -> int:
-        if number not in channels:  # where its record is damaged
+        if number not in channels:  # the record of the channel is damaged
             topic = TOPICS[number]
             if topic in CHANNELS:
                 name, schema = schema_name(CHANNELS[topic]), json_schema(CHANNELS[topic])
             else:
                 name, schema = images.SCHEMA, images.json_schema()
-            found = writer.register_schema(name, "jsonschema", schema)
-            channels[number] = writer.register_channel(topic, "json", found)
+            schema_id = writer.register_schema(name, "jsonschema", schema)
+            channels[number] = writer.register_channel(topic, "json", schema_id)
         return channels[number]
 
-    for record in records(run.path):
+    for record in read_records(run.path):
         if isinstance(record, Message) and (record.channel_id in {*channels, *TOPICS}):
             writer.add_message(
                 channel_of(record.channel_id),
@@ -120,7 +122,7 @@ def _copy(run: Run, file: PartFile) -> None:
             writer.add_attachment(
                 record.create_time, record.log_time, record.name, record.media_type, record.data
             )
-    reason = DAMAGED.format(run.damaged) if run.is_damaged else UNFINISHED
+    reason = DAMAGED_REASON.format(run.damaged) if run.is_damaged else UNFINISHED_REASON
     writer.add_metadata("fishd.end", to_metadata(run.summary) | {"reason": reason})
     writer.flush()  # type: ignore[no-untyped-call]
     writer.finish()  # type: ignore[no-untyped-call]

@@ -1,7 +1,7 @@
-"""Publishes a recording as fishd would, so that viewers work on it as if it were live.
+"""Replay of a recording on the sockets of a fishd, so that viewers show it as if it were live.
 
-Telemetry is the recorded bytes, on a PUB socket. Beside it a ROUTER socket answers what a viewer
-asks, such as `status`, and refuses to steer.
+Telemetry is the recorded bytes, on a PUB socket. A ROUTER socket answers the requests of viewers,
+such as `status`, and refuses commands.
 """
 
 import os
@@ -20,29 +20,29 @@ from fishd.core.errors import RecordingError, Refused, StartupError
 from fishd.core.signals import Event, Percentiles, Status, Tick, Timing
 from fishd.recording.reader import Run
 
-LONGEST_PAUSE = 5.0
-"""A longer silence in the recording is cut short to this [s]."""
-JOINING = 0.3
-"""Subscribers that try again all the time are given so long to connect [s]."""
+MAX_PAUSE_S = 5.0
+"""Maximum length of a pause; longer ones in the recording are shortened [s]."""
+SUBSCRIBER_WAIT_S = 0.3
+"""Time for waiting subscribers to connect before the first message [s]."""
 RIVAL = "a fishd or another replay"
-ADVICE = "end it, or give this replay addresses of its own with --control and --address"
-NOT_LIVE = "this is a replay of {}: it can be watched, not steered"
+ADVICE = "end it, or choose other addresses for this replay with --control and --address"
+REPLAY_REFUSAL = "this is a replay of {}: it can be watched, but not controlled"
 
 
 class Replay:
-    """A recording on sockets of its own; a context manager."""
+    """Replay of a recording on separate sockets; a context manager."""
 
     def __init__(self, run: Run, telemetry: str, control: str) -> None:
         """
         telemetry, control: addresses, as in the configuration of fishd
 
-        Raises `RecordingError` without a tick, and `StartupError` where an address cannot be had.
+        Raises `RecordingError` without a tick, and `StartupError` if an address cannot be bound.
         """
         self._run = run
         self._messages = list(run.messages())
-        first = next((each for each in self._messages if isinstance(each, Tick)), None)
+        first = next((message for message in self._messages if isinstance(message, Tick)), None)
         if first is None:
-            raise RecordingError(f"{run.path}: there is no tick to replay")
+            raise RecordingError(f"{run.path} contains no tick to replay")
         self._tick = first
         self._recorded: Status | None = next(iter(run.statuses), None)
         self._parameters: dict[str, Any] = self._recorded.parameters if self._recorded else {}
@@ -51,13 +51,15 @@ class Replay:
             stack.callback(context.destroy, linger=200)
             for address, option in ((control, "--control"), (telemetry, "--address")):
                 if why := addresses.find_listen_problem(address):
-                    raise StartupError(f"{option}: '{address}' is no address to serve: {why}")
+                    raise StartupError(
+                        f"{option}: '{address}' is not an address to listen on: {why}"
+                    )
                 stack.enter_context(addresses.claim_address(address, RIVAL, ADVICE))
             self._publisher = context.socket(zmq.PUB)
-            self.telemetry = _bound(self._publisher, telemetry, "--address")
+            self.telemetry = _bind_socket(self._publisher, telemetry, "--address")
             self._router = context.socket(zmq.ROUTER)
             self._router.set(zmq.MAXMSGSIZE, protocol.MAX_MESSAGE)
-            self.control = _bound(self._router, control, "--control")
+            self.control = _bind_socket(self._router, control, "--control")
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -67,26 +69,26 @@ class Replay:
         self._stack.close()
 
     def play(self, speed: float) -> None:
-        """Publish all of it.
+        """Publish all messages.
 
-        speed: seconds of the recording in a second
+        speed: seconds of the recording per second
         """
-        self._answer_until(time.monotonic() + JOINING)
+        self._answer_until(time.monotonic() + SUBSCRIBER_WAIT_S)
         due, before = time.monotonic(), self._tick.t
         for entry, message in zip(self._run.entries, self._messages, strict=True):
-            due += min(LONGEST_PAUSE, max(0.0, message.t - before)) / speed
+            due += min(MAX_PAUSE_S, max(0.0, message.t - before)) / speed
             before = message.t
             self._answer_until(due)
-            self._keep(message)
+            self._update_state(message)
             self._publisher.send_multipart([entry.topic.encode(), entry.payload])
             if isinstance(message, Tick) and self._recorded is None and self._whole_second():
                 status = protocol.encode(self.status())
                 self._publisher.send_multipart([b"status", status])
 
     def status(self) -> Status:
-        """What fishd said last, or would say, as of the tick that was published last."""
+        """Return the recorded or a synthetic status, updated to the latest published tick."""
         tick = self._tick
-        status = self._recorded or self._made_up
+        status = self._recorded or self._synthetic_status
         return replace(
             status,
             t=tick.t,
@@ -106,7 +108,7 @@ class Replay:
             name=f"replay of {self._run.name}",
         )
 
-    def _keep(self, message: Tick | Event | Status) -> None:
+    def _update_state(self, message: Tick | Event | Status) -> None:
         if isinstance(message, Tick):
             self._tick = message
         elif isinstance(message, Status):
@@ -115,11 +117,11 @@ class Replay:
             self._parameters = message.data["parameters"]
 
     def _whole_second(self) -> bool:
-        return self._tick.seq % max(1, round(1.0 / self._made_up.tick)) == 0
+        return self._tick.seq % max(1, round(1.0 / self._synthetic_status.tick)) == 0
 
     @cached_property
-    def _made_up(self) -> Status:
-        """The status of a run in virtual time, in which none was recorded."""
+    def _synthetic_status(self) -> Status:
+        """Status for a run in virtual time, whose recording contains none."""
         config, none = self._run.config, Percentiles(0.0, 0.0, 0.0, 0)
         return Status(
             t=self._tick.t,
@@ -149,10 +151,10 @@ class Replay:
         )
 
     def _answer_until(self, deadline: float) -> None:
-        """Answer requests until it is time for the next message."""
+        """Answer requests until the deadline of the next message."""
         while True:
-            wait = deadline - time.monotonic()
-            if not self._router.poll(max(0, round(wait * 1e3))):
+            remaining = deadline - time.monotonic()
+            if not self._router.poll(max(0, round(remaining * 1e3))):
                 return
             *route, payload = self._router.recv_multipart()
             self._router.send_multipart([*route, self._reply(payload)])
@@ -175,11 +177,11 @@ class Replay:
                 raise Refused("replay", str(error)) from None
         if op == "calibrations" and self._run.calibrations:
             return self._run.calibrations[-1]
-        raise Refused("replay", NOT_LIVE.format(self._run.name))
+        raise Refused("replay", REPLAY_REFUSAL.format(self._run.name))
 
 
-def _bound(socket: "zmq.Socket[bytes]", address: str, option: str) -> str:
-    """Bind what is `claimed`; the address that clients connect to. Raises `StartupError`."""
+def _bind_socket(socket: "zmq.Socket[bytes]", address: str, option: str) -> str:
+    """Bind a claimed address, and return the one for clients; raise `StartupError`."""
     path = addresses.socket_path(address)
     before = os.umask(0o117) if path else None
     try:
@@ -190,8 +192,8 @@ def _bound(socket: "zmq.Socket[bytes]", address: str, option: str) -> str:
     except (zmq.ZMQError, OSError) as error:
         why = zmq.strerror(error.errno or 0)
         raise StartupError(
-            f"cannot publish at {address}: {why}, by a fishd perhaps; end that, or name another "
-            f"with {option}"
+            f"cannot publish at {address}: {why}; end the program that uses it, or choose another "
+            f"address with {option}"
         ) from None
     finally:
         if before is not None:

@@ -1,6 +1,6 @@
-"""The channels of a recording, and their JSON Schemas, which viewers read.
+"""Channels of a recording, and their JSON Schemas for viewers.
 
-Viewers want a root of type object, no `$ref` and no `anyOf`, so what is nested stays a bare object.
+Viewers need a root of type object, without `$ref` and `anyOf`, so nested values are plain objects.
 """
 
 from typing import Any
@@ -12,7 +12,7 @@ from fishd.core.schema import fields_of
 from fishd.core.signals import Event, Status, Tick
 
 CHANNELS: dict[str, type[Struct]] = {"tick": Tick, "event": Event, "status": Status}
-"""What is recorded: topics of telemetry, and what their messages are."""
+"""Recorded topics of telemetry, and the types of their messages."""
 
 _TYPES = {
     "number": "number",
@@ -24,18 +24,18 @@ _TYPES = {
 
 
 def schema_name(message: type[Struct]) -> str:
-    """The name of the schema in the file, such as `fishd.Tick`."""
+    """Return the name of the schema in the file, such as `fishd.Tick`."""
     return f"fishd.{message.__name__}"
 
 
 def json_schema(message: type[Struct]) -> bytes:
-    """The JSON Schema of a message, flat."""
+    """Return the flat JSON Schema of a message."""
     properties: dict[str, Any] = {}
     for field in fields_of(message):
-        described = f"{field.description} [{field.unit}]" if field.unit else field.description
+        description = f"{field.description} [{field.unit}]" if field.unit else field.description
         properties[field.name] = {
             "type": _TYPES.get(field.kind, "string"),
-            "description": described,
+            "description": description,
         }
     title = schema_name(message)
     return msgspec.json.encode({"title": title, "type": "object", "properties": properties})

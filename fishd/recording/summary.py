@@ -1,4 +1,4 @@
-"""What a recording amounts to: how long, who swam, how much thrust, and what is missing."""
+"""Summary of a recording: duration, controllers, thrust, and missing data."""
 
 from typing import Any, NamedTuple
 
@@ -11,18 +11,18 @@ from fishd.recording.images import FrameHead
 
 
 class Gap(NamedTuple):
-    """Ticks that fishd made and that are not in the recording."""
+    """Gap: consecutive ticks of fishd that are missing in the recording."""
 
     after: float
-    """Time of the last tick before it; without one, of the first tick after it [s, unix]."""
+    """Time of the last tick before the gap, or else of the first tick after it [s, unix]."""
     seq: int
-    """Number of the first tick that is missing."""
+    """Number of the first missing tick."""
     lost: int
-    """How many are missing."""
+    """Number of missing ticks."""
 
 
 class Summary(Struct, frozen=True):
-    """A recording in numbers; stands in its last record `fishd.end`."""
+    """Summary of a recording; part of its last record `fishd.end`."""
 
     begins: float = 0.0
     """Time of the first tick [s, unix]."""
@@ -32,44 +32,43 @@ class Summary(Struct, frozen=True):
     events: int = 0
     marks: int = 0
     gaps: int = 0
-    """How often ticks are missing."""
+    """Number of gaps."""
     lost: int = 0
-    """How many ticks are missing in those gaps."""
+    """Number of missing ticks in all gaps."""
     missed: int = 0
-    """Slots that fishd itself skipped meanwhile: it made no tick there."""
+    """Number of slots that fishd itself skipped, without a tick."""
     restarts: int = 0
-    """How often another fishd took the place of the one before."""
+    """Number of times that another fishd took over."""
     thrust: float | None = None
-    """Mean `thrust` over the time in which the tail beat and the sensor's zero was known; where it
-    never was, mean F_x while a controller swam, as measured; None where none swam [N]."""
+    """Mean `thrust` while the tail beat and the sensor's zero was known; if it never was, mean
+    measured F_x while a controller swam; None if none swam [N]."""
     thrust_error: float | None = None
-    """Half of its 95 % interval; None where the zero was never known [N].
+    """Half-width of the 95 % confidence interval of `thrust`; None if the zero was never known [N].
 
-    It is the mean of that of the ticks: the errors of one recording are those of one zero, and do
-    not average out.
+    It is the mean of those of the ticks: all ticks share the error of one zero, which does not
+    average out.
     """
     power: float | None = None
-    """Mean electrical power of the servo while a controller swam; None where not known [W]."""
+    """Mean electrical power of the servo while a controller swam; None if unknown [W]."""
     swimming: dict[str, int] = {}
-    """Ticks in mode running, by controller."""
+    """Number of ticks in mode running, by controller."""
     force_unit: str = "N"
-    """Unit of its forces: `N` only where all are in newtons, else that of the others."""
+    """Unit of the forces: `N` if all are in newtons, else the other unit."""
     frames: int = 0
-    """Frames of a camera."""
+    """Number of frames of a camera."""
     frame_gaps: int = 0
-    """How often frames are missing, or the camera began anew."""
+    """Number of places with missing frames, or with a restart of the camera."""
     frames_lost: int = 0
-    """How many frames are known to be missing: that the camera took but nobody got, and that did
-    not arrive."""
+    """Known number of missing frames: not delivered by the camera, or lost on the way."""
 
     @property
     def duration(self) -> float:
-        """From the first tick to the last [s]."""
+        """Time from the first tick to the last [s]."""
         return self.ends - self.begins
 
 
 class TickHead(Struct, frozen=True, gc=False):
-    """As much of a `Tick` as a summary needs."""
+    """The fields of a `Tick` that a summary needs."""
 
     t: float
     seq: int
@@ -85,7 +84,7 @@ class TickHead(Struct, frozen=True, gc=False):
 
 
 class Tally:
-    """Adds up a recording, tick by tick, while it is written or read."""
+    """Running summary of a recording while it is written or read."""
 
     def __init__(self) -> None:
         self.gaps: list[Gap] = []
@@ -102,13 +101,13 @@ class Tally:
         self._frames = self._frame_gaps = self._frames_lost = 0
         self._last_frame: FrameHead | None = None
 
-    def measures_in(self, force_unit: str) -> None:
-        """Take note of the unit of the forces from now on."""
+    def set_force_unit(self, force_unit: str) -> None:
+        """Set the unit of the following forces."""
         if self._force_unit == "N":
             self._force_unit = force_unit
 
     def add(self, message: TickHead | Tick | Event | Status) -> None:
-        """Add any message."""
+        """Add a message of any kind."""
         if isinstance(message, Event):
             self.event(message)
         elif isinstance(message, Status):
@@ -117,7 +116,7 @@ class Tally:
             self.tick(message)
 
     def tick(self, tick: TickHead | Tick) -> bool:
-        """Add a tick; returns False where it is the first of another fishd."""
+        """Add a tick; return False if it is the first of another fishd."""
         last, self._last = self._last, tick
         self._ticks += 1
         if tick.mode == "running":
@@ -133,19 +132,19 @@ class Tally:
         if last is None:
             self._first_t = tick.t
             return True
-        same = tick.seq > last.seq
-        before = last.seq if same else 0  # another fishd counts from 1
+        is_same_fishd = tick.seq > last.seq
+        before = last.seq if is_same_fishd else 0  # another fishd counts from 1
         if tick.seq > before + 1:
             self.gaps.append(Gap(last.t, before + 1, tick.seq - before - 1))
-        if same:
+        if is_same_fishd:
             self._missed += max(0, tick.missed - last.missed)
         else:
             self._restarts += 1
-        return same
+        return is_same_fishd
 
     def status(self, status: Status) -> None:
-        """Add a status, which also shows another fishd whose ticks have higher numbers."""
-        if self._last and status.seq < self._last.seq:  # its next tick will show it
+        """Add a status, which also reveals another fishd whose ticks have higher numbers."""
+        if self._last and status.seq < self._last.seq:  # its next tick will reveal it
             return
         if self._pid not in (0, status.pid) and self._known == self._restarts:
             self._restarts += 1
@@ -157,9 +156,9 @@ class Tally:
         self._marks += event.kind == "mark"
 
     def frame(self, frame: FrameHead) -> int:
-        """Add a frame of a camera; returns how many are missing before it, 0 where none are.
+        """Add a frame of a camera; return the number of frames that are missing before it.
 
-        Of a camera that began anew nobody knows what is missing; that counts as one gap.
+        After a restart of the camera that number is unknown; the restart counts as one gap.
         """
         last, self._last_frame = self._last_frame, frame
         self._frames += 1
@@ -175,19 +174,19 @@ class Tally:
 
     @property
     def restarts(self) -> int:
-        """How often another fishd took the place of the one before."""
+        """Number of times that another fishd took over."""
         return self._restarts
 
     @property
     def seconds(self) -> float:
-        """From the first tick to the last [s]."""
+        """Time from the first tick to the last [s]."""
         return self._last.t - self._first_t if self._last else 0.0
 
     @property
     def summary(self) -> Summary:
-        """All that was added."""
-        swam = sum(self._swimming.values())
-        thrust = self._impulse / swam if swam else None
+        """Summary of everything added until now."""
+        swimming_ticks = sum(self._swimming.values())
+        thrust = self._impulse / swimming_ticks if swimming_ticks else None
         error = None
         if self._known_ticks:
             thrust, error = self._thrust / self._known_ticks, self._error / self._known_ticks
@@ -213,7 +212,7 @@ class Tally:
 
 
 def to_metadata(summary: Summary) -> dict[str, str]:
-    """Its fields as texts, each JSON, as MCAP's metadata wants them."""
+    """Return the fields as JSON texts, for MCAP's metadata."""
     return {
         name: msgspec.json.encode(value).decode()
         for name, value in msgspec.structs.asdict(summary).items()
@@ -224,7 +223,7 @@ _decode = decoder(Any)
 
 
 def from_metadata(data: dict[str, str]) -> Summary | None:
-    """The summary in the metadata of a recording; None if it was never written."""
+    """Return the summary in the metadata of a recording; None if it has none."""
     known = {name: data[name] for name in Summary.__struct_fields__ if name in data}
     try:
         raw = {name: _decode(value.encode()) for name, value in known.items()}

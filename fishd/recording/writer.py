@@ -1,6 +1,6 @@
-"""Writes one recording: an MCAP file that Foxglove, Lichtblick and PlotJuggler open.
+"""Writer of a recording: an MCAP file that Foxglove, Lichtblick and PlotJuggler open.
 
-docs/how-to/recording.md shows its layout.
+docs/how-to/recording.md describes its layout.
 """
 
 import time
@@ -25,19 +25,19 @@ from fishd.recording.provenance import Source, provenance
 from fishd.recording.schemas import CHANNELS, json_schema, schema_name
 from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
 
-CHUNK = 32 * 2**10
-"""A chunk is closed when it is longer; to close one stalls the writer for 0.5 ms [bytes]."""
-LATEST = 1e10
-"""No message is later than this: MCAP counts nanoseconds, in 64 bits [s, unix]."""
-CONFIG, CALIBRATIONS = "config.yaml", "calibrations.json"
+CHUNK_BYTES = 32 * 2**10
+"""Size at which a chunk is closed, which blocks the writer for 0.5 ms [bytes]."""
+MAX_TIME_S = 1e10
+"""Largest time of a message: MCAP counts nanoseconds in 64 bits [s, unix]."""
+CONFIG_ATTACHMENT, CALIBRATIONS_ATTACHMENT = "config.yaml", "calibrations.json"
 """Names of attachments."""
 
 
 class RunWriter:
-    """A recording that is being written: a publisher of ticks and events, and a context manager.
+    """A recording in progress: a publisher of ticks and events, and a context manager.
 
-    Until it is closed the file is called `<run>.mcap.part`. Whatever ends the process, all that was
-    flushed stays readable. A file is never overwritten.
+    Until it is closed, the file is named `<run>.mcap.part`. All flushed data stay readable, however
+    the process ends. A file is never overwritten.
     """
 
     def __init__(
@@ -51,13 +51,13 @@ class RunWriter:
         extra: Mapping[str, str] | None = None,
     ) -> None:
         """
-        path: of the finished file; `.mcap` is added where it is missing
-        source: what made the ticks: `fishd`, or `simulation` for a run in virtual time
-        operator: who recorded; by default the name of this user
-        subject: which fish, note: what for
-        extra: what else is to be kept with it, such as the point of a sweep
+        path: path of the finished file; `.mcap` is added if it is missing
+        source: origin of the ticks: `fishd`, or `simulation` for a run in virtual time
+        operator: name of the operator; by default this user
+        subject: name of the fish; note: purpose
+        extra: further metadata, such as the point of a sweep
 
-        Raises `RecordingError` where the file exists or cannot be made.
+        Raises `RecordingError` if the file exists or cannot be created.
         """
         path = Path(path)
         self.path = path if path.name.endswith(SUFFIX) else path.with_name(path.name + SUFFIX)
@@ -67,7 +67,7 @@ class RunWriter:
         self._file = PartFile(self.path)
         self._closed = False
         self._encode = msgspec.json.Encoder().encode
-        self._writer = Writer(self._file, CHUNK, CompressionType.ZSTD)  # type: ignore[arg-type]
+        self._writer = Writer(self._file, CHUNK_BYTES, CompressionType.ZSTD)  # type: ignore[arg-type]
         self._writer.start(profile="", library="fishd")
         self._writer.add_metadata("fishd.run", about)
         self._channels = {
@@ -86,7 +86,7 @@ class RunWriter:
         return self
 
     def __exit__(self, _: object, error: BaseException | None, __: object) -> None:
-        """Finish the file; where an error came before there was anything to keep, remove it."""
+        """Finish the file; remove it after an error before the first tick."""
         if error is not None and not self.tally.summary.ticks:
             self._file.remove()
             self._give_up()
@@ -94,47 +94,47 @@ class RunWriter:
 
     @property
     def part(self) -> Path:
-        """Where the recording is until it is closed."""
+        """Path of the recording until it is closed."""
         return self._file.path
 
     @property
     def size(self) -> int:
-        """How long the file is by now [bytes]."""
+        """Current size of the file [bytes]."""
         return self._file.tell()
 
     @property
     def gaps(self) -> list[Gap]:
-        """Where ticks are missing, so far."""
+        """Gaps until now."""
         return self.tally.gaps
 
     @property
     def summary(self) -> Summary:
-        """What was recorded so far."""
+        """Summary of the recording until now."""
         return self.tally.summary
 
     def free(self) -> int:
-        """Room left on its disk [bytes]."""
+        """Return the free space on its disk [bytes]."""
         return self._file.free()
 
     def describe(
         self, config: Config | Mapping[str, Any], daemon: Mapping[str, str] | None = None
     ) -> None:
-        """Keep the configuration that the ticks from now on are made with.
+        """Record the configuration of the following ticks.
 
-        To be called at the start, and again where another fishd takes over.
+        Call it at the start, and again when another fishd takes over.
 
-        daemon: what is to be known of that fishd, such as its process
-        Raises `RecordingError` when it cannot be written.
+        daemon: metadata of that fishd, such as its process
+        Raise `RecordingError` if it cannot be written.
         """
         number = str(self.tally.restarts)
         self._writer.add_metadata("fishd.daemon", {"number": number, **(daemon or {})})
-        self.tally.measures_in((daemon or {}).get("force_unit", "N"))
+        self.tally.set_force_unit((daemon or {}).get("force_unit", "N"))
         yaml = to_yaml(config if isinstance(config, Config) else dict(config))
-        self._attach(CONFIG, "application/yaml", yaml.encode())
+        self._attach(CONFIG_ATTACHMENT, "application/yaml", yaml.encode())
 
     def calibrated(self, calibrations: Calibrations) -> None:
-        """Keep the calibrations that are used from now on; raises `RecordingError`."""
-        self._attach(CALIBRATIONS, "application/json", self._encode(calibrations))
+        """Record the calibrations of the following ticks; raise `RecordingError`."""
+        self._attach(CALIBRATIONS_ATTACHMENT, "application/json", self._encode(calibrations))
 
     def tick(self, tick: Tick) -> None:
         """Record a tick."""
@@ -152,12 +152,12 @@ class RunWriter:
         self.tally.status(status)
 
     def frame(self, head: FrameHead, pixels: NDArray[np.uint8]) -> int:
-        """Record a frame of a camera; returns how many are missing before it.
+        """Record a frame of a camera; return the number of frames that are missing before it.
 
         pixels: shape (height, width)
-        Raises `MissingPackage` without OpenCV (extra: camera).
+        Raise `MissingPackage` without OpenCV (extra: camera).
         """
-        payload = images.encoded(head, pixels)
+        payload = images.encode_frame(head, pixels)
         if images.TOPIC not in self._channels:
             schema = self._writer.register_schema(images.SCHEMA, "jsonschema", images.json_schema())
             self._channels[images.TOPIC] = self._writer.register_channel(
@@ -167,22 +167,22 @@ class RunWriter:
         return self.tally.frame(head)
 
     def message(self, topic: str, payload: bytes) -> TickHead | Event | Status:
-        """Record a message of telemetry to the byte, and return what it says.
+        """Record the bytes of a message of telemetry, and return its content.
 
-        Raises `msgspec.DecodeError` for what is none, such as one whose `t` is not in 0…`LATEST`.
+        Raise `msgspec.DecodeError` if it is invalid, for example if `t` is not in 0…`MAX_TIME_S`.
         """
         head = _DECODERS[topic](payload)
-        if not 0.0 <= head.t <= LATEST:
-            raise msgspec.ValidationError(f"t = {head.t:g} is no time")
+        if not 0.0 <= head.t <= MAX_TIME_S:
+            raise msgspec.ValidationError(f"t = {head.t:g} is not a valid time")
         self._add(topic, head.t, 0 if isinstance(head, Event) else head.seq, payload)
         self.tally.add(head)
         return head
 
     def flush(self, *, sync: bool = False) -> None:
-        """Hand all to the kernel, so that the end of this process loses none of it.
+        """Write all data to the kernel, so that the end of this process loses none.
 
-        sync: wait until the disk has it, so that a power cut loses none of it either
-        Raises `RecordingError`.
+        sync: wait until they are on the disk, so that a power cut loses none either
+        Raise `RecordingError`.
         """
         try:
             self._writer.flush()  # type: ignore[no-untyped-call]
@@ -192,10 +192,10 @@ class RunWriter:
             raise self._failed(error) from None
 
     def close(self, reason: str = "ended") -> None:
-        """Finish the file and give it its name; may be called twice.
+        """Finish the file and give it its final name; may be called twice.
 
-        reason: why it ends, kept in the file
-        Raises `RecordingError`; the `.part` is readable all the same.
+        reason: reason of the end, stored in the file
+        Raise `RecordingError`; the `.part` then stays readable.
         """
         if self._closed:
             return
@@ -212,7 +212,7 @@ class RunWriter:
         self._give_up()
 
     def _give_up(self) -> None:
-        """Nothing more is written."""
+        """Close the file, and write nothing more."""
         self._closed = True
         self._file.close()
 
@@ -227,8 +227,8 @@ class RunWriter:
     def _add(self, topic: str, t: float, seq: int, payload: bytes) -> None:
         if self._closed:
             raise RecordingError(f"{self.path}: the recording has ended")
-        if not t <= LATEST:
-            raise RecordingError(f"{self.path}: t = {t:g} is no time")
+        if not t <= MAX_TIME_S:
+            raise RecordingError(f"{self.path}: t = {t:g} is not a valid time")
         nanoseconds = max(0, round(t * 1e9))
         channel = self._channels[topic]
         try:
@@ -239,8 +239,10 @@ class RunWriter:
     def _failed(self, error: OSError) -> RecordingError:
         self._give_up()
         what = f"{self.part}: the recording ends after {self.tally.seconds:.0f} s"
-        kept = f"what was written is readable; with more room: fishctl recover {self.part}"
-        return RecordingError(f"{what}: {error.strerror or error}; {kept}")
+        remedy = (
+            f"the written part is readable; free some space, then run fishctl recover {self.part}"
+        )
+        return RecordingError(f"{what}: {error.strerror or error}; {remedy}")
 
 
 _DECODERS: dict[str, Callable[[bytes], TickHead | Event | Status]] = {

@@ -23,7 +23,7 @@ from fishd.client import Fish
 from fishd.core.errors import RecordingError
 from fishd.core.signals import Tick
 from fishd.recording import Run, open_run
-from fishd.recording.folder import find
+from fishd.recording.folder import find_recording
 
 
 class Recording(Process):
@@ -124,7 +124,7 @@ def test_a_kill_of_fishd_loses_nothing_and_the_next_one_is_recorded_too(
         wait_until(lambda: whose(runs) == 2)
         _, _, complaints = recording.end()
     run = open_run(runs / "run.mcap")
-    assert "another fishd has taken over: the recording goes on with it" in complaints
+    assert "another fishd has taken over: the recording continues with it" in complaints
     before = [tick.seq for tick in run.ticks if tick.controller == "swing"]
     assert before[-1] >= heard[-1]
     assert before == list(range(before[0], before[-1] + 1))
@@ -148,7 +148,7 @@ def test_a_kill_of_the_recorder_leaves_a_file_to_recover(daemon: Daemon, runs: P
     done = fishctl("recover", "run", "--folder", str(runs))
     assert done.stdout.startswith(f"{runs}/run.mcap: ")
     assert open_run(runs / "run.mcap").ticks == ticks
-    assert find("latest", runs) == runs / "run.mcap"
+    assert find_recording("latest", runs) == runs / "run.mcap"
 
 
 def test_a_disk_that_is_full_ends_the_recording_and_fishd_is_told(
@@ -163,8 +163,9 @@ def test_a_disk_that_is_full_ends_the_recording_and_fishd_is_told(
         ended = call("bash", "-c", f"{limit} --folder {runs}", env=uncompiled)
         told = next(event for event in events if event.kind == "mark")
     _, complaint = ended.stderr.splitlines()
-    assert "File too large; what was written is readable; with more room: fishctl recover" in (
-        complaint
+    assert (
+        "File too large; the written part is readable; free some space, then run fishctl recover"
+        in (complaint)
     )
     assert ended.returncode == 1
     assert told.message.startswith("recording run.mcap ended: ")
@@ -181,7 +182,7 @@ def test_where_there_is_no_fishd_or_the_name_is_taken_nothing_is_begun(
     assert "start one with 'fishd'" in one_line(nobody)
     (runs / "run.mcap").touch()
     taken = daemon.fishctl("record", "run", "--folder", str(runs))
-    assert "is there already; choose another name" in one_line(taken)
+    assert "already exists; choose another name" in one_line(taken)
     assert [path.name for path in runs.iterdir()] == ["run.mcap"]
 
 

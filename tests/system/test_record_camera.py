@@ -78,13 +78,14 @@ def test_a_camera_that_dies_ends_nothing_and_is_recorded_again_once_it_is_back(
     sessions = {head.session for head in heads_in(runs)}
     with running_camera(tmp_path, *watching(daemon)):
         wait_until(lambda: {head.session for head in heads_in(runs)} > sessions)
-        wait_until(lambda: "is there again" in marks_in(runs))
+        wait_until(lambda: "is back" in marks_in(runs))
     status, _, complaints = process.end(signal.SIGINT)
     assert status == 0
-    assert "fishctl: no frames come from the camera: it does not answer; the recording goes on" in (
-        complaints.splitlines()
+    assert (
+        "fishctl: no frames come from the camera: it does not answer; the recording continues"
+        in (complaints.splitlines())
     )
-    assert "fishctl: the camera is there again: its frames are recorded" in complaints.splitlines()
+    assert "fishctl: the camera is back: its frames are recorded" in complaints.splitlines()
     run = open_run(runs / "run.mcap")
     assert run.summary.frame_gaps >= 1
     assert run.gaps == []

@@ -41,7 +41,7 @@ class Outcome(Struct, frozen=True):
 def run_verb(verb: str, file: Path, out: Path) -> Outcome:
     """Run a verb on a file in this process; out: a folder for what it writes."""
     words = [word.format(file=file, parent=file.parent, out=out) for word in VERBS[verb].split()]
-    replay.JOINING = 0.0  # there is no subscriber
+    replay.SUBSCRIBER_WAIT_S = 0.0  # there is no subscriber
     begun = time.process_time()
     status, printed, error = None, "", ""
     try:

@@ -6,7 +6,7 @@ import click
 
 from fishd.cli.output import echo, format_count
 from fishd.recording import Run, open_run
-from fishd.recording.folder import FOLDER_VARIABLE, find
+from fishd.recording.folder import FOLDER_VARIABLE, find_recording
 
 folder_option = click.option(
     "--folder",
@@ -21,7 +21,7 @@ def open_recording(name: str, folder: Path | None) -> Run:
 
     Raises `RecordingError`.
     """
-    run = open_run(find(name, folder))
+    run = open_run(find_recording(name, folder))
     if run.is_damaged:
         echo(f"fishctl: {run.path}: {format_damage(run.damaged, run.damage_reason)}", err=True)
     return run

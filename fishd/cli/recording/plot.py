@@ -10,7 +10,7 @@ from fishd.cli.output import print_paths
 from fishd.cli.recording.choice import folder_option, open_recording
 from fishd.lab.run_figure import draw_run
 from fishd.lab.run_traces import traces
-from fishd.recording.folder import check_new
+from fishd.recording.folder import check_new_files
 
 
 @click.command()
@@ -52,7 +52,7 @@ def plot(
     run_traces = traces(recorded, begin, math.inf if end is None else end)
     forms = [only] if only else ["png", "html"]
     paths = {form: target / f"{recorded.name}.{form}" for form in forms}
-    check_new(paths.values(), replace=force)
+    check_new_files(paths.values(), replace=force)
     if "png" in paths:
         draw_run(run_traces, paths["png"])
     if "html" in paths:

@@ -21,7 +21,7 @@ from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
-from fishd.recording.folder import made, named, new_path, runs_folder
+from fishd.recording.folder import ensure_folder, new_path, recording_path, runs_folder
 from fishd.recording.recorder import Recorder
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def record(
         raise click.UsageError("a black box keeps no frames: they would fill it within hours")
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     if black_box:
-        box = BlackBox(made(folder or runs_folder()), keep, begin)
+        box = BlackBox(ensure_folder(folder or runs_folder()), keep, begin)
         open_recorder = partial(Recorder, endpoint, box.open, tell=_print_line, due=box.due)
         _record_endlessly(open_recorder, _StopSignals(), seconds, as_json)
         return
@@ -160,9 +160,9 @@ def record_one(
     begin: opens the recording at a path; seconds: longest duration [s]
     """
     stopping = _StopSignals()
-    place = made(folder or runs_folder())
+    place = ensure_folder(folder or runs_folder())
     progress = _draw if sys.stdout.isatty() and not as_json else lambda writer: None
-    path = named(run, place) if run else new_path(place)
+    path = recording_path(run, place) if run else new_path(place)
     recorder = Recorder(
         endpoint, partial(begin, path), tell=_print_line, progress=progress, camera=camera
     )

@@ -9,7 +9,7 @@ from fishd.cli.options import json_option
 from fishd.cli.output import echo, format_count, print_json
 from fishd.cli.recording.choice import folder_option, format_damage
 from fishd.recording import open_run
-from fishd.recording.folder import find
+from fishd.recording.folder import find_recording
 from fishd.recording.recover import recover as finish
 
 
@@ -23,7 +23,7 @@ def recover(file: str, folder: Path | None, as_json: bool) -> None:
     FILE is a path, a name in the folder of recordings, or 'latest'. NAME.mcap.part becomes
     NAME.mcap; a file of another name stays unchanged, and NAME-recovered.mcap is written beside it.
     """
-    path = find(file, folder)
+    path = find_recording(file, folder)
     damaged = open_run(path)
     run = finish(path)
     summary = run.summary

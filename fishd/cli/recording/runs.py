@@ -16,7 +16,7 @@ from fishd.core import text
 from fishd.core.console import format_power
 from fishd.core.errors import ConfigError, RecordingError
 from fishd.lab.experiment import Header, count_rows, list_experiments
-from fishd.recording.folder import Glance, glances, runs_folder
+from fishd.recording.folder import Overview, read_overviews, runs_folder
 from fishd.recording.summary import Summary
 
 PIPE_COLUMNS = 1000
@@ -36,8 +36,8 @@ def runs(folder: Path | None, as_json: bool) -> int:
     fishd that are not in the file.
     """
     place = folder or runs_folder()
-    recordings = list(glances(place))
-    readable = [entry for entry in recordings if isinstance(entry, Glance)]
+    recordings = list(read_overviews(place))
+    readable = [entry for entry in recordings if isinstance(entry, Overview)]
     experiments = [_ExperimentSummary.read(*entry) for entry in list_experiments(place)]
     if as_json:
         print_json([*map(_to_json, readable), *experiments])
@@ -98,7 +98,7 @@ def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
     Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
 
 
-def _to_json(glance: Glance) -> dict[str, Any]:
+def _to_json(glance: Overview) -> dict[str, Any]:
     return {
         "kind": "recording",
         "name": glance.name,
@@ -111,7 +111,7 @@ def _to_json(glance: Glance) -> dict[str, Any]:
     }
 
 
-def _print_recordings(recordings: list[Glance]) -> None:
+def _print_recordings(recordings: list[Overview]) -> None:
     from rich.console import Console
     from rich.table import Table
 
@@ -156,7 +156,7 @@ def _format_thousandths(value: float) -> str:
     return f"{thousandths:.2f}" if abs(thousandths) < 1e6 else f"{thousandths:.3g}"
 
 
-def _format_remarks(glance: Glance) -> list[str]:
+def _format_remarks(glance: Overview) -> list[str]:
     state = _format_state(glance)
     restarts = glance.summary.restarts
     return [
@@ -176,7 +176,7 @@ def _format_frames(summary: Summary) -> str:
     return f"{frames}, {gaps}" if summary.frame_gaps else frames
 
 
-def _format_state(glance: Glance) -> str:
+def _format_state(glance: Overview) -> str:
     if glance.writing:
         return "recording"
     return "finished" if glance.finished else "unfinished"

@@ -11,7 +11,7 @@ from fishd.core import text
 from fishd.lab.swimmer import midline_figure
 from fishd.lab.swimmer.envelope import compute_envelope
 from fishd.lab.swimmer.files import read_midlines
-from fishd.recording.folder import check_new
+from fishd.recording.folder import check_new_files
 
 
 @click.command()
@@ -34,7 +34,7 @@ def midlines(
     FILE-midlines.png.
     """
     path = target / f"{file.stem}-midlines.{form}"
-    check_new([path], replace=force)
+    check_new_files([path], replace=force)
     envelope = compute_envelope(*read_midlines(file), settle)
     beats = len(envelope.periods)
     frequency = beats / float(envelope.periods.sum())

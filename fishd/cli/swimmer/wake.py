@@ -9,7 +9,7 @@ from fishd.cli.output import print_paths
 from fishd.cli.swimmer.options import picture_options
 from fishd.lab.swimmer import view, wake_figure
 from fishd.lab.swimmer.files import restore_fish
-from fishd.recording.folder import check_new
+from fishd.recording.folder import check_new_files
 from fishd.virtual.swimmer import checkpoint
 
 
@@ -56,7 +56,7 @@ def wake(
             "--limit applies to one field, and there are several: give one --field"
         )
     paths = {field: target / f"{file.stem}-{field}.{form}" for field in fields}
-    check_new(paths.values(), replace=force)
+    check_new_files(paths.values(), replace=force)
     fish = restore_fish(checkpoint.load(file))
     window = (view.whole_window if whole else view.window_around)(fish.settings)
     for field, path in paths.items():

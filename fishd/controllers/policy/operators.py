@@ -62,9 +62,9 @@ def check(model: "ModelProto") -> None:
         raise PolicyError("it is a model that trains itself; export it for inference")
     versions = [entry.version for entry in model.opset_import if entry.domain in _OWN]
     if len(versions) != 1 or versions[0] not in OPSETS:
-        error_message = ", ".join(map(str, versions)) or "none"
+        version_list = ", ".join(map(str, versions)) or "none"
         raise PolicyError(
-            f"its version of ONNX's operators: {error_message}; one from {OPSETS[0]} to "
+            f"its version of ONNX's operators: {version_list}; one from {OPSETS[0]} to "
             f"{OPSETS[-1]} is "
             "needed"
         )

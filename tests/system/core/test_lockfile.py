@@ -25,13 +25,13 @@ with locked(Path(sys.argv[1])):
 def test_a_lock_names_the_process_that_holds_it_and_ends_when_it_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "control"
     command = [sys.executable, "-c", HOLDER, str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as find_lock_holder:
-        assert find_lock_holder.stdout is not None
-        assert find_lock_holder.stdout.readline() == "held\n"
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
         with pytest.raises(LockHeld) as caught, locked(path):
             pass
-        assert caught.value.pid == str(find_lock_holder.pid)
-        find_lock_holder.kill()
+        assert caught.value.pid == str(process.pid)
+        process.kill()
     with locked(path):
         assert lock_path(path).read_text() == f"{os.getpid()}\n"
 

@@ -75,7 +75,7 @@ def test_a_client_sees_the_replay_and_cannot_steer_it(tmp_path: Path) -> None:
             assert (after.mode, after.controller) == ("running", "swing")
             assert after.seq >= second.seq
             assert fish.config()["tick"] == 0.05
-            with pytest.raises(Refused, match="it can be watched, not steered"):
+            with pytest.raises(Refused, match="it can be watched, but not controlled"):
                 fish.stop()
     finally:
         ended = player.end(signal.SIGINT)[0]
@@ -89,7 +89,7 @@ def test_an_address_in_use_is_said_in_one_line(replay: Replay, tmp_path: Path) -
         Replay(replay._run, "tcp://127.0.0.1:0", replay.control)
     with pytest.raises(StartupError, match="a fishd or another replay"):
         Replay(replay._run, replay.control, f"ipc://{tmp_path}/other")
-    with pytest.raises(StartupError, match="is no address to serve"):
+    with pytest.raises(StartupError, match="is not an address to listen on"):
         Replay(replay._run, "nonsense", f"ipc://{tmp_path}/other")
 
 

@@ -35,7 +35,7 @@ def test_the_wake_is_drawn_from_a_checkpoint(swum: Path, tmp_path: Path) -> None
     names = ["end-vorticity.png", "end-speed.png"]
     assert done.stdout.split() == [str(tmp_path / name) for name in names]
     assert all((tmp_path / name).stat().st_size > 20_000 for name in names)
-    assert "is there already; --force replaces it" in one_line(fishctl(*words))
+    assert "already exists; use --force to replace it" in one_line(fishctl(*words))
     assert fishctl(*words, "--force", "--field", "pressure", "--limit", "5").returncode == 0
 
 

@@ -7,7 +7,7 @@ from rigs.recordings import recorded, swum
 
 from fishd.recording import RunWriter, open_run
 from fishd.recording.black_box import BlackBox
-from fishd.recording.folder import paths
+from fishd.recording.folder import list_recordings
 
 KEEP = 600_000
 
@@ -30,7 +30,7 @@ def test_the_oldest_files_make_room_and_nobody_elses(tmp_path: Path) -> None:
     mine = recorded(swum(), tmp_path / "mine")
     box = BlackBox(tmp_path, KEEP, RunWriter)
     fill(box, tmp_path, 6)
-    oldest = next(path for path in paths(tmp_path) if path != mine).stat().st_mtime_ns
+    oldest = next(path for path in list_recordings(tmp_path) if path != mine).stat().st_mtime_ns
     fill(box, tmp_path, 6)
     assert mine.exists()
     kept = list(tmp_path.glob("blackbox-*"))
@@ -60,7 +60,7 @@ def test_a_file_that_a_power_cut_left_is_finished_at_the_next_start(tmp_path: Pa
 def test_a_full_disk_costs_the_oldest_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     box = BlackBox(tmp_path, KEEP, RunWriter)
     fill(box, tmp_path, 3)
-    oldest, *others = paths(tmp_path)
+    oldest, *others = list_recordings(tmp_path)
     writer = box.open()
     monkeypatch.setattr(RunWriter, "free", lambda self: 2 * 16 * 2**20 - 1)
     box.due(writer)

@@ -19,7 +19,7 @@ from fishd.core.errors import RecordingError
 from fishd.core.signals import Tick
 from fishd.recording import RunWriter, open_run
 from fishd.recording.export import export
-from fishd.recording.folder import glance
+from fishd.recording.folder import read_overview
 from fishd.recording.images import FrameHead
 from fishd.recording.recover import recover
 
@@ -127,7 +127,7 @@ def test_missing_frames_and_a_new_camera_are_counted_as_gaps(
         ]  # fmt: skip
         lost = [writer.frame(each, frames[0].pixels) for each in heads]
     assert lost == [0, 0, 2, 3, 0]
-    for summary in (open_run(writer.path).summary, glance(writer.path).summary):
+    for summary in (open_run(writer.path).summary, read_overview(writer.path).summary):
         assert (summary.frames, summary.frames_lost, summary.frame_gaps) == (5, 5, 3)
 
 
@@ -155,7 +155,7 @@ def test_frames_are_exported_as_one_array_with_a_table_of_their_times(
     assert all((one == frame.pixels).all() for one, frame in zip(array, frames, strict=True))
     times = pandas.read_csv(tmp_path / "run-frames.csv")
     assert list(times.time) == [frame.time for frame in frames]
-    with pytest.raises(RecordingError, match="--force replaces it"):
+    with pytest.raises(RecordingError, match="use --force to replace it"):
         export(open_run(path), tmp_path, "csv")
 
 

@@ -21,8 +21,8 @@ from fishd.core.errors import NoDaemon, RecordingError, Refused
 from fishd.core.signals import Tick
 from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording import recorder as recorder_module
-from fishd.recording.camera_tap import Taken
-from fishd.recording.folder import find, glance, glances, paths
+from fishd.recording.camera_tap import TapOutput
+from fishd.recording.folder import find_recording, list_recordings, read_overview, read_overviews
 from fishd.recording.recorder import Description, Recorder
 from fishd.recording.recover import recover
 from fishd.recording.summary import Tally
@@ -64,9 +64,12 @@ def test_its_thrust_is_the_mean_over_all_its_swimming() -> None:
 def test_an_older_recording_is_never_overwritten(tmp_path: Path) -> None:
     path = recorded(swum(), tmp_path / "run.mcap")
     before = path.read_bytes()
-    with pytest.raises(RecordingError, match="is there already; choose another name"):
+    with pytest.raises(RecordingError, match="already exists; choose another name"):
         RunWriter(path)
-    with RunWriter(tmp_path / "other"), pytest.raises(RecordingError, match="that runs or was not"):
+    with (
+        RunWriter(tmp_path / "other"),
+        pytest.raises(RecordingError, match="in progress or not finished"),
+    ):
         RunWriter(tmp_path / "other")
     assert path.read_bytes() == before
 
@@ -75,7 +78,7 @@ def test_ticks_that_are_missing_are_counted(tmp_path: Path) -> None:
     ticks = swum().recorder.ticks
     again = swum(1.0).recorder.ticks
     path = write(tmp_path / "run", [*ticks[:10], *ticks[13:], *again[2:]])
-    for summary in (open_run(path).summary, glance(path).summary):
+    for summary in (open_run(path).summary, read_overview(path).summary):
         assert (summary.gaps, summary.lost, summary.restarts) == (2, 5, 1)
     assert open_run(path).gaps == [Gap(ticks[9].t, 11, 3), Gap(ticks[-1].t, 1, 2)]
 
@@ -87,7 +90,7 @@ def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> Non
     for share in (0.3, 0.7, 0.999):
         part = tmp_path / f"cut{share}.mcap.part"
         part.write_bytes(content[: int(share * len(content))])
-        (cut,) = (each for each in glances(tmp_path) if each.path == part)
+        (cut,) = (each for each in read_overviews(tmp_path) if each.path == part)
         assert not cut.finished
         run = recover(part)
         assert run.path == tmp_path / f"cut{share}.mcap"
@@ -95,7 +98,7 @@ def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> Non
         assert run.finished
         assert run.reason.startswith("recovered")
         assert run.ticks == ticks[: len(run.ticks)]
-        assert glance(run.path).summary == run.summary
+        assert read_overview(run.path).summary == run.summary
         kept.append(len(run.ticks))
     assert kept == sorted(kept)
     assert kept[0] < kept[-1] == len(ticks)
@@ -103,9 +106,9 @@ def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> Non
 
 def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
     with RunWriter(tmp_path / "run") as writer:
-        assert glance(writer.part).writing
+        assert read_overview(writer.part).writing
         with pytest.raises(
-            RecordingError, match="is being recorded now, or recovered; end that first"
+            RecordingError, match="is being recorded or recovered; end that process first"
         ):
             recover(writer.part)
 
@@ -148,7 +151,7 @@ def test_a_recording_killed_while_it_got_its_name_gets_it_from_a_recovery(tmp_pa
     assert whole.read_bytes() == content
     part.write_bytes(content[: len(content) // 2])
     whole.write_bytes(recorded(swum(), tmp_path / "other").read_bytes())
-    with pytest.raises(RecordingError, match=r"run\.mcap is there already; move it away first"):
+    with pytest.raises(RecordingError, match=r"run\.mcap already exists; move it away first"):
         recover(part)
 
 
@@ -167,7 +170,7 @@ def test_a_damaged_byte_costs_its_chunk_at_most_and_is_told(tmp_path: Path) -> N
         worst = max(worst, lost := len(ticks) - len(read))
         assert run.ticks == [tick for tick in ticks if tick.seq in read]
         assert run.damaged == lost, offset
-        assert glance(path).damaged == (lost if run.is_damaged else None)
+        assert read_overview(path).damaged == (lost if run.is_damaged else None)
         assert run.finished
     assert worst == 10
 
@@ -221,7 +224,7 @@ def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
             writer.tick(tick)
             writer.flush()
 
-    with pytest.raises(RecordingError, match="No space left on device; what was written is reada"):
+    with pytest.raises(RecordingError, match="No space left on device; the written part is reada"):
         record()
     with pytest.raises(RecordingError, match="has ended"):
         writer.tick(ticks[0])
@@ -242,12 +245,12 @@ def test_messages_from_no_time_are_left_out_and_counted(tmp_path: Path) -> None:
         recorder._take("tick", msgspec.json.encode(tick))
     recorder.__exit__(None, None, None)
     assert said == [
-        "a message of topic tick is none of fishd's: left out",
-        "messages that are none of fishd's, left out: 3",
+        "a message of topic tick is not fishd's: ignored",
+        "messages that are not fishd's, ignored: 3",
     ]
     run = open_run(tmp_path / "run.mcap")
     assert run.ticks == ticks[:2]
-    assert run.summary == glance(run.path).summary
+    assert run.summary == read_overview(run.path).summary
 
 
 @pytest.mark.parametrize("seq", [3, 30], ids=["lower", "higher"])
@@ -267,7 +270,7 @@ def test_it_is_told_once_that_another_fishd_has_taken_over(
         hear(recorder, tick, pid=2)
     recorder.__exit__(None, None, None)
     assert [line for line in said if "another fishd" in line] == [
-        "another fishd has taken over: the recording goes on with it"
+        "another fishd has taken over: the recording continues with it"
     ]
     run = open_run(tmp_path / "run.mcap")
     assert run.summary.restarts == 1
@@ -308,8 +311,8 @@ def test_what_fishd_could_not_be_told_of_the_camera_it_is_told_later(
     class Camera:
         news: ClassVar = [["it is gone"], [], ["it is back", "and again"], ["and well"]]
 
-        def take(self) -> Taken:
-            return Taken(self.news.pop(0), [])
+        def take(self) -> TapOutput:
+            return TapOutput(self.news.pop(0), [])
 
     monkeypatch.setattr(recorder_module, "Fish", Fishd)
     recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=lambda line: None)
@@ -322,7 +325,7 @@ def test_what_fishd_could_not_be_told_of_the_camera_it_is_told_later(
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
-        (lambda path: path.write_text("t,fx\n0,1\n" * 100), "is no MCAP file"),
+        (lambda path: path.write_text("t,fx\n0,1\n" * 100), "is not an MCAP file"),
         (lambda path: path.mkdir(), "cannot be read: Is a directory"),
         (lambda path: None, "cannot be read: No such file"),
     ],
@@ -341,14 +344,19 @@ def test_what_is_no_regular_file_is_no_recording_of_a_folder(tmp_path: Path) -> 
     os.mkfifo(tmp_path / "pipe.mcap.part")
     (tmp_path / "folder.mcap").mkdir()
     (tmp_path / "link.mcap").symlink_to(path)
-    assert {found.name for found in paths(tmp_path)} == {"run.mcap", "link.mcap"}
-    assert len(list(glances(tmp_path))) == 2
+    assert {found.name for found in list_recordings(tmp_path)} == {"run.mcap", "link.mcap"}
+    assert len(list(read_overviews(tmp_path))) == 2
 
 
 def test_a_name_means_a_recording_of_the_folder(tmp_path: Path) -> None:
     path = recorded(swum(0.2), tmp_path / "morning")
-    assert find("morning", tmp_path) == find(str(path)) == find("latest", tmp_path) == path
+    assert (
+        find_recording("morning", tmp_path)
+        == find_recording(str(path))
+        == find_recording("latest", tmp_path)
+        == path
+    )
     with pytest.raises(RecordingError, match="did you mean 'morning'"):
-        find("mornin", tmp_path)
-    with pytest.raises(RecordingError, match="there is no recording in"):
-        find("latest", tmp_path / "nowhere")
+        find_recording("mornin", tmp_path)
+    with pytest.raises(RecordingError, match="contains no recording"):
+        find_recording("latest", tmp_path / "nowhere")

@@ -33,7 +33,7 @@ def test_a_table_has_every_bit_of_every_tick(path: Path, tmp_path: Path, form: s
         assert found[name].tolist() == [getattr(tick, name) for tick in open_run(path).ticks]
     assert reader(events)["kind"].tolist() == ["controller", "mode", "parameters"]
     again = fishctl("export", str(path), f"--{form}", "--to", str(tmp_path))
-    assert "is there already; --force replaces it" in one_line(again)
+    assert "already exists; use --force to replace it" in one_line(again)
     assert fishctl("export", str(path), f"--{form}", "--to", str(tmp_path), "--force").stdout
     if form == "parquet":
         about = json.loads(pyarrow.parquet.read_schema(table).metadata[b"fishd"])
@@ -50,7 +50,7 @@ def test_a_recording_is_drawn_as_picture_and_as_page(path: Path, tmp_path: Path)
     assert "Plotly.newPlot" in html
     assert "<b>stiff</b>" not in html
     refused = fishctl("plot", str(path), "--to", str(tmp_path))
-    assert "is there already; --force replaces it" in one_line(refused)
+    assert "already exists; use --force to replace it" in one_line(refused)
     nothing = fishctl("plot", str(path), "--from", "9", "--to", str(tmp_path))
     assert "no tick between these times; the recording is 3.0 s long" in one_line(nothing)
 
@@ -97,7 +97,7 @@ def test_recordings_are_listed_with_what_is_missing(path: Path, tmp_path: Path) 
     (tmp_path / "broken.mcap").write_text("nothing")
     done = fishctl("runs", "--folder", str(tmp_path))
     assert re.search(r"^second .* 50 +10 +0  swing", done.stdout, re.MULTILINE)
-    assert "broken.mcap is no MCAP file" in done.stderr
+    assert "broken.mcap is not an MCAP file" in done.stderr
     (listed,) = json.loads(fishctl("runs", "--json", "--folder", str(path.parent)).stdout)
     assert (listed["name"], listed["state"], listed["lost"]) == ("run", "finished", 0)
     nothing = fishctl("runs", "--folder", str(tmp_path / "none"))
