@@ -74,7 +74,7 @@ def open_robot(
                 release_recipe.remove(str(control))
 
         stack.push(remove_recipe)
-        if not config.has_hardware:
+        if not config.kind.has_hardware:
             release_recipe.write_without_servo(str(control))
     if config.robot == "simulated":
         if file and not (release_recipe.read(str(file)) or {}).get("fresh"):

@@ -104,7 +104,7 @@ def check(file: Path, overrides: tuple[str, ...], as_json: bool) -> None:
     loaded = load(file, overrides)
     echo(f"{file}: good")
     permitted = pulses.format_reach(loaded.servo, loaded.amplitude_limit)
-    if permitted and loaded.has_hardware:
+    if permitted and loaded.kind.has_hardware:
         echo(f"servo.lowest and servo.highest permit {permitted}, amplitude_limit")
 
 

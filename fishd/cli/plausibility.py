@@ -56,7 +56,7 @@ def _compare_with_best(
         config = read_config()
     except FishdError:  # the verb itself reports it
         return {}
-    if config is None or config.robot == "swimmer":
+    if config is None or not config.kind.is_tethered:
         return {}
     best = best_square_wave(config.plant, config.amplitude_limit).thrust
     return {

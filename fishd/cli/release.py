@@ -44,7 +44,7 @@ def release(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> int
     config, source = _load_without_bad_folder(file, overrides)
     service_result = os.environ.get("SERVICE_RESULT")
     prefix = f"the service ended with '{service_result}': " if service_result else ""
-    if config.has_hardware:
+    if config.kind.has_hardware:
         done = prefix + _release(config)
         with output_may_fail(done):
             _print(done, as_json)
@@ -72,7 +72,7 @@ def release_by_config(no_answer: NoDaemon, file: Path | None) -> str:
     no_answer: error to report if no configuration names a servo
     """
     config, source = _load_without_bad_folder(file, ())
-    if config.has_hardware:
+    if config.kind.has_hardware:
         return _release(config)
     if source is None:
         raise click.ClickException(

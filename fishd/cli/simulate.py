@@ -80,7 +80,7 @@ def _simulate(
     from fishd.lab.simulation import simulate as run
 
     config = load(file, overrides)
-    is_swimmer = config.robot == "swimmer"
+    is_swimmer = not config.kind.is_tethered
     if settle is None:
         settle = DEFAULT_SETTLE_S if is_swimmer else 10.0
     with ExitStack() as stack:

@@ -21,6 +21,7 @@ from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.overrides import apply_overrides
 from fishd.core.protocol import DEFAULT_LEASE_S, MAX_LEASE_S, MIN_LEASE_S
+from fishd.core.robots import ROBOTS, RobotKind
 from fishd.core.schema import (
     Problem,
     convert,
@@ -222,9 +223,9 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     realtime: Annotated[RealtimeSettings, note("Scheduling and memory.")] = RealtimeSettings()
 
     @property
-    def has_hardware(self) -> bool:
-        """Whether the robot has a force sensor and a servo, real or emulated."""
-        return self.robot in ("pi", "virtual-pi")
+    def kind(self) -> RobotKind:
+        """Properties of the robot."""
+        return ROBOTS[self.robot]
 
     @property
     def driver_settings(self) -> drivers.DriverSettings:
@@ -238,10 +239,10 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             amplitude=self.amplitude_limit,
             tick=self.tick,
             scaled=self.estimator.kind != "lateral_force",
-            virtual=self.lockstep or self.robot == "swimmer",
+            virtual=self.lockstep or not self.kind.is_real_time,
             dwell=self._dwell,
             chatter=self.chatter,
-            tethered=self.robot != "swimmer",
+            tethered=self.kind.is_tethered,
             thrust_coefficient=(
                 self.plant.thrust_coefficient if self.estimator.kind == "observer" else None
             ),
@@ -252,7 +253,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         """Shortest time between two reversals of a policy [s]."""
         if self.chatter.dwell != "auto":
             return self.chatter.dwell
-        if self.robot == "swimmer":  # it has muscles instead of a servo
+        if not self.kind.is_tethered:  # it has muscles instead of a servo
             return DWELL
         shortest = min(shortest_dwell(self.plant, self.amplitude_limit), LONGEST_DWELL)
         return round(math.ceil(shortest / self.tick - 1e-9) * self.tick, 9)
@@ -314,7 +315,7 @@ def _warn_of_values(config: Config, sources: Mapping[tuple[str, ...], str]) -> N
 
 def check_tethered(robot: str, what: str) -> None:
     """Raise `ConfigError` if the fish swims freely; what: name of what needs a tethered fish."""
-    if robot == "swimmer":
+    if not ROBOTS[robot].is_tethered:
         raise ConfigError(
             f"robot: swimmer is not valid for {what}, which needs the thrust of a tethered fish; "
             "set robot: simulated, or use 'fishctl simulate' for a swimmer"
@@ -336,7 +337,7 @@ CHECKS: tuple[Check, ...] = (
     lambda c: checks.check_lockstep(c.robot, c.lockstep),
     lambda c: checks.check_estimator(c.robot, c.estimator.kind, c.plant),
     lambda c: checks.check_virtual_pi(c.virtual_pi),
-    lambda c: checks.check_swimmer(c.swimmer, c.tick) if c.robot == "swimmer" else None,
+    lambda c: checks.check_swimmer(c.swimmer, c.tick) if not c.kind.is_tethered else None,
 )
 """Checks of keys against each other, in order; each raises `Problem`."""
 

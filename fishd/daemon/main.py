@@ -62,9 +62,9 @@ class Daemon:
         self._file = file
         self._print_status = print_status
         self._slow = (
-            SlowMotion(config.tick, config.swimmer.slow_motion)
-            if config.robot == "swimmer"
-            else None
+            None
+            if config.kind.is_real_time
+            else SlowMotion(config.tick, config.swimmer.slow_motion)
         )
         self._clock = SlowClock() if self._slow else _clock(config)
         self._virtual = isinstance(self._clock, VirtualClock)

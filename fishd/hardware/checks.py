@@ -6,6 +6,8 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+from fishd.core.robots import ROBOTS
+
 START_VIRTUAL_PI = "fishctl virtual-pi run"
 """Remedy if no virtual Pi is running."""
 
@@ -67,7 +69,7 @@ class Check(NamedTuple):
 
     name: str
     function: Callable[[Any], Result | None]
-    robots: tuple[str, ...] = ("simulated", "pi", "virtual-pi", "swimmer")
+    robots: tuple[str, ...] = tuple(ROBOTS)
     """Names of the robots that it applies to."""
 
 

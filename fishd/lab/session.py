@@ -24,6 +24,7 @@ from fishd.core.errors import (
     Refused,
     UnknownController,
 )
+from fishd.core.robots import ROBOTS
 from fishd.core.signals import Event, Reason, Tick
 from fishd.lab.simulation import VirtualRun
 
@@ -281,8 +282,8 @@ class LiveSession(Session):
         check_tethered(status.robot, "a measurement of thrust")
         self.name = status.robot
         self.unit = status.force_unit
-        simulated = status.robot == "simulated"
-        self.calibration = EXACT if simulated else fish.calibrations().force
+        has_hardware = ROBOTS[status.robot].has_hardware
+        self.calibration = fish.calibrations().force if has_hardware else EXACT
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
         self.source: Source = "fishd"

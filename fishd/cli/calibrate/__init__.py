@@ -7,6 +7,7 @@ from fishd.cli.output import echo, print_json
 from fishd.cli.verbs import Verb, Verbs
 from fishd.client import Fish
 from fishd.core import text
+from fishd.core.robots import ROBOTS
 
 VERBS = {
     "Verbs": {
@@ -32,8 +33,8 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     Ctrl-C during the measurement, nothing changes.
     """
     with Fish(endpoint) as fish:
-        simulated = fish.status().robot in ("simulated", "swimmer")
-        before = None if simulated else fish.calibrations().force
+        has_hardware = ROBOTS[fish.status().robot].has_hardware
+        before = fish.calibrations().force if has_hardware else None
         after = fish.tare(seconds)
     if as_json:
         print_json(after)

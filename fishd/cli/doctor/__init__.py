@@ -51,7 +51,7 @@ def doctor(
             f"{format_count(counts['warning'], 'warning')}, {counts['FAIL']} failed, "
             f"{counts['skipped']} skipped"
         )
-        if not config.has_hardware:
+        if not config.kind.has_hardware:
             echo("a simulated fish needs no hardware, so none was checked")
     return 1 if counts["FAIL"] else 0
 
@@ -69,7 +69,7 @@ def checks(context: Context) -> Iterator[Check]:
         *software.CHECKS,
         *computer.CHECKS,
         *timing.CHECKS,
-        *(drivers.checks(context) if context.config.has_hardware else ()),
+        *(drivers.checks(context) if context.config.kind.has_hardware else ()),
         *service.CHECKS,
     )
     return (check for check in all_checks if context.robot in check.robots)

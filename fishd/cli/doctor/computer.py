@@ -10,6 +10,7 @@ from fishd.assembly import state_folder
 from fishd.cli.doctor.base import Context
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import ConfigError
+from fishd.core.robots import ROBOTS
 from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.checks import Check, Result, fail, ok, skipped, user_name, warning
 
@@ -208,11 +209,13 @@ def _visible_folder(folder: Path) -> Path:
     return next(path for path in (folder, *folder.parents) if os.access(path, os.F_OK))
 
 
+_WITH_HARDWARE = tuple(name for name, kind in ROBOTS.items() if kind.has_hardware)
+
 CHECKS = (
     Check("model", model, ("pi",)),
     Check("system", system, ("pi",)),
     Check("power", power, ("pi",)),
-    Check("state folder", state, ("pi", "virtual-pi")),
+    Check("state folder", state, _WITH_HARDWARE),
     Check("disk", disk),
-    Check("calibrations", calibrations, ("pi", "virtual-pi")),
+    Check("calibrations", calibrations, _WITH_HARDWARE),
 )

@@ -44,9 +44,9 @@ def configuration(context: Context) -> Result:
 
 def packages(context: Context) -> Result:
     """Check the packages that this configuration needs, by the metadata of fishd."""
-    robot, requirements, drivers = context.robot, [], list[str]()
+    kind, requirements, drivers = context.config.kind, [], list[str]()
     texts, packages = list(metadata.requires("fishd") or []), set[str]()
-    if context.config.has_hardware:
+    if kind.has_hardware:
         for _, plugins, settings in context.drivers:
             packages |= {name.lower() for name in plugins.find(settings.driver).packages}
             texts += plugins.requirements(settings.driver)
@@ -55,16 +55,16 @@ def packages(context: Context) -> Result:
         match = _REQUIREMENT.match(text)
         assert match
         name, extra = match["name"].lower(), match["extra"]
-        is_for_swimmer = robot == "swimmer" and (extra, name) in _SWIMMER_PACKAGES
+        is_for_swimmer = not kind.is_tethered and (extra, name) in _SWIMMER_PACKAGES
         if extra is None or (extra == "pi" and name in packages) or is_for_swimmer:
             requirements.append((name, match["bounds"]))
     problems = [
         problem for name, bounds in requirements if (problem := _find_problem(name, bounds))
     ]
     if problems:
-        extra = {"simulated": "fishd", "swimmer": "fishd[swimmer]"}.get(robot, "fishd[pi]")
-        return fail("; ".join(problems), f"{sys.executable} -m pip install '{extra}'")
-    user = f"robot {robot} with {' and '.join(drivers)}" if drivers else f"robot {robot}"
+        package = f"fishd[{kind.extra}]" if kind.extra else "fishd"
+        return fail("; ".join(problems), f"{sys.executable} -m pip install '{package}'")
+    user = f"robot {context.robot}" + (f" with {' and '.join(drivers)}" if drivers else "")
     return ok(f"all {len(requirements)} that {user} needs, under {sys.executable}")
 
 

@@ -8,6 +8,7 @@ import subprocess
 from fishd.cli.doctor.base import Context
 from fishd.core.process import safe_path
 from fishd.core.process.realtime import required_priority_limit
+from fishd.core.robots import ROBOTS
 from fishd.hardware.checks import Check, Result, ok, skipped, warning
 
 _TRIAL = "import os, sys; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(int(sys.argv[1])))"
@@ -17,7 +18,7 @@ SUFFICIENT_LOCKED_BYTES = 512 * 2**20
 SERVICE_PRIORITY_LIMIT = 51
 """LimitRTPRIO= of the installed fishd.service."""
 _CAP_IPC_LOCK = 14
-_REAL_TIME_ROBOTS = ("simulated", "pi", "virtual-pi")
+_REAL_TIME_ROBOTS = tuple(name for name, kind in ROBOTS.items() if kind.is_real_time)
 """Robots whose ticks can be late; those of a swimmer, in slow motion, cannot."""
 _UNSYNCHRONISED = 0x40
 _TIME_ERROR = 5

@@ -66,7 +66,7 @@ class Lengths(Struct, frozen=True):
     @classmethod
     def of(cls, config: Config, settle: float | None, periods: int | None) -> "Lengths":
         """Return the given durations; None selects the default for the kind of fish."""
-        usual = cls(4.0, 10) if config.robot == "swimmer" else cls()
+        usual = cls() if config.kind.is_tethered else cls(4.0, 10)
         return cls(
             usual.settle if settle is None else settle,
             usual.periods if periods is None else periods,

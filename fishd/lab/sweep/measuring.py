@@ -57,7 +57,9 @@ def simulate_point(task: Task) -> tuple[PointResult, bytes] | None:
             def describe_run(run: VirtualRun) -> None:
                 writer.describe(run.config, run.about())
 
-            if task.config.robot == "swimmer":
+            if task.config.kind.is_tethered:
+                result = swim(task.point, task.config, task.lengths, writer, describe_run)
+            else:
                 from fishd.lab.sweep.free_swimming import swim_freely
 
                 arguments = (task.point, task.config, task.lengths, writer)
@@ -65,8 +67,6 @@ def simulate_point(task: Task) -> tuple[PointResult, bytes] | None:
                 if speed is None:
                     return None
                 result = speed
-            else:
-                result = swim(task.point, task.config, task.lengths, writer, describe_run)
         return result, path.read_bytes()
 
 

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 from msgspec import Struct
 from msgspec.structs import fields
 
+from fishd.core.robots import ROBOTS
+
 
 class Result(Struct, frozen=True):
     """Thrust at a point; the fields are the measured columns of a sweep's table."""
@@ -87,6 +89,6 @@ class Quantity(NamedTuple):
 
 def select_quantity(on: str, config: Mapping[str, Any], force_unit: str) -> Quantity:
     """Return the quantity that a sweep of this fish measures; config: as plain data."""
-    if on == "simulation" and config.get("robot") == "swimmer":
+    if on == "simulation" and not ROBOTS[config["robot"]].is_tethered:
         return Quantity("speed", "m/s", SpeedResult)
     return Quantity("thrust", force_unit, Result)
