@@ -1,4 +1,4 @@
-"""Writes the keys of the configuration, and those of a camera, into docs/, from their schemas.
+"""Writer of the tables of configuration keys, also of a camera, into docs/, from their schemas.
 
 python tools/config_reference.py --write
 python tools/config_reference.py --check     exits with 1 when they are out of date
@@ -28,11 +28,11 @@ ANY = {
     "section": "keys and values",
     "list": "a list",
 }
-"""What is permitted where there are no bounds."""
+"""Texts for permitted values of types without bounds."""
 
 
 def references() -> dict[str, str]:
-    """A table for each section, by the document in which they stand."""
+    """Return the tables of the sections, by document."""
     whole: dict[str, Struct] = {
         "reference/configuration.md": Config(),
         "how-to/camera.md": CameraSettings(),
@@ -41,7 +41,7 @@ def references() -> dict[str, str]:
 
 
 def _sections(section: Struct, prefix: str) -> Iterator[str]:
-    """A heading and a table for a section, then the same for each section inside it."""
+    """Yield a heading and a table for a section, then for each section inside it."""
     plain, nested = [], []
     for field in fields_of(type(section)):
         value = getattr(section, field.name)
@@ -61,7 +61,7 @@ def _sections(section: Struct, prefix: str) -> Iterator[str]:
 
 
 def _choice_section(section: str) -> Iterator[str]:
-    """The keys that all drivers or plants have, then those of each of fishd's own."""
+    """Yield the keys of all drivers or plants, then those of each built-in one."""
     plugins, default, settings_of_default, key, page = CHOICES[section]
     base = settings_of_default.__base__ if default else Struct
     common = (settings_of_default if base is Struct else base)(**{key: default or ""})
@@ -72,15 +72,15 @@ def _choice_section(section: str) -> Iterator[str]:
     choice[2] = f"{', '.join(f'`{name}`' for name in mine)}, or [another](../how-to/{page})"
     yield table(HEAD, [choice, *rows])
     for name in mine:
-        found = plugins.find(name)
-        settings = found.Settings(**{key: name})
+        plugin_class = plugins.find(name)
+        settings = plugin_class.Settings(**{key: name})
         own = [
             _row(field, getattr(settings, field.name), f"{section}.")
-            for field in fields_of(found.Settings)
+            for field in fields_of(plugin_class.Settings)
             if not hasattr(common, field.name)
         ]
         if own:
-            about = inspect.cleandoc(found.__doc__).partition("\n")[0]
+            about = inspect.cleandoc(plugin_class.__doc__).partition("\n")[0]
             yield f"#### `{key}: {name}`\n\n{about}"
             yield table(HEAD, own)
 
@@ -93,19 +93,19 @@ def _row(field: Field, default: object, prefix: str) -> list[str]:
     if field.optional:
         permitted += ", or `null`"
     unit = "" if field.unit == "1" else field.unit
-    value = f"`{_spelled(default)}`"
+    value = f"`{_to_yaml(default)}`"
     cells = (f"`{prefix}{field.name}`", unit, permitted, value, field.description)
     return [cell.replace("|", r"\|") for cell in cells]
 
 
-def _spelled(value: object) -> str:
-    """A value as one writes it in YAML."""
+def _to_yaml(value: object) -> str:
+    """Return a value as YAML."""
     text: str = yaml.safe_dump(value, default_flow_style=True)
     return text.removesuffix("\n").removesuffix("\n...")
 
 
 def main() -> int:
-    """Print, write or check; the exit status."""
+    """Print, write or check the tables, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--write", action="store_true", help="put them into docs/")
     parser.add_argument("--check", action="store_true", help="exit with 1 when out of date there")

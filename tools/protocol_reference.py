@@ -1,7 +1,7 @@
 """Writer of the tables of messages, operations, events, faults and tracks in docs/.
 
-`tools/protocol_reference.py --write` puts them into the documents; `--check` exits with 1 where one
-is out of date there.
+`tools/protocol_reference.py --write` writes them into the documents; `--check` exits with 1 where
+one is out of date.
 """
 
 import argparse
@@ -44,18 +44,18 @@ STRUCTS: dict[str, type[Struct]] = {
     "lease holder": signals.LeaseHolder,
     "calibrations": protocol.Calibrations,
 }
-"""By the name of their markers."""
+"""Structs by the name of their markers."""
 CAMERA: dict[str, type[Struct]] = {
     "frame": messages.FrameHeader,
     "view": messages.ViewHeader,
     "camera-state": messages.CameraState,
     "until": messages.Until,
 }
-"""Likewise, in docs/how-to/camera.md."""
+"""Structs of docs/how-to/camera.md, by the name of their markers."""
 
 
 def references() -> Iterator[tuple[str, str, str]]:
-    """Document, name of the markers, and the table between them."""
+    """Yield documents, names of markers, and the tables between them."""
     for name, struct in STRUCTS.items():
         yield "reference/protocol.md", name, _fields(struct)
     for name, struct in CAMERA.items():
@@ -136,7 +136,7 @@ def _times(in_a_row: int) -> str:
 
 
 def main() -> int:
-    """Print, write or check; the exit status."""
+    """Print, write or check the tables, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--write", action="store_true", help="put them into docs/")
     parser.add_argument("--check", action="store_true", help="exit with 1 when one is out of date")

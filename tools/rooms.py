@@ -1,9 +1,9 @@
-"""Writer of the table of rooms in docs/: what each is for, and which others it imports.
+"""Writer of the table of rooms in docs/: the purpose of each, and the rooms that it imports.
 
-A room is a package or a module at the top of fishd/, but for `__main__.py`, which starts the
+A room is a package or a module at the top of fishd/, except `__main__.py`, which starts the
 commands; an arrow is a pair of rooms of which the first imports the second, in any of its files.
 
-`tools/rooms.py --write` puts the table into the page; `--check` exits with 1 where it is out of
+`tools/rooms.py --write` writes the table into the page; `--check` exits with 1 where it is out of
 date.
 """
 
@@ -28,19 +28,19 @@ def rooms(folder: Path = FISHD) -> dict[str, Path]:
 
 
 def purpose(room: Path) -> str:
-    """The first line of its docstring; empty where it has none."""
+    """Return the first line of a room's docstring; empty where it has none."""
     file = room / "__init__.py" if room.is_dir() else room
     docstring = ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or ""
     return docstring.partition("\n")[0]
 
 
 def arrows(folder: Path = FISHD) -> set[tuple[str, str]]:
-    """Every pair of rooms of which the first imports the second."""
-    found = rooms(folder)
-    by_module = {path.stem: name for name, path in found.items()}
+    """Return every pair of rooms of which the first imports the second."""
+    room_paths = rooms(folder)
+    by_module = {path.stem: name for name, path in room_paths.items()}
     pairs = {
         (name, by_module[imported])
-        for name, path in found.items()
+        for name, path in room_paths.items()
         for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])
         for imported in _imported(ast.parse(file.read_text(encoding="utf-8")), folder.name)
         if imported in by_module
@@ -49,7 +49,7 @@ def arrows(folder: Path = FISHD) -> set[tuple[str, str]]:
 
 
 def _imported(tree: ast.Module, package: str) -> Iterator[str]:
-    """What stands behind the name of the package in each import."""
+    """Return the names after that of the package in all imports."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]

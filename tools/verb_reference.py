@@ -1,4 +1,4 @@
-"""Writes the table of verbs and the options they share into docs/, from the commands themselves.
+"""Writer of the table of verbs and their shared options into docs/, from the commands.
 
 python tools/verb_reference.py --write
 python tools/verb_reference.py --check     exits with 1 when it is out of date
@@ -19,7 +19,7 @@ SHARED = (
     *("--on", "--for", "--budget", "--folder", "--resume", "--to", "--plot", "--json", "--seed"),
     *("--config", "--endpoint", "--take"),
 )
-"""Options with one meaning wherever they are, in the order of the columns."""
+"""Options with the same meaning for all verbs, in the order of the columns."""
 
 
 def commands(
@@ -28,9 +28,9 @@ def commands(
     """Yield each verb with its command; of a verb that takes a controller, with `square`."""
     context = click.Context(command)
     if isinstance(command, ControllerGroup):
-        found = command.get_command(context, "square")
-        assert found
-        yield " ".join(path), found
+        subcommand = command.get_command(context, "square")
+        assert subcommand
+        yield " ".join(path), subcommand
     elif isinstance(command, click.Group):
         if command.invoke_without_command:
             yield " ".join(path), command
@@ -63,7 +63,7 @@ def reference() -> str:
 
 
 def main() -> int:
-    """Print, write or check; the exit status."""
+    """Print, write or check the table, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--write", action="store_true", help="put it into docs/")
     parser.add_argument("--check", action="store_true", help="exit with 1 when out of date there")

@@ -1,1 +1,1 @@
-"""Measures how punctual, quick and light fishd is, and what learning and policies come to."""
+"""Benchmarks of the punctuality, speed and size of fishd, and of learning and policies."""

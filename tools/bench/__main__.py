@@ -1,4 +1,4 @@
-"""The benchmarks: `python tools/bench NAME [OPTIONS]`, or `python -m bench NAME` in tools/."""
+"""Benchmarks: `python tools/bench NAME [OPTIONS]`, or `python -m bench NAME` in tools/."""
 
 import sys
 from pathlib import Path

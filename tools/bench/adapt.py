@@ -1,8 +1,9 @@
-"""`fishctl adapt` on harsh fish that differ from the model: is its choice good, and its claim true?
+"""Quality of the choice and of the claim of `fishctl adapt`, on harsh fish that differ from the
+model.
 
-The fish are those of the bench `swing`, of other seeds, each with everything that a real rig does,
-in random sizes. Each is adapted to in virtual time, by default in five minutes of tank time. The
-truth is the mean thrust of the simulated fish, which no step of it sees.
+The fish are like those of the bench `swing`, with other seeds and with all effects of a real rig,
+in random sizes. `adapt` runs on each in virtual time, by default for five minutes of tank time. The
+truth is the mean thrust of the simulated fish, which `adapt` does not use.
 """
 
 import os
@@ -29,52 +30,53 @@ from fishd.virtual.plant.optimum import best_square_wave
 
 DOCUMENT = "how-to/adapt.md"
 FIRST_SEED = 900
-"""Of the harsh fish; others were looked at while it was made."""
+"""First seed of the harsh fish; other seeds were used during development."""
 FISH = 10
 
 
 class Adapted(Struct, frozen=True):
-    """One fish."""
+    """Result for one fish."""
 
     seed: int
     best: float
-    """Thrust of the best of all square waves [N]."""
+    """Thrust of the best square wave [N]."""
     chosen: str
     decided: bool
-    """Whether the measurement alone says that it is the best one."""
+    """Whether the measurement alone shows that the chosen gait is the best one."""
     undecided: list[str]
-    """The gaits that may be the best one, as far as the measurement tells."""
+    """Gaits that may be the best one according to the measurement."""
     explained: float
-    """Share of the worse explained force that the identified fish explains."""
+    """Fraction of the variance that the identified fish explains, for the worse explained force."""
     share: float
     """True thrust of the chosen gait over `best`."""
     of_square: float
-    """True thrust of the square wave found, over `best`."""
+    """True thrust of the square wave of the search, over `best`."""
     claimed: tuple[float, float, float]
-    """Relative thrust of the chosen gait over the square wave found, and its interval."""
+    """Thrust of the chosen gait relative to the square wave of the search, and its interval."""
     claims: dict[str, tuple[float, float, float, float]]
-    """Of each but the square wave: the same, and the truth."""
+    """`claimed` with the true value, for each gait except the square wave."""
     thrusts: dict[str, tuple[float, float, float, float]]
-    """Measured, half-widths of its 95 % intervals by statistics and in total, true [N]."""
+    """Measured thrust, half-widths of its statistical and total 95 % confidence intervals, and true
+    thrust, by gait [N]."""
     tank_time: float
-    """[s]"""
+    """Duration of the adaptation [s]."""
 
 
 class _Silent:
-    """Shows nothing."""
+    """Progress display without output."""
 
     def done(self, line: str, amount: float) -> None:
-        """A step is done."""
+        """Ignore the end of a step."""
 
-    def at(self, amount: float, found: str = "") -> None:
-        """It goes on."""
+    def at(self, amount: float, outcome: str = "") -> None:
+        """Ignore progress."""
 
     def warn(self, line: str) -> None:
-        """Something is to be said."""
+        """Ignore a warning."""
 
 
 def adapted(task: tuple[int, int, float]) -> Adapted:
-    """Adapt to one fish; seed, steps of the training, tank time [s]."""
+    """Adapt to one fish; task: seed, steps of the training, tank time [s]."""
     seed, steps, tank_time = task
     config = replace(load(None, harsh(seed).overrides), start=Start())
     header = Header(kind="adapt", on="simulation")
@@ -119,7 +121,7 @@ def adapted(task: tuple[int, int, float]) -> Adapted:
 
 
 def truth(one: Contender) -> float:
-    """Its true thrust [N]."""
+    """Return the true thrust [N]."""
     assert one.true_thrust is not None
     return one.true_thrust
 
@@ -134,23 +136,23 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Two tables; half a minute for each fish."""
+    """Return two tables; takes half a minute per fish."""
     seeds = range(options.first, options.first + options.fish)
     tasks = [(seed, options.steps, options.tank_time) for seed in seeds]
     with ProcessPoolExecutor(options.jobs) as pool:
-        found = list(pool.map(adapted, tasks))
+        results = list(pool.map(adapted, tasks))
     head = (
         "fish | best square wave, mN | verdict | true thrust of the chosen gait, % of that | of "
-        "the square wave found, % of that | chosen gait over the square wave found, % | its "
+        "the square wave results, % of that | chosen gait over the square wave results, % | its "
         "truth, % | tank time, s"
     )
-    rows = [row(each) for each in found]
-    names = {"bench adapt": table(head, rows), "bench adapt summary": summary(found)}
-    return Report(names, [msgspec.to_builtins(each) for each in found])
+    rows = [row(each) for each in results]
+    names = {"bench adapt": table(head, rows), "bench adapt summary": summary(results)}
+    return Report(names, [msgspec.to_builtins(each) for each in results])
 
 
 def row(one: Adapted) -> list[str]:
-    """Of the table."""
+    """Return the row of the table for one fish."""
     value, low, high = map(percent, one.claimed)
     own = one.claims.get(one.chosen)
     return [
@@ -166,35 +168,38 @@ def row(one: Adapted) -> list[str]:
 
 
 def _undecided(one: Adapted) -> str:
-    """Return the gaits between which it is undecided, the chosen one in bold."""
+    """Return the undecided gaits, with the chosen one in bold."""
     return ", ".join(f"**{name}**" if name == one.chosen else name for name in one.undecided)
 
 
-def summary(found: list[Adapted]) -> str:
-    """Medians, worst and coverage."""
-    shares = [each.share for each in found]
-    claims = [each.claims[each.chosen] for each in found if each.chosen in each.claims]
-    every = [claim for each in found for claim in each.claims.values()]
-    policies = [each.thrusts["policy"][3] / each.best for each in found if "policy" in each.thrusts]
-    thrusts = [thrust for each in found for thrust in each.thrusts.values()]
-    decided = [each for each in found if each.decided]
-    lost = [1.0 - each.thrusts[each.chosen][3] / _largest(each) for each in found]
-    # What rounding of a simulation makes of equal gaits is no difference.
+def summary(results: list[Adapted]) -> str:
+    """Return medians, worst values and coverage."""
+    shares = [each.share for each in results]
+    claims = [each.claims[each.chosen] for each in results if each.chosen in each.claims]
+    every = [claim for each in results for claim in each.claims.values()]
+    policies = [
+        each.thrusts["policy"][3] / each.best for each in results if "policy" in each.thrusts
+    ]
+    thrusts = [thrust for each in results for thrust in each.thrusts.values()]
+    decided = [each for each in results if each.decided]
+    lost = [1.0 - each.thrusts[each.chosen][3] / _largest(each) for each in results]
+    # Differences by rounding between equal gaits are ignored.
     kept = [
-        max(each.thrusts[k][3] for k in each.undecided) > 0.9999 * _largest(each) for each in found
+        max(each.thrusts[k][3] for k in each.undecided) > 0.9999 * _largest(each)
+        for each in results
     ]
     rows = [
         ["chosen gait, of the best square wave, median", f"{percent(statistics.median(shares))} %"],
         ["chosen gait, of the best square wave, worst", f"{percent(min(shares))} %"],
-        ["policies that took part", f"{len(policies)} of {len(found)}"],
-        ["verdicts that name a winner", f"{len(decided)} of {len(found)}"],
+        ["policies that took part", f"{len(policies)} of {len(results)}"],
+        ["verdicts that name a winner", f"{len(decided)} of {len(results)}"],
         [
             "of these, winners that are truly the best of the three",
-            f"{sum(kept[found.index(each)] for each in decided)} of {len(decided)}",
+            f"{sum(kept[results.index(each)] for each in decided)} of {len(decided)}",
         ],
         [
             "verdicts whose gaits include the truly best one",
-            f"{sum(kept)} of {len(found)}",
+            f"{sum(kept)} of {len(results)}",
         ],
         [
             "chosen gait below the truly best of the three, median",
@@ -211,7 +216,7 @@ def summary(found: list[Adapted]) -> str:
             ]
             for column, name in enumerate(("statistical interval", "total interval"), 1)
         ),
-        ["longest tank time", f"{max(each.tank_time for each in found):.0f} s"],
+        ["longest tank time", f"{max(each.tank_time for each in results):.0f} s"],
     ]
     if policies:
         middle = f"{percent(statistics.median(policies))} %"

@@ -1,4 +1,4 @@
-"""What a camera costs fishd, how old frames are at a learner, and how fast they are drawn.
+"""Cost of a camera for fishd, age of frames at a learner, and speed of drawing.
 
 In each round the same fishd swims twice: alone, and with a fishd-camera, a learner that takes its
 frames and a page that takes its views. Which comes first alternates, so that a noisy machine
@@ -25,14 +25,14 @@ from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSetting
 from fishd.camera.simulated.tail_painter import TailPainter
 
 DOCUMENT = "how-to/camera.md"
-OLDEST = 10e-3
-"""Age of a frame at a learner that is asked for, at p99 [s]."""
-MOST = 1.2
-"""Lateness with camera, learner and page over that without that is asked for, at p99."""
-FEWEST = 10_000
-"""Frames drawn a second that are asked for."""
+MAX_AGE_S = 10e-3
+"""Goal for the age of a frame at a learner, p99 [s]."""
+MAX_LATENESS_RATIO = 1.2
+"""Goal for the lateness with camera, learner and page relative to that without, p99."""
+MIN_FRAMES_PER_S = 10_000
+"""Goal for the number of drawn frames per second."""
 RATE = 60.0
-"""Frames a second of the camera."""
+"""Frame rate of the camera [1/s]."""
 LEARNER = """
 import json, sys, time
 from fishd.camera.client import CameraClient
@@ -58,19 +58,19 @@ with CameraClient(sys.argv[1], views=True) as client:
 
 
 class Round(NamedTuple):
-    """What one fishd did twice."""
+    """Results of one fishd without and with a camera."""
 
     without: list[float]
     """Lateness of its ticks [s]."""
     with_camera: list[float]
-    """The same beside a camera, a learner and a page [s]."""
+    """Lateness of its ticks beside a camera, a learner and a page [s]."""
     ages: list[float]
-    """Of frames at the learner [s]."""
+    """Ages of frames at the learner [s]."""
 
 
 @contextmanager
 def process(*command: str, ready: bool = True) -> Iterator[subprocess.Popen[str]]:
-    """A program beside the bench, once it has said a line."""
+    """Start a program, and yield it after its first line of output."""
     started = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         if ready:
@@ -84,7 +84,7 @@ def process(*command: str, ready: bool = True) -> Iterator[subprocess.Popen[str]
 
 @contextmanager
 def camera(fishd: Fishd) -> Iterator[str]:
-    """A fishd-camera above the fish; where it takes requests."""
+    """Start a fishd-camera above the fish, and yield the address of its requests."""
     requests = f"ipc://{fishd.folder}/camera"
     pairs = {
         "simulated.fishd": fishd.endpoint,
@@ -109,7 +109,7 @@ def camera(fishd: Fishd) -> Iterator[str]:
 
 
 def lateness(fishd: Fishd, seconds: float) -> list[float]:
-    """Of the ticks of so long [s]."""
+    """Return the lateness of the ticks during `seconds` [s]."""
     time.sleep(1.0)
     fishd.waiting_ticks()
     time.sleep(seconds)
@@ -117,7 +117,7 @@ def lateness(fishd: Fishd, seconds: float) -> list[float]:
 
 
 def beside_camera(fishd: Fishd, seconds: float) -> tuple[list[float], list[float]]:
-    """Lateness beside a camera, a learner and a page, and the ages of frames [s]."""
+    """Return the lateness beside a camera, a learner and a page, and the ages of frames [s]."""
     with (
         camera(fishd) as requests,
         process(sys.executable, "-c", VIEWER, requests),
@@ -129,7 +129,7 @@ def beside_camera(fishd: Fishd, seconds: float) -> tuple[list[float], list[float
 
 
 def run_round(number: int, seconds: float) -> Round:
-    """One round; the order alternates."""
+    """Run one round; the order alternates."""
     with Fishd() as fishd:
         fishd.next_tick()
         if number % 2:
@@ -140,7 +140,7 @@ def run_round(number: int, seconds: float) -> Round:
 
 
 def drawn(settings: SimulatedCameraSettings) -> float:
-    """Frames of 84 x 84 px that are drawn a second, by one thread; the best of five."""
+    """Return the frames of 84 x 84 px drawn per second by one thread, best of five."""
     painter = TailPainter(settings, 84)
     rates = []
     for _ in range(5):
@@ -158,7 +158,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """All three."""
+    """Return the three tables."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     rates = {"default": drawn(DEFAULT), "web": drawn(WEB)}
     rounds = []
@@ -177,18 +177,18 @@ def measure(options: Namespace) -> Report:
         [
             "p99 with over without",
             f"{ratio:.2f} (median of rounds {statistics.median(each):.2f})",
-            f"≤ {MOST:g}",
-            _verdict(ratio <= MOST),
+            f"≤ {MAX_LATENESS_RATIO:g}",
+            _verdict(ratio <= MAX_LATENESS_RATIO),
         ],
         [
             "age of a frame at a learner, p50 / p99",
             " / ".join(f"{quantile(ages, share) * 1e3:.1f}" for share in (0.5, 0.99)) + " ms",
-            f"p99 ≤ {OLDEST * 1e3:g} ms",
-            _verdict(quantile(ages, 0.99) <= OLDEST),
+            f"p99 ≤ {MAX_AGE_S * 1e3:g} ms",
+            _verdict(quantile(ages, 0.99) <= MAX_AGE_S),
         ],
         *(
-            [f"frames drawn a second, rig {name}", f"{rate:.0f}", f"≥ {FEWEST}",
-             _verdict(rate >= FEWEST)]
+            [f"frames drawn a second, rig {name}", f"{rate:.0f}", f"≥ {MIN_FRAMES_PER_S}",
+             _verdict(rate >= MIN_FRAMES_PER_S)]
             for name, rate in rates.items()
         ),
     ]  # fmt: skip

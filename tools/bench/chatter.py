@@ -1,6 +1,6 @@
-"""What the shortest dwell is worth: a policy on fish that make it reverse too fast.
+"""Effect of the shortest dwell: a policy on fish that make it reverse too fast.
 
-Each fish swims a minute from rest in virtual time, with each seed of the noise: with
+Each fish swims for a minute from rest in virtual time, with each seed of the noise: with
 `chatter.dwell: 0`, with the defaults, and with `swing` for comparison. About half a minute.
 """
 
@@ -45,11 +45,11 @@ HARSH = {
 }
 SECONDS, SETTLE = 60.0, 10.0
 FAST = 0.2
-"""Reversals that follow within less than this are fast ones [s]."""
+"""Time between two reversals below which they count as fast [s]."""
 
 
 class Swum(NamedTuple):
-    """One run."""
+    """Result of one run."""
 
     relative_thrust: float
     every_tick: float
@@ -60,7 +60,7 @@ class Swum(NamedTuple):
 
 
 def swim(config: Config, name: str, parameters: dict[str, str]) -> Swum:
-    """Let a controller swim a fish."""
+    """Run a controller on a fish, and return the result."""
     reversals = ReversalTimes()
     controller = registry.create(name, parameters, config.limits)
     report = judge(config, name, controller, SECONDS, SETTLE, reversals)
@@ -73,7 +73,7 @@ def swim(config: Config, name: str, parameters: dict[str, str]) -> Swum:
 
 
 def swum(changes: Iterable[str], name: str, parameters: dict[str, str], seeds: int) -> list[Swum]:
-    """The same with several seeds of the noise."""
+    """Return the results of `swim` for several seeds of the noise."""
     return [
         swim(load(None, [*RIG, f"simulation.seed={seed}", *changes]), name, parameters)
         for seed in range(seeds)
@@ -93,7 +93,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Every fish."""
+    """Return the table of all fish."""
     seeds = options.seeds
     fish = {"as configured": (), **HARSH}
     ppo = {"policy": options.policy}
@@ -130,11 +130,11 @@ def measure(options: Namespace) -> Report:
 
 
 def relative_thrust(runs: list[Swum]) -> str:
-    """Median in %, for a cell."""
+    """Return the median in % for a cell."""
     return f"{statistics.median(run.relative_thrust for run in runs) * 100:.1f}"
 
 
 def spread(runs: list[Swum]) -> str:
-    """Median and lowest."""
+    """Return median and lowest value."""
     lowest = min(run.relative_thrust for run in runs)
     return f"{relative_thrust(runs)} % ({lowest * 100:.1f} %)"

@@ -1,7 +1,7 @@
-"""Two checkouts of fishd in turns, for `tick --against`: is this one worse than that one?
+"""Comparison of two checkouts of fishd in turns, for `tick --against`.
 
-It knows of either only what users know: the programs fishd and fishctl, READY=1, and the fields
-`lateness_us` and `busy_us` of a tick. So the checkouts may differ in all else.
+It uses only the public interface of both: the programs fishd and fishctl, READY=1, and the fields
+`lateness_us` and `busy_us` of a tick. The checkouts may differ in everything else.
 """
 
 import json
@@ -17,41 +17,41 @@ from pathlib import Path
 import numpy as np
 from msgspec import Struct
 
-from common.daemon import PATIENCE, Fishd
+from common.daemon import TIMEOUT_S, Fishd
 from common.machine import machine_in_short, priorities, scheduling
 from common.report import Report, progress, quantile, table
 
 SETTLE = 2.0
-"""How long a fishd ticks before it is measured [s]."""
+"""Time that a fishd ticks before it is measured [s]."""
 VIRTUAL_SECONDS = 300.0
 RESAMPLES = 10_000
 Quantity = tuple[str, str, Callable[["Turn"], float]]
 
 
 class Turn(Struct, frozen=True):
-    """What one checkout did in one turn."""
+    """Results of one checkout in one turn."""
 
     start_up: float
-    """From starting the process to its READY=1 [ms]."""
+    """Time from the start of the process to its READY=1 [ms]."""
     start_up_cpu: float
-    """Processor time until then, of all its processes [ms]."""
+    """Processor time of all its processes until READY=1 [ms]."""
     lateness: list[float]
-    """Of each tick [µs]."""
+    """Lateness of each tick [µs]."""
     busy: list[float]
-    """Of each tick, until its record was sealed [µs]."""
+    """Time of each tick until its record was sealed [µs]."""
     cpu: float
-    """Of all its processes, per tick [µs]."""
+    """Processor time of all its processes per tick [µs]."""
     memory: float
-    """Of fishd's own process, at rest [MB]."""
+    """Memory of the main process of fishd, at rest [MB]."""
     total_memory: float
-    """With its gateways, shared pages counted once [MB]."""
+    """Memory including its gateways, with shared pages counted once [MB]."""
     virtual: float
-    """Per tick of `fishctl simulate` [µs]."""
+    """Time per tick of `fishctl simulate` [µs]."""
     virtual_cpu: float
-    """Processor time of all of `fishctl simulate` [ms]."""
+    """Processor time of a run of `fishctl simulate` [ms]."""
 
 
-# More is worse for each.
+# Larger is worse for each.
 QUANTITIES: list[Quantity] = [
     ("lateness p50", "µs", lambda turn: quantile(turn.lateness, 0.5)),
     ("lateness p99", "µs", lambda turn: quantile(turn.lateness, 0.99)),
@@ -68,22 +68,22 @@ QUANTITIES: list[Quantity] = [
 
 
 def compare(checkout: Path, seconds: float, rounds: int) -> Report:
-    """Let both take turns, each first in every other round.
+    """Measure both in turns, each first in every other round.
 
-    checkout: the other one, with its virtual environment in .venv, or that environment itself
-    seconds: how long a fishd ticks in a turn [s]
+    checkout: the other checkout, with its virtual environment in .venv, or that environment
+    seconds: time that a fishd ticks in a turn [s]
     """
     other = next((b for b in (checkout / ".venv/bin", checkout / "bin") if b.is_dir()), None)
     if other is None:
         raise SystemExit(f"{checkout}: no virtual environment here: no .venv/bin and no bin")
     sides = [other.absolute(), Path(sys.executable).parent]
     for side in sides:
-        take_turn(side, 1.0)  # whatever is compiled or read from disk only once
+        take_turn(side, 1.0)  # warm up: files that are compiled or read from disk only once
     turns: list[tuple[Turn, Turn]] = []
     for number in range(rounds):
         order = sides if number % 2 else sides[::-1]
-        found = {side: take_turn(side, seconds) for side in order}
-        turns.append((found[sides[0]], found[sides[1]]))
+        turn_by_side = {side: take_turn(side, seconds) for side in order}
+        turns.append((turn_by_side[sides[0]], turn_by_side[sides[1]]))
         progress(f"round {number + 1} of {rounds}", *_row(QUANTITIES[1], turns)[:4])
     head = "quantity | before | after | after / before | 95 % interval | worse"
     text = (
@@ -96,10 +96,10 @@ def compare(checkout: Path, seconds: float, rounds: int) -> Report:
 
 
 def take_turn(bin_folder: Path, seconds: float) -> Turn:
-    """Start a fishd, let it tick at rest, end it; then swim in virtual time."""
+    """Measure a fishd that ticks at rest, then a swim in virtual time."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
-        ready.bind("")  # the kernel gives it an abstract name, which ends with it
-        ready.settimeout(PATIENCE)
+        ready.bind("")  # the kernel assigns an abstract name, which ends with the socket
+        ready.settimeout(TIMEOUT_S)
         name = ready.getsockname().decode().replace("\0", "@")
         command = (str(bin_folder / "fishd"), "--no-print-status")
         priority = f"realtime.priority={priorities()[-1]}"
@@ -130,7 +130,7 @@ def take_turn(bin_folder: Path, seconds: float) -> Turn:
 
 
 def virtual_time(bin_folder: Path) -> tuple[float, float]:
-    """What one tick takes in virtual time [µs], and the processor time of the whole run [s]."""
+    """Return the time of a tick in virtual time [µs], and the processor time of the run [s]."""
     command = [str(bin_folder / "fishctl"), "simulate", "swing", "--json"]
     command += ["--seconds", str(VIRTUAL_SECONDS)]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -141,7 +141,7 @@ def virtual_time(bin_folder: Path) -> tuple[float, float]:
 
 
 def interval(ratios: Sequence[float]) -> tuple[float, float]:
-    """Where the median of such ratios lies, with 95 % confidence."""
+    """Return the 95 % confidence interval of the median of ratios."""
     draw = np.random.default_rng(0)
     medians = np.median(draw.choice(ratios, (RESAMPLES, len(ratios))), axis=1)
     low, high = np.percentile(medians, (2.5, 97.5))

@@ -1,7 +1,6 @@
-"""`swing` on each of the two estimators: how near it comes to the best square wave.
+"""Thrust of `swing` with each of the two estimators, relative to the best square wave.
 
-The observer is given the plant as it is, or one that is wrong in every parameter; what swims is the
-same fish.
+The observer uses the true plant, or one that is wrong in every parameter, of the same fish.
 """
 
 import itertools
@@ -31,17 +30,17 @@ from fishd.virtual.plant.parameters import PlantParameters
 DOCUMENT = "how-to/identification.md"
 
 RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 3.0)
-"""ω₀Φ/Ω."""
+"""Values of ω₀Φ/Ω."""
 CRITERION = 0.6
 SECONDS, SETTLE = 140.0, 20.0
-"""What is judged is two periods of the drift long."""
+"""Length of a run and of its unevaluated start [s]; the rest has two periods of the drift."""
 REAL = SimulationSettings(noise=1e-3, offset_y=0.02, drift=5e-3)
 WRONG = 0.1
-"""By so large a share each parameter of the wrong plant is too large or too small."""
+"""Relative error of each parameter of the wrong plant."""
 
 
 class Rig(NamedTuple):
-    """What swims, and how it is measured."""
+    """Simulated fish and its sensor."""
 
     name: str
     plant: PlantParameters
@@ -63,7 +62,7 @@ ESTIMATORS = ("model-free", "observer", "observer, wrong plant")
 
 
 def believed(plant: PlantParameters, estimator: str, seed: int) -> PlantParameters:
-    """What the observer takes the fish for."""
+    """Return the plant that the observer uses."""
     if estimator != ESTIMATORS[2]:
         return plant
     chance = random.Random(seed)
@@ -73,7 +72,7 @@ def believed(plant: PlantParameters, estimator: str, seed: int) -> PlantParamete
 
 
 def relative_thrust(run: tuple[Rig, str, float, int]) -> float:
-    """Thrust over that of the best square wave of the same amplitude; zero after a fault."""
+    """Return the thrust over that of the best square wave of this amplitude; 0 after a fault."""
     rig, estimator, ratio, seed = run
     amplitude = ratio * PlantParameters().servo_speed / PlantParameters().omega0
     config = Config(
@@ -111,16 +110,16 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """A table of medians; about a minute."""
+    """Return a table of medians; takes about a minute."""
     runs = list(itertools.product(RIGS, ESTIMATORS, RATIOS, range(options.seeds)))
     with ProcessPoolExecutor(options.jobs) as pool:
         done = list(pool.map(relative_thrust, runs, chunksize=options.seeds))
     shape = (len(RIGS), len(ESTIMATORS), len(RATIOS), options.seeds)
-    found = np.median(np.array(done).reshape(shape), axis=3)
+    medians = np.median(np.array(done).reshape(shape), axis=3)
     rows = [
-        [rig.name, estimator, *(f"{100 * value:.1f}" for value in found[i, j])]
+        [rig.name, estimator, *(f"{100 * value:.1f}" for value in medians[i, j])]
         for i, rig in enumerate(RIGS)
         for j, estimator in enumerate(ESTIMATORS)
     ]
     head = " | ".join(["rig", "estimator \\ ω₀Φ/Ω", *(f"{ratio:g}" for ratio in RATIOS)])
-    return Report({"bench estimators": table(head, rows)}, found.tolist())
+    return Report({"bench estimators": table(head, rows)}, medians.tolist())

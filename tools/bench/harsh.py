@@ -1,8 +1,8 @@
-"""What each imperfection of config/harsh.yaml does to `swing`, alone and with all the others.
+"""Effect of each imperfection of config/harsh.yaml on `swing`, alone and with all others.
 
-Each fish swims in virtual time with C = 0.6, a minute of which the first 10 s are not judged, and
-with C = auto, of which the second minute is. Relative thrust is the true thrust over that of each
-fish's own best square wave.
+Each fish swims in virtual time with C = 0.6 for a minute, without its first 10 s, and with
+C = auto, of which the second minute counts. Relative thrust is the true thrust over that of the
+best square wave of the same fish.
 """
 
 import os
@@ -37,11 +37,11 @@ NAMES = {
     "offsets": ("simulation.offset_x", "simulation.offset_y"),
     "drift": ("simulation.drift", "simulation.drift_walk"),
 }
-"""The keys of each."""
+"""Configuration keys of each imperfection."""
 
 
 def cases(file: Path, amplitude: float) -> list[OtherFish]:
-    """None of them, each alone, all of them; amplitude: Φ, the first override of each [rad]"""
+    """Return the cases: none of them, each alone, all of them; amplitude: Φ [rad]"""
     sections = yaml.safe_load(file.read_text(encoding="utf-8"))
     values = {
         f"{section}.{key}": value
@@ -67,18 +67,18 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """One table; a minute or two."""
+    """Return one table; takes a minute or two."""
     fish = cases(FILE, options.amplitude)
     with ProcessPoolExecutor(options.jobs) as pool:
-        found = list(pool.map(measured, fish))
-    rows = [row(case, shares) for case, shares in zip(fish, found, strict=True)]
+        all_shares = list(pool.map(measured, fish))
+    rows = [row(case, shares) for case, shares in zip(fish, all_shares, strict=True)]
     head = "imperfection | keys | best square wave, mN | C = 0.6, % | C = auto, %"
-    figures = {case.name: shares._asdict() for case, shares in zip(fish, found, strict=True)}
+    figures = {case.name: shares._asdict() for case, shares in zip(fish, all_shares, strict=True)}
     return Report({"bench harsh": table(head, rows)}, figures)
 
 
 def row(case: OtherFish, shares: Shares) -> list[str]:
-    """Of the table."""
+    """Return the row of the table for one case."""
     config = load(None, case.overrides)
     best = best_square_wave(config.plant, config.amplitude_limit)
     own = case.overrides[1:]

@@ -1,6 +1,6 @@
-"""How true `fishctl identify` is: errors and coverage of its intervals, on fish that are known.
+"""Errors of `fishctl identify` and coverage of its intervals, on known fish.
 
-Each fish swims one experiment of three minutes in virtual time, measured with noise, a turned
+Each fish swims one experiment of three minutes in virtual time, measured with noise, a rotated
 sensor, offsets and drift. Every fit begins with the default fish.
 """
 
@@ -28,16 +28,16 @@ DOCUMENT = "how-to/identification.md"
 
 RIG = SimulationSettings(noise=1e-3, rotation=radians(5), offset_x=0.02, offset_y=0.02, drift=5e-3)
 SPREAD = 0.3
-"""Other fish differ from the default one by up to this share, in each of:"""
+"""Largest relative difference of the other fish from the default one, in each of `VARIED`."""
 VARIED = (
     "omega0", "xi", "coupling", "servo_speed", "servo_lag", "thrust_coefficient", "lateral_drag",
 )  # fmt: skip
-LONGEST_DELAY, MOST_BACKLASH = 0.1, 0.05
-"""[s], [rad]"""
-MOST_DRAG, MOST_LATERAL_DRAG = 2.0, 0.01
-"""Quadratic drag of the fin [1/rad], and in F_y [N s²/rad²]."""
+MAX_DELAY_S, MAX_BACKLASH_RAD = 0.1, 0.05
+"""Largest delay of the servo [s], and largest backlash [rad]."""
+MAX_DRAG, MAX_LATERAL_DRAG = 2.0, 0.01
+"""Largest quadratic drag of the fin [1/rad], and in F_y [N s²/rad²]."""
 RATIOS = (0.6, 0.85, 1.15, 1.6)
-"""K_y/K is between the first two or between the last two of these."""
+"""Ranges of K_y/K: between the first two, or between the last two."""
 FIRST_SEED = {"other": 51000, "outside": 52000, "harsh": 900}
 """Seed of the first fish of each kind, and of its sensor."""
 SECONDS = 180.0
@@ -47,7 +47,7 @@ ABSOLUTE = {
     "quadratic_drag": (1.0, "1/rad"),
     "lateral_quadratic_drag": (1e3, "mN s²/rad²"),
 }
-"""Judged by their errors; all others by their share of the truth."""
+"""Quantities with absolute errors; all others have errors relative to the true value."""
 
 
 KINDS = {
@@ -55,14 +55,14 @@ KINDS = {
     "outside": "the same with quadratic drag and K_y ≠ K",
     "harsh": "harsh fish: dead zone and reaction, too; K_y = K",
 }
-"""What is identified, with the words of the table."""
+"""Kinds of fish, with their names in the table."""
 
 EQUALLY_FITTED = ("other", "outside")
-"""Kinds whose fish all have the same numbers fitted, but for what the data demand."""
+"""Kinds whose fits all have the same parameters, except those that the data require."""
 
 
 class Interval(NamedTuple):
-    """An estimate of a fish that is known."""
+    """Estimate of a parameter of a known fish."""
 
     truth: float
     value: float
@@ -74,7 +74,7 @@ class Interval(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came of one experiment."""
+    """Result of one experiment."""
 
     intervals: dict[str, Interval]
     trusted: bool
@@ -82,48 +82,48 @@ class Outcome(NamedTuple):
 
 
 def fish(kind: str, seed: int) -> Config:
-    """A fish that is known, of one of `KINDS`, and its rig."""
+    """Return a known fish of one of `KINDS`, and its rig."""
     if kind == "harsh":
         return load(None, harsh(FIRST_SEED[kind] + seed).overrides)
     rig = msgspec.structs.replace(RIG, seed=FIRST_SEED[kind] + seed)
     chance = random.Random(FIRST_SEED[kind] + seed)
     plain = msgspec.structs.asdict(PlantParameters())
     varied = {name: plain[name] * chance.uniform(1 - SPREAD, 1 + SPREAD) for name in VARIED}
-    varied["servo_delay"] = chance.uniform(0.0, LONGEST_DELAY)
-    varied["backlash"] = chance.uniform(0.0, MOST_BACKLASH)
+    varied["servo_delay"] = chance.uniform(0.0, MAX_DELAY_S)
+    varied["backlash"] = chance.uniform(0.0, MAX_BACKLASH_RAD)
     if kind == "outside":
-        varied["quadratic_drag"] = chance.uniform(0.0, MOST_DRAG)
-        varied["lateral_quadratic_drag"] = chance.uniform(0.0, MOST_LATERAL_DRAG)
+        varied["quadratic_drag"] = chance.uniform(0.0, MAX_DRAG)
+        varied["lateral_quadratic_drag"] = chance.uniform(0.0, MAX_LATERAL_DRAG)
         side = chance.choice((RATIOS[:2], RATIOS[2:]))
         varied["lateral_inertia_ratio"] = chance.uniform(*side)
     return Config(plant=PlantParameters(**varied), simulation=rig)
 
 
 def one(run: tuple[str, int]) -> Outcome:
-    """Let one fish swim, and identify it."""
+    """Run one fish, and identify it."""
     kind, seed = run
     config = fish(kind, seed)
     with VirtualSession(config) as swum:
-        found = identify(experiment(swum, SECONDS))
+        identification = identify(experiment(swum, SECONDS))
     truth: dict[str, Any] = msgspec.structs.asdict(config.plant)
     truth |= msgspec.structs.asdict(config.simulation)
-    # Nearly three whole periods of the drift: its mean is as good as zero.
+    # Nearly three whole periods of the drift, so that its mean is almost zero.
     intervals = {
         each.name: Interval(
             truth[each.name], each.value, each.low, each.high, *each.narrowest_interval
         )
-        for each in found.estimates
+        for each in identification.estimates
         if each.fitted
     }
-    return Outcome(intervals, found.headline.startswith("identified"))
+    return Outcome(intervals, identification.headline.startswith("identified"))
 
 
 def rows(outcomes: Sequence[Outcome], *, known: bool) -> list[list[str]]:
-    """One for each quantity that all fits have: errors, width, coverage.
+    """Return one row for each quantity of all fits: errors, width, coverage.
 
     known: K_y/K is, so that intervals for it are meant
     """
-    found = []
+    cells = []
     for name in outcomes[0].intervals:
         if any(name not in outcome.intervals for outcome in outcomes):
             continue  # what only some of the data demand
@@ -136,18 +136,18 @@ def rows(outcomes: Sequence[Outcome], *, known: bool) -> list[list[str]]:
         scale = factor if is_absolute else factor / np.abs(truth)
         error, width = np.abs(value - truth) * scale, 0.5 * (high - low) * scale
         covered = int(np.sum((low <= truth) & (truth <= high)))
-        found.append(
+        cells.append(
             [
                 f"`{name}`",
                 *(f"{x:.2g} {unit}" for x in (np.median(error), error.max(), np.median(width))),
                 f"{covered} of {len(intervals)}",
             ]
         )
-    return found
+    return cells
 
 
 def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
-    """The row of one kind of fish."""
+    """Return the row of one kind of fish."""
     known = kind != "outside"
     held = narrow = count = astray = withheld = own = own_held = 0
     errors, worst = [], 0.0
@@ -197,7 +197,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """The tables; each experiment takes some seconds."""
+    """Return the tables; each experiment takes some seconds."""
     sections, figures, whole = {}, {}, []
     with ProcessPoolExecutor(options.jobs) as pool:
         for kind in KINDS:

@@ -1,8 +1,8 @@
-"""What a reversed F_y costs, with and without its correction, on fish that differ from the model.
+"""Cost of a reversed F_y, with and without its correction, on fish that differ from the model.
 
-Each fish rests for 3 s and then swims for 40 s, of which the last 30 s are judged: once as it is,
-once with F_y reversed and corrected, and once with F_y reversed and only warned of. Relative
-thrusts are shares of each fish's own best square wave, of its true thrust.
+Each fish rests for 3 s and then swims for 40 s, of which the last 30 s count: once unchanged, once
+with F_y reversed and corrected, and once with F_y reversed and only a warning. Relative thrust is
+the true thrust over that of the best square wave of the same fish.
 """
 
 import logging
@@ -38,7 +38,7 @@ CONTROLLERS: dict[str, dict[str, Any]] = {
 
 
 class Case(NamedTuple):
-    """A run of one fish."""
+    """Run of one fish."""
 
     fish: OtherFish
     contestant: str
@@ -49,8 +49,8 @@ class Case(NamedTuple):
 
 
 def relative_thrust(case: Case) -> float:
-    """Swim a fish, and return its relative thrust [1]."""
-    logging.getLogger("fishd").setLevel(logging.ERROR)  # each reversed fish is a warning
+    """Run a fish, and return its relative thrust [1]."""
+    logging.getLogger("fishd").setLevel(logging.ERROR)  # each reversed fish causes a warning
 
     def rest(run: VirtualRun) -> None:
         loop = run.loop
@@ -73,7 +73,7 @@ COLUMNS = ((False, "correct"), (True, "correct"), (True, "warn"))
 
 
 def measure(options: Namespace) -> Report:
-    """One table; a minute or two."""
+    """Return one table; takes a minute or two."""
     cases = [
         Case(fish, contestant, turned, treatment)
         for group in GROUPS.values()

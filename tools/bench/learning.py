@@ -1,7 +1,7 @@
-"""What learning comes to: learning curves, policies on fish they never met, and speed.
+"""Results of learning: learning curves, policies on unknown fish, and speed.
 
-Trainings are those of `fishctl learn ppo`, in a temporary folder. Relative thrust is the share of
-the thrust of the best square wave of the same fish and amplitude.
+Trainings are those of `fishctl learn ppo`, in a temporary folder. Relative thrust is the thrust
+over that of the best square wave of the same fish and amplitude.
 
     relative_thrust  learning curves: several fish and settings; draws learning-curves.png
     amplitude        Φ = 0.3 rad, where two waves of whole ticks are nearly as good
@@ -59,24 +59,24 @@ from fishd.virtual.plant.optimum import best_square_wave
 DOCUMENT = "how-to/learning.md"
 FIGURE = DOCS / "figures" / "learning-curves.png"
 MILESTONES = (500, 1000, 2000, 4000, 8000, 20_000)
-"""Control steps."""
+"""Numbers of control steps at which learning curves are reported."""
 PAPER_STEPS, CHOICE_STEPS = 20_000, 3000
 CHOOSING = range(300, 310)
-"""Seeds that settings were compared with."""
+"""Seeds with which settings were compared."""
 SHIPPED, SWINGS = "default-fish", ("swing:C=0.6", "swing:C=auto")
 MANY_SEEDS = range(1000, 1040)
 """Seeds of mild and harsh fish that no policy was trained or chosen with."""
 GOOD = 0.95
-"""What a policy is to reach on each of sixteen fish."""
+"""Goal for the relative thrust of a policy on each of sixteen fish."""
 SIMULATED = "`config/simulated.yaml`"
-NEARLY, ENOUGH = 0.95, 0.97
-REACHED = f" | {100 * NEARLY:.0f} % | seeds | {100 * ENOUGH:.0f} % | seeds"
+NEARLY, GOOD_RELATIVE_THRUST = 0.95, 0.97
+REACHED = f" | {100 * NEARLY:.0f} % | seeds | {100 * GOOD_RELATIVE_THRUST:.0f} % | seeds"
 STALLED = 0.5
-"""A policy of less relative thrust than this counts as stalled."""
+"""Relative thrust below which a policy counts as stalled."""
 
 
 def relative_thrust(options: Namespace) -> str:
-    """Learning curves of the default settings on several fish, and of two others; the figure."""
+    """Draw learning curves of the default settings on several fish, and of two other settings."""
     plain, paper = settings_of(None), settings_of("learning-paper.yaml", PAPER_STEPS)
     blind = replace(plain, ppo=replace(plain.ppo, symmetric=False))
     rows = {
@@ -88,20 +88,20 @@ def relative_thrust(options: Namespace) -> str:
         "Φ = 0.42 rad, without the mirror": Row(rig(), blind),
         "Φ = 0.42 rad, as in the paper": Row(rig(), paper),
     }
-    found = several(rows, UNTOUCHED[: options.seeds], options.jobs)
+    trainings = several(rows, UNTOUCHED[: options.seeds], options.jobs)
     picture = {
         row.replace("`", ""): [
             ([p.steps for p in one.points], [p.relative_thrust for p in one.points]) for one in runs
         ]
-        for row, runs in found.items()
+        for row, runs in trainings.items()
         if row != SIMULATED
     }
     if options.write:
-        learning_curves(FIGURE, picture, ENOUGH)
+        learning_curves(FIGURE, picture, GOOD_RELATIVE_THRUST)
     heads = " | ".join(["", "seeds", *(f"{steps} steps" for steps in MILESTONES)])
     reached, learned, best, shape = [], [], [], []
-    for row, runs in found.items():
-        reached.append([row, *to_reach(runs, NEARLY), *to_reach(runs, ENOUGH)])
+    for row, runs in trainings.items():
+        reached.append([row, *to_reach(runs, NEARLY), *to_reach(runs, GOOD_RELATIVE_THRUST)])
         learned.append(
             [row, str(len(runs)), *curve_of(runs, lambda one, k: one.points[k].relative_thrust)]
         )
@@ -142,7 +142,7 @@ def relative_thrust(options: Namespace) -> str:
 
 
 def choices(options: Namespace) -> str:
-    """What each of the default settings is worth, on two fish where it matters."""
+    """Return the effect of each of the default settings, on two fish where it matters."""
     plain = settings_of(None, CHOICE_STEPS)
     ppo, seen = plain.ppo, plain.environment
     others = tuple(name for name in seen.observation if name != "side_time")
@@ -162,7 +162,7 @@ def choices(options: Namespace) -> str:
         "no shortest dwell": replace(plain, environment=replace(seen, dwell=False)),
     }
     fish = {
-        "Φ = 0.2 rad": (rig(0.2), ENOUGH),
+        "Φ = 0.2 rad": (rig(0.2), GOOD_RELATIVE_THRUST),
         "`config/harsh.yaml`": (load(CONFIG / "harsh.yaml"), NEARLY),
     }
     rows = {
@@ -170,12 +170,12 @@ def choices(options: Namespace) -> str:
         for name, chosen in variants.items()
         for one, (config, _) in fish.items()
     }
-    found = several(rows, CHOOSING[: options.seeds], options.jobs)
+    trainings = several(rows, CHOOSING[: options.seeds], options.jobs)
     table_rows = [
         [
             name,
             *itertools.chain.from_iterable(
-                to_reach(found[f"{one}, {name}"], share) for one, (_, share) in fish.items()
+                to_reach(trainings[f"{one}, {name}"], share) for one, (_, share) in fish.items()
             ),
         ]
         for name in variants
@@ -187,7 +187,7 @@ def choices(options: Namespace) -> str:
 
 
 def curve_of(runs: list[Trained], figure: Callable[[Trained, int], float]) -> list[str]:
-    """The cells of a row: one for each milestone until the training's end."""
+    """Return the cells of a row: one for each milestone until the training's end."""
     cells = []
     for steps in MILESTONES:
         known = [sum(point.steps <= steps for point in one.points) for one in runs]
@@ -198,13 +198,13 @@ def curve_of(runs: list[Trained], figure: Callable[[Trained, int], float]) -> li
 
 
 def transfer(options: Namespace) -> str:
-    """Policies of randomised and of plain trainings, and swing, on fish that they never met."""
+    """Return results of randomised and plain trainings, and of swing, on unknown fish."""
     rows = {
         "`learning-transfer.yaml`": Row(rig(), settings_of("learning-transfer.yaml")),
         "default settings": Row(rig(), settings_of(None)),
     }
-    found = several(rows, UNTOUCHED[: options.seeds], options.jobs, others=True)
-    shares = {row: [one.others for one in runs] for row, runs in found.items()}
+    trainings = several(rows, UNTOUCHED[: options.seeds], options.jobs, others=True)
+    shares = {row: [one.others for one in runs] for row, runs in trainings.items()}
     for text in SWINGS:
         _, name, parameters = parse(text)
         fish = fish_that_are_off(rig())
@@ -228,30 +228,30 @@ def transfer(options: Namespace) -> str:
 
 
 def harsh(options: Namespace) -> str:
-    """What `fishctl learn evaluate --fish harsh` shows, and mild fish, for three contestants."""
+    """Return the results of `fishctl learn evaluate --fish harsh`, and of mild fish."""
     changes, random = list(CHANGES), list(harsh_fish())
     clean = [mild(FIRST_SEED + number) for number in range(HARSH_FISH_COUNT)]
     configs = [(fish, load(None, fish.overrides)) for fish in (*changes, *random, *clean)]
     contestants = [parse(text) for text in (SHIPPED, *SWINGS)]
-    found = survey(configs, contestants, SECONDS, SETTLE)
+    results = survey(configs, contestants, SECONDS, SETTLE)
     rows = [
-        [fish.name, *(f"{100 * one.fish[row].relative_thrust:.1f}" for one in found)]
+        [fish.name, *(f"{100 * one.fish[row].relative_thrust:.1f}" for one in results)]
         for row, fish in enumerate(changes)
     ]
     first = len(changes)
     for kind, group in (("harsh", random), ("mild", clean)):
-        groups = [one.fish[first : first + len(group)] for one in found]
+        groups = [one.fish[first : first + len(group)] for one in results]
         for name, pick in (("median", statistics.median), ("worst", min)):
             figures = [pick(swum.relative_thrust for swum in row) for row in groups]
             rows.append(
                 [f"{len(group)} {kind} fish, {name}", *(f"{100 * share:.1f}" for share in figures)]
             )
         first += len(group)
-    lost = [sum(swum.fallback is not None for swum in one.fish) for one in found]
+    lost = [sum(swum.fallback is not None for swum in one.fish) for one in results]
     rows.append(["another took over, runs", *map(str, lost)])
-    shaken = [max(swum.shaken for swum in one.fish) for one in found]
+    shaken = [max(swum.shaken for swum in one.fish) for one in results]
     rows.append(["reversals in consecutive ticks, at most, s", *(f"{s:.1f}" for s in shaken)])
-    heads = " | ".join(["fish", *(f"`{one.contestant}`" for one in found)])
+    heads = " | ".join(["fish", *(f"`{one.contestant}`" for one in results)])
     return "\n\n".join(
         (
             "Relative thrust in %, of a minute whose first 10 s do not count:",
@@ -269,8 +269,8 @@ def on_many_fish() -> str:
     for kind, fish_of_seed in (("mild", mild), ("harsh", harsh_of_seed)):
         fish = [fish_of_seed(seed) for seed in MANY_SEEDS]
         configs = [load(None, each.overrides) for each in fish]
-        (found,) = survey(list(zip(fish, configs, strict=True)), [parse(SHIPPED)], SECONDS, SETTLE)
-        shares = [swum.relative_thrust for swum in found.fish]
+        (result,) = survey(list(zip(fish, configs, strict=True)), [parse(SHIPPED)], SECONDS, SETTLE)
+        shares = [swum.relative_thrust for swum in result.fish]
         grids = [best_on_grid(config).thrust / best_thrust(config) for config in configs]
         limits = [statistics.median(shares), *np.quantile(shares, (0.1, 0.05)), min(shares)]
         cells = [*limits, statistics.median(grids), min(grids)]
@@ -284,7 +284,7 @@ def on_many_fish() -> str:
 
 
 def speed(options: Namespace) -> str:
-    """Steps of the environment per second, and time of an inference, on one core."""
+    """Return the steps of the environment per second and the time of an inference, on one core."""
     config = rig()
     lines = []
     for name, file in (
@@ -299,7 +299,7 @@ def speed(options: Namespace) -> str:
 
 
 def steps_per_second(config: Config, settings: TrainingSettings) -> str:
-    """Of the environment with random actions, on one core; always the configured fish."""
+    """Return the steps per second with random actions and the configured fish, on one core."""
     env = SwimEnv(SimulatedLink(config), config, settings.environment)
     env.reset(seed=0)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (10_000, 1)).astype(np.float32)
@@ -317,7 +317,7 @@ def steps_per_second(config: Config, settings: TrainingSettings) -> str:
 
 
 def inference(config: Config, policy: str) -> str:
-    """Time of the controller `ppo` in the tick."""
+    """Return the time of the controller `ppo` in the tick."""
     controller = registry.create("ppo", {"policy": policy}, config.limits)
     observation = SimulatedLink(config).reset()
     times = []
@@ -354,7 +354,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """The parts that are asked for."""
+    """Return the requested parts."""
     sections = {}
     for part in PARTS if options.part == "all" else (options.part,):
         begun = time.perf_counter()

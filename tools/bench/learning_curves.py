@@ -1,4 +1,4 @@
-"""Draws the learning curves of `tools/bench learning`."""
+"""Figure of the learning curves of `tools/bench learning`."""
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -16,22 +16,24 @@ _CURVES = (
     ("#000000", (0, (6, 1.5, 1, 1.5)), 1.1),
     ("#e69f00", "-", 0.9),
 )
-"""Colour (Okabe and Ito's, which the colour-blind can tell apart), line style, width [points].
-Later ones are thinner or have gaps, so that an earlier one with the same course is still seen."""
+"""Colours, line styles and widths [points] of the curves.
+
+The colours, by Okabe and Ito, are suitable for colour-blind people. Later curves are thinner or
+have gaps, so that an earlier curve below remains visible."""
 _FIRST, _TICKS = 200, (200, 500, 1000, 2000, 5000, 10_000, 20_000)
-"""Control steps."""
+"""First number of control steps on the axis, and its ticks."""
 _LOWEST = 60
-"""Relative thrust at which the axis begins [%]."""
+"""Relative thrust at the begin of the axis [%]."""
 
 
 def learning_curves(
     path: Path, curves: Mapping[str, Sequence[tuple[Sequence[int], Sequence[float]]]], goal: float
 ) -> None:
-    """Relative thrust against steps: median and range of the seeds of each training.
+    """Draw relative thrust against steps: median and range of the seeds of each training.
 
-    curves: for each training its seeds, each as steps and relative thrusts
-    goal: drawn as a line
-    Raises `FishdError` where the file cannot be made, and `MissingPackage`.
+    curves: seeds of each training, each as steps and relative thrusts
+    goal: relative thrust that is drawn as a line
+    Raises `FishdError` where the file cannot be written, and `MissingPackage`.
     """
     steps_shown = max(seeds[0][0][-1] for seeds in curves.values())
     with open_figure(path, (6.4, 3.8)) as figure:

@@ -1,4 +1,4 @@
-"""How often the interval of the shown thrust holds the true thrust, over minutes and an hour.
+"""Coverage of the interval of the shown thrust, over minutes and an hour.
 
 The shown thrust is `thrust` and `thrust_error` of each tick; the true one is the plant's own, over
 the whole beats of the latest 4 s. The first 30 s after the start do not count. Each run begins with
@@ -67,7 +67,7 @@ def _warm_up(tau: float) -> Callable[[random.Random, float], Callable[[float], f
 
 
 def _flicker(rng: random.Random, seconds: float) -> Callable[[float], float]:
-    """Noise with a spectrum of 1/f from one over the run's length to 10 Hz, 5 mN rms."""
+    """Return noise with a 1/f spectrum from the inverse length of the run to 10 Hz, 5 mN rms."""
     step, count = 0.05, int(seconds / 0.05) + 2
     white = np.random.default_rng(rng.getrandbits(32)).standard_normal(count)
     spectrum = np.fft.rfft(white)
@@ -84,7 +84,7 @@ def _step(rng: random.Random, seconds: float) -> Callable[[float], float]:
 
 
 def _steps(rng: random.Random, seconds: float) -> Callable[[float], float]:
-    """Steps of 3 mN, either way, on average one in 20 s."""
+    """Return steps of 3 mN in either direction, on average one in 20 s."""
     begins = sorted(rng.uniform(0.0, seconds) for _ in range(round(seconds / 20.0)))
     sizes = np.cumsum([0.0] + [rng.choice((-3e-3, 3e-3)) for _ in begins])
     return lambda time: float(sizes[np.searchsorted(begins, time)])
@@ -110,44 +110,44 @@ DRIFTS = (
 
 
 class Outcome(NamedTuple):
-    """How good the shown thrust of one run was."""
+    """Quality of the shown thrust in one run."""
 
     truth: float
     """Mean true thrust [N]."""
     inside: float
-    """Share of the ticks whose interval holds the truth."""
+    """Fraction of the ticks whose interval contains the true value."""
     withheld: float
-    """Share of the ticks that show no interval."""
+    """Fraction of the ticks without an interval."""
     median_half_width: float
     """Median half-width of the interval [N]."""
     half_width: float
     """Largest half-width of the interval [N]."""
     error: float
-    """Mean of the shown thrust less the true one [N]."""
+    """Mean of the shown thrust minus the true one [N]."""
     drift: float
-    """Change of that error in an hour, as a share of the thrust: a line through it."""
+    """Change of that error in an hour relative to the thrust, from a linear fit."""
     held_miss: float = math.nan
-    """Relative error of the controller `thrust`: mean true thrust over its target, less 1."""
+    """Relative error of the controller `thrust`: mean true thrust over its target, minus 1."""
     held_ci95: float = math.nan
     """Mean half-width of the interval of `held_thrust`, over the target."""
     held_inside: float = math.nan
-    """Share of the ticks in which the interval of `held_thrust` holds the truth."""
+    """Fraction of the ticks in which the interval of `held_thrust` contains the true value."""
 
 
 class Drifting:
-    """A force sensor with a drift of F_x added."""
+    """Force sensor with an added drift of F_x."""
 
     def __init__(self, sensor: ForceSensor, drift: Callable[[float], float]) -> None:
         self._sensor, self._drift = sensor, drift
 
     def read(self, now: float) -> Measurement:
-        """Read the sensor, and add the drift at that time."""
+        """Read the sensor, and add the drift."""
         measurement = self._sensor.read(now)
         return replace(measurement, fx=measurement.fx + self._drift(now))
 
 
 class BeatTruth:
-    """The true thrust over the whole beats of the latest seconds."""
+    """True thrust over the whole beats of the latest seconds."""
 
     def __init__(self) -> None:
         self.mean: float | None = None
@@ -156,7 +156,7 @@ class BeatTruth:
         self._open = False
 
     def add(self, window: TrueWindow, angle: float, tick: float) -> None:
-        """Take in a tick; angle: the instruction angle that begins with it [rad]."""
+        """Add a tick; angle: instruction angle from this tick on [rad]."""
         self._count += 1
         self._sum += window.thrust
         if self._angle < 0.0 < angle:
@@ -172,24 +172,24 @@ class BeatTruth:
 
 
 class LastTick:
-    """A publisher that keeps the latest tick."""
+    """Publisher that stores the latest tick."""
 
     latest: Tick
 
     def tick(self, tick: Tick) -> None:
-        """Keep it."""
+        """Store the tick."""
         self.latest = tick
 
     def event(self, event: object) -> None:
-        """Drop."""
+        """Ignore the event."""
 
 
 def swim(
     config: Config, wave: str, seconds: float, rest_each: float, drift: Drift | None = None
 ) -> Outcome:
-    """Swim, after a rest and with further ones, and compare the shown thrust with the true one.
+    """Swim with rests, and compare the shown thrust with the true one.
 
-    rest_each: time from the begin of a rest to that of the next [s]
+    rest_each: time from the begin of a rest to that of the next one [s]
     """
     rng = random.Random(config.simulation.seed)
     publisher, (name, parameters) = LastTick(), WAVES[wave]
@@ -232,7 +232,7 @@ def swim(
 
 
 def replace_sensor(robot: Any, added: Callable[[float], float]) -> Any:
-    """Return the same robot with a drift of F_x."""
+    """Return the robot with an added drift of F_x."""
     return dataclasses.replace(robot, sensor=Drifting(robot.sensor, added))
 
 
@@ -263,12 +263,12 @@ def _judge(
 
 
 def quiet(wave: str, seed: int) -> Outcome:
-    """Five minutes of the default configuration, whose sensor does not drift."""
+    """Measure five minutes of the default configuration, whose sensor does not drift."""
     return swim(load(None, [f"simulation.seed={seed}"]), wave, 300.0, math.inf)
 
 
 def drifting(wave: str, seed: int, rest_each: float) -> Outcome:
-    """An hour of the rig of `make run`: its drift, offset and rotation."""
+    """Measure an hour of the rig of `make run`, with its drift, offset and rotation."""
     config = Config(
         simulation=replace(
             Config().simulation, seed=seed, offset_y=0.01, drift=0.005, rotation=0.05
@@ -278,12 +278,12 @@ def drifting(wave: str, seed: int, rest_each: float) -> Outcome:
 
 
 def strange(drift: int, seed: int) -> Outcome:
-    """Five minutes of swing on a sensor that drifts in a way that is not configured."""
+    """Measure five minutes of swing on a sensor with a drift that is not configured."""
     return swim(load(None, [f"simulation.seed={seed}"]), "swing", 300.0, math.inf, DRIFTS[drift])
 
 
 def holding(target: float, seed: int) -> Outcome:
-    """Half an hour of `thrust`."""
+    """Measure half an hour of `thrust`."""
     WAVES["held"] = ("thrust", {"target": target})
     return swim(load(None, [f"simulation.seed={seed}"]), "held", 1800.0, math.inf)
 
@@ -301,7 +301,7 @@ HEAD = (
 
 
 def measure(options: Namespace) -> Report:
-    """Four tables; a quarter of an hour on two cores."""
+    """Return four tables; takes a quarter of an hour on two cores."""
     seeds = range(options.seed, options.seed + options.runs)
     hours = seeds[: options.hours]
     with joblib.Parallel(options.jobs) as pool:

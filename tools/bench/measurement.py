@@ -1,4 +1,4 @@
-"""How well `fishctl measure` knows the thrust, under several drifts of the force sensor.
+"""Accuracy of `fishctl measure` under several drifts of the force sensor.
 
 Each number is of many runs on the simulated fish, of `swing` with its defaults; the runs differ in
 the seed of noise and drift. The truth is that of the plant. Drifts that the simulation does not
@@ -83,10 +83,10 @@ def outliers(chance: random.Random, seconds: float) -> Force:
 
 def _times(chance: random.Random, seconds: float, per_minute: float) -> Sequence[float]:
     """Return the times of a Poisson process [s]."""
-    found = [chance.expovariate(per_minute / 60.0)]
-    while found[-1] < seconds:
-        found.append(found[-1] + chance.expovariate(per_minute / 60.0))
-    return found[:-1]
+    times = [chance.expovariate(per_minute / 60.0)]
+    while times[-1] < seconds:
+        times.append(times[-1] + chance.expovariate(per_minute / 60.0))
+    return times[:-1]
 
 
 ADDED: dict[str, Callable[[random.Random, float], Force]] = {
@@ -98,18 +98,18 @@ ADDED: dict[str, Callable[[random.Random, float], Force]] = {
 
 
 class DisturbedRig(VirtualSession):
-    """A simulated fish whose F_x has a force added that fishd does not know."""
+    """Simulated fish with a force added to F_x that is unknown to fishd."""
 
     def __init__(self, config: Config, force: Force) -> None:
         super().__init__(config)
         self._force = force
 
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
-        """As `Rig.swim`."""
+        """Swim like `Rig.swim`, with the added force."""
         return self._disturbed(super().swim(controller, parameters, seconds), True)
 
     def rest(self, seconds: float) -> list[Tick]:
-        """As `Rig.rest`."""
+        """Rest like `Rig.rest`, with the added force."""
         return self._disturbed(super().rest(seconds), False)
 
     def _disturbed(self, ticks: list[Tick], swims: bool) -> list[Tick]:
@@ -119,19 +119,19 @@ class DisturbedRig(VirtualSession):
 
 
 class Run(NamedTuple):
-    """One measurement; forces in N."""
+    """Result of one measurement; forces in N."""
 
     thrust: float
     error: float
     """Half-width of the statistical interval."""
     total_ci95: float
-    """Half-width of the interval that has the sensor's rotation in it, too."""
+    """Half-width of the interval that includes the sensor's rotation."""
     plain: float
     """Plain mean of F_x while the fish swims."""
     is_named: bool
-    """Was a disturbance of the zero named?"""
+    """Whether the result names a disturbance of the zero."""
     is_flagged: bool
-    """Did the result say that it may be wrong?"""
+    """Whether the result says that it may be wrong."""
 
 
 def run(drift: str, seconds: float, seed: int) -> Run:
@@ -139,11 +139,11 @@ def run(drift: str, seconds: float, seed: int) -> Run:
     config = Config(simulation=replace(RIG, seed=seed, **DRIFTS.get(drift, {})))
     force = ADDED[drift](random.Random(f"{drift} {seed}"), seconds) if drift in ADDED else None
     with DisturbedRig(config, force) if force else VirtualSession(config) as rig:
-        found = measured(rig, "swing", {}, seconds)
-    plain = float(np.mean([tick.fx for tick in found.ticks if tick.mode == "running"]))
-    assert found.total_ci95 is not None
-    named, flagged = bool(found.disturbances), bool(found.remark)
-    return Run(found.thrust, found.error, found.total_ci95, plain, named, flagged)
+        measurement = measured(rig, "swing", {}, seconds)
+    plain = float(np.mean([tick.fx for tick in measurement.ticks if tick.mode == "running"]))
+    assert measurement.total_ci95 is not None
+    named, flagged = bool(measurement.disturbances), bool(measurement.remark)
+    return Run(measurement.thrust, measurement.error, measurement.total_ci95, plain, named, flagged)
 
 
 def measure(options: Namespace) -> Report:

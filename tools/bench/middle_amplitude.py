@@ -1,4 +1,4 @@
-"""Learning at Φ = 0.3 rad, for `learning`: why a seed may stay at five ticks."""
+"""Learning at Φ = 0.3 rad, for `learning`, where a seed may stay at half beats of five ticks."""
 
 import math
 import statistics
@@ -28,19 +28,19 @@ WATCHED_SEED = 252
 """Seed whose policy swims half beats of five ticks at the end of its training."""
 STEPS, LONG_STEPS = 2048, 8000
 """Control steps of each training, and of that of the watched seed."""
-NEARLY, ENOUGH = 0.95, 0.97
+NEARLY, GOOD_RELATIVE_THRUST = 0.95, 0.97
 WATCHED_TICKS = 400
-"""Ticks in which the commands of a policy are looked at."""
+"""Number of ticks in which the commands of a policy are evaluated."""
 
 
 class Checkpoint(NamedTuple):
-    """What a policy does after some steps of its training."""
+    """Behaviour of a policy after some steps of its training."""
 
     steps: int
     half_beat: float
     """Median half beat without exploration [ticks]."""
     stay: float
-    """Median probability of exploration to delay a reversal by one tick."""
+    """Median probability that exploration delays a reversal by one tick."""
 
 
 def amplitude(options: Namespace) -> str:
@@ -48,11 +48,12 @@ def amplitude(options: Namespace) -> str:
     config, seeds = rig(AMPLITUDE_RAD), SEEDS[: options.seeds]
     name = f"Φ = {AMPLITUDE_RAD} rad"
     runs = several({name: Row(config, settings_of(None, STEPS))}, seeds, options.jobs)[name]
-    cells = [name, *to_reach(runs, NEARLY), *to_reach(runs, ENOUGH)]
+    cells = [name, *to_reach(runs, NEARLY), *to_reach(runs, GOOD_RELATIVE_THRUST)]
     cells.append(spread([run.best[-1] for run in runs]))
     cells.append(spread([run.exported.frequency for run in runs], 1.0, 3))
     heads = (
-        f" | {100 * NEARLY:.0f} % | seeds | {100 * ENOUGH:.0f} % | seeds | best policy (%) | "
+        f" | {100 * NEARLY:.0f} % | seeds | {100 * GOOD_RELATIVE_THRUST:.0f} % | seeds | "
+        "best policy (%) | "
         "its frequency (Hz)"
     )
     waves = (wave(config, ticks) for ticks in (4, 5, 6, 7))
@@ -66,14 +67,14 @@ def amplitude(options: Namespace) -> str:
 
 
 def wave(config: Config, ticks: int) -> str:
-    """Return the relative thrust of a square wave whose half beats have so many ticks."""
+    """Return the relative thrust of a square wave with half beats of `ticks` ticks."""
     frequency = 0.5 / (ticks * config.tick)
     thrust = square_wave(config.plant, config.amplitude_limit, frequency).thrust
     return f"{ticks} ticks ({frequency:.2f} Hz) {100 * thrust / best_thrust(config):.1f} %"
 
 
 def exploration(options: Namespace) -> str:
-    """Train the watched seed for longer, and return a table of what its policies explore."""
+    """Train the watched seed for longer, and return a table of its policies' exploration."""
     config, seed = rig(AMPLITUDE_RAD), WATCHED_SEED
     fish = replace(config, simulation=replace(config.simulation, seed=seed))
     settings = replace(settings_of(None, LONG_STEPS), seed=seed, checkpoint_every=500)
@@ -84,9 +85,9 @@ def exploration(options: Namespace) -> str:
         shares = {point.steps: point.relative_thrust for point in points}
         best = best_so_far(points)[-1]
         folders = [each for each in list_all(job.folder) if each.name.startswith("step-")]
-        found = [checkpoint(fish, each) for each in folders[1:]]
+        checkpoints = [checkpoint(fish, each) for each in folders[1:]]
     rows = []
-    for each in (found[0], *found[1:4:2], *found[7::8]):
+    for each in (checkpoints[0], *checkpoints[1:4:2], *checkpoints[7::8]):
         share = f"{100.0 * shares[each.steps]:.1f}" if each.steps in shares else "–"
         cells = (each.steps, share, f"{each.half_beat:g}", f"{each.stay:.0e}")
         rows.append([str(cell) for cell in cells])
@@ -98,7 +99,7 @@ def exploration(options: Namespace) -> str:
 
 
 def checkpoint(config: Config, folder: Path) -> Checkpoint:
-    """Let the policy of a checkpoint swim without exploration, and look at its reversals."""
+    """Run the policy of a checkpoint without exploration, and return its reversals."""
     policy, _ = load_policy(folder)
     env = SwimEnv(SimulatedLink(config), config, settings_of(None).environment)
     seen, _ = env.reset(seed=0)

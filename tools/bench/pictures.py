@@ -1,7 +1,7 @@
-"""What learning from pictures comes to: steps until it swims, for each eye; its optimum; speed.
+"""Results of learning from pictures: steps of the training for each eye, optimum, and speed.
 
 Trainings are those of `fishctl learn ppo --see camera`, in a temporary folder, with seeds that no
-setting was chosen with. Relative thrust is the share of the best square wave's thrust.
+setting was chosen with. Relative thrust is the thrust over that of the best square wave.
 
     steps     control steps until 97 %, babble included; draws docs/figures/camera-learning.png
     optimum   what was learned at four amplitudes, from pictures and from forces
@@ -31,22 +31,22 @@ from fishd.virtual.plant.optimum import best_square_wave
 
 DOCUMENT = "how-to/camera.md"
 FIGURE = DOCS / "figures" / "camera-learning.png"
-ENOUGH = 0.97
+GOOD_RELATIVE_THRUST = 0.97
 UNUSED = 230
-"""The first seed; none from here on was used to choose a setting."""
-LONGEST = 4096
-"""Control steps of a training."""
+"""First seed; no setting was chosen with this seed or the following ones."""
+TRAINING_STEPS = 4096
+"""Number of control steps of a training."""
 AMPLITUDES = (0.2, 0.31, 0.42, 0.8)
-"""[rad]"""
+"""Amplitudes Φ [rad]."""
 
-MODES = replace(settings_of(None, LONGEST), see="camera")
-CNN = settings_of("learning-cnn.yaml", LONGEST)
+MODES = replace(settings_of(None, TRAINING_STEPS), see="camera")
+CNN = settings_of("learning-cnn.yaml", TRAINING_STEPS)
 PAPER = settings_of("learning-camera-paper.yaml", 15_360)
-FORCE = settings_of(None, LONGEST)
+FORCE = settings_of(None, TRAINING_STEPS)
 
 
 def steps(options: Namespace) -> str:
-    """Control steps until 97 %, for each eye, and the curves."""
+    """Return the control steps until 97 % for each eye, and draw the curves."""
     blind = replace(CNN, ppo=replace(CNN.ppo, symmetric=False))
     rows = {
         "`modes`, rig default": Row(rig(), MODES),
@@ -56,16 +56,18 @@ def steps(options: Namespace) -> str:
         "`cnn`, default, without the mirror": Row(rig(), blind),
         "force": Row(rig(), FORCE),
     }
-    found = several(rows, range(UNUSED, UNUSED + options.seeds), options.jobs)
+    trainings = several(rows, range(UNUSED, UNUSED + options.seeds), options.jobs)
     few = range(UNUSED, UNUSED + max(1, round(0.3 * options.seeds)))
     paper = {"as in the paper": Row(rig(), PAPER)}
-    found |= several(paper, few, options.jobs)
+    trainings |= several(paper, few, options.jobs)
     if options.write:
         shown = ("`modes`, rig default", "`cnn`, rig default", "as in the paper", "force")
         learning_curves(
-            FIGURE, {name.replace("`", ""): curves(found[name]) for name in shown}, ENOUGH
+            FIGURE,
+            {name.replace("`", ""): curves(trainings[name]) for name in shown},
+            GOOD_RELATIVE_THRUST,
         )
-    lines = [[name, *summary(runs)] for name, runs in found.items()]
+    lines = [[name, *summary(runs)] for name, runs in trainings.items()]
     heads = (
         "what it sees with | steps to 97 %, median | lowest – highest | seeds that reach it | "
         "best at the end (%) | processor (s for 1000 steps)"
@@ -74,13 +76,13 @@ def steps(options: Namespace) -> str:
 
 
 def curves(runs: list[Trained]) -> list[tuple[list[int], list[float]]]:
-    """Steps and best relative thrust so far, of each seed."""
+    """Return steps and best relative thrust up to each, for each seed."""
     return [([point.steps for point in one.points], one.best) for one in runs]
 
 
 def summary(runs: list[Trained]) -> list[str]:
-    """The cells of a row."""
-    reached = sorted(one.steps_to(ENOUGH) for one in runs)
+    """Return the cells of a row."""
+    reached = sorted(one.steps_to(GOOD_RELATIVE_THRUST) for one in runs)
     ends = sorted(100.0 * one.best[-1] for one in runs)
     return [
         number(statistics.median_low(reached)),
@@ -92,12 +94,12 @@ def summary(runs: list[Trained]) -> list[str]:
 
 
 def number(steps: float) -> str:
-    """Steps, or that there was no such step."""
+    """Format a number of steps, or that it was not reached."""
     return f"{steps:.0f}" if math.isfinite(steps) else "never"
 
 
 def optimum(options: Namespace) -> str:
-    """Frequency and thrust of the best policies, from forces and from pictures."""
+    """Return frequency and thrust of the best policies, from forces and from pictures."""
     longer = 8064
     kinds = {
         "force": replace(FORCE, steps=longer),
@@ -110,14 +112,14 @@ def optimum(options: Namespace) -> str:
         for name, settings in kinds.items()
     }
     seeds = range(UNUSED, UNUSED + max(1, round(0.3 * options.seeds)))
-    found = several(rows, seeds, options.jobs)
+    trainings = several(rows, seeds, options.jobs)
     lines = []
     for amplitude in AMPLITUDES:
         config = rig(amplitude)
         grid, best = best_on_grid(config), best_square_wave(config.plant, amplitude)
         cells = [f"{amplitude}", f"{grid.frequency:.2f} / {100.0 * grid.thrust / best.thrust:.1f}"]
         for name in kinds:
-            ends = [one.exported for one in found[f"{amplitude} {name}"]]
+            ends = [one.exported for one in trainings[f"{amplitude} {name}"]]
             frequency = statistics.median(end.frequency for end in ends)
             share = statistics.median(100.0 * end.relative_thrust for end in ends)
             low, high = (pick(end.frequency for end in ends) for pick in (min, max))
@@ -126,12 +128,13 @@ def optimum(options: Namespace) -> str:
     heads = " | ".join(("Φ (rad)", "best on the grid of ticks", *kinds))
     return (
         f"Frequency (Hz), median [lowest – highest] of {len(seeds)} seeds, and relative thrust "
-        f"(%), of the best policy of {longer} steps, `cnn` {LONGEST}:\n\n{table(heads, lines)}"
+        f"(%), of the best policy of {longer} steps, `cnn` {TRAINING_STEPS}:\n\n"
+        f"{table(heads, lines)}"
     )
 
 
 def speed(options: Namespace) -> str:
-    """Steps of the environment with pictures, per second, on one core."""
+    """Return the steps per second of the environment with pictures, on one core."""
     config = rig()
     lines = []
     for name, camera in (("default", DEFAULT), ("web", WEB)):
@@ -141,7 +144,7 @@ def speed(options: Namespace) -> str:
 
 
 def rate(settings: TrainingSettings, camera: SimulatedCameraSettings, config: Config) -> float:
-    """Steps a second."""
+    """Return the steps per second."""
     eye = make_eye(settings)
     assert eye
     link = SimulatedLink(config, camera=Camera(camera, settings.camera.stack))
@@ -168,7 +171,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """The parts that are asked for."""
+    """Return the requested parts."""
     sections = {}
     for part in PARTS if options.part == "all" else (options.part,):
         begun = time.perf_counter()

@@ -1,4 +1,4 @@
-"""A program for `tick`: a loop as one writes it without much thought.
+"""Program for `tick`: a naive loop.
 
 python plain_loop.py asyncio|sleep PERIOD SECONDS PRIORITY
 """

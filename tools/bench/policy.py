@@ -1,8 +1,8 @@
-"""What a policy costs in the tick: one update of the controller `ppo`.
+"""Cost of a policy in the tick: one update of the controller `ppo`.
 
-First the loop on the virtual clock, where one update follows the other, in turn with the controller
-`hold`, whose update does nothing. Then real fishd, whose update comes after 50 ms of sleep: with
-warmed-up ticks as usual, and without.
+The first measurement is the loop on the virtual clock, with updates in direct succession, in turn
+with the controller `hold`, whose update does nothing. The second one is a real fishd, whose update
+follows 50 ms of sleep, with and without warmed-up ticks.
 """
 
 import itertools
@@ -31,25 +31,25 @@ from fishd.core.signals import Event, Observation, Percentiles, Tick
 
 DOCUMENT = "reference/policies.md"
 GOAL = 50.0
-"""Longest update that is asked for, at p99 [µs]."""
+"""Goal for the time of an update, p99 [µs]."""
 BLOCK = 500
-"""Updates before the other controller has its turn."""
+"""Number of updates per turn of a controller."""
 RIG = ("simulation.noise=1e-3", "simulation.offset_y=5e-3")
 HEAD = "controller | where | updates | p50 [µs] | p99 [µs] | worst [µs]"
 
 
 class Deaf:
-    """A publisher that keeps nothing."""
+    """Publisher that ignores everything."""
 
     def tick(self, tick: Tick) -> None:
-        """Drop."""
+        """Ignore the tick."""
 
     def event(self, event: Event) -> None:
         """Drop."""
 
 
 def random_policy() -> bytes:
-    """A 64 × 64 tanh network of random weights, which sees what training shows by default."""
+    """Return a 64 × 64 tanh network with random weights and the default observation."""
     draw = np.random.default_rng(0)
     sizes = (5, 64, 64, 1)
     layers = [
@@ -79,7 +79,7 @@ def random_policy() -> bytes:
 
 
 class Swimmer:
-    """A controller in a loop on the virtual clock, with a stopwatch around its update."""
+    """Controller in a loop on the virtual clock, with a timer around its update."""
 
     def __init__(self, config: Config, name: str, parameters: dict[str, Any]) -> None:
         clock = VirtualClock()
@@ -92,14 +92,14 @@ class Swimmer:
         self._slots = virtual_slots(clock, config.tick)
 
     def swim(self, ticks: int) -> None:
-        """Turn the loop."""
+        """Run the loop."""
         for slot in itertools.islice(self._slots, ticks):
             self._loop.tick(slot)
         if self._loop.supervisor.reason:
             raise SystemExit(self._loop.supervisor.reason.message)
 
     def percentiles(self) -> Percentiles:
-        """Of all updates so far, but for the first block [µs]."""
+        """Return the percentiles of all updates except those of the first block [µs]."""
         times = [nanoseconds / 1e3 for nanoseconds in self.times[BLOCK:]]
         return Percentiles(quantile(times, 0.5), quantile(times, 0.99), max(times), 0)
 
@@ -116,7 +116,7 @@ class Swimmer:
 
 
 def in_virtual_time(policy: str, updates: int) -> Iterator[list[str]]:
-    """The rows of both controllers, which swim in turn."""
+    """Return the rows of both controllers, which run in turn."""
     config = load(None, RIG)
     swimmers = {
         "hold": Swimmer(config, "hold", {}),
@@ -131,7 +131,7 @@ def in_virtual_time(policy: str, updates: int) -> Iterator[list[str]]:
 
 
 def in_real_time(policy: str, seconds: float) -> Iterator[list[str]]:
-    """The rows of daemons that swim at the same time, with the policy and with `hold`."""
+    """Return the rows of daemons that run at the same time, with the policy and with `hold`."""
     with ExitStack() as stack:
         started = []
         for name, parameters in (("hold", ()), ("ppo", (f"start.parameters.policy={policy}",))):
@@ -149,14 +149,14 @@ def in_real_time(policy: str, seconds: float) -> Iterator[list[str]]:
             yield _row(name, where, status.seq, status.timing.phases["update"])
 
 
-def _row(name: str, where: str, updates: int, found: Percentiles) -> list[str]:
-    times = (f"{value:.1f}" for value in (found.p50, found.p99, found.worst))
+def _row(name: str, where: str, updates: int, figures: Percentiles) -> list[str]:
+    times = (f"{value:.1f}" for value in (figures.p50, figures.p99, figures.worst))
     return [f"`{name}`", where, str(updates), *times]
 
 
 @contextmanager
 def policy_file(given: str | None) -> Iterator[str]:
-    """The policy to measure: the given one, or a random one in a file of its own."""
+    """Return the file of the policy: the given one, or that of a new random one."""
     if given:
         yield str(Path(given).absolute()) if "/" in given or given.endswith(".onnx") else given
         return
@@ -174,7 +174,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """In virtual and in real time."""
+    """Return the tables of virtual and real time."""
     with policy_file(options.policy) as policy:
         rows = [*in_virtual_time(policy, options.updates), *in_real_time(policy, options.seconds)]
     met = "met" if float(rows[1][4]) <= GOAL else "**not met**"

@@ -1,4 +1,4 @@
-"""How long the controller `remote` waits for an agent in another process.
+"""Time that the controller `remote` waits for an agent in another process.
 
 A round trip begins when a tick is about to send its observation, and ends when it has the action.
 The agent is `fishd.client.Agent`, a Python program that answers at once: at normal priority and,
@@ -31,9 +31,9 @@ from fishd.daemon.warm_up import mock_ticks
 
 DOCUMENT = "how-to/remote.md"
 GOAL = 2e-3
-"""Longest round trip that is asked for, at p99 [s]."""
+"""Goal for the round trip, p99 [s]."""
 AGENT_PRIORITY = 40
-"""Below that of fishd."""
+"""SCHED_FIFO priority of the agent, below that of fishd."""
 HEAD = (
     "over | tick | agent | trips | p50 [µs] | p99 [µs] | p99.9 [µs] | worst [µs] | late | "
     "p99 ≤ 2 ms"
@@ -50,7 +50,7 @@ with Agent(sys.argv[1], timeout=30.0) as agent:
 
 
 class Trips(Struct, frozen=True):
-    """The round trips of one run."""
+    """Round trips of one run."""
 
     transport: str
     tick: float
@@ -60,11 +60,11 @@ class Trips(Struct, frozen=True):
     times: list[float]
     """[s]"""
     late: int
-    """Ticks whose deadline, 0.45 of a tick, was not met."""
+    """Number of ticks whose deadline, 0.45 of a tick, was missed."""
 
 
 class TimedRemote(Remote):
-    """`remote`, with a stopwatch around it once its agent has answered for the first time."""
+    """Controller `remote` with a timer, which starts after the first answer of its agent."""
 
     def __init__(self, agent: str, config: Config) -> None:
         parameters = RemoteParameters(agent=agent, deadline=0.45 * config.tick, misses=1000)
@@ -73,7 +73,7 @@ class TimedRemote(Remote):
         self.late = 0
 
     def update(self, observation: Observation) -> float:
-        """Ask, and take the time."""
+        """Update the controller, and record the time."""
         begun = time.perf_counter()
         command = super().update(observation)
         if command != 0.0 or self.times:
@@ -84,7 +84,7 @@ class TimedRemote(Remote):
 
 @contextmanager
 def agent_process(address: str, priority: int) -> Iterator[str]:
-    """An agent that answers at once, and where."""
+    """Start an agent that answers at once, and yield its address."""
     under = ["chrt", "-f", str(priority)] if priority else []
     process = subprocess.Popen(
         [*under, sys.executable, "-c", AGENT, address], stdout=subprocess.PIPE, text=True
@@ -98,7 +98,7 @@ def agent_process(address: str, priority: int) -> Iterator[str]:
 
 
 async def swim(controller: TimedRemote, config: Config, trips: int) -> None:
-    """Tick as the daemon does until there are so many round trips."""
+    """Tick like the daemon until there are `count` round trips."""
     realtime.enter(PRIORITY if fifo_permitted() else 0, lock_memory=False)
     fish = simulated_fish(config)
     loop = build_loop(config, fish.robot(), SystemClock(), Telemetry(lambda message: None))
@@ -116,7 +116,7 @@ async def swim(controller: TimedRemote, config: Config, trips: int) -> None:
 
 
 def round_trips(transport: str, tick: float, priority: int, trips: int) -> Trips:
-    """One run over `ipc` or `tcp`, in this process, which is to do nothing else."""
+    """Return one run over `ipc` or `tcp`, in this process, which does nothing else."""
     config = load(None, [f"tick={tick}"])
     with tempfile.TemporaryDirectory() as folder:
         wanted = f"ipc://{folder}/agent" if transport == "ipc" else "tcp://127.0.0.1:*"
@@ -127,8 +127,8 @@ def round_trips(transport: str, tick: float, priority: int, trips: int) -> Trips
 
 
 def row(trips: Trips) -> list[str]:
-    """What a run came to, and whether that is what was asked for."""
-    # Not the default method, which goes beyond the worst of fewer than 999 trips.
+    """Return the row of a run, and whether it meets the goal."""
+    # The default method would extrapolate beyond the worst of fewer than 999 trips.
     cuts = quantiles(trips.times, n=1000, method="inclusive")
     p50, p99 = cuts[499], cuts[989]
     figures = (p50, p99, cuts[998], max(trips.times))
@@ -150,12 +150,12 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Every tick over every transport, with an agent of every priority."""
-    found = []
+    """Measure every tick over every transport, with an agent of every priority."""
+    runs = []
     for priority in priorities(AGENT_PRIORITY) if shutil.which("chrt") else (0,):
         for tick in (0.005,) if options.quick else (0.005, 0.05):
             for transport in ("ipc", "tcp"):
-                found.append(round_trips(transport, tick, priority, options.trips))
-                progress(*row(found[-1]))
-    text = f"{machine_in_short()}\n\n{table(HEAD, map(row, found))}"
-    return Report({"bench remote": text}, found)
+                runs.append(round_trips(transport, tick, priority, options.trips))
+                progress(*row(runs[-1]))
+    text = f"{machine_in_short()}\n\n{table(HEAD, map(row, runs))}"
+    return Report({"bench remote": text}, runs)

@@ -1,7 +1,7 @@
-"""What the force sampler costs: CPU, pairs per tick, and lateness of the ticks beside it.
+"""Cost of the force sampler: CPU, pairs per tick, and lateness of the ticks beside it.
 
-Two real fishd swim side by side, so that a noisy machine disturbs them alike: one with a simulated
-fish and no sampler, one on a virtual Pi, which runs in a process of its own.
+Two real fishd run side by side, so that a noisy machine disturbs both equally: one with a simulated
+fish and no sampler, one on a virtual Pi, which runs in a separate process.
 """
 
 import statistics
@@ -28,7 +28,7 @@ HEAD = (
 
 @contextmanager
 def virtual_pi() -> Iterator[list[str]]:
-    """A virtual Pi in a process of its own; the settings of a fishd that is to use it."""
+    """Start a virtual Pi in a separate process, and yield the settings of a fishd for it."""
     with tempfile.TemporaryDirectory(prefix="fishd-") as folder:
         address = Path(folder) / "pi"
         settings = [f"virtual_pi.socket={address}", "virtual_pi.pigpio_port=0"]
@@ -48,13 +48,13 @@ def virtual_pi() -> Iterator[list[str]]:
 
 
 def late(ticks: list[Tick]) -> tuple[float, float]:
-    """Median and 99th percentile of the lateness [µs]."""
+    """Return median and 99th percentile of the lateness [µs]."""
     lateness = [tick.lateness_us for tick in ticks]
     return quantile(lateness, 0.5), quantile(lateness, 0.99)
 
 
 def run_round(stressed: bool, priority: int, seconds: float) -> list[str]:
-    """Let both swim for `seconds`; a row of the table."""
+    """Run both for `seconds`, and return a row of the table."""
     setting = f"realtime.priority={priority}"
     with (
         virtual_pi() as settings,
@@ -100,7 +100,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Every load with every scheduler."""
+    """Measure every load with every scheduler."""
     rows = []
     for priority in reversed(priorities()):
         for stressed in (False, True):

@@ -1,6 +1,6 @@
-"""How long a sweep takes, and how many ticks of swimming a search needs.
+"""Duration of a sweep, and ticks of swimming that a search needs.
 
-sweep      3 waveforms × 20 frequencies in simulation, as `fishctl sweep` does it, with its start
+sweep      3 waveforms × 20 frequencies in simulation, by `fishctl sweep`, including its start
 search     the frequency of `square` on config/simulated.yaml, sensor drift included
 """
 
@@ -29,12 +29,12 @@ DOCUMENT = "how-to/sweeps.md"
 FISH = DOCS.parent / "config" / "simulated.yaml"
 FREQUENCIES = "0.2:4:0.2"
 RANGE = (0.4, 5.0)
-"""What `--over frequency` searches with ticks of 50 ms [Hz]."""
-ENOUGH, UNTIL, BUDGET = 0.97, 0.01, 300.0
+"""Range of `--over frequency` with ticks of 50 ms [Hz]."""
+GOOD_RELATIVE_THRUST, MIN_IMPROVEMENT, BUDGET_S = 0.97, 0.01, 300.0
 
 
 def sweep_seconds() -> tuple[float, float]:
-    """How long the whole command takes, and how much of all cores together [s]."""
+    """Return the duration of the command and its processor time of all cores [s]."""
     fishctl = Path(sys.executable).with_name("fishctl")
     with tempfile.TemporaryDirectory() as folder:
         words = ["sweep", "square,sine,triangle", "--frequency", FREQUENCIES, "--config", str(FISH)]
@@ -45,34 +45,34 @@ def sweep_seconds() -> tuple[float, float]:
 
 
 def _of_children() -> float:
-    found = os.times()
-    return found.children_user + found.children_system
+    cpu_times = os.times()
+    return cpu_times.children_user + cpu_times.children_system
 
 
 @lru_cache(maxsize=1000)
 def thrust(frequency: float) -> float:
-    """The true one of a square wave [N]; a sensor's noise and drift have no part in it."""
+    """Return the true thrust of a square wave, without noise and drift of the sensor [N]."""
     return simulate(load(FISH), "square", {"frequency": frequency}, 40.0).mean_thrust
 
 
 def search(config: Config, seed: int) -> tuple[int, int, int, float, bool]:
-    """Ticks of swimming until a proposal is good, until all later ones are, and until it ends;
+    """Return the ticks until a proposal is good, until all later ones are, and until the end;
     the share of the best thrust in the end, and whether that proposal's interval has the best."""
     config = replace(config, simulation=replace(config.simulation, seed=seed))
     grid = [0.5 / (ticks * config.tick) for ticks in range(5, 8)]
     frequencies = [*np.arange(1.5, 2.0, 0.02).tolist(), *grid]
     best = max(frequencies, key=thrust)
-    found = Search([restrict_to_whole_ticks(Range("frequency", *RANGE), config.tick)], seed)
+    search_state = Search([restrict_to_whole_ticks(Range("frequency", *RANGE), config.tick)], seed)
     swum, shares = [], []
     with VirtualSession(config) as rig:
-        for trial in measure_trials(rig, "square", {}, found, BUDGET):
-            proposal = found.propose()
+        for trial in measure_trials(rig, "square", {}, search_state, BUDGET_S):
+            proposal = search_state.propose()
             swum.append(trial.swum)
             at = round(proposal.parameters["frequency"], 3)
             shares.append(thrust(at) / thrust(best))
-            if found.is_warm and proposal.improvement <= UNTIL:
+            if search_state.is_warm and proposal.improvement <= MIN_IMPROVEMENT:
                 break
-    good = [share >= ENOUGH for share in shares]
+    good = [share >= GOOD_RELATIVE_THRUST for share in shares]
     first = swum[good.index(True)] if any(good) else sys.maxsize
     last_bad = max((index for index, each in enumerate(good) if not each), default=-1)
     stays = swum[last_bad + 1] if last_bad + 1 < len(swum) else sys.maxsize
@@ -87,7 +87,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Both; a minute."""
+    """Return both tables; takes a minute."""
     load_before = os.getloadavg()[0]
     sweeps = []
     for _ in range(options.runs):
@@ -95,18 +95,18 @@ def measure(options: Namespace) -> Report:
         progress("sweep", *(f"{seconds:.1f} s" for seconds in sweeps[-1]))
     times, used = zip(*sweeps, strict=True)
     config = load(FISH)
-    found = []
+    searches = []
     for seed in range(options.seeds):
-        found.append(search(config, seed))
-        progress("search", str(seed), str(found[-1]))
-    first, stays, ends, shares, covers = zip(*found, strict=True)
+        searches.append(search(config, seed))
+        progress("search", str(seed), str(searches[-1]))
+    first, stays, ends, shares, covers = zip(*searches, strict=True)
     rows = [
         ["ticks until the proposal gives 97 % of the best", *_spread(first)],
         ["ticks until all later proposals do, too", *_spread(stays)],
         ["ticks until it ended by itself", *_spread(ends)],
         ["true thrust of what it proposed then, % of the best", *_spread(shares, 100.0)],
     ]
-    text = table(f"search of the frequency, {len(found)} seeds | median | range", rows)
+    text = table(f"search of the frequency, {len(searches)} seeds | median | range", rows)
     return Report(
         {
             "bench sweep": f"60 points on {joblib.cpu_count()} cores: "
@@ -117,7 +117,7 @@ def measure(options: Namespace) -> Report:
             "bench search": f"{text}\n\nThe best frequency was within the interval of "
             f"{sum(covers)} of {len(covers)}.",
         },
-        {"sweep": sweeps, "search": found},
+        {"sweep": sweeps, "search": searches},
     )
 
 

@@ -1,11 +1,11 @@
-"""How right the free swimmer is, and how fast: each number beside the one that is asked for.
+"""Accuracy and speed of the free swimmer, compared with reference values.
 
-Several minutes to hours, mostly on one core; options of cells let a look be quicker.
+It takes several minutes to hours, mostly on one core; options for larger cells make it faster.
 
     turek-hron    an elastic flag behind a cylinder, FSI3 and FSI2, beside the published values
     cylinder      flow past a fixed cylinder at a Reynolds number of 100
-    beam          frequencies of a free beam, and how far its own weight bends a clamped one
-    momentum      of a fish and its water, against what crosses the boundaries
+    beam          frequencies of a free beam, and deflection of a clamped one by its weight
+    momentum      momentum of a fish and its water, against the flux through the boundaries
     convergence   swimming speed with smaller cells and shorter steps
     speed         seconds for a second of swimming, beside a finite-element solver
 """
@@ -44,7 +44,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """The parts that are asked for."""
+    """Return the requested parts."""
     sections = {}
     for part in PARTS if options.part == "all" else (options.part,):
         begun = time.perf_counter()

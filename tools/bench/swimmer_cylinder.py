@@ -1,7 +1,7 @@
 """Flow past a fixed circular cylinder at a Reynolds number of 100, far from any wall.
 
-Numbers of others as collected by Qu, Norberg, Davidson, Peng and Wang, J. Fluids Struct. 39, 2013,
-pp. 347–370, doi:10.1016/j.jfluidstructs.2013.02.007, table 1.
+The published values are those collected by Qu, Norberg, Davidson, Peng and Wang, J. Fluids Struct.
+39, 2013, pp. 347–370, doi:10.1016/j.jfluidstructs.2013.02.007, table 1.
 """
 
 import numpy as np
@@ -19,11 +19,11 @@ CYLINDER = {
     "Qu, Norberg, Davidson, Peng and Wang 2013": ("0.1648", "1.319"),
 }
 STROUHAL, DRAG = (0.164, 0.165), (1.319, 1.33)
-"""Lowest and highest of these."""
+"""Lowest and highest published values."""
 
 
 def past_cylinder(cells: int) -> tuple[float, float]:
-    """Strouhal number and mean drag coefficient; diameter and stream are 1, Re = 100."""
+    """Return Strouhal number and mean drag coefficient, for diameter 1, velocity 1 and Re = 100."""
     h = 1.0 / cells
     dt = min(0.2 * h, 4.8 * h * h)  # advection; diffusion
     x, y = edges(-40.0, 80.0, (-1.0, 3.0), h, 1.05), edges(-40.0, 40.0, (-1.0, 1.0), h, 1.05)
@@ -45,16 +45,16 @@ def past_cylinder(cells: int) -> tuple[float, float]:
 
 
 def cylinder(finest: float) -> str:
-    """Strouhal number and drag at Re = 100."""
+    """Return the table of Strouhal number and drag at Re = 100."""
     rows = [[source, *values, ""] for source, values in CYLINDER.items()]
     for cells in (20, 40):
-        found = past_cylinder(round(cells / finest))
-        off = [outside(value, band) for value, band in zip(found, (STROUHAL, DRAG), strict=True)]
+        results = past_cylinder(round(cells / finest))
+        off = [outside(value, band) for value, band in zip(results, (STROUHAL, DRAG), strict=True)]
         rows.append(
             [
                 f"here, {round(cells / finest)} cells across",
-                f"{found[0]:.4f}",
-                f"{found[1]:.3f}",
+                f"{results[0]:.4f}",
+                f"{results[1]:.3f}",
                 f"{off[0]:+.1%}, {off[1]:+.1%}" + (" ✓" if max(map(abs, off)) <= 0.02 else ""),
             ]
         )
@@ -63,6 +63,6 @@ def cylinder(finest: float) -> str:
 
 
 def outside(value: float, band: tuple[float, float]) -> float:
-    """How far from the nearest of the published values, relative; 0 between them."""
+    """Return the relative distance from the nearest published value; 0 between them."""
     nearest = min(max(value, band[0]), band[1])
     return value / nearest - 1.0

@@ -13,23 +13,23 @@ from scipy.sparse import bmat
 from scipy.sparse.linalg import splu
 
 NU, STEP = 1e-6, 1e-3
-ENOUGH = 1e-6
-"""Change of the velocity, relative, with which an iteration was the last."""
+TOLERANCE = 1e-6
+"""Relative change of the velocity at which the iteration ends."""
 
 
 class ElementStep(NamedTuple):
-    """What a step took."""
+    """Duration of a step."""
 
     unknowns: int
     iterations: int
     solve_seconds: float
-    """An iteration, assembly included; the best [s]."""
+    """Shortest time of an iteration, including assembly [s]."""
     assembly_seconds: float
-    """[s]"""
+    """Time of the assembly [s]."""
 
 
 def element_step(unknowns: int) -> ElementStep:
-    """A step with about so many unknowns, from a field of vortices of 0.3 m/s."""
+    """Measure a step with about `unknowns` unknowns, from a field of vortices of 0.3 m/s."""
     if importlib.util.find_spec("skfem") is None:
         raise SystemExit(
             "tools/bench swimmer speed compares with scikit-fem: pip install scikit-fem"
@@ -76,11 +76,11 @@ def element_step(unknowns: int) -> ElementStep:
         A = momentum.assemble(velocity, wind=velocity.interpolate(u))
         system = bmat([[A, B.T], [B, None]], format="csc")[free][:, free]
         assembled = time.perf_counter()
-        found = np.zeros(size)
-        found[free] = splu(system.tocsc()).solve(load[free])
+        solution = np.zeros(size)
+        solution[free] = splu(system.tocsc()).solve(load[free])
         times.append((time.perf_counter() - begun, assembled - begun))
-        before, u = u, found[: velocity.N]
-        if np.abs(u - before).max() <= ENOUGH * np.abs(u).max():
+        before, u = u, solution[: velocity.N]
+        if np.abs(u - before).max() <= TOLERANCE * np.abs(u).max():
             break
     best = min(times)
     return ElementStep(size, len(times), *best)

@@ -1,4 +1,4 @@
-"""The fish itself: its momentum, its speed with smaller cells and steps, and what it costs."""
+"""Tests of the fish: its momentum, its speed with smaller cells and steps, and its cost."""
 
 import math
 import multiprocessing
@@ -18,37 +18,37 @@ from fishd.virtual.swimmer.fish import Fish
 from fishd.virtual.swimmer.settings import Numerics, SwimmerSettings
 
 BEAT = 3.0
-"""Of the square wave [Hz]."""
+"""Frequency of the square wave [Hz]."""
 SETTLE, BEATS = 18, 15
-"""Beats until it swims evenly, and that the speed is a mean of."""
+"""Number of beats until the swim is steady, and number of beats over which speed is averaged."""
 START = 4
-"""The first beats from rest, in which the water is not yet at random."""
+"""Number of first beats from rest, before the water becomes turbulent."""
 
 
 def fish(cell: float, step: float) -> Fish:
-    """The default fish; cell in mm, step in ms."""
+    """Return the default fish; cell in mm, step in ms."""
     return Fish(SwimmerSettings(numerics=Numerics(cell=1e-3 * cell, step=1e-3 * step)))
 
 
 def square(t: float) -> float:
-    """The activation."""
+    """Return the activation."""
     return 1.0 if (t * BEAT) % 1.0 < 0.5 else -1.0
 
 
 class Swum(NamedTuple):
-    """What a fish did."""
+    """Result of a swim."""
 
     speed: float
-    """Mean over the last beats [m/s]."""
+    """Mean speed over the last beats [m/s]."""
     uncertainty: float
-    """Standard error of that, by the scatter of beats [m/s]."""
+    """Standard error of `speed`, from the scatter of beats [m/s]."""
     started: float
-    """How far it came in its first beats [m]."""
+    """Distance of the first beats [m]."""
     courant: float
 
 
 def swum(cell: float, step: float) -> Swum:
-    """Swim until it is even, and then some."""
+    """Swim until the motion is steady, and measure further beats."""
     one = fish(cell, step)
     times, places, courant = [0.0], [one.motion().x], 0.0
     while one.time < (SETTLE + BEATS) / BEAT:
@@ -59,41 +59,41 @@ def swum(cell: float, step: float) -> Swum:
             courant = max(courant, one.flow.courant_number(one.dt))
     passed = np.interp(np.arange(SETTLE + BEATS + 1) / BEAT, times, places)
     speeds = -np.diff(passed[SETTLE:]) * BEAT
-    found = Swum(
+    result = Swum(
         float(speeds.mean()),
         float(speeds.std(ddof=1)) / math.sqrt(BEATS),
         float(passed[1] - passed[START]),
         courant,
     )
-    progress(f"{cell:g} mm", f"{step:g} ms", f"{found.speed:.4f} m/s", f"{found.started:.5f} m")
-    return found
+    progress(f"{cell:g} mm", f"{step:g} ms", f"{result.speed:.4f} m/s", f"{result.started:.5f} m")
+    return result
 
 
 def order(values: Sequence[float]) -> tuple[float, float]:
-    """Observed order and Richardson's limit of three values, each at half the size of the last.
+    """Return the observed order and Richardson's limit of three values at halved sizes.
 
-    Not a number where their differences do not become smaller.
+    NaN where the differences do not decrease.
     """
     first, second = values[1] - values[0], values[2] - values[1]
     if first * second <= 0.0 or abs(second) > 0.9 * abs(first):
         return math.nan, math.nan
-    found = math.log2(first / second)
-    return found, values[2] + second / (2.0**found - 1.0)
+    observed_order = math.log2(first / second)
+    return observed_order, values[2] + second / (2.0**observed_order - 1.0)
 
 
 def convergence(finest: float) -> str:
-    """Speed with finer cells and shorter steps."""
+    """Return the table of speeds with finer cells and shorter steps."""
     space = [
         (2.0 * finest, 2.0 * finest),
         (1.0 * finest, 1.0 * finest),
         (0.5 * finest, 0.5 * finest),
     ]
     in_time = [(1.0 * finest, share * finest) for share in (1.0, 0.5, 0.25)]
-    found = {pair: swum(*pair) for pair in dict.fromkeys([*space, *in_time])}
+    results = {pair: swum(*pair) for pair in dict.fromkeys([*space, *in_time])}
     rows = []
     for title, pairs in (("cells and steps", space), ("steps alone", in_time)):
         for cell, step in pairs:
-            one = found[cell, step]
+            one = results[cell, step]
             rows.append(
                 [
                     title,
@@ -103,8 +103,8 @@ def convergence(finest: float) -> str:
                     f"{one.courant:.2f}",
                 ]
             )
-        speeds = [found[pair].speed for pair in pairs]
-        starts = [found[pair].started for pair in pairs]
+        speeds = [results[pair].speed for pair in pairs]
+        starts = [results[pair].started for pair in pairs]
         (p, limit), (q, far) = order(speeds), order(starts)
         rows.append(
             [
@@ -123,7 +123,7 @@ def convergence(finest: float) -> str:
 
 
 def momentum(finest: float) -> str:
-    """Change of momentum against what crosses the boundaries, step by step."""
+    """Return the change of momentum against the flux through the boundaries, step by step."""
     one = fish(2.0 * finest, 2.0 * finest)
     rho = one.settings.water.density
     gaps, terms, nets, forces = [], [], [], []
@@ -150,21 +150,21 @@ def _closed(name: str, gaps: list[float], terms: list[float]) -> list[str]:
 
 
 class Cost(NamedTuple):
-    """Of swimming, on one core."""
+    """Cost of swimming on one core."""
 
     best: float
-    """Seconds for a simulated second, in the best piece."""
+    """Shortest time per simulated second [s]."""
     median: float
     processor: float
-    """The same in seconds of the processor, in the best piece."""
+    """Shortest processor time per simulated second [s]."""
     memory: float
-    """At most [MB]."""
+    """Peak memory [MB]."""
     unknowns: int
-    """Two velocities and a pressure for each cell."""
+    """Number of unknowns: two velocities and a pressure for each cell."""
 
 
 def cost(cell: float, step: float) -> Cost:
-    """In pieces of 100 steps, after 0.2 s."""
+    """Measure pieces of 100 steps, after 0.2 s."""
     one = fish(cell, step)
     while one.time < 0.2:
         one.step(square(one.time))
@@ -182,7 +182,7 @@ def cost(cell: float, step: float) -> Cost:
 
 
 def speed(finest: float) -> str:
-    """Seconds for a second, in a process of its own, beside a finite-element step."""
+    """Return the time per simulated second in a separate process, and of a finite-element step."""
     rows = []
     costs = []
     context = multiprocessing.get_context("spawn")

@@ -1,4 +1,4 @@
-"""An elastic flag behind a cylinder in a channel, and beams alone, beside published numbers.
+"""Elastic flag behind a cylinder in a channel, and beams, compared with published values.
 
 Turek and Hron, Proposal for numerical benchmarking of fluid–structure interaction between an
 elastic object and laminar incompressible flow, Springer 2006, doi:10.1007/3-540-34596-5_15. The
@@ -20,42 +20,42 @@ from fishd.virtual.swimmer.immersed import Immersed
 
 RHO = 1000.0
 RADIUS, CENTRE, HEIGHT, LENGTH, TIP, THICKNESS = 0.05, 0.2, 0.41, 2.5, 0.6, 0.02
-"""Of the benchmark's cylinder, channel and flag [m]."""
+"""Sizes of the benchmark's cylinder, channel and flag [m]."""
 POISSON = 0.4
 RAMP = 1.0
-"""The inflow grows for so long [s]."""
+"""Duration of the increase of the inflow [s]."""
 
 
 class Wave(NamedTuple):
-    """What an oscillating quantity comes to, as in the benchmark."""
+    """Mean and amplitude of an oscillating quantity, as in the benchmark."""
 
     mean: float
-    """Of highest and lowest."""
+    """Mean of the highest and the lowest value."""
     amplitude: float
 
     def text(self, factor: float = 1.0, digits: int = 2) -> str:
-        """The two with a sign between."""
+        """Format mean and amplitude."""
         mean, amplitude = factor * self.mean, factor * self.amplitude
         return f"{mean:.{digits}f} ± {amplitude:.{digits}f}"
 
 
 class Case(NamedTuple):
-    """One of the benchmark's flows."""
+    """Flow of the benchmark."""
 
     inflow: float
-    """Mean [m/s]."""
+    """Mean velocity of the inflow [m/s]."""
     density: float
-    """Of the flag [kg/m³]."""
+    """Density of the flag [kg/m³]."""
     shear_modulus: float
     """[Pa]"""
     runs: tuple[tuple[float, float], ...]
-    """Cells [m], and how long [s]."""
+    """Sizes of the cells [m], and durations of the runs [s]."""
     step: float
-    """With cells of 5 mm [s]."""
+    """Time step with cells of 5 mm [s]."""
     allowed: float
-    """Deviation of amplitude and frequency."""
+    """Allowed relative deviation of amplitude and frequency."""
     published: dict[str, tuple[Wave, float, str, str]]
-    """By source: u_y [m], frequency [Hz], drag, lift."""
+    """Published u_y [m], frequency [Hz], drag and lift, by source."""
 
 
 PROPOSAL = "Turek and Hron 2006"
@@ -79,7 +79,7 @@ CASES = {
 
 
 class Swing(NamedTuple):
-    """What a flag does."""
+    """Motion of a flag."""
 
     across: Wave
     """u_y of its tip [m]."""
@@ -91,7 +91,7 @@ class Swing(NamedTuple):
 
 
 def flag(case: Case, cell: float) -> Immersed:
-    """The channel with cylinder and flag, at rest."""
+    """Return the channel with cylinder and flag, at rest."""
     rows = round(HEIGHT / cell)
     h = HEIGHT / rows
     root = CENTRE + math.sqrt(RADIUS**2 - 0.25 * THICKNESS**2)
@@ -114,12 +114,12 @@ def flag(case: Case, cell: float) -> Immersed:
 
 
 def even(value: float) -> Profile:
-    """The same all along."""
+    """Return a constant profile."""
     return lambda X: np.full_like(X, value)
 
 
 def swing(case: Case, cell: float, end: float) -> Swing:
-    """Let the flag swing, and measure its last five periods."""
+    """Simulate the flag, and measure its last five periods."""
     body, dt = flag(case, cell), case.step * cell / 5e-3
     beam, grid = body.beam, body.flow.grid
     assert beam
@@ -146,36 +146,36 @@ def swing(case: Case, cell: float, end: float) -> Swing:
 
 
 def crossings(t: Array, values: Array) -> Array:
-    """When values rise through their mean over the last third."""
+    """Return the times at which values rise through their mean of the last third."""
     offset = values - values[2 * len(values) // 3 :].mean()
     k = np.flatnonzero((offset[:-1] < 0.0) & (offset[1:] >= 0.0))
     return np.asarray(t[k] - offset[k] / (offset[k + 1] - offset[k]) * (t[k + 1] - t[k]))
 
 
 def wave(values: Array) -> Wave:
-    """Mean and amplitude of a history."""
+    """Return mean and amplitude of a history."""
     low, high = float(values.min()), float(values.max())
     return Wave(0.5 * (high + low), 0.5 * (high - low))
 
 
 def turek_hron(finest: float) -> str:
-    """FSI3 and FSI2."""
+    """Return the table of FSI3 and FSI2."""
     rows = []
     for name, case in CASES.items():
         for source, (across, frequency, drag, lift) in case.published.items():
             rows.append([name, source, across.text(1e3), f"{frequency:g}", drag, lift, "", ""])
         for coarse, end in case.runs:
             cell = coarse * finest
-            found = swing(case, cell, end)
+            result = swing(case, cell, end)
             rows.append(
                 [
                     name,
                     f"here, cells of {cell * 1e3:.3g} mm",
-                    found.across.text(1e3),
-                    f"{found.frequency:.3f}",
-                    found.drag.text(digits=1),
-                    found.lift.text(digits=1),
-                    *deviations(found, case),
+                    result.across.text(1e3),
+                    f"{result.frequency:.3f}",
+                    result.drag.text(digits=1),
+                    result.lift.text(digits=1),
+                    *deviations(result, case),
                 ]
             )
             progress(*rows[-1])
@@ -186,11 +186,11 @@ def turek_hron(finest: float) -> str:
     return table(heads, rows)
 
 
-def deviations(found: Swing, case: Case) -> list[str]:
-    """Of amplitude and frequency from each publication; ✓ where both are allowed."""
+def deviations(result: Swing, case: Case) -> list[str]:
+    """Return the deviations of amplitude and frequency from each publication; ✓ where allowed."""
     cells = []
     for across, frequency, _, _ in case.published.values():
-        off = found.across.amplitude / across.amplitude - 1.0, found.frequency / frequency - 1.0
+        off = result.across.amplitude / across.amplitude - 1.0, result.frequency / frequency - 1.0
         met = max(map(abs, off)) <= case.allowed
         cells.append(f"{off[0]:+.1%}, {off[1]:+.1%}" + (" ✓" if met else ""))
     return cells
@@ -203,7 +203,7 @@ WEIGHT = {"CSM1": (0.5e6, -66.10), "CSM2": (2e6, -16.97)}
 
 
 def beam(finest: float) -> str:
-    """Frequencies of a free beam in vacuum; the flag of Turek and Hron under its own weight."""
+    """Return the frequencies of a free beam in vacuum, and the deflection of a heavy flag."""
     thin, EI, line = 1e-3, 1e-2, 2.0
     rows = []
     for segments in (25, 50):
@@ -211,13 +211,13 @@ def beam(finest: float) -> str:
         moves = free.motion(np.zeros(free.slices)).reshape(-1, free.size)
         M = moves.T @ (free.excess.ravel()[:, None] * moves)
         squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, free.K)).real)
-        found = np.sqrt(squares[3:6] * line / EI) * free.length**2
-        off = found / FREE_FREE - 1.0
+        frequencies = np.sqrt(squares[3:6] * line / EI) * free.length**2
+        off = frequencies / FREE_FREE - 1.0
         rows += [
             [
                 f"free beam, mode {k + 1}, {segments} segments",
                 f"{FREE_FREE[k]:.3f}",
-                f"{found[k]:.3f}",
+                f"{frequencies[k]:.3f}",
                 f"{off[k]:+.2%}" + (" ✓" if abs(off[k]) <= 0.01 else ""),
             ]
             for k in range(3)
@@ -231,7 +231,7 @@ def beam(finest: float) -> str:
 
 
 def sagged(case: Case) -> float:
-    """u_y of the flag's tip under 2 m/s² [mm]."""
+    """Return u_y of the flag's tip under 2 m/s² [mm]."""
     held = flag(case, 5e-3).beam
     assert held
     weight = np.zeros((held.slices, 3))

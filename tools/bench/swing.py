@@ -1,8 +1,8 @@
-"""`swing --C auto` on fish that differ from the model: beside C = 0.6, after a minute and before.
+"""`swing --C auto` on fish that differ from the model, compared with C = 0.6.
 
 The single changes are those of a real rig, one at a time. The harsh fish have all of them, in
-random sizes; the mild ones are as random, on clean rigs. Relative thrusts are shares of each fish's
-own best square wave, of its true thrust.
+random sizes; the mild fish are equally random, on clean rigs. Relative thrust is the true thrust
+over that of the best square wave of the same fish.
 """
 
 import os
@@ -18,11 +18,11 @@ from fishd.lab.other_fish import CHANGES, OtherFish, harsh, harsh_fish, mild
 from fishd.lab.simulation import simulate
 
 DOCUMENT = "explanation/swing-efficiency.md"
-LEARNT = 60.0
-"""The search is judged after so long [s]."""
+LEARNING_TIME_S = 60.0
+"""Time after which the search is evaluated [s]."""
 SECONDS = 120.0
 RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 2, 3)
-"""ω₀Φ/Ω."""
+"""Values of ω₀Φ/Ω."""
 
 
 OMEGA0, AMPLITUDE = 12.5, 0.42
@@ -31,28 +31,28 @@ GROUPS = {
     "40 other harsh fish (seeds 720 to 759)": tuple(map(harsh, range(720, 760))),
     "40 mild fish (seeds 300 to 339)": tuple(map(mild, range(300, 340))),
 }
-"""Random fish; nothing was chosen with those that have their seeds here."""
+"""Seeds of random fish; nothing was chosen with these seeds."""
 
 
 def at_ratio(ratio: float) -> OtherFish:
-    """The model with another servo."""
+    """Return the model with another servo."""
     speed = OMEGA0 * AMPLITUDE / ratio
     return OtherFish(f"ω₀Φ/Ω = {ratio:g}", (f"plant.servo_speed={speed}",))
 
 
 class Shares(NamedTuple):
-    """Of the best square wave."""
+    """Thrusts relative to the best square wave."""
 
     fixed: float
-    """C = 0.6."""
+    """Relative thrust with C = 0.6."""
     first: float
-    """C = auto in its first minute."""
+    """Relative thrust with C = auto in the first minute."""
     auto: float
-    """C = auto in the second one."""
+    """Relative thrust with C = auto in the second minute."""
 
 
 def measured(case: OtherFish) -> Shares:
-    """Swim it three times."""
+    """Run the fish three times."""
     config: Config = load(None, case.overrides)
 
     def share(C: float | str, seconds: float, settle: float) -> float:
@@ -62,7 +62,9 @@ def measured(case: OtherFish) -> Shares:
         return report.relative_thrust
 
     return Shares(
-        share(0.6, LEARNT, 10.0), share("auto", LEARNT, 0.0), share("auto", SECONDS, LEARNT)
+        share(0.6, LEARNING_TIME_S, 10.0),
+        share("auto", LEARNING_TIME_S, 0.0),
+        share("auto", SECONDS, LEARNING_TIME_S),
     )
 
 
@@ -72,21 +74,24 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """One table; a minute or two."""
+    """Return one table; takes a minute or two."""
     single = [*CHANGES, *map(at_ratio, RATIOS)]
     cases = [*single, *chain.from_iterable(GROUPS.values())]
     with ProcessPoolExecutor(options.jobs) as pool:
-        found = dict(zip(cases, pool.map(measured, cases), strict=True))
-    rows = [[case.name, *map(percent, found[case])] for case in single]
+        shares_by_case = dict(zip(cases, pool.map(measured, cases), strict=True))
+    rows = [[case.name, *map(percent, shares_by_case[case])] for case in single]
     for group, fish in GROUPS.items():
         for name, pick in (("median", statistics.median), ("worst", min)):
-            shares = [pick(column) for column in zip(*(found[case] for case in fish), strict=True)]
+            shares = [
+                pick(column)
+                for column in zip(*(shares_by_case[case] for case in fish), strict=True)
+            ]
             rows.append([f"{group}, {name}", *map(percent, shares)])
     head = "change | C = 0.6 | auto, first minute | auto, second minute"
-    figures = {case.name: found[case]._asdict() for case in cases}
+    figures = {case.name: shares_by_case[case]._asdict() for case in cases}
     return Report({"bench swing": table(head, rows)}, figures)
 
 
 def percent(share: float) -> str:
-    """With one decimal."""
+    """Format a fraction in % with one decimal."""
     return f"{round(100 * share, 1) + 0.0:.1f}"  # no negative zero

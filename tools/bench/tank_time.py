@@ -1,6 +1,6 @@
-"""How long a training on a robot takes in the tank, its evaluations included, for `learning tank`.
+"""Tank time of a training on a robot, including its evaluations, for `learning tank`.
 
-The fish is a simulated one, in virtual time, where the link to a fishd would be.
+A simulated fish in virtual time replaces the link to a fishd.
 """
 
 import math
@@ -32,35 +32,35 @@ from fishd.learning.train.progress import Display
 from fishd.learning.train.training import Training
 
 STEPS = 2048
-ENOUGH = 0.97
+GOOD_RELATIVE_THRUST = 0.97
 AFTER = (60.0, 120.0, 180.0, 300.0)
-"""Tank times that are compared [s]."""
+"""Tank times at which results are compared [s]."""
 BEFORE = 30.0
-"""How long an evaluation of one policy took, before policies were compared [s]."""
+"""Duration of an evaluation by the former rule, without comparison of policies [s]."""
 
 
 class Run(NamedTuple):
-    """One training."""
+    """Result of one training."""
 
     bests: list[tuple[float, float]]
-    """Tank time [s], and true relative thrust of the policy called the best from then on."""
+    """Tank times [s], and true relative thrusts of the best policy from then on."""
     highest: float
-    """True relative thrust of the best candidate of all."""
+    """True relative thrust of the best of all candidates."""
     tank_time: float
-    """[s]"""
+    """Total tank time [s]."""
 
     def at(self, seconds: float) -> float:
-        """Relative thrust of what was called the best at that tank time; 0 before the first."""
+        """Return the relative thrust of the best policy at a tank time; 0 before the first one."""
         return next((share for time, share in reversed(self.bests) if time <= seconds), 0.0)
 
     @property
     def reached(self) -> float:
-        """When what was called the best had `ENOUGH` for the first time [s]."""
-        return next((time for time, share in self.bests if share >= ENOUGH), math.inf)
+        """Return the first time at which the best policy had `GOOD_RELATIVE_THRUST` [s]."""
+        return next((time for time, share in self.bests if share >= GOOD_RELATIVE_THRUST), math.inf)
 
 
 class Comparing(Training):
-    """A training as it is, in which the true relative thrust of each candidate is noted."""
+    """Unchanged training that records the true relative thrust of each candidate."""
 
     truth: dict[int, float]
 
@@ -74,7 +74,7 @@ class Comparing(Training):
 
 
 class OneByOne(Comparing):
-    """The rule before: each policy is measured once, for `BEFORE`, and the highest is the best."""
+    """Former rule: each policy is measured once, for `BEFORE`, and the highest is the best."""
 
     def _evaluate(self) -> None:
         env, decide, steps = self._env, self._policy(), self._recorder.steps
@@ -93,16 +93,16 @@ class OneByOne(Comparing):
         shares /= env.link.amplitude
         frequency, fullness = beat_frequency(shares, tick), float(abs(shares).mean())
         try:
-            found = evaluate(samples, tick)
+            evaluation = evaluate(samples, tick)
         except ParameterError:
             return
         row = Evaluation(
             steps=steps,
             policy=steps,
             tank_time=env.tank_time,
-            thrust=found.thrust,
-            error=found.error,
-            relative_thrust=found.thrust / env.best_thrust,
+            thrust=evaluation.thrust,
+            error=evaluation.error,
+            relative_thrust=evaluation.thrust / env.best_thrust,
             frequency=frequency,
             fullness=fullness,
             stalled=is_stalled(frequency, fullness, tick),
@@ -111,7 +111,7 @@ class OneByOne(Comparing):
 
 
 def true_relative_thrust(config: Config, decide: DeterministicPolicy) -> float:
-    """Without noise and drift, as `ppo` swims; 0 where another controller took over."""
+    """Return the relative thrust of `ppo` without noise and drift; 0 after a takeover."""
     quiet = replace(config.simulation, noise=0.0, drift=0.0)
     limits = config.limits
     limit = DwellLimit(limits.dwell, limits, config.amplitude_limit)
@@ -124,7 +124,7 @@ def true_relative_thrust(config: Config, decide: DeterministicPolicy) -> float:
 
 
 def trained(config: Config, seed: int, kind: type[Comparing]) -> Run:
-    """Train once; in a process of its own."""
+    """Train once, in a separate process."""
     torch.set_num_threads(1)
     config = replace(config, simulation=replace(config.simulation, seed=seed))
     settings = replace(settings_of(None, STEPS), seed=seed)
@@ -139,7 +139,7 @@ def trained(config: Config, seed: int, kind: type[Comparing]) -> Run:
 
 
 def tank(options: Namespace) -> str:
-    """Tank time until what a training calls its best is good, and how good it is."""
+    """Return the tank time until the best policy of a training is good, and its thrust."""
     rigs = {
         "Φ = 0.42 rad": rig(),
         "`config/simulated.yaml`": load(CONFIG / "simulated.yaml"),
@@ -147,9 +147,9 @@ def tank(options: Namespace) -> str:
     }
     rules = {"the bandit": Comparing, f"each once, for {BEFORE:g} s": OneByOne}
     seeds = UNTOUCHED[: options.seeds]
-    found = _all(rigs, rules, seeds, options.jobs)
+    runs_by_row = _all(rigs, rules, seeds, options.jobs)
     lines = []
-    for (fish, rule), runs in found.items():
+    for (fish, rule), runs in runs_by_row.items():
         short = [run.highest - run.at(math.inf) for run in runs]
         lines.append(
             [
@@ -184,20 +184,20 @@ def _all(
 ) -> dict[tuple[str, str], list[Run]]:
     rows = [(fish, rule) for fish in rigs for rule in rules]
     tasks = [(row, seed) for row in rows for seed in seeds]
-    found: dict[tuple[str, str], list[Run]] = {row: [] for row in rows}
+    runs_by_row: dict[tuple[str, str], list[Run]] = {row: [] for row in rows}
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = joblib.Parallel(n_jobs=jobs, batch_size=1, return_as="generator")
         work = parallel(
             joblib.delayed(trained)(rigs[fish], seed, rules[rule]) for (fish, rule), seed in tasks
         )
         for (row, seed), run in zip(tasks, work, strict=True):
-            found[row].append(run)
+            runs_by_row[row].append(run)
             progress(*row, f"seed {seed}", f"{run.reached:.0f} s", f"{run.at(math.inf):.1%}")
-    return found
+    return runs_by_row
 
 
 def _seconds(values: Sequence[float]) -> str:
-    """As `spread`, where some may never have come so far."""
+    """Format like `spread`, where some values may be infinite."""
     if math.isinf(max(values)):
         middle, low = statistics.median(values), min(values)
         return f"{middle:.0f} [{low:.0f} – never]".replace("inf", "never")

@@ -1,4 +1,4 @@
-"""How well `thrust` holds a thrust: its error and how long it takes, by what it knows of the fish.
+"""Error and settling time of `thrust`, by its prior knowledge of the fish.
 
 Errors are those of the plant's true mean thrust, from 10 s on.
 """
@@ -24,17 +24,18 @@ from fishd.lab.simulation import KeepingPublisher, VirtualRun, simulate
 
 DOCUMENT = "explanation/holding-thrust.md"
 TARGETS = (2, 4, 6, 8, 10, 12, 14, 20, 26)
-"""[mN]"""
+"""Targets [mN]."""
 SEEDS = range(10)
 FIRST_SEED = 300
 FISH = 20
 SECONDS = 60.0
 HELD_AFTER = 10.0
-"""The error is that of the mean after so long [s]."""
-REST, SWIM = 3.0, 15.0
-"""Before it begins: a rest; with a known factor, a swim by which fishd knows its wave [s]."""
+"""Time from which the mean thrust is evaluated [s]."""
+REST_S, SWIM_S = 3.0, 15.0
+"""Duration of the rest before the start, and with a known factor of the swim that calibrates its
+wave [s]."""
 BAND, WINDOW = 0.02, 3.0
-"""It has settled once the mean over each such time that follows is that near to the target [s]."""
+"""Relative band around the target, and length of the averages that must stay in it [s]."""
 RIG = ("simulation.noise=1e-3", "simulation.offset_y=0.02", "simulation.drift=5e-3")
 WAYS = {
     "none": "nothing is known",
@@ -45,26 +46,25 @@ WAYS = {
 
 
 class Held(NamedTuple):
-    """One run."""
+    """Result of one run."""
 
     target: float
     """[N]"""
     thrust: float
-    """True mean [N]."""
+    """True mean thrust [N]."""
     settled: float
     """[s]"""
     stated: float
-    """Half of the interval that it states at the end, over its thrust; infinite where it does not
-    know it."""
+    """Half-width of its final interval relative to its thrust; infinite without one."""
     amplitude: float
-    """At the end [rad]."""
+    """Amplitude at the end [rad]."""
     saturated: float
     spread: float
-    """Standard deviation of the true thrust of beats, over the mean."""
+    """Standard deviation of the true thrust of beats, relative to the mean."""
 
     @property
     def error(self) -> float:
-        """Over the target."""
+        """Error relative to the target."""
         return self.thrust / self.target - 1.0
 
 
@@ -74,19 +74,19 @@ def held(
     factor: tuple[float, float] | None,
     way: str = "thrust",
 ) -> Held:
-    """Swim with `thrust`, from rest.
+    """Run `thrust` from rest.
 
-    factor: thrust over the mean square of the fin velocity, and half of its interval
-    way: the factor is that of this controller
+    factor: thrust over the mean square of the fin velocity, and half-width of its interval
+    way: controller to which the factor belongs
     """
     config, keeper = load(None, overrides), KeepingPublisher()
     with VirtualRun(config, keeper) as run:
-        rest = round(REST / config.tick)
+        rest = round(REST_S / config.tick)
         for _ in range(rest):
             run.tick()
         if factor:
             run.set_controller(way, {"target": target} if way == "thrust" else {})
-            for _ in range(round(SWIM / config.tick)):
+            for _ in range(round(SWIM_S / config.tick)):
                 run.tick()
             run.loop.thrust.calibrate(*factor)
             run.loop.stop()
@@ -102,7 +102,7 @@ def held(
     return Held(
         target,
         float(late.mean()),
-        _settled(beats, target),
+        _settling_time(beats, target),
         shown["held_error"] / shown["held_thrust"] if "held_thrust" in shown else math.inf,
         shown["amplitude"],
         shown["saturated"],
@@ -111,14 +111,14 @@ def held(
 
 
 def _beats(angles: list[float], truth: list[float], tick: float) -> Iterator[tuple[float, float]]:
-    """Start and true mean thrust of each whole beat, half a beat after the other."""
+    """Return start and true mean thrust of each whole beat, at distances of half a beat."""
     turns = [k for k, (a, b) in enumerate(pairwise(angles), 1) if a * b < 0.0]
     for a, b in zip(turns, turns[2:], strict=False):
         yield a * tick, float(np.mean(truth[a + 1 : b + 1]))
 
 
-def _settled(beats: Any, target: float) -> float:
-    """Since when every mean over `WINDOW` was within `BAND`; the end where it never was."""
+def _settling_time(beats: Any, target: float) -> float:
+    """Return the time from which every mean over `WINDOW` is within `BAND`; else the end."""
     starts = beats[:, 0]
     last = 0.0
     for start in starts[starts < SECONDS - WINDOW]:
@@ -129,7 +129,7 @@ def _settled(beats: Any, target: float) -> float:
 
 
 def exact(overrides: tuple[str, ...], target: float) -> tuple[float, float]:
-    """The true factor at this target."""
+    """Return the true factor at this target."""
     config, keeper = load(None, overrides), KeepingPublisher()
     with VirtualRun(config, keeper) as run:
         run.set_controller("thrust", {"target": target})
@@ -143,16 +143,16 @@ def exact(overrides: tuple[str, ...], target: float) -> tuple[float, float]:
 def by_measurement(
     overrides: tuple[str, ...], controller: str, parameters: dict[str, float]
 ) -> tuple[float, float] | None:
-    """The factor that a minute of `fishctl measure` finds, and half of its interval."""
+    """Return the factor of a minute of `fishctl measure`, and half-width of its interval."""
     with VirtualSession(load(None, overrides)) as rig:
-        found = summarise(measured(rig, controller, parameters, 60.0), rig.tick)
-    if not found.thrust > 0.0 or not found.factor > 0.0:
+        summary = summarise(measured(rig, controller, parameters, 60.0), rig.tick)
+    if not summary.thrust > 0.0 or not summary.factor > 0.0:
         return None
-    return found.factor, found.error / found.thrust * found.factor
+    return summary.factor, summary.error / summary.thrust * summary.factor
 
 
 def factor_of(way: str, overrides: tuple[str, ...], target: float) -> tuple[float, float] | None:
-    """What is known beforehand."""
+    """Return the factor that is known beforehand."""
     with suppress(ValueError):
         if way == "swing":
             return by_measurement(overrides, "swing", {})
@@ -164,7 +164,7 @@ def factor_of(way: str, overrides: tuple[str, ...], target: float) -> tuple[floa
 
 
 def on_model(job: tuple[str, float, int]) -> Held:
-    """A run on the default fish."""
+    """Run on the default fish."""
     way, target, seed = job
     overrides = (*RIG, f"simulation.seed={seed}")
     wave = "swing" if way == "swing" else "thrust"
@@ -172,7 +172,7 @@ def on_model(job: tuple[str, float, int]) -> Held:
 
 
 def on_harsh(job: tuple[str, OtherFish]) -> Held:
-    """A run on a harsh fish, at half of the thrust that it swings with."""
+    """Run on a harsh fish, at half of the thrust of `swing`."""
     way, case = job
     config: Config = load(None, case.overrides)
     target = 0.5 * simulate(config, "swing", {}).mean_thrust
@@ -188,7 +188,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Two tables; some minutes."""
+    """Return two tables; takes some minutes."""
     ways = ("exact", "swing", "none")
     jobs = [(way, 1e-3 * target, seed) for way in ways for target in TARGETS for seed in SEEDS]
     fish = [(way, harsh(FIRST_SEED + k)) for way in WAYS for k in range(FISH)]
@@ -216,9 +216,9 @@ def measure(options: Namespace) -> Report:
     sections = {"thrust model": table(head, rows)}
     rows = []
     for way, name in WAYS.items():
-        found = [each for (which, _), each in zip(fish, strange, strict=True) if which == way]
-        errors = np.array([abs(each.error) for each in found])
-        stated = np.array([each.stated for each in found])
+        held_runs = [each for (which, _), each in zip(fish, strange, strict=True) if which == way]
+        errors = np.array([abs(each.error) for each in held_runs])
+        stated = np.array([each.stated for each in held_runs])
         within = np.sum(errors < stated)
         quantiles = (np.quantile(errors, share) for share in (0.5, 0.9))
         rows.append(

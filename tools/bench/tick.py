@@ -1,9 +1,9 @@
-"""How punctual, quick and light fishd is, next to other loops on the same busy machine.
+"""Punctuality, speed and size of fishd, compared with other loops on the same busy machine.
 
-Machines are noisy, so look at ratios: all contestants run at the same time, under the same load.
+Machines are noisy, so compare ratios: all contestants run at the same time, under the same load.
 Everything stays on this machine and stops by itself.
 
-With --against, two checkouts of fishd take turns instead: is one of them slower?
+With --against, two checkouts of fishd are compared instead, in turns.
 """
 
 import json
@@ -30,29 +30,29 @@ from fishd.core.signals import Percentiles, Tick, Timing
 
 DOCUMENT = "reference/performance.md"
 TICK = 0.05
-"""The tick that the robot swims with [s]."""
+"""Tick of the robot [s]."""
 FAST = 0.002
-"""The shortest tick that fishd can be asked for [s]."""
+"""Shortest tick of fishd [s]."""
 FISHCTL = str(BIN / "fishctl")
 
 
 class Figures(Struct, frozen=True):
-    """What one fishd cost over one round."""
+    """Cost of one fishd in one round."""
 
     sealed: Percentiles
-    """Start of a tick until its record is sealed, from every tick of the round [µs]."""
+    """Time from the start of a tick until its record is sealed, for all ticks of the round [µs]."""
     timing: Timing
-    """What `fishctl status` says at the end, start-up included."""
+    """Timing in `fishctl status` at the end, including start-up."""
     cpu: float
-    """Share of one core."""
+    """Fraction of one core."""
     rss: float
     """Resident memory at the end [MB]."""
     peak: float
-    """Most resident memory ever [MB]."""
+    """Peak resident memory [MB]."""
 
 
 class Round(Struct, frozen=True):
-    """All contestants at the same time; fishd is the first of `lateness`."""
+    """Results of all contestants at the same time; fishd is the first of `lateness`."""
 
     stressed: bool
     priority: int
@@ -63,17 +63,17 @@ class Round(Struct, frozen=True):
 
 
 class Latency(Struct, frozen=True):
-    """What a person waits for, idle or stressed: medians over several runs [s]."""
+    """Waiting times of a user, idle or under load: medians over several runs [s]."""
 
     stressed: bool
     first_tick: float
-    """From starting the process to the first tick."""
+    """Time from the start of the process to the first tick."""
     status: float
-    """`fishctl status`, from starting the process to its exit."""
+    """Time of `fishctl status`, from the start of the process to its exit."""
 
 
 class Results(Struct, frozen=True):
-    """Everything that one run measured."""
+    """Results of one run."""
 
     machine: dict[str, str]
     seconds: float
@@ -81,11 +81,11 @@ class Results(Struct, frozen=True):
     rounds: list[Round]
     latencies: list[Latency]
     real_time_factor: float
-    """Of `fishctl simulate` at 50 ms ticks."""
+    """Real-time factor of `fishctl simulate` at 50 ms ticks."""
 
 
 def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Round:
-    """Let fishd and all the others tick for `seconds`."""
+    """Run fishd and all other contestants for `seconds`."""
     with ExitStack() as stack:
         fishd = stack.enter_context(Fishd(f"tick={tick}", f"realtime.priority={priority}"))
         fishd.next_tick()
@@ -121,7 +121,7 @@ def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Rou
 
 
 def _wall_offset() -> float:
-    """Unix time less monotonic time [s]; it changes, as only one of the two is steered by NTP."""
+    """Return Unix time minus monotonic time [s]; it changes, because NTP adjusts only one."""
     before, wall, after = min(
         ((time.monotonic(), time.time(), time.monotonic()) for _ in range(10)),
         key=lambda clocks: clocks[2] - clocks[0],
@@ -132,7 +132,7 @@ def _wall_offset() -> float:
 def _tick_times(
     ticks: list[Tick], period: float, slewed: float
 ) -> Iterator[tuple[float, float, float]]:
-    """Lateness [s], time until sealed [µs] and offset from whole periods [s] of each tick."""
+    """Return lateness [s], time until sealed [µs] and offset from whole periods [s] of ticks."""
     first = ticks[0]
     for index, tick in enumerate(ticks):
         slots = tick.seq - first.seq + tick.missed - first.missed
@@ -141,12 +141,14 @@ def _tick_times(
 
 
 def measure_latency(stressed: bool, priority: int, runs: int) -> Latency:
-    """Start fishd a few times, and ask for its status a few times."""
+    """Measure several starts of fishd, and several requests for its status."""
     first_ticks, statuses = [], []
     override = f"realtime.priority={priority}"
     for _ in range(runs):
         with Fishd(override) as fishd:
-            tick = fishd.next_tick()  # the very first one may have been sent to nobody yet
+            tick = (
+                fishd.next_tick()
+            )  # the very first tick may have been published before the subscription
             before = (tick.seq - 1 + tick.missed) * fishd.status().tick
             first_ticks.append(tick.t - before - fishd.started)
             for _ in range(3):
@@ -158,33 +160,33 @@ def measure_latency(stressed: bool, priority: int, runs: int) -> Latency:
 
 
 def real_time_factor() -> float:
-    """How much faster than time a simulated fish swims; the better of two runs."""
+    """Return the real-time factor of a simulated fish, the better of two runs."""
     command = [FISHCTL, "simulate", "swing", "--seconds", "600", "--json"]
     reports = [subprocess.run(command, check=True, stdout=subprocess.PIPE) for _ in range(2)]
     return max(float(json.loads(report.stdout)["real_time_factor"]) for report in reports)
 
 
 def measure_all(seconds: float, runs: int) -> Results:
-    """The whole benchmark: idle, then under load."""
+    """Run the whole benchmark: idle, then under load."""
     factor = real_time_factor()
     best = priorities()[-1]
     rounds, latencies = [], []
     for stressed in (False, True):
         with stress(stressed, limit=4 * seconds + 30 * runs + 60):
             for tick, priority in (*((TICK, priority) for priority in priorities()), (FAST, best)):
-                _say(f"{seconds:g} s of {tick * 1e3:g} ms ticks", stressed, priority)
+                _show_progress(f"{seconds:g} s of {tick * 1e3:g} ms ticks", stressed, priority)
                 rounds.append(run_round(stressed, priority, tick, seconds))
-            _say("start-up and fishctl status", stressed, best)
+            _show_progress("start-up and fishctl status", stressed, best)
             latencies.append(measure_latency(stressed, best, runs))
     return Results(machine(), seconds, rounds, latencies, factor)
 
 
-def _say(what: str, stressed: bool, priority: int) -> None:
+def _show_progress(what: str, stressed: bool, priority: int) -> None:
     progress(what, load(stressed), f"{scheduling(priority)} scheduling")
 
 
 def markdown(results: Results) -> str:
-    """All tables, goals first."""
+    """Return all tables, goals first."""
     rounds = results.rounds
     late = [
         [
@@ -229,8 +231,8 @@ def markdown(results: Results) -> str:
 
 
 def goals(results: Results) -> list[list[str]]:
-    """One row per goal: what was aimed at, and what came out idle and under load."""
-    best = max(round_.priority for round_ in results.rounds)  # as the robot would run
+    """Return one row per goal: the goal, and the results idle and under load."""
+    best = max(round_.priority for round_ in results.rounds)  # the scheduler of a robot
 
     def judged(
         goal: str,

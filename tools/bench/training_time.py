@@ -1,4 +1,4 @@
-"""How long `fishctl learn ppo` takes with its defaults, for `learning time`."""
+"""Duration of `fishctl learn ppo` with its defaults, for `learning time`."""
 
 import math
 import resource
@@ -14,7 +14,7 @@ from common.machine import machine_in_short
 from common.report import progress, spread, table
 from fishd.learning.run_folder.tables import best_so_far, read_evaluations
 
-ENOUGH = 0.97
+GOOD_RELATIVE_THRUST = 0.97
 FIRST_SEED = 3000
 """No setting was chosen with this seed or the following ones."""
 
@@ -23,13 +23,14 @@ class Timing(NamedTuple):
     """Times of one training, from the start of its process to its end."""
 
     to_enough: float
-    """Time until an evaluation shows a relative thrust of `ENOUGH`; infinite without one [s]."""
+    """Time until an evaluation has a relative thrust of `GOOD_RELATIVE_THRUST`; infinite without
+    one [s]."""
     total: float
     """[s]"""
     processor: float
     """Processor time [s]."""
     steps: int
-    """Control steps that were learned from."""
+    """Number of control steps of the training."""
     best: float
     """Relative thrust of the best policy."""
 
@@ -69,7 +70,7 @@ def _timed(seed: int) -> Timing:
         total = time.perf_counter() - begun
         evaluations = read_evaluations(folder)
     best = best_so_far(evaluations)
-    reached = (when for when, share in zip(shown, best) if share >= ENOUGH)  # noqa: B905
+    reached = (when for when, share in zip(shown, best) if share >= GOOD_RELATIVE_THRUST)  # noqa: B905
     timing = Timing(
         to_enough=next(reached, math.inf),
         total=total,

@@ -1,4 +1,4 @@
-"""Trainings for `learning`: many at a time, and what their policies do on other fish."""
+"""Trainings for `learning`, many at a time, and evaluation of their policies on other fish."""
 
 import itertools
 import math
@@ -27,52 +27,52 @@ CONFIG = DOCS.parent / "config"
 UNTOUCHED = range(240, 250)
 """Seeds that no setting was chosen with."""
 OFF = 0.15
-"""By this share each of four parameters of a fish is off, up or down."""
+"""Relative change of each of four parameters of a fish, up or down."""
 SECONDS, SETTLE = 60.0, 10.0
-"""How long policies and controllers are judged on other fish, and not judged at first [s]."""
+"""Length of an evaluation on other fish, and of its ignored start [s]."""
 
 
 class Row(NamedTuple):
-    """What is trained with several seeds."""
+    """Training with several seeds."""
 
     config: Config
     settings: TrainingSettings
     camera: SimulatedCameraSettings = SimulatedCameraSettings()
-    """What the fish is seen with, where the settings ask for pictures."""
+    """Camera, where the settings require pictures."""
 
 
 class Trained(NamedTuple):
-    """One training."""
+    """Result of one training."""
 
     points: list[Evaluation]
     best: list[float]
-    """Relative thrust of the best policy until each of them."""
+    """Relative thrust of the best policy up to each step."""
     others: list[float]
-    """Relative thrusts of its best policy on fish that are off, if those were asked for."""
+    """Relative thrusts of its best policy on changed fish, if requested."""
     cost: float
-    """Seconds of the processor for 1000 steps, evaluations included."""
+    """Processor time for 1000 steps, including evaluations [s]."""
 
     def steps_to(self, relative_thrust: float) -> float:
-        """Steps before the first evaluation with that relative thrust; inf if there is none."""
+        """Return the steps until the first evaluation with that relative thrust; inf without."""
         reached = zip(self.points, self.best, strict=True)
         return next((point.steps for point, best in reached if best >= relative_thrust), math.inf)
 
     @property
     def exported(self) -> Evaluation:
-        """The evaluation of its best policy."""
+        """Evaluation of its best policy."""
         return max(self.points, key=lambda point: point.relative_thrust)
 
 
 def rig(amplitude: float = 0.42) -> Config:
-    """A fish of which F_y has 1 mN of noise and an offset of 5 mN."""
+    """Return a fish with 1 mN of noise and an offset of 5 mN on F_y."""
     keys = ("simulation.noise=0.001", "simulation.offset_y=0.005")
     return load(None, [f"amplitude_limit={amplitude}", *keys])
 
 
 def settings_of(name: str | None, steps: int | None = None) -> TrainingSettings:
-    """Those of a file in config/, or the defaults; with another number of steps.
+    """Return the settings in a file of config/, or the defaults, with another number of steps.
 
-    A training does all steps, so that learning curves can be compared.
+    A training runs all steps, so that learning curves can be compared.
     """
     chosen = training.load(CONFIG / name if name else None)
     evaluation = replace(chosen.evaluation, patience=None)
@@ -80,7 +80,7 @@ def settings_of(name: str | None, steps: int | None = None) -> TrainingSettings:
 
 
 def trained(row: Row, seed: int, others: bool) -> Trained:
-    """Train once; in a process of its own."""
+    """Train once, in a separate process."""
     fish = replace(row.config, simulation=replace(row.config.simulation, seed=seed))
     with tempfile.TemporaryDirectory() as temporary:
         job = Job(
@@ -102,16 +102,16 @@ def trained(row: Row, seed: int, others: bool) -> Trained:
 
 
 def swum(checkpoint: Path, config: Config) -> list[float]:
-    """Relative thrust of a policy on each fish that is off."""
-    found = []
+    """Return the relative thrust of a policy on each changed fish."""
+    thrusts = []
     for off in fish_that_are_off(config):
         decide = DeterministicPolicy(*load_policy(checkpoint), config.amplitude_limit)
-        found.append(judge(off, decide, SECONDS, SETTLE).relative_thrust)
-    return found
+        thrusts.append(judge(off, decide, SECONDS, SETTLE).relative_thrust)
+    return thrusts
 
 
 def fish_that_are_off(config: Config) -> Iterator[Config]:
-    """Sixteen: each of four parameters is off, up or down."""
+    """Return sixteen fish with each of four parameters changed up or down."""
     for signs in itertools.product((-1.0, 1.0), repeat=4):
         plant = config.plant
         values = (plant.omega0, plant.xi, plant.servo_speed, plant.coupling)
@@ -125,21 +125,21 @@ def fish_that_are_off(config: Config) -> Iterator[Config]:
 def several(
     rows: Mapping[str, Row], seeds: Sequence[int], jobs: int, others: bool = False
 ) -> dict[str, list[Trained]]:
-    """All seeds of all rows, in parallel."""
+    """Run all seeds of all rows in parallel."""
     tasks = [(row, seed) for row in rows for seed in seeds]
     with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = joblib.Parallel(n_jobs=jobs, batch_size=1, return_as="generator")
         work = parallel(joblib.delayed(trained)(rows[row], seed, others) for row, seed in tasks)
-        found: dict[str, list[Trained]] = {row: [] for row in rows}
+        trainings: dict[str, list[Trained]] = {row: [] for row in rows}
         for (row, seed), result in zip(tasks, work, strict=True):
-            found[row].append(result)
+            trainings[row].append(result)
             last = result.points[-1]
             progress(f"{row}, seed {seed}: {last.relative_thrust:.1%}, best {result.best[-1]:.1%}")
-    return found
+    return trainings
 
 
 def to_reach(runs: list[Trained], share: float) -> list[str]:
-    """The cells of a row: steps to that relative thrust, and how many seeds reached it."""
+    """Return the cells of a row: steps to that relative thrust, and number of seeds with it."""
     steps = [one.steps_to(share) for one in runs]
     reached = sum(map(math.isfinite, steps))
     return [spread(steps, 1.0, 0).replace("inf", "never"), f"{reached} of {len(runs)}"]

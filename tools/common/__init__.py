@@ -1,1 +1,1 @@
-"""What the packages beside this one share."""
+"""Shared modules of the tools."""

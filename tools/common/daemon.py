@@ -1,4 +1,4 @@
-"""A real fishd in a process of its own, its sockets and files in a folder that ends with it."""
+"""Real fishd in a separate process, with its sockets and files in a temporary folder."""
 
 import contextlib
 import os
@@ -23,14 +23,14 @@ from fishd.virtual.pi.virtual_pi import VirtualPi
 from fishd.virtual.plant.parameters import PlantParameters
 
 START = (FISHD, "--no-print-status")
-PATIENCE = 20.0
-"""How long a fishd may take to start or to end [s]."""
+TIMEOUT_S = 20.0
+"""Longest time that a fishd may take to start or to end [s]."""
 
 
 class Fishd(Process):
-    """It swings a simulated fish unless `settings`, each KEY=VALUE, say otherwise.
+    """Real fishd with a simulated fish under `swing`, unless `settings`, each KEY=VALUE, differ.
 
-    A context manager; on leaving, fishd is asked to end, and killed when it does not.
+    A context manager; at the end, fishd is terminated, and killed if it does not end.
     """
 
     def __init__(
@@ -42,8 +42,8 @@ class Fishd(Process):
         tcp: bool = False,
     ) -> None:
         """
-        command: what starts fishd; output: where standard output and error go, not to a log
-        tcp: telemetry over TCP; another program may take the port before fishd does
+        command: command that starts fishd; output: file for standard output and error instead of a
+        log tcp: telemetry over TCP; another program may take the port before fishd
         """
         self._folder = tempfile.TemporaryDirectory(prefix="fishd-")
         self.folder = Path(self._folder.name)
@@ -54,7 +54,7 @@ class Fishd(Process):
         self.log = self.folder / "log"
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
-        self._socket.set(zmq.RCVHWM, 0)  # ticks wait here, so that nobody else wakes up for them
+        self._socket.set(zmq.RCVHWM, 0)  # ticks wait here, without a thread
         self._socket.set(zmq.RECONNECT_IVL, 2)
         self._socket.subscribe(b"tick")
         self._socket.connect(self.telemetry)
@@ -76,14 +76,14 @@ class Fishd(Process):
             )
 
     def __exit__(self, *_: object) -> None:
-        self.end_or_kill(PATIENCE)
+        self.end_or_kill(TIMEOUT_S)
         self._context.destroy(linger=0)
         self._folder.cleanup()
 
-    def next_message(self, patience: float = PATIENCE) -> bytes:
-        """Wait for what is published of a tick; raises SystemExit with fishd's log if nothing is.
+    def next_message(self, patience: float = TIMEOUT_S) -> bytes:
+        """Wait for the next message of a tick; raises SystemExit with fishd's log after a timeout.
 
-        patience: how long to wait [s]
+        patience: longest wait [s]
         """
         deadline = time.monotonic() + patience
         while not self._socket.poll(50):
@@ -92,34 +92,34 @@ class Fishd(Process):
         return self._socket.recv_multipart()[1]
 
     def waiting_messages(self) -> list[bytes]:
-        """What has been published of all ticks since the last look."""
-        found = []
+        """Return the messages of all ticks since the last call."""
+        messages = []
         while self._socket.poll(0):
-            found.append(self._socket.recv_multipart()[1])
-        return found
+            messages.append(self._socket.recv_multipart()[1])
+        return messages
 
-    def next_tick(self, patience: float = PATIENCE) -> Tick:
-        """The same as `next_message`, decoded."""
+    def next_tick(self, patience: float = TIMEOUT_S) -> Tick:
+        """Return the decoded result of `next_message`."""
         return msgspec.json.decode(self.next_message(patience), type=Tick)
 
     def waiting_ticks(self) -> list[Tick]:
-        """The same as `waiting_messages`, decoded."""
+        """Return the decoded results of `waiting_messages`."""
         return [msgspec.json.decode(message, type=Tick) for message in self.waiting_messages()]
 
     def status(self) -> Status:
-        """What `fishctl status` gets."""
+        """Return the status, as `fishctl status` does."""
         with Fish(self.endpoint) as fish:
             return fish.status()
 
     def seconds_to_end(self, number: signal.Signals) -> float:
-        """Send a signal; return how long the process takes to end [s]."""
+        """Send a signal, and return the time until the process has ended [s]."""
         begun = time.monotonic()
         self.process.send_signal(number)
-        self.process.wait(PATIENCE)
+        self.process.wait(TIMEOUT_S)
         return time.monotonic() - begun
 
     def gateways(self) -> list[int]:
-        """Return the processes of the gateways, and first that of their fork server."""
+        """Return the process of the gateways' fork server, then those of the gateways."""
         servers = _children(self.pid)
         return [*servers, *(pid for server in servers for pid in _children(server))]
 
@@ -128,7 +128,7 @@ class Fishd(Process):
 
         Waits until there is one.
         """
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT_S
         while time.monotonic() < deadline:
             for pid in self.gateways():
                 with contextlib.suppress(OSError):
@@ -138,20 +138,20 @@ class Fishd(Process):
         raise SystemExit(f"fishd has no gateway of {kind}: {self.log.read_text(encoding='utf-8')}")
 
     def cpu_seconds(self) -> float:
-        """User and system time so far, of all threads and of the gateways [s]."""
+        """Return the user and system time of all threads and of the gateways [s]."""
         return sum(_cpu_seconds(Path(f"/proc/{pid}")) for pid in (self.pid, *self.gateways()))
 
     def thread_seconds(self) -> dict[int, float]:
-        """The same of each thread of fishd's own process [s]."""
+        """Return the user and system time of each thread of the main process [s]."""
         tasks = Path(f"/proc/{self.pid}/task").iterdir()
         return {int(task.name): _cpu_seconds(task) for task in tasks}
 
     def memory(self, field: str = "VmRSS") -> float:
-        """A size of fishd's own process, of those in /proc/PID/status [MB]."""
+        """Return a size of the main process in /proc/PID/status [MB]."""
         return _size(Path(f"/proc/{self.pid}/status"), field)
 
     def total_memory(self) -> float:
-        """Of fishd and its gateways, pages that they share counted once (PSS) [MB]."""
+        """Return the memory of fishd and its gateways, shared pages counted once (PSS) [MB]."""
         return sum(
             _size(Path(f"/proc/{pid}/smaps_rollup"), "Pss") for pid in (self.pid, *self.gateways())
         )
@@ -159,7 +159,7 @@ class Fishd(Process):
 
 @contextlib.contextmanager
 def virtual_pi(folder: Path) -> Iterator[tuple[VirtualPi, list[str]]]:
-    """A virtual Pi in this process, and the settings of a fishd that is to swim on it."""
+    """Run a virtual Pi in this process; yield it and the settings of a fishd for it."""
     settings = VirtualPiSettings(pigpio_port=0)
     pi = VirtualPi(settings, PlantParameters(), SimulationSettings(), 0.05, SystemClock())
     with LinkServer(pi, folder / "virtual-pi"):
@@ -167,9 +167,9 @@ def virtual_pi(folder: Path) -> Iterator[tuple[VirtualPi, list[str]]]:
 
 
 def virtual_pi_settings(address: Path, port: int) -> list[str]:
-    """Those of a fishd that is to swim on a virtual Pi.
+    """Return the settings of a fishd on a virtual Pi.
 
-    address: the socket of the virtual Pi; port: its pigpiod's
+    address: socket of the virtual Pi; port: TCP port of its pigpiod
     """
     return [
         "robot=virtual-pi",
@@ -181,7 +181,7 @@ def virtual_pi_settings(address: Path, port: int) -> list[str]:
 def _children(pid: int) -> list[int]:
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
-    except OSError:  # it has ended
+    except OSError:  # the process has ended
         return []
     return [int(child) for child in children.split()]
 
@@ -192,13 +192,13 @@ def _cpu_seconds(of: Path) -> float:
 
 
 def _size(file: Path, field: str) -> float:
-    """[MB]; 0 once the process has ended."""
+    """Return a size [MB]; 0 after the end of the process."""
     try:
         lines = file.read_text(encoding="utf-8").splitlines()
     except OSError:
         return 0.0
-    found = (int(line.split()[1]) * 1024e-6 for line in lines if line.startswith(f"{field}:"))
-    return next(found, 0.0)
+    sizes = (int(line.split()[1]) * 1024e-6 for line in lines if line.startswith(f"{field}:"))
+    return next(sizes, 0.0)
 
 
 def _free_port() -> int:

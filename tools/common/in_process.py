@@ -1,4 +1,4 @@
-"""The commands of fishd, run in this process, which saves their start."""
+"""Commands of fishd in this process, which saves their start-up time."""
 
 import contextlib
 import io
@@ -11,9 +11,9 @@ from fishd.core.process.interruption import SIGNALS
 
 
 def fishctl(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run fishctl, and return what it says and its exit status.
+    """Run fishctl, and return its output and its exit status.
 
-    Not for what a signal or a terminal is part of.
+    Not suitable for trials with signals or terminals.
     """
     out, err = io.StringIO(), io.StringIO()
     argv, sys.argv = sys.argv, ["fishctl", *arguments]
@@ -25,7 +25,7 @@ def fishctl(*arguments: str) -> subprocess.CompletedProcess[str]:
         status = ended.code
     finally:
         sys.argv = argv
-        for number, handler in handlers.items():  # `watch` and `record` set some and leave them
+        for number, handler in handlers.items():  # `watch` and `record` change some
             signal.signal(number, handler)
     assert isinstance(status, int)
     return subprocess.CompletedProcess(arguments, status, out.getvalue(), err.getvalue())

@@ -1,4 +1,4 @@
-"""The machine that is measured on: what it is, what it permits, and how to keep it busy."""
+"""Machine of a measurement: its description, its permissions, and load for it."""
 
 import os
 import shutil
@@ -11,18 +11,20 @@ from functools import cache
 from pathlib import Path
 
 PRIORITY = 50
-"""SCHED_FIFO priority of fishd and of what it is compared with."""
+"""SCHED_FIFO priority of fishd and of the programs compared with it."""
 
 
 def machine() -> dict[str, str]:
-    """What the numbers depend on."""
+    """Return the properties of the machine that affect measurements."""
     cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     names = [line for line in cpuinfo.splitlines() if line.startswith(("model name", "Model"))]
     kernel = os.uname()
     virtual = "yes" if "hypervisor" in cpuinfo else "no hypervisor is visible"
     if shutil.which("systemd-detect-virt"):
-        found = subprocess.run(["systemd-detect-virt"], stdout=subprocess.PIPE, text=True).stdout
-        virtual += f"; systemd-detect-virt says {found.strip()}"
+        virtualisation = subprocess.run(
+            ["systemd-detect-virt"], stdout=subprocess.PIPE, text=True
+        ).stdout
+        virtual += f"; systemd-detect-virt says {virtualisation.strip()}"
     load = "one busy Python process per core, as stress-ng is not installed"
     if shutil.which("stress-ng"):
         load = "stress-ng: one cpu worker per core, one io, one vm"
@@ -39,7 +41,7 @@ def machine() -> dict[str, str]:
 
 
 def machine_in_short() -> str:
-    """The same as one sentence."""
+    """Return the properties of the machine in one sentence."""
     about = machine()
     cores, python, fifo = (about[key] for key in ("Cores", "Python", "SCHED_FIFO"))
     return f"{about['CPU']}, {cores} cores; Python {python}; SCHED_FIFO: {fifo}."
@@ -47,29 +49,29 @@ def machine_in_short() -> str:
 
 @cache
 def fifo_permitted() -> bool:
-    """May processes that this one starts ask for real-time scheduling?"""
+    """Return whether child processes may use real-time scheduling."""
     ask = f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({PRIORITY}))"
     return subprocess.run([sys.executable, "-c", ask], stderr=subprocess.DEVNULL).returncode == 0
 
 
 def priorities(highest: int = PRIORITY) -> tuple[int, ...]:
-    """Those to measure with: 0, the normal scheduler, and a real-time one where permitted."""
+    """Return the priorities to measure: 0 (normal), and a real-time one if permitted."""
     return (0, highest) if fifo_permitted() else (0,)
 
 
 def scheduling(priority: int) -> str:
-    """A priority in words."""
+    """Return a description of a priority."""
     return f"SCHED_FIFO {priority}" if priority else "normal"
 
 
 def load(stressed: bool) -> str:
-    """A load in words."""
+    """Return a description of a load."""
     return "under load" if stressed else "idle"
 
 
 @contextmanager
 def stress(wanted: bool, limit: float) -> Iterator[None]:
-    """Keep every core busy; whatever happens to us, it ends after `limit` seconds."""
+    """Keep every core busy; the load ends after `limit` seconds even if this process dies."""
     cores = os.cpu_count() or 1
     commands: list[list[str]] = []
     if wanted and shutil.which("stress-ng"):

@@ -1,4 +1,4 @@
-"""MCAP files made record by record, also such as no writer makes: right sums, wrong content."""
+"""MCAP files built record by record, also with valid checksums and invalid content."""
 
 import struct
 import zlib
@@ -19,17 +19,17 @@ from fishd.recording.images import FrameHead
 
 MAGIC = b"\x89MCAP0\r\n"
 Record = tuple[int, bytes]
-"""Opcode and content."""
+"""Record as opcode and content."""
 
 
 def text(words: str | bytes) -> bytes:
-    """A text with its length before it."""
+    """Return a text with its length before it."""
     content = words.encode() if isinstance(words, str) else words
     return struct.pack("<I", len(content)) + content
 
 
 def pack(opcode: int, body: bytes, length: int | None = None) -> bytes:
-    """A record; length: what it claims to have [bytes]."""
+    """Return a record; length: stated length [bytes]."""
     return struct.pack("<BQ", opcode, len(body) if length is None else length) + body
 
 
@@ -40,10 +40,10 @@ def chunk(
     data: bytes | None = None,
     size: int | None = None,
 ) -> Record:
-    """A chunk of this content, with the right checksum.
+    """Return a chunk of this content, with the valid checksum.
 
-    data: what stands in the file; by default the content as zstd
-    size: what the chunk claims to hold [bytes]
+    data: data in the file; by default the content compressed by zstd
+    size: stated size of the content [bytes]
     """
     compressed = zstandard.ZstdCompressor().compress(content) if data is None else data
     claimed = len(content) if size is None else size
@@ -53,7 +53,7 @@ def chunk(
 
 
 def message(channel: int, payload: bytes, t: float = 1.0) -> bytes:
-    """A message, as it stands in a chunk."""
+    """Return a message of a chunk."""
     nanoseconds = round(t * 1e9)
     return pack(
         Opcode.MESSAGE, struct.pack("<HIQQ", channel, 0, nanoseconds, nanoseconds) + payload
@@ -61,20 +61,20 @@ def message(channel: int, payload: bytes, t: float = 1.0) -> bytes:
 
 
 def attachment(name: str, data: bytes, length: int | None = None) -> Record:
-    """An attachment with the right checksum; length: what its data claim to have [bytes]."""
+    """Return an attachment with the valid checksum; length: stated length of its data [bytes]."""
     claimed = struct.pack("<Q", len(data) if length is None else length)
     body = struct.pack("<QQ", 0, 0) + text(name) + text("") + claimed + data
     return Opcode.ATTACHMENT, body + struct.pack("<I", zlib.crc32(body))
 
 
 def metadata(name: str, entries: Mapping[str, str]) -> Record:
-    """Metadata."""
+    """Return a metadata record."""
     content = b"".join(text(key) + text(value) for key, value in entries.items())
     return Opcode.METADATA, text(name) + text(content)
 
 
 def split(content: bytes) -> list[Record]:
-    """The records of an intact file."""
+    """Return the records of an intact file."""
     records, offset = [], len(MAGIC)
     while offset < len(content) - len(MAGIC):
         opcode, length = struct.unpack_from("<BQ", content, offset)
@@ -84,17 +84,17 @@ def split(content: bytes) -> list[Record]:
 
 
 def join(records: list[Record]) -> bytes:
-    """A file of these records."""
+    """Return a file of these records."""
     return MAGIC + b"".join(pack(*record) for record in records) + MAGIC
 
 
 def chunk_content(body: bytes) -> bytes:
-    """What an intact chunk of `RunWriter` holds."""
+    """Return the content of an intact chunk of `RunWriter`."""
     return zstandard.decompress(body[8 + 8 + 8 + 4 + 4 + 4 + 8 :])
 
 
 def write_good_recording(path: Path, seconds: float = 3.0) -> None:
-    """Write a short recording with something of everything that a recording can hold."""
+    """Write a short recording with every kind of content."""
     config, extra = Config(), {"force_unit": "N", "lowest": "-0.42", "highest": "0.42"}
     with RunWriter(path.with_name(f"{path.stem}-ticks"), source="simulation") as writer:
         writer.describe(config, extra)

@@ -1,4 +1,4 @@
-"""Programs that run beside tools and tests: started, awaited, and gone in the end."""
+"""Programs that run beside tools and tests: start, wait and end."""
 
 import signal
 import subprocess
@@ -12,7 +12,7 @@ BIN = Path(sys.executable).parent
 FISHD = str(BIN / "fishd")
 FISHCTL = str(BIN / "fishctl")
 PATIENCE = 60.0
-"""Time after which a test or a tool gives up on what it waits for [s]."""
+"""Timeout of the waits of tests and tools [s]."""
 
 
 def call(*command: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
@@ -27,9 +27,9 @@ def sets(*pairs: str) -> list[str]:
 
 
 def wait_until(true: Callable[[], bool]) -> None:
-    """Wait until a condition is true; the longer a look takes, the fewer looks.
+    """Wait until a condition is true; slow checks are repeated less often.
 
-    Otherwise the looks would slow down what is waited for. Raises AssertionError after PATIENCE.
+    Frequent checks would slow down the awaited process. Raises AssertionError after `PATIENCE`.
     """
     looked = time.monotonic()
     deadline = looked + PATIENCE
@@ -41,7 +41,7 @@ def wait_until(true: Callable[[], bool]) -> None:
 
 
 class Process:
-    """A program that runs beside this one; as a context manager it is gone afterwards."""
+    """Program that runs beside this one; as a context manager it has ended afterwards."""
 
     def __init__(self, *command: str, **options: Any) -> None:
         """options: those of `subprocess.Popen`"""
@@ -50,7 +50,7 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """The number of the process."""
+        """Number of the process."""
         return self.process.pid
 
     def __enter__(self) -> Self:
@@ -61,18 +61,18 @@ class Process:
             self.process.kill()
 
     def finish(self, patience: float = PATIENCE) -> tuple[int, str, str]:
-        """Wait until it ends by itself; return exit status, output and errors."""
+        """Wait until the process ends by itself; return exit status, output and errors."""
         out, err = self.process.communicate(timeout=patience)
         return self.process.returncode, out, err
 
     def end(self, number: int = signal.SIGTERM) -> tuple[int, str, str]:
-        """Send a signal, if it still runs, and return exit status, output and errors."""
+        """Send a signal if the process still runs; return exit status, output and errors."""
         if self.process.poll() is None:
             self.process.send_signal(number)
         return self.finish()
 
     def end_or_kill(self, patience: float) -> None:
-        """End it also if it is stopped; kill it if that takes too long [s]."""
+        """End the process, also if it is stopped; kill it after a timeout [s]."""
         self.process.send_signal(signal.SIGCONT)
         self.process.terminate()
         try:
@@ -81,6 +81,6 @@ class Process:
             self.kill()
 
     def kill(self) -> None:
-        """Kill it and wait for its end."""
+        """Kill the process and wait for its end."""
         self.process.kill()
         self.process.wait(PATIENCE)

@@ -1,4 +1,4 @@
-"""The verbs that read recordings, run on files of any kind, and what is wrong with an answer."""
+"""Runs of the verbs that read recordings on files of any kind, and checks of their results."""
 
 import time
 import traceback
@@ -22,11 +22,11 @@ VERBS = {
 }
 """Arguments of fishctl, by verb."""
 MAX_SECONDS, MAX_MEGABYTES = 10.0, 300.0
-"""A verb takes no more processor time and memory for a short file, whatever is in it [s, MB]."""
+"""Largest processor time [s] and memory [MB] of a verb for a short file of any content."""
 
 
 class Outcome(Struct, frozen=True):
-    """How a verb ended."""
+    """Result of a verb."""
 
     verb: str
     file: str
@@ -39,9 +39,9 @@ class Outcome(Struct, frozen=True):
 
 
 def run_verb(verb: str, file: Path, out: Path) -> Outcome:
-    """Run a verb on a file in this process; out: a folder for what it writes."""
+    """Run a verb on a file in this process; out: folder for its output."""
     words = [word.format(file=file, parent=file.parent, out=out) for word in VERBS[verb].split()]
-    replay.SUBSCRIBER_WAIT_S = 0.0  # there is no subscriber
+    replay.SUBSCRIBER_WAIT_S = 0.0  # without a subscriber
     begun = time.process_time()
     status, printed, error = None, "", ""
     try:
@@ -53,7 +53,7 @@ def run_verb(verb: str, file: Path, out: Path) -> Outcome:
 
 
 def find_mistakes(outcome: Outcome) -> list[str]:
-    """Return what is wrong with the way in which a verb ended."""
+    """Return the mistakes in the result of a verb."""
     lines = outcome.err.splitlines()
     mistakes = []
     if outcome.status not in (0, 1):
@@ -70,6 +70,6 @@ def find_mistakes(outcome: Outcome) -> list[str]:
 
 
 def peak_memory() -> float:
-    """The most memory that this process has held [MB]."""
+    """Return the peak memory of this process [MB]."""
     status = Path("/proc/self/status").read_text(encoding="ascii")
     return int(status.partition("VmHWM:")[2].split()[0]) / 1024

@@ -1,4 +1,4 @@
-"""What all measurements share: the command line, tables in Markdown, and their place in docs/."""
+"""Command line of measurements, tables in Markdown, and their place in docs/."""
 
 import argparse
 import ast
@@ -14,29 +14,29 @@ import msgspec
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 Options = dict[str, dict[str, Any]]
-"""What a command line can ask for: arguments of `ArgumentParser.add_argument`, by name."""
+"""Options of a command line: arguments of `ArgumentParser.add_argument`, by name."""
 
 
 class Report(NamedTuple):
-    """What a measurement has found; each has a function `measure` that returns one."""
+    """Result of a measurement, returned by its function `measure`."""
 
     sections: dict[str, str]
-    """Markdown, by the name of the markers in its document that it belongs between."""
+    """Markdown by the name of the markers in the document that enclose it."""
     figures: Any
-    """The same for programs: whatever msgspec can write as JSON."""
+    """Results for programs, as data that msgspec can write as JSON."""
     broken: bool = False
-    """A promise of fishd was not kept; the exit status is 1 then."""
+    """Whether a promise of fishd was not kept; the exit status is 1 then."""
 
 
 class BrokenPromise(BaseException):
-    """A promise of fishd was not kept; nothing in fishd may catch it."""
+    """A promise of fishd was not kept; fishd must not catch this exception."""
 
 
 def run(package: str, names: Sequence[str]) -> int:
-    """Do what the command line asks for; the exit status.
+    """Run the measurement of the command line, and return the exit status.
 
-    package: the folder below tools/; each of `names` is a module in it with `DOCUMENT`, the file in
-    docs/ that has its markers, `OPTIONS` and `measure(options) -> Report`
+    package: folder below tools/; each of `names` is a module in it with `DOCUMENT`, the file in
+    docs/ with its markers, `OPTIONS` and `measure(options) -> Report`
     """
     parser = argparse.ArgumentParser(prog=f"tools/{package}")
     commands = parser.add_subparsers(dest="name", metavar="NAME", required=True)
@@ -48,7 +48,7 @@ def run(package: str, names: Sequence[str]) -> int:
             description=text,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
-        if name in sys.argv[1:2]:  # the others may need extras that are not installed
+        if name in sys.argv[1:2]:  # other modules may need extras that are not installed
             module = importlib.import_module(f"{package}.{name}")
             for option, settings in module.OPTIONS.items():
                 command.add_argument(option, **settings)
@@ -79,18 +79,18 @@ def _docstring(module: str) -> str:
 
 
 def progress(*words: str) -> None:
-    """Say on standard error how far a long measurement is."""
+    """Write the progress of a long measurement to standard error."""
     print(" | ".join(words), file=sys.stderr, flush=True)
 
 
 def table(head: str, rows: Iterable[Iterable[str]]) -> str:
-    """A table in Markdown; the cells of its head are separated by " | "."""
+    """Return a table in Markdown; the cells of its head are separated by " | "."""
     rule = " | ".join("---" for _ in head.split(" | "))
     return "\n".join(f"| {line} |" for line in (head, rule, *map(" | ".join, rows)))
 
 
 def put(document: Path, name: str, text: str) -> None:
-    """Replace what is between the two markers of `name` in a document.
+    """Replace the text between the two markers of `name` in a document.
 
     Raises SystemExit where the markers are missing.
     """
@@ -99,26 +99,26 @@ def put(document: Path, name: str, text: str) -> None:
 
 
 def between(document: Path, name: str) -> str:
-    """What is between the two markers; raises as `put` does."""
+    """Return the text between the two markers; raises as `put` does."""
     return _parted(document, name)[1].strip("\n")
 
 
 def _parted(document: Path, name: str) -> tuple[str, str, str]:
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
-    before, found, rest = document.read_text(encoding="utf-8").partition(begin)
+    before, opening, rest = document.read_text(encoding="utf-8").partition(begin)
     text, ended, after = rest.partition(end)
-    if not (found and ended):
+    if not (opening and ended):
         raise SystemExit(f"{document}: the markers {begin} and {end} are needed")
     return before + begin, text, end + after
 
 
 def quantile(values: Sequence[float], share: float) -> float:
-    """The value that `share` of all values do not exceed."""
+    """Return the value that a fraction `share` of all values does not exceed."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
 
 
 def spread(values: Sequence[float], factor: float = 100.0, digits: int = 1) -> str:
-    """Median, and range in brackets; in per cent unless there is another factor."""
+    """Format the median, and the range in brackets; in per cent unless `factor` differs."""
     middle, low, high = (
         f"{factor * function(values):.{digits}f}" for function in (statistics.median, min, max)
     )

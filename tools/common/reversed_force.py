@@ -1,4 +1,4 @@
-"""A robot whose F_y has the wrong sign, for tests and measurements."""
+"""Robot with reversed F_y, for tests and measurements."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ from fishd.hardware.base import ForceSensor, Robot
 
 
 class ReversedSensor:
-    """A force sensor whose wires of F_y are interchanged."""
+    """Force sensor with interchanged wires of F_y."""
 
     def __init__(self, sensor: ForceSensor) -> None:
         self._sensor = sensor

@@ -1,1 +1,1 @@
-"""The figures and the numbers of the paper of Fu et al., computed again."""
+"""Reproduction of the figures and numbers of the paper of Fu et al."""

@@ -1,4 +1,4 @@
-"""Compute the paper's figures and numbers again: `make figures`, or `python tools/paper`."""
+"""Reproduction of the paper's figures and numbers: `make figures`, or `python tools/paper`."""
 
 import argparse
 import os
@@ -13,11 +13,11 @@ from paper import claims, figure_2b, figure_3, figure_4, figure_5, figure_6, swi
 from paper.runs import FOLDER  # noqa: E402
 
 PARTS = (swing_map, figure_2b, figure_3, figure_4, figure_5, figure_6)
-"""Each has `compute(jobs)`, which writes its tables, and `draw()`, which reads them again."""
+"""Modules with `compute(jobs)`, which writes tables, and `draw()`, which reads them."""
 
 
 def main() -> None:
-    """Write docs/figures/ and the parts of docs/explanation/ that state their numbers."""
+    """Write docs/figures/ and the parts of docs/explanation/ with their numbers."""
     parser = argparse.ArgumentParser(prog="tools/paper", description=__doc__)
     parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
     jobs = parser.parse_args().jobs

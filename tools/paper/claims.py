@@ -1,7 +1,6 @@
-"""Every number that the paper of Fu et al. states, beside what the tables and equations here give.
+"""Numbers of the paper of Fu et al., compared with the tables and equations of fishd.
 
-The tables are those that the figures are drawn from; docs/explanation/paper.md holds the result of
-`sections`.
+The tables are those of the figures; docs/explanation/paper.md contains the result of `sections`.
 """
 
 import math
@@ -22,31 +21,31 @@ from paper.runs import PLANT, column, read
 
 DOCUMENT = "explanation/paper.md"
 HARD_SERVO_LAG = 1e-4
-"""Δ that stands for a servo without a lag, which turns at Ω until it is there [rad]."""
+"""Δ that represents a servo without a lag, which turns at Ω until it arrives [rad]."""
 PLATEAU = 0.99
-"""Share of the best thrust from which on a frequency counts as good as the best."""
-SOON, SLOW = 0.02, 100.0
-"""Amplitudes that stand for a small and a large Φ, in units of Φ_s."""
+"""Fraction of the best thrust from which a frequency counts as equally good."""
+SMALL_AMPLITUDE, LARGE_AMPLITUDE = 0.02, 100.0
+"""Amplitudes that represent a small and a large Φ, in units of Φ_s."""
 NEAR = 0.05
-"""A number agrees with one of the paper that differs from it by less than this share."""
+"""Relative difference below which a number agrees with one of the paper."""
 
 
 class Claim(NamedTuple):
-    """A line of the table."""
+    """Row of the table."""
 
     paper: str
     computed: str
     agrees: bool | None
-    """None where nothing can be compared."""
+    """Whether the numbers agree; None where they cannot be compared."""
 
 
 def sections() -> list[tuple[str, str, str]]:
-    """Document, name of the markers, and what belongs between them."""
+    """Return document, name of the markers, and the text between them."""
     return [(DOCUMENT, name, section(name)) for name in SECTIONS]
 
 
 def section(name: str) -> str:
-    """What belongs between the markers of this name."""
+    """Return the text between the markers of this name."""
     if name == REFINEMENT:
         cells = " | ".join(f"{cell:g} mm" for cell in figure_6.CELLS)
         return table(f"speed (mm/s), cells of | {cells}", refinement())
@@ -58,7 +57,7 @@ def section(name: str) -> str:
 
 
 def constants() -> Iterator[Claim]:
-    """What the fish is made of; the defaults of the configuration."""
+    """Return the claims on the fish's constants, the defaults of the configuration."""
     stated = (
         ("ω₀", 12.5, "omega0", "rad/s"),
         ("ξ", 1.2, "xi", ""),
@@ -77,7 +76,7 @@ def constants() -> Iterator[Claim]:
 
 
 def equations() -> Iterator[Claim]:
-    """What the equations say, without a tick."""
+    """Return the claims on the equations, without a tick."""
     p = PLANT
     yield _near("Φ_s = Ω/ω₀ = 0.464 rad", saturation_amplitude(p), 0.464, "{:.3f} rad")
     resonance = p.omega0 / (2.0 * math.pi)
@@ -89,17 +88,20 @@ def equations() -> Iterator[Claim]:
     )
     peak = p.omega0 * math.sqrt(1.0 - p.xi**2 / 2.0) / (2.0 * math.pi)
     yield _near("resonance of the fin angle ≈ 1.1 Hz", peak, 1.1, "{:.3f} Hz")
-    amplitude = SLOW * saturation_amplitude(p)
+    amplitude = LARGE_AMPLITUDE * saturation_amplitude(p)
     best, limit = best_square_waves(p, [amplitude]), slow_servo(p, [amplitude])
     ratio = float(best.frequency[0] / limit.frequency[0])
     yield _near(
-        "slow servo: best frequency Ω/4Φ", ratio, 1.0, f"{{:.4f}} of it at Φ = {SLOW:g} Φ_s"
+        "slow servo: best frequency Ω/4Φ",
+        ratio,
+        1.0,
+        f"{{:.4f}} of it at Φ = {LARGE_AMPLITUDE:g} Φ_s",
     )
     yield _near(
         "slow servo: thrust Kλ²Ω² = 91.8 mN",
         1e3 * float(best.thrust[0]),
         91.8,
-        f"{{:.2f}} mN at Φ = {SLOW:g} Φ_s",
+        f"{{:.2f}} mN at Φ = {LARGE_AMPLITUDE:g} Φ_s",
     )
     best = best_square_waves(p, [0.42])
     thrust, frequency = float(best.thrust[0]), float(best.frequency[0])
@@ -120,7 +122,7 @@ def equations() -> Iterator[Claim]:
         1.8,
         f"{{:.3f}} Hz, {1e3 * float(hard.thrust[0]):.2f} mN",
     )
-    ends = best_square_waves(p, [SOON * saturation_amplitude(p), 1.57]).frequency
+    ends = best_square_waves(p, [SMALL_AMPLITUDE * saturation_amplitude(p), 1.57]).frequency
     yield Claim(
         "best frequency falls from 2.5 to 1 Hz over the range of Φ",
         f"from {ends[0]:.2f} Hz (Φ → 0) to {ends[1]:.2f} Hz (Φ = 1.57 rad)",
@@ -137,7 +139,7 @@ def equations() -> Iterator[Claim]:
 
 
 def control() -> Iterator[Claim]:
-    """The best command of any shape."""
+    """Return the claims on the best command of any shape."""
     cases = read(figure_2b.CASES)
     full = min(column(cases, "share_of_time_at_limit"))
     ratios = column(cases, "thrust_over_best_square")
@@ -156,7 +158,7 @@ def control() -> Iterator[Claim]:
 
 
 def waveforms() -> Iterator[Claim]:
-    """The loop with three waveforms."""
+    """Return the claims on the loop with three waveforms."""
     for tick in figure_4.TICKS:
         waves = [
             column(read(figure_4.NAME, waveform=wave, tick_s=tick), "thrust_mN")
@@ -182,7 +184,7 @@ def waveforms() -> Iterator[Claim]:
 
 
 def swinging() -> Iterator[Claim]:
-    """Swinging control."""
+    """Return the claims on swinging control."""
     best = read(figure_5.NAME, C=swing_map.RECOMMENDED)
     everything = read(figure_5.NAME)
     for claim, rows, bound in (
@@ -210,25 +212,25 @@ def swinging() -> Iterator[Claim]:
 
 
 def _listed(thresholds: Set[float], choices: Set[float]) -> str:
-    """Return some C of several choices, as a list in words; empty where there is no choice."""
+    """Return several values of C as a list in words; empty for a single value."""
     return ", ".join(f"C = {c:g}" for c in sorted(thresholds)) if len(choices) > 1 else ""
 
 
 def _in_continuous_time(thresholds: Set[float], bound: float) -> str:
-    """Return what the reference has for these C, and which of them miss the bound by how much."""
+    """Return the results of the reference for these C, and those that miss the bound."""
     shares = {case: s for case, s in swing_map.continuous_time().items() if case[0] in thresholds}
     low = min(shares, key=shares.__getitem__)
-    found = f"from {shares[low]:.1%} up (C = {low[0]:g}, ω₀Φ/Ω = {low[1]:g})"
+    description = f"from {shares[low]:.1%} up (C = {low[0]:g}, ω₀Φ/Ω = {low[1]:g})"
     missed = {c for (c, _), share in shares.items() if share <= bound}
     if not missed:
-        return found
+        return description
     lacking = _listed(missed, thresholds)
     alone = f"only {lacking} misses it, by" if lacking else "less by"
-    return f"{found}; {alone} {100 * (bound - shares[low]):.1f} points"
+    return f"{description}; {alone} {100 * (bound - shares[low]):.1f} points"
 
 
 def learning() -> Iterator[Claim]:
-    """PPO, with ticks of 50 ms."""
+    """Return the claims on PPO, with ticks of 50 ms."""
     learned = read(figure_3.NAME, source=figure_3.LEARNT)
     relative_thrusts = column(learned, "relative_thrust")
     full = column(learned, "mean_command_over_limit")
@@ -276,18 +278,18 @@ def learning() -> Iterator[Claim]:
 
 
 def swimming() -> Iterator[Claim]:
-    """The free swimmer, on cells of 1 mm."""
-    found = list(figure_6.fastest())
-    if not found:  # nothing has swum yet
+    """Return the claims on the free swimmer, on cells of 1 mm."""
+    fastest_waves = list(figure_6.fastest())
+    if not fastest_waves:  # without results yet
         return
     best = ", ".join(
         f"{frequency:g} Hz {first}{''.join(f' or {wave}' for wave in alike)}"
-        for frequency, first, alike in found
+        for frequency, first, alike in fastest_waves
     )
     yield Claim(
         "the square wave is the fastest at every frequency",
         f"the fastest, within the intervals: {best}",
-        all(first == "square" and not alike for _, first, alike in found),
+        all(first == "square" and not alike for _, first, alike in fastest_waves),
     )
     waves = [row for wave in figure_6.WAVES for row in _swum(wave)]
     top = max(waves, key=lambda row: row["speed_mm_per_s"])
@@ -313,7 +315,7 @@ def swimming() -> Iterator[Claim]:
 
 
 def refinement() -> Iterator[tuple[str, str, str, str]]:
-    """Who swims, and how fast on cells of each size."""
+    """Return the table of swims, with their speeds on cells of each size."""
     for controller, setting in figure_6.REFINED:
         what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
         rows = [figure_6.row_of(figure_6.Case(controller, setting, c)) for c in figure_6.CELLS]
@@ -332,7 +334,7 @@ def _swum(controller: str) -> list[dict[str, Any]]:
 
 
 def _steps(policy: str) -> int:
-    """How long a policy has learned [control steps]."""
+    """Return the length of a policy's training [control steps]."""
     return file.read(library.find(policy)).card.provenance.steps
 
 

@@ -1,4 +1,4 @@
-"""Figure 2B: the best command at Φ = 0.31 rad, and what fin and thrust make of it."""
+"""Figure 2B: the best command at Φ = 0.31 rad, with the motion of the fin and the thrust."""
 
 import joblib
 import numpy as np
@@ -14,16 +14,16 @@ from paper.runs import FINE_TICK, FOLDER, PERFECT, PLANT, column, read, write
 
 NAME, CASES = "figure-2b", "optimal-control"
 AMPLITUDE = 0.31
-"""Φ [rad]"""
+"""Amplitude Φ [rad]."""
 SHOWN = 0.42
 """Φ of the picture in docs/explanation/optimum.md [rad]."""
 REFERENCES = [(xi, amplitude) for xi in (1.2, 0.05) for amplitude in (0.1, 0.31, 0.42, 1.0, 1.4)]
-"""ξ and Φ for which the best command of any shape is sought."""
+"""ξ and Φ for which the best command of any shape is computed."""
 SETTLE, BEATS = 10.0, 2
 
 
 class _Fins:
-    """Takes the fin angle from what the loop publishes."""
+    """Publisher that stores the fin angle."""
 
     def __init__(self) -> None:
         self.angles: list[float] = []
@@ -37,7 +37,7 @@ class _Fins:
 
 
 def compute(jobs: int) -> None:
-    """The traces of the loop and of optimal control, and the reference cases of the latter."""
+    """Compute the traces of the loop and of optimal control, and its reference cases."""
     controls = joblib.Parallel(jobs)(
         joblib.delayed(optimal_control)(PlantParameters(xi=xi), phi) for xi, phi in REFERENCES
     )
@@ -78,7 +78,7 @@ def _each(time, control):  # type: ignore[no-untyped-def]
 
 
 def _swum() -> tuple[list[float], ...]:
-    """The best square wave in the loop: time (s), command, fin (rad), thrust (mN)."""
+    """Return the best square wave in the loop: time (s), command, fin (rad), thrust (mN)."""
     best = best_square_waves(PLANT, [AMPLITUDE])
     fins = _Fins()
     commands, thrusts, sides = [], [], []
@@ -102,7 +102,7 @@ def _swum() -> tuple[list[float], ...]:
 
 
 def draw() -> None:
-    """Command, fin and thrust; lines from the loop, dots from optimal control."""
+    """Draw command, fin and thrust; lines from the loop, dots from optimal control."""
     loop, control = read(NAME, source="loop"), read(NAME, source="optimal control")
     with drawing.open_figure(FOLDER / f"{NAME}.svg", (6.0, 4.8)) as drawn:
         panels = drawn.subplots(3, 1, sharex=True)

@@ -14,33 +14,33 @@ NAME = "figure-3"
 AMPLITUDES = (0.05, 0.1, 0.2, 0.31, 0.42, 0.63, 0.8, 1.0, 1.4)
 LEARNED = (0.1, 0.2, 0.31, 0.42, 0.63, 0.8, 1.0, 1.4)
 NEAR = np.linspace(0.8, 1.2, 13)
-"""Frequencies that are tried in the loop, over the best of the equations."""
+"""Frequencies in the loop, relative to the best one of the equations."""
 SECONDS, SETTLE = 40.0, 10.0
 RANGE = (0.04, 1.57)
 BY_SIGHT = (0.1, 0.2, 0.31, 0.42, 0.63, 0.8, 1.0, 1.4)
-"""Amplitudes of the policies that learned from pictures, and see nothing else."""
+"""Amplitudes of the policies that learned from pictures only."""
 BEST, FAST, SLOW = "best square wave", "fast servo", "slow servo"
 LOOP, SWING, LEARNT = "square wave in the loop", "swing in the loop", "learned, in the loop"
 SEEN = "learned from pictures, in the loop"
 
 
 def policy(amplitude: float) -> str:
-    """The policy that has learned to swim at an amplitude [rad]."""
+    """Return the policy for an amplitude [rad]."""
     return str(DOCS / "figures" / "policies" / f"amplitude-{amplitude:.2f}.onnx")
 
 
 def sighted_policy(amplitude: float) -> str:
-    """The policy that has learned to swim at an amplitude [rad] from pictures."""
+    """Return the policy from pictures for an amplitude [rad]."""
     return str(DOCS / "figures" / "policies" / f"sight-{amplitude:.2f}.onnx")
 
 
 def run(controller: str, parameters: dict[str, float | str], amplitude: float) -> Run:
-    """With ticks of 50 ms, the default estimator and 1 mN of noise."""
+    """Return a run with ticks of 50 ms, the default estimator and 1 mN of noise."""
     return Run(controller, parameters, Config(amplitude_limit=amplitude), SECONDS, SETTLE)
 
 
 def compute(jobs: int) -> None:
-    """Curves from the equations, points from the loop."""
+    """Compute curves from the equations, and points from the loop."""
     angles = np.geomspace(*RANGE, 50)
     rows: list[Row] = []
     for source, optima in (
@@ -98,7 +98,7 @@ def _row(
 
 
 def draw() -> None:
-    """Three panels side by side."""
+    """Draw three panels side by side."""
     curves = (
         (BEST, {"color": BLACK, "lw": 1.6}),
         (FAST, {"color": GREY, "ls": (0, (4, 2))}),

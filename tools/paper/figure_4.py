@@ -15,18 +15,18 @@ TICKS = {
     0.05: np.arange(1, 21) / 5,
 }
 """Frequencies for each tick [Hz by s]."""
-SETTLE, LONGEST, BEATS = 4.0, 10.0, 4
+SETTLE, MIN_SECONDS, BEATS = 4.0, 10.0, 4
 
 
 def run(wave: str, tick: float, frequency: float) -> Run:
-    """Without noise: it does nothing to these controllers."""
+    """Return a run without noise, which does not affect these controllers."""
     config = Config(amplitude_limit=AMPLITUDE, tick=tick, simulation=PERFECT)
-    seconds = SETTLE + max(LONGEST, BEATS / frequency)
+    seconds = SETTLE + max(MIN_SECONDS, BEATS / frequency)
     return Run(wave, {"frequency": frequency}, config, seconds, SETTLE)
 
 
 def compute(jobs: int) -> None:
-    """Every waveform at every frequency, with a fine tick and with that of the robot."""
+    """Compute every waveform at every frequency, with a fine tick and with that of the robot."""
     cases = [
         (wave, tick, float(frequency))
         for tick, frequencies in TICKS.items()
@@ -50,7 +50,7 @@ def compute(jobs: int) -> None:
 
 
 def draw() -> None:
-    """Lines for the fine tick, points for that of the robot."""
+    """Draw lines for the fine tick, points for that of the robot."""
     styles = (("-", "s", BLACK), ((0, (5, 2)), "o", BLUE), ((0, (1, 1)), "^", ORANGE))
     with drawing.open_figure(FOLDER / f"{NAME}.svg", (6.0, 3.8)) as figure:
         axes = figure.subplots()

@@ -32,7 +32,7 @@ INSET_SECONDS, INSET_SETTLE = 50.0, 30.0
 
 
 def run(criterion: float, ratio: float) -> Run:
-    """With the true fin velocity, at a tick that stands for continuous time."""
+    """Return a run with the true fin velocity, at a tick that represents continuous time."""
     amplitude = ratio * saturation_amplitude(PLANT)
     config = Config(
         amplitude_limit=amplitude, tick=FINE_TICK, simulation=PERFECT, estimator=TRUE_VELOCITY
@@ -41,7 +41,7 @@ def run(criterion: float, ratio: float) -> Run:
 
 
 def inset_run(xi: float, criterion: float) -> Run:
-    """The same with a wheel that follows at once."""
+    """Return a run like that of `run`, with a wheel that follows at once."""
     config = Config(
         amplitude_limit=INSET_AMPLITUDE,
         tick=FINE_TICK,
@@ -53,7 +53,7 @@ def inset_run(xi: float, criterion: float) -> Run:
 
 
 def compute(jobs: int) -> None:
-    """Every C at every ω₀Φ/Ω, and with fast servos."""
+    """Compute every C at every ω₀Φ/Ω, and with fast servos."""
     cases = [(criterion, ratio) for criterion in CRITERIA for ratio in RATIOS]
     fast = [(xi, criterion) for xi in DAMPINGS for criterion in INSET_CRITERIA]
     runs = [run(*case) for case in cases] + [inset_run(*case) for case in fast]
@@ -80,7 +80,7 @@ def compute(jobs: int) -> None:
 
 
 def draw() -> None:
-    """Lines in continuous time, points of the robot's tick and an imperfect sensor."""
+    """Draw lines for continuous time, points for the robot's tick and an imperfect sensor."""
     styles = zip(
         CRITERIA,
         (PURPLE, GREEN, BLUE, BLACK, ORANGE),

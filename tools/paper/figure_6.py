@@ -1,6 +1,6 @@
-"""Figure 6: the speed of the free swimmer against frequency, and what finer grids say of it.
+"""Figure 6: the speed of the free swimmer against frequency, also on finer grids.
 
-Hours of computing on the finest grid: rows that figure-6.csv has are not computed again.
+The finest grid takes hours: existing rows of figure-6.csv are not computed again.
 """
 
 from collections.abc import Iterator
@@ -25,24 +25,24 @@ WAVES = ("square", "sine", "triangle")
 FREQUENCIES = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0)
 CRITERIA = (0.0, 0.6)
 TICK = 0.002
-"""As short as fishd's may be, so that hardly a reversal waits [s]."""
+"""Shortest tick of fishd, so that reversals are hardly delayed [s]."""
 CELL = 1.0
-"""Of the figure [mm]; the step in ms is the same number on all grids."""
+"""Size of the cells of the figure [mm]; the step in ms has the same number on all grids."""
 CELLS = (2.0, 1.0, 0.5)
-"""Of what is refined."""
-NEVER = "never"
-"""Of a speed that still changed in the end."""
+"""Sizes of the cells of the refinement [mm]."""
+NOT_STEADY = "never"
+"""Text for a speed that still changed at the end."""
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "swimmer.yaml"
 
 
 class Case(NamedTuple):
-    """One swim."""
+    """Case of one swim."""
 
     controller: str
     setting: float
-    """The frequency of a wave [Hz], or C."""
+    """Frequency of a wave [Hz], or C."""
     cell: float
-    """[mm]"""
+    """Size of the cells [mm]."""
 
 
 FIGURE = [
@@ -54,7 +54,7 @@ CASES = FIGURE + [Case(*each, cell) for cell in CELLS if cell != CELL for each i
 
 
 def config(cell: float) -> Config:
-    """The default swimmer on such a grid; cell: [mm]"""
+    """Return the default swimmer on such a grid; cell: size of the cells [mm]"""
     numerics = "swimmer.numerics."
     return load(
         CONFIG, (f"tick={TICK}", f"{numerics}cell={1e-3 * cell}", f"{numerics}step={1e-3 * cell}")
@@ -62,27 +62,27 @@ def config(cell: float) -> Config:
 
 
 def swim(case: Case, lengths: Lengths | None = None) -> SpeedResult:
-    """As `fishctl sweep` does; raises SystemExit where the fish could not go on."""
+    """Run a swim as `fishctl sweep` does; raises SystemExit where the simulation diverged."""
     name = "C" if case.controller == "swing" else "frequency"
     fish = config(case.cell)
     point = Point(case.controller, {name: case.setting})
     lengths = lengths or Lengths.of(fish, None, None)
-    found = swim_freely(point, fish, lengths, EncodingPublisher())
-    assert found
-    if found.trouble:
-        raise SystemExit(f"{point.label()} at {case.cell:g} mm: {found.trouble}")
-    return found
+    result = swim_freely(point, fish, lengths, EncodingPublisher())
+    assert result
+    if result.trouble:
+        raise SystemExit(f"{point.label()} at {case.cell:g} mm: {result.trouble}")
+    return result
 
 
 def compute(jobs: int) -> None:
-    """Every swim that is not in the table; each is kept as it ends."""
+    """Compute every swim that is not in the table; each is stored when it ends."""
     rows = {case: row for case in CASES if (row := row_of(case))}
     missing = [case for case in CASES if case not in rows]
-    missing.sort(key=lambda case: case.cell)  # the longest first
+    missing.sort(key=lambda case: case.cell)  # start with the longest
     parallel = joblib.Parallel(jobs, batch_size=1, return_as="generator_unordered")
-    for case, found in parallel(joblib.delayed(_numbered)(case) for case in missing):
-        rows[case] = _row(case, found)
-        progress(NAME, f"{case}", f"{1e3 * (found.speed or 0.0):.2f} mm/s")
+    for case, result in parallel(joblib.delayed(_numbered)(case) for case in missing):
+        rows[case] = _row(case, result)
+        progress(NAME, f"{case}", f"{1e3 * (result.speed or 0.0):.2f} mm/s")
         write(NAME, [rows[each] for each in CASES if each in rows])
 
 
@@ -91,34 +91,34 @@ def _numbered(case: Case) -> tuple[Case, SpeedResult]:
 
 
 def row_of(case: Case) -> dict[str, Any] | None:
-    """What the table has of a swim."""
+    """Return the row of a swim in the table."""
     if not (FOLDER / f"{NAME}.csv").exists():
         return None
     having = {"controller": case.controller, "setting": case.setting, "cell_mm": case.cell}
     return next(iter(read(NAME, **having)), None)
 
 
-def _row(case: Case, found: SpeedResult) -> Row:
+def _row(case: Case, result: SpeedResult) -> Row:
     return {
         "controller": case.controller,
         "setting": case.setting,
         "cell_mm": case.cell,
-        "frequency_Hz": found.beat_frequency,
-        "speed_mm_per_s": 1e3 * (found.speed or 0.0),
-        "error_mm_per_s": 1e3 * (found.error or 0.0),
-        "beats": found.beats,
-        "steady_from_s": NEVER if found.settled is None else found.settled,
-        "seconds": found.seconds,
-        "tail_side_to_side_over_L": found.tail_width or 0.0,
-        "muscle_power_W_per_m": found.muscle_power or 0.0,
-        "cost_of_transport_J_per_kg_m": found.cost_of_transport or "",
-        "Strouhal": found.strouhal or "",
-        "Froude_efficiency": found.froude_efficiency or "",
+        "frequency_Hz": result.beat_frequency,
+        "speed_mm_per_s": 1e3 * (result.speed or 0.0),
+        "error_mm_per_s": 1e3 * (result.error or 0.0),
+        "beats": result.beats,
+        "steady_from_s": NOT_STEADY if result.settled is None else result.settled,
+        "seconds": result.seconds,
+        "tail_side_to_side_over_L": result.tail_width or 0.0,
+        "muscle_power_W_per_m": result.muscle_power or 0.0,
+        "cost_of_transport_J_per_kg_m": result.cost_of_transport or "",
+        "Strouhal": result.strouhal or "",
+        "Froude_efficiency": result.froude_efficiency or "",
     }
 
 
 def draw() -> None:
-    """Speeds over frequencies on the left, over the size of the cells on the right."""
+    """Draw speeds over frequencies on the left, over the size of the cells on the right."""
     with drawing.open_figure(FOLDER / f"{NAME}.svg", (8.4, 3.9)) as figure:
         left, right = figure.subplots(1, 2, sharey=True, width_ratios=(5, 2))
         styles = zip(WAVES, (BLACK, BLUE, ORANGE), "so^", strict=True)
@@ -155,7 +155,7 @@ def _bars(
     label: str,
     line: Any,
 ) -> None:
-    """Hollow where the speed still changed, and without a line."""
+    """Draw intervals without a line, hollow where the speed still changed."""
     axes.errorbar(
         column(rows, over),
         column(rows, "speed_mm_per_s"),
@@ -163,7 +163,7 @@ def _bars(
         color=colour, marker=marker, mfc=colour if line else "white", ls=line, lw=1.0,
         elinewidth=0.9, capsize=2, label=label,
     )  # fmt: skip
-    changing = [row for row in rows if row["steady_from_s"] == NEVER]
+    changing = [row for row in rows if row["steady_from_s"] == NOT_STEADY]
     axes.plot(
         column(changing, over), column(changing, "speed_mm_per_s"), ls="", marker=marker,
         color=colour, mfc="white", zorder=5,
@@ -171,7 +171,7 @@ def _bars(
 
 
 def fastest() -> Iterator[tuple[float, str, list[str]]]:
-    """For each frequency the fastest wave, and those that may be as fast within the intervals."""
+    """Yield for each frequency the fastest wave, and those equally fast within the intervals."""
     for frequency in FREQUENCIES:
         rows = {wave: row_of(Case(wave, frequency, CELL)) for wave in WAVES}
         speeds = {

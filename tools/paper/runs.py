@@ -1,4 +1,4 @@
-"""Runs of the robot's own loop on a simulated fish, side by side, and tables of what they gave."""
+"""Runs of the loop on a simulated fish, in parallel, and tables of their results."""
 
 import csv
 import math
@@ -21,17 +21,17 @@ from fishd.virtual.plant.parameters import PlantParameters
 FOLDER = DOCS / "figures"
 PLANT = PlantParameters()
 FINE_TICK = 0.005
-"""Of runs that stand for continuous time [s]."""
+"""Tick of runs that represent continuous time [s]."""
 PERFECT = SimulationSettings(noise=0.0)
 TRUE_VELOCITY = EstimatorSettings(
     leak=PLANT.thrust_coefficient / PLANT.lateral_drag, bias_time=1000.0
 )
-"""The estimator that gives the true fin velocity, where the sensor has no noise and no offset."""
+"""Estimator that returns the true fin velocity for a sensor without noise and offset."""
 Row = Mapping[str, float | str]
 
 
 class Run(NamedTuple):
-    """Who swims, on which fish, for how long."""
+    """Controller, fish and length of a run."""
 
     controller: str
     parameters: dict[str, Any]
@@ -41,9 +41,9 @@ class Run(NamedTuple):
 
 
 def swim(run: Run) -> Report:
-    """One run; raises SystemExit where it ended in mode fault or another controller took over.
+    """Perform one run; raises SystemExit after a fault or a takeover by another controller.
 
-    A policy that sees is shown the fish by the default simulated camera.
+    A policy from pictures sees the fish through the default simulated camera.
     """
     limits = replace(run.config.limits, virtual=True)
     contestant = Contestant(run.controller, run.controller, run.parameters)
@@ -60,11 +60,11 @@ def swim(run: Run) -> Report:
 
 
 def _nothing(_: VirtualRun) -> None:
-    """No camera is needed."""
+    """Return None, for policies without a camera."""
 
 
 def swim_all(runs: Iterable[Run], jobs: int) -> list[Report]:
-    """All of them, in their order, on `jobs` cores."""
+    """Perform all runs on `jobs` cores, and return the results in their order."""
     chosen: list[Report] = joblib.Parallel(jobs)(joblib.delayed(swim)(run) for run in runs)
     return chosen
 
@@ -72,27 +72,27 @@ def swim_all(runs: Iterable[Run], jobs: int) -> list[Report]:
 def write(name: str, rows: Sequence[Row]) -> None:
     """Write docs/figures/NAME.csv; the columns are the keys of the first row.
 
-    Four or five digits, so that the file is the same on every machine.
+    Numbers have four or five digits, so that the file is the same on every machine.
     """
     with (FOLDER / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         table.writeheader()
-        table.writerows({key: _spelled(value) for key, value in row.items()} for row in rows)
+        table.writerows({key: _format_number(value) for key, value in row.items()} for row in rows)
 
 
 def read(name: str, **having: str | float) -> list[dict[str, Any]]:
-    """The rows of docs/figures/NAME.csv in which columns have given values; numbers as numbers."""
+    """Return the rows of docs/figures/NAME.csv with given values in columns, as numbers."""
     with (FOLDER / f"{name}.csv").open(newline="", encoding="utf-8") as file:
         rows = [{k: _number(v) for k, v in row.items()} for row in csv.DictReader(file)]
     return [row for row in rows if all(row[key] == value for key, value in having.items())]
 
 
 def column(rows: Iterable[Mapping[str, Any]], name: str) -> list[Any]:
-    """One column of some rows."""
+    """Return one column of some rows."""
     return [row[name] for row in rows]
 
 
-def _spelled(value: float | str) -> str:
+def _format_number(value: float | str) -> str:
     if isinstance(value, str):
         return value
     if value == 0.0 or abs(value) < 1e-9:

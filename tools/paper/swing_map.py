@@ -1,4 +1,4 @@
-"""How near `swing` comes to the best square wave in the robot's own loop, for each C and amplitude.
+"""Thrust of `swing` relative to the best square wave in the loop, for each C and amplitude.
 
 Each number is the median of several runs on a simulated fish with an imperfect force sensor; the
 runs differ in the seed of noise and drift.
@@ -23,18 +23,18 @@ DOCUMENT = "explanation/swing-efficiency.md"
 REFERENCE = DOCS.parent / "tests" / "reference" / "swing_efficiency.csv"
 
 CRITERIA = tuple(tenths / 10 for tenths in range(11))
-"""C."""
+"""Values of C."""
 RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 2.0, 3.0)
-"""ω₀Φ/Ω."""
+"""Values of ω₀Φ/Ω."""
 REAL = SimulationSettings(noise=0.001, offset_y=0.02, drift=0.02)
 SEEDS = 10
 SECONDS, SETTLE = 140.0, 20.0
-"""What is judged is two periods of the drift long."""
+"""Length of a run and of its ignored start [s]; the rest has two periods of the drift."""
 
 RECOMMENDED, NEARLY_BEST = 0.6, 0.95
-"""The paper: C = 0.6 gives over 95 % of the optimum for every ω₀Φ/Ω."""
+"""Claim of the paper: C = 0.6 gives over 95 % of the optimum for every ω₀Φ/Ω."""
 ANY_UPTO, GOOD = 0.8, 0.7
-"""The paper: any C in 0 … 0.8 gives over 70 %."""
+"""Claim of the paper: any C in 0 … 0.8 gives over 70 %."""
 CLAIMS = (
     f"C = {RECOMMENDED:g}: over {100 * NEARLY_BEST:g} % for every ω₀Φ/Ω",
     f"any C in 0 … {ANY_UPTO:g}: over {100 * GOOD:g} %",
@@ -45,17 +45,19 @@ Array = NDArray[np.float64]
 
 
 def run(criterion: float, ratio: float, rig: SimulationSettings) -> Run:
-    """Of `swing` with ticks of 50 ms."""
+    """Return a run of `swing` with ticks of 50 ms."""
     config = Config(amplitude_limit=ratio * saturation_amplitude(PLANT), simulation=rig)
     return Run("swing", {"C": criterion}, config, SECONDS, SETTLE)
 
 
 def compute(jobs: int) -> None:
-    """The map of the imperfect rig, and of a perfect one."""
+    """Compute the map of the imperfect rig, and of a perfect one."""
     rigs = [PERFECT, *(msgspec.structs.replace(REAL, seed=seed) for seed in range(SEEDS))]
     cells = list(itertools.product(CRITERIA, RATIOS))
     reports = swim_all((run(*cell, rig) for cell in cells for rig in rigs), jobs)
-    found = np.array([report.relative_thrust for report in reports]).reshape(len(cells), len(rigs))
+    relative_thrusts = np.array([report.relative_thrust for report in reports]).reshape(
+        len(cells), len(rigs)
+    )
     exact = continuous_time()
     write(
         NAME,
@@ -70,7 +72,7 @@ def compute(jobs: int) -> None:
                 "continuous_time": exact.get((criterion, ratio), ""),
             }
             for (criterion, ratio), (perfect, *_), real in zip(
-                cells, found, found[:, 1:], strict=True
+                cells, relative_thrusts, relative_thrusts[:, 1:], strict=True
             )
         ],
     )
@@ -86,13 +88,13 @@ def continuous_time() -> dict[tuple[float, float], float]:
 
 
 def _map(name: str) -> Array:
-    """A column of the table, of shape (criteria, ratios); NaN where nothing was measured."""
+    """Return a column of the table, shape (criteria, ratios); NaN where nothing was measured."""
     values = [np.nan if value == "" else value for value in column(read(NAME), name)]
     return np.array(values, dtype=np.float64).reshape(_SHAPE)
 
 
 def draw() -> None:
-    """The map of medians."""
+    """Draw the map of medians."""
     from matplotlib.patches import Rectangle
 
     median = _map("median")
@@ -121,7 +123,7 @@ def draw() -> None:
 
 
 def verdicts(median: Array) -> tuple[str, str]:
-    """What a map says to each of the claims."""
+    """Return the results of a map for each of the claims."""
     best, floor = median[CRITERIA.index(RECOMMENDED)], median[: CRITERIA.index(ANY_UPTO) + 1]
     missed = [f"{RATIOS[i]:g}" for i in np.flatnonzero(best <= NEARLY_BEST)]
     low = [f"C = {CRITERIA[i]:g} at {RATIOS[j]:g}" for i, j in np.argwhere(floor <= GOOD)]
@@ -134,13 +136,13 @@ def verdicts(median: Array) -> tuple[str, str]:
 
 
 def percent(value: float, exact: float = np.nan) -> str:
-    """A share in percent, and in brackets what it should be; a dash if nothing is known."""
+    """Format a fraction in %, with its goal in brackets; a dash if unknown."""
     known = "" if np.isnan(exact) else f" ({percent(exact)})"
     return "–" if np.isnan(value) else f"{100 * value:.1f}{known}"
 
 
 def sections() -> list[tuple[str, str, str]]:
-    """Document, name of the markers, and what belongs between them."""
+    """Return document, name of the markers, and the text between them."""
     median, exact, perfect = _map("median"), _map("continuous_time"), _map("perfect_sensor")
     spread = _map("highest") - _map("lowest")
     widest = np.unravel_index(np.argmax(spread), spread.shape)

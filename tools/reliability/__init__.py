@@ -1,1 +1,1 @@
-"""Measures what fishd and its servo do when something dies, hangs, misbehaves or attacks."""
+"""Measurements of fishd and its servo under deaths, hangs, misbehaviour and attacks."""

@@ -1,4 +1,4 @@
-"""What hostile or broken neighbours do to fishd's sockets; each ends by itself.
+"""Attacks of hostile or broken clients on fishd's sockets; each ends by itself.
 
     python tools/reliability/attackers.py NAME TELEMETRY CONTROL SECONDS
 
@@ -26,7 +26,7 @@ Attack = Callable[[str, str, float], None]
 
 
 def raw(address: str) -> socket.socket:
-    """A plain connection."""
+    """Return a plain connection."""
     if address.startswith("ipc://"):
         connection = socket.socket(socket.AF_UNIX)
         connection.connect(address.removeprefix("ipc://"))
@@ -36,7 +36,7 @@ def raw(address: str) -> socket.socket:
 
 
 def idle_connections(address: str, seconds: float) -> None:
-    """1000 connections that say nothing."""
+    """Open 1000 connections that send nothing."""
     end = time.monotonic() + seconds
     held = []
     for _ in range(1000):
@@ -50,17 +50,17 @@ def idle_connections(address: str, seconds: float) -> None:
 
 
 def idle_telemetry(telemetry: str, control: str, seconds: float) -> None:
-    """1000 idle connections to the telemetry socket."""
+    """Open 1000 idle connections to the telemetry socket."""
     idle_connections(telemetry, seconds)
 
 
 def idle_control(telemetry: str, control: str, seconds: float) -> None:
-    """1000 idle connections to the control socket."""
+    """Open 1000 idle connections to the control socket."""
     idle_connections(control, seconds)
 
 
 def subscriptions(telemetry: str, control: str, seconds: float) -> None:
-    """A subscriber with 300 000 topics of 100 bytes, which leaves."""
+    """Subscribe to 300 000 topics of 100 bytes, and disconnect."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     with context.socket(zmq.SUB) as subscriber:
         subscriber.set(zmq.LINGER, 0)
@@ -76,7 +76,7 @@ def subscriptions(telemetry: str, control: str, seconds: float) -> None:
 
 
 def long_frame(telemetry: str, control: str, seconds: float) -> None:
-    """Frames that announce 8 GB, sent as fast as they are taken, up to 2 GB."""
+    """Send frames that announce 8 GB as fast as possible, up to 2 GB."""
     end, sent = time.monotonic() + seconds, 0
     chunk = bytes(2**20)
     while time.monotonic() < end and sent < 2 * 2**30:
@@ -93,7 +93,7 @@ def long_frame(telemetry: str, control: str, seconds: float) -> None:
 
 @contextmanager
 def clients(control: str, count: int, **options: int) -> Iterator[list["zmq.Socket[bytes]"]]:
-    """So many clients of the control socket, with options of ZeroMQ by name."""
+    """Return `count` clients of the control socket, with options of ZeroMQ by name."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     context.set(zmq.MAX_SOCKETS, count + 10)
     dealers = [context.socket(zmq.DEALER) for _ in range(count)]
@@ -106,7 +106,7 @@ def clients(control: str, count: int, **options: int) -> Iterator[list["zmq.Sock
 
 
 def send(dealer: "zmq.Socket[bytes]", payloads: list[bytes], read: bool = True) -> None:
-    """Send as many of these as there is room for, and read all answers that are there."""
+    """Send as many of these as possible, and read all waiting answers."""
     with suppress(zmq.Again):
         for payload in payloads:
             dealer.send(payload, zmq.DONTWAIT)
@@ -115,7 +115,7 @@ def send(dealer: "zmq.Socket[bytes]", payloads: list[bytes], read: bool = True) 
 
 
 def silent_dealers(telemetry: str, control: str, seconds: float) -> None:
-    """500 clients that ask for `status` all the time and never read an answer."""
+    """Run 500 clients that request `status` all the time and never read an answer."""
     end = time.monotonic() + seconds
     with clients(control, 500, RCVHWM=1) as dealers:
         while time.monotonic() < end:
@@ -124,7 +124,7 @@ def silent_dealers(telemetry: str, control: str, seconds: float) -> None:
 
 
 def long_ops(telemetry: str, control: str, seconds: float) -> None:
-    """20 clients that read, and ask for ops with names of 16 and of 64 kB."""
+    """Run 20 clients that read, and request operations with names of 16 and 64 kB."""
     longest = b'{"v":1,"id":1,"op":"' + b"x" * 65_000 + b'"}'
     long = b'{"v":1,"id":1,"op":"' + b"x" * 16_000 + b'"}'
     key = b'{"v":1,"id":1,"op":"set-controller","args":{"name":"swing","parameters":{"%b":1}}}'
@@ -137,7 +137,7 @@ def long_ops(telemetry: str, control: str, seconds: float) -> None:
 
 
 def fuzz(telemetry: str, control: str, seconds: float) -> None:
-    """100 000 requests, damaged at random, from eight clients; at their own pace."""
+    """Send 100 000 randomly damaged requests from eight clients, as fast as answered."""
     chance = random.Random(7)
     seeds = [
         STATUS,
@@ -155,7 +155,7 @@ def fuzz(telemetry: str, control: str, seconds: float) -> None:
 
 
 def damaged(request: bytes, chance: random.Random) -> bytes:
-    """A request of which up to three places are changed, deleted or have bytes put in."""
+    """Return a request with up to three changes, deletions or insertions of bytes."""
     payload = bytearray(request)
     for _ in range(chance.randrange(4)):
         kind, place = chance.randrange(3), chance.randrange(len(payload))
@@ -171,7 +171,7 @@ def damaged(request: bytes, chance: random.Random) -> bytes:
 
 
 def flood(telemetry: str, control: str, seconds: float) -> None:
-    """10 000 requests a second, from 25 clients that read the answers."""
+    """Send 10 000 requests per second from 25 clients that read the answers."""
     begun, sent = time.monotonic(), 0
     with clients(control, 25) as dealers:
         while (now := time.monotonic()) < begun + seconds:

@@ -1,7 +1,7 @@
-"""Attacks the sockets of a fishd, and measures what it costs: ticks, lateness, memory.
+"""Attacks on the sockets of a fishd, and measurement of their cost: ticks, lateness, memory.
 
-A second fishd swims beside it that nobody attacks. Both share the machine with the attackers, so
-what the attack as such costs is the difference. Everything stays on this machine, and ends.
+A second fishd without attacks runs beside it. Both share the machine with the attackers, so that
+the difference is the cost of the attack itself. Everything stays on this machine, and ends.
 """
 
 import math
@@ -29,27 +29,27 @@ TICKS = 0.05, 0.005
 
 
 class Seen(Struct, frozen=True):
-    """One fishd over one attack."""
+    """Measurements of one fishd during one attack."""
 
     missed: int
-    """Slots skipped."""
+    """Number of skipped slots."""
     ticks: int
     worst: float
-    """Latest tick since its start [ms]."""
+    """Largest lateness of a tick since its start [ms]."""
     memory: float
-    """Most resident memory of fishd's own process [MB]."""
+    """Peak resident memory of the main process [MB]."""
     total: float
-    """Most of it with its gateways, pages that they share counted once (PSS) [MB]."""
+    """Peak memory including the gateways, with shared pages counted once (PSS) [MB]."""
     restarts: int
-    """How often a gateway was started again."""
+    """Number of restarts of gateways."""
     answer: float
-    """Slowest answer to another client during the attack [ms]; infinite where one was given up."""
+    """Slowest answer to another client during the attack [ms]; infinite after a timeout."""
     estop: float
-    """How long an emergency stop took in the midst of it [ms]."""
+    """Duration of an emergency stop during the attack [ms]."""
 
 
 class Outcome(Struct, frozen=True):
-    """An attack, and what it did to the fishd that was attacked and to the one beside it."""
+    """Results of an attack for the attacked fishd and for the one beside it."""
 
     attack: str
     tick: float
@@ -58,7 +58,7 @@ class Outcome(Struct, frozen=True):
 
 
 class Watch:
-    """Looks at a fishd while it is attacked."""
+    """Observer of a fishd during an attack."""
 
     def __init__(self, fishd: Fishd) -> None:
         self._fishd = fishd
@@ -66,16 +66,16 @@ class Watch:
         self._memory = self._total = self._answer = self._estop = 0.0
 
     def look(self) -> None:
-        """Take its memory."""
+        """Measure the memory."""
         self._memory = max(self._memory, self._fishd.memory())
         self._total = max(self._total, self._fishd.total_memory())
 
     def ask(self) -> None:
-        """Ask for its status, as another client."""
+        """Request the status as another client."""
         self._answer = max(self._answer, self._time(lambda fish: fish.status()))
 
     def stop(self) -> None:
-        """Ask for an emergency stop, as another client."""
+        """Request an emergency stop as another client."""
         self._estop = self._time(lambda fish: fish.estop())
 
     def _time(self, request: Callable[[Fish], object]) -> float:
@@ -86,7 +86,7 @@ class Watch:
         return math.inf
 
     def result(self) -> Seen:
-        """Once the attack is over."""
+        """Return the measurements after the attack."""
         after = self._fishd.status()
         return Seen(
             missed=after.missed - self._before.missed,
@@ -101,7 +101,7 @@ class Watch:
 
 
 def attack(name: str, tick: float, seconds: float) -> Outcome:
-    """Let one attack happen."""
+    """Run one attack, and return its outcome."""
     settings = (f"tick={tick}", f"realtime.priority={priorities()[-1]}")
     with ExitStack() as stack:
         fishes = [stack.enter_context(Fishd(*settings, tcp=True)) for _ in range(2)]
@@ -126,14 +126,14 @@ def attack(name: str, tick: float, seconds: float) -> Outcome:
                 for watch in watches:
                     watch.stop()
             time.sleep(0.05)
-        time.sleep(2.0)  # what it led to may come later
+        time.sleep(2.0)  # effects of the attack may come later
         for watch in watches:
             watch.look()
         return Outcome(name, tick, *(watch.result() for watch in watches))
 
 
 def row(outcome: Outcome) -> list[str]:
-    """A line of the table."""
+    """Return the row of an attack."""
     a, b = outcome.attacked, outcome.beside
     what = (attackers.ATTACKS[outcome.attack].__doc__ or "").rstrip(".")
     return [
@@ -156,7 +156,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Every attack, at both ticks; some minutes."""
+    """Run every attack at both ticks; takes some minutes."""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(8192, files[1]), files[1]))
     outcomes = []

@@ -1,7 +1,7 @@
-"""Lets fishd die in every way on a virtual Pi, and measures what its servo gets.
+"""Deaths of fishd on a virtual Pi, and measurement of the servo pulses after each.
 
-The virtual Pi runs in this process and fishd in its own, as on a robot. Times are those at which
-the servo pulses changed, from the moment of the deed. Ends by itself.
+The virtual Pi runs in this process and fishd in another one, as on a robot. Times are those of
+changes of the servo pulses, from the moment of the failure. Ends by itself.
 """
 
 import signal
@@ -19,7 +19,7 @@ from threading import Barrier, Lock
 
 from msgspec import Struct
 
-from common.daemon import PATIENCE, START, Fishd, virtual_pi
+from common.daemon import START, TIMEOUT_S, Fishd, virtual_pi
 from common.report import Options, Report, progress, table
 from fishd.client import Fish, NoDaemon
 from fishd.virtual.pi.virtual_pi import VirtualPi
@@ -28,7 +28,7 @@ DOCUMENT = "reference/reliability.md"
 GPIO = 18
 NEUTRAL = 1500.0
 WATCHED = 1.8
-"""How long the pulses are watched after the deed [s]."""
+"""Time that the pulses are observed after the failure [s]."""
 
 SABOTAGED_FISHD = """
 import signal
@@ -43,18 +43,18 @@ fishd.daemon.main.main()
 """
 
 _ONE_BY_ONE = Lock()
-"""Fishds start one after the other: several at once would hold up those that swim already."""
+"""Lock for the start of a fishd: several starts at once would disturb the running ones."""
 
 Deed = Callable[[VirtualPi, Fishd], None]
 
 
 def signalled(number: signal.Signals) -> Deed:
-    """Send fishd a signal."""
+    """Return a failure that sends fishd a signal."""
     return lambda pi, fishd: fishd.process.send_signal(number)
 
 
 def stopped(seconds: float) -> Deed:
-    """Stop fishd for a while."""
+    """Return a failure that stops fishd for a while."""
 
     def deed(pi: VirtualPi, fishd: Fishd) -> None:
         fishd.process.send_signal(signal.SIGSTOP)
@@ -65,18 +65,18 @@ def stopped(seconds: float) -> Deed:
 
 
 def injected(fault: str) -> Deed:
-    """Let a fault of the virtual Pi begin."""
+    """Return a failure that starts a fault of the virtual Pi."""
     return lambda pi, fishd: pi.faults.inject(fault)
 
 
 def killed_with_pigpiod(pi: VirtualPi, fishd: Fishd) -> None:
-    """Kill fishd, and pigpiod right after; it is started again."""
+    """Kill fishd, and pigpiod directly afterwards, which restarts."""
     fishd.process.kill()
     time.sleep(0.02)
     pi.faults.inject("pigpiod-restart")
 
 
-# What is done, how it is called in the table.
+# Failures, and their names in the table.
 DEATHS: dict[str, tuple[str, Deed]] = {
     "SIGTERM": ("asked to stop", signalled(signal.SIGTERM)),
     "SIGINT": ("Ctrl-C", signalled(signal.SIGINT)),
@@ -91,7 +91,7 @@ DEATHS: dict[str, tuple[str, Deed]] = {
     "frozen-code": ("the ADC repeats itself", injected("frozen-code")),
     "pigpiod-gone": ("pigpiod ends", injected("pigpiod-gone")),
 }
-# An exception in each phase of a tick, and between ticks: module, class and method that raises.
+# Exceptions in each phase of a tick, and between ticks: module, class and method that raises.
 PHASES = {
     "read": ("fishd.hardware.force_sensor.sampled_sensor", "SampledSensor", "read"),
     "estimate": ("fishd.control.estimators.lateral_force", "LateralForceEstimator", "update"),
@@ -106,25 +106,25 @@ ENDS = {
     *("SIGTERM", "SIGINT", "SIGKILL", "SIGKILL of both", "SIGSEGV"),
     *("statistics", "between ticks"),
 }
-"""After these fishd is to end; after the others it goes on, or hangs."""
+"""Failures after which fishd must end; after the others it continues, or hangs."""
 
 
 class Outcome(Struct):
-    """What the servo got after the deed; times in seconds from then, None for never."""
+    """Servo pulses after a failure; times from the failure [s], None for never."""
 
     neutral: float | None
-    """When the pulses came to neutral to stay there until they ended."""
+    """Time from which the pulses stayed at neutral until they ended."""
     off: float | None
-    """When they ended."""
+    """Time of the end of the pulses."""
     status: int | None
     """Exit status of fishd, negative for a signal; None while it still runs."""
     reason: str | None
-    """Reason of the fault, from `status`, where fishd still answers."""
+    """Reason of the fault in `status`, where fishd still answers."""
 
 
 def await_pulses(pi: VirtualPi, fishd: Fishd, count: int) -> None:
-    """Until the servo was told to go to so many angles."""
-    deadline = time.monotonic() + PATIENCE
+    """Wait until the servo has received `count` angles."""
+    deadline = time.monotonic() + TIMEOUT_S
     while len(pi.pigpiod.history(GPIO)) < count:
         if time.monotonic() > deadline or fishd.process.poll() is not None:
             raise SystemExit(f"fishd does not swim: {fishd.log.read_text()}")
@@ -132,7 +132,7 @@ def await_pulses(pi: VirtualPi, fishd: Fishd, count: int) -> None:
 
 
 def swim_again(fishd: Fishd) -> None:
-    """Clear a fault, and give the tail a second to beat."""
+    """Clear a fault, and let the tail beat for a second."""
     with Fish(fishd.endpoint) as fish:
         fish.clear_fault()
         fish.set_controller("square")
@@ -140,7 +140,7 @@ def swim_again(fishd: Fishd) -> None:
 
 
 def die(name: str, together: Barrier) -> Outcome:
-    """Do one of DEATHS or PHASES to a fishd, once all of `together` swim, and watch its servo."""
+    """Apply one of `DEATHS` or `PHASES` to a fishd once all of `together` swim; watch its servo."""
     command: Sequence[str] = START
     deed = DEATHS[name][1] if name in DEATHS else signalled(signal.SIGUSR1)
     if name in PHASES:
@@ -148,8 +148,8 @@ def die(name: str, together: Barrier) -> Outcome:
         source = SABOTAGED_FISHD.format(module=module, owner=owner, method=method)
         command = (sys.executable, "-c", source)
     settings = (
-        "servo.timeout=0.05",  # a stall of the machine is not what is measured here
-        "force_sensor.data_rate=128",  # nor is the sensor, whose emulation takes half a core at 860
+        "servo.timeout=0.05",  # stalls of the machine must not cause a fault
+        "force_sensor.data_rate=128",  # the emulated sensor takes half a core at 860
         "start.controller=square",
     )
     with ExitStack() as stack:
@@ -159,9 +159,9 @@ def die(name: str, together: Barrier) -> Outcome:
             fishd = stack.enter_context(Fishd(*on_it, *settings, command=command))
             await_pulses(pi, fishd, 1)
         await_pulses(pi, fishd, 6)  # the tail has beaten from side to side a few times
-        together.wait(3 * PATIENCE)
+        together.wait(3 * TIMEOUT_S)
         if not pi.pigpiod.width(GPIO, time.monotonic()):
-            swim_again(fishd)  # the machine stood still meanwhile, and fishd is in fault
+            swim_again(fishd)  # the machine stalled meanwhile, and fishd is in fault
         begun = time.monotonic()
         deed(pi, fishd)
         time.sleep(WATCHED + (2.0 if name == "frozen-code" else 0.0))
@@ -169,14 +169,14 @@ def die(name: str, together: Barrier) -> Outcome:
         changes = [(when - begun, width) for when, width in pi.pigpiod.history(GPIO)]
         if name in ENDS:
             with suppress(subprocess.TimeoutExpired):
-                fishd.process.wait(PATIENCE)  # a busy machine may need longer than that
+                fishd.process.wait(TIMEOUT_S)  # a busy machine may need longer than that
         status = fishd.process.poll()
         reason = None if status is not None or name == "SIGSTOP" else fault(fishd)
     return Outcome(*ending(changes), status, reason)
 
 
 def ending(changes: list[tuple[float, float]]) -> tuple[float | None, float | None]:
-    """When the pulses came to neutral, and when they ended, if they did."""
+    """Return the times at which the pulses came to neutral and ended; None for never."""
     if not changes or changes[-1][1] != 0.0:
         return None, None
     off = changes[-1][0]
@@ -185,7 +185,7 @@ def ending(changes: list[tuple[float, float]]) -> tuple[float | None, float | No
 
 
 def fault(fishd: Fishd) -> str | None:
-    """The code of the reason that fishd gives."""
+    """Return the code of fishd's fault."""
     try:
         reason = fishd.status().reason
     except NoDaemon:
@@ -194,7 +194,7 @@ def fault(fishd: Fishd) -> str | None:
 
 
 def row(name: str, outcome: Outcome) -> list[str]:
-    """A line of the table."""
+    """Return the row of a failure."""
     what = f"{name}: {DEATHS[name][0]}" if name in DEATHS else f"an exception in `{name}`"
     neutral = "–" if outcome.neutral is None else f"{outcome.neutral * 1e3:.0f}"
     off = "–" if outcome.off is None else f"{outcome.off * 1e3:.0f}"
@@ -216,12 +216,12 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Every death, one after the other; half a minute."""
+    """Run every failure; takes half a minute."""
     outcomes = {}
     for names in [options.only] if options.only else [[name] for name in (*DEATHS, *PHASES)]:
         with ThreadPoolExecutor(len(names)) as pool:
-            found = list(pool.map(partial(die, together=Barrier(len(names))), names))
-        outcomes |= dict(zip(names, found, strict=True))
+            results = list(pool.map(partial(die, together=Barrier(len(names))), names))
+        outcomes |= dict(zip(names, results, strict=True))
         for name in names:
             progress(*row(name, outcomes[name]))
     head = "what happens | neutral after [ms] | no pulses after [ms] | fishd"

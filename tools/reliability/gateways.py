@@ -1,10 +1,10 @@
-"""Kills and stops the processes between fishd and its clients, and fishd, and times what follows.
+"""Kills and stops of fishd and of its gateways, and measurement of the recovery.
 
-For each failure: how soon an emergency stop is answered, for a client that connects after it and
-for one that was connected before, and how soon the sockets are served again. Then eight kills of
-the control gateway in a row, each as soon as the one before it is answered; and `fishctl estop`
-where fishd itself hangs or is dead, on a virtual Pi. Ends by itself; exit status 1 where a promise
-was not kept.
+For each failure, measure the time until an emergency stop is answered, for a client that connects
+afterwards and for one that was connected before, and the time until the sockets are served again.
+Then kill the control gateway eight times in a row, each time as soon as it answers; and run
+`fishctl estop` where fishd itself hangs or is dead, on a virtual Pi. Ends by itself; exit status 1
+where a promise was not kept.
 """
 
 import os
@@ -19,7 +19,7 @@ from statistics import median
 import zmq
 from msgspec import Struct
 
-from common.daemon import PATIENCE, Fishd, virtual_pi
+from common.daemon import TIMEOUT_S, Fishd, virtual_pi
 from common.processes import FISHCTL, call
 from common.report import Options, Report, progress, table
 from fishd.client import Fish, NoDaemon
@@ -31,7 +31,7 @@ MAX_ESTOP_S = 0.2
 MAX_CONTROL_S = 0.5
 """Longest time until the control socket is served again after its gateway failed [s]."""
 MAX_TELEMETRY_S = 1.0
-"""The same for telemetry [s]."""
+"""Longest time until the telemetry socket is served again after its gateway failed [s]."""
 KILLS_IN_A_ROW = 8
 SETTLE_S = 0.5
 """Time for fishd to swim again before the next failure [s]."""
@@ -50,12 +50,12 @@ SINGLE = [name for name in FAILURES if name != "SIGSTOP of all three"]
 
 
 class Trials(Struct):
-    """Times that were measured of one failure [s]."""
+    """Measured times of one failure [s]."""
 
     new_client: list[float] = []
     """Times to the answer to an emergency stop, for clients that connected after the failure."""
     old_client: list[float] = []
-    """The same for clients that were connected before."""
+    """Times to the answer to an emergency stop, for clients that were connected before."""
     control: list[float] = []
     """Times until a request was answered through the control socket."""
     telemetry: list[float] = []
@@ -63,7 +63,7 @@ class Trials(Struct):
 
 
 def fail(fishd: Fishd, name: str) -> float:
-    """Let it happen; returns the time of it [s]."""
+    """Cause the failure, and return its time [s]."""
     kinds, number = FAILURES[name]
     pids = [fishd.gateway(kind) for kind in kinds]
     for pid in pids:
@@ -72,12 +72,12 @@ def fail(fishd: Fishd, name: str) -> float:
 
 
 def time_answer(fishd: Fishd, begun: float) -> float:
-    """Return the time until `status` is answered, asked by new clients one after the other [s]."""
-    while time.monotonic() < begun + PATIENCE:
+    """Return the time until `status` is answered to one of a series of new clients [s]."""
+    while time.monotonic() < begun + TIMEOUT_S:
         with suppress(NoDaemon), Fish(fishd.endpoint, timeout=0.25) as fish:
             fish.status(0.25)
             return time.monotonic() - begun
-    raise SystemExit(f"no answer within {PATIENCE} s: {fishd.log.read_text(encoding='utf-8')}")
+    raise SystemExit(f"no answer within {TIMEOUT_S} s: {fishd.log.read_text(encoding='utf-8')}")
 
 
 def time_tick(fishd: Fishd, begun: float) -> float:
@@ -87,7 +87,7 @@ def time_tick(fishd: Fishd, begun: float) -> float:
     socket.set(zmq.RECONNECT_IVL, 2)
     socket.subscribe(b"tick")
     socket.connect(fishd.telemetry)
-    if not socket.poll(int(PATIENCE * 1e3)):
+    if not socket.poll(int(TIMEOUT_S * 1e3)):
         raise SystemExit(f"no tick: {fishd.log.read_text(encoding='utf-8')}")
     took = time.monotonic() - begun
     context.destroy(linger=0)
@@ -125,7 +125,7 @@ def try_failure(fishd: Fishd, name: str, times: int) -> Trials:
 
 
 def kill_in_a_row(fishd: Fishd) -> list[float]:
-    """Kill the control gateway again and again; the times to the answer to `status` [s]."""
+    """Kill the control gateway repeatedly; return the times to the answer to `status` [s]."""
     times = []
     for _ in range(KILLS_IN_A_ROW):
         os.kill(fishd.gateway("control"), signal.SIGKILL)
@@ -139,11 +139,11 @@ class LastResort(Struct):
     off: list[float] = []
     """Times from its start to the end of the pulses."""
     failed: int = 0
-    """How often its exit status was not 0, or pulses were left."""
+    """Number of trials with an exit status other than 0, or with remaining pulses."""
 
 
 def try_last_resort(number: signal.Signals, times: int) -> LastResort:
-    """Stop or kill a fishd that swims on a virtual Pi whose countdown is long, and call it."""
+    """Stop or kill a fishd on a virtual Pi with a long countdown, and run `fishctl estop`."""
     trials = LastResort()
     settings = ("servo.timeout=0.05", "servo.countdown=2", "force_sensor.data_rate=128")
     with ExitStack() as stack:
@@ -167,7 +167,7 @@ def try_last_resort(number: signal.Signals, times: int) -> LastResort:
 
 def await_pulses(pi: VirtualPi) -> None:
     """Wait until the servo gets pulses."""
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT_S
     while not pi.pigpiod.width(GPIO, time.monotonic()):
         if time.monotonic() > deadline:
             raise SystemExit("fishd does not swim")
@@ -186,7 +186,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Fail, and time what follows; about ten minutes."""
+    """Run all failures; takes about ten minutes."""
     trials: dict[str, Trials] = {}
     with Fishd() as fishd:
         fishd.next_tick()

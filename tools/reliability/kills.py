@@ -1,8 +1,8 @@
-"""Kills fishd at random microseconds, whatever it is doing, and looks whether its pulses end.
+"""Kills of fishd at random times and in random situations, with a check that its pulses end.
 
 Each lane has a virtual Pi and, one after another, real fishds on it. They are forked from a process
-that has loaded everything, which makes many of them affordable. A kill is stuck when the servo
-still gets pulses 1.5 s later. Ends by itself; exit status 1 when one was stuck.
+that has loaded all modules, which makes them fast. A kill is stuck when the servo still gets pulses
+1.5 s later. Ends by itself; exit status 1 when one was stuck.
 """
 
 import asyncio
@@ -37,46 +37,46 @@ from fishd.virtual.pi.virtual_pi import VirtualPi
 
 DOCUMENT = "reference/reliability.md"
 GPIO = 18
-PATIENCE = 120.0
-BEGINNING = 5.0
-"""How long a fishd may take until it swims [s]; then another one is started, which gets longer."""
+TIMEOUT_S = 120.0
+SWIM_TIMEOUT_S = 5.0
+"""Time until a fishd must swim [s]; after it, another one is started with a longer timeout."""
 WATCHED = 1.5
-"""How long after a kill no pulses may be left [s]."""
+"""Time after a kill from which there must be no pulses [s]."""
 STOPPED = 0.15
-"""Share of the kills that are a SIGSTOP instead: a process that hangs, and holds its sockets."""
+"""Fraction of the kills that are a SIGSTOP instead: a process that hangs, and keeps its sockets."""
 POLICY = {"policy": "default-fish"}
 
 
 class Situation(Struct):
-    """What fishd is doing when it is killed."""
+    """Situation of fishd when it is killed."""
 
     what: str
-    """In words, for the table."""
+    """Description for the table."""
     share: int
-    """Of a hundred kills."""
+    """Number per hundred kills."""
     window: float
-    """The kill comes at a random moment of so many seconds from the deed on."""
+    """Length of the interval after the action in which the kill occurs at random [s]."""
     deed: Callable[["Lane"], None]
 
 
 class Kill(Struct):
-    """One kill, and what the servo got."""
+    """One kill, and the servo pulses after it."""
 
     situation: str
     stopped: bool
-    """SIGSTOP instead of SIGKILL."""
+    """Whether SIGSTOP was sent instead of SIGKILL."""
     after: float
-    """From the deed to the kill [s]."""
+    """Time from the action to the kill [s]."""
     swimming: bool
     """Whether there were pulses at that moment."""
     off: float | None
-    """When the last pulse ended, from the kill on [s]; None: they are still on."""
+    """Time from the kill to the end of the last pulse [s]; None: pulses continue."""
     width: float
-    """The pulse that is still on [µs]; 0 for none."""
+    """Width of the continuing pulses [µs]; 0 without pulses."""
 
 
 class Lane:
-    """A virtual Pi, and the fishd that swims on it."""
+    """Virtual Pi, and the fishd that swims on it."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ class Lane:
         zygote: Connection,
         number: random.Random,
     ) -> None:
-        """on_it: settings of a fishd on this virtual Pi; zygote: forks one for settings"""
+        """on_it: settings of a fishd on this virtual Pi; zygote: forks a fishd for settings"""
         self.folder = folder
         self.pi = pi
         self._on_it = on_it
@@ -96,14 +96,14 @@ class Lane:
         self._pidfd = -1
 
     def swim(self) -> None:
-        """Start a fishd, and wait until its tail beats; again where a busy machine disturbs it."""
-        deadline = time.monotonic() + PATIENCE
+        """Start a fishd, and wait until its tail beats; retry where a busy machine disturbs it."""
+        deadline = time.monotonic() + TIMEOUT_S
         for attempt in itertools.count(1):
             if time.monotonic() > deadline:
                 break
             self.start()
             beats = self._beats()
-            until = time.monotonic() + BEGINNING * attempt
+            until = time.monotonic() + SWIM_TIMEOUT_S * attempt
             while time.monotonic() < until:
                 if self._beats() >= beats + 3:
                     return
@@ -114,7 +114,7 @@ class Lane:
     def start(self) -> None:
         """Start a fishd."""
         pairs = {
-            "force_sensor.data_rate": 128,  # light on a busy machine
+            "force_sensor.data_rate": 128,  # a low load on a busy machine
             "servo.timeout": self.random.choice((0.008, 0.02, 0.1)),
             "state_folder": self.folder / "state",
             "control.address": self.endpoint,
@@ -126,25 +126,25 @@ class Lane:
         }
         self._zygote.send([*self._on_it, *(f"{key}={value}" for key, value in pairs.items())])
         pid = self._zygote.recv()
-        with suppress(ProcessLookupError):  # a busy machine: what it was to follow is still there
+        with suppress(ProcessLookupError):  # on a busy machine, the previous process may still run
             self._pidfd = os.pidfd_open(pid)
 
     def signal(self, number: signal.Signals) -> None:
-        """Send fishd a signal; nothing where it is gone."""
+        """Send fishd a signal, if it still runs."""
         if self._pidfd >= 0:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, number)
 
     def end(self) -> None:
-        """Kill fishd where it still lives, and wait until it is gone."""
+        """Kill fishd if it still runs, and wait for its end."""
         if self._pidfd >= 0:
             self.signal(signal.SIGKILL)
-            select.select([self._pidfd], [], [], PATIENCE)
+            select.select([self._pidfd], [], [], TIMEOUT_S)
             os.close(self._pidfd)
             self._pidfd = -1
 
     def ask(self, request: Callable[[Fish], object]) -> None:
-        """Send a request, and do not wait for the answer."""
+        """Send a request without waiting for the answer."""
 
         def call() -> None:
             with suppress(FishdError), Fish(self.endpoint, timeout=5.0) as fish:
@@ -153,11 +153,11 @@ class Lane:
         threading.Thread(target=call, daemon=True).start()
 
     def inject(self, fault: str, seconds: float | None = None) -> None:
-        """Let a fault of the virtual Pi begin."""
+        """Start a fault of the virtual Pi."""
         self.pi.faults.inject(fault, seconds)
 
     def kill(self, name: str, stop: bool) -> Kill:
-        """Bring a fishd into a situation, kill or stop it in there, and watch its pulses."""
+        """Bring a fishd into a situation, kill or stop it there, and observe its pulses."""
         situation = SITUATIONS[name]
         self.swim()
         time.sleep(self.random.uniform(0.0, 0.2))
@@ -173,7 +173,7 @@ class Lane:
         changes = [(when, width) for when, width in self.pi.pigpiod.history(GPIO) if when <= now]
         off = None if width else max(0.0, changes[-1][0] - dead)
         self.end()
-        if width:  # the next one is to find a good pigpiod
+        if width:  # reset pigpiod for the next fishd
             self.inject("pigpiod-restart")
         return Kill(name, stop, after, swimming, off, width)
 
@@ -185,14 +185,14 @@ class Lane:
         return self.pi.pigpiod.width(GPIO, now)
 
 
-def succeed(lane: Lane) -> None:
-    """Kill the fishd that swims, and start the next one at once."""
+def replace_fishd(lane: Lane) -> None:
+    """Kill the running fishd, and start the next one at once."""
     lane.end()
     lane.start()
 
 
 def clear(fish: Fish) -> None:
-    """An emergency stop and, once it has acted, its end."""
+    """Send an emergency stop, and clear it after it has acted."""
     fish.estop()
     time.sleep(0.1)
     fish.clear_fault()
@@ -200,7 +200,7 @@ def clear(fish: Fish) -> None:
 
 SITUATIONS = {
     "swims": Situation("it swims", 10, 0.2, lambda lane: None),
-    "starts": Situation("it starts after one that was killed", 16, 0.5, succeed),
+    "starts": Situation("it starts after one that was killed", 16, 0.5, replace_fishd),
     "frozen": Situation(
         "pigpiod hangs for 30 ms, and on",
         22,
@@ -239,14 +239,14 @@ SITUATIONS = {
 
 
 def order(kills: int, seed: int, only: str | None) -> list[tuple[str, bool]]:
-    """So many kills, in a random order that the seed decides: the situation; a SIGSTOP instead?"""
+    """Return `count` kills in random order by the seed: situation, and whether to send SIGSTOP."""
     names = [only] * kills if only else situations(kills, seed)
     stops = random.Random(f"stops {seed}")
     return [(name, stops.random() < STOPPED) for name in names]
 
 
 def situations(kills: int, seed: int) -> list[str]:
-    """The situations of so many kills."""
+    """Return the situations of `count` kills."""
     hundred = [name for name, situation in SITUATIONS.items() for _ in range(situation.share)]
     shuffled = random.Random(seed)
     names = list(itertools.islice(itertools.cycle(shuffled.sample(hundred, len(hundred))), kills))
@@ -257,11 +257,11 @@ def situations(kills: int, seed: int) -> list[str]:
 def serve_forks(
     requests: Connection, log: Path, prepare: Callable[[list[str]], Callable[[], None]]
 ) -> None:
-    """Fork a process for each list of words that comes in, and answer with its number.
+    """Fork a process for each received list of words, and answer with its number.
 
-    prepare: makes of the words what the new process runs, which never returns
+    prepare: converts the words to the function of the new process, which never returns
     """
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for them
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # children are not awaited
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     os.dup2(output, 1)
     os.dup2(output, 2)
@@ -279,12 +279,12 @@ def serve_forks(
 
 
 def fishd_of(settings: list[str]) -> Callable[[], None]:
-    """Return what a fishd with these settings runs."""
+    """Return the function of a fishd with these settings."""
     return partial(be_fishd, load(None, settings))
 
 
 def be_fishd(config: Config) -> None:
-    """Never returns."""
+    """Run fishd, and never return."""
     try:
         asyncio.run(swim(config, False, Shutdown()))
     except BaseException as error:
@@ -295,7 +295,7 @@ def be_fishd(config: Config) -> None:
 
 @contextmanager
 def lane(folder: Path, seed: int) -> Iterator[Lane]:
-    """A lane; must be called while its process has one thread, as it forks."""
+    """Run a lane; must be called while its process has one thread, because it forks."""
     ours, theirs = multiprocessing.Pipe()
     if os.fork() == 0:
         ours.close()
@@ -314,7 +314,7 @@ def lane(folder: Path, seed: int) -> Iterator[Lane]:
 
 
 def work(kills: list[tuple[str, bool]], seed: int, deadline: float, results: Connection) -> None:
-    """Do these kills, one after another, and send what was seen."""
+    """Perform these kills one after another, and send the results."""
     with (
         tempfile.TemporaryDirectory(prefix="fishd-") as folder,
         lane(Path(folder), seed) as made,
@@ -333,9 +333,9 @@ def run(
     limit: float,
     work: Callable[[list[tuple[str, bool]], int, float, Connection], None] = work,
 ) -> Iterator[Any]:
-    """The kills as they come in; those that do not fit into `limit` [s] are left out.
+    """Yield the results of the kills; those that do not fit into `limit` [s] are left out.
 
-    work: does the kills of one lane, in a process of its own, and sends what it saw
+    work: performs the kills of one lane in a separate process, and sends the results
     """
     deadline = time.monotonic() + limit
     waiting: dict[Connection, int] = {}
@@ -363,7 +363,7 @@ def run(
 
 
 def summary(kills: list[Kill], seed: int) -> str:
-    """What is put into the document."""
+    """Return the sections for the document."""
     rows = []
     for name, situation in SITUATIONS.items():
         of_it = [kill for kill in kills if kill.situation == name]
@@ -391,7 +391,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Kill, and look; a quarter of an hour for 2000 with 8 lanes."""
+    """Run the kills; 2000 take a quarter of an hour with 8 lanes."""
     warm_up()
     kills = []
     planned = order(options.kills, options.seed, options.only)
@@ -404,7 +404,7 @@ def measure(options: Namespace) -> Report:
 
 
 def warm_up() -> None:
-    """Load what a fishd loads, without a thread: it is forked afterwards."""
+    """Load the modules of a fishd, without starting a thread, because it is forked afterwards."""
     import fishd.hardware.force_sensor.sampled_sensor
     import fishd.hardware.servo.pigpio  # noqa: F401
     from fishd.controllers import registry

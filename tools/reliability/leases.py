@@ -1,9 +1,9 @@
-"""Kills experiments on a running fishd at random instants, and measures when its fish is at rest.
+"""Kills of experiments on a running fishd at random times, and time until its fish is at rest.
 
-In each lane a real fishd swims the simulated fish, and the verbs of fishctl run on it, one after
-another, forked from a process that has loaded everything. From 0 to `WINDOW` seconds after a verb
-took the lease of the fish it is killed, or stopped. The exit status is 1 if a fish was not at rest
-within the lease and `GRACE` seconds more, its fade to neutral included.
+In each lane a real fishd controls the simulated fish, and the verbs of fishctl run on it, one after
+another, forked from a process that has loaded all modules. A verb is killed, or stopped, 0 to
+`WINDOW` seconds after it has taken the lease of the fish. The exit status is 1 if a fish was not at
+rest within the lease plus `GRACE` seconds, including its fade to neutral.
 """
 
 import multiprocessing
@@ -27,17 +27,18 @@ from common.daemon import Fishd
 from common.report import Options, Report, progress, table
 from fishd.cli import main as fishctl
 from fishd.client import Fish
-from reliability.kills import PATIENCE, run, serve_forks
+from reliability.kills import TIMEOUT_S, run, serve_forks
 
 DOCUMENT = "reference/reliability.md"
 LEASE = 2.0
 """Time that a lease lasts, by default [s]."""
 GRACE = 0.5
-"""[s]"""
+"""Time after the lease until a fish must be at rest [s]."""
 TICK = 0.05
 """Period of the loop, by default [s]."""
 WINDOW = 6.0
-"""An experiment rests for about 3 s at first, and swims then [s]."""
+"""Interval after the start of the lease in which kills occur [s]; an experiment rests for about 3 s
+at first, and then swims."""
 STOPPED = 0.15
 """Fraction of the kills that are a SIGSTOP instead."""
 ATTEMPTS = 5
@@ -75,11 +76,11 @@ MODULES = (
 
 
 class Kill(Struct):
-    """One kill, and what the fish did."""
+    """One kill, and the motion of the fish after it."""
 
     verb: str
     stopped: bool
-    """SIGSTOP instead of SIGKILL."""
+    """Whether SIGSTOP was sent instead of SIGKILL."""
     after: float
     """From the start of the lease to the kill [s]."""
     swimming: bool
@@ -89,13 +90,13 @@ class Kill(Struct):
     rest: float
     """Time from the kill until the last tick away from neutral [s]; infinite where it swims on."""
     faults: int = 0
-    """Attempts before this one in which fishd was held up until that was a fault."""
+    """Number of previous attempts in which a delay of fishd caused a fault."""
     losses: int = 0
-    """Attempts before this one in which the experiment was held up until it lost its lease."""
+    """Number of previous attempts in which a delay of the experiment lost its lease."""
 
 
 class Lane:
-    """A fishd, and the experiments on it."""
+    """Running fishd, and the experiments on it."""
 
     def __init__(self, folder: Path, seed: int, zygote: Connection) -> None:
         """zygote: forks a fishctl for a command line, and answers with its process number"""
@@ -111,13 +112,13 @@ class Lane:
         self._daemon.__exit__()
 
     def kill(self, verb: str, stop: bool) -> Kill:
-        """Begin an experiment, kill or stop it, and watch its fish; again where that is void.
+        """Start an experiment, kill or stop it, and observe its fish; retry invalid attempts.
 
-        It is void where a busy machine has held up fishd or the experiment before the kill.
+        An attempt is invalid if a busy machine has delayed fishd or the experiment before the kill.
         """
         voids: list[str] = []
         while len(voids) < ATTEMPTS:
-            with Fish(self._daemon.endpoint, timeout=PATIENCE) as fish:
+            with Fish(self._daemon.endpoint, timeout=TIMEOUT_S) as fish:
                 kill = self._try(fish, verb, stop)
                 fault = fish.status().reason is not None
                 fish.clear_fault()
@@ -129,7 +130,7 @@ class Lane:
         raise SystemExit(self._log())
 
     def _try(self, fish: Fish, verb: str, stop: bool) -> Kill | None:
-        """Return what was seen; None where there was no experiment to be killed."""
+        """Return the result; None where there was no experiment to kill."""
         self._count += 1
         words = [word.format(folder=self.folder / f"{verb}{self._count}") for word in VERBS[verb]]
         process = self._begin(words)
@@ -149,7 +150,7 @@ class Lane:
         finally:
             with suppress(ProcessLookupError):
                 signal.pidfd_send_signal(process, signal.SIGKILL)
-            select.select([process], [], [], PATIENCE)
+            select.select([process], [], [], TIMEOUT_S)
             os.close(process)
 
     def _begin(self, words: list[str]) -> int:
@@ -164,7 +165,7 @@ class Lane:
 
     def _await_lease(self, fish: Fish) -> bool:
         """Wait until an experiment holds the fish; False where fishd is in mode fault."""
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + TIMEOUT_S
         while time.monotonic() < deadline:
             status = fish.status()
             if status.reason or status.lease:
@@ -188,7 +189,7 @@ class Lane:
 
 
 def fishctl_of(words: list[str]) -> Callable[[], None]:
-    """Return what a fishctl with this command line runs."""
+    """Return the function of a fishctl with this command line."""
 
     def run() -> None:
         sys.argv = words
@@ -202,7 +203,7 @@ def fishctl_of(words: list[str]) -> Callable[[], None]:
 
 
 def work(kills: list[tuple[str, bool]], seed: int, deadline: float, results: Connection) -> None:
-    """Do these kills, one after another, and send what was seen."""
+    """Perform these kills one after another, and send the results."""
     with tempfile.TemporaryDirectory(prefix="fishd-") as name:
         folder = Path(name)
         ours, theirs = multiprocessing.Pipe()
@@ -225,12 +226,12 @@ def work(kills: list[tuple[str, bool]], seed: int, deadline: float, results: Con
 
 
 def in_time(kill: Kill) -> bool:
-    """Return whether the fish was at rest in time, its fade included."""
+    """Return whether the fish was at rest in time, including its fade."""
     return kill.rest + TICK <= LEASE + GRACE
 
 
 def summary(kills: list[Kill], seed: int) -> str:
-    """One row for each verb, and one for all."""
+    """Return one row for each verb, and one for all."""
     rows = []
     for verb in [*VERBS, "all"]:
         of_it = [kill for kill in kills if verb in (kill.verb, "all")]
@@ -274,7 +275,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Kill, and make the table."""
+    """Run the kills, and return the table."""
     for module in MODULES:
         import_module(module)
     verbs = [options.verb] if options.verb else list(VERBS)

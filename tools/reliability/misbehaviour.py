@@ -1,4 +1,4 @@
-"""Lets the true fishd meet controllers that raise, return and hang whatever they can."""
+"""Trials of a real fishd with controllers that raise, return wrong values, or hang."""
 
 import contextlib
 import fcntl
@@ -18,7 +18,7 @@ from pathlib import Path
 import zmq
 from msgspec import Struct
 
-from common.daemon import PATIENCE, Fishd
+from common.daemon import TIMEOUT_S, Fishd
 from common.processes import BIN
 from common.report import DOCS, Options, Report, progress, table
 from fishd.client import Fish, NoDaemon, Refused
@@ -27,8 +27,8 @@ from fishd.daemon.background_calls import MAX_CALLS
 
 DOCUMENT = "reference/reliability.md"
 ZOO = DOCS.parent / "tests" / "rigs" / "zoo"
-LONGEST_END = 3.0
-"""What fishd may take from a signal to its end, whatever hangs [s]."""
+MAX_END_S = 3.0
+"""Longest time from a signal to the end of fishd, with anything hanging [s]."""
 IMPATIENT_FISHD = """
 from fishd.core import protocol
 protocol.LOADING_TIMEOUT_S = {loading}
@@ -43,26 +43,26 @@ sys.path.insert(0, str(ZOO))
 from fishd_zoo import BAD, GOOD, HANGS, RAISED  # noqa: E402
 
 COMPUTE = ("loop",)
-"""Those of `HANGS` that take all that a processor gives."""
+"""Kinds of `HANGS` that use all of a processor."""
 
 
 class Outcome(Struct):
-    """What came of one kind of misbehaviour."""
+    """Result of one kind of misbehaviour."""
 
     what: str
     does: str
-    """What fishd did."""
+    """Reaction of fishd."""
     cases: int
     ended: int
-    """How many of them ended fishd, left it without an answer, or kept it from ending in time."""
+    """Number of trials after which fishd had ended, did not answer, or did not end in time."""
     longest: float | None = None
     """Longest time from the signal to the end of the process [s]."""
     statuses: list[int] = []
-    """Exit statuses that were seen."""
+    """Observed exit statuses."""
 
 
 def install(folder: Path, bad_imports: bool = False) -> Path:
-    """The zoo as an installed package; bad_imports: also modules that raise or hang in it."""
+    """Install the zoo as a package; bad_imports: include modules that raise or hang."""
     site = folder / "site"
     info = site / "fishd_zoo-1.0.dist-info"
     info.mkdir(parents=True)
@@ -81,29 +81,29 @@ def install(folder: Path, bad_imports: bool = False) -> Path:
 def running(
     bad_imports: bool = False, output: int | None = None, loading: float | None = None
 ) -> Iterator[tuple[Fishd, Fish]]:
-    """A fishd that is up, with the zoo installed, and a client of it.
+    """Run a fishd with the zoo installed, and yield it and a client.
 
-    loading: what a load may take [s], if not LOADING
+    loading: timeout of a load [s], if not LOADING
     """
     command: tuple[str, ...] = (str(BIN / "fishd"),)
     if loading is not None:
         command = (sys.executable, "-c", IMPATIENT_FISHD.format(loading=loading))
     with tempfile.TemporaryDirectory(prefix="fishd-") as folder:
         fishd = Fishd(
-            # A controller that computes for ever must not hold up what else runs in real time.
+            # A controller in an endless loop must not delay other real-time processes.
             "realtime.priority=5",
             command=(*command, "--print-status"),
             environment={"PYTHONPATH": str(install(Path(folder), bad_imports))},
             output=output,
         )
         with fishd, Fish(fishd.endpoint, timeout=5.0) as fish:
-            fishd.next_tick(PATIENCE + LOADING_TIMEOUT_S)
+            fishd.next_tick(TIMEOUT_S + LOADING_TIMEOUT_S)
             yield fishd, fish
 
 
 def await_mode(fish: Fish, mode: str) -> None:
-    """Raises TimeoutError when it does not come to this mode."""
-    deadline = time.monotonic() + PATIENCE
+    """Wait for a mode; raises TimeoutError."""
+    deadline = time.monotonic() + TIMEOUT_S
     while fish.status().mode != mode:
         if time.monotonic() > deadline:
             raise TimeoutError(f"it is not in mode {mode}")
@@ -111,7 +111,7 @@ def await_mode(fish: Fish, mode: str) -> None:
 
 
 def survives(fishd: Fishd, fish: Fish, method: str, deed: str) -> bool:
-    """Does fishd take it as a fault or a refusal, answer, and go on ticking?"""
+    """Return whether fishd enters a fault or refuses, answers, and continues to tick."""
     before = fish.status().seq
     try:
         try:
@@ -142,7 +142,7 @@ def survives(fishd: Fishd, fish: Fish, method: str, deed: str) -> bool:
 
 
 def raising() -> Outcome:
-    """Every exception in every method."""
+    """Try every exception in every method."""
     cases = [(method, deed) for method in METHODS for deed in RAISED]
     with running() as (fishd, fish):
         ended = sum(not survives(fishd, fish, *case) for case in cases)
@@ -153,7 +153,7 @@ def raising() -> Outcome:
 
 
 def numbers() -> Outcome:
-    """Every odd number as an angle."""
+    """Try every odd number as an angle."""
     ended = 0
     with running() as (fishd, fish):
         for deed in GOOD:
@@ -167,26 +167,26 @@ def numbers() -> Outcome:
 
 
 def loading(patience: float | None = None) -> Outcome:
-    """Loads that never end: each is refused, and others load.
+    """Try loads that never end: each is refused, and others load.
 
-    Three fishds at once. Those that compute for ever share one: a core is left for who asks.
+    Three fishds run at once. The endless computations share one, so that a core remains free.
 
-    patience: what a load may take [s], if not LOADING
+    patience: timeout of a load [s], if not LOADING
     """
     cases = [(method, way) for way in HANGS for method in ("check", "__init__")]
     computing = [case for case in cases if case[1] in COMPUTE]
     waiting = [case for case in cases if case[1] not in COMPUTE]
     groups = computing, waiting[:MAX_CALLS], waiting[MAX_CALLS:]
     with ThreadPoolExecutor(len(groups)) as pool:
-        found = list(pool.map(partial(refused_loads, patience=patience), groups))
-    ended, times, statuses = zip(*found, strict=True)
+        results = list(pool.map(partial(refused_loads, patience=patience), groups))
+    ended, times, statuses = zip(*results, strict=True)
     does = f"refusal `too-slow` after {patience or LOADING_TIMEOUT_S:g} s; others load"
     what = "a load that never ends"
     return Outcome(what, does, len(cases), sum(ended), max(times), sorted(set(statuses)))
 
 
 def refused_loads(cases: list[tuple[str, str]], patience: float | None) -> tuple[int, float, int]:
-    """How many loads were not refused, the time to the end of fishd [s], its exit status."""
+    """Return the number of loads not refused, the time to the end [s], the exit status."""
     with running(loading=patience) as (fishd, fish), ThreadPoolExecutor(len(cases)) as pool:
         refusals = list(pool.map(partial(refusal_of_load, fishd.endpoint), cases))
         fish.set_controller("square")
@@ -196,7 +196,7 @@ def refused_loads(cases: list[tuple[str, str]], patience: float | None) -> tuple
 
 
 def refusal_of_load(endpoint: str, case: tuple[str, str]) -> str:
-    """Ask for a controller that hangs; the code of the refusal, or what happened instead."""
+    """Request a controller that hangs; return the code of the refusal, or another result."""
     try:
         with Fish(endpoint) as fish:
             fish.set_controller("zoo", deed=case[1], method=case[0])
@@ -208,7 +208,7 @@ def refusal_of_load(endpoint: str, case: tuple[str, str]) -> str:
 
 
 def importing() -> Outcome:
-    """Packages that raise or hang when they are imported: the others are there."""
+    """Try packages that raise or hang at their import: the others remain available."""
     with running(bad_imports=True) as (fishd, fish):
         known = {info.name for info in fish.controllers()}
         ended = int(not {"zoo", "swing"} <= known)
@@ -225,12 +225,12 @@ def importing() -> Outcome:
 
 
 def ask(fishd: Fishd, method: str, way: str) -> None:
-    """Let a method hang, and wait until it does; one that loads holds up nobody."""
+    """Make a method hang, and wait until it does; a hanging load does not delay requests."""
     begun = fishd.folder / "begun"
     zoo = {"deed": way, "method": method, "begun": str(begun)}
-    with Fish(fishd.endpoint, timeout=PATIENCE) as fish:
+    with Fish(fishd.endpoint, timeout=TIMEOUT_S) as fish:
         if method in ("retune", "close"):
-            fish.set_controller("zoo", **zoo)  # answered once it is active
+            fish.set_controller("zoo", **zoo)  # answered when it is active
         match method:
             case "retune":
                 request = fish.request("set-parameter", {"parameters": {"nudge": 1}})
@@ -239,7 +239,7 @@ def ask(fishd: Fishd, method: str, way: str) -> None:
             case _:
                 request = fish.request("set-controller", {"name": "zoo", "parameters": zoo})
         send(fishd.endpoint, request[1])
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + TIMEOUT_S
     while not begun.exists():
         if time.monotonic() > deadline:
             raise TimeoutError("fishd does not hang")
@@ -247,7 +247,7 @@ def ask(fishd: Fishd, method: str, way: str) -> None:
 
 
 def send(endpoint: str, request: bytes) -> None:
-    """Send a request whose answer nobody reads."""
+    """Send a request without reading the answer."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.set(zmq.LINGER, 1000)
         socket.connect(endpoint)
@@ -255,33 +255,33 @@ def send(endpoint: str, request: bytes) -> None:
 
 
 def hanging(method: str) -> Callable[[], Outcome]:
-    """SIGTERM while a method hangs, in every way, with one processor for all of fishd."""
+    """Send SIGTERM while a method hangs, in every way, with one processor for fishd."""
 
     def measure() -> Outcome:
-        # Side by side, but for what would take the processor from the others.
-        found = ends(method, [way for way in HANGS if way not in COMPUTE])
+        # In parallel, except for those that would take the processor from the others.
+        results = ends(method, [way for way in HANGS if way not in COMPUTE])
         for way in COMPUTE:
-            found += ends(method, [way])
-        times, statuses = zip(*found, strict=True)
+            results += ends(method, [way])
+        times, statuses = zip(*results, strict=True)
         load = method in ("check", "__init__")
         does = "goes on ticking" if load else "the countdown ends the pulses; ends when asked to"
         what = f"`{method}` hangs" + (" while it loads" if load else "")
-        ended = sum(took > LONGEST_END for took in times)
+        ended = sum(took > MAX_END_S for took in times)
         return Outcome(what, does, len(HANGS), ended, max(times), sorted(set(statuses)))
 
     return measure
 
 
 def ends(method: str, ways: list[str]) -> list[tuple[float, int]]:
-    """The time from SIGTERM to the end of a fishd that hangs [s], and its exit status, of each way.
+    """Return the time from SIGTERM to the end [s] and the exit status for each way to hang.
 
-    None is sent a SIGTERM before all of them hang: their starts would disturb it.
+    SIGTERM is sent after all of them hang, because their starts would disturb it.
     """
 
     def hang(way: str) -> Fishd:
         fishd, _ = stack.enter_context(running())
         for thread in Path(f"/proc/{fishd.pid}/task").iterdir():
-            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+            with contextlib.suppress(ProcessLookupError):  # the process has ended meanwhile
                 os.sched_setaffinity(int(thread.name), {min(os.sched_getaffinity(0))})
         ask(fishd, method, way)
         return fishd
@@ -294,7 +294,7 @@ def ends(method: str, ways: list[str]) -> list[tuple[float, int]]:
 
 
 def unread(number: signal.Signals, terminal: bool) -> Callable[[], Outcome]:
-    """A signal while nobody reads what fishd says."""
+    """Send a signal while the output of fishd is not read."""
 
     def measure() -> Outcome:
         if terminal:
@@ -303,20 +303,20 @@ def unread(number: signal.Signals, terminal: bool) -> Callable[[], Outcome]:
             reader, writer = os.pipe()
         fill(writer)
         with running(output=writer) as (fishd, _):
-            time.sleep(1.5)  # a status line, which is stuck
+            time.sleep(1.5)  # until a status line is blocked
             took = fishd.seconds_to_end(number)
             status = fishd.process.returncode
         os.close(reader)
         os.close(writer)
         what = f"{number.name}, a {'terminal' if terminal else 'pipe'} that nobody reads"
-        ended = int(took > LONGEST_END or status != 0)
+        ended = int(took > MAX_END_S or status != 0)
         return Outcome(what, "fades, and loses its last lines", 1, ended, took, [status])
 
     return measure
 
 
 def fill(writer: int) -> None:
-    """Write until no more goes in."""
+    """Write until the pipe is full."""
     flags = fcntl.fcntl(writer, fcntl.F_GETFL)
     fcntl.fcntl(writer, fcntl.F_SETFL, flags | os.O_NONBLOCK)
     with contextlib.suppress(BlockingIOError):
@@ -341,7 +341,7 @@ KINDS: dict[str, Callable[[], Outcome]] = {
 
 
 def row(outcome: Outcome) -> list[str]:
-    """A line of the table."""
+    """Return a row of the table."""
     took = "–" if outcome.longest is None else f"{outcome.longest:.2f}"
     statuses = ", ".join(map(str, outcome.statuses)) or "–"
     return [outcome.what, outcome.does, str(outcome.cases), str(outcome.ended), took, statuses]
@@ -353,7 +353,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Every kind of misbehaviour; three minutes."""
+    """Try every kind of misbehaviour; takes three minutes."""
     outcomes = {}
     for name in [options.only] if options.only else KINDS:
         outcomes[name] = KINDS[name]()

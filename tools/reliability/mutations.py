@@ -1,10 +1,10 @@
-"""Damages a good recording at random, and reads it by every verb that reads recordings.
+"""Random damage to a good recording, which is then read by every verb that reads recordings.
 
-Bytes flip, parts are cut out, inserted, repeated and spliced, lengths change; and within chunks,
-whose checksums are then made right again, so that what is damaged reaches the parsers of messages.
-An answer is wrong that is a traceback, more than one line, or a line that does not name the file;
-that takes more than 10 s of processor time, or more memory than 300 MB. `plot` draws one file of a
-hundred, in another process; of the others its curves are computed. One of ten is exported as
+Bytes flip, parts are cut out, inserted, repeated and spliced, lengths change. The same happens
+within chunks with corrected checksums, so that damaged data reaches the parsers of messages. An
+answer is wrong if it is a traceback, more than one line, or a line without the name of the file, or
+if it takes more than 10 s of processor time, or more than 300 MB. `plot` draws one file of a
+hundred, in another process; for the others its curves are computed. One file of ten is exported as
 Parquet and listed as JSON. Exit status 1 where an answer was wrong.
 """
 
@@ -110,7 +110,7 @@ def insert(dice: random.Random, content: bytes) -> bytes:
 
 
 def lengthen(dice: random.Random, content: bytes) -> bytes:
-    """Let a record, or what looks like a length within one, claim another length."""
+    """Change the length of a record, or a number within one that looks like a length."""
     records = split(content)
     offset = 8
     starts = []
@@ -144,7 +144,7 @@ def splice(dice: random.Random, content: bytes) -> bytes:
 
 
 def corrupt_content(dice: random.Random, content: bytes) -> bytes:
-    """Change what a chunk or an attachment holds, with the right checksum."""
+    """Change the content of a chunk or an attachment, with the valid checksum."""
     records = split(content)
     places = [i for i, (opcode, _) in enumerate(records) if opcode == Opcode.CHUNK]
     places += [i for i, (opcode, _) in enumerate(records) if opcode == Opcode.ATTACHMENT]
@@ -177,7 +177,7 @@ def _corrupt(dice: random.Random, opcode: int, body: bytes) -> Record:
 
 
 def replace_value(dice: random.Random, content: bytes) -> bytes:
-    """Put something else in place of a value of JSON or YAML."""
+    """Replace a value of JSON or YAML."""
     colons = [i for i in range(len(content)) if content[i : i + 1] == b":"]
     if not colons:
         return flip(dice, content)
@@ -199,7 +199,7 @@ KINDS = (
 
 
 def read(file: Path, folder: Path, verbs: Sequence[str]) -> list[Outcome]:
-    """Run these verbs on a file; where `plot` is none of them, compute its curves."""
+    """Run these verbs on a file; without `plot`, compute its curves."""
     outcomes = []
     for verb in verbs:
         out = folder / "out"
@@ -232,10 +232,10 @@ def verbs_for(number: int) -> tuple[str, ...]:
 def try_all(
     numbers: Iterable[int], seed: int, draw: bool, deadline: float = math.inf
 ) -> tuple[list[Result], list[str]]:
-    """Damage a good file once for each number, the kinds in turn; results, and what was wrong.
+    """Damage a good file once for each number, with the kinds in turn; return results and mistakes.
 
-    draw: let the verbs that draw read the files, instead of the others
-    deadline: end at this time [s, monotonic]
+    draw: run the verbs that draw, instead of the others
+    deadline: time of the end [s, monotonic clock]
     """
     results, wrong = [Result(kind.what) for kind in KINDS], []
     with tempfile.TemporaryDirectory(prefix="fishd-") as name:
@@ -265,7 +265,7 @@ def try_all(
 
 
 def try_in_process(*arguments: Any) -> list[Result]:
-    """Do the same in another process, whose memory is that of these verbs."""
+    """Run `try_all` in another process, to measure the memory of these verbs."""
     with get_context("spawn").Pool(1, _limit_memory) as pool:
         return pool.apply(try_all, arguments)[0]
 
@@ -282,7 +282,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Damage and read; a quarter of an hour where nothing else computes."""
+    """Damage and read files; takes a quarter of an hour on an idle machine."""
     deadline = time.monotonic() + 60.0 * options.minutes
     numbers = range(options.number)
     drawn = [n for n in numbers if n // len(KINDS) % DRAWING_PERIOD == 0]

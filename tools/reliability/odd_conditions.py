@@ -1,8 +1,8 @@
-"""Runs fishctl and fishd under odd conditions: a full disk, few file descriptors, a closed output.
+"""Trials of fishctl and fishd under odd conditions: full disk, few file descriptors, closed output.
 
-Each command either does its work, or says in one line why not, with the exit status that belongs to
-it; an emergency stop passes whatever the condition. A condition that needs a file system mounts it
-in a mount namespace that ends with the command; where that is not permitted, the cell says so.
+Each command either does its work, or says in one line why not, with the matching exit status; an
+emergency stop works under every condition. A condition that needs a file system mounts it in a
+mount namespace that ends with the command; where that is not permitted, the cell says so.
 """
 
 import os
@@ -26,9 +26,9 @@ from fishd.client import Fish, FishError
 
 DOCUMENT = "reference/reliability.md"
 TIMEOUT_S = 90.0
-"""Time after which a command hangs [s]."""
+"""Time after which a command counts as hung [s]."""
 START_S = 30.0
-"""Longest time until fishd answers, or is asked to end [s]."""
+"""Longest time until fishd answers, or is terminated [s]."""
 
 OPTIONS: Options = {
     "--only": {"nargs": "+", "metavar": "CONDITION", "help": "of all conditions"},
@@ -37,10 +37,10 @@ OPTIONS: Options = {
 
 
 class Condition(NamedTuple):
-    """An odd condition, as the beginning of a shell script in the folder of the trial."""
+    """Odd condition, as the beginning of a shell script in the folder of the trial."""
 
     setup: str
-    """Commands that bring it about; `$FOLDER` is where the command is to write."""
+    """Commands that cause the condition; `$FOLDER` is the folder for the command's files."""
     redirect: str = ""
     """Redirection of the command."""
     environment: tuple[tuple[str, str | None], ...] = ()
@@ -50,7 +50,7 @@ class Condition(NamedTuple):
     keeps_from_writing: bool = False
     """Whether a command that writes files may fail."""
     loses_output: bool = False
-    """Whether standard output takes nothing."""
+    """Whether standard output cannot be written."""
 
 
 _CONFIG = Path(__file__).resolve().parents[2] / "config/simulated.yaml"
@@ -92,16 +92,15 @@ class Verb(NamedTuple):
     """One command of a group of verbs."""
 
     words: str
-    """Words of its command line; `FOLDER` is where it writes, `RUN` a recording that is there."""
+    """Words of its command line; `FOLDER` is its folder for files, `RUN` an existing recording."""
     statuses: tuple[int, ...] = (0,)
     """Exit statuses without an odd condition."""
     writes: bool = False
-    """Whether it has to write into a folder, and so may fail where that is not possible."""
+    """Whether it writes into a folder, and may fail where that is not possible."""
     is_heavy: bool = False
-    """Whether it starts processes or loads large libraries, and so may fail where either is short.
-    """
+    """Whether it starts processes or loads large libraries, and may fail without resources."""
     after: Callable[[Fish], bool] | None = None
-    """Condition that the fish must meet afterwards, whatever the exit status."""
+    """Condition that the fish must meet afterwards, for any exit status."""
 
 
 def _is_stopped(fish: Fish) -> bool:
@@ -143,7 +142,7 @@ class Cell(Struct, frozen=True):
     said: str
     """Standard error."""
     wrong: str
-    """Fault of its result; empty where there is none."""
+    """Mistake in its result; empty without one."""
     tried: bool = True
 
 
@@ -166,12 +165,12 @@ def measure(options: Namespace) -> Report:
 
 
 class Place(NamedTuple):
-    """The folders of a trial."""
+    """Folders of a trial."""
 
     folder: Path
     """Folder that the commands write into, empty before each."""
     runs: Path
-    """Recordings that are there."""
+    """Folder of existing recordings."""
     run: Path
 
 
@@ -227,7 +226,7 @@ def _under(
     if condition.mounts:
         shell = ["unshare", "--mount", *shell]
     variables = environment | {"FOLDER": str(place.folder)}
-    for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # which few users set
+    for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # few users set these
         variables.pop(key, None)
     for key, value in condition.environment:
         if value is None:
@@ -311,7 +310,7 @@ def _judge(
     name: str,
     done: "subprocess.CompletedProcess[str] | subprocess.TimeoutExpired",
 ) -> str:
-    """Return what is wrong with how a command has ended; empty where nothing is."""
+    """Return the mistake in the end of a command; empty without one."""
     fault = _common_fault(done)
     if fault or isinstance(done, subprocess.TimeoutExpired) or done.returncode == _NOT_TRIED:
         return fault
@@ -347,7 +346,7 @@ def _cell(
 
 
 def _describe(cell: Cell) -> str:
-    """Return one command's result: its exit status, or what is wrong."""
+    """Return one command's result: its exit status, or its mistake."""
     if not cell.tried:
         return "not tried"
     if cell.wrong:

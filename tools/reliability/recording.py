@@ -1,8 +1,8 @@
-"""What a kill costs a recording, and what a recording costs the ticks.
+"""Losses of recordings by kills, and cost of recordings for the ticks.
 
-Recorders and fishds are killed at random instants. What is lost is counted in ticks, against a
-subscriber beside the recorder that hears all of them. Then one fishd ticks with and without a
-recorder and two subscribers that hardly read, in turn. Ends by itself; exit status 1 where a
+Recorders and fishds are killed at random times. Lost ticks are counted by comparison with a
+subscriber beside the recorder that receives all of them. Then one fishd ticks with and without a
+recorder and two subscribers that do not read, in turn. Ends by itself; exit status 1 where a
 promise was not kept.
 """
 
@@ -27,22 +27,22 @@ from fishd.core.errors import RecordingError
 from fishd.recording import open_run
 
 DOCUMENT = "how-to/recording.md"
-MOST_LOST = 1.0
-"""A kill of the recorder may lose so much [s]."""
-MOST_LATER = 1.2
-"""A recorder may make the lateness of ticks, p99, so many times as large."""
+MAX_LOSS_S = 1.0
+"""Largest loss by a kill of the recorder [s]."""
+MAX_LATENESS_RATIO = 1.2
+"""Largest ratio of the lateness of ticks, p99, with and without a recorder."""
 SETTLE = 2.0
-"""After a change of load, ticks are not counted for so long [s]."""
+"""Time after a change of load in which ticks are ignored [s]."""
 
 
 class Kill(Struct, frozen=True):
-    """One kill, and what was lost of the ticks before it."""
+    """One kill, and the ticks before it that were lost."""
 
     who: str
     lost: int
-    """Ticks that the subscriber beside it heard before the kill, and that the file lacks."""
+    """Number of ticks that the subscriber received before the kill, and that the file lacks."""
     torn: bool
-    """Does the file hold a tick twice, or lack one in its midst?"""
+    """Whether the file contains a tick twice, or has a gap."""
 
 
 class Load(Struct, frozen=True):
@@ -56,7 +56,7 @@ class Load(Struct, frozen=True):
 
 @contextmanager
 def recorder(fishd: Fishd, folder: Path, name: str) -> Iterator[subprocess.Popen[bytes]]:
-    """`fishctl record` on a fishd, once it records."""
+    """Run `fishctl record` on a fishd, and yield it when it records."""
     command = [BIN / "fishctl", "--endpoint", fishd.endpoint, "record", name, "--folder", folder]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
@@ -71,7 +71,7 @@ def recorder(fishd: Fishd, folder: Path, name: str) -> Iterator[subprocess.Popen
 
 
 def ticks_in(path: Path) -> list[int]:
-    """The numbers of the ticks of a recording; empty before it exists."""
+    """Return the numbers of the ticks of a recording; empty before it exists."""
     try:
         return [tick.seq for tick in open_run(path).ticks]
     except RecordingError:
@@ -79,7 +79,7 @@ def ticks_in(path: Path) -> list[int]:
 
 
 def kill_recorder(fishd: Fishd, folder: Path, name: str, instant: float) -> Kill:
-    """Kill a recorder after so long [s], and count what its file lacks."""
+    """Kill a recorder after a time [s], and count the missing ticks of its file."""
     with recorder(fishd, folder, name) as process:
         time.sleep(instant)
         fishd.waiting_messages()
@@ -91,7 +91,7 @@ def kill_recorder(fishd: Fishd, folder: Path, name: str, instant: float) -> Kill
 
 
 def kill_fishd(folder: Path, name: str, instant: float) -> Kill:
-    """Kill a fishd after so long [s], and count what its recording lacks."""
+    """Kill a fishd after a time [s], and count the missing ticks of its recording."""
     with Fishd() as fishd:
         fishd.next_tick()
         with recorder(fishd, folder, name):
@@ -109,7 +109,7 @@ def _judged(who: str, ticks: list[int], heard: int) -> Kill:
 
 
 def measure_load(folder: Path, rounds: int, seconds: float) -> tuple[Load, Load]:
-    """Lateness without and with a recorder and two slow subscribers, in turn."""
+    """Return the lateness without and with a recorder and two slow subscribers, in turn."""
     late: dict[bool, list[float]] = {False: [], True: []}
     with Fishd() as fishd:
         fishd.next_tick()
@@ -125,15 +125,15 @@ def measure_load(folder: Path, rounds: int, seconds: float) -> tuple[Load, Load]
                 late[loaded] += [tick.lateness_us for tick in fishd.waiting_ticks()]
             progress("lateness", "with a recorder" if loaded else "without")
     without, with_ = (
-        Load(len(found), quantile(found, 0.5), quantile(found, 0.99), max(found))
-        for found in late.values()
+        Load(len(lateness), quantile(lateness, 0.5), quantile(lateness, 0.99), max(lateness))
+        for lateness in late.values()
     )
     return without, with_
 
 
 @contextmanager
 def slow_subscribers(address: str) -> Iterator[None]:
-    """Two subscribers that never read, and have room for ten messages."""
+    """Run two subscribers that never read, with room for ten messages."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     for _ in range(2):
         socket = context.socket(zmq.SUB)
@@ -147,7 +147,7 @@ def slow_subscribers(address: str) -> Iterator[None]:
 
 
 def summary(kills: list[Kill], loads: tuple[Load, Load], tick: float) -> str:
-    """What is put into the document."""
+    """Return the sections for the document."""
     rows = []
     for who in ("recorder", "fishd"):
         of_it = [kill for kill in kills if kill.who == who]
@@ -175,7 +175,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Kill, count, and measure lateness; about eight minutes."""
+    """Run the kills and measure lateness; takes about eight minutes."""
     instants = random.Random(options.seed)
     kills = []
     with tempfile.TemporaryDirectory(prefix="fishd-") as name:
@@ -194,8 +194,8 @@ def measure(options: Namespace) -> Report:
     broken = (
         any(kill.torn for kill in kills)
         or any(kill.who == "fishd" and kill.lost for kill in kills)
-        or max(kill.lost for kill in kills) * tick >= MOST_LOST
-        or loads[1].p99 > MOST_LATER * loads[0].p99
+        or max(kill.lost for kill in kills) * tick >= MAX_LOSS_S
+        or loads[1].p99 > MAX_LATENESS_RATIO * loads[0].p99
     )
     figures = {"kills": kills, "without": loads[0], "with": loads[1]}
     return Report({"reliability recording": summary(kills, loads, tick)}, figures, broken=broken)

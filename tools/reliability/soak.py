@@ -1,4 +1,4 @@
-"""Runs fishd for very long in virtual time while everything around it fails at random.
+"""Long runs of fishd in virtual time with random failures of everything around it.
 
     simulated    the loop, with a robot that fails in all ways
     virtual-pi   the whole hardware path, with injected faults
@@ -8,10 +8,10 @@ Each ends with a line of figures, and with exit status 1 if a promise was broken
 got out of a tick, an angle beyond the limits, pulses that go on in fault or estop, memory that
 grows, a value of the wrong channel.
 
-Memory counts after the first fifth of a run. One of the default length may grow by less than 1 MB.
-In a shorter one that would measure how the interpreter warms up: such a run is judged, as the long
-ones are too, by the objects that are left behind in every tick, in both halves of the rest. It does
-not find what leaks less than a record per tick.
+Memory counts after the first fifth of a run. In a run of the default length it may grow by less
+than 1 MB. In a shorter run this would measure the warm-up of the interpreter. All runs are
+therefore also checked for objects that remain from every tick, in both halves of the rest, which
+does not detect leaks below a record per tick.
 """
 
 import itertools
@@ -46,13 +46,13 @@ VIRTUAL_PI_TICKS = 20_000
 
 
 def check(loop: ControlLoop) -> None:
-    """The present angle is within limits."""
+    """Check that the current angle is within limits."""
     if not abs(loop.applied) <= 0.42 + 1e-9:
         raise BrokenPromise(f"tick {loop.seq}: the present angle is {loop.applied} rad")
 
 
 def soak_simulated(ticks: int, seed: int) -> str:
-    """The loop on a simulated fish whose robot, controllers and users misbehave."""
+    """Run the loop on a simulated fish whose robot, controllers and users misbehave."""
     dice = random.Random(seed)
     config = load(None, [f"simulation.seed={seed}"])
     clock = VirtualClock()
@@ -79,7 +79,7 @@ def soak_simulated(ticks: int, seed: int) -> str:
 
 
 def soak_virtual_pi(ticks: int, seed: int) -> str:
-    """The whole hardware path in virtual time, with faults injected by name."""
+    """Run the whole hardware path in virtual time, with faults injected by name."""
     dice = random.Random(seed)
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
@@ -88,7 +88,7 @@ def soak_virtual_pi(ticks: int, seed: int) -> str:
         robot, pi = open_in_virtual_time(config, stack)
         publisher = Counting()
         loop = build_loop(config, robot, clock, publisher)
-        rest = Rest(loop, patience=30)  # one attempt to connect to pigpiod takes up to ten
+        rest = Rest(loop, patience=30)  # one attempt to connect to pigpiod takes up to ten ticks
         memory = Memory(ticks, long_run=VIRTUAL_PI_TICKS)
         injected: Counter[str] = Counter()
         width_limits = (1500 - 600 * 0.42 - 6, 1500 + 600 * 0.42 + 6)
@@ -117,7 +117,7 @@ def soak_virtual_pi(ticks: int, seed: int) -> str:
 
 
 def soak_channels(reads: int, seed: int) -> str:
-    """Two channels far apart, 1 % of the transfers fail: is one ever taken for the other?"""
+    """Check that two channels are never confused while 1 % of the transfers fail."""
     clock = VirtualClock()
     faults = Faults(clock, seed)
     faults.error_rate = 0.01
@@ -154,13 +154,13 @@ def soak_channels(reads: int, seed: int) -> str:
 
 
 def virtual_pi_config(folder: str, seed: int) -> Config:
-    """The default virtual Pi, its state in `folder`."""
+    """Return the configuration of the default virtual Pi, with its state in `folder`."""
     overrides = ["robot=virtual-pi", f"simulation.seed={seed}"]
     return load(None, [*overrides, f"state_folder={folder}"])
 
 
 def verdict(what: str, publisher: Counting, memory: Memory) -> str:
-    """The figures of a soak as a line; raises `BrokenPromise` when memory grew."""
+    """Return the figures of a soak as a line; raises `BrokenPromise` when memory grew."""
     grown = memory.verdict(what)
     reasons = ", ".join(f"{count} {code}" for code, count in sorted(publisher.reasons.items()))
     return (
@@ -178,8 +178,8 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """The soaks that are asked for; raises `BrokenPromise`."""
-    logging.disable(logging.CRITICAL)  # thousands of faults would be reported
+    """Run the requested soaks; raises `BrokenPromise`."""
+    logging.disable(logging.CRITICAL)  # avoids reports of thousands of faults
     soaks: dict[str, Callable[[], str]] = {
         "simulated": lambda: soak_simulated(options.ticks or SIMULATED_TICKS, options.seed),
         "virtual-pi": lambda: soak_virtual_pi(options.ticks or VIRTUAL_PI_TICKS, options.seed),

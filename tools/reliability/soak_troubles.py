@@ -1,4 +1,4 @@
-"""The trouble that `soak` makes: robots, controllers, subscribers and users that misbehave."""
+"""Misbehaving robots, controllers, subscribers and users of `soak`."""
 
 import dataclasses
 import itertools
@@ -19,14 +19,14 @@ from fishd.hardware.base import Robot
 
 
 class Counting:
-    """A publisher that keeps counts only, and fails now and then where it is told to."""
+    """Publisher that only counts, and fails occasionally if requested."""
 
     def __init__(self, failing: Callable[[], bool] = lambda: False) -> None:
         self.reasons: Counter[str] = Counter()
         self._failing = failing
 
     def tick(self, tick: Tick) -> None:
-        """Check, and drop."""
+        """Check the tick."""
         if self._failing():
             raise ConnectionError("telemetry is gone")
         if abs(tick.phi_c) > 0.42 + 1e-9:
@@ -39,7 +39,7 @@ class Counting:
 
 
 class Saboteur:
-    """A sensor and servo that fail in short bursts, each in its own way."""
+    """Sensor and servo that fail in short bursts, each in a different way."""
 
     def __init__(self, robot: Robot, dice: random.Random) -> None:
         self._robot = robot
@@ -49,15 +49,15 @@ class Saboteur:
         self._failing: tuple[str, ...] = ()
         self._victims = itertools.cycle((("write", "release"), ("release",), ("write",)))
         self.servo_on = False
-        """The latest that reached the servo was a write, not a release."""
+        """Whether the latest successful call of the servo was a write, not a release."""
 
     def robot(self) -> Robot:
-        """The robot with this in between."""
+        """Return the robot with the failures of this object."""
         return dataclasses.replace(self._robot, sensor=self, servo=self)
 
     @property
     def in_trouble(self) -> bool:
-        """The servo cannot be written to, or not be released."""
+        """Return whether the servo cannot be written or released."""
         return self._trouble.startswith("servo")
 
     def read(self, now: float) -> Measurement:
@@ -98,7 +98,7 @@ class Saboteur:
         self.servo_on = False
 
     def close(self) -> None:
-        """Let go."""
+        """Release the robot."""
         self._robot.servo.close()
 
     def _fail(self, action: str) -> None:
@@ -111,20 +111,20 @@ class Saboteur:
 
 
 class Rest:
-    """The promise that in fault and estop the pulses end, as soon as the servo can be reached."""
+    """Check that pulses end in fault and estop as soon as the servo can be reached."""
 
     LIMITS = {Mode.ESTOP: 10, Mode.FAULT: 12}  # noqa: RUF012 - never changed
-    """Ticks that may pass first; a fault fades to neutral before."""
+    """Ticks that may pass before; a fault first fades to neutral."""
 
     def __init__(self, loop: ControlLoop, patience: int = 0) -> None:
-        """`patience`: ticks that a lost servo may take to come back."""
+        """`patience`: ticks until a lost servo must return."""
         self._loop = loop
         self._patience = patience
         self._reason: Reason | None = None
         self._ticks = 0
 
     def check(self, in_trouble: bool, servo_on: bool) -> None:
-        """Once per tick; whether the servo cannot be reached, and whether it has pulses."""
+        """Check a tick: whether the servo cannot be reached, and whether it has pulses."""
         loop = self._loop
         reason = loop.supervisor.reason
         if in_trouble or reason is None or reason is not self._reason:
@@ -138,7 +138,7 @@ class Rest:
 
 
 class Drunk(Controller[Any]):
-    """A controller that does what none should."""
+    """Controller that misbehaves."""
 
     def __init__(self, dice: random.Random, loop: ControlLoop) -> None:
         parameters = registry.create("hold", {}, loop.limits).parameters
@@ -158,7 +158,7 @@ class Drunk(Controller[Any]):
 
 
 def misuse(loop: ControlLoop, dice: random.Random) -> None:
-    """Ask the loop for something, as impatient users do."""
+    """Send random requests to the loop, like an impatient user."""
     name = dice.choice(("square", "sine", "triangle", "swing", "hold", "drunk"))
     try:
         match dice.randrange(8):
@@ -176,4 +176,4 @@ def misuse(loop: ControlLoop, dice: random.Random) -> None:
             case _:
                 loop.clear_fault()
     except FishdError:
-        pass  # refused, which is what a fault or an emergency stop does
+        pass  # refused during a fault or an emergency stop

@@ -1,4 +1,4 @@
-"""Boots a real systemd in a container, installs fishd there, and starts, stops, hangs and kills it.
+"""Trials of an installed fishd under a real systemd in a container: starts, stops, hangs and kills.
 
 Needs root, a network and Debian's packages debootstrap and systemd-container; some minutes.
 """
@@ -31,7 +31,7 @@ OPTIONS: Options = {
 
 
 def measure(options: Namespace) -> Report:
-    """Every trial; raises `BrokenPromise`, and SystemExit when nothing can be tried here."""
+    """Run every trial; raises `BrokenPromise`, and SystemExit where trials are not possible."""
     check_machine(options.base)
     with _work_folder(options.keep) as work, Container(build(work, options.base)) as container:
         return _try_all(container)
@@ -54,15 +54,15 @@ def _try_all(container: Container) -> Report:
 
 
 def _install(container: Container) -> None:
-    """As on a Pi, but for the network."""
+    """Install fishd as on a Pi, without a network."""
     progress("installing fishd")
     pip = ["PIP_NO_INDEX=1", "PIP_FIND_LINKS=/root/wheels", "FISHD_GPIO=none"]
-    for _ in range(2):  # the second time, everything is there already
+    for _ in range(2):  # the second run finds everything installed
         container.run("env", *pip, "make", "-C", "/root/fishd", "install-pi")
 
 
 def _uninstall(container: Container) -> None:
-    """It stops a fish that swims, and leaves the configuration, which was edited."""
+    """Uninstall fishd, which stops a swimming fish and keeps the edited configuration."""
     container.run("systemctl", "start", "fishd")
     container.run("make", "-C", "/root/fishd", "uninstall-pi")
     left = [path for path in ("opt/fishd", UNIT) if (container.root / path).exists()]
@@ -90,7 +90,7 @@ def _configure(container: Container, limits: bool) -> None:
 
 
 def _may_raise_limits() -> bool:
-    """Whether systemd in the container will be able to grant LimitRTPRIO; some machines forbid."""
+    """Return whether systemd in the container can grant LimitRTPRIO, which some machines forbid."""
     try:
         resource.setrlimit(resource.RLIMIT_RTPRIO, (50, 50))
     except (OSError, ValueError):

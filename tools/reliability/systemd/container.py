@@ -1,4 +1,4 @@
-"""A Debian that runs from a root folder, with a systemd of its own; and what its journal says."""
+"""Debian container in a root folder, with a separate systemd, and its journal."""
 
 import contextlib
 import json
@@ -10,28 +10,28 @@ from typing import NamedTuple
 
 from common.report import BrokenPromise
 
-PATIENCE = 30.0
-"""How long anything may take [s]."""
+TIMEOUT_S = 30.0
+"""Timeout of every operation [s]."""
 _ENVIRONMENT = ("env", "-i", "LANG=C.UTF-8", "PATH=/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin")
 
 
 class Entry(NamedTuple):
-    """A line of the journal."""
+    """Line of the journal."""
 
     time: float
-    """[s], on the monotonic clock that the container shares with this machine."""
+    """Time on the monotonic clock that the container shares with this machine [s]."""
     unit: str
     message: str
 
 
 class Container:
-    """Boots on entering and is shut down on leaving, whatever happens."""
+    """Container that boots at the start of the context, and is always shut down at its end."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
 
     def __enter__(self) -> "Container":
-        # No registration and no scope of its own: both would need a systemd on this machine.
+        # No registration and no scope: both would need a systemd on this machine.
         options = ["--register=no", "--keep-unit", "--private-network", "--resolv-conf=off"]
         options += ["--console=read-only", "--capability=CAP_IPC_LOCK"]
         self._console = (self.root.parent / "console.log").open("wb")
@@ -50,16 +50,16 @@ class Container:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._nspawn.terminate()  # it shuts its systemd down
+        self._nspawn.terminate()  # this shuts down its systemd
         try:
-            self._nspawn.wait(PATIENCE)
+            self._nspawn.wait(TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._nspawn.kill()
             self._nspawn.wait()
         self._console.close()
 
     def run(self, *command: str, check: bool = True) -> str:
-        """Run a command inside; its output. Raises `BrokenPromise` when it fails."""
+        """Run a command inside, and return its output; raises `BrokenPromise` when it fails."""
         done = subprocess.run(
             self.command(*command), capture_output=True, text=True, check=False, timeout=300
         )
@@ -68,33 +68,33 @@ class Container:
         return done.stdout.strip()
 
     def command(self, *command: str) -> list[str]:
-        """What runs a command inside, from outside."""
+        """Return the command line that runs a command inside."""
         namespaces = ["--mount", "--uts", "--ipc", "--net", "--pid"]
         return ["nsenter", f"--target={self._leader}", *namespaces, *_ENVIRONMENT, *command]
 
     def show(self, unit: str, name: str) -> str:
-        """A property of a unit."""
+        """Return a property of a unit."""
         return self.run("systemctl", "show", "--property", name, "--value", unit)
 
     def journal(self, since: float) -> list[Entry]:
-        """What systemd has said about fishd and what fishd has said, from a time [s] on."""
+        """Return the journal of systemd about fishd and of fishd, from a time [s] on."""
         self.run("journalctl", "--sync")
         units = ["--unit=fishd.service", "--unit=fishd-failure.service"]
         lines = self.run("journalctl", "--output=json", "--no-pager", *units).splitlines()
-        found = []
+        entries = []
         for fields in map(json.loads, lines):
             at = int(fields["__MONOTONIC_TIMESTAMP"]) * 1e-6
             unit = fields.get("UNIT") or fields.get("_SYSTEMD_UNIT", "")
             if at >= since and isinstance(fields["MESSAGE"], str):
-                found.append(Entry(at, unit, fields["MESSAGE"]))
-        return found
+                entries.append(Entry(at, unit, fields["MESSAGE"]))
+        return entries
 
     def _has_leader(self) -> bool:
         if self._nspawn.poll() is not None:
             raise BrokenPromise(f"systemd-nspawn ended; see {self._console.name}")
         children = Path(f"/proc/{self._nspawn.pid}/task/{self._nspawn.pid}/children").read_text()
         for child in children.split():
-            # Children that only prepare the container end again.
+            # Children that only prepare the container end by themselves.
             with contextlib.suppress(OSError):
                 status = Path(f"/proc/{child}/status").read_text()
                 if "Name:\tsystemd\n" in status:
@@ -106,8 +106,8 @@ class Container:
         return self.run("systemctl", "is-system-running", check=False) in ("running", "degraded")
 
 
-def wait_for(condition: Callable[[], bool], otherwise: str, patience: float = PATIENCE) -> float:
-    """Wait until it holds and return the time [s]; raises `BrokenPromise` with `otherwise`."""
+def wait_for(condition: Callable[[], bool], otherwise: str, patience: float = TIMEOUT_S) -> float:
+    """Wait for a condition, and return the time [s]; raises `BrokenPromise` with `otherwise`."""
     deadline = time.monotonic() + patience
     while time.monotonic() < deadline:
         if condition():

@@ -1,4 +1,4 @@
-"""The root folder of a small Debian with fishd's checkout and its wheels in it, ready to boot."""
+"""Root folder of a small Debian with fishd's checkout and its wheels, ready to boot."""
 
 import os
 import shutil
@@ -10,15 +10,15 @@ from common.report import progress
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 _SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
-"""Debian's release with the same Python as this one, so that wheels of compiled code fit."""
+"""Debian's release with the same Python as this one, so that binary wheels are compatible."""
 _TOOLS = {"debootstrap": "debootstrap", "systemd-nspawn": "systemd-container", "git": "git"}
 _PACKAGES = "systemd,systemd-sysv,dbus,make,python3,python3-venv"
 
 
 def check_machine(base: Path | None) -> None:
-    """Raise SystemExit when a root folder could not be made or booted here.
+    """Raise SystemExit when a root folder cannot be made or booted here.
 
-    base: as for `build`; what makes it is not needed where it is there
+    base: as for `build`; the tools that make it are not required where it exists
     """
     if os.geteuid() != 0:
         raise SystemExit("to boot a root folder needs root: sudo make trial-systemd")
@@ -37,7 +37,7 @@ def check_machine(base: Path | None) -> None:
 def build(work: Path, base: Path | None) -> Path:
     """Make the folder `work`/root and return it.
 
-    base: keeps the bare Debian from one trial to the next; made when it is not there
+    base: folder that keeps the bare Debian between trials; made when it does not exist
     """
     root = work / "root"
     if base is None:
@@ -73,17 +73,17 @@ def _debootstrap(folder: Path) -> None:
 
 
 def _wheels(folder: Path) -> None:
-    """Everything that installing fishd takes: there is no network inside."""
+    """Collect all wheels of the installation, which runs without a network."""
     progress("collecting wheels")
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
     wanted = [f"{CHECKOUT}[{core_extras()}]", "hatchling"]
     subprocess.run([*pip, "wheel", "--wheel-dir", folder, *wanted], check=True)
     for own in folder.glob("fishd-*.whl"):
-        own.unlink()  # the installation builds its own
+        own.unlink()  # the installation builds this wheel itself
 
 
 def core_extras() -> str:
-    """What the installation will ask for, in its own words."""
+    """Return the extras that the installation installs, read from its script."""
     script = 'source "$0/tools/install_pi.sh"; core_extras $(about_python "$1")'
     command = ["bash", "-c", script, str(CHECKOUT), sys.executable]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -1,4 +1,4 @@
-"""What is tried on the booted system, and what must come of it.
+"""Trials on the booted system, and their required results.
 
 Each trial returns a row of the report; raises `BrokenPromise` where a promise of fishd is not kept.
 """
@@ -32,21 +32,21 @@ _UNIT = "fishd.service"
 
 
 class Row(NamedTuple):
-    """One trial; times [s] count from what was done to the daemon."""
+    """Result of one trial; times count from the action on the daemon [s]."""
 
     what: str
     neutral: float | None
     off: float | None
     again: float | None
-    """Until the restarted daemon was ready."""
+    """Time until the restarted daemon was ready."""
     outcome: str
 
 
 class Rig:
-    """The container with fishd and its virtual Pi, and the pulses that reach the servo."""
+    """Container with fishd and its virtual Pi, and the pulses at the servo."""
 
     def __init__(self, container: Container, pulses: Path) -> None:
-        """pulses: the file that watch_pulses.py writes"""
+        """pulses: file that watch_pulses.py writes"""
         self.container = container
         self._pulses = pulses
 
@@ -55,7 +55,7 @@ class Rig:
         return self.container.run("systemctl", *words, check=check)
 
     def swim(self) -> None:
-        """Have a fresh fishd that swims, whatever was before."""
+        """Restart fishd, and make it swim."""
         self.systemctl("stop", _UNIT, check=False)
         self.systemctl("reset-failed", _UNIT, "fishd-failure.service", check=False)
         begun = time.monotonic()
@@ -66,32 +66,32 @@ class Rig:
             raise BrokenPromise(f"the fish does not swim: {', '.join(faults) or 'no pulses'}")
 
     def pulse(self) -> float:
-        """The pulse of now [us]; 0: none."""
+        """Return the current pulse [us]; 0: none."""
         return self.pulses()[-1][1]
 
     def pulses(self) -> list[tuple[float, float]]:
-        """Time [s] and pulse [us] at each change."""
+        """Return time [s] and pulse [us] at each change."""
         lines = self._pulses.read_text().splitlines(keepends=True)
         return [(float(t), float(p)) for t, p in (x.split() for x in lines if x.endswith("\n"))]
 
     def signal(self, name: str) -> float:
-        """Send a signal to the daemon; when [s]."""
+        """Send a signal to the daemon, and return its time [s]."""
         now = time.monotonic()
         self.systemctl("kill", "--kill-whom=main", f"--signal={name}", _UNIT)
         return now
 
     def when(self, since: float, words: str, unit: str = _UNIT) -> float:
-        """Time from `since` until the journal has a line with these words; waits for it [s]."""
+        """Wait for a line with these words in the journal; return its time after `since` [s]."""
 
-        def found() -> list[Entry]:
+        def matching_entries() -> list[Entry]:
             entries = self.container.journal(since)
             return [e for e in entries if words in e.message and e.unit == unit]
 
-        wait_for(lambda: bool(found()), f"the journal does not say '{words}'")
-        return found()[0].time - since
+        wait_for(lambda: bool(matching_entries()), f"the journal does not say '{words}'")
+        return matching_entries()[0].time - since
 
-    def settled(self, since: float) -> tuple[float, float]:
-        """Time from `since` until the servo was neutral for good, and until its pulses ended."""
+    def time_pulses(self, since: float) -> tuple[float, float]:
+        """Return the times from `since` until the servo stayed neutral and its pulses ended."""
         wait_for(lambda: any(t > since and p == 0 for t, p in self.pulses()), "pulses go on")
         changes = [(t, p) for t, p in self.pulses() if t > since]
         last = next(i for i, (_, pulse) in enumerate(changes) if pulse == 0)
@@ -101,7 +101,7 @@ class Rig:
 
 
 def start(rig: Rig) -> Row:
-    """From the start of the unit to READY=1, which the first tick sends."""
+    """Start the unit until READY=1, which the first tick sends."""
     rig.systemctl("stop", _UNIT)
     begun = time.monotonic()
     rig.systemctl("start", _UNIT)
@@ -118,28 +118,30 @@ def check_scheduling(status: str) -> None:
 
 
 def stop(rig: Rig) -> Row:
-    """SIGTERM: fade, release, done."""
+    """Stop the unit by SIGTERM: fade, release, end."""
     begun = time.monotonic()
     rig.systemctl("stop", _UNIT)
     ended = rig.when(begun, "Stopped fishd.service")
     if rig.container.show(_UNIT, "Result") != "success":
         raise BrokenPromise("a clean stop counts as a failure")
-    return Row("`systemctl stop`", *rig.settled(begun), None, f"stopped after {ended:.2f} s")
+    return Row("`systemctl stop`", *rig.time_pulses(begun), None, f"stopped after {ended:.2f} s")
 
 
 def killed(rig: Rig) -> Row:
-    """kill -9: the script in pigpiod, then ExecStopPost, then a restart."""
-    return _survived(rig, "kill −9", rig.signal("SIGKILL"), "Main process exited", "ended")
+    """Kill fishd by SIGKILL: the script in pigpiod acts, then ExecStopPost, then a restart."""
+    return _check_restart(rig, "kill −9", rig.signal("SIGKILL"), "Main process exited", "ended")
 
 
 def hung(rig: Rig) -> Row:
-    """A process that stands still: nothing feeds the watchdog."""
-    return _survived(rig, "hang (SIGSTOP)", rig.signal("SIGSTOP"), "Watchdog timeout", "watchdog")
+    """Stop the process, so that nothing feeds the watchdog."""
+    return _check_restart(
+        rig, "hang (SIGSTOP)", rig.signal("SIGSTOP"), "Watchdog timeout", "watchdog"
+    )
 
 
-def _survived(rig: Rig, what: str, begun: float, sign: str, name: str) -> Row:
+def _check_restart(rig: Rig, what: str, begun: float, sign: str, name: str) -> Row:
     noticed = rig.when(begun, sign)
-    neutral, off = rig.settled(begun)
+    neutral, off = rig.time_pulses(begun)
     again = rig.when(begun, "Started fishd.service")
     if neutral > NEUTRAL_LIMIT:
         raise BrokenPromise(
@@ -149,7 +151,7 @@ def _survived(rig: Rig, what: str, begun: float, sign: str, name: str) -> Row:
 
 
 def killed_again_and_again(rig: Rig) -> Row:
-    """A daemon that always dies is given up, and the failure unit says so."""
+    """Kill fishd until systemd gives up, which the failure unit reports."""
     begun = time.monotonic()
     while (state := rig.container.show(_UNIT, "ActiveState")) != "failed":
         if time.monotonic() > begun + 120:
@@ -170,7 +172,7 @@ def killed_again_and_again(rig: Rig) -> Row:
 
 
 def wrong_config(rig: Rig) -> Row:
-    """Exit status 78, once; the failure unit says so."""
+    """Start with a wrong configuration: exit status 78, once, which the failure unit reports."""
     config = rig.container.root / CONFIG
     good = config.read_text()
     rig.systemctl("stop", _UNIT)

@@ -1,4 +1,4 @@
-"""Runs inside the container: writes each change of the virtual Pi's servo pulses, with its time."""
+"""Program in the container that writes the changes of the virtual Pi's servo pulses."""
 
 import contextlib
 import sys
@@ -7,11 +7,12 @@ from pathlib import Path
 
 from fishd.virtual.pi.link import RemotePi
 
-PERIOD = 0.005  # [s]
+PERIOD = 0.005
+"""Time between two checks of the pulses [s]."""
 
 
 def main() -> None:
-    """Arguments: the socket of the virtual Pi. Ends with the virtual Pi."""
+    """Watch until the virtual Pi ends; argument of the command: socket of the virtual Pi."""
     last = -1.0
     with contextlib.suppress(OSError), RemotePi(Path(sys.argv[1])) as pi:
         while True:
