@@ -34,33 +34,41 @@ def purpose(room: Path) -> str:
     return docstring.partition("\n")[0]
 
 
-def arrows(folder: Path = FISHD) -> set[tuple[str, str]]:
-    """Return every pair of rooms of which the first imports the second."""
-    room_paths = rooms(folder)
-    by_module = {path.stem: name for name, path in room_paths.items()}
+def arrows() -> set[tuple[str, str]]:
+    """Return each pair of rooms of which the first imports the second."""
+    names = {path.stem: name for name, path in rooms().items()}
     pairs = {
-        (name, by_module[imported])
-        for name, path in room_paths.items()
-        for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])
-        for imported in _imported(ast.parse(file.read_text(encoding="utf-8")), folder.name)
-        if imported in by_module
+        (module.split(".")[1], imported.split(".")[1])
+        for module, others in imports().items()
+        for imported in others
     }
-    return {(one, other) for one, other in pairs if one != other}
+    return {(names[one], names[other]) for one, other in pairs if one != other and one in names}
 
 
-def _imported(tree: ast.Module, package: str) -> Iterator[str]:
-    """Return the names after that of the package in all imports."""
+def imports() -> dict[str, set[str]]:
+    """Return the other modules of fishd that each module imports, anywhere in its file."""
+    files = {_module_name(path): path for path in FISHD.rglob("*.py")}
+    del files["fishd"]  # its version, which every module may import
+    graph = {}
+    for module, path in files.items():
+        names = _imported_names(ast.parse(path.read_text(encoding="utf-8")))
+        modules = {name if name in files else name.rpartition(".")[0] for name in names}
+        graph[module] = modules & files.keys() - {module}
+    return graph
+
+
+def _module_name(file: Path) -> str:
+    parts = file.relative_to(FISHD.parent).with_suffix("").parts
+    return ".".join(parts).removesuffix(".__init__")
+
+
+def _imported_names(tree: ast.Module) -> Iterator[str]:
+    """Yield the dotted name of whatever is imported: of modules, and of what is in them."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and not node.level:
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-        else:
-            continue
-        for name in names:
-            first, *rest = name.split(".")
-            if first == package and rest:
-                yield rest[0]
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def layers() -> list[str]:

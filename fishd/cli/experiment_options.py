@@ -13,7 +13,7 @@ from msgspec import to_builtins
 from msgspec.structs import replace
 
 from fishd.cli.config import config_option, set_option
-from fishd.cli.options import F, endpoint_option, take_option, verb_lease
+from fishd.cli.options import ControllerGroup, F, endpoint_option, take_option, verb_lease
 from fishd.cli.output import echo
 from fishd.config import Config, Start, load
 from fishd.core.addresses import ENDPOINT_VARIABLE, find_control_address, socket_path
@@ -303,6 +303,10 @@ class Resumable(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments after those of the resumed experiment."""
         return super().parse_args(ctx, restore_arguments(ctx, args))
+
+
+class ResumableGroup(Resumable, ControllerGroup):
+    """The same, for a verb whose sub-commands are the controllers."""
 
 
 class ExperimentEnding:

@@ -16,11 +16,11 @@ from fishd.cli.experiment_options import (
     ChosenFish,
     ExperimentEnding,
     ExperimentFolder,
+    ResumableGroup,
     fish_choice,
     folder_options,
 )
 from fishd.cli.options import (
-    ControllerGroup,
     FiniteRange,
     ParameterType,
     json_option,
@@ -93,7 +93,7 @@ def optimise_options(function: Any) -> Any:
     return function
 
 
-@click.group(cls=ControllerGroup, options=optimise_options, remote=True, resumable=True)
+@click.group(cls=ResumableGroup, options=optimise_options, remote=True)
 def optimise() -> None:
     """Search the parameters of a controller that give the most thrust, in a minute of swimming.
 

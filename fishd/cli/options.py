@@ -291,11 +291,9 @@ class ControllerGroup(click.Group):
         options: Callable[[F], F],
         remote: bool = False,
         several: bool = False,
-        resumable: bool = False,
         **kwargs: Any,
     ) -> None:
         """
-        resumable: the verb has `--resume`
         options: decorator that adds the verb's own options to each sub-command
         several: `square,sine` is a sub-command, too; each parameter takes several values
         """
@@ -303,7 +301,6 @@ class ControllerGroup(click.Group):
         self.options_metavar = ""
         self.subcommand_metavar = "CONTROLLER [OPTIONS]"
         self._options = options
-        self._resumable = resumable
         self._remote = remote
         self._several = several
         self._action: Callable[..., Any] = lambda: None
@@ -317,11 +314,7 @@ class ControllerGroup(click.Group):
         return function
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse `square:frequency=1.7,amplitude=0.3`, and the arguments of a resumed experiment."""
-        if self._resumable:
-            from fishd.cli.experiment_options import restore_arguments
-
-            args = restore_arguments(ctx, args)
+        """Parse `square:frequency=1.7,amplitude=0.3`."""
         if args and ":" in args[0] and not args[0].startswith("-"):
             from fishd.controllers import registry
 

@@ -12,10 +12,11 @@ from fishd.cli.experiment_options import (
     ChosenFish,
     ExperimentEnding,
     ExperimentFolder,
+    ResumableGroup,
     fish_choice,
     folder_options,
 )
-from fishd.cli.options import ControllerGroup, FiniteRange, for_option, json_option, plot_option
+from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, warn_of_fin
 from fishd.cli.progress import show_progress
 from fishd.config import Config
@@ -76,7 +77,7 @@ def sweep_options(function: Any) -> Any:
     return function
 
 
-@click.group(cls=ControllerGroup, options=sweep_options, remote=True, several=True, resumable=True)
+@click.group(cls=ResumableGroup, options=sweep_options, remote=True, several=True)
 def sweep() -> None:
     """Measure thrust over a grid of parameters; write a table, recordings and a picture.
 

@@ -6,14 +6,11 @@ import socket
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, Self
 
 from fishd.core import text
 from fishd.core.errors import FishError, LeaseLost
 from fishd.core.protocol import Grant, State
-
-if TYPE_CHECKING:
-    from fishd.client.synchronous import Fish
 
 log = logging.getLogger(__name__)
 
@@ -21,6 +18,20 @@ RENEWALS_PER_LEASE = 5
 """Number of renewals during the duration of a lease."""
 MIN_BUSY_FRACTION = 0.02
 """Fraction of the time of a processor above which a thread counts as computing."""
+
+
+class LeaseConnection(Protocol):
+    """The part of `Fish` that the renewal of a lease needs."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def renew_lease(self, lease: str) -> State:
+        """Restart the full duration of a lease."""
+
+    def end_lease(self, lease: str) -> State:
+        """Return the fish."""
 
 
 class LeaseRenewal(threading.Thread):
@@ -32,7 +43,7 @@ class LeaseRenewal(threading.Thread):
     """
 
     def __init__(
-        self, connect: Callable[..., "Fish"], grant: Grant, idle_limit: float | None
+        self, connect: Callable[..., LeaseConnection], grant: Grant, idle_limit: float | None
     ) -> None:
         """connect: opens a connection with a timeout [s]; idle_limit: None for no limit [s]"""
         super().__init__(name="lease", daemon=True)
@@ -71,7 +82,7 @@ class LeaseRenewal(threading.Thread):
         self._stopping.set()
         self.join()
 
-    def _judge(self, fish: "Fish", state: State) -> None:
+    def _judge(self, fish: LeaseConnection, state: State) -> None:
         """Return the fish if it swims while the program is idle."""
         now, computed = time.monotonic(), self._cpu_seconds()
         busy = computed - self._computed > MIN_BUSY_FRACTION * (now - self._looked)

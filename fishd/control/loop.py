@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from msgspec import Struct
+from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
 from fishd.control.active_controller import ActiveController, Successor, fault_and_successor
@@ -29,7 +29,7 @@ from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock, Slot
 from fishd.core.errors import ControllerFault, FishLost, Refused, SensorError
 from fishd.core.foreign_code import call_foreign
-from fishd.core.signals import Measurement, Observation
+from fishd.core.signals import Measurement, Observation, Tick
 from fishd.hardware.base import Robot
 
 if TYPE_CHECKING:
@@ -99,7 +99,9 @@ class ControlLoop:
         self._estimator = estimator
         self.found_leak = estimator.found_leak
         """Leak time of the estimator at the latest tick [s]; None unless the estimator finds it."""
-        self._now = clock.monotonic
+        self._now, self._wall = clock.monotonic, clock.wall
+        self._publisher = publisher
+        self._mode = self.supervisor.mode.value
         self._notify = notify
         self._budget = UPDATE_BUDGET * limits.tick
         self._trusted = Measurement(clock.monotonic(), 0.0, 0.0, 0)
@@ -166,8 +168,8 @@ class ControlLoop:
         updated = self._now()
         self._write(neutral=not moved and self.has_settled)
         written = self._now()
-        if self.reporter.publishes:
-            self._publish(turn, written)
+        if self._publisher is not None:
+            self._publish(self._publisher, turn, written)
         marks = (started, read, estimated, updated, written, self._now())
         late = self.statistics.add(self.seq, slot.now - slot.deadline, slot.missed, marks)
         if late:
@@ -285,6 +287,7 @@ class ControlLoop:
         if mode is not Mode.RUNNING:
             self.active.activate_hold()
             self._estimator.rest()
+        self._mode = mode.value
         self.reporter.mode(before, mode, self.supervisor.reason)
 
     def _fail(self, code: str, what: str, error: Exception) -> None:
@@ -456,8 +459,67 @@ class ControlLoop:
                 )
                 self.reporter.event("servo", message, "error")
 
-    def _publish(self, turn: Turn, now: float) -> None:
+    def _publish(self, publisher: Publisher, turn: Turn, now: float) -> None:
         try:
-            self.reporter.tick(self, turn, now)
+            publisher.tick(self._record(turn, now))
         except Exception as error:
             self._fail("publish-error", "telemetry cannot be published", error)
+
+    def _record(self, turn: Turn, now: float) -> Tick:
+        """Return the record of a tick; all its fields are filled here.
+
+        now: time after the servo was driven [s, monotonic]
+        """
+        slot, measurement, observation, power = (
+            turn.slot,
+            turn.measurement,
+            turn.observation,
+            turn.power,
+        )
+        thrust, thrust_ci95 = self.known_thrust
+        extremes = measurement.extremes
+        swims = self.supervisor.mode is Mode.RUNNING
+        factor = observation.thrust_factor if swims else None
+        factor_ci95 = observation.thrust_factor_error if swims else None
+        truth = self.robot.truth() if self.robot.truth else None
+        course = truth.course if truth else None
+        corrected = self.fy_corrected
+        return Tick(
+            t=self._wall(),
+            seq=self.seq,
+            mode=self._mode,
+            controller=self.active.name,
+            fx=measurement.fx,
+            fy=measurement.fy,
+            fy_rate=-observation.fy_rate if corrected else observation.fy_rate,
+            fin_velocity=observation.fin_velocity,
+            phi_c=self.applied,
+            servo_on=self.servo.on,
+            thrust=thrust,
+            thrust_error=UNSET if thrust_ci95 is None else thrust_ci95,
+            frequency=observation.frequency,
+            samples=measurement.samples,
+            fx_min=extremes.fx_min if extremes else UNSET,
+            fx_max=extremes.fx_max if extremes else UNSET,
+            fy_min=extremes.fy_min if extremes else UNSET,
+            fy_max=extremes.fy_max if extremes else UNSET,
+            age_ms=(slot.now - measurement.time) * 1e3,
+            lateness_us=(slot.now - slot.deadline) * 1e6,
+            busy_us=(now - turn.marks[0]) * 1e6,
+            missed=self.statistics.missed,
+            alpha=truth.alpha if truth else UNSET,
+            alpha_rate=truth.alpha_rate if truth else UNSET,
+            phi=truth.phi if truth else UNSET,
+            quantities=self.active.quantities or UNSET,
+            time=observation.time,
+            x=course.x if course else UNSET,
+            y=course.y if course else UNSET,
+            speed=course.speed if course else UNSET,
+            heading=course.heading if course else UNSET,
+            thrust_factor=UNSET if factor is None else factor,
+            thrust_factor_error=UNSET if factor_ci95 is None else factor_ci95,
+            power=UNSET if power is None else power,
+            leak=UNSET if self.found_leak is None else self.found_leak,
+            fy_corrected=True if corrected else UNSET,
+            suspect=text.line(measurement.suspect) if measurement.suspect else UNSET,
+        )

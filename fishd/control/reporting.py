@@ -1,10 +1,8 @@
-"""The output of the loop to the outside: the record of each tick, and events."""
+"""The output of the loop to the outside: its publisher, and the report of events."""
 
 import logging
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Protocol
-
-from msgspec import UNSET
+from typing import Any, Protocol
 
 from fishd.control.supervisor import Mode
 from fishd.core import text
@@ -12,9 +10,6 @@ from fishd.core.clock import Clock
 from fishd.core.errors import FishdError
 from fishd.core.schema import format_values
 from fishd.core.signals import Event, EventKind, Level, Reason, Tick
-
-if TYPE_CHECKING:
-    from fishd.control.loop import ControlLoop, Turn
 
 log = logging.getLogger(__name__)
 
@@ -30,16 +25,13 @@ class Publisher(Protocol):
 
 
 class Reporter:
-    """Adds the wall-clock time to ticks and events, and passes them to the publisher."""
+    """Logs the events of the loop, and passes them to the publisher with the wall-clock time."""
 
     def __init__(self, clock: Clock, publisher: Publisher | None) -> None:
-        """publisher: None where ticks and events have no reader; events are logged nevertheless"""
-        self.publishes = publisher is not None
-        """Whether the records of ticks have a reader."""
+        """publisher: None where events have no reader; they are logged nevertheless"""
         self._clock = clock
         self._publisher = publisher
         self._latest_problem = ""
-        self._mode = Mode.IDLE.value
 
     def event(self, kind: EventKind, message: str, level: Level = "info", **data: Any) -> None:
         """Publish and log an event; never raises, so that a report cannot cause another problem."""
@@ -88,7 +80,6 @@ class Reporter:
 
     def mode(self, before: Mode, mode: Mode, reason: Reason | None) -> None:
         """Report a change of mode and its reason; mode fault gives an event of kind `fault`."""
-        self._mode = mode.value
         if mode is Mode.FAULT:
             assert reason is not None
             message = f"{reason.code}: {reason.message}"
@@ -106,68 +97,6 @@ class Reporter:
             log.error("%s", line, exc_info=None if isinstance(error, FishdError) else error)
         self._latest_problem = line
         return line
-
-    def tick(self, loop: "ControlLoop", turn: "Turn", now: float) -> None:
-        """Publish the record of a tick; all its fields are filled here.
-
-        now: time after the servo was driven [s, monotonic]
-        """
-        assert self._publisher
-        slot, measurement, observation, power = (
-            turn.slot,
-            turn.measurement,
-            turn.observation,
-            turn.power,
-        )
-        thrust, thrust_ci95 = loop.known_thrust
-        extremes = measurement.extremes
-        swims = loop.supervisor.mode is Mode.RUNNING
-        factor = observation.thrust_factor if swims else None
-        factor_ci95 = observation.thrust_factor_error if swims else None
-        truth = loop.robot.truth() if loop.robot.truth else None
-        course = truth.course if truth else None
-        corrected = loop.fy_corrected
-        self._publisher.tick(
-            Tick(
-                t=self._clock.wall(),
-                seq=loop.seq,
-                mode=self._mode,
-                controller=loop.active.name,
-                fx=measurement.fx,
-                fy=measurement.fy,
-                fy_rate=-observation.fy_rate if corrected else observation.fy_rate,
-                fin_velocity=observation.fin_velocity,
-                phi_c=loop.applied,
-                servo_on=loop.servo.on,
-                thrust=thrust,
-                thrust_error=UNSET if thrust_ci95 is None else thrust_ci95,
-                frequency=observation.frequency,
-                samples=measurement.samples,
-                fx_min=extremes.fx_min if extremes else UNSET,
-                fx_max=extremes.fx_max if extremes else UNSET,
-                fy_min=extremes.fy_min if extremes else UNSET,
-                fy_max=extremes.fy_max if extremes else UNSET,
-                age_ms=(slot.now - measurement.time) * 1e3,
-                lateness_us=(slot.now - slot.deadline) * 1e6,
-                busy_us=(now - turn.marks[0]) * 1e6,
-                missed=loop.statistics.missed,
-                alpha=truth.alpha if truth else UNSET,
-                alpha_rate=truth.alpha_rate if truth else UNSET,
-                phi=truth.phi if truth else UNSET,
-                quantities=loop.active.quantities or UNSET,
-                time=observation.time,
-                x=course.x if course else UNSET,
-                y=course.y if course else UNSET,
-                speed=course.speed if course else UNSET,
-                heading=course.heading if course else UNSET,
-                thrust_factor=UNSET if factor is None else factor,
-                thrust_factor_error=UNSET if factor_ci95 is None else factor_ci95,
-                power=UNSET if power is None else power,
-                leak=UNSET if loop.found_leak is None else loop.found_leak,
-                fy_corrected=True if corrected else UNSET,
-                suspect=text.line(measurement.suspect) if measurement.suspect else UNSET,
-            )
-        )
 
 
 def _format_parameters(parameters: Mapping[str, Any], units: Mapping[str, str]) -> str:

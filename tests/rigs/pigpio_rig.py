@@ -1,7 +1,7 @@
 """What tests of the pigpio servo are built from: an emulated pigpiod, and servos on it."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -57,6 +57,11 @@ class Bench:
         )
         self._stack.callback(self._close, servo)
         return servo
+
+    def link(self, prepare: Callable[[Client], None]) -> PigpioLink:
+        settings = self.settings()
+        address = settings.host, settings.port
+        return PigpioLink(address, settings.timeout, SystemClock(), prepare, threaded=True)
 
     def last_resort(self, neutral: float = 1500.0) -> bool:
         """What another process does when fishd is dead."""

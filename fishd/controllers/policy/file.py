@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fishd.controllers.policy import checksum, library, operators, size_check
+from fishd.controllers.policy import checksum, operators, size_check
 from fishd.controllers.policy.card import KEY, Card, decode
 from fishd.controllers.policy.size_check import EXPORT, NOT_ONNX
 from fishd.core import files
@@ -48,7 +48,7 @@ def read(path: Path) -> PolicyFile:
     except files.NoFile as problem:
         raise PolicyError(f"{path}: {problem}{_why_hidden(path)}") from None
     except (files.FileProblem, PolicyError) as problem:
-        raise PolicyError(f"{path}: {library.of_run(path) or problem}") from None
+        raise PolicyError(f"{path}: {problem}") from None
 
 
 def parse(content: bytes) -> Card:

@@ -38,10 +38,13 @@ def names() -> list[str]:
 def find(text: str) -> Path:
     """The file of a policy: `text` is its name, or a path, as it has a slash or ends in .onnx.
 
-    Raises `PolicyError` for an unknown name; a path is not checked here.
+    Raises `PolicyError` for an unknown name, and for the folder of a training.
     """
     if names_file(text, SUFFIX):
-        return files.expand_user(text)
+        path = files.expand_user(text)
+        if run := of_run(path):
+            raise PolicyError(f"{path}: {run}")
+        return path
     known = _files()
     if text not in known:
         if run := of_run(Path(text)):

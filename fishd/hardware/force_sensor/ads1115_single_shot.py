@@ -1,14 +1,11 @@
 """ADS1115 through its Adafruit driver, with single-shot mode made safe and cheap."""
 
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from adafruit_ads1x15 import ADS1115, AnalogIn, ads1x15
 
 from fishd.core.clock import Clock
-
-if TYPE_CHECKING:
-    from fishd.hardware.force_sensor.ads1115 import Ads1115Settings, Channel
 
 MAX_CONVERSION_PERIODS, CONVERSION_TIMEOUT_PERIODS = 1.1, 1.25
 """Longest time of a conversion, and time after which it has failed, as multiples of 1/data rate."""
@@ -23,22 +20,28 @@ _GAINS = {6.144: 2 / 3, 4.096: 1, 2.048: 2, 1.024: 4, 0.512: 8, 0.256: 16}
 class SingleShot(ADS1115):  # type: ignore[misc]
     """The Adafruit driver, changed to sleep while the chip converts and to wait with a timeout."""
 
-    def __init__(self, bus: Any, settings: "Ads1115Settings", clock: Clock) -> None:
-        """Find the chip on a bus and set it up; raise OSError if that fails."""
+    def __init__(
+        self, bus: Any, address: int, full_scale: float, data_rate: int, clock: Clock
+    ) -> None:
+        """Find the chip on a bus and set it up; raise OSError if that fails.
+
+        full_scale: range of the inputs, ± this [V]
+        data_rate: number of conversions per second
+        """
         self._clock = clock
-        self._sleep = _WAKE_UP_S + MAX_CONVERSION_PERIODS / settings.data_rate
-        self._limit = CONVERSION_TIMEOUT_PERIODS / settings.data_rate
+        self._sleep = _WAKE_UP_S + MAX_CONVERSION_PERIODS / data_rate
+        self._limit = CONVERSION_TIMEOUT_PERIODS / data_rate
         self._pointer = bytearray(1)
         self._word = bytearray(2)
         try:
             super().__init__(
                 bus,
-                gain=_GAINS[settings.full_scale],
-                data_rate=settings.data_rate,
+                gain=_GAINS[full_scale],
+                data_rate=data_rate,
                 # It has no effect, as the comparator is off, but makes every config of fishd
                 # differ from that after a reset, so that a reset is detected.
                 comparator_mode=ads1x15.Comp_Mode.WINDOW,
-                address=settings.address,
+                address=address,
             )
         except ValueError as error:
             # The cause gets no name: its traceback refers to this frame, which would refer to it.
@@ -47,8 +50,8 @@ class SingleShot(ADS1115):  # type: ignore[misc]
                 raise
             raise OSError(number, os.strerror(number)) from None
 
-    def input(self, channel: "Channel") -> Any:
-        """Return an input; reading its `value` makes a conversion."""
+    def input(self, channel: str) -> Any:
+        """Return an input, such as `A0` or `A0-A1`; reading its `value` makes a conversion."""
         return AnalogIn(self, *(int(pin[1]) for pin in channel.split("-")))
 
     def check_idle(self) -> None:

@@ -77,7 +77,8 @@ class Pigpio(ServoDriver[PigpioSettings]):
         self._armed = 0.0  # time when the latest countdown that pigpiod confirmed was sent
         self._closed = False
         self._link = pigpio_link.PigpioLink(
-            self.settings,
+            (self.settings.host, self.settings.port),
+            self.settings.timeout,
             self.clock,
             self._prepare,
             threaded=self.threaded,

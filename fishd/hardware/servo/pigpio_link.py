@@ -4,7 +4,6 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 from fishd.core.clock import Clock
 from fishd.core.errors import ServoError
@@ -15,9 +14,6 @@ from fishd.hardware.servo.pigpio_client import (
     describe_error,
     pigpiod_at,
 )
-
-if TYPE_CHECKING:
-    from fishd.hardware.servo.pigpio import PigpioSettings
 
 START_TIMEOUT_S = 2.0
 """Longest time that a new link waits for its first connection [s]."""
@@ -44,7 +40,8 @@ class PigpioLink:
 
     def __init__(
         self,
-        settings: "PigpioSettings",
+        address: tuple[str, int],
+        timeout: float,
         clock: Clock,
         prepare: Callable[[Client], None],
         *,
@@ -53,6 +50,8 @@ class PigpioLink:
     ) -> None:
         """Wait up to 2 s for the first connection; without one, keep trying.
 
+        address: host and port of pigpiod
+        timeout: longest time that a session waits for pigpiod [s]
         prepare: function called with every new client before its use; if it raises, the client is
             closed
         threaded: connect in a separate thread; otherwise in `session`, at most once per 0.5 s of
@@ -64,8 +63,9 @@ class PigpioLink:
         """Number of connections after the first."""
         self.late_answers = 0
         """Number of sessions that ended without an answer in time."""
-        self._settings = settings
-        self._where = pigpiod_at(settings.host, settings.port)
+        self._address = address
+        self._timeout = timeout
+        self._where = pigpiod_at(*address)
         self._clock = clock
         self._prepare = prepare
         self._standstill = standstill
@@ -92,7 +92,7 @@ class PigpioLink:
     def session(
         self, *, may_be_late: Callable[[], bool] | None = None, last: bool = False
     ) -> Iterator[Client]:
-        """Return the client; all commands in the context share the time limit of the settings.
+        """Return the client; all commands in the context share the timeout of this link.
 
         may_be_late: function called when an answer is late; if it returns True, the next session
             waits for the answer, and the rest of this session is skipped without an error
@@ -100,7 +100,7 @@ class PigpioLink:
         Raises `ServoError` at once if not connected, and if a command fails. A failure ends the
         connection, except for late answers, up to two in a row.
         """
-        limit = ANSWER_TIMEOUT_S if last else self._settings.timeout
+        limit = ANSWER_TIMEOUT_S if last else self._timeout
         suffix = "" if last else "; reconnecting"
         real_limit = self._real_limit(limit)
         deadline = time.monotonic() + real_limit
@@ -174,7 +174,7 @@ class PigpioLink:
         time_limit = limit
         try:
             client = self._opening = Client(
-                self._settings.host, self._settings.port, self._real_limit(limit), self._standstill
+                *self._address, self._real_limit(limit), self._standstill
             )
             if self._closed.is_set():  # `close` may have run before `_opening` was set
                 raise ConnectionError("closed")

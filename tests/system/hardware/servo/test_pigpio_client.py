@@ -11,12 +11,10 @@ import pytest
 from rigs.pigpio_rig import Bench
 from rigs.processes import PATIENCE
 
-from fishd.core.clock import SystemClock
 from fishd.core.errors import ServoError
 from fishd.hardware.servo import pigpio_link
 from fishd.hardware.servo.pigpio import PigpioSettings
 from fishd.hardware.servo.pigpio_client import Client, open_client
-from fishd.hardware.servo.pigpio_link import PigpioLink
 
 
 class Server:
@@ -83,7 +81,7 @@ def test_the_thread_outlives_an_error_that_nobody_thought_of(bench: Bench) -> No
         if len(attempts) == 1:
             raise IndexError("out of range")
 
-    link = PigpioLink(bench.settings(), SystemClock(), prepare, threaded=True)
+    link = bench.link(prepare)
     assert link._connected.wait(PATIENCE)
     with contextlib.closing(link), link.session(last=True) as client:
         assert client is attempts[1]
@@ -112,7 +110,7 @@ def test_a_link_that_is_closed_while_it_connects_asks_for_nothing_more(
 
     monkeypatch.setattr(pigpio_link, "Client", Held)
     monkeypatch.setattr(pigpio_link, "START_TIMEOUT_S", 0.0)
-    link = PigpioLink(bench.settings(), SystemClock(), asked.append, threaded=True)
+    link = bench.link(asked.append)
     thread = link._thread
     assert thread
     assert connected.wait(PATIENCE)
