@@ -60,7 +60,7 @@ def show(ctx: click.Context, policy: str, endpoint: str | None, as_json: bool) -
     else:
         infos = {info.name: info for info in _list_policies(endpoint)}
         if policy not in infos:
-            raise PolicyError(library.unknown(policy, sorted(infos)))
+            raise PolicyError(library.unknown_name_message(policy, sorted(infos)))
         policy_info = infos[policy]
     if policy_info.card is None:
         raise PolicyError(f"{policy_info.file}: {policy_info.problem}")

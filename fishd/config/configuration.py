@@ -16,7 +16,7 @@ from msgspec import Meta, Struct
 from fishd.config import consistency as checks
 from fishd.config import drivers
 from fishd.control.estimators.base import EstimatorSettings
-from fishd.controllers.base import DWELL, LONGEST_DWELL, ChatterSettings, Limits
+from fishd.controllers.base import DEFAULT_DWELL_S, MAX_DWELL_S, ChatterSettings, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.overrides import apply_overrides
@@ -254,8 +254,8 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         if self.chatter.dwell != "auto":
             return self.chatter.dwell
         if not self.kind.is_tethered:  # it has muscles instead of a servo
-            return DWELL
-        shortest = min(shortest_dwell(self.plant, self.amplitude_limit), LONGEST_DWELL)
+            return DEFAULT_DWELL_S
+        shortest = min(shortest_dwell(self.plant, self.amplitude_limit), MAX_DWELL_S)
         return round(math.ceil(shortest / self.tick - 1e-9) * self.tick, 9)
 
 

@@ -135,7 +135,7 @@ def _wave_kind(
     if not isinstance(likeness, Likeness):
         return name, parameters
     return likeness.name, {
-        key: value for key, value in parameters.items() if key not in likeness.but_for
+        key: value for key, value in parameters.items() if key not in likeness.ignored_parameters
     }
 
 

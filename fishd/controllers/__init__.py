@@ -1,7 +1,7 @@
 """The controllers: an observation in, an instruction angle out.
 
-None of them looks at a clock, a socket or a file while the fish swims, but for `remote`, which
-waits for the answer of its agent. `policy/` reads its file before it takes over.
+None of them uses a clock, a socket or a file while the fish swims, except `remote`, which waits for
+the answer of its agent. `policy/` reads its file before it takes over.
 """
 
 from fishd.controllers.base import Amplitude, Controller, Limits, amplitude_of

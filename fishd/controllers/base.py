@@ -1,4 +1,4 @@
-"""What a controller is. docs/how-to/writing-a-controller.md works through an example."""
+"""Base class of controllers; docs/how-to/writing-a-controller.md has an example."""
 
 import math
 from abc import ABC, abstractmethod
@@ -11,19 +11,19 @@ from fishd.core.errors import ParameterError
 from fishd.core.schema import note, unit
 from fishd.core.signals import Observation
 
-DWELL, LONGEST_DWELL = 0.2, 2.0
-"""Of a fish whose servo is that of Fu et al., and the longest there may be [s]."""
+DEFAULT_DWELL_S, MAX_DWELL_S = 0.2, 2.0
+"""Dwell for the servo of Fu et al., and the largest permitted one [s]."""
 
 
 class ChatterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What becomes of a policy that reverses too fast."""
+    """Settings for a policy that reverses too fast."""
 
     dwell: Annotated[
-        Annotated[float, Meta(ge=0, le=LONGEST_DWELL)] | Literal["auto"],
+        Annotated[float, Meta(ge=0, le=MAX_DWELL_S)] | Literal["auto"],
         unit(
             "s",
-            "Shortest time between two reversals of ppo, in whole ticks, rounded up; those that "
-            "would come sooner are held back. 0 holds none back; auto: what the servo of section "
+            "Shortest time between two reversals of ppo, rounded up to whole ticks; earlier "
+            "reversals are held back. 0 holds none back; auto: the time that the servo of section "
             "plant takes for a reversal.",
         ),
     ] = "auto"
@@ -31,79 +31,80 @@ class ChatterSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         float,
         unit(
             "s",
-            "Time after which a policy that keeps reversing too fast loses command.",
+            "Time after which a policy that keeps reversing too fast is replaced.",
             ge=0.2,
             le=600,
             usual=60,
         ),
     ] = 2.0
     fallback: Annotated[
-        Literal["swing", "fault"], note("What comes then: swing takes over, or mode fault.")
+        Literal["swing", "fault"], note("Replacement: the controller swing, or mode fault.")
     ] = "swing"
 
 
 Amplitude = Annotated[float, Meta(gt=0, le=math.pi)] | None
-"""Type of a parameter `amplitude` [rad]; None for all that the robot grants: see `amplitude_of`."""
+"""Type of a parameter `amplitude` [rad]; None for the robot's limit: see `amplitude_of`."""
 
 
 class Limits(Struct, frozen=True):
-    """What the loop grants a controller."""
+    """Limits of the loop for a controller."""
 
     amplitude: float
     """Φ: commands beyond ±Φ are clamped by the guard [rad]."""
     tick: float
     """Period of the loop [s]."""
     scaled: bool = False
-    """The fin velocity is in rad/s, by the model of the fish, not up to an unknown scale."""
+    """Whether the fin velocity is in rad/s, from a model of the fish, not up to an unknown
+    scale."""
     virtual: bool = False
-    """Time stands still while a controller thinks, so it may wait for others as long as it must."""
-    dwell: float = DWELL
+    """Whether time stops during `update`, so that a controller may wait without limit."""
+    dwell: float = DEFAULT_DWELL_S
     """Shortest time between two reversals of a policy; 0 holds none back [s]."""
     chatter: ChatterSettings = ChatterSettings()
-    """What becomes of a policy that reverses too fast; the dwell that holds is the one above."""
+    """Settings for a policy that reverses too fast; `dwell` above is the effective one."""
     tethered: bool = True
-    """The fish hangs from its force sensor, so that F_x is its thrust."""
+    """Whether the fish hangs from its force sensor, so that F_x is its thrust."""
     thrust_coefficient: float | None = None
-    """K of the fish that the observer believes in: thrust over the mean square of its fin velocity
-    [N s²/rad²]; None where the fin velocity is of no model."""
+    """K of the observer's model of the fish: ratio of thrust to the mean square of the fin velocity
+    [N s²/rad²]; None if the fin velocity is not from a model."""
 
 
 class Likeness(NamedTuple):
-    """Of the wave of a controller to that of another one."""
+    """Similarity of the wave of a controller to that of another one."""
 
     name: str
-    """Of the other one."""
-    but_for: frozenset[str]
-    """Parameters that the other one has not, and that are not of the kind of wave."""
+    """Name of the other controller."""
+    ignored_parameters: frozenset[str]
+    """Parameters that the other controller lacks, and that do not change the kind of wave."""
 
 
 P = TypeVar("P", bound=Struct)
 
 
 class Controller(ABC, Generic[P]):
-    """Chooses the instruction angle, once a tick.
+    """Base of controllers, which choose the instruction angle once per tick.
 
-    A subclass names its `Parameters`, a frozen msgspec struct whose fields carry bounds, unit and
-    description: help texts, command-line options and documentation are made from it. Everything
-    slow (loading a file, warming up) belongs into `__init__`, which runs outside the tick. What
-    it wants to show of its inside is a `quantity`.
+    A subclass has `Parameters`, a frozen msgspec struct whose fields have bounds, unit and
+    description, from which help texts, command-line options and documentation are generated.
+    Everything slow (loading a file, warming up) belongs into `__init__`, which runs outside the
+    tick. Internal values for display are declared with `quantity`.
     """
 
     Parameters: ClassVar[type[Struct]]
     swims_like: ClassVar[Likeness | None] = None
-    """What is known of the thrust of that other controller's wave holds for this one's, too."""
+    """The other controller whose known thrust applies to the wave of this one, too."""
 
     uses_lateral_force: ClassVar[bool] = True
-    """False where neither F_y nor the fin velocity changes what it commands: then it may start
-    although F_y is known to be reversed and `estimator.reversed_fy` is refuse."""
+    """False if the commands depend neither on F_y nor on the fin velocity: then the controller may
+    start although F_y is reversed and `estimator.reversed_fy` is refuse."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
-        """Raises TypeError where its quantities cannot be shown."""
+        """Raises TypeError if its quantities are invalid."""
         super().__init_subclass__(**kwargs)
         quantities_of(cls)
 
     def __init__(self, parameters: P, limits: Limits) -> None:
-        """Raises `ParameterError` when the parameters do not fit the limits."""
+        """Raises `ParameterError` if the parameters do not fit the limits."""
         self.check(parameters, limits)
         self.parameters = parameters
         self.limits = limits
@@ -112,7 +113,7 @@ class Controller(ABC, Generic[P]):
     def check(cls, parameters: Any, limits: Limits) -> None:
         """Refuse parameters that are valid one by one but not on this robot.
 
-        Raises `ParameterError`. The default knows one such rule: no `amplitude` above Φ.
+        Raise `ParameterError`. The default has one such rule: no `amplitude` above Φ.
         """
         amplitude = getattr(parameters, "amplitude", None)
         if amplitude is not None and amplitude > limits.amplitude:
@@ -124,33 +125,32 @@ class Controller(ABC, Generic[P]):
     def activate(self, observation: Observation) -> None:
         """Take over: called in the tick of the switch, just before the first `update`.
 
-        `observation.instruction_angle` is the present angle; start from it where that makes sense.
+        `observation.instruction_angle` is the current angle; start from it if that is reasonable.
         """
 
     def retune(self, parameters: P) -> None:
-        """Take new, already checked parameters while running; called between two updates."""
+        """Apply new, already checked parameters while active; called between two updates."""
         self.parameters = parameters
 
     def warm_up(self) -> None:
-        """Do what `update` does, without any effect, so that it finds warm caches.
+        """Do the computation of `update` without an effect, to warm the caches for it.
 
-        Called up to once a tick, just before it; only what takes `update` long from cold is worth
-        it.
+        Called up to once per tick, just before it; only for work that is slow with cold caches.
         """
 
     def close(self) -> None:
-        """Let go of everything: called once, when it is out of command for good."""
+        """Release all resources: called once, when the controller is no longer used."""
 
     @abstractmethod
     def update(self, observation: Observation) -> float:
-        """The instruction angle from now until the next tick [rad].
+        """Return the instruction angle from now until the next tick [rad].
 
-        Called once a tick; must return within half a period. Whatever it raises is a fault, of the
-        code `controller-error`, or of its own where that is a `ControllerFault`.
+        Called once per tick; must return within half a period. An exception causes a fault, with
+        the code `controller-error`, or with the code of a `ControllerFault`.
         """
 
 
 def amplitude_of(parameters: Any, limits: Limits) -> float:
-    """The present amplitude: the parameter where it is given, else all that the robot grants."""
+    """Return the amplitude [rad]: the parameter if it is given, else the limit of the robot."""
     amplitude: float | None = getattr(parameters, "amplitude", None)
     return limits.amplitude if amplitude is None else amplitude

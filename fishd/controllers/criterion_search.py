@@ -1,14 +1,15 @@
-"""Finds the C with which `swing` pushes most, by trying its neighbours there and back.
+"""Search for the C with which `swing` has the largest thrust, by trials of neighbouring values.
 
-Two signs of the thrust are compared, the ripple and the mean of F_x. A fin that swings as
-α = A sin ωt gives F_x = −Kαα̈ = ½KA²ω² (1 − cos 2ωt): the force ripples twice a beat, and by as much
-as its mean. The ripple does not drift with the sensor, but other shapes of the beat have a ripple
-that is a few percent larger or smaller for the same thrust. The mean is the thrust itself, and
-drifts. The difference of a trial from the gait before and after it is free of a steady drift, and
-how much the zero drifts is seen from before a trial to after it. So each counts by how well it is
-known: on a rig that hardly drifts the mean decides, on another one the ripple.
+Two measures of the thrust are compared, the ripple and the mean of F_x. A fin that swings as
+α = A sin ωt gives F_x = −Kαα̈ = ½KA²ω² (1 − cos 2ωt): the force has a ripple at twice the beat
+frequency, whose amplitude equals its mean. The ripple does not drift with the sensor, but other
+shapes of the beat have a ripple that is a few percent larger or smaller for the same thrust. The
+mean is the thrust itself, but drifts. The difference of a trial from the gait before and after it
+is free of a steady drift, and the change of the zero from before a trial to after it measures the
+drift. Each measure is weighted by its uncertainty: on a rig with little drift the mean decides, on
+others the ripple.
 
-What a turned sensor mixes in of F_y is taken off first, so the sign of F_y does not matter.
+The part of F_y that a turned sensor adds is subtracted first, so the sign of F_y does not matter.
 """
 
 import math
@@ -21,87 +22,89 @@ Forces = tuple[float, float]
 
 
 class Rung(NamedTuple):
-    """When to reverse."""
+    """Criterion of a reversal."""
 
     C: float
-    """When the fin's speed falls to this share of its last maximum,"""
+    """Fraction of the fin's last maximum speed at which to reverse."""
     lead: float = 0.0
-    """or rather the speed that is predicted so far ahead [s]."""
+    """Time by which the compared speed is predicted ahead [s]."""
 
 
 LADDER = (
     *(Rung(C) for C in (0.0, 0.2, 0.4, 0.6, 0.75, 0.9, 0.98)),
     *(Rung(0.95, lead) for lead in (0.05, 0.1, 0.2, 0.4)),
 )
-"""From late to early reversals. A servo that is late, or a fin that the water brakes much, needs
-them before the fin is at its fastest."""
-BEGIN = LADDER.index(Rung(0.6))
-BEATS = 3
-"""Whole beats by which a rung is judged, after one in which the fin settles."""
-CLEAR = 0.01
-"""A rung is taken where its ripple is larger by this share than before and after it."""
+"""Criteria from late to early reversals. A slow servo, or a fin with strong damping, needs
+reversals before the fin reaches its maximum speed."""
+START_INDEX = LADDER.index(Rung(0.6))
+"""Index of the first rung."""
+TRIAL_BEATS = 3
+"""Number of whole beats of a trial, after one beat in which the fin settles."""
+MIN_GAIN = 0.01
+"""Relative gain above which a rung replaces the current one [1]."""
 RIPPLE_BIAS = 0.04
-"""Standard deviation of the ripple's gain from the thrust's, as gaits differ in shape [1]."""
-UNSTEADY = 0.25
-"""Share of the move of the zero, from before a trial to after it, that is taken for unsteady: by so
-much the zero within the trial may differ from the mean of the two [1]."""
-MOVES = 8
-"""Number of latest trials whose moves are remembered."""
-DRIFT_AT_FIRST = 0.03
-"""One more such difference, for the first trials: as a share of the ripple [1]."""
-SURE = 1.0
-"""A trial is repeated while its gain is known no better than within so many standard errors,"""
-ROUNDS = 3
-"""but no more often than this."""
-WORSE = 0.8
-"""After one beat with a ripple below this share a trial ends."""
-FALLEN = 0.5
-"""Below this share of its ripple a gait is lost: the tail only trembles."""
-LAUNCH = 4
-"""Half beats with the latest of all reversals, by which a lost gait is begun again."""
-SAME = 0.03
-"""Half beats that differ by less than this share are the same gait; the next rung is tried."""
-PATIENCE = 40.0
-"""Once all neighbours are worse, so long until one of them is tried again [s]."""
-CHANGED = 0.25
-"""With a ripple that differs by this share from what it was, it is another fish,"""
-CERTAIN = 3.0
-"""if it differs by so many standard errors, too."""
-FURTHEST = 8
-"""Half steps on the ladder that are looked beyond at most."""
-NEIGHBOURS = (2, -2, 4, -4, 1, -1)
-"""Half steps that are tried, in this order. Half way between two rungs, one side goes by the one
-and the other side by the other: where a half beat has few ticks, the best may lie between."""
+"""Standard deviation of the ripple's gain from the thrust's, since gaits differ in shape [1]."""
+UNSTEADY_DRIFT_FRACTION = 0.25
+"""Deviation of the zero within a trial from the mean of before and after, as a fraction of its
+change from before to after: the unsteady part of the drift [1]."""
+MAX_MOVES = 8
+"""Number of latest trials whose changes of the zero are kept."""
+INITIAL_DRIFT = 0.03
+"""Additional such deviation for the first trials, as a fraction of the ripple [1]."""
+MIN_STANDARD_ERRORS = 1.0
+"""Number of standard errors by which a gain must differ from `MIN_GAIN`; else repeat the trial."""
+MAX_ROUNDS = 3
+"""Maximum number of repetitions of a trial."""
+MIN_TRIAL_RATIO = 0.8
+"""Ratio of the ripple to the reference below which a trial ends after one beat."""
+LOST_RATIO = 0.5
+"""Ratio of the ripple to its former value below which a gait is lost: the tail only trembles."""
+LAUNCH_HALF_BEATS = 4
+"""Number of half beats with the latest reversals that restart a lost gait."""
+SAME_GAIT_TOLERANCE = 0.03
+"""Relative difference of half beats below which two rungs give the same gait, so that the next
+rung is tried."""
+RETRY_INTERVAL_S = 40.0
+"""Time until the next trial, once all neighbours are worse [s]."""
+MIN_CHANGE = 0.25
+"""Relative change of the ripple that restarts the search, as for another fish,"""
+MIN_CHANGE_STANDARD_ERRORS = 3.0
+"""Number of standard errors that this change must exceed, too."""
+MAX_STEP = 8
+"""Largest step of a trial on the ladder [half steps]."""
+NEIGHBOUR_STEPS = (2, -2, 4, -4, 1, -1)
+"""Steps that are tried, in this order [half steps]. Halfway between two rungs, one side uses one
+rung and the other side the other: with few ticks per half beat, the optimum may lie between."""
 
 
 class Judgement(NamedTuple):
-    """What the force says of some beats."""
+    """Measurement of some beats by the force."""
 
     ripple: float
-    """Of F_x, rms [N]."""
+    """Ripple of F_x, rms [N]."""
     error: float
-    """Its standard error [N]."""
+    """Standard error of `ripple` [N]."""
     half_beat: float
-    """Mean [s]."""
+    """Mean duration of a half beat [s]."""
     level: float
-    """Mean of F_x: the thrust, and the zero of the sensor [N]."""
+    """Mean of F_x: the thrust plus the zero of the sensor [N]."""
     level_error: float
-    """Standard error of `level`, drift not counted [N]."""
+    """Standard error of `level` without drift [N]."""
 
 
 class Gain(NamedTuple):
     """Relative gain of a trial over the mean of the gaits before and after it."""
 
     ripple: float
-    """By the ripple [1]."""
+    """Gain by the ripple [1]."""
     ripple_variance: float
     level: float
-    """By the mean of F_x [1]."""
+    """Gain by the mean of F_x [1]."""
     level_variance: float
 
 
 def compare_gaits(before: Judgement, trial: Judgement, after: Judgement) -> Gain:
-    """Return the gain of a trial; the ripple of a sine is its thrust over √2, which is the unit."""
+    """Return the gain of a trial, relative to the thrust: √2 times the ripple of a sine."""
     ripple = 0.5 * (before.ripple + after.ripple)
     level = 0.5 * (before.level + after.level)
     noise = trial.error**2 + 0.25 * (before.error**2 + after.error**2)
@@ -116,7 +119,7 @@ def compare_gaits(before: Judgement, trial: Judgement, after: Judgement) -> Gain
 
 
 class Phase(Enum):
-    """Where the search is."""
+    """State of the search."""
 
     BEFORE = "before a trial"
     TRIAL = "a trial"
@@ -126,22 +129,24 @@ class Phase(Enum):
 
 
 class CriterionSearch:
-    """Chooses the rung from the force of each tick."""
+    """Search for the best rung from the force of each tick."""
 
     def __init__(self) -> None:
-        from fishd.controllers.ripple import ripples  # with numpy, which fishctl does without
+        from fishd.controllers.ripple import (
+            compute_ripples,  # imports numpy, which fishctl does not need
+        )
 
-        self._ripples = ripples
+        self._ripples = compute_ripples
         self.ripple = 0.0
-        """Of the latest beats [N]."""
-        self._place = self._former = 2 * BEGIN  # on the ladder, in half steps; and the last one
-        self._avoided: set[int] = set()  # where a gait was lost, or is much worse
-        self._lost = 0.0  # ripple that a lost gait had
-        self._trials = list(NEIGHBOURS)
+        """Ripple of the latest beats [N]."""
+        self._place = self._former = 2 * START_INDEX  # current and previous place [half steps]
+        self._avoided: set[int] = set()  # places where a gait was lost, or is much worse
+        self._lost = 0.0  # former ripple of a lost gait
+        self._trials = list(NEIGHBOUR_STEPS)
         self._turn = 0
         self._reference = self._trial = Judgement(0.0, 0.0, 0.0, 0.0, 0.0)
-        self._gains: list[Gain] = []  # of this trial, in each round
-        self._moves: deque[float] = deque(maxlen=MOVES)  # of the zero, within a trial [N]
+        self._gains: list[Gain] = []  # gain of this trial in each round
+        self._moves: deque[float] = deque(maxlen=MAX_MOVES)  # changes of the zero [N]
         self._known = 0.0
         self._watched = 0.0
         self._side = 0.0
@@ -150,27 +155,27 @@ class CriterionSearch:
 
     @property
     def rung(self) -> Rung:
-        """To be used now."""
+        """The rung for the current tick."""
         place = self._in_use
         return LADDER[(place + 1) // 2 if self._side > 0.0 else place // 2]
 
     @property
     def halfway(self) -> bool:
-        """Do the two sides go by two rungs?"""
+        """Whether the two sides use two different rungs."""
         return self._in_use % 2 == 1
 
     @property
     def _in_use(self) -> int:
-        """Where on the ladder, in half steps."""
+        """Current place on the ladder [half steps]."""
         if self.phase is Phase.LAUNCH:
             return 0
         return self._place + (self._trials[0] if self.phase is Phase.TRIAL else 0)
 
     def update(self, fx: float, fy: float, dt: float, side: float) -> None:
-        """Take in a tick.
+        """Process a tick.
 
-        fx, fy: mean forces since the tick before [N]
-        dt: since then [s]
+        fx, fy: mean forces since the previous tick [N]
+        dt: time since then [s]
         side: sign of the command since then
         """
         self._watched += dt
@@ -182,48 +187,52 @@ class CriterionSearch:
 
     def _begin(self, phase: Phase) -> None:
         self.phase = phase
-        self._skip = 2  # half beats in which the fin settles
+        self._skip = 2  # number of half beats in which the fin settles
         self._start_sums()
 
     def _start_sums(self) -> None:
         self._halves: list[list[Forces]] = []
         self._lasted = 0.0
 
-    def _close_half(self, forces: list[Forces], lasted: float) -> None:
+    def _close_half(self, forces: list[Forces], duration: float) -> None:
         if self._skip:
             self._skip -= 1
             return
-        self._lasted += lasted
+        self._lasted += duration
         self._halves.append(forces)
         if len(self._halves) < 2:
             return
         gait = self._gait()
-        hopeless = self.phase is Phase.TRIAL and gait.ripple < WORSE * self._reference.ripple
-        wanted = LAUNCH if self.phase is Phase.LAUNCH else 2 * BEATS
-        if len(self._halves) >= wanted or hopeless:
+        is_worse = (
+            self.phase is Phase.TRIAL and gait.ripple < MIN_TRIAL_RATIO * self._reference.ripple
+        )
+        required_half_beats = LAUNCH_HALF_BEATS if self.phase is Phase.LAUNCH else 2 * TRIAL_BEATS
+        if len(self._halves) >= required_half_beats or is_worse:
             self._judge(gait)
 
     def _gait(self) -> Judgement:
-        """As the half beats since the phase began show it."""
+        """Return the measurement over the half beats since the phase began."""
         squares, levels = self._ripples(self._halves)
         middle = _median(squares)
         half_beat = self._lasted / len(self._halves)
         self.ripple = math.sqrt(middle)
-        scatter = 1.25 * _mean([abs(each - middle) for each in squares])
-        # Of the root. Each half beat is in two of them, so they count for two thirds; and a median
-        # is off by a fourth more than a mean.
+        scatter = 1.25 * _mean([abs(value - middle) for value in squares])
+        # Error of the root. Each half beat is in two values, so their number counts for two thirds;
+        # the error of a median is a quarter larger than that of a mean.
         error = (
             0.5 * 1.25 * scatter * math.sqrt(1.5 / len(squares)) / self.ripple if middle else 0.0
         )
         level = _mean(levels[::2])
-        scatter = 1.25 * _mean([abs(each - level) for each in levels])
+        scatter = 1.25 * _mean([abs(value - level) for value in levels])
         level_error = scatter * math.sqrt(1.5 / len(levels))
-        if len(self._halves) < 2 * BEATS:  # the gait is not settled, and a turned sensor shows it
+        if (
+            len(self._halves) < 2 * TRIAL_BEATS
+        ):  # the gait is not settled, which disturbs a turned sensor
             level_error = self.ripple
         return Judgement(self.ripple, error, half_beat, level, level_error)
 
     def _judge(self, gait: Judgement) -> None:
-        """Go on, knowing the gait of a whole phase."""
+        """Continue with the next phase after a measurement."""
         match self.phase:
             case Phase.LAUNCH:
                 self._begin(Phase.BEFORE)
@@ -232,7 +241,7 @@ class CriterionSearch:
             case Phase.TRIAL:
                 self._trial = gait
                 usual = self._reference.half_beat
-                if abs(gait.half_beat - usual) < SAME * usual:
+                if abs(gait.half_beat - usual) < SAME_GAIT_TOLERANCE * usual:
                     self._look_beyond()
                 else:
                     self._begin(Phase.AFTER)
@@ -242,84 +251,84 @@ class CriterionSearch:
                 self._watch(gait)
 
     def _launch(self, lost: float) -> None:
-        """Begin a gait again that had this ripple [N]."""
+        """Restart a lost gait, which had this ripple [N]."""
         self._lost = lost
         self._begin(Phase.LAUNCH)
 
     def _resume(self, gait: Judgement) -> None:
-        """Go on with trials where the gait is there; where it stays lost, look for another one."""
+        """Continue with trials if the gait is back; if it stays lost, look for another one."""
         self._reference = gait
-        if gait.ripple < FALLEN * self._lost:
+        if gait.ripple < LOST_RATIO * self._lost:
             if self._place != self._former:
                 self._avoided.add(self._place)
                 self._place, self._trials = self._former, []
                 self._launch(self._lost)
                 return
-            self._search_anew()
+            self._restart_search()
         self._lost = 0.0
         self._try_next()
 
-    def _search_anew(self) -> None:
-        self._trials = list(NEIGHBOURS)
+    def _restart_search(self) -> None:
+        self._trials = list(NEIGHBOUR_STEPS)
         self._avoided.clear()
 
     def _decide(self, after: Judgement) -> None:
-        """Take the rung that was tried, or stay; or try it once more."""
+        """Take the tried rung, keep the current one, or repeat the trial."""
         before, self._reference = self._reference, after
-        if after.ripple < FALLEN * before.ripple and self._trial.ripple < before.ripple:
+        if after.ripple < LOST_RATIO * before.ripple and self._trial.ripple < before.ripple:
             self._avoided.add(self._place + self._trials.pop(0))
             self._launch(before.ripple)
             return
         self._moves.append(after.level - before.level)
         self._gains.append(compare_gaits(before, self._trial, after))
         gain, error = self._mean_gain()
-        above = gain - CLEAR
-        if abs(above) < SURE * error and len(self._gains) < ROUNDS:
+        excess = gain - MIN_GAIN
+        if abs(excess) < MIN_STANDARD_ERRORS * error and len(self._gains) < MAX_ROUNDS:
             self._begin(Phase.TRIAL)
             return
         step = self._trials.pop(0)
-        if above > 0.0:
-            if WORSE * (1.0 + gain) > 1.0:
+        if excess > 0.0:
+            if MIN_TRIAL_RATIO * (1.0 + gain) > 1.0:
                 self._avoided.add(self._place)
             self._former = self._place
             self._place += step
-            ahead = 1 if step > 0 else -1
-            # What lies behind was worse; what was jumped over is not known.
-            behind = [-2 * ahead] if abs(step) > 2 else []
-            self._trials = [2 * ahead, 4 * ahead, *behind, 1, -1] if step % 2 == 0 else []
+            direction = 1 if step > 0 else -1
+            # The rungs behind were worse; a skipped rung is unknown.
+            skipped = [-2 * direction] if abs(step) > 2 else []
+            self._trials = [2 * direction, 4 * direction, *skipped, 1, -1] if step % 2 == 0 else []
             self._begin(Phase.BEFORE)
         else:
-            if self._trial.ripple < WORSE * after.ripple:
+            if self._trial.ripple < MIN_TRIAL_RATIO * after.ripple:
                 self._avoided.add(self._place + step)
             self._try_next()
 
     def _mean_gain(self) -> tuple[float, float]:
-        """Return the relative gain of the trial by all its rounds, and its standard error [1]."""
+        """Return the relative gain of the trial over all its rounds, and its standard error [1]."""
         rounds = len(self._gains)
         ripple, noise, level, level_noise = (
             sum(column) / rounds for column in zip(*self._gains, strict=True)
         )
         noise, level_noise = noise / rounds, level_noise / rounds
         ripple_now = self._reference.ripple
-        drifts = [UNSTEADY * move / ripple_now for move in self._moves]
-        # As a share of the thrust. Rounds do not average it.
-        level_noise += 0.5 * _mean([drift**2 for drift in (*drifts, DRIFT_AT_FIRST)])
-        share = level_noise / (level_noise + noise + RIPPLE_BIAS**2)  # by which the ripple counts
+        drifts = [UNSTEADY_DRIFT_FRACTION * move / ripple_now for move in self._moves]
+        # Drift as a fraction of the thrust; repetitions do not average it out.
+        level_noise += 0.5 * _mean([drift**2 for drift in (*drifts, INITIAL_DRIFT)])
+        share = level_noise / (level_noise + noise + RIPPLE_BIAS**2)  # weight of the ripple
         error = math.hypot(share * math.sqrt(noise), (1.0 - share) * math.sqrt(level_noise))
         return share * ripple + (1.0 - share) * level, error
 
     def _look_beyond(self) -> None:
-        """This rung gives the gait that is in use: try the next one instead."""
+        """Try the next rung instead of one that gives the current gait."""
         step = self._trials.pop(0)
         further = step + (2 if step > 0 else -2)
         if further in self._trials:
             self._trials.remove(further)
-        if abs(further) <= FURTHEST:
+        if abs(further) <= MAX_STEP:
             self._trials.insert(0, further)
         self._try_next()
 
     def _try_next(self) -> None:
-        """Begin the next trial; once all are made, watch."""
+        """Begin the next trial; after the last one, watch."""
         while self._trials and not self._may_try(self._place + self._trials[0]):
             self._trials.pop(0)
         if not self._trials:
@@ -331,16 +340,18 @@ class CriterionSearch:
         return 0 <= place <= 2 * (len(LADDER) - 1) and place not in self._avoided
 
     def _watch(self, gait: Judgement) -> None:
-        """Search anew where the fish is another one; now and then try one neighbour."""
+        """Restart the search if the fish has changed; try one neighbour from time to time."""
         self._reference = gait
-        if gait.ripple < FALLEN * self._known:
+        if gait.ripple < LOST_RATIO * self._known:
             self._launch(self._known)
-        elif abs(gait.ripple - self._known) > max(CHANGED * self._known, CERTAIN * gait.error):
-            self._search_anew()
+        elif abs(gait.ripple - self._known) > max(
+            MIN_CHANGE * self._known, MIN_CHANGE_STANDARD_ERRORS * gait.error
+        ):
+            self._restart_search()
             self._try_next()
-        elif self._watched > PATIENCE:
-            self._trials = [NEIGHBOURS[self._turn]]
-            self._turn = (self._turn + 1) % len(NEIGHBOURS)
+        elif self._watched > RETRY_INTERVAL_S:
+            self._trials = [NEIGHBOUR_STEPS[self._turn]]
+            self._turn = (self._turn + 1) % len(NEIGHBOUR_STEPS)
             self._try_next()
         else:
             self._known += 0.2 * (gait.ripple - self._known)
@@ -352,7 +363,7 @@ def _mean(values: list[float]) -> float:
 
 
 def _median(values: list[float]) -> float:
-    """Return the median; `statistics`, which has both, takes milliseconds to load."""
+    """Return the median; `statistics` has both, but takes milliseconds to load."""
     middle = len(values) // 2
     values = sorted(values)
     return values[middle] if len(values) % 2 else 0.5 * (values[middle - 1] + values[middle])

@@ -1,7 +1,7 @@
-"""Holds back reversals that come too soon, and gives command away where a policy insists on them.
+"""Dwell: a minimum time between reversals, with a fault for policies that keep violating it.
 
-`ppo` and `remote` pass their commands through it, and whoever learns; `swing` and the waveforms do
-not.
+It applies to the commands of `ppo`, `remote` and of trainings, but not to `swing` and the
+waveforms.
 """
 
 import math
@@ -12,51 +12,51 @@ from fishd.controllers.base import Controller, Limits
 from fishd.controllers.swing import Swing, SwingParameters
 from fishd.core.errors import ControllerFault
 
-RESTING = 0.05
-"""An angle below this share of the amplitude is as good as neutral."""
-MOST = 0.5
-"""To be held back in this share of the ticks in which that can be is to fight the limit."""
-_ROUNDING = 1e-3  # in ticks; a sum of ticks is not exact
+NEUTRAL_FRACTION = 0.05
+"""Fraction of the amplitude below which an angle counts as neutral."""
+MAX_HELD_FRACTION = 0.5
+"""Fraction of the ticks with a held reversal, of those in which it is possible, that is a fault."""
+_ROUNDING_TICKS = 1e-3  # a sum of ticks is not exact
 
 
 class Dwell:
-    """Lets a command change its side of neutral no sooner than the dwell after it last did.
+    """Limit of a command: at least the dwell must pass between two changes of its side.
 
-    Within a side it may do what it likes. What is held back stays at the angle of before, or goes
-    to neutral where it wants to rest there.
+    Within a side, the command is free. A reversal that is held back keeps the previous angle, or
+    goes to neutral if the command is neutral.
     """
 
     def __init__(self, dwell: float, tick: float, amplitude: float) -> None:
         """
-        dwell: the shortest time between two reversals [s]; 0 holds nothing back
+        dwell: shortest time between two reversals [s]; 0 for no limit
         tick: period of the loop [s]
-        amplitude: Φ of who is limited [rad]
+        amplitude: Φ of the limited controller [rad]
         """
         self.dwell = dwell
         self.held = False
-        """Was a reversal held back, in the latest tick?"""
+        """Whether a reversal was held back in the latest tick."""
         self._tick = tick
-        self._resting = RESTING * amplitude
+        self._resting = NEUTRAL_FRACTION * amplitude
         self._angle = 0.0
         self._side = 0.0
         self._elapsed = 0.0
-        """Since the last reversal [s]."""
+        """Time since the last reversal [s]."""
 
     def activate(self, angle: float) -> None:
-        """Begin at the present angle [rad], as if the tail had reversed just now."""
+        """Begin at the current angle [rad], as if the tail had just reversed."""
         self._angle = angle
         self._side = math.copysign(1.0, angle) if angle else 0.0
         self._elapsed = 0.0
 
     def apply(self, angle: float, dt: float) -> float:
-        """The angle to command [rad], `dt` s after the one before."""
+        """Return the angle to command [rad], `dt` [s] after the previous one."""
         self._elapsed += dt
         self.held = False
         if not (self.dwell and math.isfinite(angle)):
             return angle
         side = math.copysign(1.0, angle) if angle else self._side
         if side != self._side:
-            if self._side and self._elapsed < self.dwell - _ROUNDING * self._tick:
+            if self._side and self._elapsed < self.dwell - _ROUNDING_TICKS * self._tick:
                 self.held = abs(angle) > self._resting
                 angle = self._angle if self.held else 0.0
             else:
@@ -66,13 +66,13 @@ class Dwell:
 
 
 class DwellLimit(Dwell):
-    """A dwell that loses patience with who insists on reversals that it holds back."""
+    """Dwell that raises a fault for a policy that keeps commanding reversals too early."""
 
     def __init__(self, dwell: float, limits: Limits, amplitude: float) -> None:
-        """Builds who may take over, so that no tick has to.
+        """Prepare the successor in advance, outside of a tick.
 
-        dwell: as for `Dwell`
-        amplitude: Φ of the controller that is limited, and of the one that may take over [rad]
+        dwell: see `Dwell`
+        amplitude: Φ of the limited controller, and of its successor [rad]
         """
         super().__init__(dwell, limits.tick, amplitude)
         settings = limits.chatter
@@ -81,18 +81,18 @@ class DwellLimit(Dwell):
         if settings.fallback == "swing":
             self._successor = "swing", Swing(SwingParameters(amplitude=amplitude), limits)
         self._held: deque[bool] = deque()
-        """`held`, of the latest ticks."""
+        """Values of `held` in the latest ticks."""
         self._count = 0
 
     @property
     def share(self) -> float:
-        """In what share of the latest ticks, as many as patience has, a reversal was held back."""
+        """Fraction of the latest ticks, over the patience, in which a reversal was held back."""
         return self._count / self._patience
 
     def apply(self, angle: float, dt: float) -> float:
-        """As `Dwell.apply`.
+        """Return the angle to command [rad], like `Dwell.apply`.
 
-        Raises `ControllerFault` with the code `chatter`, and who takes over if anyone does, once
+        Raise `ControllerFault` with the code `chatter`, and a successor if configured, once
         reversals were held back for too long.
         """
         angle = super().apply(angle, dt)
@@ -105,10 +105,10 @@ class DwellLimit(Dwell):
         self._count += held
         if len(self._held) > self._patience:
             self._count -= self._held.popleft()
-        ticks = math.ceil(self.dwell / self._tick - _ROUNDING)
-        # Of so many ticks of dwell, who always wants to reverse is held back in all but one.
-        most = MOST * self._patience * (ticks - 1) / ticks
-        if ticks > 1 and len(self._held) == self._patience and self._count >= most:
+        ticks = math.ceil(self.dwell / self._tick - _ROUNDING_TICKS)
+        # A policy that reverses in every tick is held back in all but one tick of a dwell.
+        max_count = MAX_HELD_FRACTION * self._patience * (ticks - 1) / ticks
+        if ticks > 1 and len(self._held) == self._patience and self._count >= max_count:
             raise ControllerFault(
                 "chatter",
                 f"in {self._count} of the last {self._patience} ticks it wanted to reverse sooner "

@@ -1,4 +1,4 @@
-"""`excitation`: the command from whose forces a fish can be identified."""
+"""`excitation`: a command for the identification of a fish."""
 
 from typing import Annotated, Any
 
@@ -21,31 +21,31 @@ class ExcitationParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_o
         float,
         unit(
             "Hz",
-            "Frequency at which it turns back, or that of a beat of two ticks if that is lower.",
+            "Highest frequency of the sweep, or that of a beat of two ticks if that is lower.",
             gt=0,
             le=10,
         ),
     ] = 3.0
     sweep_time: Annotated[
-        float, unit("s", "Time from lowest to highest and back.", ge=1, le=3600)
+        float, unit("s", "Time of a sweep from lowest to highest and back.", ge=1, le=3600)
     ] = 20.0
     amplitude: Annotated[
         Amplitude,
         unit("rad", "The larger instruction angle; null: the robot's amplitude_limit."),
     ] = None
     smaller: Annotated[
-        float, unit("1", "The smaller instruction angle, as a share of the larger.", gt=0, le=1)
+        float, unit("1", "The smaller instruction angle, as a fraction of the larger.", gt=0, le=1)
     ] = 0.4
     beats: Annotated[
-        int, unit("1", "Whole beats of each of the two amplitudes in turn.", ge=1, le=1000)
+        int, unit("1", "Number of beats of each of the two amplitudes in turn.", ge=1, le=1000)
     ] = 4
 
 
 class Excitation(Controller[ExcitationParameters]):
-    """Sweep a square wave's frequency, in groups of beats of two amplitudes: tells fish apart.
+    """Sweep a square wave's frequency with two amplitudes in turn, for identification.
 
-    The sweep tells of fin and delay. A large step saturates the servo and a small one does not, so
-    the two amplitudes tell its highest speed from its lag, and backlash from both.
+    The sweep identifies fin and delay. A large step saturates the servo and a small one does not,
+    so the two amplitudes separate its maximum speed from its lag, and backlash from both.
     """
 
     Parameters = ExcitationParameters
@@ -54,9 +54,9 @@ class Excitation(Controller[ExcitationParameters]):
     def __init__(self, parameters: ExcitationParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
         self._progress = 0.0
-        """0 to 1 over one sweep, there and back."""
+        """Progress of the sweep, 0 to 1 from lowest to highest and back."""
         self._phase = 0.0
-        """In beats, since the start."""
+        """Phase since the start [beats]."""
 
     @classmethod
     def check(cls, parameters: Any, limits: Limits) -> None:
@@ -70,11 +70,11 @@ class Excitation(Controller[ExcitationParameters]):
             )
 
     def activate(self, observation: Observation) -> None:
-        """Start on the side of the present angle."""
+        """Start on the side of the current angle."""
         self._phase = 0.0 if observation.instruction_angle >= 0 else 0.5
 
     def update(self, observation: Observation) -> float:
-        """Plus or minus one of the two amplitudes [rad]."""
+        """Return plus or minus one of the two amplitudes [rad]."""
         p = self.parameters
         group, phase = int(self._phase // p.beats), self._phase % 1.0
         self._progress = (self._progress + observation.dt / p.sweep_time) % 1.0

@@ -20,7 +20,7 @@ class HoldParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class Hold(Controller[HoldParameters]):
-    """Hold one instruction angle, neutral unless told otherwise."""
+    """Hold one instruction angle, by default neutral."""
 
     Parameters = HoldParameters
     uses_lateral_force = False
@@ -35,5 +35,5 @@ class Hold(Controller[HoldParameters]):
             )
 
     def update(self, observation: Observation) -> float:
-        """The constant angle [rad]."""
+        """Return the constant angle [rad]."""
         return self.parameters.angle

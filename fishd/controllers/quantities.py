@@ -1,4 +1,4 @@
-"""A controller's own quantities: internal values that it shows, such as its present frequency."""
+"""Quantities of controllers: internal values for display, such as the current frequency."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -7,14 +7,14 @@ from fishd.core import text
 from fishd.core.foreign_code import call_foreign, real_number
 from fishd.core.signals import QuantityInfo
 
-MOST = 16
-"""Quantities of a controller."""
-LONGEST_NAME = 40
-"""[characters]"""
+MAX_QUANTITIES = 16
+"""Maximum number of quantities of a controller."""
+MAX_NAME_CHARACTERS = 40
+"""Maximum length of the name of a quantity [characters]."""
 
 
 class _Declared:
-    """Of no account once a controller has a value of its own: its attribute comes first."""
+    """Declaration of a quantity; an instance attribute with a value takes precedence over it."""
 
     def __init__(self, unit: str, description: str) -> None:
         self.unit, self.description = unit, description
@@ -35,58 +35,60 @@ class _Declared:
 
 
 def quantity(unit: str, description: str) -> Any:
-    """An attribute that everybody sees: in telemetry, recordings and plots.
+    """Declare an attribute that is published in telemetry, recordings and plots.
 
-    `frequency: float = quantity("Hz", "Present frequency of the sweep.")` in the class of a
-    controller, and `self.frequency = 1.5` wherever it changes. What it is after `update` goes into
-    the tick. It is left out before it is assigned, and while it is None or no finite real number;
-    to read it before it is assigned raises AttributeError.
+    Write `frequency: float = quantity("Hz", "Current frequency of the sweep.")` in the class of a
+    controller, and `self.frequency = 1.5` wherever it changes. The tick gets its value after
+    `update`. It is omitted before the first assignment, and while it is None or not a finite real
+    number; reading it before the first assignment raises AttributeError.
 
-    unit: in SI notation, `1` for a pure number
+    unit: unit in SI notation, `1` for a pure number
     description: one sentence
     """
     return _Declared(unit, description)
 
 
 def quantities_of(controller: type[Any]) -> tuple[QuantityInfo, ...]:
-    """What the quantities of a class of controllers are called and mean, its bases' first.
+    """Return the descriptions of the quantities of a controller class, those of its bases first.
 
-    Raises TypeError where they cannot be shown: too many of them, or too long a name.
+    Raise TypeError for too many quantities, or an invalid name.
     """
-    found = dict(_declarations(controller))
-    if len(found) > MOST:
-        raise TypeError(f"it has {len(found)} quantities; at most {MOST} are possible")
-    for name, declared in found.items():
-        if not name.isidentifier() or len(name) > LONGEST_NAME:
+    declarations = dict(_declarations(controller))
+    if len(declarations) > MAX_QUANTITIES:
+        raise TypeError(
+            f"it has {len(declarations)} quantities; at most {MAX_QUANTITIES} are possible"
+        )
+    for name, declaration in declarations.items():
+        if not name.isidentifier() or len(name) > MAX_NAME_CHARACTERS:
             raise TypeError(
                 f"'{text.quoted(name)}' cannot name a quantity: a Python name of at most "
-                f"{LONGEST_NAME} characters is needed"
+                f"{MAX_NAME_CHARACTERS} characters is needed"
             )
-        if not (isinstance(declared.unit, str) and isinstance(declared.description, str)):
+        if not (isinstance(declaration.unit, str) and isinstance(declaration.description, str)):
             raise TypeError(f"unit and description of quantity '{name}' must be texts")
     return tuple(
-        QuantityInfo(name, text.quoted(declared.unit), text.line(declared.description))
-        for name, declared in found.items()
+        QuantityInfo(name, text.quoted(declaration.unit), text.line(declaration.description))
+        for name, declaration in declarations.items()
     )
 
 
 def values_of(controller: object, names: Iterable[str]) -> dict[str, float]:
-    """What these quantities of a controller are now; without those that are no finite number."""
-    held, found = controller.__dict__, {}
+    """Return the current values of these quantities of a controller, if they are finite numbers."""
+    attributes, values = controller.__dict__, {}
     for name in names:
-        if name not in held:
+        if name not in attributes:
             continue
-        value = held[name]
+        value = attributes[name]
         if type(value) is not float:
             if value is None:
                 continue
             try:
                 value = call_foreign(real_number, value, name)
-            except Exception:  # which costs no more than the quantity
+            except Exception:  # affects only this quantity
                 continue
         if value - value == 0.0:  # it is finite
-            found[name] = value
-    return found
+            values[name] = value
+    return values
 
 
 def _declarations(controller: type[Any]) -> Iterable[tuple[str, _Declared]]:

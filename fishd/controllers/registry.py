@@ -1,4 +1,4 @@
-"""Finds controllers, built in and third-party, by the entry-point group `fishd.controllers`."""
+"""Registry of controllers, built-in and third-party (entry-point group `fishd.controllers`)."""
 
 import contextlib
 from collections.abc import Mapping
@@ -17,11 +17,11 @@ from fishd.core.plugins import Plugins
 from fishd.core.schema import Problem, UnknownKey, convert, fields_of, suggest, units_of
 from fishd.core.signals import ControllerInfo
 
-LONGEST_IMPORT = 10.0
-"""How long a package may take to import before its controllers are left out [s]."""
+IMPORT_TIMEOUT_S = 10.0
+"""Maximum time to import a package; after that its controllers are omitted [s]."""
 
 
-_found: Plugins[Controller[Any]] = Plugins(
+_plugins: Plugins[Controller[Any]] = Plugins(
     "controller",
     "fishd.controllers",
     Controller,
@@ -39,14 +39,14 @@ _found: Plugins[Controller[Any]] = Plugins(
     },
     UnknownController,
 )
-names, find = _found.names, _found.find
-"""All names; and the class of one, or `UnknownController`."""
+names, find = _plugins.names, _plugins.find
+"""Functions that return all names, and the class of a name (or raise `UnknownController`)."""
 
 
 def split_spec(spec: str) -> tuple[str, list[tuple[str, str]]]:
     """Return name and parameters of a text such as `square:frequency=1.7,amplitude=0.3`.
 
-    Raises `ParameterError` where a parameter is not NAME=VALUE.
+    Raise `ParameterError` if a parameter is not NAME=VALUE.
     """
     name, _, values = spec.partition(":")
     pairs = []
@@ -59,19 +59,19 @@ def split_spec(spec: str) -> tuple[str, list[tuple[str, str]]]:
 
 
 def describe(name: str) -> ControllerInfo:
-    """Name, summary, parameters and quantities of a controller; raises `UnknownController`."""
-    found = find(name)
-    summary = text.line(str(found.__doc__ or "").strip().partition("\n")[0])
+    """Return the description of a controller; raise `UnknownController`."""
+    controller = find(name)
+    summary = text.line(str(controller.__doc__ or "").strip().partition("\n")[0])
     return ControllerInfo(
         name=name,
         summary=summary,
-        parameters=fields_of(found.Parameters),
-        quantities=quantities_of(found),
+        parameters=fields_of(controller.Parameters),
+        quantities=quantities_of(controller),
     )
 
 
 def units(name: str) -> dict[str, str]:
-    """Return the units of a controller's parameters; none of one that is not installed here."""
+    """Return the units of a controller's parameters; empty if it is not installed."""
     try:
         return units_of(fields_of(find(name).Parameters))
     except UnknownController:
@@ -79,51 +79,51 @@ def units(name: str) -> dict[str, str]:
 
 
 def describe_all(prefix: str = "") -> list[ControllerInfo]:
-    """Describe all controllers that load in time; a use of one that does not says why.
+    """Describe all controllers that load in time; using another one raises the reason.
 
-    prefix: what their names begin with
+    prefix: beginning of their names
     """
-    found = []
+    descriptions = []
     for name in filter(lambda name: name.startswith(prefix), names()):
-        attempt = Attempt(partial(describe, name))  # of a package that may never come back
-        if attempt.wait(LONGEST_IMPORT) or not attempt.give_up():
+        attempt = Attempt(partial(describe, name))  # the import may never end
+        if attempt.wait(IMPORT_TIMEOUT_S) or not attempt.give_up():
             with contextlib.suppress(UnknownController):
-                found.append(attempt.result())
-    return found
+                descriptions.append(attempt.result())
+    return descriptions
 
 
 def check(name: str, values: Mapping[str, Any], limits: Limits) -> Struct:
-    """Validated parameters for the controller `name`.
+    """Return validated parameters for the controller `name`.
 
-    Raises `UnknownController` and `ParameterError`.
+    Raise `UnknownController` and `ParameterError`.
     """
-    found = find(name)
+    controller = find(name)
     try:
-        parameters = call_foreign(convert, dict(values), found.Parameters)
+        parameters = call_foreign(convert, dict(values), controller.Parameters)
     except Problem as problem:
         if isinstance(problem, UnknownKey) and len(problem.path) == 1:
             key = problem.path[0]
             hint = suggest(
-                key, [field.name for field in fields_of(found.Parameters)], listed="it has"
+                key, [field.name for field in fields_of(controller.Parameters)], listed="it has"
             )
             raise ParameterError(
                 f"unknown parameter '{text.quoted(key)}' of controller {name}; {hint}", problem.path
             ) from None
-        what = text.quoted(".".join(problem.path)) or "parameters"
-        raise ParameterError(f"{name}: {what}: {problem}", problem.path) from None
+        place = text.quoted(".".join(problem.path)) or "parameters"
+        raise ParameterError(f"{name}: {place}: {problem}", problem.path) from None
     try:
-        call_foreign(found.check, parameters, limits)
+        call_foreign(controller.check, parameters, limits)
     except ParameterError as error:
         raise ParameterError(f"{name}: {text.error_message(error)}", error.path) from None
     return parameters
 
 
 def create(name: str, values: Mapping[str, Any], limits: Limits) -> Controller[Any]:
-    """A new controller, ready to be swapped in; raises `UnknownController`, `ParameterError`."""
+    """Create a controller; raise `UnknownController`, `ParameterError`."""
     return call_foreign(find(name), check(name, values, limits), limits)
 
 
-def merged(controller: Controller[Any], name: str, values: Mapping[str, Any]) -> Struct:
-    """The controller's parameters with `values` changed, checked; raises `ParameterError`."""
+def merge_parameters(controller: Controller[Any], name: str, values: Mapping[str, Any]) -> Struct:
+    """Return the controller's parameters with changed `values`, checked; raise `ParameterError`."""
     current = msgspec.structs.asdict(controller.parameters)
     return check(name, {**current, **values}, controller.limits)

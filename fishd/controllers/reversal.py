@@ -1,67 +1,69 @@
-"""When the tail is to reverse: as the fin slows down. For controllers that swim as `swing` does."""
+"""Detection of the time to reverse, as the fin slows down, for controllers such as `swing`."""
 
 from collections import deque
 
 from fishd.controllers.base import Limits
 from fishd.core.signals import Observation
 
-REFRACTORY = 0.05
-"""Share of the longest half period in which noise, at small ticks, cannot cause a reversal; of one
-beyond 1 s it is that of 1 s: noise lasts no longer because somebody is ready to wait longer."""
-FIRST_PUSH = 0.2
-"""Who begins from neutral does not reverse sooner: until the servo acts, all speed is noise [s]."""
-SLOPE_OVER = 0.05
-"""The speed ahead is predicted from its change over this time, or a tick if that is longer [s]."""
+REFRACTORY_FRACTION = 0.05
+"""Fraction of the longest half period, but of at most 1 s, during which no reversal is possible, so
+that noise at small ticks does not cause one."""
+MIN_FIRST_PUSH_S = 0.2
+"""Minimum time to the first reversal from neutral: until the servo acts, all speed is noise [s]."""
+SLOPE_WINDOW_S = 0.05
+"""Time over which the change of speed is measured for the prediction; at least one tick [s]."""
 
 
 class Reversal:
-    """Which way to push: the other one once the fin slows to a fraction C of its top speed."""
+    """Direction of the push, which reverses when the fin slows to a fraction C of its top speed."""
 
     def __init__(self, limits: Limits) -> None:
         self.top_speed = 0.0
-        """The fin's highest in a half beat: of this one, once past it; before, of the last."""
+        """Top speed of the fin in this half beat, or, until it is reached, in the previous one."""
         self.reversal_speed = 0.0
-        """C times that."""
+        """C times `top_speed`."""
         self.since_reversal = 0.0
-        """[s]"""
+        """Time since the last reversal [s]."""
         self.direction = 1.0
-        """1 or -1."""
+        """Direction of the push, 1 or -1."""
         self._tick = limits.tick
         self._first = False
-        """Has it begun from neutral, and not reversed yet?"""
+        """Whether it began from neutral and has not reversed yet."""
         self._top_speed = 0.0  # since the last reversal
-        ticks = max(1, round(SLOPE_OVER / limits.tick))
+        ticks = max(1, round(SLOPE_WINDOW_S / limits.tick))
         self._velocities: deque[float] = deque(maxlen=ticks + 1)
 
     def begin(self, angle: float) -> None:
-        """Push on towards the side of this angle; from 0, towards plus."""
+        """Push towards the side of this angle; from 0, towards plus."""
         self.direction = 1.0 if angle >= 0 else -1.0
         self._first = angle == 0.0
 
     def update(self, observation: Observation, C: float, lead: float, longest: float) -> None:
-        """Take in a tick.
+        """Process a tick.
 
-        C: share of the top speed
-        lead: the speed that counts is predicted so far ahead [s]
+        C: fraction of the top speed
+        lead: time by which the compared speed is predicted ahead [s]
         longest: half period after which it reverses in any case [s]
         """
         self.since_reversal += observation.dt
         velocities = self._velocities
         velocities.append(observation.fin_velocity)
         speed = self.direction * observation.fin_velocity
-        if lead and len(velocities) > 1:  # the speed ahead, if it goes on changing as it does
+        if lead and len(velocities) > 1:  # predict the speed with a constant slope
             elapsed = observation.dt * (len(velocities) - 1)
             speed += self.direction * lead * (velocities[-1] - velocities[0]) / elapsed
         slowed = self._top_speed > 0.0 and speed <= C * self._top_speed
         if speed > self._top_speed:
             self._top_speed = speed
-        # Half a tick early is nearer to the longest half period than half a tick late.
-        nearly = self.since_reversal + 0.5 * self._tick
-        settled = self.since_reversal > REFRACTORY * (longest if longest < 1.0 else 1.0)
+        # Rounds the longest half period to the nearest tick.
+        rounded_time = self.since_reversal + 0.5 * self._tick
+        may_reverse = self.since_reversal > REFRACTORY_FRACTION * (
+            longest if longest < 1.0 else 1.0
+        )
         if self._first:
-            settled = settled and nearly > FIRST_PUSH
-        overdue = nearly > longest
-        reverses = (slowed and settled) or overdue
+            may_reverse = may_reverse and rounded_time > MIN_FIRST_PUSH_S
+        overdue = rounded_time > longest
+        reverses = (slowed and may_reverse) or overdue
         if self._top_speed > 0.0 and (reverses or speed < self._top_speed):
             self.top_speed = self._top_speed
         if reverses:

@@ -1,4 +1,4 @@
-"""`thrust`: hold a wanted mean thrust, by the amplitude, at the frequency of swinging control."""
+"""`thrust`: control of the mean thrust by the amplitude, at the frequency of `swing`."""
 
 import math
 from typing import Annotated, ClassVar
@@ -13,24 +13,24 @@ from fishd.core.errors import ParameterError
 from fishd.core.schema import unit
 from fishd.core.signals import Observation
 
-LONGEST_TICK = 0.15
-"""With longer ones a half beat has two or three, and the ripple of F_x cannot be told [s]."""
-LEAST = 0.05
-"""The smallest amplitude is this share of the largest one."""
-BEGIN = 0.4
-"""The first amplitude, as a share of the largest one."""
-FAST, SLOW = 0.3, 0.03
-"""By which share of what is missing (as a logarithm) the amplitude changes after a half beat: at
-first, and once it has settled. A thrust that goes with the square of the amplitude needs half of
-it, and the beat that it is taken over is by a half beat older than the amplitude."""
-SETTLES = 6
-"""Half beats until the share becomes smaller, as one over their number."""
-UPSET = 0.15
-"""With so much missing on average over the latest beats it has to settle anew: another fish."""
-MOST = 0.7
-"""No more than this is believed to be missing, as a logarithm: a beat may be disturbed."""
-MISSES = 0.005
-"""A target that is missed by this share at an end of the range cannot be reached."""
+MAX_TICK_S = 0.15
+"""Longest tick: with longer ones the ripple of a half beat cannot be measured [s]."""
+MIN_AMPLITUDE_FRACTION = 0.05
+"""Smallest amplitude, as a fraction of the largest one."""
+START_AMPLITUDE_FRACTION = 0.4
+"""First amplitude, as a fraction of the largest one."""
+FAST_RATE, SLOW_RATE = 0.3, 0.03
+"""Gains of the controller, at first and once it has settled: change of the logarithm of the
+amplitude per half beat over the logarithmic error of the thrust. Thrust is proportional to the
+square of the amplitude, and its measurement lags by half a beat."""
+SETTLING_HALF_BEATS = 6
+"""Number of half beats after which the gain begins to decrease, inversely to their number."""
+RESETTLING_ERROR = 0.15
+"""Mean error over the latest beats that restarts the settling, as for another fish."""
+MAX_ERROR = 0.7
+"""Limit of the logarithmic error, since a beat may be disturbed."""
+SATURATION_TOLERANCE = 0.005
+"""Relative error at an end of the range above which the target counts as unreachable."""
 
 
 class ThrustParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -49,7 +49,7 @@ class ThrustParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         float,
         unit(
             "s",
-            "Reverse after this time even if the fin shows no sign of slowing down.",
+            "Reverse after this time even if the fin does not slow down.",
             gt=0,
             le=10,
             usual=5,
@@ -58,19 +58,23 @@ class ThrustParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class Thrust(Controller[ThrustParameters]):
-    """Hold a wanted mean thrust: swim as swing does, at the amplitude that gives it.
+    """Hold a target mean thrust: swim like swing, at the amplitude that gives it.
 
-    The thrust is told from the fin velocity, which does not drift: see `ThrustGauge`. A target
-    beyond what the amplitude can do is held at the nearest amplitude.
+    The thrust is measured from the fin velocity, which does not drift: see `ThrustGauge`. For an
+    unreachable target, the nearest amplitude is used.
     """
 
     Parameters = ThrustParameters
     swims_like: ClassVar[Likeness | None] = Likeness("swing", frozenset({"target"}))
-    amplitude: float = quantity("rad", "Amplitude in use.")
-    held_thrust: float | None = quantity("N", "Thrust of the latest beats, as it is regulated by.")
-    held_error: float | None = quantity("N", "Half of the 95 % interval of `held_thrust`.")
+    amplitude: float = quantity("rad", "Current amplitude.")
+    held_thrust: float | None = quantity(
+        "N", "Thrust of the latest beats, as used by the controller."
+    )
+    held_error: float | None = quantity(
+        "N", "Half-width of the 95 % confidence interval of `held_thrust`."
+    )
     saturated: float = quantity(
-        "1", "1: the target is more than the largest amplitude gives; -1: less than the smallest."
+        "1", "1: the largest amplitude gives less than the target; -1: the smallest gives more."
     )
 
     def __init__(self, parameters: ThrustParameters, limits: Limits) -> None:
@@ -79,24 +83,25 @@ class Thrust(Controller[ThrustParameters]):
         self._gauge = ThrustGauge(limits.thrust_coefficient)
         self._missing = 0.0
         self._settled = 0
-        """Half beats since it was far from the target."""
+        """Number of half beats since it was far from the target."""
         self._largest = amplitude_of(parameters, limits)
-        self.amplitude = BEGIN * self._largest
+        self.amplitude = START_AMPLITUDE_FRACTION * self._largest
         self.held_thrust = self.held_error = None
         self.saturated = 0.0
 
     @classmethod
     def check(cls, parameters: ThrustParameters, limits: Limits) -> None:
-        """As for any controller; and F_x must be the thrust. Raises `ParameterError`."""
+        """Check the amplitude, and that F_x is the thrust; raise `ParameterError`."""
         super().check(parameters, limits)
         if not limits.tethered:
             raise ParameterError(
-                "it holds a thrust by F_x, which is the thrust of a tethered fish only; swing and "
-                "the waves swim with an amplitude that is set"
+                "it controls F_x, which is the thrust of a tethered fish only; use swing or a "
+                "waveform, with an amplitude"
             )
-        if limits.tick > LONGEST_TICK:
+        if limits.tick > MAX_TICK_S:
             raise ParameterError(
-                f"it needs ticks of {LONGEST_TICK:g} s at most, not {limits.tick:g} s, to see the "
+                f"it needs ticks of {MAX_TICK_S:g} s at most, not {limits.tick:g} s, to measure "
+                "the "
                 "ripple of F_x"
             )
 
@@ -105,7 +110,7 @@ class Thrust(Controller[ThrustParameters]):
         self._reversal.begin(observation.instruction_angle)
 
     def retune(self, parameters: ThrustParameters) -> None:
-        """Take new parameters, and settle anew."""
+        """Apply new parameters, and restart the settling."""
         super().retune(parameters)
         self._largest = amplitude_of(parameters, self.limits)
         self.amplitude = self._within(self.amplitude)
@@ -120,24 +125,24 @@ class Thrust(Controller[ThrustParameters]):
         return self._reversal.direction * self.amplitude
 
     def _regulate(self) -> None:
-        """After a half beat: nearer to the target."""
+        """Move the amplitude towards the target after a half beat."""
         gauge, target = self._gauge, self.parameters.target
         self.held_thrust, self.held_error = gauge.thrust, gauge.error
         if gauge.latest is None:
             return
-        missing = max(-MOST, min(MOST, math.log(target / max(gauge.latest, 1e-3 * target))))
-        self._missing += 0.5 * (missing - self._missing)
-        if abs(self._missing) > UPSET:
+        error = max(-MAX_ERROR, min(MAX_ERROR, math.log(target / max(gauge.latest, 1e-3 * target))))
+        self._missing += 0.5 * (error - self._missing)
+        if abs(self._missing) > RESETTLING_ERROR:
             self._settled = 0
         self._settled += 1
-        share = max(SLOW, FAST / max(1.0, self._settled - SETTLES))
-        wanted = self.amplitude * math.exp(share * missing)
-        self.amplitude = self._within(wanted)
-        believed = gauge.thrust or gauge.latest
-        above = self.amplitude < wanted and believed < (1.0 - MISSES) * target
-        below = self.amplitude > wanted and believed > (1.0 + MISSES) * target
+        share = max(SLOW_RATE, FAST_RATE / max(1.0, self._settled - SETTLING_HALF_BEATS))
+        unlimited = self.amplitude * math.exp(share * error)
+        self.amplitude = self._within(unlimited)
+        thrust = gauge.thrust or gauge.latest
+        above = self.amplitude < unlimited and thrust < (1.0 - SATURATION_TOLERANCE) * target
+        below = self.amplitude > unlimited and thrust > (1.0 + SATURATION_TOLERANCE) * target
         self.saturated = float(above - below)
 
     def _within(self, amplitude: float) -> float:
         largest = self._largest
-        return max(LEAST * largest, min(largest, amplitude))
+        return max(MIN_AMPLITUDE_FRACTION * largest, min(largest, amplitude))

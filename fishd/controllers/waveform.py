@@ -1,6 +1,6 @@
 """`square`, `sine` and `triangle`: periodic commands of a given frequency and amplitude.
 
-All keep their phase when the frequency changes. Sine and triangle start from the present angle.
+All keep their phase when the frequency changes. Sine and triangle start from the current angle.
 """
 
 import math
@@ -16,15 +16,14 @@ from fishd.core.schema import unit
 from fishd.core.signals import Observation
 
 _ROUNDING = 1e-5
-"""Of a highest frequency that is a short number, such as 7.14286 Hz for ticks of 0.07 s."""
+"""Relative rounding of a highest frequency with few digits, such as 7.14286 Hz for 0.07 s."""
 
 
 def check_frequency(name: str, frequency: float, tick: float, *, highest: bool = True) -> None:
-    """Refuse a parameter with which a beat has less than two ticks: it would be that of a slower
-    wave, or none.
+    """Refuse a frequency with fewer than two ticks per beat, which would alias.
 
-    highest: whether just two are enough
-    Raises `ParameterError`.
+    highest: whether exactly two ticks are permitted
+    Raise `ParameterError`.
     """
     ratio = frequency * 2.0 * tick
     if ratio > 1.0 + _ROUNDING or (ratio > 1.0 - _ROUNDING and not highest):
@@ -45,16 +44,16 @@ class WaveformParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class Waveform(Controller[WaveformParameters]):
-    """A phase that advances with time, and a shape that turns it into an angle.
+    """Base of waveforms: a phase that advances with time, and a shape that maps it to an angle.
 
-    The phase runs from 0 to 1 over one period. Half periods that are no whole number of ticks are
-    dithered over the periods, so that the mean frequency is exact.
+    The phase runs from 0 to 1 over one period. Half periods that are not a whole number of ticks
+    are dithered, so that the mean frequency is exact.
     """
 
     Parameters = WaveformParameters
     uses_lateral_force = False
     two_ticks_are_a_beat: ClassVar[bool] = True
-    """Else it stands still where each beat has just two."""
+    """Whether two ticks per beat are enough; otherwise both may be at neutral."""
     phase: float = quantity("1", "Phase of the waveform: 0 to 1 over one period.")
 
     def __init__(self, parameters: WaveformParameters, limits: Limits) -> None:
@@ -64,14 +63,14 @@ class Waveform(Controller[WaveformParameters]):
 
     @classmethod
     def check(cls, parameters: WaveformParameters, limits: Limits) -> None:
-        """As for any controller; and the ticks are short enough. Raises `ParameterError`."""
+        """Check the amplitude, and that the ticks are short enough; raise `ParameterError`."""
         super().check(parameters, limits)
         check_frequency(
             "frequency", parameters.frequency, limits.tick, highest=cls.two_ticks_are_a_beat
         )
 
     def update(self, observation: Observation) -> float:
-        """The waveform's angle at this tick [rad]."""
+        """Return the waveform's angle at this tick [rad]."""
         if self._first:
             self._first = False
         else:
@@ -80,34 +79,34 @@ class Waveform(Controller[WaveformParameters]):
 
     @property
     def amplitude(self) -> float:
-        """The present amplitude [rad]."""
+        """Current amplitude [rad]."""
         return amplitude_of(self.parameters, self.limits)
 
     @abstractmethod
     def shape(self, phase: float) -> float:
-        """The waveform between −1 and 1; `phase` in [0, 1)."""
+        """Return the waveform, between −1 and 1; `phase` in [0, 1)."""
 
 
 class Square(Waveform):
-    """A square wave between plus and minus the amplitude: the best waveform there is."""
+    """A square wave between plus and minus the amplitude: the waveform with the largest thrust."""
 
     def activate(self, observation: Observation) -> None:
-        """Start on the side of the present angle."""
+        """Start on the side of the current angle."""
         self.phase = 0.0 if observation.instruction_angle >= 0 else 0.5
 
     def shape(self, phase: float) -> float:
-        """+1 in the first half of the period, −1 in the second."""
+        """Return +1 in the first half of the period, −1 in the second."""
         # A half period that is a whole number of ticks must not lose a tick to rounding.
         return 1.0 if (phase + 1e-9) % 1.0 < 0.5 else -1.0
 
 
 class Smooth(Waveform):
-    """A waveform without jumps: on a switch or a new amplitude it goes on from the present angle.
+    """A waveform without jumps: on a switch or a new amplitude it continues from the current angle.
 
-    An angle that the new waveform never reaches is left at the waveform's own top speed.
+    From an angle outside of the new waveform's range it returns at the waveform's top speed.
     """
 
-    two_ticks_are_a_beat = False  # they may both be at neutral
+    two_ticks_are_a_beat = False
     TOP_SPEED: float
     """Largest slope of the shape [1 / period]."""
 
@@ -116,19 +115,19 @@ class Smooth(Waveform):
         self._excess = 0.0
 
     def activate(self, observation: Observation) -> None:
-        """Choose phase and excess such that the first angle is the present one."""
+        """Choose phase and excess so that the first angle is the current one."""
         angle = observation.instruction_angle
         self.phase = self.phase_of(max(-1.0, min(1.0, angle / self.amplitude)))
         self._excess = angle - self.amplitude * self.shape(self.phase)
 
     def retune(self, parameters: WaveformParameters) -> None:
-        """Keep the phase; take a jump that a new amplitude would make into the excess."""
+        """Keep the phase; add the jump that a new amplitude would cause to the excess."""
         before = self.amplitude * self.shape(self.phase)
         super().retune(parameters)
         self._excess += before - self.amplitude * self.shape(self.phase)
 
     def update(self, observation: Observation) -> float:
-        """The waveform's angle at this tick, plus what is left of the excess [rad]."""
+        """Return the waveform's angle at this tick plus the remaining excess [rad]."""
         if not self._first:
             step = self.TOP_SPEED * self.amplitude * self.parameters.frequency * observation.dt
             self._excess -= max(-step, min(step, self._excess))
@@ -136,7 +135,7 @@ class Smooth(Waveform):
 
     @abstractmethod
     def phase_of(self, level: float) -> float:
-        """The phase on the rising flank at which the shape has `level`, in −1 … 1."""
+        """Return the phase on the rising flank at which the shape has `level`, in −1 … 1."""
 
 
 class Sine(Smooth):
@@ -145,11 +144,11 @@ class Sine(Smooth):
     TOP_SPEED = math.tau
 
     def shape(self, phase: float) -> float:
-        """sin 2π·phase."""
+        """Return sin 2π·phase."""
         return math.sin(math.tau * phase)
 
     def phase_of(self, level: float) -> float:
-        """Inverse of the rising flank."""
+        """Return the inverse of the rising flank."""
         return math.asin(level) / math.tau % 1.0
 
 
@@ -159,9 +158,9 @@ class Triangle(Smooth):
     TOP_SPEED = 4.0
 
     def shape(self, phase: float) -> float:
-        """Zero at phase 0, 1 at a quarter, −1 at three quarters."""
+        """Return 0 at phase 0, 1 at a quarter, −1 at three quarters."""
         return 1.0 - 4.0 * abs((phase + 0.25) % 1.0 - 0.5)
 
     def phase_of(self, level: float) -> float:
-        """Inverse of the rising flank."""
+        """Return the inverse of the rising flank."""
         return level / 4.0 % 1.0

@@ -289,7 +289,7 @@ class Operations:
                     f"{name}: {field.name}: it cannot change in flight; start the controller "
                     f"again: 'fishctl set-controller {name} --{option} …'"
                 )
-        return registry.merged(loop.active.controller, loop.active.name, values)
+        return registry.merge_parameters(loop.active.controller, loop.active.name, values)
 
     async def _stop(self, request: protocol.Stop) -> State:
         self._renew(request.lease)

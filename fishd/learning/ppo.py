@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 
-from fishd.controllers.policy.pilot import HOLD
+from fishd.controllers.policy.pilot import HOLD_TIME_S
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
@@ -269,12 +269,13 @@ class DeterministicPolicy:
     def __call__(self, observation: Observation, stack: Stack | None = None) -> float:
         """Return the angle for an observation [rad].
 
-        If frames are needed and missing, hold the last angle for `HOLD`, then return neutral.
+        If frames are needed and missing, hold the last angle for `HOLD_TIME_S`, then return
+        neutral.
         """
         if stack is None and self._perception.eye:
             self._perception.note(observation)
             self._blind += observation.dt
-            return self._latest if self._blind <= HOLD else 0.0
+            return self._latest if self._blind <= HOLD_TIME_S else 0.0
         self._blind = 0.0
         action = self._mean(self._perception.vector(observation, stack))
         self._latest = max(-1.0, min(1.0, action)) * self._amplitude

@@ -7,7 +7,7 @@ import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from fishd.controllers.policy.card import COMMANDS, LONGEST_HISTORY, FeatureName
+from fishd.controllers.policy.card import COMMAND_FEATURES, MAX_HISTORY_TICKS, FeatureName
 from fishd.core import strict_yaml
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import ConfigError
@@ -33,7 +33,7 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
             "Number of latest ticks that the inputs are from, newest first: one tick does not show "
             "the effects of the delay or play of a servo.",
             ge=1,
-            le=LONGEST_HISTORY,
+            le=MAX_HISTORY_TICKS,
         ),
     ] = 1
     force_scale: Annotated[
@@ -301,7 +301,7 @@ class TrainingSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """Settings of the environment; with `see: camera`, the observation has no forces."""
         names = self.environment.observation
         if self.see == "camera":
-            names = tuple(name for name in names if name in COMMANDS)
+            names = tuple(name for name in names if name in COMMAND_FEATURES)
         return replace(self.environment, observation=names)
 
 

@@ -53,7 +53,7 @@ def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 def forget_drivers() -> None:
     """Look for the drivers, plants and controllers of other packages again."""
-    for plugins in (FORCE_SENSORS, SERVOS, PLANTS, registry._found):
+    for plugins in (FORCE_SENSORS, SERVOS, PLANTS, registry._plugins):
         plugins._found.clear()
 
 

@@ -90,7 +90,9 @@ class Rig:
 
     def retune(self, **parameters: Any) -> None:
         loop = self.loop
-        loop.active.retune(registry.merged(loop.active.controller, loop.active.name, parameters))
+        loop.active.retune(
+            registry.merge_parameters(loop.active.controller, loop.active.name, parameters)
+        )
 
     def run(self, ticks: int = 1, *, missed: int = 0, lateness: float = 0.0) -> list[Tick]:
         """Turn the loop; `missed` slots are skipped before the first of these ticks."""

@@ -12,7 +12,7 @@ from onnx import TensorProto, helper
 
 from fishd.controllers.policy import file
 from fishd.controllers.policy.card import (
-    KEY,
+    CARD_KEY,
     Card,
     Feature,
     FeatureName,
@@ -20,7 +20,7 @@ from fishd.controllers.policy.card import (
     StackSettings,
     encode,
 )
-from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.checksum import seal
 from fishd.controllers.policy.network import Layer, Sight, to_onnx
 from fishd.core.errors import PolicyError
 
@@ -135,8 +135,8 @@ def of_nodes(
     ]
     graph = helper.make_graph(list(nodes), "policy", *ends, list(weights))
     model = helper.make_model(graph, ir_version=8, opset_imports=[helper.make_opsetid("", opset)])
-    helper.set_model_props(model, {KEY: encode(about or card())})
-    return sealed(model)
+    helper.set_model_props(model, {CARD_KEY: encode(about or card())})
+    return seal(model)
 
 
 def refusal(content: bytes) -> str:

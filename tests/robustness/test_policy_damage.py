@@ -8,7 +8,7 @@ from onnx import helper
 from rigs.policy_files import FLIP, card, random_layers, refusal
 
 from fishd.controllers.policy import checksum, file, library, size_check
-from fishd.controllers.policy.file import LARGEST, parse
+from fishd.controllers.policy.file import MAX_FILE_BYTES, parse
 from fishd.controllers.policy.network import to_onnx
 from fishd.core.errors import PolicyError
 
@@ -42,19 +42,19 @@ def test_a_weight_that_is_another_number_is_called_damage() -> None:
 def test_a_file_without_a_checksum_or_with_two_is_refused() -> None:
     model = onnx.load_model_from_string(FLIP)
     entries = {entry.key: entry.value for entry in model.metadata_props}
-    digest = entries.pop(checksum.KEY)
+    digest = entries.pop(checksum.CHECKSUM_KEY)
     helper.set_model_props(model, entries)
     assert refusal(model.SerializeToString()).startswith("its metadata lacks fishd.sha256, ")
     for value in ("0" * 64, digest, "", "none"):
-        model.metadata_props.add(key=checksum.KEY, value=value)
+        model.metadata_props.add(key=checksum.CHECKSUM_KEY, value=value)
         assert refusal(model.SerializeToString()).startswith("it is damaged: ")
 
 
 def test_a_model_that_is_sealed_again_is_whole() -> None:
     model = onnx.load_model_from_string(FLIP)
-    assert checksum.sealed(model) == FLIP
+    assert checksum.seal(model) == FLIP
     model.doc_string = "by another tool"
-    assert file.parse(checksum.sealed(model)) == card()
+    assert file.parse(checksum.seal(model)) == card()
 
 
 def field(number: int, content: bytes) -> bytes:
@@ -70,7 +70,7 @@ def varint(number: int) -> bytes:
 
 
 HEAD = b"\x08\x07" + field(8, b"\x10\x0d")
-MANY = LARGEST // 4
+MANY = MAX_FILE_BYTES // 4
 BOMBS = {
     "properties": HEAD + field(14, b"") * MANY,
     "nodes": HEAD + field(7, field(1, b"") * MANY),

@@ -105,7 +105,7 @@ def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(
         "kind": "number",
         "unit": "1",
         "description": "Reverse when the fin's speed falls to C times its last maximum; auto: "
-        "begin with 0.6, and find what pushes most.",
+        "begin with 0.6, and search for the largest thrust.",
         "default": 0.6,
         "interval": "[0, 1]",
         "optional": False,

@@ -20,16 +20,16 @@ from fishd.core.files import MAX_SETTINGS_BYTES
 from fishd.core.schema import Problem, convert, format_literal, nested_too_deeply
 from fishd.core.signals import Observation
 
-KEY = "fishd.card"
+CARD_KEY = "fishd.card"
 """Key of the card in the metadata of an ONNX file."""
 
 FORMAT = 3
 """Version of the card; a file with another one is refused."""
 
-LONGEST = MAX_SETTINGS_BYTES
+MAX_CARD_CHARACTERS = MAX_SETTINGS_BYTES
 """Of a card as text; that of a training has some two thousand [characters]."""
 
-SAME_TICK = 1e-9
+TICK_TOLERANCE_S = 1e-9
 """Largest difference between two ticks that are the same [s]."""
 
 FeatureName = Literal[
@@ -37,10 +37,10 @@ FeatureName = Literal[
 ]
 """Fields of `Observation` that a policy may see."""
 
-COMMANDS = ("instruction_angle", "previous_angle", "side_time")
+COMMAND_FEATURES = ("instruction_angle", "previous_angle", "side_time")
 """Those that are known without any sensor."""
 
-LONGEST_HISTORY = 64
+MAX_HISTORY_TICKS = 64
 """[ticks]"""
 
 _TOO_DEEP = "its card is JSON that is nested too deeply"
@@ -169,7 +169,7 @@ class Card(Struct, frozen=True, kw_only=True):
     format: int = FORMAT
     observation: tuple[Feature, ...]
     """The numbers that the network is given, in order."""
-    history: Annotated[int, Meta(ge=1, le=LONGEST_HISTORY)] = 1
+    history: Annotated[int, Meta(ge=1, le=MAX_HISTORY_TICKS)] = 1
     """Of how many ticks it is given these numbers, the newest first."""
     pictures: StackSettings | None = None
     """The frames that it is given; None where it sees none."""
@@ -192,14 +192,14 @@ class Card(Struct, frozen=True, kw_only=True):
     @property
     def sees(self) -> str:
         """What it is shown of the fish, in a word or two; the command is no sight of it."""
-        forces = any(feature.name not in COMMANDS for feature in self.observation)
+        forces = any(feature.name not in COMMAND_FEATURES for feature in self.observation)
         if self.pictures is None:
             return "forces"
         return "forces, pictures" if forces else "pictures"
 
     def check_fit(self, tick: float, amplitude: float) -> None:
         """Raises `PolicyError` unless it can run on a robot with this tick [s] and Φ [rad]."""
-        if abs(self.tick - tick) > SAME_TICK:
+        if abs(self.tick - tick) > TICK_TOLERANCE_S:
             raise PolicyError(
                 f"it was trained at a tick of {self.tick * 1e3:g} ms, this robot's is "
                 f"{tick * 1e3:g} ms; set tick: {self.tick:g}, or train one at this tick"
@@ -218,8 +218,8 @@ def encode(card: Card) -> str:
 
 def decode(text: str) -> Card:
     """The card in `text`; raises `PolicyError` that names what is missing or wrong."""
-    if len(text) > LONGEST:
-        raise PolicyError(f"its card has {len(text)} letters; {LONGEST} are the most")
+    if len(text) > MAX_CARD_CHARACTERS:
+        raise PolicyError(f"its card has {len(text)} letters; {MAX_CARD_CHARACTERS} are the most")
     try:
         data = msgspec.json.decode(text)
     except RecursionError:

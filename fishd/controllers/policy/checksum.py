@@ -8,30 +8,31 @@ from fishd.core.errors import PolicyError
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-KEY = "fishd.sha256"
+CHECKSUM_KEY = "fishd.sha256"
 """Its key in the metadata of an ONNX file."""
 
 _BLANK = "0" * 64
 
 
-def sealed(model: "ModelProto") -> bytes:
+def seal(model: "ModelProto") -> bytes:
     """The file of a model, with its checksum, which replaces an existing one."""
-    kept = [(entry.key, entry.value) for entry in model.metadata_props if entry.key != KEY]
+    kept = [(entry.key, entry.value) for entry in model.metadata_props if entry.key != CHECKSUM_KEY]
     del model.metadata_props[:]
     for key, value in kept:
         model.metadata_props.add(key=key, value=value)
     place = hashlib.sha256(model.SerializeToString()).hexdigest()  # does not occur in it
-    model.metadata_props.add(key=KEY, value=place)
+    model.metadata_props.add(key=CHECKSUM_KEY, value=place)
     content: bytes = model.SerializeToString()
     return content.replace(place.encode(), _digest(content, place).encode())
 
 
 def check(content: bytes, model: "ModelProto") -> None:
     """Raises `PolicyError` unless the content of a file fits its checksum."""
-    found = [entry.value for entry in model.metadata_props if entry.key == KEY]
+    found = [entry.value for entry in model.metadata_props if entry.key == CHECKSUM_KEY]
     if not found:
         raise PolicyError(
-            f"its metadata lacks {KEY}, the checksum; export it again with 'fishctl learn export'"
+            f"its metadata lacks {CHECKSUM_KEY}, the checksum; export it again with 'fishctl learn "
+            "export'"
         )
     if len(found) > 1 or len(found[0]) != len(_BLANK) or found[0] != _digest(content, found[0]):
         raise PolicyError(
@@ -40,9 +41,9 @@ def check(content: bytes, model: "ModelProto") -> None:
         )
 
 
-def is_there(model: "ModelProto") -> bool:
+def has_checksum(model: "ModelProto") -> bool:
     """Does the model have a checksum?"""
-    return any(entry.key == KEY for entry in model.metadata_props)
+    return any(entry.key == CHECKSUM_KEY for entry in model.metadata_props)
 
 
 def _digest(content: bytes, checksum: str) -> str:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from fishd.controllers.policy import checksum, operators, size_check
-from fishd.controllers.policy.card import KEY, Card, decode
-from fishd.controllers.policy.size_check import EXPORT, NOT_ONNX
+from fishd.controllers.policy.card import CARD_KEY, Card, decode
+from fishd.controllers.policy.size_check import EXPORT_REMEDY, NOT_ONNX
 from fishd.core import files
 from fishd.core.errors import PolicyError
 from fishd.core.text import describe_error, quoted
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto, ValueInfoProto
 
 INPUT, FRAMES, OUTPUT = "observation", "frames", "action"
-LARGEST = 16 * 2**20
+MAX_FILE_BYTES = 16 * 2**20
 """Longer files are not read: a policy has some ten thousand weights [bytes]."""
-MISSING = (
+MISSING_PACKAGE = (
     "is not installed: install fishd[policy], or onnx and onnxruntime, which have no build for "
     "32-bit ARM"
 )
 
-_HIDDEN = ("/home/", "/root/", "/run/user/")
+_HIDDEN_FOLDERS = ("/home/", "/root/", "/run/user/")
 """What systemd's ProtectHome= hides from a service."""
 
 
@@ -43,7 +43,7 @@ class PolicyFile(NamedTuple):
 def read(path: Path) -> PolicyFile:
     """The policy in a file; raises `PolicyError` that names it."""
     try:
-        content = files.read(path, LARGEST, "a policy")
+        content = files.read(path, MAX_FILE_BYTES, "a policy")
         return PolicyFile(path, content, parse(content))
     except files.NoFile as problem:
         raise PolicyError(f"{path}: {problem}{_why_hidden(path)}") from None
@@ -55,16 +55,16 @@ def parse(content: bytes) -> Card:
     """The card of a policy file whose content is valid; raises `PolicyError`."""
     _refuse_pickles(content)
     size_check.check(content)
-    model = _model(content)
+    model = _load_model(content)
     try:
-        return _checked(content, model)
+        return _check_model(content, model)
     except (AttributeError, TypeError, UnicodeError):  # text that is not UTF-8 comes as bytes
-        raise PolicyError(f"this is not a complete ONNX model; {EXPORT}") from None
+        raise PolicyError(f"this is not a complete ONNX model; {EXPORT_REMEDY}") from None
 
 
-def _checked(content: bytes, model: "ModelProto") -> Card:
-    text = _card(model)
-    if checksum.is_there(model):  # else a damaged card would be blamed
+def _check_model(content: bytes, model: "ModelProto") -> Card:
+    text = _card_text(model)
+    if checksum.has_checksum(model):  # else a damaged card would be blamed
         checksum.check(content, model)
     card = decode(text)
     checksum.check(content, model)
@@ -76,7 +76,7 @@ def _checked(content: bytes, model: "ModelProto") -> Card:
 
 def _why_hidden(path: Path) -> str:
     state = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-    if not (state and str(path).startswith(_HIDDEN)):
+    if not (state and str(path).startswith(_HIDDEN_FOLDERS)):
         return ""
     return (
         f": this fishd is a service that sees no home folders; put the file into {state}/policies "
@@ -86,19 +86,19 @@ def _why_hidden(path: Path) -> str:
 
 def _refuse_pickles(content: bytes) -> None:
     if content.startswith(b"\x80"):
-        raise PolicyError(f"this is a pickle, which could run any code; {EXPORT}")
+        raise PolicyError(f"this is a pickle, which could run any code; {EXPORT_REMEDY}")
     if content.startswith(b"PK"):
         raise PolicyError(
             "this is a zip archive as torch writes, with a pickle, which could run any code; "
-            f"{EXPORT}"
+            f"{EXPORT_REMEDY}"
         )
 
 
-def _model(content: bytes) -> "ModelProto":
+def _load_model(content: bytes) -> "ModelProto":
     try:
         import onnx
     except ImportError:
-        raise PolicyError(f"it cannot be checked: onnx {MISSING}") from None
+        raise PolicyError(f"it cannot be checked: onnx {MISSING_PACKAGE}") from None
     try:
         model = onnx.load_model_from_string(content)
     except Exception:  # protobuf has classes of its own
@@ -109,12 +109,12 @@ def _model(content: bytes) -> "ModelProto":
     return model
 
 
-def _card(model: "ModelProto") -> str:
-    cards = [entry.value for entry in model.metadata_props if entry.key == KEY]
+def _card_text(model: "ModelProto") -> str:
+    cards = [entry.value for entry in model.metadata_props if entry.key == CARD_KEY]
     if not cards:
         raise PolicyError(
             "this ONNX file does not say for which observation, tick and Φ it was trained: its "
-            f"metadata lacks {KEY}; {EXPORT}"
+            f"metadata lacks {CARD_KEY}; {EXPORT_REMEDY}"
         )
     if len(cards) > 1:
         raise PolicyError(f"it has {len(cards)} cards that may contradict one another")
@@ -124,17 +124,17 @@ def _card(model: "ModelProto") -> str:
 def _check_ends(graph: "GraphProto", card: Card) -> None:
     given = {tensor.name for tensor in graph.initializer}
     inputs = [value for value in graph.input if value.name not in given]
-    _check_values("inputs", inputs, inputs_of(card))
+    _check_values("inputs", inputs, network_inputs(card))
     _check_values("outputs", list(graph.output), [(OUTPUT, "float32", (1, 1))])
 
 
-_Form = tuple[str, str, tuple[int | str, ...]]
+_TensorForm = tuple[str, str, tuple[int | str, ...]]
 """Name, type and dimensions; a dimension that is left open is its name, or `?`."""
 
 
-def inputs_of(card: Card) -> list[_Form]:
+def network_inputs(card: Card) -> list[_TensorForm]:
     """What the network of a policy is given: frames where it sees any, then its other numbers."""
-    found: list[_Form] = []
+    found: list[_TensorForm] = []
     if card.pictures:
         found.append((FRAMES, "uint8", (1, *card.pictures.shape)))
     if card.observation:
@@ -142,20 +142,20 @@ def inputs_of(card: Card) -> list[_Form]:
     return found
 
 
-def _check_values(what: str, found: "list[ValueInfoProto]", wanted: list[_Form]) -> None:
-    forms = [_form(value) for value in found]
+def _check_values(what: str, found: "list[ValueInfoProto]", wanted: list[_TensorForm]) -> None:
+    forms = [_tensor_form(value) for value in found]
     if len(forms) == len(wanted) and set(forms) == set(wanted):
         return
-    shown = ", ".join(map(_spelled, forms)) or "none"
+    shown = ", ".join(map(_format_form, forms)) or "none"
     needed = " and ".join(
         f"one {kind} {what[:-1]} of shape [{', '.join(map(str, dims))}] named '{name}'"
         for name, kind, dims in wanted
     )
     verb = "is" if len(wanted) == 1 else "are"
-    raise PolicyError(f"its {what}: {shown}; {needed} {verb} needed; {EXPORT}")
+    raise PolicyError(f"its {what}: {shown}; {needed} {verb} needed; {EXPORT_REMEDY}")
 
 
-def _form(value: "ValueInfoProto") -> _Form:
+def _tensor_form(value: "ValueInfoProto") -> _TensorForm:
     from onnx import TensorProto
 
     tensor = value.type.tensor_type
@@ -170,7 +170,7 @@ def _form(value: "ValueInfoProto") -> _Form:
     return value.name, "float32" if kind == "float" else kind, dims
 
 
-def _spelled(form: _Form) -> str:
+def _format_form(form: _TensorForm) -> str:
     name, kind, dims = form
     return f"{kind} of shape [{quoted(', '.join(map(str, dims)))}] named '{quoted(name)}'"
 

@@ -26,13 +26,13 @@ def folders() -> list[Path]:
         *(files.expand_user(folder).absolute() for folder in given if folder),
         _state_folder() / "policies",
         _SYSTEM,
-        _shipped(),
+        _shipped_folder(),
     ]
 
 
 def names() -> list[str]:
     """All names, sorted."""
-    return sorted(_files())
+    return sorted(_list_files())
 
 
 def find(text: str) -> Path:
@@ -42,18 +42,18 @@ def find(text: str) -> Path:
     """
     if names_file(text, SUFFIX):
         path = files.expand_user(text)
-        if run := of_run(path):
+        if run := describe_training_folder(path):
             raise PolicyError(f"{path}: {run}")
         return path
-    known = _files()
+    known = _list_files()
     if text not in known:
-        if run := of_run(Path(text)):
+        if run := describe_training_folder(Path(text)):
             raise PolicyError(f"{text} {run}")
-        raise PolicyError(unknown(text, sorted(known)))
+        raise PolicyError(unknown_name_message(text, sorted(known)))
     return known[text]
 
 
-def of_run(path: Path) -> str:
+def describe_training_folder(path: Path) -> str:
     """What to say of the folder of a training, or of one of its checkpoints; else nothing."""
     if not (path.is_dir() and any((at / "settings.yaml").is_file() for at in (path, path.parent))):
         return ""
@@ -94,7 +94,7 @@ def describe(name: str, tick: float | None = None, amplitude: float | None = Non
     )
 
 
-def _files() -> dict[str, Path]:
+def _list_files() -> dict[str, Path]:
     """The file of each name."""
     found: dict[str, Path] = {}
     for folder in folders():
@@ -108,7 +108,7 @@ def _files() -> dict[str, Path]:
     return found
 
 
-def unknown(name: str, known: list[str]) -> str:
+def unknown_name_message(name: str, known: list[str]) -> str:
     """The message about a name that is not among the known ones."""
     if not known:
         return (
@@ -127,7 +127,7 @@ def _state_folder() -> Path:
     return files.expand_user(os.environ.get("XDG_STATE_HOME") or "~/.local/state") / "fishd"
 
 
-def _shipped() -> Path:
+def _shipped_folder() -> Path:
     """In the package once it is installed, else in the checkout."""
     package = Path(__file__).parent
     installed = package / "shipped"

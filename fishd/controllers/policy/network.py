@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.controllers.policy import file
-from fishd.controllers.policy.card import KEY, Card, encode
-from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.card import CARD_KEY, Card, encode
+from fishd.controllers.policy.checksum import seal
 from fishd.core.errors import PolicyError
 
 Layer = tuple[NDArray[Any], NDArray[Any]]
@@ -60,7 +60,7 @@ def to_onnx(
         "policy",
         [
             helper.make_tensor_value_info(name, kinds[kind], dims)
-            for name, kind, dims in file.inputs_of(card)
+            for name, kind, dims in file.network_inputs(card)
         ],
         [helper.make_tensor_value_info(file.OUTPUT, TensorProto.FLOAT, [1, width])],
         [numpy_helper.from_array(array, name) for name, array in constants.items()],
@@ -72,12 +72,13 @@ def to_onnx(
         ir_version=IR_VERSION,
         opset_imports=[helper.make_opsetid("", OPSET)],
     )
-    helper.set_model_props(model, {KEY: encode(card)})
+    helper.set_model_props(model, {CARD_KEY: encode(card)})
     onnx.checker.check_model(model)
-    content = sealed(model)
-    if len(content) > file.LARGEST:
+    content = seal(model)
+    if len(content) > file.MAX_FILE_BYTES:
         raise PolicyError(
-            f"this policy takes {len(content) / 2**20:.0f} MB, and {file.LARGEST // 2**20} are the "
+            f"this policy takes {len(content) / 2**20:.0f} MB, and {file.MAX_FILE_BYTES // 2**20} "
+            "are the "
             "most; train one on smaller frames"
         )
     file.parse(content)

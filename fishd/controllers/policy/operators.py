@@ -39,15 +39,15 @@ PERMITTED: Mapping[str, tuple[str, ...]] = {
 
 OPSETS = range(11, 27)
 """Supported versions of these operators."""
-LARGEST_NODES = 1000
-LARGEST_VALUES = 4 * 2**20
+MAX_NODES = 1000
+MAX_VALUES = 4 * 2**20
 """Numbers that all operators together may output in one run."""
-LARGEST_WORK = 10**8
+MAX_MULTIPLICATIONS = 10**8
 """Multiplications in one run, more or less: 0.1 s on a slow robot."""
 
 _NAMES = frozenset(name for names in PERMITTED.values() for name in names)
-_OWN = ("", "ai.onnx")
-_COUNTS = ("dilations", "group", "kernel_shape", "strides")
+_ONNX_DOMAINS = ("", "ai.onnx")
+_COUNT_ATTRIBUTES = ("dilations", "group", "kernel_shape", "strides")
 """Attributes that must not be 0: some operator divides by them."""
 
 Shapes = Mapping[str, tuple[int, ...] | None]
@@ -60,7 +60,7 @@ def check(model: "ModelProto") -> None:
         raise PolicyError(f"it defines an operator of its own, {quoted(model.functions[0].name)}")
     if model.training_info:
         raise PolicyError("it is a model that trains itself; export it for inference")
-    versions = [entry.version for entry in model.opset_import if entry.domain in _OWN]
+    versions = [entry.version for entry in model.opset_import if entry.domain in _ONNX_DOMAINS]
     if len(versions) != 1 or versions[0] not in OPSETS:
         version_list = ", ".join(map(str, versions)) or "none"
         raise PolicyError(
@@ -69,16 +69,16 @@ def check(model: "ModelProto") -> None:
             "needed"
         )
     nodes = model.graph.node
-    if len(nodes) > LARGEST_NODES:
-        raise PolicyError(f"it has {len(nodes)} operators; {LARGEST_NODES} are the most")
+    if len(nodes) > MAX_NODES:
+        raise PolicyError(f"it has {len(nodes)} operators; {MAX_NODES} are the most")
     for node in nodes:
         _check_node(node)
     _check_size(model)
 
 
 def _check_node(node: "NodeProto") -> None:
-    if node.domain not in _OWN or node.op_type not in _NAMES:
-        name = f"{node.domain}.{node.op_type}" if node.domain not in _OWN else node.op_type
+    if node.domain not in _ONNX_DOMAINS or node.op_type not in _NAMES:
+        name = f"{node.domain}.{node.op_type}" if node.domain not in _ONNX_DOMAINS else node.op_type
         raise PolicyError(
             f"its operator {quoted(name)} is not permitted; what is: {', '.join(sorted(_NAMES))}"
         )
@@ -86,7 +86,7 @@ def _check_node(node: "NodeProto") -> None:
         if attribute.HasField("g") or attribute.graphs:
             raise PolicyError(f"its {node.op_type} holds a graph of its own")
         counts = [attribute.i] if attribute.type == attribute.INT else attribute.ints
-        if attribute.name in _COUNTS and min(counts, default=0) < 1:
+        if attribute.name in _COUNT_ATTRIBUTES and min(counts, default=0) < 1:
             raise PolicyError(
                 f"its {node.op_type}: {attribute.name} {list(counts)}: 1 or more is needed"
             )
@@ -94,7 +94,7 @@ def _check_node(node: "NodeProto") -> None:
 
 def _check_size(model: "ModelProto") -> None:
     """Bound what one run computes and keeps, from the shape of every value."""
-    shapes = _shapes(model)
+    shapes = _infer_shapes(model)
     values = work = 0
     for node in model.graph.node:
         given = [shapes.get(name) for name in node.output if name]
@@ -109,8 +109,8 @@ def _check_size(model: "ModelProto") -> None:
         values += out
         work += out * _factor(node, sizes) or max(out, sum(map(prod, sizes)))
     for what, found, largest in (
-        ("values", values, LARGEST_VALUES),
-        ("multiplications", work, LARGEST_WORK),
+        ("values", values, MAX_VALUES),
+        ("multiplications", work, MAX_MULTIPLICATIONS),
     ):
         if found > largest:
             raise PolicyError(
@@ -126,7 +126,7 @@ def _factor(node: "NodeProto", taken: list[tuple[int, ...]]) -> int:
     return prod(taken[1][1:]) if node.op_type == "Conv" else 0
 
 
-def _shapes(model: "ModelProto") -> Shapes:
+def _infer_shapes(model: "ModelProto") -> Shapes:
     """Inferred from inputs and weights; shapes that the model itself states are ignored."""
     import onnx
     from onnx import TensorProto

@@ -14,7 +14,7 @@ from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 
-HOLD = 0.25
+HOLD_TIME_S = 0.25
 """So long the last angle is held where frames are missing; then neutral, until they are back [s].
 
 Before the first of them it is neutral, too.
@@ -46,7 +46,7 @@ class Pilot:
     @property
     def waits(self) -> bool:
         """Is it at neutral, for want of frames?"""
-        return self.blind > HOLD
+        return self.blind > HOLD_TIME_S
 
     def angle(self, observation: Observation, stack: Stack | None = None) -> float:
         """The angle that answers an observation [rad].

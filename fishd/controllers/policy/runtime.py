@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.controllers.policy.file import FRAMES, INPUT, MISSING, OUTPUT, PolicyFile
+from fishd.controllers.policy.file import FRAMES, INPUT, MISSING_PACKAGE, OUTPUT, PolicyFile
 from fishd.core.errors import PolicyError
 from fishd.core.text import describe_error
 
-_PROBES = 64
+_PROBE_COUNT = 64
 """Inputs on which a network is tried, which warms it up as well."""
 _LARGEST_PROBE = 1e3
 """In units of a feature's scale."""
-_TIMED = 8
+_TIMED_PROBES = 8
 """Number of probes, of which the fastest must be fast enough."""
-_SHARE = 0.5
+_MAX_TICK_FRACTION = 0.5
 """Share of the tick that one run may take."""
 
 
@@ -61,7 +61,7 @@ class Network:
         """The other numbers, shape (`card.numbers`,)."""
         self._output = np.zeros((1, 1), np.float32)
         try:
-            self._session = _session(policy.content)
+            self._session = _create_session(policy.content)
             self._binding = self._bound({FRAMES: frames, INPUT: inputs})
             self._try(card.tick)
         except PolicyError as error:
@@ -93,11 +93,11 @@ class Network:
         in this thread, so a busy machine refuses nothing; tick: [s]
         """
         rng = random.Random(0)  # numpy.random would be 2 MB at the start of each fishd
-        sizes = np.geomspace(1e-3, _LARGEST_PROBE, _PROBES)
+        sizes = np.geomspace(1e-3, _LARGEST_PROBE, _PROBE_COUNT)
         fastest = math.inf
         for number, size in enumerate(sizes, 1):
             self.row[:] = [rng.gauss(0.0, size) for _ in self.row]
-            self.frames[:] = _picture(rng, self.frames.shape)
+            self.frames[:] = _random_picture(rng, self.frames.shape)
             began = time.thread_time()
             output = self.run()
             fastest = min(fastest, time.thread_time() - began)
@@ -107,25 +107,25 @@ class Network:
                     f"its output is not finite for {what}; "
                     "train it again, or export an earlier checkpoint"
                 )
-            if number == _TIMED and fastest > _SHARE * tick:
+            if number == _TIMED_PROBES and fastest > _MAX_TICK_FRACTION * tick:
                 raise PolicyError(
                     f"this machine takes {fastest * 1e3:.3g} ms to run it once, more than half of "
                     f"its tick of {tick * 1e3:g} ms; train a smaller network"
                 )
 
 
-def _picture(rng: random.Random, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+def _random_picture(rng: random.Random, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """Return noise about any grey level, from none at all to black and white."""
     grey, contrast = rng.uniform(0.0, 255.0), rng.choice((0.0, 10.0, 300.0))
     noise = np.frombuffer(rng.randbytes(math.prod(shape)), np.uint8).reshape(shape) / 127.5 - 1.0
     return np.clip(grey + contrast * noise, 0.0, 255.0).astype(np.uint8)
 
 
-def _session(content: bytes) -> Any:
+def _create_session(content: bytes) -> Any:
     try:
         onnxruntime = load()
     except ImportError:
-        raise PolicyError(f"it cannot be run: onnxruntime {MISSING}") from None
+        raise PolicyError(f"it cannot be run: onnxruntime {MISSING_PACKAGE}") from None
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1

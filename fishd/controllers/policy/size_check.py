@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 from fishd.core.errors import PolicyError
 
-EXPORT = "export it with 'fishctl learn export'"
-NOT_ONNX = f"this is not an ONNX model; {EXPORT}"
-MOST = 256 * 2**10
+EXPORT_REMEDY = "export it with 'fishctl learn export'"
+NOT_ONNX = f"this is not an ONNX model; {EXPORT_REMEDY}"
+MAX_OVERHEAD_BYTES = 256 * 2**10
 """Largest size of everything but weights: the card, the names, the layers [bytes]."""
 
 _GRAPH, _INITIALIZER, _RAW_DATA = 7, 5, 9
@@ -22,12 +22,13 @@ _FIXED = {_FIXED64: 8, _FIXED32: 4}
 
 def check(content: bytes) -> None:
     """Raises `PolicyError` for more than MOST, and for what is not a protobuf message."""
-    left = MOST
+    left = MAX_OVERHEAD_BYTES
     for size in _overheads(content, 0, len(content), (_GRAPH, _INITIALIZER, _RAW_DATA)):
         left -= size
         if left < 0:
             raise PolicyError(
-                f"more than {MOST // 2**10} kB of it are not raw weights, far more than a policy "
+                f"more than {MAX_OVERHEAD_BYTES // 2**10} kB of it are not raw weights, far more "
+                "than a policy "
                 "needs; save weights as raw data"
             )
 

@@ -1,1 +1,1 @@
-"""The controller `remote`: an agent in another process chooses the instruction angle."""
+"""Controller `remote`: an agent in another process chooses the instruction angle."""

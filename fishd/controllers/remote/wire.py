@@ -1,4 +1,4 @@
-"""The socket between the controller `remote` and its agent, which has a ROUTER or a DEALER."""
+"""Socket of the controller `remote` for its agent, which has a ROUTER or a DEALER socket."""
 
 import re
 import select
@@ -11,12 +11,12 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import ControllerFault, ParameterError
 from fishd.core.zmtp import Dealer
 
-_SHOWN = 200
-"""How much of a bad message is shown [bytes]."""
+_MAX_EXCERPT_BYTES = 200
+"""Maximum length of an excerpt of an invalid message [bytes]."""
 
 
 class _Versioned(msgspec.Struct):
-    """Any message, as far as every version will have it."""
+    """The part of a message that all versions have."""
 
     v: int = VERSION
 
@@ -25,10 +25,10 @@ _decode_version: Callable[[bytes], _Versioned] = decoder(_Versioned)
 
 
 class Wire(Dealer[FromAgent | ControllerFault]):
-    """A connection to the agent."""
+    """Connection to the agent."""
 
     def __init__(self, address: str) -> None:
-        """Raises `ParameterError` where the address is none."""
+        """Raises `ParameterError` if the address is invalid."""
         self._address = address
         try:
             super().__init__(address, MAX_MESSAGE)
@@ -38,9 +38,9 @@ class Wire(Dealer[FromAgent | ControllerFault]):
             ) from None
 
     def receive(self) -> FromAgent:
-        """Return a message, where `state` says that there is one.
+        """Return a message; only if `state` reports one.
 
-        Raises `ControllerFault` when it is not a message that an agent may send.
+        Raise `ControllerFault` if it is not a valid message of an agent.
         """
         message = self._inbox.popleft()
         if isinstance(message, ControllerFault):
@@ -48,22 +48,22 @@ class Wire(Dealer[FromAgent | ControllerFault]):
         return message
 
     def wait(self, seconds: float) -> None:
-        """Return when `state` may have changed, or after a while."""
-        # epoll counts whole milliseconds, too coarse for a tick of a few.
+        """Wait until `state` may have changed, at most for this time [s]."""
+        # epoll counts whole milliseconds, which is too coarse for short ticks.
         select.select([self._poll], [], [], self._until_attempt(seconds))
 
     def _decode(self, payload: bytes) -> FromAgent | ControllerFault:
         try:
             message = decode_from_agent(payload)
-        except msgspec.DecodeError as error:  # of the syntax, or of what is in it
-            return self._bad(_why(payload, error))
+        except msgspec.DecodeError as error:  # of the syntax or the content
+            return self._bad(_describe_problem(payload, error))
         return message if message.v == VERSION else self._bad(_other_version(message.v))
 
     def _bad(self, what: str) -> ControllerFault:
         return ControllerFault("remote-error", f"the agent at {self._address} sent {what}")
 
 
-def _why(payload: bytes, error: msgspec.DecodeError) -> str:
+def _describe_problem(payload: bytes, error: msgspec.DecodeError) -> str:
     try:
         version = _decode_version(payload).v
     except msgspec.DecodeError:
@@ -74,12 +74,16 @@ def _why(payload: bytes, error: msgspec.DecodeError) -> str:
 
 
 def _excerpt(payload: bytes, error: str) -> str:
-    """Return the part of a message that is wrong: around the byte that the decoder names."""
+    """Return the invalid part of a message, around the byte that the decoder names."""
     match = re.search(r"\(byte (\d+)\)", error)
-    begin = max(0, int(match[1]) - _SHOWN // 2) if match and len(payload) > _SHOWN else 0
-    shown = payload[begin : begin + _SHOWN]
-    before, after = "…" * (begin > 0), "…" * (begin + len(shown) < len(payload))
-    return f"{before}{shown.decode(errors='replace')}{after}"
+    begin = (
+        max(0, int(match[1]) - _MAX_EXCERPT_BYTES // 2)
+        if match and len(payload) > _MAX_EXCERPT_BYTES
+        else 0
+    )
+    excerpt = payload[begin : begin + _MAX_EXCERPT_BYTES]
+    before, after = "…" * (begin > 0), "…" * (begin + len(excerpt) < len(payload))
+    return f"{before}{excerpt.decode(errors='replace')}{after}"
 
 
 def _other_version(version: int) -> str:

@@ -41,7 +41,7 @@ def parse(text: str) -> Contestant:
         )
     if name not in registry.names():
         if not (names_file(text, library.SUFFIX) or text in library.names()):
-            if run := library.of_run(Path(text)):
+            if run := library.describe_training_folder(Path(text)):
                 raise ParameterError(f"{text} {run}")
             comparable = [controller for controller in registry.names() if controller != "remote"]
             files = [f"{text}{library.SUFFIX}"] if Path(f"{text}{library.SUFFIX}").is_file() else []

@@ -28,7 +28,7 @@ from fishd.hardware.base import Robot
 PROGRAM = """
 import logging, sys, threading, time
 from fishd.core.process import shutdown as module
-from fishd.core.process.shutdown import Shutdown, leave
+from fishd.core.process.shutdown import Shutdown, exit_now
 
 {limits}
 
@@ -42,7 +42,7 @@ shutdown.last_words = sys.stdout.flush
 print("up", flush=True)
 {hang}
 asked.wait()
-leave(7)
+exit_now(7)
 """
 TIME_LIMIT_S = 3.0
 SLOW_LAST_WORDS = "module._MESSAGE_TIMEOUT_S = 10.0"

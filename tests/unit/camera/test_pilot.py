@@ -9,7 +9,7 @@ from rigs.harness import observe
 from rigs.policy_files import FLIP, of_pixels, seeing_card, velocity_follower, write
 
 from fishd.controllers.base import Limits
-from fishd.controllers.policy.pilot import HOLD, Pilot
+from fishd.controllers.policy.pilot import HOLD_TIME_S, Pilot
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import ControllerFault, PolicyError
 
@@ -42,7 +42,7 @@ def test_without_frames_it_holds_its_angle_for_a_while_and_then_goes_to_neutral(
     pilot = Pilot(brightness, LIMITS)
     held = pilot.angle(observe(), stack(50))
     blind = [pilot.angle(observe()) for _ in range(8)]
-    ticks = round(HOLD / TICK)
+    ticks = round(HOLD_TIME_S / TICK)
     assert blind == [held] * ticks + [0.0] * (8 - ticks)
     assert pilot.waits
     assert pilot.blind == pytest.approx(8 * TICK)

@@ -114,7 +114,7 @@ def test_a_wave_too_fast_for_the_tick_is_refused_with_the_highest_frequency(
     )
     slower = made(name, limits, frequency=1.0)
     with pytest.raises(ParameterError, match="too fast"):
-        registry.merged(slower, name, {"frequency": frequency})
+        registry.merge_parameters(slower, name, {"frequency": frequency})
 
 
 @pytest.mark.parametrize(("tick", "frequency"), [(0.05, 10.0), (0.07, 7.14286)])

@@ -6,7 +6,7 @@ from rigs.harness import LIMITS, Rig, observe
 
 from fishd.config import load
 from fishd.controllers import registry
-from fishd.controllers.criterion_search import BEGIN, LADDER
+from fishd.controllers.criterion_search import LADDER, START_INDEX
 from fishd.core.errors import ParameterError
 from fishd.lab.other_fish import harsh
 from fishd.lab.simulation import simulate
@@ -90,7 +90,7 @@ def test_it_shows_what_it_does_in_telemetry() -> None:
     rig = Rig().start("swing", C="auto")
     ticks = rig.run(600)
     tried = {tick.quantities["criterion"] for tick in ticks if tick.quantities}
-    assert {LADDER[BEGIN].C, LADDER[BEGIN + 1].C, LADDER[BEGIN - 1].C} <= tried
+    assert {LADDER[START_INDEX].C, LADDER[START_INDEX + 1].C, LADDER[START_INDEX - 1].C} <= tried
     assert ticks[0].quantities["searching"] == 1.0
     assert ticks[-1].quantities["ripple"] > 1e-3
 
@@ -105,10 +105,10 @@ def test_it_searches_anew_when_the_fish_changes() -> None:
 def test_a_number_that_is_set_ends_the_search_and_auto_begins_a_new_one() -> None:
     controller = registry.create("swing", {"C": "auto"}, LIMITS)
     controller.activate(observe())
-    controller.retune(registry.merged(controller, "swing", {"C": 0.3}))
+    controller.retune(registry.merge_parameters(controller, "swing", {"C": 0.3}))
     controller.update(observe(fin_velocity=1.0))
     assert controller.criterion is None
-    controller.retune(registry.merged(controller, "swing", {"C": "auto"}))
+    controller.retune(registry.merge_parameters(controller, "swing", {"C": "auto"}))
     controller.update(observe(fin_velocity=1.0))
     assert controller.criterion == 0.6
 

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from rigs.harness import LIMITS, Rig
 
 from fishd.controllers import registry
-from fishd.controllers.thrust import LEAST
+from fishd.controllers.thrust import MIN_AMPLITUDE_FRACTION
 from fishd.controllers.thrust_gauge import mean_of_ripple
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
@@ -96,7 +96,9 @@ def test_less_than_the_smallest_amplitude_gives_is_held_there_and_told() -> None
     rig.start("thrust", target=1e-6)
     ticks = rig.run_for(15)
     assert shown(ticks)["saturated"] == -1.0
-    assert abs(ticks[-1].phi_c) == pytest.approx(LEAST * rig.config.amplitude_limit)
+    assert abs(ticks[-1].phi_c) == pytest.approx(
+        MIN_AMPLITUDE_FRACTION * rig.config.amplitude_limit
+    )
     assert ticks[-1].frequency > 0.5
 
 

@@ -16,7 +16,7 @@ from fishd.cli.doctor.base import Context
 from fishd.cli.main import fishctl
 from fishd.config import Config, keys, load
 from fishd.controllers.policy import checksum, file, library, operators
-from fishd.controllers.policy.card import FORMAT, KEY, Card, Provenance
+from fishd.controllers.policy.card import CARD_KEY, FORMAT, Card, Provenance
 from fishd.core.errors import UnknownController
 from fishd.core.schema import fields_of
 from fishd.daemon.main import fishd
@@ -205,15 +205,15 @@ def test_each_key_of_the_card_is_described() -> None:
 def test_names_of_files_ends_and_folders_are_right() -> None:
     text = text_of(DOCUMENT)
     for word in (
-        KEY,
-        checksum.KEY,
+        CARD_KEY,
+        checksum.CHECKSUM_KEY,
         file.INPUT,
         file.OUTPUT,
         library.SUFFIX,
         f"${library.FOLDERS_VARIABLE}",
     ):
         assert f"`{word}`" in text or f"`{word} " in text or f"metadata `{word}`" in text
-    assert f"more than {file.LARGEST // 2**20} MB" in text
+    assert f"more than {file.MAX_FILE_BYTES // 2**20} MB" in text
     assert "/etc/fishd/policies" in text
 
 
@@ -222,8 +222,8 @@ def test_each_permitted_operator_is_listed() -> None:
     for what, names in operators.PERMITTED.items():
         assert f"| {what} | {', '.join(f'`{name}`' for name in sorted(names))} |" in text
     assert f"versions {operators.OPSETS[0]} to {operators.OPSETS[-1]}:" in text
-    assert f"more than {operators.LARGEST_NODES} operators, 10⁸ multiplications" in text
-    assert operators.LARGEST_WORK == 10**8
+    assert f"more than {operators.MAX_NODES} operators, 10⁸ multiplications" in text
+    assert operators.MAX_MULTIPLICATIONS == 10**8
 
 
 def test_installing_lists_all_files_and_groups_that_come_onto_a_pi() -> None:

@@ -90,7 +90,7 @@ def test_the_first_action_may_take_its_time_at_neutral(rig: Rig, agent: Scripted
     rig.run()
     assert rig.reason == "remote-silent"
     assert "no action has come from" in reason(rig)
-    assert "within 2 s: does it run, and is that its address?" in reason(rig)
+    assert "within 2 s; start the agent, and check its address" in reason(rig)
 
 
 def test_a_late_action_is_for_no_other_tick(rig: Rig, agent: ScriptedAgent) -> None:

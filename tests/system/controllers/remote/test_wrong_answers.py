@@ -211,7 +211,7 @@ def test_answers_of_another_session_are_told_from_late_ones(rig: Rig, agent: Scr
     swim(rig, agent)
     assert {answered(rig, agent, 0.3, session="0123").phi_c for _ in range(5)} == {0.0}
     assert rig.reason == "remote-silent"
-    assert "5 ticks in a row (5 named another session)" in reason(rig)
+    assert "5 ticks in a row (5 were for another session)" in reason(rig)
 
 
 def test_before_the_first_action_wrong_answers_count_too(rig: Rig, agent: ScriptedAgent) -> None:
@@ -221,7 +221,7 @@ def test_before_the_first_action_wrong_answers_count_too(rig: Rig, agent: Script
         answered(rig, agent, 0.3, session="0123")
     assert rig.reason == "remote-silent"
     assert "no action has come in time from the agent at" in reason(rig)
-    assert "(9 named another session)" in reason(rig)
+    assert "(9 were for another session)" in reason(rig)
 
 
 def flip(agent: ScriptedAgent, seen: dict[str, float]) -> dict[str, object]:

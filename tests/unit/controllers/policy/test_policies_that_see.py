@@ -20,8 +20,8 @@ from rigs.policy_files import (
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.controllers.policy import file, library
-from fishd.controllers.policy.card import KEY, encode
-from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.card import CARD_KEY, encode
+from fishd.controllers.policy.checksum import seal
 from fishd.controllers.policy.network import Sight, to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.camera_frames import StackSettings
@@ -63,14 +63,14 @@ def test_a_file_of_which_frames_are_missing_or_others_is_refused() -> None:
     def refused(change: Any) -> str:
         model = onnx.load_model_from_string(FOLLOWER)
         change(model)
-        return refusal(sealed(model))
+        return refusal(seal(model))
 
     def smaller(model: Any) -> None:
         model.graph.input[0].type.tensor_type.shape.dim[3].dim_value = 31
 
     def also_numbers(model: Any) -> None:
         about = encode(seeing_card(("fy", 0.1)))
-        helper.set_model_props(model, {KEY: about})
+        helper.set_model_props(model, {CARD_KEY: about})
 
     assert refused(smaller) == (
         f"its inputs: uint8 of shape [1, 2, 32, 31] named 'frames'; {wanted}"
@@ -83,8 +83,8 @@ def test_a_file_of_which_frames_are_missing_or_others_is_refused() -> None:
 def test_a_card_with_impossible_frames_is_refused_with_the_key_to_blame() -> None:
     model = onnx.load_model_from_string(FOLLOWER)
     text = encode(seeing_card()).replace('"size":32', '"size":4000')
-    helper.set_model_props(model, {KEY: text})
-    assert refusal(sealed(model)).startswith("its card: pictures.size: 4000 is not valid")
+    helper.set_model_props(model, {CARD_KEY: text})
+    assert refusal(seal(model)).startswith("its card: pictures.size: 4000 is not valid")
 
 
 def test_a_network_too_large_for_a_file_is_not_written() -> None:

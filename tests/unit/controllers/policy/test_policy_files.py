@@ -17,8 +17,8 @@ from rigs.documents import ROOT
 from rigs.policy_files import FLIP, card, random_layers, refusal, write
 
 from fishd.controllers.policy import file
-from fishd.controllers.policy.card import KEY, encode
-from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.card import CARD_KEY, encode
+from fishd.controllers.policy.checksum import seal
 from fishd.controllers.policy.network import to_onnx
 from fishd.core.errors import PolicyError
 
@@ -29,14 +29,14 @@ def changed(change: Change, content: bytes = FLIP) -> bytes:
     """A policy file after a change of its ONNX model, with a checksum that fits."""
     model = onnx.load_model_from_string(content)
     change(model)
-    return sealed(model)
+    return seal(model)
 
 
 def with_card(**values: Any) -> bytes:
     """A policy file in whose card these keys have these values, or are missing where None."""
     data = msgspec.json.decode(encode(card())) | values
     text = msgspec.json.encode({key: value for key, value in data.items() if value is not None})
-    return changed(lambda model: helper.set_model_props(model, {KEY: text.decode()}))
+    return changed(lambda model: helper.set_model_props(model, {CARD_KEY: text.decode()}))
 
 
 class Trap:
@@ -127,7 +127,7 @@ def test_a_bad_card_is_refused_with_the_key_to_blame(values: dict[str, Any], mes
     ],
 )
 def test_a_card_that_is_not_json_or_no_object_is_refused(text: str, why: str) -> None:
-    content = changed(lambda model: helper.set_model_props(model, {KEY: text}))
+    content = changed(lambda model: helper.set_model_props(model, {CARD_KEY: text}))
     assert refusal(content).startswith(f"its card {why}")
 
 
@@ -188,7 +188,7 @@ def strip(model: Any) -> None:
 
 
 def double(model: Any) -> None:
-    model.metadata_props.add(key=KEY, value=encode(card(amplitude=0.1)))
+    model.metadata_props.add(key=CARD_KEY, value=encode(card(amplitude=0.1)))
 
 
 def move_out(model: Any) -> None:

@@ -20,7 +20,7 @@ def no_folders(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     monkeypatch.setattr(library, "_SYSTEM", tmp_path / "system")
-    monkeypatch.setattr(library, "_shipped", lambda: tmp_path / "shipped")
+    monkeypatch.setattr(library, "_shipped_folder", lambda: tmp_path / "shipped")
 
 
 def test_the_folders_are_those_of_the_variable_the_state_the_system_and_the_package(

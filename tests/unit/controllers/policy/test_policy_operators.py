@@ -13,7 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 from rigs.policy_files import card, of_nodes, random_layers, refusal, write
 
 from fishd.controllers.policy import file, operators
-from fishd.controllers.policy.checksum import sealed
+from fishd.controllers.policy.checksum import seal
 from fishd.controllers.policy.network import to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
@@ -75,7 +75,7 @@ def test_an_operator_that_the_file_defines_itself_is_refused() -> None:
         "", "Tanh", ["x"], ["y"], [make("Sin", ["x"], ["y"])], [helper.make_opsetid("", 17)]
     )
     model.functions.append(own)
-    assert refusal(sealed(model)) == "it defines an operator of its own, Tanh"
+    assert refusal(seal(model)) == "it defines an operator of its own, Tanh"
 
 
 def test_a_graph_in_an_attribute_is_refused() -> None:
@@ -154,7 +154,7 @@ def test_a_size_that_the_file_only_claims_does_not_count() -> None:
     content = of_nodes(nodes, [floats("a", 100_000, 1), floats("b", 1, 100_000)])
     model = onnx.load_model_from_string(content)
     model.graph.value_info.append(helper.make_tensor_value_info("c", TensorProto.FLOAT, [1, 1]))
-    assert "its network computes 1e+10 values" in refusal(sealed(model))
+    assert "its network computes 1e+10 values" in refusal(seal(model))
 
 
 def test_a_network_that_takes_over_half_a_tick_is_refused_with_its_time(tmp_path: Path) -> None:
