@@ -1,1 +1,1 @@
-"""What the tests share: rigs, stand-ins for parts, and processes."""
+"""Shared rigs, replacements of parts, and processes of the tests."""

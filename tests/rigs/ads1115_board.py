@@ -1,4 +1,4 @@
-"""An emulated ADS1115 behind an emulated /dev/i2c-N, in virtual time if no other clock is given."""
+"""Emulated ADS1115 behind an emulated /dev/i2c-N, by default in virtual time."""
 
 from collections.abc import Sequence
 from typing import Any, Self
@@ -13,19 +13,19 @@ from fishd.virtual.pi.i2c import I2cBus, Message, Read, Write
 from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 VOLTS = [0.5, -0.3, 0.1, -0.25, 1.0, 0.7, 0.0, 1.9]
-"""The mean voltage of each input, by mux bits."""
+"""Mean voltage of each input, by mux bits."""
 
 X, Y = 0, 3
 """Mux bits of the inputs A0-A1 and A2-A3."""
 
 ABSENT_BUS = 201
-"""A bus that is there only while a board is; a Pi may have a true bus 1."""
+"""Bus that exists only while a board exists; a Pi may have a real bus 1."""
 
 
 class Board:
-    """A chip on a bus, with what a test wants to look at or change.
+    """Chip on a bus, with the parts that a test observes or changes.
 
-    A context manager, while which the bus has a device file.
+    A context manager, during which the bus has a device file.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Board:
         self.bus.timeout = seconds
 
     def wait(self, rate: float = 860.0) -> None:
-        """Until any conversion at that rate has ended."""
+        """Wait until any conversion at that rate has ended."""
         self.clock.sleep(1.25 / rate + 1e-3)
 
 
@@ -78,5 +78,5 @@ def codes(volts: float, full_scale: float = 4.096) -> int:
 
 
 def config(mux: int, *, rate: int = 7) -> int:
-    """A single-shot config at ±4.096 V."""
+    """Return a single-shot config at ±4.096 V."""
     return 0x8000 | mux << 12 | 1 << 9 | 0x100 | rate << 5 | 3

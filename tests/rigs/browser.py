@@ -1,4 +1,4 @@
-"""A true browser that looks at a page."""
+"""Real browser that opens a page."""
 
 import shutil
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not ins
 
 @contextmanager
 def opened(url: str) -> Iterator[tuple[Page, list[str]]]:
-    """The page, and what goes wrong on it: errors, and requests that leave this machine."""
+    """Yield the page, and its problems: errors, and requests that leave this machine."""
     complaints: list[str] = []
     with sync_playwright() as playwright:
         options = ["--no-sandbox", "--disable-gpu"]

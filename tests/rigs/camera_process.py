@@ -1,4 +1,4 @@
-"""A running `fishd-camera` with addresses of its own, and one that has an emulated V4L2 camera."""
+"""Running `fishd-camera` with separate addresses, and one with an emulated V4L2 camera."""
 
 import contextlib
 import sys
@@ -19,7 +19,7 @@ COMMAND = [str(Path(sys.executable).with_name("fishd-camera"))]
 
 
 class CameraProcess(Process):
-    """What a test needs of it."""
+    """Running `fishd-camera`."""
 
     def __init__(self, folder: Path, *pairs: str, command: list[str] | None = None) -> None:
         """pairs: settings, KEY=VALUE"""
@@ -36,7 +36,7 @@ class CameraProcess(Process):
             return client.status()
 
     def until(self, true: Callable[[CameraState], bool]) -> CameraState:
-        """Its state once that is so."""
+        """Wait for a condition, and return the state."""
         states: list[CameraState] = []
 
         def is_so() -> bool:
@@ -55,13 +55,13 @@ class CameraProcess(Process):
 
 @contextlib.contextmanager
 def running_camera(folder: Path, *pairs: str) -> Iterator[CameraProcess]:
-    """It is up, and gone afterwards whatever happens."""
+    """Run a `fishd-camera` that always ends with the context."""
     with _ended(CameraProcess(folder, *pairs)) as process:
         yield process
 
 
 class V4l2Rig(CameraProcess):
-    """A `fishd-camera` above an emulated camera, for a test to disturb."""
+    """`fishd-camera` with an emulated camera that a test can disturb."""
 
     def __init__(self, folder: Path, *pairs: str, **faults: Any) -> None:
         self._file = folder / "faults.json"
@@ -70,7 +70,7 @@ class V4l2Rig(CameraProcess):
         super().__init__(folder, "source=v4l2", f"v4l2.device={DEVICE}", *pairs, command=program)
 
     def set(self, **faults: Any) -> None:
-        """What is wrong with the camera from now on."""
+        """Set the faults of the camera."""
         part = self._file.with_suffix(".part")
         part.write_bytes(msgspec.json.encode(Faults(**faults)))
         part.replace(self._file)

@@ -1,4 +1,4 @@
-"""A free swimmer that is soon computed, and looks like one: for tests of what is around it."""
+"""Free swimmer that is fast to compute, for tests of its surroundings."""
 
 from fishd.assembly import open_swimmer
 from fishd.config import Config, load
@@ -16,7 +16,7 @@ COARSE = (
     "swimmer.water.length=0.3",
 )
 OPTIONS = ("--config", str(FILE), *sets(*COARSE))
-"""Of a command line."""
+"""Options of a command line."""
 
 
 def coarse(*overrides: str) -> Config:

@@ -1,4 +1,4 @@
-"""Runs the real `fishctl doctor`, and reads what it found."""
+"""Runs of the real `fishctl doctor`, and their results."""
 
 import json
 import os
@@ -12,7 +12,7 @@ Findings = dict[str, tuple[str, str]]
 def doctor(
     folder: Path, *settings: str, under: tuple[str, ...] = (), **env: str
 ) -> tuple[int, Findings]:
-    """Exit status, and level and message of each check; a FAIL or warning says how to mend it."""
+    """Return the exit status, and level and message of each check; all problems have remedies."""
     verb = ("doctor", "--json", "--set", f"control.address=ipc://{folder}/control", *settings)
     apart = bool(under or env)
     ended = call(*under, FISHCTL, *verb, env=os.environ | env) if apart else fishctl(*verb)

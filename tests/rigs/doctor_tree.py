@@ -1,4 +1,4 @@
-"""A tree of a Raspberry Pi's own files, and a check of `fishctl doctor` on it."""
+"""Tree of the system files of a Raspberry Pi, and a check of `fishctl doctor` on it."""
 
 import contextlib
 import os
@@ -10,11 +10,11 @@ from fishd.cli.doctor.base import Context
 from fishd.config import load
 
 Examine = Callable[..., tuple[str, str, str]]
-"""Makes a check with these overrides: level, message and mend; empty where there is none."""
+"""Function that runs a check with overrides; it returns level, message, remedy, or empty texts."""
 
 
 def examiner(root: Path) -> Examine:
-    """What makes one check on the tree, for robot pi."""
+    """Return the function that runs one check on the tree, for robot pi."""
 
     def make(name: str, *overrides: str) -> tuple[str, str, str]:
         settings = ["robot=pi", f"state_folder={root}/state", *overrides]
@@ -39,7 +39,7 @@ def put(root: Path, path: str, content: str | bytes = "") -> Path:
 
 @contextlib.contextmanager
 def unprivileged() -> Iterator[None]:
-    """As somebody whom permissions bind: for root user 65534, without groups."""
+    """Run as a user without privileges: for root, as user 65534 without groups."""
     if os.geteuid() != 0:
         yield
         return

@@ -1,4 +1,4 @@
-"""The documentation as tests read it: prose, blocks, code, tables."""
+"""Parts of the documentation for tests: prose, blocks, code, tables."""
 
 import re
 from collections.abc import Iterator
@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
-"""A fenced block: its kind, and what is in it."""
+"""Fenced block: its kind, and its content."""
 _SPAN = re.compile(r"`([^`\n]+)`")
 
 
@@ -21,14 +21,14 @@ def prose_of(document: Path) -> str:
 
 
 def code_of(document: Path) -> Iterator[str]:
-    """Each line of a fenced block, continued ones joined, and each code span."""
+    """Return each line of a fenced block, with continued ones joined, and each code span."""
     for _, block in FENCE.findall(text_of(document)):
         yield from block.replace("\\\n", " ").splitlines()
     yield from _SPAN.findall(prose_of(document))
 
 
 def first_cells(document: Path, heading: str) -> list[str]:
-    """The code in the first column of the tables below a heading, down to the next one."""
+    """Return the code in the first column of the tables between a heading and the next one."""
     section = re.split(rf"^#+ {re.escape(heading)}$", text_of(document), flags=re.MULTILINE)[1]
     section = re.split(r"^#", section, flags=re.MULTILINE)[0]
     return re.findall(r"^\| `([^`]+)`", section, re.MULTILINE)

@@ -1,9 +1,9 @@
-"""A program that draws on a terminal, interrupted at the moment when it takes the screen."""
+"""Program that draws on a terminal, interrupted when it enters the screen."""
 
 from pathlib import Path
 
 ENTER_SCREEN, LEAVE_SCREEN = "\x1b[?1049h", "\x1b[?1049l"
-"""What changes to a screen of its own, and back."""
+"""Sequences that enter and leave the alternate screen."""
 _SOURCE = """
 import signal
 from rich.console import Console
@@ -21,6 +21,6 @@ Console.set_alt_screen = take_and_be_interrupted
 
 
 def signal_as_drawing_begins(folder: Path, name: str) -> dict[str, str]:
-    """The environment of a Python that gets this signal just after its screen was taken."""
+    """Return the environment of a Python that gets this signal just after it enters the screen."""
     (folder / "sitecustomize.py").write_text(_SOURCE.format(name=name))
     return {"PYTHONPATH": str(folder)}

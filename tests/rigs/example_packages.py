@@ -1,4 +1,4 @@
-"""The example packages of docs/, installed, and fish that swim with them in virtual time."""
+"""Installed example packages of docs/, and fish with them in virtual time."""
 
 import os
 import subprocess
@@ -31,11 +31,11 @@ from rigs.processes import FISHCTL
 
 MILLIVOLTS_PER_NEWTON = 20.0
 BUS = 204
-"""A bus that no machine has."""
+"""Bus that does not exist on any machine."""
 
 
 def install(folder: Path, examples: str) -> None:
-    """Build the packages in docs/`examples`, as their reader would, without the network."""
+    """Build the packages in docs/`examples` as in their documentation, without the network."""
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-cache-dir", "--no-index"]
     packages = [str(path.parent) for path in (ROOT / "docs" / examples).rglob("pyproject.toml")]
     offline = ["--no-build-isolation", "--no-deps", "--target", str(folder)]
@@ -43,7 +43,7 @@ def install(folder: Path, examples: str) -> None:
 
 
 def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Where the packages of a folder are installed, and no daemon runs."""
+    """Run fishctl with the installed packages of a folder, without a daemon."""
     mine = {"PYTHONPATH": str(site), "XDG_RUNTIME_DIR": str(site), "COLUMNS": "100"}
     command = [FISHCTL, *arguments]
     return subprocess.run(
@@ -52,13 +52,13 @@ def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def forget_drivers() -> None:
-    """Look for the drivers, plants and controllers of other packages again."""
+    """Reload the drivers, plants and controllers of other packages."""
     for plugins in (FORCE_SENSORS, SERVOS, PLANTS, registry._plugins):
         plugins._found.clear()
 
 
 class LoadCellRig(LockstepRig):
-    """A fish on two load cells, its servo on pigpiod."""
+    """Fish on two load cells, with its servo on pigpiod."""
 
     robot_name = "pi"
 
@@ -80,7 +80,7 @@ class LoadCellRig(LockstepRig):
 
 
 class ServoBoardRig(LockstepRig):
-    """A fish whose servo is on a PCA9685, on one bus with the ADS1115."""
+    """Fish whose servo is on a PCA9685, on one bus with the ADS1115."""
 
     robot_name = "pi"
 

@@ -1,4 +1,4 @@
-"""A swim in virtual time, filmed by a simulated camera: forces and frames on one clock."""
+"""Swim in virtual time with a simulated camera: forces and frames on one clock."""
 
 from itertools import pairwise
 

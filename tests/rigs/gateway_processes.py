@@ -1,4 +1,4 @@
-"""Finds the processes of the gateways of a fishd."""
+"""Processes of the gateways of a fishd."""
 
 import contextlib
 from pathlib import Path
@@ -15,21 +15,21 @@ def children(pid: int) -> list[int]:
 
 
 def fork_server(daemon: Daemon) -> int:
-    """The process that forks the gateways."""
+    """Return the process that forks the gateways."""
     (pid,) = children(daemon.process.pid)
     return pid
 
 
 def gateways(daemon: Daemon) -> dict[str, int]:
-    """The processes of the gateways, by what they are for."""
-    found = {}
+    """Return the processes of the gateways by their purpose."""
+    pids = {}
     for server in children(daemon.process.pid):
         for pid in children(server):
             with contextlib.suppress(FileNotFoundError, ProcessLookupError):
                 name = Path(f"/proc/{pid}/comm").read_text().strip()
-                if not gone(pid) and name != "fishd-gateways":  # one that is being forked
-                    found[name.removeprefix("fishd-")] = pid
-    return found
+                if not gone(pid) and name != "fishd-gateways":  # a process that is being forked
+                    pids[name.removeprefix("fishd-")] = pid
+    return pids
 
 
 def both_gateways(daemon: Daemon) -> dict[str, int]:
@@ -42,7 +42,7 @@ def both_gateways(daemon: Daemon) -> dict[str, int]:
 
 
 def gone(pid: int) -> bool:
-    """Has a process ended? One that nobody has waited for yet has."""
+    """Return whether a process has ended; a zombie has."""
     try:
         return "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text()
     except (FileNotFoundError, ProcessLookupError):

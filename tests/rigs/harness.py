@@ -1,4 +1,4 @@
-"""What tests are built from: the real loop on a simulated fish and a virtual clock."""
+"""Real loop on a simulated fish and a virtual clock."""
 
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -17,7 +17,7 @@ from fishd.virtual.plant.tethered import TetheredFish
 
 
 class Recorder:
-    """A publisher that keeps everything."""
+    """Publisher that stores everything."""
 
     def __init__(self) -> None:
         self.ticks: list[Tick] = []
@@ -37,7 +37,7 @@ class Recorder:
 
 
 class Rig:
-    """A loop on a virtual clock, and everything a test wants to look at or break."""
+    """Loop on a virtual clock, with the parts that a test observes or breaks."""
 
     def __init__(
         self,
@@ -46,7 +46,7 @@ class Rig:
         notify: Callable[[float], None] = lambda now: None,
         stack: ExitStack | None = None,
     ) -> None:
-        """stack: closes what the robot has opened"""
+        """stack: closes the resources of the robot"""
         self.config: Config = load(None, overrides)
         self.clock = VirtualClock()
         self.recorder = Recorder()
@@ -59,14 +59,14 @@ class Rig:
         return self.fish.robot()
 
     def change_fin(self, thrust_coefficient: float) -> None:
-        """Give the fish another fin while it swims."""
+        """Change the fin of the fish while it swims."""
         fish = self.fish.fish
         plant = structs.replace(fish.parameters, thrust_coefficient=thrust_coefficient)
         self.fish.fish = TetheredFish(plant, fish.state, self.config.simulation.motor)
 
     @property
     def now(self) -> float:
-        """The latest deadline [s]."""
+        """Latest deadline [s]."""
         return (self.index - 1) * self.config.tick
 
     @property
@@ -79,7 +79,7 @@ class Rig:
         return reason.code if reason else None
 
     def start(self, controller: str | Controller[Any], **parameters: Any) -> Self:
-        """Give a controller command, which takes over with the next tick."""
+        """Select a controller, which takes over with the next tick."""
         if isinstance(controller, str):
             name = controller
             controller = registry.create(controller, parameters, self.config.limits)
@@ -95,7 +95,7 @@ class Rig:
         )
 
     def run(self, ticks: int = 1, *, missed: int = 0, lateness: float = 0.0) -> list[Tick]:
-        """Turn the loop; `missed` slots are skipped before the first of these ticks."""
+        """Run the loop; `missed` slots are skipped before the first of these ticks."""
         for _ in range(ticks):
             self.index += missed
             deadline = self.index * self.config.tick
@@ -113,7 +113,7 @@ LIMITS = Limits(amplitude=0.42, tick=0.05)
 
 
 def observe(angle: float = 0.0, fin_velocity: float = 0.0, dt: float = 0.05) -> Observation:
-    """An observation in which only what controllers use is set."""
+    """Return an observation with only the fields that controllers use."""
     return Observation(
         time=0.0,
         dt=dt,
@@ -129,7 +129,7 @@ def observe(angle: float = 0.0, fin_velocity: float = 0.0, dt: float = 0.05) -> 
 
 
 def commands(controller: Controller[Any], ticks: int, angle: float = 0.0) -> list[float]:
-    """What a freshly activated controller commands, with nothing else in between."""
+    """Return the commands of a newly activated controller, without the loop."""
     controller.activate(observe(angle))
     given = []
     for _ in range(ticks):
@@ -139,7 +139,7 @@ def commands(controller: Controller[Any], ticks: int, angle: float = 0.0) -> lis
 
 
 class Scripted(Controller[Any]):
-    """A controller that does what a test tells it to."""
+    """Controller that a test scripts."""
 
     Parameters = type(registry.create("hold", {}, LIMITS).parameters)
 
@@ -152,7 +152,7 @@ class Scripted(Controller[Any]):
 
 
 class Wrapped:
-    """A sensor and servo that pass everything on until a test makes one of them fail."""
+    """Sensor and servo that forward all calls until a test makes one of them fail."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -162,11 +162,11 @@ class Wrapped:
         self.suspect = ""
         self.fx: float | None = None
         self.fy: float | None = None
-        """What every measurement says instead of the true ones [N]."""
+        """Value that replaces F_y in every measurement [N]; None: true values."""
         self.delay = 0.0
-        """Age that is added to every measurement [s]."""
+        """Additional age of every measurement [s]."""
         self.log: list[float | None] = []
-        """What reached the servo: angles, and None for a release."""
+        """Calls of the servo: angles, and None for a release."""
 
     def robot(self) -> Robot:
         return Robot(
@@ -202,7 +202,7 @@ class Wrapped:
 
 
 def fragile_rig(*overrides: str, kind: type[Any] = Wrapped) -> tuple[Rig, Any]:
-    """A rig whose robot can be made to fail.
+    """Return a rig whose robot can be made to fail.
 
     kind: a subclass of Wrapped
     """

@@ -1,4 +1,4 @@
-"""Files that claim to be recordings, made by code; none is large."""
+"""Generated files that pretend to be recordings; none is large."""
 
 import base64
 import json
@@ -30,11 +30,11 @@ from common.mcap_records import (
 from fishd.core.signals import Event
 
 TICK, EVENT, STATUS, CAMERA = 1, 2, 3, 4
-"""Channels, as `RunWriter` numbers them."""
+"""Numbers of the channels of `RunWriter`."""
 CLAIM = 8 * 2**30
-"""Size that a hostile file claims to have [bytes]."""
+"""Size that a hostile file states [bytes]."""
 ODD = '\x1b[31m<script>alert(1)</script>\x9b\u202e$\\frac{"&'
-"""Text that a terminal, a page or matplotlib would take for commands."""
+"""Text that a terminal, a page or matplotlib could interpret as commands."""
 
 Good = list[Record]
 """Records of a good recording; its first chunk comes after metadata and configuration."""
@@ -48,19 +48,19 @@ def file(make: Callable[[Good], bytes]) -> Callable[[Good], bytes]:
 
 
 def with_first_chunk(good: Good, *instead: Record) -> bytes:
-    """The good file with something else in place of its first chunk."""
+    """Return the good file with its first chunk replaced."""
     at = next(index for index, (opcode, _) in enumerate(good) if opcode == Opcode.CHUNK)
     return join([*good[:at], *instead, *good[at + 1 :]])
 
 
 def with_more(good: Good, *more: Record) -> bytes:
-    """The good file with more at the end of its data."""
+    """Return the good file with more records at the end of its data."""
     at = next(index for index, (opcode, _) in enumerate(good) if opcode == Opcode.DATA_END)
     return join([*good[:at], *more, *good[at:]])
 
 
 def with_config(good: Good, yaml: bytes) -> bytes:
-    """The good file with another configuration."""
+    """Return the good file with another configuration."""
     return join(
         [
             attachment("config.yaml", yaml) if b"config.yaml" in body[:40] else (opcode, body)
@@ -71,13 +71,13 @@ def with_config(good: Good, yaml: bytes) -> bytes:
 
 
 def with_messages(good: Good, channel: int, messages: Iterable[Any]) -> bytes:
-    """The good file with more messages, each plain data or bytes."""
+    """Return the good file with more messages, each plain data or bytes."""
     payloads = (each if isinstance(each, bytes) else json.dumps(each).encode() for each in messages)
     return with_more(good, chunk(b"".join(message(channel, payload) for payload in payloads)))
 
 
 def tick_of(good: Good, **changes: Any) -> dict[str, Any]:
-    """The first tick of the good file, as plain data, changed."""
+    """Return the changed first tick of the good file as plain data."""
     chunks = (chunk_content(body) for opcode, body in good if opcode == Opcode.CHUNK)
     payloads = (
         body[22:]

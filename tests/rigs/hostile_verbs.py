@@ -1,6 +1,6 @@
-"""Runs verbs on every hostile recording, in one process: FOLDER VERB...
+"""Program that runs verbs on every hostile recording in one process: FOLDER VERB...
 
-Prints how each ended, and the most memory that the process has held, as JSON.
+It prints how each ended, and the peak memory of the process, as JSON.
 """
 
 import resource
@@ -15,7 +15,7 @@ from common.recording_verbs import Outcome, peak_memory, run_verb
 from rigs.hostile_recordings import FILES
 
 MAX_ADDRESSES = 4 * 2**30
-"""Limit of what the process may allocate [bytes]."""
+"""Limit of the address space of the process [bytes]."""
 TEXTS_AND_NUMBERS = {"texts-that-are-commands", "numbers-that-no-fish-has"}
 MANY = {"ten-thousand-quantities", "thousands-of-events"}
 FILES_OF = {
@@ -23,21 +23,21 @@ FILES_OF = {
     "plot --html": {*TEXTS_AND_NUMBERS, *MANY},
     "plot --png": TEXTS_AND_NUMBERS,
 }
-"""Files that a verb is tried with: the others it reads as `export --csv` does.
+"""Files for a verb; it reads the others like `export --csv`.
 
-How many quantities and events are drawn is decided for page and picture at once.
+The number of drawn quantities and events is decided for page and picture at once.
 """
 
 
 class Result(msgspec.Struct):
-    """How the verbs ended for each file."""
+    """Results of the verbs for each file."""
 
     outcomes: list[Outcome]
     megabytes: float
 
 
 def write_all(folder: Path) -> None:
-    """Write all of them, and a good one, into a folder."""
+    """Write all hostile files and a good one into a folder."""
     good = folder / "good.mcap"
     write_good_recording(good)
     records = split(good.read_bytes())
@@ -57,7 +57,7 @@ def main(folder: Path, *verbs: str) -> None:
             out.mkdir(parents=True)
             copy = Path(shutil.copy(file, out)) if verb == "recover" else file
             outcomes.append(run_verb(verb, copy, out))
-            if verb.startswith("runs"):  # it reads the folder
+            if verb.startswith("runs"):  # the verb reads the folder
                 break
     print(msgspec.json.encode(Result(outcomes, peak_memory())).decode())
 

@@ -1,6 +1,6 @@
-"""HX711 chips at the level of their two wires, and the RPi.GPIO that they are read through.
+"""HX711 chips emulated at the level of their two wires, and the RPi.GPIO that reads them.
 
-After the data sheet of Avia Semiconductor. Each call of RPi.GPIO takes two microseconds.
+They follow the data sheet of Avia Semiconductor. Each call of RPi.GPIO takes two microseconds.
 """
 
 import sys
@@ -16,7 +16,7 @@ STEPS = 1 << 23
 
 
 class Hx711Chip:
-    """One chip; its channel A measures `volts`."""
+    """Emulated chip; its channel A measures `volts`."""
 
     def __init__(
         self,
@@ -25,15 +25,15 @@ class Hx711Chip:
         rate: float = 80.0,
         supply: float = 4.3,
     ) -> None:
-        """volts: (start, end [s]) to the mean voltage in that time"""
+        """volts: returns the mean voltage between two times [s]"""
         self._clock = clock
         self._volts = volts
         self._period = 1.0 / rate
         self._supply = supply
         self.conversions: list[tuple[float, int]] = []
-        """When each that was read ended [s], and its gain."""
+        """Ends of the conversions that were read [s], and their gains."""
         self.level = 0
-        """Of PD_SCK."""
+        """Level of PD_SCK."""
         self._rose = 0.0
         self._power_up()
 
@@ -41,10 +41,10 @@ class Hx711Chip:
         self._gain = 128
         self._pulses = 0
         self._down = False
-        self._ready_at = self._clock.now + 4 * self._period  # the settling time
+        self._ready_at = self._clock.now + 4 * self._period  # settling time
 
     def clock_to(self, level: int) -> None:
-        """An edge of PD_SCK."""
+        """Receive an edge of PD_SCK."""
         self._look()
         if level and not self.level:
             self._rose = self._clock.now
@@ -55,7 +55,7 @@ class Hx711Chip:
         self.level = level
 
     def data(self) -> int:
-        """The level of DOUT."""
+        """Return the level of DOUT."""
         self._look()
         if self._down:
             return 1
@@ -69,7 +69,7 @@ class Hx711Chip:
         return self._clock.now >= self._ready_at
 
     def _look(self) -> None:
-        """What has happened by itself: power-down, and the next conversion."""
+        """Apply events since the previous access: power-down, and the next conversion."""
         if self.level and self._clock.now - self._rose > POWER_DOWN:
             self._down = True
             self._pulses = 0
@@ -85,10 +85,10 @@ class Hx711Chip:
         assert self._pulses <= 27, "no more than 27 pulses may come in one go"
         if self._pulses == 25:
             behind = (self._clock.now - self._ready_at) // self._period
-            self._ready_at += (behind + 1) * self._period  # conversions went on meanwhile
+            self._ready_at += (behind + 1) * self._period  # conversions continued meanwhile
 
     def _convert(self) -> None:
-        """The newest conversion, which is what is shifted out."""
+        """Store the newest conversion, which is shifted out."""
         end = self._ready_at + (self._clock.now - self._ready_at) // self._period * self._period
         full_scale = 0.5 * self._supply / self._gain
         code = round(self._volts(end - self._period, end) / full_scale * STEPS)
@@ -97,21 +97,21 @@ class Hx711Chip:
 
 
 class GpioStandIn:
-    """Module RPi.GPIO with chips on its pins; a context manager, while which it can be imported."""
+    """Module RPi.GPIO with chips on its pins; it can be imported within the context manager."""
 
     BCM, IN, OUT, LOW, HIGH, PUD_UP = 11, 1, 0, 0, 1, 22
 
     def __init__(self, clock: VirtualClock, sck: int, chips: dict[int, Hx711Chip]) -> None:
-        """sck: the pin of PD_SCK of all chips; chips: by the pin of DOUT"""
+        """sck: pin of PD_SCK of all chips; chips: chips by the pin of DOUT"""
         self._clock = clock
         self._sck = sck
         self.chips = chips
         self.unplugged: set[int] = set()
-        """Pins whose wire is off."""
+        """Pins with a disconnected wire."""
         self.shorted: set[int] = set()
-        """Pins that are at ground."""
+        """Pins connected to ground."""
         self.hold_up = 0.0
-        """How long the next rising edge keeps the program from going on [s]."""
+        """Delay of the program at the next rising edge [s]."""
         self.claimed: dict[int, int] = {}
 
     def setmode(self, mode: int) -> None:

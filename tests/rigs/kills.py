@@ -10,7 +10,7 @@ WRITING = ("open", "write", "fdatasync", "fsync", "link", "unlink", "rename", "r
 
 
 def ends_before(call: int, act: Callable[[], object]) -> bool:
-    """Act in another process, which is killed at this system call of `WRITING`; had it ended?"""
+    """Act in a process that is killed at this system call of `WRITING`; return if it had ended."""
     if not (child := os.fork()):
         calls = count()
 

@@ -1,4 +1,4 @@
-"""The real loop and the real drivers on a virtual Pi, all of it in virtual time."""
+"""Real loop and real drivers on a virtual Pi, in virtual time."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,7 +13,7 @@ NEUTRAL = 1500.0
 
 
 class LockstepRig(Rig):
-    """A loop on the whole hardware path, and the virtual Pi for a test to break."""
+    """Loop on the whole hardware path, with a virtual Pi that a test can break."""
 
     robot_name = "virtual-pi"
 
@@ -27,11 +27,11 @@ class LockstepRig(Rig):
 
     @property
     def pulse(self) -> float:
-        """What the servo gets now [µs]; 0 for no pulses."""
+        """Return the current servo pulse [µs]; 0 without pulses."""
         return self.pi.pigpiod.width(GPIO, self.now)
 
     def run_until_fault(self, limit: float) -> float:
-        """How long it took [s]."""
+        """Run until a fault, and return the time [s]."""
         begun = self.now
         while self.mode != "fault":
             assert self.now - begun < limit, f"still {self.mode} after {limit} s"
@@ -39,7 +39,7 @@ class LockstepRig(Rig):
         return self.now - begun
 
     def pulses_since(self, time: float) -> list[tuple[float, float]]:
-        """(time, width) of every change of the pulses from `time` on."""
+        """Return time and width of every change of the pulses from `time` on."""
         history = self.pi.pigpiod.history(GPIO)
         return [(when, width) for when, width in history if when >= time]
 

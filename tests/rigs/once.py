@@ -1,4 +1,4 @@
-"""What takes seconds to make is made by one of the test processes, and used by all of them."""
+"""Results that take seconds, computed by one of the test processes and used by all."""
 
 import fcntl
 import os
@@ -13,9 +13,9 @@ T = TypeVar("T")
 
 
 def once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], T]) -> T:
-    """Return what `make` returns, which the first process calls while the others wait for it.
+    """Return the result of `make`, which the first process calls while the others wait.
 
-    name: of the folder that it is given; what is in there must not be changed by a test
+    name: name of the folder for `make`; tests must not change its content
     """
     base = factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / name

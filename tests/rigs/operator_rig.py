@@ -1,4 +1,4 @@
-"""What tests of the operator's verbs are built from: a virtual Pi, loads on its fish, dialogues."""
+"""Virtual Pi, loads on its fish, and dialogues, for tests of the operator's verbs."""
 
 import contextlib
 import multiprocessing
@@ -26,23 +26,23 @@ from fishd.virtual.plant.parameters import PlantParameters
 from rigs.processes import FISHCTL, PATIENCE, Daemon, fishctl, running, sets, wait_until
 
 SENSITIVITY_X, SENSITIVITY_Y = 2.0, 1.5
-"""Of the sensor with loads on it [V/N]."""
+"""Sensitivities of the loaded sensor [V/N]."""
 CROSSTALK = 0.1
-"""Share of the other voltage that shows on each channel."""
+"""Fraction of the other voltage on each channel."""
 ZERO_X, ZERO_Y = 0.3, -0.2
 """Voltages without a load [V]."""
 SERVO = 18
-"""Its GPIO."""
+"""GPIO of the servo."""
 _MUX_X, _MUX_Y = 0, 3  # A0-A1 and A2-A3
 
 
 class LoadedPi:
-    """A virtual Pi whose fish can be loaded; lives in a process of its own."""
+    """Virtual Pi whose fish can be loaded, in a separate process."""
 
     def __init__(self, socket: str) -> None:
         self._load = (0.0, 0.0)
         self._shaking = 0.0
-        # Its own chip moves aside for the one that feels the loads.
+        # Replace its chip by the one with the loads.
         settings = VirtualPiSettings(socket=socket, pigpio_port=0, address=0x49)
         clock = SystemClock()
         self._pi = VirtualPi(
@@ -64,11 +64,11 @@ class LoadedPi:
         return {_MUX_X: vx + ZERO_X, _MUX_Y: vy + ZERO_Y}[mux] + fish
 
     def load(self, fx: float, fy: float, shaking: float = 0.0) -> None:
-        """Pull at the fish [N], with a force along x that comes and goes, ±shaking."""
+        """Load the fish [N], with an additional alternating force along x, ±shaking."""
         self._load, self._shaking = (fx, fy), shaking
 
     def write_register(self, register: int, value: int) -> None:
-        """Do to the chip what another program might."""
+        """Write a register of the chip, like another program."""
         self._pi.bus.transfer(0x48, [Write(bytes([register, *value.to_bytes(2, "big")]))])
 
     def inject(self, fault: str) -> None:
@@ -81,11 +81,11 @@ class LoadedPi:
         return self._pi.pigpiod.port
 
     def pulse(self) -> float:
-        """The servo pulse now [µs]; 0 for none."""
+        """Return the current servo pulse [µs]; 0 without pulses."""
         return self._pi.pigpiod.width(SERVO, time.monotonic())
 
     def widths(self) -> list[float]:
-        """The pulses that the servo has got, one after the other [µs]."""
+        """Return all widths of the servo pulses, in their order [µs]."""
         return [width for _, width in self._pi.pigpiod.history(SERVO)]
 
 
@@ -97,24 +97,24 @@ _Manager.register("LoadedPi", LoadedPi)
 
 
 def _be_prompt() -> None:
-    """fishd gives pigpiod a few milliseconds; the real one has a priority of its own, too."""
+    """Raise the priority, because fishd gives pigpiod only a few milliseconds."""
     sys.setswitchinterval(2e-4)
     with contextlib.suppress(PermissionError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(20))
 
 
 class Bench:
-    """A virtual Pi that other processes reach, and what they have to be told about it."""
+    """Virtual Pi for other processes, and the settings that they need."""
 
     def __init__(self, folder: Path, pi: Any) -> None:
-        """pi: a `LoadedPi`, in its process"""
+        """pi: `LoadedPi` in its process"""
         self.folder = folder
         self.pi = pi
         self._port = pi.port()
 
     @property
     def settings(self) -> list[str]:
-        """Options for a fishd, or a verb, that is to use this virtual Pi."""
+        """Options of a fishd, or a verb, for this virtual Pi."""
         return sets(
             "robot=virtual-pi",
             f"virtual_pi.socket={self.folder}/virtual-pi",
@@ -123,23 +123,23 @@ class Bench:
             "servo.countdown=2",
             f"state_folder={self.folder}/state",
             "force_sensor.tare_limit=0.5",
-            "force_sensor.data_rate=64",  # enough for them, and a fifth of the work
+            "force_sensor.data_rate=64",  # sufficient, with a fifth of the load
         )
 
     def files(self, kind: str) -> list[Path]:
-        """Calibration files, oldest first."""
+        """Return the calibration files, oldest first."""
         return sorted((self.folder / "state" / "virtual-pi").glob(f"{kind}-*.yaml"))
 
     def wait_for_pulse(self, lowest: float, highest: float) -> None:
-        """Until the pulse is within these [µs]."""
+        """Wait until the pulse is within these limits [µs]."""
         wait_until(lambda: lowest <= self.pi.pulse() <= highest)
 
     def daemon(self, *arguments: str) -> AbstractContextManager[Daemon]:
-        """A fishd on this virtual Pi."""
+        """Run a fishd on this virtual Pi."""
         return running(self.folder, *self.settings, *arguments)
 
     def renew(self, daemon: Daemon) -> None:
-        """Take away loads, faults and calibrations, and bring its fishd to rest."""
+        """Remove loads, faults and calibrations, and bring its fishd to rest."""
         self.pi.load(0.0, 0.0)
         self.pi.clear()
         wait_until(lambda: not daemon.status().sensor_lost)
@@ -155,7 +155,7 @@ class Bench:
 
 @contextlib.contextmanager
 def pi_process() -> Iterator[Any]:
-    """A process in which a `LoadedPi` can be made, one after the other."""
+    """Run a process in which `LoadedPi`s can be created one after another."""
     manager = _Manager(ctx=multiprocessing.get_context("spawn"))
     manager.start(initializer=_be_prompt)
     try:
@@ -166,7 +166,7 @@ def pi_process() -> Iterator[Any]:
 
 @contextlib.contextmanager
 def bench(process: Any, folder: Path) -> Iterator[Bench]:
-    """A virtual Pi that runs as long as this, in a `pi_process`."""
+    """Run a virtual Pi in a `pi_process`."""
     pi = process.LoadedPi(str(folder / "virtual-pi"))
     try:
         yield Bench(folder, pi)
@@ -175,7 +175,7 @@ def bench(process: Any, folder: Path) -> Iterator[Bench]:
 
 
 class Dialogue:
-    """A `fishctl` whose prompts are answered one by one."""
+    """Running `fishctl` whose prompts are answered one by one."""
 
     def __init__(self, daemon: Daemon, *arguments: str) -> None:
         self.process = subprocess.Popen(
@@ -193,7 +193,7 @@ class Dialogue:
         self._seen = 0
 
     def close(self) -> None:
-        """End it, whatever it is doing; may be called after `finish`."""
+        """End the program; may be called after `finish`."""
         self.process.kill()
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe:
@@ -201,7 +201,7 @@ class Dialogue:
         self.process.wait(PATIENCE)
 
     def expect(self, text: str) -> str:
-        """Wait until this turns up in what is new; returns all that is new up to there."""
+        """Wait for a text in the new output, and return the new output up to it."""
         deadline = time.monotonic() + PATIENCE
         while text not in self.text[self._seen :]:
             assert time.monotonic() < deadline, f"no '{text}' in: {self.text}"
@@ -217,13 +217,13 @@ class Dialogue:
         return self.text[before : self._seen]
 
     def answer(self, prompt: str, line: str = "") -> str:
-        """Wait for a prompt and type a line; returns what came before it."""
+        """Wait for a prompt and type a line; return the output before it."""
         shown = self.expect(prompt)
         os.write(self._in, f"{line}\n".encode())
         return shown
 
     def finish(self) -> int:
-        """Close its input and wait for its end; returns the exit status."""
+        """Close its input and wait for its end; return the exit status."""
         assert self.process.stdin
         assert self.process.stdout
         self.process.stdin.close()
@@ -234,22 +234,22 @@ class Dialogue:
 
 
 Talk = Callable[..., Dialogue]
-"""Begins a `Dialogue` with a fishctl that is gone after the test."""
+"""Function that starts a `Dialogue` with a fishctl that ends with the test."""
 
 
 def forces(daemon: Daemon, seconds: float = 0.6) -> tuple[float, float]:
-    """F_x and F_y as the daemon measures them now [N]."""
+    """Return the current F_x and F_y of the daemon [N]."""
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         sample = fish.sample_force(seconds)
     return sample.fx, sample.fy
 
 
 def calibrations(daemon: Daemon) -> Calibrations:
-    """What fishd uses now."""
+    """Return the active calibrations of fishd."""
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         return fish.calibrations()
 
 
 def fishctl_alone(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """fishctl where no daemon runs."""
+    """Run fishctl without a daemon."""
     return fishctl("--endpoint", f"ipc://{folder}/nobody", *arguments)

@@ -1,4 +1,4 @@
-"""A PCA9685 at the level of its registers, for an `I2cBus`; after its data sheet, NXP, Rev. 4."""
+"""PCA9685 emulated at the level of its registers, for an `I2cBus`; data sheet: NXP, Rev. 4."""
 
 import errno
 
@@ -14,7 +14,7 @@ START_UP = 500e-6
 
 
 class Pca9685Chip:
-    """Sixteen channels, of which one is looked at."""
+    """Emulated chip with sixteen channels, of which one is recorded."""
 
     def __init__(self, clock: Clock, channel: int = 0) -> None:
         self.clock = clock
@@ -27,7 +27,7 @@ class Pca9685Chip:
         self.reset()
 
     def reset(self) -> None:
-        """As after power-on."""
+        """Reset as after power-on."""
         self.registers = bytearray(256)
         self.registers[MODE1], self.registers[MODE2] = SLEEP | 0x01, 0x04
         self.registers[PRE_SCALE] = 0x1E
@@ -38,12 +38,12 @@ class Pca9685Chip:
         self._update()
 
     def power_cycle(self) -> None:
-        """A brown-out: no pulse is ended in good order."""
+        """Simulate a brown-out, which cuts off a running pulse."""
         self.pulses.cut(self.clock.monotonic())
         self.reset()
 
     def width(self, time: float) -> float:
-        """The pulse that is sent at a time [µs]; 0 for none."""
+        """Return the pulse at a time [µs]; 0 without pulses."""
         return self.pulses.width(time)
 
     def write(self, data: bytes) -> None:
@@ -57,15 +57,15 @@ class Pca9685Chip:
                 raise kernel_error(errno.EREMOTEIO)
             self._store(self._pointer, value)
             self._advance()
-        self._update()  # with the stop condition, as OCH is 0
+        self._update()  # at the stop condition, because OCH is 0
 
     def read(self, length: int) -> bytes:
         self._need_power()
-        found = bytearray()
+        content = bytearray()
         for _ in range(length):
-            found.append(self.registers[self._pointer])
+            content.append(self.registers[self._pointer])
             self._advance()
-        return bytes(found)
+        return bytes(content)
 
     def _need_power(self) -> None:
         if not self.plugged_in:
@@ -78,7 +78,7 @@ class Pca9685Chip:
     def _store(self, register: int, value: int) -> None:
         mode = self.registers[MODE1]
         if register == PRE_SCALE:
-            if mode & SLEEP:  # else the write is blocked
+            if mode & SLEEP:  # otherwise the write is blocked
                 self.registers[PRE_SCALE] = max(3, value)
         elif register == MODE1:
             self._set_mode(mode, value)
@@ -106,7 +106,7 @@ class Pca9685Chip:
         return not off & FULL << 8 and on & 0xFFF != off & 0xFFF
 
     def _update(self) -> None:
-        """Tell the outside what the channel sends from now on."""
+        """Update the recorded pulses of the channel."""
         now = max(self.clock.monotonic(), self._runs_from)
         on, off = self._counts(self.channel)
         asleep = self.registers[MODE1] & (SLEEP | RESTART)

@@ -1,9 +1,9 @@
-"""What a picture says."""
+"""Texts in pictures."""
 
 from pathlib import Path
 from xml.etree import ElementTree
 
 
 def letters_of(picture: Path) -> str:
-    """What is written in an SVG picture whose text was kept as text, without any spaces."""
+    """Return the text of an SVG picture whose text is stored as text, without spaces."""
     return "".join("".join(ElementTree.parse(picture).getroot().itertext()).split())

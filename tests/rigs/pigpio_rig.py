@@ -1,4 +1,4 @@
-"""What tests of the pigpio servo are built from: an emulated pigpiod, and servos on it."""
+"""Emulated pigpiod and servos on it, for tests of the pigpio servo."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -25,7 +25,7 @@ TICK = 0.05
 
 
 class Bench:
-    """In virtual time, or in real time if that is what its clock shows."""
+    """Emulated pigpiod and its servos, in virtual or real time by its clock."""
 
     def __init__(
         self, stack: contextlib.ExitStack, clock: VirtualClock | SystemClock | None = None
@@ -64,7 +64,7 @@ class Bench:
         return PigpioLink(address, settings.timeout, SystemClock(), prepare, threaded=True)
 
     def last_resort(self, neutral: float = 1500.0) -> bool:
-        """What another process does when fishd is dead."""
+        """Run the last resort, as another process does when fishd is dead."""
         place = {"gpio": GPIO, "host": "127.0.0.1", "port": self.daemon.port}
         return neutralise(neutral, **place, sleep=self.clock.sleep)  # type: ignore[arg-type]
 
@@ -75,7 +75,7 @@ class Bench:
 
     @property
     def width(self) -> float:
-        """The pulse one frame from now [µs]."""
+        """Return the pulse after one frame [µs]."""
         return self.daemon.width(GPIO, self.clock.monotonic() + FRAME)
 
     def wait(self, seconds: float) -> None:
@@ -85,16 +85,16 @@ class Bench:
         return open_client("127.0.0.1", self.daemon.port)
 
     def scripts(self) -> int:
-        """How many scripts pigpiod holds."""
-        found = 0
+        """Return the number of scripts that pigpiod stores."""
+        running = 0
         with self.client() as client:
             for script in range(MAX_SCRIPTS):
                 client.within(ANSWER_TIMEOUT_S)
-                found += bool(client.script_status(script)[1])
-        return found
+                running += bool(client.script_status(script)[1])
+        return running
 
     def refuse(self, command: int, value: int) -> None:
-        """From now on pigpiod refuses this command with this second parameter."""
+        """Make pigpiod refuse this command with this second parameter."""
         commands = self.daemon._commands
         execute = commands.execute
 
@@ -108,16 +108,16 @@ class Bench:
         commands.execute = refusing
 
     def hang_up(self) -> None:
-        """Pigpiod ends all connections; pulses go on."""
+        """Close all connections of pigpiod; pulses continue."""
         for connection in list(self.daemon._connections.values()):
             connection.hang_up()
 
     def hang_up_in_next_sleep(self) -> None:
-        """As `hang_up`, while fishd sleeps the next time."""
+        """Close all connections during the next sleep of fishd."""
         sleep = self.clock.sleep
 
         def hang_up(seconds: float) -> None:
-            if self.clock.sleep is not sleep:  # who has this one calls it again
+            if self.clock.sleep is not sleep:  # callers with the old function call it again
                 self.clock.sleep = sleep
                 self.hang_up()
             sleep(seconds)
@@ -129,19 +129,19 @@ class Bench:
 
 
 def connect(servo: CalibratedServo) -> None:
-    """Connect, but neither write nor release."""
+    """Return a connected servo without a write or release."""
     with link_of(servo).session():
         pass
 
 
 def link_of(servo: CalibratedServo) -> PigpioLink:
-    """Its link to pigpiod."""
+    """Return the servo's link to pigpiod."""
     assert isinstance(servo.driver, Pigpio)
     return servo.driver._link
 
 
 def script_of(servo: CalibratedServo) -> int:
-    """The number of its countdown script."""
+    """Return the number of the servo's countdown script."""
     assert isinstance(servo.driver, Pigpio)
     return servo.driver._script
 

@@ -1,4 +1,4 @@
-"""An emulated pigpiod with the true client on it, for tests of the emulation itself."""
+"""Emulated pigpiod with the real client, for tests of the emulation."""
 
 import contextlib
 import time
@@ -15,7 +15,7 @@ GPIO = 18
 
 
 class Bench:
-    """A pigpiod, on virtual time unless another clock is given, and its client."""
+    """Emulated pigpiod, by default in virtual time, and its client."""
 
     def __init__(self, clock: Clock | None = None) -> None:
         self.clock = clock or VirtualClock()
@@ -32,17 +32,17 @@ class Bench:
 
     @property
     def width(self) -> float:
-        """The pulse now [µs]."""
+        """Return the current pulse [µs]."""
         return self.daemon.width(GPIO, self.clock.monotonic())
 
     @property
     def settled_width(self) -> float:
-        """The pulse when the next frame has begun [µs]."""
+        """Return the pulse after the begin of the next frame [µs]."""
         self.sleep(0.02)
         return self.width
 
     def result(self, method: str, *arguments: object) -> int:
-        """What the client gets from a command, be it good or a negative error number."""
+        """Return the result of a command, or its negative error number."""
         pigpio.exceptions = False
         try:
             return getattr(self.pi, method)(*arguments)
@@ -57,7 +57,7 @@ class Bench:
 
 
 def dispose(pi: pigpio.pi) -> None:
-    """Stop a client and wait for its thread, even if its daemon is gone and the thread spins."""
+    """Stop a client and wait for its thread, even if its daemon has ended and the thread loops."""
     thread = pi._notify
     with contextlib.suppress(OSError):
         pi.stop()
@@ -78,7 +78,7 @@ def pigpiod_bench(clock: Clock | None = None) -> Iterator[Bench]:
 
 
 def eventually(condition: Callable[[], bool]) -> bool:
-    """Wait until another thread has made it true."""
+    """Wait until another thread has made a condition true."""
     end = time.monotonic() + PATIENCE
     while not condition():
         if time.monotonic() > end:

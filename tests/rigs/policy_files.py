@@ -1,4 +1,4 @@
-"""Policies whose answers are known, and files that only look like policies."""
+"""Policies with known results, and files that only resemble policies."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -40,7 +40,7 @@ PROVENANCE = Provenance(
 
 
 def card(*features: tuple[FeatureName, float], tick: float = 0.05, amplitude: float = 0.42) -> Card:
-    """By default it sees the present angle, over Φ."""
+    """Return a card; by default the policy sees the current angle, over Φ."""
     return Card(
         observation=tuple(Feature(*f) for f in features or (("instruction_angle", 0.42),)),
         tick=tick,
@@ -50,12 +50,12 @@ def card(*features: tuple[FeatureName, float], tick: float = 0.05, amplitude: fl
 
 
 def linear(*weights: float, bias: float = 0.0) -> list[Layer]:
-    """One layer: the weighted sum of the inputs."""
+    """Return one layer, the weighted sum of the inputs."""
     return [(np.array([weights]), np.array([bias]))]
 
 
 def random_layers(*sizes: int, seed: int = 0) -> list[Layer]:
-    """Layers of these sizes, from the inputs on."""
+    """Return random layers of these sizes, from the inputs on."""
     draw = np.random.default_rng(seed)
     return [
         (draw.normal(0.0, before**-0.5, (after, before)), draw.normal(0.0, 0.1, after))
@@ -64,7 +64,7 @@ def random_layers(*sizes: int, seed: int = 0) -> list[Layer]:
 
 
 def answer(layers: Sequence[Layer], activation: str, inputs: NDArray[Any]) -> float:
-    """What a network says, in numpy and double precision."""
+    """Return the output of a network, computed in double precision."""
     value = np.asarray(inputs, np.float64)
     for number, (weight, bias) in enumerate(layers):
         value = weight @ value + bias
@@ -76,7 +76,7 @@ def answer(layers: Sequence[Layer], activation: str, inputs: NDArray[Any]) -> fl
 def seeing_card(
     *features: tuple[FeatureName, float], pictures: StackSettings | None = None, tick: float = 0.05
 ) -> Card:
-    """By default it sees two frames of 32 x 32 pixels, and nothing else."""
+    """Return a card; by default the policy sees only two frames of 32 x 32 pixels."""
     return Card(
         observation=tuple(Feature(*f) for f in features),
         pictures=pictures or StackSettings(size=32, frames=2, delay=0.02),
@@ -87,7 +87,7 @@ def seeing_card(
 
 
 def of_pixels(weights: NDArray[Any], about: Card, *others: float) -> bytes:
-    """A policy that is a weighted sum of all grey levels, and of its other numbers behind them.
+    """Return a policy with the weighted sum of all grey levels, followed by its other inputs.
 
     weights: shape (frames, size, size)
     """
@@ -106,29 +106,29 @@ def of_pixels(weights: NDArray[Any], about: Card, *others: float) -> bytes:
 
 
 def velocity_follower(gain: float = 4.0, about: Card | None = None) -> bytes:
-    """A policy that sees where the tail goes, and sends it further: it swims.
+    """Return a policy that drives the tail in the direction of its motion, so that it swims.
 
     The tail is dark, so the upper half of a frame becomes lighter as the tail goes to higher rows.
 
-    gain: Φ for each grey level by which the halves differ more than in the frame before
+    gain: Φ per grey level of the change of the difference between the halves
     """
-    found = about or seeing_card()
-    assert found.pictures
-    size = found.pictures.size
+    policy_card = about or seeing_card()
+    assert policy_card.pictures
+    size = policy_card.pictures.size
     halves = np.where(np.arange(size) < size / 2, 1.0, -1.0)[:, None] * np.full(size, 2.0 / size**2)
-    weights = np.zeros(found.pictures.shape)
+    weights = np.zeros(policy_card.pictures.shape)
     weights[:2] = gain * halves, -gain * halves
-    return of_pixels(weights, found)
+    return of_pixels(weights, policy_card)
 
 
 FLIP = to_onnx(linear(-100.0, bias=1.0), "tanh", card())
-"""To the other side of where the tail is, from neutral to plus: a square wave of two ticks."""
+"""Policy that commands the other side, from neutral to plus: a square wave of two ticks."""
 
 
 def of_nodes(
     nodes: Sequence[Any], weights: Sequence[Any] = (), about: Card | None = None, opset: int = 17
 ) -> bytes:
-    """A policy of nodes that turn `observation` into `action`, both of shape [1, 1]."""
+    """Return a policy of nodes from `observation` to `action`, both of shape [1, 1]."""
     ends = [
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1])]
         for name in (file.INPUT, file.OUTPUT)
@@ -140,7 +140,7 @@ def of_nodes(
 
 
 def refusal(content: bytes) -> str:
-    """The one line that says why this is no policy."""
+    """Return the line that says why a file is not a policy."""
     with pytest.raises(PolicyError) as caught:
         file.parse(content)
     assert "\n" not in str(caught.value)

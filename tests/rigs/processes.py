@@ -1,4 +1,4 @@
-"""Starts and ends the real `fishd` and calls the real `fishctl`, as a user would."""
+"""Real `fishd` and `fishctl` processes."""
 
 import contextlib
 import os
@@ -25,7 +25,7 @@ __all__ = [
 
 
 def one_line(done: subprocess.CompletedProcess[str]) -> str:
-    """What a command that failed says: a line on standard error, and nothing else."""
+    """Return the message of a failed command, the only line on standard error."""
     assert done.returncode != 0
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1, done.stderr
@@ -33,27 +33,27 @@ def one_line(done: subprocess.CompletedProcess[str]) -> str:
 
 
 LEASE = 6.0
-"""Time after which an experiment that renews nothing loses an unhurried fish [s]."""
+"""Time after which an experiment without renewals loses an unhurried fish [s]."""
 START: tuple[str, ...] = (FISHD,)
-"""The command that starts a fishd."""
+"""Command that starts a fishd."""
 EXPERIMENT: tuple[str, ...] = (FISHCTL,)
-"""The command that starts a fishctl of its own, for an experiment on a fishd."""
+"""Command that starts a separate fishctl, for an experiment on a fishd."""
 if not os.environ.get("JUDGES_REAL_TIME"):
     _unhurried = (sys.executable, "-P", str(Path(__file__).with_name("unhurried.py")))
-    # Without the warm-up it computes half as much.
+    # Without the warm-up, the load is half.
     START = (*_unhurried, "fishd", *sets("realtime.warm_up=false", f"control.lease={LEASE:g}"))
     EXPERIMENT = (*_unhurried, "fishctl")
 
 
 def addresses(folder: Path) -> list[str]:
-    """Those of a fishd of its own: options of a command line."""
+    """Return the options for the addresses of a separate fishd."""
     return sets(f"control.address=ipc://{folder}/control", "telemetry.address=tcp://127.0.0.1:0")
 
 
 def install(
     site: Path, modules: Mapping[str, str], *, group: str = "fishd.controllers", **classes: str
 ) -> None:
-    """Put a package of controllers, or of another group, into a folder of PYTHONPATH, as pip would.
+    """Install a package of controllers, or of another group, into a folder of PYTHONPATH.
 
     classes: name to `module:class`
     """
@@ -68,7 +68,7 @@ def install(
 
 
 class Daemon(Process):
-    """A running fishd with addresses of its own."""
+    """Running fishd with separate addresses."""
 
     def __init__(
         self,
@@ -78,8 +78,8 @@ class Daemon(Process):
         start: Sequence[str] = START,
     ) -> None:
         """
-        under: the beginning of the command that starts the daemon, `setpriv` say
-        start: the rest of it
+        under: beginning of the command that starts the daemon, for example `setpriv`
+        start: rest of the command
         """
         self.endpoint = f"ipc://{folder}/control"
         super().__init__(*under, *start, *addresses(folder), *arguments)
@@ -99,22 +99,22 @@ class Daemon(Process):
             return fish.status()
 
     def at_rest(self) -> Self:
-        """The same one as at its start, whatever a controller or an emergency stop has done."""
+        """Return the daemon in its state at the start, after any controller or emergency stop."""
         with Fish(self.endpoint, timeout=PATIENCE) as fish:
             fish.stop()
             wait_until(lambda: _rests(fish))
         return self
 
     def fishctl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """What fishctl says of this daemon."""
+        """Run fishctl for this daemon, and return the result."""
         return fishctl("--endpoint", self.endpoint, *arguments)
 
     def fishctl_apart(self, *arguments: str, **options: Any) -> subprocess.CompletedProcess[str]:
-        """The same in a process of its own, where the environment decides what it finds."""
+        """Run fishctl for this daemon in a separate process, with its environment."""
         return call(FISHCTL, "--endpoint", self.endpoint, *arguments, **options)
 
     def socket(self, kind: int = zmq.DEALER) -> "zmq.Socket[bytes]":
-        """A bare ZeroMQ client, as any program in any language would have it."""
+        """Return a plain ZeroMQ client."""
         socket = zmq.Context.instance().socket(kind)
         socket.set(zmq.LINGER, 0)
         socket.set(zmq.RCVTIMEO, int(PATIENCE * 1000))
@@ -122,7 +122,7 @@ class Daemon(Process):
         return socket
 
     def estop_socket(self) -> sockets.socket:
-        """A bare client of fishd's own socket for an emergency stop."""
+        """Return a plain client of fishd's socket for an emergency stop."""
         client = sockets.socket(sockets.AF_UNIX, sockets.SOCK_DGRAM)
         client.settimeout(PATIENCE)
         client.bind("")
@@ -131,7 +131,7 @@ class Daemon(Process):
 
 
 def _rests(fish: Fish) -> bool:
-    fish.clear_fault()  # that of the test before, or one that a busy machine brought since
+    fish.clear_fault()  # from the previous test, or caused by a busy machine
     status = fish.status()
     return status.mode == "idle" and status.servo_on and status.phi_c == 0.0
 
@@ -140,16 +140,16 @@ def _rests(fish: Fish) -> bool:
 def running(
     folder: Path, *arguments: str, under: Sequence[str] = (), start: Sequence[str] = START
 ) -> Iterator[Daemon]:
-    """A daemon that is up, and gone afterwards whatever happens."""
+    """Run a daemon that always ends with the context."""
     with Daemon(folder, *arguments, under=under, start=start) as daemon:
         try:
             yield daemon.wait_until_up()
         finally:
-            print(f"fishd said:\n{daemon.end()[2]}")  # which pytest shows for a test that failed
+            print(f"fishd said:\n{daemon.end()[2]}")  # pytest shows this for a failed test
 
 
 class Subscriber:
-    """A bare ZeroMQ subscriber, as any program in any language would have it."""
+    """Plain ZeroMQ subscriber."""
 
     def __init__(self, address: str, topic: bytes = b"") -> None:
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -159,9 +159,9 @@ class Subscriber:
         self.socket.connect(address)
 
     def connected(self) -> Self:
-        """Wait until ticks come, from where on nothing is missed."""
+        """Wait until ticks arrive; later messages are not missed."""
         self.socket.subscribe(b"tick")
-        while self.socket.recv_multipart()[0] != b"tick":  # but what was said before
+        while self.socket.recv_multipart()[0] != b"tick":  # earlier messages
             pass
         self.socket.unsubscribe(b"tick")
         return self
@@ -172,7 +172,7 @@ class Subscriber:
         return message
 
     def until(self, **wanted: Any) -> dict[str, Any]:
-        """The first message in which these fields have these values."""
+        """Return the first message in which these fields have these values."""
         deadline = time.monotonic() + PATIENCE
         while time.monotonic() < deadline:
             message = self.message()

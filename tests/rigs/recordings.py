@@ -10,7 +10,7 @@ from rigs.harness import Rig
 
 
 def swum(seconds: float = 3.0, *overrides: str) -> Rig:
-    """A virtual fish that has swum, and was retuned in the middle of it."""
+    """Return a rig with a virtual fish that has swum and was retuned meanwhile."""
     rig = Rig(*overrides).start("swing")
     rig.run_for(seconds / 2)
     rig.retune(C=0.3)
@@ -19,7 +19,7 @@ def swum(seconds: float = 3.0, *overrides: str) -> Rig:
 
 
 def recorded(rig: Rig, path: Path, *, flush_every: int = 1000, **about: Any) -> Path:
-    """What the rig published, in its order."""
+    """Return the published messages of the rig, in their order."""
     with RunWriter(path, **about) as writer:
         writer.describe(rig.config)
         for number, message in enumerate(rig.recorder.messages):
@@ -30,7 +30,7 @@ def recorded(rig: Rig, path: Path, *, flush_every: int = 1000, **about: Any) -> 
 
 
 def write(path: Path, ticks: Sequence[Tick]) -> Path:
-    """A recording of these ticks."""
+    """Write a recording of these ticks."""
     with RunWriter(path) as writer:
         writer.describe(Rig().config)
         for tick in ticks:
@@ -39,7 +39,7 @@ def write(path: Path, ticks: Sequence[Tick]) -> Path:
 
 
 def status(tick: Tick, pid: int) -> Status:
-    """What a fishd of this process says of itself just after a tick."""
+    """Return the status of a fishd of this process just after a tick."""
     never = Percentiles(0.0, 0.0, 0.0, 0)
     return Status(
         tick.t, "", pid, tick.time, tick.mode, None, tick.controller, {}, tick.servo_on, 0.0, 0.0,

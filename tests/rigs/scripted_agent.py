@@ -1,4 +1,4 @@
-"""Agents that say exactly what a test wants: bare sockets, as any language would have them."""
+"""Scripted agents on plain sockets."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -19,7 +19,7 @@ Answer = dict[str, Any] | bytes | None
 
 
 class ScriptedAgent:
-    """A ROUTER that receives when it is told to, and sends anything."""
+    """ROUTER socket that receives on request and sends anything."""
 
     def __init__(self, folder: Path) -> None:
         self.address = f"ipc://{folder}/agent"
@@ -28,13 +28,13 @@ class ScriptedAgent:
         self._socket.bind(self.address)
         self._peer = b""
         self.seen: list[dict[str, Any]] = []
-        """Every message so far."""
+        """All received messages."""
 
     def close(self) -> None:
         self._context.destroy(linger=0)
 
     def next(self, seconds: float = PATIENCE) -> dict[str, Any]:
-        """The next message; AssertionError when none comes."""
+        """Return the next message; raises AssertionError without one."""
         assert self._socket.poll(int(seconds * 1e3)), f"nothing came within {seconds} s"
         self._peer, payload = self._socket.recv_multipart()
         message: dict[str, Any] = msgspec.json.decode(payload)
@@ -45,7 +45,7 @@ class ScriptedAgent:
         return bool(self._socket.poll(0))
 
     def drain(self) -> list[dict[str, Any]]:
-        """Everything that has come by now."""
+        """Return all waiting messages."""
         begun = len(self.seen)
         while self._socket.poll(50):
             self.next()
@@ -56,7 +56,7 @@ class ScriptedAgent:
         self._socket.send_multipart([self._peer, *parts])
 
     def action(self, angle: float, **changes: Any) -> dict[str, Any]:
-        """An action for the latest observation."""
+        """Return an action for the latest observation."""
         latest = next(m for m in reversed(self.seen) if m["kind"] == "observation")
         own = {"kind": "action", "v": 1, "session": latest["session"], "seq": latest["seq"]}
         return {**own, "phi_c": angle, **changes}
@@ -67,7 +67,7 @@ class ScriptedAgent:
 
     @contextmanager
     def answering(self, answer: Callable[[dict[str, Any]], Answer]) -> Iterator[None]:
-        """Answer each observation in another thread; None keeps silent."""
+        """Answer each observation in another thread; None does not answer."""
         done = threading.Event()
 
         def answer_all() -> None:
@@ -89,14 +89,14 @@ class ScriptedAgent:
 
 
 def remote(rig: Rig) -> Remote:
-    """The active controller."""
+    """Return the active controller."""
     controller = rig.loop.active.controller
     assert isinstance(controller, Remote), rig.reason
     return controller
 
 
 def connect(rig: Rig, agent: ScriptedAgent, **parameters: Any) -> dict[str, Any]:
-    """Make `remote` active, and let it send its first observation; that."""
+    """Activate `remote`, and return its first observation."""
     before = {message["session"] for message in agent.seen}
     rig.start("remote", agent=agent.address, **parameters)
     connected(rig)
@@ -112,14 +112,14 @@ def connected(rig: Rig) -> None:
 
 
 def arrived(rig: Rig) -> None:
-    """Wait until something that the agent has sent is there, for the next tick."""
+    """Wait until a message of the agent has arrived for the next tick."""
     wait_until(lambda: remote(rig)._wire.state()[1])
 
 
 def answered(rig: Rig, agent: ScriptedAgent, angle: float, **changes: Any) -> Tick:
-    """One tick; its answer is there before its deadline begins to count.
+    """Run one tick, with its answer before its deadline starts.
 
-    changes: to the action that is the answer
+    changes: changes of the action in the answer
     """
     controller, deadline = remote(rig), rig.index * rig.config.tick
     before = controller._seq
@@ -136,11 +136,11 @@ def answered(rig: Rig, agent: ScriptedAgent, angle: float, **changes: Any) -> Ti
 
 
 def swim(rig: Rig, agent: ScriptedAgent, angle: float = 0.2) -> None:
-    """One tick in which an action is in force."""
+    """Run one tick with an active action."""
     assert answered(rig, agent, angle).phi_c == angle
 
 
 def reason(rig: Rig) -> str:
-    """Of the fault, in words."""
+    """Return the message of the fault."""
     assert rig.loop.supervisor.reason
     return rig.loop.supervisor.reason.message

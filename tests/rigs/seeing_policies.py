@@ -1,4 +1,4 @@
-"""Networks for pictures that have learned nothing, with an eye that has seen a babble."""
+"""Untrained networks for pictures, with an eye after a babble."""
 
 import numpy as np
 import torch
@@ -16,11 +16,11 @@ from fishd.learning.run_folder.runs import make_card
 from fishd.learning.settings import TrainingSettings
 
 SPREAD = 30.0
-"""How much larger than that of a new network the last layer is, so that actions differ."""
+"""Factor of the last layer relative to a new network, so that actions differ."""
 
 
 def babbled(settings: TrainingSettings) -> tuple[Card, ActorCriticPolicy, Perception]:
-    """What a training has after its babble."""
+    """Return the state of a training after its babble."""
     config, eye = Config(), making.make_eye(settings)
     assert eye
     link = SimulatedLink(config, camera=Camera(DEFAULT, eye.stack))

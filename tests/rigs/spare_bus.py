@@ -1,4 +1,4 @@
-"""The number of an I2C bus for tests that need one which nobody else drives."""
+"""Numbers of unused I2C buses for tests."""
 
 import atexit
 import socket
@@ -6,16 +6,16 @@ from functools import cache
 
 LOWEST, BEYOND = 100, 178
 ANOTHER = BEYOND - LOWEST
-"""So much larger is the number of a second bus, spare as well."""
+"""Offset of the number of a second unused bus."""
 
 
 @cache
 def spare_bus() -> int:
-    """A bus that no machine has, and no test of another process as long as this one lives."""
+    """Return a bus that no machine has, and that no other test process uses meanwhile."""
     for bus in range(LOWEST, BEYOND):
         held = socket.socket(socket.AF_UNIX)
         try:
-            held.bind(f"\0fishd-tests-i2c-{bus}")  # a name without a file, gone with its socket
+            held.bind(f"\0fishd-tests-i2c-{bus}")  # an abstract name, which ends with its socket
         except OSError:
             held.close()
             continue

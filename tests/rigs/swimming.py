@@ -1,4 +1,4 @@
-"""What tests of learning are built from: short trainings, and links that pause, lose or fail."""
+"""Short trainings, and links that pause, lose actions or fail, for tests of learning."""
 
 import csv
 import subprocess
@@ -19,7 +19,7 @@ from fishd.learning.train.jobs import Job
 from rigs.processes import fishctl
 
 LONG_ENOUGH = 120.0
-"""What a training may take until something comes of it, with the import of torch [s]."""
+"""Longest time until a training has a result, including the import of torch [s]."""
 Done = subprocess.CompletedProcess[str]
 NOISY = ("simulation.noise=0.001", "simulation.offset_y=0.005")
 BRIEF = TrainingSettings(
@@ -27,11 +27,11 @@ BRIEF = TrainingSettings(
     ppo=PpoSettings(n_steps=64, n_epochs=4, log_std_init=0.7),
     evaluation=EvaluationSettings(every=1, patience=None, seconds=4.0, settle=2.0),
 )
-"""Two short updates, each followed by a short evaluation; so few epochs need less exploration."""
+"""Settings of two short updates, each followed by a short evaluation, with less exploration."""
 
 
 def brief_job(folder: Path, **changes: Any) -> Job:
-    """A training of a second; changes: to its settings, or fields of the job."""
+    """Return a training of a second; changes: of its settings, or of fields of the job."""
     fields = {name: changes.pop(name) for name in ("on", "resume", "parent") if name in changes}
     return Job(
         config=load(None, NOISY), settings=replace(BRIEF, **changes), folder=folder, **fields
@@ -39,7 +39,7 @@ def brief_job(folder: Path, **changes: Any) -> Job:
 
 
 def rows(path: Path) -> list[dict[str, str]]:
-    """A CSV file with a head."""
+    """Return the rows of a CSV file with a head."""
     with path.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
@@ -52,7 +52,7 @@ def wait_for(what: Callable[[], object]) -> None:
 
 
 def while_it_trains(what: Callable[[], object], act: Callable[[], None], *words: str) -> Done:
-    """What fishctl says of a training during which we act, once something is the case."""
+    """Run a training, act when a condition is true, and return the result of fishctl."""
 
     def wait_and_act() -> None:
         try:
@@ -68,17 +68,17 @@ def while_it_trains(what: Callable[[], object], act: Callable[[], None], *words:
 
 
 class Resting(SimulatedLink):
-    """A fish that comes to rest while the agent learns, as a real one does."""
+    """Fish that rests while the agent learns, like a real one."""
 
     def __init__(self, job: Job) -> None:
         super().__init__(job.config)
         self.shown: list[Observation] = []
-        """Everything that the agent was shown."""
+        """All observations of the agent."""
 
-    def resume(self) -> Observation:  # and so does the first reset
-        found = super().resume()
-        self.shown.append(found)
-        return found
+    def resume(self) -> Observation:  # also called by the first reset
+        observation = super().resume()
+        self.shown.append(observation)
+        return observation
 
     def step(self, angle: float) -> StepResult:
         sensed = super().step(angle)
@@ -91,7 +91,7 @@ class Resting(SimulatedLink):
 
 
 class Losing(SimulatedLink):
-    """A link over which one action in so many comes a tick too late."""
+    """Link that delays every `one_in`-th action by a tick."""
 
     def __init__(self, job: Job, every: int = 10) -> None:
         super().__init__(job.config)
@@ -107,7 +107,7 @@ class Losing(SimulatedLink):
 
 
 class Failing(SimulatedLink):
-    """A fish that is gone after some steps."""
+    """Fish that is lost after some steps."""
 
     def __init__(self, job: Job, steps: int) -> None:
         super().__init__(job.config)

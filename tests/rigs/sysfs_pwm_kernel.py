@@ -1,8 +1,7 @@
-"""The kernel's PWM class as files in memory: refuses what Linux refuses, with the same errors.
+"""PWM class of the kernel as files in memory, with the checks and errors of Linux.
 
-Takes the place of module `os` in `fishd.hardware.servo.pwm_channel`. It is as strict as kernels
-up to 6.9: while the period is 0 they refuse everything. They ignore a state that they believe to
-be set.
+It replaces module `os` in `fishd.hardware.servo.pwm_channel`. It is as strict as kernels up to 6.9,
+which refuse everything while the period is 0, and ignore a state that they believe to be set.
 """
 
 import errno
@@ -17,7 +16,7 @@ from fishd.virtual.pi.pulse_train import PulseTrain
 
 @dataclass(frozen=True)
 class _State:
-    """What the kernel believes of a channel; times in ns."""
+    """State of a channel in the kernel; times in ns."""
 
     period: int = 0
     duty_cycle: int = 0
@@ -30,7 +29,7 @@ class _Channel:
     state: _State = _State()
     exported_at: float | None = None
     pulses: PulseTrain = field(default_factory=PulseTrain)
-    """What the hardware puts out."""
+    """Output of the hardware."""
 
 
 class SysfsPwm:
@@ -43,35 +42,35 @@ class SysfsPwm:
         root: str = "/sys/class/pwm",
         udev_delay: float = 0.03,
     ) -> None:
-        """`chips`: how many channels each device has, in the order of the chips' numbers.
+        """`chips`: number of channels of each device, in the order of the chips' numbers.
 
-        udev_delay: how long after an export the files of a channel belong to root alone [s]
+        udev_delay: time after an export in which the files of a channel belong to root only [s]
         """
         self._clock = clock
         self._root = root
         self._udev_delay = udev_delay
         self.unwritable: set[tuple[str, int]] = set()
-        """Names of files and numbers that they fail to take."""
+        """Names of files and values whose write fails."""
         self.unreadable: set[str] = set()
-        """Names of files that fail to be read."""
+        """Names of files whose read fails."""
         self._chips = {
             device: [_Channel() for _ in range(channels)] for device, channels in chips.items()
         }
         self._numbers = dict(enumerate(chips))
         self._taken: set[tuple[str, int]] = set()
         self._fds: dict[int, tuple[str, int | None, str]] = {}
-        self._next_fd = 1000  # far from any true one
+        self._next_fd = 1000  # distinct from real descriptors
 
     def pulses(self, device: str, channel: int) -> PulseTrain:
-        """What comes out of a channel."""
+        """Return the output of a channel."""
         return self._chips[device][channel].pulses
 
     def take(self, device: str, channel: int) -> None:
-        """Let a driver of the kernel use a channel, as the one of the Pi 5's fan does."""
+        """Let a driver of the kernel use a channel, like that of the Pi 5's fan."""
         self._taken.add((device, channel))
 
     def unload(self, device: str) -> None:
-        """Unload a chip's driver: its pulses and files are gone, open ones too."""
+        """Unload a chip's driver, which removes its pulses and files, also open ones."""
         for number, channel in enumerate(self._chips[device]):
             if channel.exported_at is not None:
                 self._unexport(device, number)
@@ -79,11 +78,11 @@ class SysfsPwm:
         self._numbers = {n: chip for n, chip in self._numbers.items() if chip != device}
 
     def load(self, device: str, number: int) -> None:
-        """Load a chip's driver again, which gets the number that is free."""
+        """Load a chip's driver again, which gets the next free number."""
         self._numbers[number] = device
 
     def open(self, path: str, flags: int, /) -> int:
-        """As os.open."""
+        """Replace os.open."""
         device, channel, name = self._find(path)
         if channel is not None:
             since = self._chips[device][channel].exported_at or 0.0
@@ -95,22 +94,22 @@ class SysfsPwm:
         return self._next_fd
 
     def close(self, fd: int, /) -> None:
-        """As os.close."""
+        """Replace os.close."""
         if self._fds.pop(fd, None) is None:
             raise _error(errno.EBADF)
 
     def pread(self, fd: int, length: int, offset: int, /) -> bytes:
-        """As os.pread."""
+        """Replace os.pread."""
         device, channel, name = self._opened(fd)
         if channel is None:
-            raise _error(errno.EIO)  # export and unexport can only be written to
+            raise _error(errno.EIO)  # export and unexport are write-only
         if name in self.unreadable:
             raise _error(errno.EIO)
         text = f"{getattr(self._chips[device][channel].state, name)}\n".encode()
         return text[offset : offset + length]
 
     def pwrite(self, fd: int, data: bytes, offset: int, /) -> int:
-        """As os.pwrite."""
+        """Replace os.pwrite."""
         device, channel, name = self._opened(fd)
         if name == "polarity" and channel is not None:
             self._apply(self._chips[device][channel], name, data.decode().strip())
@@ -132,7 +131,7 @@ class SysfsPwm:
         return len(data)
 
     def listdir(self, path: str, /) -> list[str]:
-        """As os.listdir."""
+        """Replace os.listdir."""
         folders = {self._root: [f"pwmchip{number}" for number in self._numbers]}
         for number, device in self._numbers.items():
             channels = enumerate(self._chips[device])
@@ -143,14 +142,14 @@ class SysfsPwm:
         return folders[path]
 
     def readlink(self, path: str, /) -> str:
-        """As os.readlink."""
+        """Replace os.readlink."""
         folder, _, name = path.rpartition("/")
         if name != "device" or name not in self.listdir(folder):
             raise _error(errno.ENOENT, path)
         return f"../../../{self._device(folder)}"
 
     def _find(self, path: str) -> tuple[str, int | None, str]:
-        """Device, channel and name of a file; no channel for export and unexport."""
+        """Return device, channel and name of a file; no channel for export and unexport."""
         folder, _, name = path.rpartition("/")
         if name in ("export", "unexport") and name in self.listdir(folder):
             return self._device(folder), None, name
@@ -163,7 +162,7 @@ class SysfsPwm:
         return self._numbers[int(folder.removeprefix(f"{self._root}/pwmchip"))]
 
     def _opened(self, fd: int) -> tuple[str, int | None, str]:
-        """What is open as `fd`."""
+        """Return the device, channel and name of the open file `fd`."""
         if fd not in self._fds:
             raise _error(errno.EBADF)
         device, channel, name = self._fds[fd]
@@ -179,12 +178,12 @@ class SysfsPwm:
         channel.exported_at = self._clock.monotonic()
 
     def _unexport(self, device: str, number: int) -> None:
-        """The driver switches the hardware off; the kernel's belief stays."""
+        """Unexport a channel: the driver switches the hardware off; the kernel's state remains."""
         channel = self._chips[device][number]
         if channel.exported_at is None:
             raise _error(errno.ENODEV)
         channel.exported_at = None
-        # A file that was open stays dead, even if the channel is exported again.
+        # An open file remains invalid, even if the channel is exported again.
         dead = [fd for fd, opened in self._fds.items() if opened[:2] == (device, number)]
         for fd in dead:
             self._fds[fd] = ("", None, "")

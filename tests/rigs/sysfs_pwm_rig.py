@@ -1,4 +1,4 @@
-"""A kernel's PWM in memory, and servos on it, for tests to drive and disturb."""
+"""PWM of a kernel in memory, and servos on it."""
 
 import math
 import os
@@ -17,7 +17,7 @@ PI4 = "fe20c000.pwm"
 
 
 class Bench:
-    """A Pi 5's kernel, or another one's, and servos on it."""
+    """Kernel of a Pi 5 or another machine, and servos on it."""
 
     def __init__(self, chips: dict[str, int] | None = None, udev_delay: float = 0.03) -> None:
         self.clock = VirtualClock()
@@ -40,20 +40,20 @@ class Bench:
     def last_resort(
         self, neutral: float = 1500.0, settings: SysfsPwmSettings | None = None
     ) -> bool:
-        """What another process does when fishd is dead."""
+        """Run the last resort, as another process does when fishd is dead."""
         resort = SysfsPwm.last_resort(settings or SysfsPwmSettings())
         return pwm_pulses.neutralise(
             neutral, files=self.kernel, clock=self.clock, **resort.arguments
         )
 
     def write(self, servo: CalibratedServo, angle: float) -> float:
-        """Write and wait for the next frame; the pulse that is sent then [µs]."""
+        """Write, wait for the next frame, and return its pulse [µs]."""
         servo.write(angle)
         self.clock.sleep(0.05)
         return self.width()
 
     def go_into_a_pulse(self) -> None:
-        """On to where a frame has just begun, and the level is high."""
+        """Advance to the begin of a frame, where the level is high."""
         self.clock.now = math.ceil(self.clock.now / 0.02) * 0.02 + 0.0007
 
     def width(self, channel: int = 2, device: str = PI5) -> float:
@@ -63,7 +63,7 @@ class Bench:
         return [width for _, width in self.kernel.pulses(device, channel).history]
 
     def shell(self, path: str, value: int | str) -> None:
-        """`echo value > /sys/class/pwm/path`, by somebody else."""
+        """Run `echo value > /sys/class/pwm/path` as another program."""
         fd = self.kernel.open(f"/sys/class/pwm/{path}", os.O_WRONLY)
         self.kernel.pwrite(fd, f"{value}\n".encode(), 0)
         self.kernel.close(fd)

@@ -1,8 +1,8 @@
-"""fishd and fishctl, undisturbed by a busy machine: for tests of anything but time.
+"""fishd and fishctl without limits of time, for tests on a busy machine of anything but time.
 
-A tick that comes late, a controller that was kept from computing and a sample that is old are no
-faults, no answer of pigpiod is too late, and a measurement may miss any of its ticks. `make
-test-realtime` and the tests on the virtual clock judge them.
+A late tick, a delayed controller and an old sample are not faults, no answer of pigpiod is too
+late, and a measurement may miss any of its ticks. `make test-realtime` and the tests on the virtual
+clock check these limits.
 """
 
 import math
@@ -18,7 +18,7 @@ from fishd.lab import session
 
 
 def have_patience() -> None:
-    """Lift the limits of time, in this process."""
+    """Remove the limits of time in this process."""
     supervisor.OVERRUN_SHARE = math.inf
     loop.MAX_SAMPLE_AGE_PERIODS = 100.0
     pigpio_link.MAX_LATE_ANSWERS = 1_000_000

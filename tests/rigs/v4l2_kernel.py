@@ -1,7 +1,7 @@
-"""A V4L2 camera as the kernel shows it, below linuxpy: open, ioctl and mmap of one device file.
+"""V4L2 camera emulated below linuxpy: open, ioctl and mmap of one device file.
 
-Run as a program it is `fishd-camera` with that camera: rigs/v4l2_kernel.py FAULTS ARGUMENTS...
-FAULTS is a JSON file that says what is wrong with the camera; a test writes it at any time.
+As a program it is `fishd-camera` with that camera: rigs/v4l2_kernel.py FAULTS ARGUMENTS...
+FAULTS is a JSON file with the faults of the camera, which a test may write at any time.
 """
 
 import errno
@@ -34,28 +34,28 @@ LEVELS = 18
 
 
 class Faults(msgspec.Struct, frozen=True):
-    """What is wrong with the camera; the defaults are a good one."""
+    """Faults of the camera; the defaults are none."""
 
     unplugged: bool = False
     denied: bool = False
     busy: bool = False
     stalled: bool = False
     broken: bool = False
-    """Its JPEGs are cut off."""
+    """Whether its JPEGs are cut off."""
     garbage: bool = False
-    """It sends anything."""
+    """Whether it sends random bytes."""
     realtime_stamps: bool = False
-    """Time stamps are of another clock than the monotonic one."""
+    """Whether time stamps are not those of the monotonic clock."""
     late: int = 0
-    """So many frames come with time stamps that are 3 s old, as if they had waited so long."""
+    """Number of frames with time stamps that are 3 s old."""
     end_of_frame: bool = False
     formats: tuple[str, ...] = FORMATS
     rate: float | None = None
-    """The only one that it has [1/s]; None takes any."""
+    """Only available rate [1/s]; None: any rate."""
     skip: int = 0
-    """Of so many frames, one is lost between camera and kernel; 0 for none."""
+    """Number of frames of which one is lost between camera and kernel; 0: none."""
     no_video: bool = False
-    """It is a device for metadata."""
+    """Whether the device is one for metadata."""
 
 
 class Control:
@@ -73,7 +73,7 @@ def _controls() -> dict[int, Control]:
 
 
 class V4l2Camera:
-    """One camera: its driver, and the light that falls on it."""
+    """Camera with its driver, and the light on it."""
 
     def __init__(self, faults: Path) -> None:
         self._file = faults
@@ -97,7 +97,7 @@ class V4l2Camera:
         threading.Thread(target=self._live, daemon=True).start()
 
     def plug_in(self) -> None:
-        """Put it below linuxpy."""
+        """Install the camera below linuxpy."""
         own = {"open": self.open, "O_NONBLOCK": os.O_NONBLOCK, "O_CLOEXEC": os.O_CLOEXEC}
         linuxpy.io.os = SimpleNamespace(**own)
         linuxpy.ioctl.fcntl = SimpleNamespace(ioctl=self.ioctl)
@@ -115,12 +115,12 @@ class V4l2Camera:
             self._streaming, self._buffers = False, 0
             self._queued.clear()
             self._done.clear()
-            # Readable as often as there are frames; FileIO closes it.
+            # Readable once per frame; FileIO closes it.
             self._event = os.eventfd(0, os.EFD_SEMAPHORE | os.EFD_NONBLOCK)
             self._gone.discard(self._event)
             if self._ours is not None:
                 os.close(self._ours)
-            self._ours = os.dup(self._event)  # whose number nobody else may have meanwhile
+            self._ours = os.dup(self._event)  # keeps the number of the descriptor reserved
             return self._event
 
     def mmap(self, descriptor: int, length: int, offset: int = 0) -> mmap.mmap:
@@ -142,15 +142,15 @@ class V4l2Camera:
             handler(argument)
         return 0
 
-    def _querycap(self, found: Any) -> None:
-        found.driver, found.card = b"emulated", b"Emulated camera"
+    def _querycap(self, argument: Any) -> None:
+        argument.driver, argument.card = b"emulated", b"Emulated camera"
         kind = raw.Capability.META_CAPTURE if self.faults.no_video else raw.Capability.VIDEO_CAPTURE
-        found.device_caps = found.capabilities = int(kind | raw.Capability.STREAMING)
+        argument.device_caps = argument.capabilities = int(kind | raw.Capability.STREAMING)
 
-    def _enum_fmt(self, found: Any) -> None:
-        if self.faults.no_video or found.index >= len(self.faults.formats):
+    def _enum_fmt(self, argument: Any) -> None:
+        if self.faults.no_video or argument.index >= len(self.faults.formats):
             raise OSError(errno.EINVAL, "Invalid argument")
-        found.pixelformat = raw.v4l2_fourcc(*self.faults.formats[found.index])
+        argument.pixelformat = raw.v4l2_fourcc(*self.faults.formats[argument.index])
 
     def _s_fmt(self, wanted: Any) -> None:
         if self.faults.no_video:
@@ -164,9 +164,9 @@ class V4l2Camera:
         self._format = (fourcc, min(1280, pix.width), min(720, pix.height))
         self._g_fmt(wanted)
 
-    def _g_fmt(self, found: Any) -> None:
+    def _g_fmt(self, argument: Any) -> None:
         fourcc, width, height = self._format
-        pix = found.fmt.pix
+        pix = argument.fmt.pix
         pix.pixelformat, pix.width, pix.height = raw.v4l2_fourcc(*fourcc), width, height
         pix.bytesperline = {"YUYV": 2 * width, "GREY": width + 16}.get(fourcc, 0)
         pix.sizeimage = BUFFER
@@ -177,27 +177,31 @@ class V4l2Camera:
         self._rate = rate
         self._g_parm(wanted)
 
-    def _g_parm(self, found: Any) -> None:
-        found.parm.capture.timeperframe.numerator = 1000
-        found.parm.capture.timeperframe.denominator = round(1000 * self._rate)
+    def _g_parm(self, argument: Any) -> None:
+        argument.parm.capture.timeperframe.numerator = 1000
+        argument.parm.capture.timeperframe.denominator = round(1000 * self._rate)
 
-    def _query_ext_ctrl(self, found: Any) -> None:
-        after = found.id & ~int(raw.ControlFlag.NEXT_CTRL | raw.ControlFlag.NEXT_COMPOUND)
+    def _query_ext_ctrl(self, argument: Any) -> None:
+        after = argument.id & ~int(raw.ControlFlag.NEXT_CTRL | raw.ControlFlag.NEXT_COMPOUND)
         later = [number for number in sorted(self._controls) if number > after]
         if not later:
             raise OSError(errno.EINVAL, "Invalid argument")
         control = self._controls[later[0]]
-        found.id, found.type, found.name = later[0], int(control.kind), control.name.encode()
-        found.minimum, found.maximum, found.step = control.low, control.high, 1
-        found.elems, found.elem_size, found.flags = 1, 4, 0
+        argument.id, argument.type, argument.name = (
+            later[0],
+            int(control.kind),
+            control.name.encode(),
+        )
+        argument.minimum, argument.maximum, argument.step = control.low, control.high, 1
+        argument.elems, argument.elem_size, argument.flags = 1, 4, 0
 
-    def _querymenu(self, found: Any) -> None:
-        if found.index not in (1, 3):
+    def _querymenu(self, argument: Any) -> None:
+        if argument.index not in (1, 3):
             raise OSError(errno.EINVAL, "Invalid argument")
-        found.m1.name = {1: b"Manual Mode", 3: b"Aperture Priority Mode"}[found.index]
+        argument.m1.name = {1: b"Manual Mode", 3: b"Aperture Priority Mode"}[argument.index]
 
-    def _g_ext_ctrls(self, found: Any) -> None:
-        each = found.controls[0]
+    def _g_ext_ctrls(self, argument: Any) -> None:
+        each = argument.controls[0]
         each.m1.value = self._controls[each.id].value
 
     def _s_ext_ctrls(self, wanted: Any) -> None:
@@ -212,23 +216,31 @@ class V4l2Camera:
             raise OSError(errno.EBUSY, "Device or resource busy")
         self._buffers = wanted.count = min(wanted.count, 32)
 
-    def _querybuf(self, found: Any) -> None:
-        found.length, found.m.offset = BUFFER, found.index * BUFFER
+    def _querybuf(self, argument: Any) -> None:
+        argument.length, argument.m.offset = BUFFER, argument.index * BUFFER
 
     def _qbuf(self, given: Any) -> None:
-        # As vb2 does: what the caller has in hand loses what it knew of its frame.
+        # Like vb2: the buffer of the caller loses the data of its frame.
         given.sequence = given.flags = 0
         given.timestamp.secs = given.timestamp.usecs = 0
         self._queued.append(given.index)
 
-    def _dqbuf(self, found: Any) -> None:
+    def _dqbuf(self, argument: Any) -> None:
         if not self._done:
             raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
         assert self._ours is not None
         os.eventfd_read(self._ours)
         index, size, sequence, stamp, flags = self._done.popleft()
-        found.index, found.bytesused, found.sequence, found.flags = index, size, sequence, flags
-        found.timestamp.secs, found.timestamp.usecs = int(stamp), round(stamp % 1.0 * 1e6) % 10**6
+        argument.index, argument.bytesused, argument.sequence, argument.flags = (
+            index,
+            size,
+            sequence,
+            flags,
+        )
+        argument.timestamp.secs, argument.timestamp.usecs = (
+            int(stamp),
+            round(stamp % 1.0 * 1e6) % 10**6,
+        )
 
     def _streamon(self, _: Any) -> None:
         self._streaming, self._sequence = True, -1
@@ -302,21 +314,21 @@ class V4l2Camera:
 
 
 def level(number: int) -> int:
-    """Grey level of the left half of a picture."""
+    """Return the grey level of the left half of a picture."""
     return 40 + 10 * (number % LEVELS)
 
 
 def picture(number: int, width: int, height: int) -> "np.ndarray[Any, np.dtype[np.uint8]]":
-    """Its left half tells which it is, and its upper right quarter is black."""
-    found = np.full((height, width), 250, np.uint8)
-    found[:, : width // 2] = level(number)
-    found[: height // 2, width // 2 :] = 0
-    return found
+    """Return a picture whose left half encodes its number, with a black upper right quarter."""
+    picture = np.full((height, width), 250, np.uint8)
+    picture[:, : width // 2] = level(number)
+    picture[: height // 2, width // 2 :] = 0
+    return picture
 
 
 @cache
 def encoded(number: int, fourcc: str, width: int, height: int) -> bytes:
-    """A picture as a camera sends it."""
+    """Return a picture in the format of the camera."""
     grey = picture(number, width, height)
     if fourcc == "GREY":
         return b"".join(bytes(line) + bytes(16) for line in grey)

@@ -1,4 +1,4 @@
-"""A fishd in virtual time behind the methods of a client, for a test to disturb."""
+"""fishd in virtual time behind the methods of a client, which a test can disturb."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ from fishd.lab.simulation import KeepingPublisher, VirtualRun
 
 
 class VirtualStatus:
-    """What a `LiveSession` asks of a status."""
+    """Fields of a status that a `LiveSession` uses."""
 
     def __init__(self, run: VirtualRun, pid: int) -> None:
         loop = run.loop
@@ -28,17 +28,17 @@ class VirtualStatus:
 
 
 class VirtualDaemon:
-    """It ticks as its ticks are read; stands in for a `Fish`."""
+    """Replacement of a `Fish` whose ticks run when they are read."""
 
     def __init__(self, config: Config | None = None) -> None:
         self.config_of_run = config or Config()
         self.lost: set[int] = set()
-        """Numbers of ticks that nobody hears."""
+        """Numbers of ticks that are not delivered."""
         self.pid = 0
         self.restart()
 
     def restart(self) -> None:
-        """As a service manager would."""
+        """Restart like a service manager."""
         self.pid += 1
         self._token = ""
         self._kept = KeepingPublisher()

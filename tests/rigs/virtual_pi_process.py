@@ -1,4 +1,4 @@
-"""Runs `fishctl virtual-pi run` as a process of its own, for a real fishd to drive."""
+"""`fishctl virtual-pi run` as a separate process, for a real fishd."""
 
 import json
 import re
@@ -15,7 +15,7 @@ SHIPPED = str(Path(__file__).parents[2] / "config" / "virtual-pi.yaml")
 
 
 class Pi(Process):
-    """A running `fishctl virtual-pi run`."""
+    """Running `fishctl virtual-pi run`."""
 
     def __init__(self, folder: Path, *settings: str) -> None:
         self.folder = folder
@@ -28,14 +28,14 @@ class Pi(Process):
     def wait_until_up(self) -> Self:
         assert self.process.stdout
         self.greeting = self.process.stdout.readline()
-        found = re.search(r"pigpiod on 127.0.0.1:(\d+)", self.greeting)
-        assert found, self.end()
-        self.port = int(found[1])
+        match = re.search(r"pigpiod on 127.0.0.1:(\d+)", self.greeting)
+        assert match, self.end()
+        self.port = int(match[1])
         return self
 
     @property
     def settings(self) -> list[str]:
-        """What a fishd on this virtual Pi has to be told; machines that run tests may stall."""
+        """Return the settings of a fishd on this virtual Pi, for machines that may stall."""
         servo = (f"port={self.port}", "timeout=0.1", "countdown=2")
         own = sets(*(f"servo.{pair}" for pair in servo), f"state_folder={self.folder}")
         return [*self._options, *own]
@@ -49,11 +49,11 @@ class Pi(Process):
         return done.stdout
 
     def pulse(self) -> float:
-        found: float = json.loads(self.control("status", "--json"))["pulse"]
-        return found
+        pulse: float = json.loads(self.control("status", "--json"))["pulse"]
+        return pulse
 
     def wait_until_released(self) -> None:
-        """Until there are no pulses: a frame that has begun is sent to its end."""
+        """Wait until the pulses have ended; a running frame is completed."""
         wait_until(lambda: not self.pulse())
 
 

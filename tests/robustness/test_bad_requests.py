@@ -1,4 +1,4 @@
-"""The control socket under fire: an error reply or silence, and never a missed tick."""
+"""Bad requests to the control socket: an error reply or silence, and never a missed tick."""
 
 import json
 import os
@@ -67,7 +67,7 @@ def test_a_bad_request_gets_an_error(
 
 
 def shoot(daemon: Daemon, seconds: float) -> None:
-    """Everything a broken or hostile peer may send, as fast as it can, for a bounded time."""
+    """Send everything that a broken or hostile peer may send, as fast as possible, for a time."""
     garbage: list[list[bytes]] = [
         [b""],
         [b"", b""],

@@ -1,4 +1,4 @@
-"""A client that was itself held up past its time-out takes the answer that has come meanwhile."""
+"""A client that was delayed beyond its timeout uses the answer that has arrived meanwhile."""
 
 import os
 import signal
@@ -16,7 +16,7 @@ from fishd.core import protocol
 from fishd.core.protocol import State
 
 TIMEOUT = 3.0
-"""What a client waits for an answer: longer than a busy machine takes to stop it [s]."""
+"""Timeout of a client, longer than a busy machine takes to stop it [s]."""
 SYNCHRONOUS = """
 import sys
 from fishd.client import Fish
@@ -44,14 +44,14 @@ with zmq.Context() as context:
     finally:
         context.destroy(linger=0)
 """
-LONG = "x" * 1_000_000
-"""Makes an answer take a moment to be read, once the client goes on."""
-IDLE = State(1, "idle", None, "hold", {"text": LONG})
-CAMERA_SETTINGS = CameraSettings(simulated=SimulatedSettings(fishd=LONG))
+LONG_TEXT = "x" * 1_000_000
+"""Text that takes a moment to be read, after the client continues."""
+IDLE = State(1, "idle", None, "hold", {"text": LONG_TEXT})
+CAMERA_SETTINGS = CameraSettings(simulated=SimulatedSettings(fishd=LONG_TEXT))
 
 
 def state_of(pid: int) -> str:
-    """Of a process, as /proc has it: T where it is stopped."""
+    """Return the state of a process in /proc: T where it is stopped."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
 
 
@@ -60,7 +60,7 @@ CLIENTS = (
     (ASYNCHRONOUS, IDLE, "idle"),
     (CAMERA, CAMERA_SETTINGS, CAMERA_SETTINGS.source),
 )
-"""Programs, what each is answered, and what it prints then."""
+"""Programs, the answer to each, and its output."""
 
 
 def test_an_answer_that_nobody_has_read_yet_is_no_silence(tmp_path: Path) -> None:
@@ -77,7 +77,7 @@ def test_an_answer_that_nobody_has_read_yet_is_no_silence(tmp_path: Path) -> Non
                 command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
             )
             clients[server] = stack.enter_context(client), answer, words
-        for _ in clients:  # in the order in which they ask
+        for _ in clients:  # in the order of their requests
             ((server, _), *_) = poller.poll(PATIENCE * 1e3)
             client, answer, _ = clients[server]
             *envelope, payload = server.recv_multipart()
@@ -85,7 +85,7 @@ def test_an_answer_that_nobody_has_read_yet_is_no_silence(tmp_path: Path) -> Non
             wait_until(lambda pid=client.pid: state_of(pid) == "T")
             request = protocol.decode_request(payload)
             server.send_multipart([*envelope, protocol.success(request.id, answer)])
-        time.sleep(TIMEOUT + 0.2)  # longer than a client means to wait
+        time.sleep(TIMEOUT + 0.2)  # longer than the timeout of a client
         for client, _, words in clients.values():
             os.kill(client.pid, signal.SIGCONT)
             assert client.communicate(timeout=PATIENCE) == (f"{words}\n", "")

@@ -1,4 +1,4 @@
-"""Code that is not fishd's: it may raise anything and never return, and is no trouble."""
+"""Code of other packages, which may raise anything and never return, without harm."""
 
 import gc
 import signal
@@ -94,7 +94,7 @@ def test_what_comes_too_late_is_handed_to_whoever_takes_it_away() -> None:
             try:
                 begun.set()
                 go.wait(PATIENCE)
-            except BaseException:  # what gives it up
+            except BaseException:  # the exception that abandons it
                 continue
             return "late"
 
@@ -112,7 +112,7 @@ def test_what_comes_too_late_is_handed_to_whoever_takes_it_away() -> None:
 
 
 def test_many_that_are_given_up_just_when_they_are_done_are_either_taken_or_thrown_away() -> None:
-    """Given up at every moment of a short life, a result is never lost and never there twice."""
+    """A call that is abandoned at any moment never loses or duplicates its result."""
     for number in range(400):
         late: list[int] = []
         attempt = Attempt(lambda: 1, late=late.append)
@@ -122,7 +122,7 @@ def test_many_that_are_given_up_just_when_they_are_done_are_either_taken_or_thro
         deadline = time.monotonic() + PATIENCE
         while attempt.alive and time.monotonic() < deadline:
             time.sleep(0)
-        # One that was ended before it returned has no result at all.
+        # A call that was ended before its return has no result.
         assert attempt.wait(0.0) == done
         assert len(late) <= (0 if done else 1)
 

@@ -1,4 +1,4 @@
-"""A daemon that would talk to the terminal: fishctl prints nothing of it but printable text."""
+"""A daemon that sends control sequences: fishctl prints only printable text."""
 
 import json
 import re
@@ -20,11 +20,11 @@ from fishd.core.protocol import Calibrations, PolicyInfo, State
 from fishd.core.signals import ControllerInfo, Status, Tick
 
 EVIL = "\x1b[2J\x9b31m\x07\u202e\r\nfishctl: forged\x00"
-"""Clears the screen, changes colours, rings, turns the text round, and forges a line."""
+"""Text that clears the screen, changes colours, rings, reverses the text, and forges a line."""
 
 
 def evil(kind: Any, **known: Any) -> Any:
-    """A value of this type of the protocol, in which every text but the `known` is EVIL."""
+    """Return a value of this type of the protocol with `EVIL` for every text except the `known`."""
     return _evil(inspect.type_info(kind), known)
 
 
@@ -55,7 +55,7 @@ def _evil(kind: inspect.Type, known: dict[str, Any] | None = None) -> Any:
 
 
 class Hostile:
-    """Answers every request, and publishes, with what no terminal should see."""
+    """Daemon that answers every request, and publishes, with control sequences."""
 
     def __init__(self, folder: Path) -> None:
         self.endpoint = f"ipc://{folder}/control"
@@ -63,7 +63,7 @@ class Hostile:
         self._over = threading.Event()
         self.refuses = False
         self.rubbish = b""
-        """What is answered and published instead."""
+        """Data that is sent instead of valid answers and messages."""
         self._thread = threading.Thread(target=self._serve)
         self._ready = threading.Event()
         self._thread.start()
@@ -118,7 +118,7 @@ def asked(hostile: Hostile, *arguments: str) -> subprocess.CompletedProcess[str]
 
 
 def check(output: str) -> None:
-    """Nothing but printable text, and no line that fishctl has not begun."""
+    """Check that the output is printable, and that every line is one of fishctl."""
     assert all(line.isprintable() for line in output.split("\n"))
     assert "\nfishctl: forged" not in output
 
@@ -179,7 +179,7 @@ def test_as_json_all_of_it_is_there_and_escaped(hostile: Hostile, verb: str) -> 
 
 
 def texts(value: Any) -> Iterator[str]:
-    """All texts in a document."""
+    """Return all texts in a document."""
     if isinstance(value, str):
         yield value
     elif isinstance(value, dict | list):

@@ -1,4 +1,4 @@
-"""No file makes a verb end otherwise than with one line that names it."""
+"""Every verb ends with one line that names the file, for every hostile file."""
 
 import json
 import os
@@ -21,7 +21,7 @@ GROUPS = (
     ("runs", "runs --json", "rerun", "replay", "recover", "export --csv", "export --parquet"),
     ("plot --html", "plot --png"),
 )
-"""Verbs that share a process, each group with what it loads."""
+"""Groups of verbs that share a process and its modules."""
 SAID = {
     ("export --csv", "zstd-chunk-of-8-gb"): "20 ticks lost (a chunk claims 8192 MB, 64 MB at most)",
     ("export --csv", "zstd-frame-of-8-gb"): "20 ticks lost (a zstd frame claims 8589934592 bytes,",
@@ -43,7 +43,7 @@ SAID = {
     ("rerun", "parameters-that-no-controller-has"): "swing",
     ("plot --png", "numbers-that-no-fish-has"): "is 1e+308 somewhere, which cannot be drawn",
 }
-"""What a verb says of a file, in part."""
+"""Parts of the messages of verbs, by file."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def results(folder: Path) -> dict[tuple[str, str], Outcome]:
-    """How each verb ended for each file; the memory of each process is judged at once."""
+    """Return the result of each verb for each file; the memory of each process is checked."""
     root = ROOT
     paths = os.pathsep.join(map(str, (root, root / "tests", root / "tools")))
     outcomes = []

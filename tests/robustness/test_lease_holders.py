@@ -1,4 +1,4 @@
-"""A program that holds the fish, killed or stopped or busy, and who else gets it."""
+"""Programs that hold the lease, killed, stopped or busy, and the next holder."""
 
 import asyncio
 import signal
@@ -31,7 +31,7 @@ with Fish(sys.argv[1], timeout=60.0) as fish:
 
 
 def swimming(daemon: Daemon) -> Process:
-    """A program that holds the fish, which swims."""
+    """Run a program that holds the lease of a swimming fish."""
     program = Process(sys.executable, "-c", PROGRAM, daemon.endpoint)
     wait_until(lambda: daemon.status().mode == "running")
     return program
@@ -140,7 +140,7 @@ def test_a_fish_that_could_not_be_given_back_is_spoken_of_once(
 
 
 class Silent:
-    """A fishd that does not answer at times, and says then that the lease has ended."""
+    """fishd that sometimes does not answer, and then reports the end of the lease."""
 
     def __init__(self, silences: int) -> None:
         self.asked = 0

@@ -1,4 +1,4 @@
-"""Whatever a controller raises, in whichever method, the loop goes on ticking and says why."""
+"""For any exception in any method of a controller, the loop continues and reports the reason."""
 
 from typing import Any
 
@@ -17,7 +17,7 @@ def started(method: str, deed: str) -> Rig:
 
 
 def check_latched(rig: Rig) -> None:
-    """A fault with a reason that everybody can be told, and ticks that go on."""
+    """Check for a fault with a reason that can be sent, and for continuing ticks."""
     reason = rig.loop.supervisor.reason
     assert reason is not None
     assert reason.code == "controller-error"
@@ -75,7 +75,7 @@ def test_what_is_no_angle_is_a_fault_that_says_so(deed: str) -> None:
 
 
 class Forgetful(Zoo):
-    """Loses its parameters."""
+    """Controller that loses its parameters."""
 
     def __init__(self, lost: Any) -> None:
         super().__init__(ZooParameters(), LIMITS)

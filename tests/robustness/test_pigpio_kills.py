@@ -1,4 +1,4 @@
-"""Whatever instant a process dies at, the pulses that it asked pigpiod for end by themselves."""
+"""The pulses that a process has requested from pigpiod end after its death at any instant."""
 
 import contextlib
 from collections.abc import Callable
@@ -10,17 +10,17 @@ from fishd.core.errors import Escaped, ServoError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio_client import TimedSocket
 
-SOON = 2.0
-"""Neutral after 0.2 s and off 0.5 s later; longer where a test has lengthened the countdown [s]."""
+MAX_END_S = 2.0
+"""Time until pulses end: neutral after 0.2 s and off 0.5 s later, or a longer countdown [s]."""
 
 
 class Killed(BaseException):
-    """Kill -9, as the process itself would see it if it could."""
+    """Simulated kill -9 of the process."""
 
 
 @pytest.fixture
 def mortal(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | None], None]:
-    """Call it with n: the process dies instead of sending for the n-th time; None revives it."""
+    """Yield a function of n: the process dies instead of its n-th send; None revives it."""
     send = TimedSocket.sendall
     left: int | None = None
 
@@ -114,7 +114,7 @@ DEEDS = (
 def die_at(
     n: int, bench: Bench, deed: Callable[[Bench], None], kill_after: Callable[[int | None], None]
 ) -> bool:
-    """True when it died; False when it had done everything before."""
+    """Return whether the process died before it had finished."""
     kill_after(n)
     try:
         deed(bench)
@@ -138,8 +138,8 @@ def test_a_kill_between_any_two_commands_leaves_no_pulses(
         with contextlib.ExitStack() as stack:
             bench = Bench(stack)
             died = die_at(n, bench, deed, mortal)
-            bench.wait(SOON)
-            # Pulses of others that nobody has touched yet are theirs.
+            bench.wait(MAX_END_S)
+            # Pulses of others that were not changed remain theirs.
             others = deed is last_resort_on_pulses_of_others
             untouched = others and [width for _, width in bench.daemon.history(GPIO)] == [1800]
             assert bench.width == 0 or (died and untouched), f"died at command {n}"
@@ -150,7 +150,7 @@ def test_a_kill_between_any_two_commands_leaves_no_pulses(
 
 def swim_until_the_countdown_has_ended(bench: Bench) -> None:
     swim(bench)
-    bench.wait(SOON)
+    bench.wait(MAX_END_S)
     assert bench.width == 0
 
 
@@ -163,7 +163,7 @@ def test_bytes_of_a_dead_process_or_connection_that_pigpiod_reads_late_do_not_st
     past(bench)
     with bench.client() as late:
         late.set_servo_pulsewidth(GPIO, 1800)
-    bench.wait(0.1 if past is swim_until_the_countdown_has_ended else SOON)
+    bench.wait(0.1 if past is swim_until_the_countdown_has_ended else MAX_END_S)
     assert bench.width == 0
 
 
@@ -172,7 +172,7 @@ def test_a_release_that_only_reaches_pigpiod_in_half_ends_the_pulses_at_once(
 ) -> None:
     servo = swim(bench)
     with bench.client() as client:
-        # The first of its two commands, as after a cable that broke in between.
+        # The first of its two commands, as if a cable broke in between.
         client.update_script(script_of(servo), [1, GPIO, 0])
     bench.wait(0.05)
     assert bench.width == 0

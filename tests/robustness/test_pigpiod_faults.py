@@ -1,4 +1,4 @@
-"""What the true client meets when the emulated pigpiod is gone, frozen or restarted."""
+"""Real client with an emulated pigpiod that has ended, is frozen or restarts."""
 
 from collections.abc import Iterator
 
@@ -23,7 +23,7 @@ def test_frozen_its_pulses_go_on_and_its_scripts_stand_still(bench: Bench) -> No
     bench.faults.inject("pigpiod-frozen", 10.0)
     bench.sleep(9.99)
     assert bench.width == 1600
-    # Half of the countdown is left when it goes on.
+    # Half of the countdown remains when it continues.
     bench.sleep(0.01 + 0.09)
     assert bench.width == 1600
     bench.sleep(0.04)

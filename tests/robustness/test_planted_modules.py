@@ -1,4 +1,4 @@
-"""Files of the working directory are never executed: another user may have put them there."""
+"""Files of the working directory are never executed, because another user may have written them."""
 
 import importlib.metadata
 import re
@@ -19,7 +19,7 @@ STARTS_PROCESSES = (
 
 
 class Trap:
-    """A folder with a module of every name that there is, each of which leaves a mark."""
+    """Folder with a module of every known name, each of which leaves a mark."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "trap"
@@ -31,7 +31,7 @@ class Trap:
 
     @property
     def executed(self) -> list[str]:
-        """Names of the modules that a process has executed."""
+        """Return the names of the modules that a process has executed."""
         return self._mark.read_text().split() if self._mark.exists() else []
 
 

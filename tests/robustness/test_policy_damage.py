@@ -1,4 +1,4 @@
-"""A damaged policy file, or one that would fill the memory, is refused, whichever byte it is."""
+"""A policy file with any damaged byte, or one that would fill the memory, is refused."""
 
 import random
 
@@ -62,21 +62,21 @@ def field(number: int, content: bytes) -> bytes:
 
 
 def varint(number: int) -> bytes:
-    found = b""
+    encoded = b""
     while number > 0x7F:
-        found += bytes([number & 0x7F | 0x80])
+        encoded += bytes([number & 0x7F | 0x80])
         number >>= 7
-    return found + bytes([number])
+    return encoded + bytes([number])
 
 
 HEAD = b"\x08\x07" + field(8, b"\x10\x0d")
-MANY = MAX_FILE_BYTES // 4
+LARGE_COUNT = MAX_FILE_BYTES // 4
 BOMBS = {
-    "properties": HEAD + field(14, b"") * MANY,
-    "nodes": HEAD + field(7, field(1, b"") * MANY),
-    "dimensions": HEAD + field(7, field(5, field(1, bytes(MANY)))),
-    "texts": HEAD + field(7, field(5, field(6, b"") * MANY)),
-    "attributes": HEAD + field(7, field(1, field(5, field(9, b"") * MANY))),
+    "properties": HEAD + field(14, b"") * LARGE_COUNT,
+    "nodes": HEAD + field(7, field(1, b"") * LARGE_COUNT),
+    "dimensions": HEAD + field(7, field(5, field(1, bytes(LARGE_COUNT)))),
+    "texts": HEAD + field(7, field(5, field(6, b"") * LARGE_COUNT)),
+    "attributes": HEAD + field(7, field(1, field(5, field(9, b"") * LARGE_COUNT))),
 }
 
 

@@ -1,4 +1,4 @@
-"""A short run of docs/reference/reliability.md: however fishd ends, the servo goes to neutral."""
+"""Short run of docs/reference/reliability.md: the servo goes to neutral after any end of fishd."""
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -11,12 +11,12 @@ from rigs.processes import call
 
 from reliability import misbehaviour
 
-LONGEST_END = 3.0
-"""From a signal to the end of the process, whatever hangs [s]."""
+MAX_END_S = 3.0
+"""Longest time from a signal to the end of the process, with anything hanging [s]."""
 
 
 def measured(*arguments: str) -> Any:
-    """What the tool finds that writes docs/reference/reliability.md."""
+    """Return the results of the tool that writes docs/reference/reliability.md."""
     done = call(sys.executable, ROOT / "tools" / "reliability", *arguments, "--json", timeout=200)
     assert done.returncode in (0, 1), done.stderr
     assert done.stdout, done.stderr
@@ -32,12 +32,12 @@ def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then() ->
     """One test of all six, who die side by side: judged again, they are measured again."""
     deaths = measured("deaths", "--only", *SIGNALS, *PHASES)
     for name, status in SIGNALS.items():
-        found = deaths[name]
-        assert found["status"] == status, name
+        outcome = deaths[name]
+        assert outcome["status"] == status, name
         limit = 0.3 if status != 0 else 0.6  # a countdown in pigpiod; a fade of 0.4 s
-        assert found["neutral"] <= limit, name
-        assert found["neutral"] < found["off"] <= found["neutral"] + 0.8, name
-    assert deaths["SIGCONT"]["reason"] == "overrun"  # it goes on after a hang
+        assert outcome["neutral"] <= limit, name
+        assert outcome["neutral"] < outcome["off"] <= outcome["neutral"] + 0.8, name
+    assert deaths["SIGCONT"]["reason"] == "overrun"  # it continues after a hang
     for phase in PHASES:  # an exception outside the phases of a tick
         assert deaths[phase]["status"] == 1, phase
         assert deaths[phase]["neutral"] < deaths[phase]["off"], phase
@@ -68,10 +68,10 @@ def test_a_load_that_never_ends_ends_no_fishd() -> None:
     ("kind", "status"), [("hanging-update", 1), ("hanging-close", 1), ("hanging-__init__", 0)]
 )
 def test_a_fishd_that_hangs_ends_soon(kind: str, status: int) -> None:
-    found = misbehaviour.KINDS[kind]()
-    assert found.longest is not None
-    assert found.longest <= LONGEST_END
-    assert found.statuses == [status]
+    outcome = misbehaviour.KINDS[kind]()
+    assert outcome.longest is not None
+    assert outcome.longest <= MAX_END_S
+    assert outcome.statuses == [status]
 
 
 @pytest.mark.realtime
@@ -80,7 +80,7 @@ def test_a_fishd_that_says_what_nobody_reads_ends_soon() -> None:
     kinds = ("unread-pipe", "unread-terminal", "hangup")
     with ThreadPoolExecutor(len(kinds)) as pool:
         outcomes = list(pool.map(lambda kind: misbehaviour.KINDS[kind](), kinds))
-    for kind, found in zip(kinds, outcomes, strict=True):
-        assert found.longest is not None, kind
-        assert found.longest <= LONGEST_END, kind
-        assert found.statuses == [0], kind
+    for kind, outcome in zip(kinds, outcomes, strict=True):
+        assert outcome.longest is not None, kind
+        assert outcome.longest <= MAX_END_S, kind
+        assert outcome.statuses == [0], kind

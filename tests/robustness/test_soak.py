@@ -1,4 +1,4 @@
-"""A short run of each soak; docs/reference/reliability.md has the figures of long ones."""
+"""Short run of each soak; docs/reference/reliability.md has the figures of long ones."""
 
 import subprocess
 import sys

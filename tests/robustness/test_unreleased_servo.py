@@ -1,4 +1,4 @@
-"""A fishd that ends while its pigpiod is stopped says that the servo may keep its pulses."""
+"""A fishd that ends while its pigpiod is stopped reports that the servo may keep its pulses."""
 
 import signal
 from pathlib import Path
@@ -9,7 +9,7 @@ from rigs.virtual_pi_process import virtual_pi
 
 def test_the_last_line_says_so_and_fishctl_release_ends_the_pulses_later(tmp_path: Path) -> None:
     with virtual_pi(tmp_path) as pi:
-        # Loads the drivers: the next one has to come before pigpiod's countdown is over.
+        # This loads the drivers: the next start must be faster than pigpiod's countdown.
         assert fishctl("release", *pi.settings).stdout == "there were no pulses\n"
         with running(tmp_path, *pi.settings) as daemon:
             with Subscriber(daemon.telemetry, b"tick") as ticks:

@@ -1,6 +1,6 @@
-"""A controller that misbehaves as it is told: `deed` is done in `method`.
+"""Controller that misbehaves on request: `deed` is done in `method`.
 
-`tools/reliability misbehaviour` installs it as a package and lets the true fishd meet it.
+`tools/reliability misbehaviour` installs it as a package and tries it with the real fishd.
 """
 
 import asyncio
@@ -20,14 +20,14 @@ from fishd.core.signals import Observation
 
 
 class Mute(Exception):
-    """Has a text that cannot be had."""
+    """Exception whose text cannot be read."""
 
     def __str__(self) -> str:
         raise SystemExit("no text")
 
 
 class Swapped(ControllerFault):
-    """Has a code that is no text."""
+    """Exception whose code is not a text."""
 
     def __init__(self) -> None:
         super().__init__("zoo", "swapped")
@@ -80,13 +80,13 @@ BAD = {
 
 
 def loop() -> None:
-    """For ever, in Python."""
+    """Loop endlessly in Python."""
     while True:
         pass
 
 
 def stubborn() -> None:
-    """For ever, and nothing that is raised here ends it."""
+    """Loop endlessly, and ignore all exceptions."""
     while True:
         try:
             time.sleep(0.01)
@@ -95,18 +95,18 @@ def stubborn() -> None:
 
 
 def sleep() -> None:
-    """For a day."""
+    """Sleep for a day."""
     time.sleep(86400)
 
 
 def block() -> None:
-    """For ever, in C, without the interpreter's lock."""
+    """Block endlessly in C, without the interpreter's lock."""
     reader, _ = os.pipe()
     os.read(reader, 1)
 
 
 class Endless:
-    """Whoever writes this in a log never comes back."""
+    """Object whose text never ends, for a log."""
 
     def __str__(self) -> str:
         sleep()
@@ -114,7 +114,7 @@ class Endless:
 
 
 def log_for_ever() -> None:
-    """For ever, in the midst of a log record."""
+    """Loop endlessly within a log record."""
     logging.getLogger("zoo").error("%s", Endless())
 
 
@@ -128,11 +128,11 @@ class ZooParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     method: str = "update"
     nudge: int = 0
     begun: str = ""
-    """A file that is there once the deed begins."""
+    """File that is created when the deed begins."""
 
 
 class Zoo(Controller[ZooParameters]):
-    """Misbehave as told."""
+    """Controller that misbehaves."""
 
     Parameters = ZooParameters
 

@@ -1,4 +1,4 @@
-"""What is said of how a camera stands over the fish."""
+"""Check of the alignment of a camera above the fish."""
 
 import math
 from functools import cache
@@ -31,23 +31,23 @@ def judged(seen: Pixels, settings: CameraSettings = V4L2, picture: Any = VGA) ->
 
 
 def turned(quarters: int) -> Pixels:
-    """By so many quarter turns clockwise."""
+    """Return pictures turned clockwise by a number of quarter turns."""
     return np.ascontiguousarray(np.rot90(pictures(), -quarters, axes=(1, 2)))
 
 
 def test_a_camera_that_stands_well_is_left_alone() -> None:
-    found = judged(pictures())
-    assert (found.good, found.advice, found.settings) == (True, (), {})
-    assert 20 < found.place.left < found.place.right < 75
-    assert found.place.top < 42 < found.place.bottom
+    alignment = judged(pictures())
+    assert (alignment.good, alignment.advice, alignment.settings) == (True, (), {})
+    assert 20 < alignment.place.left < alignment.place.right < 75
+    assert alignment.place.top < 42 < alignment.place.bottom
 
 
 @pytest.mark.parametrize(("tilt", "way"), [(0.1, "clockwise"), (-0.05, "counter-clockwise")])
 def test_a_tilted_camera_is_turned_by_its_tilt(tilt: float, way: str) -> None:
-    found = judged(pictures(tilt=tilt))
-    assert not found.good
-    assert f"turn the camera {way}, as seen from behind it, by " in found.advice[0]
-    degrees = float(found.advice[0].split()[-1].rstrip("°"))
+    alignment = judged(pictures(tilt=tilt))
+    assert not alignment.good
+    assert f"turn the camera {way}, as seen from behind it, by " in alignment.advice[0]
+    degrees = float(alignment.advice[0].split()[-1].rstrip("°"))
     assert degrees == pytest.approx(abs(math.degrees(tilt)), abs=0.6)
 
 
@@ -55,8 +55,11 @@ def test_a_tilted_camera_is_turned_by_its_tilt(tilt: float, way: str) -> None:
 @pytest.mark.parametrize("off", [3.0, -6.0])
 def test_the_crop_is_moved_so_that_the_axis_lies_in_its_middle(off: float, side: float) -> None:
     settings = replace(V4L2, picture=PictureSettings(crop=Square(side=side)))
-    found = judged(pictures(off_axis=off), settings)
-    y, new_side = found.settings["picture.crop.y"], found.settings.get("picture.crop.side", side)
+    alignment = judged(pictures(off_axis=off), settings)
+    y, new_side = (
+        alignment.settings["picture.crop.y"],
+        alignment.settings.get("picture.crop.side", side),
+    )
     assert isinstance(y, float)
     assert isinstance(new_side, float)
     assert y == pytest.approx(0.5 + off / 84 * side, abs=0.01)
@@ -70,31 +73,31 @@ def test_the_crop_is_moved_so_that_the_axis_lies_in_its_middle(off: float, side:
 def test_a_fish_that_lies_otherwise_is_turned_with_its_head_to_the_left(
     quarters: int, rotate: Any
 ) -> None:
-    found = judged(turned(quarters), replace(V4L2, picture=PictureSettings(rotate=rotate)))
-    assert found.settings == {"picture.rotate": (rotate + 360 - 90 * quarters) % 360}
-    assert not found.good
-    assert "head to the left: turn it" in found.advice[-1]
+    alignment = judged(turned(quarters), replace(V4L2, picture=PictureSettings(rotate=rotate)))
+    assert alignment.settings == {"picture.rotate": (rotate + 360 - 90 * quarters) % 360}
+    assert not alignment.good
+    assert "head to the left: turn it" in alignment.advice[-1]
 
 
 def test_a_tail_that_leaves_the_picture_is_said_to() -> None:
-    found = judged(pictures()[:, 33:51, :56])
-    assert not found.good
-    assert found.advice[0].startswith(
+    alignment = judged(pictures()[:, 33:51, :56])
+    assert not alignment.good
+    assert alignment.advice[0].startswith(
         "the motion is cut off at the upper edge and the lower edge and the right"
     )
 
 
 def test_an_axis_at_the_edge_of_what_is_looked_at_is_said_to_be_unsure() -> None:
     motion = find_motion(pictures())
-    found = judge(motion._replace(sure=False), VGA, V4L2)
-    assert not found.good
-    assert "may be further off or steeper" in found.advice[0]
+    alignment = judge(motion._replace(sure=False), VGA, V4L2)
+    assert not alignment.good
+    assert "may be further off or steeper" in alignment.advice[0]
 
 
 def test_of_a_simulated_camera_its_own_settings_are_named() -> None:
     settings = CameraSettings(
         simulated=replace(CameraSettings().simulated, off_axis=3.0, tilt=0.05)
     )
-    found = judged(pictures(off_axis=3.0, tilt=0.05), settings, (84, 84))
-    assert found.settings["simulated.off_axis"] == pytest.approx(0.0, abs=0.3)
-    assert found.settings["simulated.tilt"] == pytest.approx(0.0, abs=0.015)
+    alignment = judged(pictures(off_axis=3.0, tilt=0.05), settings, (84, 84))
+    assert alignment.settings["simulated.off_axis"] == pytest.approx(0.0, abs=0.3)
+    assert alignment.settings["simulated.tilt"] == pytest.approx(0.0, abs=0.015)

@@ -1,4 +1,4 @@
-"""The axis of motion, found in pictures of a simulated camera."""
+"""Axis of motion in pictures of a simulated camera."""
 
 import math
 

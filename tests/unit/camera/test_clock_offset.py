@@ -1,4 +1,4 @@
-"""The offset between two clocks is as good as the shortest round trip."""
+"""Offset between two clocks, as accurate as the shortest round trip."""
 
 import random
 
@@ -19,7 +19,7 @@ AHEAD = 1234.5
 
 
 class Network:
-    """Two machines; there and back take random times."""
+    """Network between two machines with random travel times."""
 
     def __init__(self, seed: int = 0, shortest: float = 1e-3, longest: float = 0.05) -> None:
         self.now = 100.0

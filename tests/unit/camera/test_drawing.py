@@ -38,10 +38,10 @@ def test_a_file_shows_the_same_colours(tmp_path: Path) -> None:
     red = np.zeros((4, 4, 3), np.uint8)
     red[:, :, 0] = 255
     drawing.write_png(tmp_path / "red.png", drawing.enlarge(red))
-    found = cv2.imread(str(tmp_path / "red.png"))
-    assert found is not None
-    assert found.shape == (640, 640, 3)
-    assert (found == [0, 0, 255]).all()
+    image = cv2.imread(str(tmp_path / "red.png"))
+    assert image is not None
+    assert image.shape == (640, 640, 3)
+    assert (image == [0, 0, 255]).all()
 
 
 def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:

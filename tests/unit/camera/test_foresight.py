@@ -1,4 +1,4 @@
-"""What the simulated camera believes of the motion until the next tick is what happens."""
+"""Agreement of the simulated camera's prediction until the next tick with the motion."""
 
 import random
 from itertools import pairwise
@@ -18,7 +18,7 @@ TICK = 0.05
 
 
 class Swim:
-    """A simulated fish under random commands, and what a camera would hear of it."""
+    """Simulated fish under random commands, and the ticks that a camera receives."""
 
     def __init__(self, plant: PlantParameters, seed: int) -> None:
         self._fish = SimulatedFish(plant, SimulationSettings(), TICK)
@@ -27,7 +27,7 @@ class Swim:
         self.command = 0.0
 
     def tick(self, slots: int = 1, *, released: bool = False) -> TickTruth:
-        """slots: how many periods after the previous one"""
+        """slots: periods since the previous tick"""
         self._slot += slots
         self._seq += 1
         now = self._slot * TICK
@@ -88,6 +88,6 @@ def test_after_ticks_that_nobody_heard_it_begins_anew_from_the_true_state() -> N
     tick = swim.tick()
     ((begin, _),) = ahead.follow(tick)
     assert (begin.time, begin.alpha) == (tick.time, tick.alpha)
-    for _ in range(4):  # until what was under way to the servo has arrived
+    for _ in range(4):  # until delayed commands have reached the servo
         ((_, believed),) = ahead.follow(swim.tick())
     assert swim.tick().alpha == pytest.approx(believed.alpha, abs=1e-9)

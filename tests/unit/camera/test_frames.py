@@ -1,4 +1,4 @@
-"""Which frames a tick is shown."""
+"""Frames that a tick sees."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from fishd.core.camera_frames import Frame, FrameHistory, StackSettings
 
 
 def history_of(*times: float, late: float = 0.0, **settings: float) -> FrameHistory:
-    """Frames of one pixel each, whose level is their number."""
+    """Return frames of one pixel each, whose level is their number."""
     history = FrameHistory(StackSettings(**settings))
     for number, time in enumerate(times):
         pixels = np.full((1, 1), number % 256, np.uint8)
@@ -15,33 +15,33 @@ def history_of(*times: float, late: float = 0.0, **settings: float) -> FrameHist
     return history
 
 
-def shown(history: FrameHistory, tick: float) -> list[int] | None:
+def levels_at(history: FrameHistory, tick: float) -> list[int] | None:
     stack = history.stack(tick)
     return None if stack is None else [int(frame[0, 0]) for frame in stack]
 
 
 def test_a_tick_is_shown_the_newest_frame_at_or_before_each_of_its_times() -> None:
     history = history_of(0.0, 0.03, 0.06, 0.1, 0.13, 0.16, 0.2)
-    assert shown(history, 0.2) == [6, 4, 3, 1]
+    assert levels_at(history, 0.2) == [6, 4, 3, 1]
 
 
 def test_times_that_differ_by_rounding_alone_are_equal() -> None:
     history = history_of(*(k * 0.05 + 1e-9 for k in range(5)))
-    assert shown(history, 0.2) == [4, 3, 2, 1]
+    assert levels_at(history, 0.2) == [4, 3, 2, 1]
 
 
 def test_a_slow_camera_is_shown_twice_rather_than_not_at_all() -> None:
-    assert shown(history_of(0.0, 0.1, 0.2), 0.2) == [2, 1, 1, 0]
+    assert levels_at(history_of(0.0, 0.1, 0.2), 0.2) == [2, 1, 1, 0]
 
 
 def test_a_frame_that_has_not_arrived_yet_is_not_shown() -> None:
     history = history_of(0.0, 0.05, 0.1, 0.15, 0.2, late=0.03)
-    assert shown(history, 0.2) == [3, 3, 2, 1]
+    assert levels_at(history, 0.2) == [3, 3, 2, 1]
 
 
 def test_with_a_delay_frames_of_a_late_camera_are_evenly_spaced() -> None:
     history = history_of(*(k * 0.025 for k in range(13)), late=0.04, delay=0.05)
-    assert shown(history, 0.3) == [10, 8, 6, 4]
+    assert levels_at(history, 0.3) == [10, 8, 6, 4]
 
 
 @pytest.mark.parametrize("missing", [0, 1, 2, 3])
@@ -49,17 +49,17 @@ def test_nothing_is_shown_where_a_frame_is_missing_for_too_long(missing: int) ->
     times = [k * 0.05 for k in range(20)]
     newest = len(times) - 1 - missing
     del times[newest - 3 : newest + 1]
-    assert shown(history_of(*times), 0.95) is None
+    assert levels_at(history_of(*times), 0.95) is None
 
 
 @pytest.mark.parametrize("rate", [20, 100, 1000])
 def test_a_stack_is_found_however_many_frames_there_are_a_second(rate: int) -> None:
     history = history_of(*(k / rate for k in range(10 * rate)), delay=0.1, oldest=0.06)
     expected = [round((9.8 - 0.05 * k) * rate) % 256 for k in range(4)]
-    assert shown(history, 9.9) == expected
+    assert levels_at(history, 9.9) == expected
 
 
 def test_frames_that_no_tick_can_want_any_more_are_forgotten() -> None:
     history = history_of(*(k * 1e-3 for k in range(20_000)))
-    assert shown(history, 19.99) is not None
-    assert shown(history, 15.0) is None
+    assert levels_at(history, 19.99) is not None
+    assert levels_at(history, 15.0) is None

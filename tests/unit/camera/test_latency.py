@@ -1,4 +1,4 @@
-"""The delay of a camera, told from its frames and the lateral force."""
+"""Delay of a camera, measured from its frames and the lateral force."""
 
 import random
 from functools import cache
@@ -14,7 +14,7 @@ from fishd.core.camera_frames import Frame
 
 BAD = replace(WEB, contrast=50.0, noise=10.0, light_drift=0.3)
 
-swum = cache(filmed_swim.swum)  # nobody changes a tick or a frame
+swum = cache(filmed_swim.swum)  # ticks and frames are immutable
 
 
 @cache
@@ -23,7 +23,7 @@ def film(camera: SimulatedCameraSettings) -> list[Frame]:
 
 
 def stamped_late(frames: list[Frame], late: float) -> list[Frame]:
-    """As by a driver whose time stamps are so much later than it says [s]."""
+    """Return frames of a driver whose time stamps are late by a time [s]."""
     return [frame._replace(time=frame.time + late) for frame in frames]
 
 
@@ -38,12 +38,12 @@ def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_ar
     camera: SimulatedCameraSettings, within: float, late: float
 ) -> None:
     ticks = swum(40.0)
-    found = find_latency(stamped_late(film(camera), late), felt(ticks))
-    assert found.stamps == pytest.approx(late, abs=within)
-    assert found.total == pytest.approx(camera.latency, abs=within + 1e-3)
-    assert abs(found.stamps - late) < 1.5 * found.error
-    assert found.error < 3e-3
-    assert found.agreement > 0.95
+    latency = find_latency(stamped_late(film(camera), late), felt(ticks))
+    assert latency.stamps == pytest.approx(late, abs=within)
+    assert latency.total == pytest.approx(camera.latency, abs=within + 1e-3)
+    assert abs(latency.stamps - late) < 1.5 * latency.error
+    assert latency.error < 3e-3
+    assert latency.agreement > 0.95
 
 
 @pytest.mark.slow
@@ -52,8 +52,8 @@ def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_ar
 )  # fmt: skip
 def test_no_parameter_of_the_fish_is_needed(other: str) -> None:
     ticks = swum(40.0, other)
-    found = find_latency(filmed(ticks, WEB), felt(ticks))
-    assert found.stamps == pytest.approx(0.0, abs=3e-3)
+    latency = find_latency(filmed(ticks, WEB), felt(ticks))
+    assert latency.stamps == pytest.approx(0.0, abs=3e-3)
 
 
 def test_the_window_of_a_force_does_not_reach_back_over_ticks_that_were_skipped() -> None:
@@ -66,9 +66,9 @@ def test_the_window_of_a_force_does_not_reach_back_over_ticks_that_were_skipped(
 
 
 def test_ninety_nine_of_a_hundred_frames_arrive_within_what_is_said() -> None:
-    found = find_latency(film(WEB), felt(swum(40.0)))
-    assert 0.055 < found.latest < 0.07
-    assert found.arrival == pytest.approx(0.05, abs=2e-3)
+    latency = find_latency(film(WEB), felt(swum(40.0)))
+    assert 0.055 < latency.latest < 0.07
+    assert latency.arrival == pytest.approx(0.05, abs=2e-3)
 
 
 def test_frames_of_another_swim_are_refused() -> None:

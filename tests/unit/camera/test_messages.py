@@ -1,4 +1,4 @@
-"""What a camera says: what fits is read back, what does not is refused in one line."""
+"""Messages of a camera: valid ones are decoded, others are refused in one line."""
 
 import numpy as np
 import pytest
@@ -14,17 +14,17 @@ HEADER = FrameHeader(session="s", seq=7, time=1.25, available=1.5, width=4, heig
 
 
 def test_a_frame_is_read_back_as_it_was_sent() -> None:
-    found = messages.decode(messages.encode_frame(HEADER, PIXELS))
-    assert isinstance(found, PublishedFrame)
-    assert found.header == HEADER
-    assert np.array_equal(found.pixels, PIXELS)
+    message = messages.decode(messages.encode_frame(HEADER, PIXELS))
+    assert isinstance(message, PublishedFrame)
+    assert message.header == HEADER
+    assert np.array_equal(message.pixels, PIXELS)
 
 
 def test_a_part_of_a_larger_picture_is_sent_as_what_it_shows() -> None:
     whole = np.arange(48, dtype=np.uint8).reshape(6, 8)
-    found = messages.decode(messages.encode_frame(HEADER, whole[::2, ::2]))
-    assert isinstance(found, PublishedFrame)
-    assert np.array_equal(found.pixels, whole[::2, ::2])
+    message = messages.decode(messages.encode_frame(HEADER, whole[::2, ::2]))
+    assert isinstance(message, PublishedFrame)
+    assert np.array_equal(message.pixels, whole[::2, ::2])
 
 
 def test_no_topic_begins_like_another() -> None:
@@ -69,5 +69,5 @@ def test_anything_is_a_message_or_refused(parts: list[bytes]) -> None:
 
 def test_a_frame_whose_time_its_settings_moved_is_still_one() -> None:
     moved = replace(HEADER, time=HEADER.available + 1.0)
-    found = messages.decode(messages.encode_frame(moved, PIXELS))
-    assert isinstance(found, PublishedFrame)
+    message = messages.decode(messages.encode_frame(moved, PIXELS))
+    assert isinstance(message, PublishedFrame)

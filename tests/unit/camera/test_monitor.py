@@ -1,4 +1,4 @@
-"""What a camera says of its rate and of the age of its frames."""
+"""Rate of a camera and age of its frames in its state."""
 
 import pytest
 
@@ -15,7 +15,7 @@ class Clock:
 
 
 def streaming(clock: Clock, *, apart: float = 0.04, virtual: bool = False) -> Monitor:
-    """Ten frames have come, each 30 ms after its exposure."""
+    """Return a monitor after ten frames, each 30 ms after its exposure."""
     monitor = Monitor(CameraSettings(), "a camera", "ipc://frames", clock)
     monitor.begin("one", Timeline(virtual, "", None), ())
     for _ in range(10):

@@ -1,4 +1,4 @@
-"""From a camera's picture to what learners see."""
+"""Conversion of a camera's picture for learners."""
 
 import numpy as np
 import pytest
@@ -25,15 +25,15 @@ def test_the_square_lies_in_the_picture_wherever_it_is_asked_for(
 @pytest.mark.parametrize("rotate", [0, 90, 180, 270])
 def test_a_picture_is_turned_clockwise(rotate: int) -> None:
     whole = np.arange(12, dtype=np.uint8).reshape(3, 4)
-    found = picture.turned(whole, PictureSettings(rotate=rotate))  # type: ignore[arg-type]
-    assert np.array_equal(found, np.rot90(whole, -rotate // 90))
+    turned = picture.turned(whole, PictureSettings(rotate=rotate))  # type: ignore[arg-type]
+    assert np.array_equal(turned, np.rot90(whole, -rotate // 90))
 
 
 def test_a_frame_is_the_mean_over_areas() -> None:
     whole = np.random.default_rng(0).integers(0, 256, (64, 64), dtype=np.uint8)
-    found = picture.frame(whole, PictureSettings(size=16))
+    frame = picture.frame(whole, PictureSettings(size=16))
     mean = whole.reshape(16, 4, 16, 4).mean(axis=(1, 3))
-    assert np.abs(found - mean).max() <= 0.51
+    assert np.abs(frame - mean).max() <= 0.51
 
 
 def test_a_small_picture_has_larger_pixels_for_people() -> None:

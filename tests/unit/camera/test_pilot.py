@@ -1,4 +1,4 @@
-"""A policy that swims outside of fishd's loop, with frames and without."""
+"""Policy that runs outside of fishd's loop, with and without frames."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ def stack(grey: int, size: int = 32) -> Stack:
 
 @pytest.fixture
 def brightness(tmp_path: Path) -> str:
-    """A policy whose angle is as large as the newest frame is bright, and 0 at 100."""
+    """Return a policy whose angle follows the brightness of the newest frame, and is 0 at 100."""
     about = seeing_card(("instruction_angle", 0.42))
     weights = np.zeros((2, 32, 32))
     weights[0] = 1.0 / 32**2 / 100.0

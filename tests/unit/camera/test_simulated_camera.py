@@ -1,4 +1,4 @@
-"""The simulated camera: what it draws, and when."""
+"""Pictures of the simulated camera, and their times."""
 
 from itertools import pairwise
 
@@ -17,15 +17,15 @@ TICK = 0.05
 
 def frames_of(settings: SimulatedCameraSettings, ticks: int) -> list[Frame]:
     camera = SimulatedCamera(settings, 84)
-    found = []
+    frames = []
     for tick in range(ticks):
         ends = (Tail(time, 0.1, 0.0) for time in (tick * TICK, (tick + 1) * TICK))
-        found += camera.frames(*ends)
-    return found
+        frames += camera.frames(*ends)
+    return frames
 
 
 def tip(settings: SimulatedCameraSettings, alpha: float, rate: float = 0.0) -> tuple[float, float]:
-    """Row of the tail's tip, and how wide it is smeared [px]."""
+    """Return the row of the tail's tip, and the width of its blur [px]."""
     column = TailPainter(settings, 84).paint(alpha, rate, 0.0)[:, 72].astype(float)
     dark = column.max() - column
     rows = np.arange(84)

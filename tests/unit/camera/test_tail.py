@@ -1,4 +1,4 @@
-"""Where the tail is in a picture."""
+"""Position of the tail in a picture."""
 
 from functools import cache
 
@@ -11,7 +11,7 @@ from rigs.filmed_swim import filmed
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.camera.tail import find_tails
 
-swum = cache(filmed_swim.swum)  # nobody changes a tick
+swum = cache(filmed_swim.swum)  # ticks are immutable
 
 
 @pytest.mark.parametrize("camera", [DEFAULT, WEB, replace(DEFAULT, off_axis=6.0, tilt=0.1)])

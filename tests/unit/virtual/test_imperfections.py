@@ -10,11 +10,11 @@ from fishd.virtual.plant.parameters import PlantParameters
 
 TICK = 0.05
 SAMPLES = 10
-"""In a tick."""
+"""Number of samples per tick."""
 
 
 def at_rest(ticks: int, tick: float = TICK, **rig: float) -> list[Measurement]:
-    """What a fish that hangs still is said to feel."""
+    """Return the measurements of a fish at rest."""
     settings = SimulationSettings(sample_rate=SAMPLES / tick, **{"noise": 0.0, **rig})
     fish = SimulatedFish(PlantParameters(), settings, tick)
     return [fish.read(k * tick) for k in range(ticks)]
@@ -56,21 +56,21 @@ def test_a_long_conversion_has_the_mean_of_all_of_the_hum() -> None:
 
 def test_spikes_are_as_frequent_as_said_and_shared_by_the_samples_of_a_window() -> None:
     seconds = 1000
-    found = at_rest(round(seconds / TICK), spike_rate=0.5, spike_size=0.2)
-    for values in ([f.fx for f in found], [f.fy for f in found]):
+    measurements = at_rest(round(seconds / TICK), spike_rate=0.5, spike_size=0.2)
+    for values in ([f.fx for f in measurements], [f.fy for f in measurements]):
         spikes = [round(value / (0.2 / SAMPLES), 6) for value in values if value]
         assert all(size == int(size) for size in spikes)
         count = sum(map(abs, spikes))
         assert count == pytest.approx(0.5 * seconds, abs=4.0 * math.sqrt(0.5 * seconds))
         upwards = sum(size for size in spikes if size > 0)
         assert upwards == pytest.approx(0.5 * count, abs=2.0 * math.sqrt(count))
-    together = sum(1 for f in found if f.fx and f.fy)
+    together = sum(1 for f in measurements if f.fx and f.fy)
     assert together < 30  # 0.025² of the windows by chance: 12
 
 
 def test_forces_are_told_in_whole_steps() -> None:
-    found = at_rest(500, quantum=0.0005, noise=0.002)
-    steps = {round(f.fx / 0.0005, 9) for f in found}
+    measurements = at_rest(500, quantum=0.0005, noise=0.002)
+    steps = {round(f.fx / 0.0005, 9) for f in measurements}
     assert len(steps) > 10
     assert all(step == int(step) for step in steps)
 

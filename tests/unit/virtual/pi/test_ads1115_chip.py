@@ -1,4 +1,4 @@
-"""What the emulated ADS1115 measures and how fast, its registers, and its faults."""
+"""Measurements and speed of the emulated ADS1115, its registers, and its faults."""
 
 import statistics
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from fishd.virtual.pi.ads1115 import DATA_RATES, POWER_UP
 from fishd.virtual.pi.i2c import Read, Write
 
 PINS = [(0, 1), (0, 3), (1, 3), (2, 3), (0,), (1,), (2,), (3,)]
-"""What AnalogIn is given, by mux bits."""
+"""Arguments of AnalogIn, by mux bits."""
 
 
 @pytest.fixture
@@ -45,10 +45,10 @@ def test_noise_is_as_large_as_asked_for_and_the_same_for_the_same_seed() -> None
             ads = board.driver()
             return [ads.read(X) for _ in range(400)]
 
-    found = readings(1)
-    assert statistics.stdev(found) == pytest.approx(5.0, rel=0.15)
-    assert statistics.mean(found) == pytest.approx(codes(VOLTS[X]), abs=1.0)
-    assert readings(1) == found != readings(2)
+    noisy_codes = readings(1)
+    assert statistics.stdev(noisy_codes) == pytest.approx(5.0, rel=0.15)
+    assert statistics.mean(noisy_codes) == pytest.approx(codes(VOLTS[X]), abs=1.0)
+    assert readings(1) == noisy_codes != readings(2)
 
 
 @pytest.mark.parametrize(("bits", "rate"), list(enumerate(DATA_RATES)))

@@ -1,4 +1,4 @@
-"""The emulated I2C bus: its transfers, and what the true drivers meet at its /dev/i2c-N."""
+"""Emulated I2C bus: its transfers, and the real drivers at its /dev/i2c-N."""
 
 import errno
 import fcntl

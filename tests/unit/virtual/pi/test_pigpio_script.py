@@ -1,4 +1,4 @@
-"""Scripts of the emulated pigpiod: what they compute, how long they take, what is refused."""
+"""Scripts of the emulated pigpiod: their results, durations and errors."""
 
 import pytest
 from hypothesis import given
@@ -19,7 +19,7 @@ START = 1.0
 
 
 class Rig:
-    """A script and a record of its servo pulses: (time from its start, GPIO, width)."""
+    """Script and a record of its servo pulses: (time from its start, GPIO, width)."""
 
     def __init__(self, text: str, *parameters: int, answer: int = 0) -> None:
         self.pulses: list[tuple[float, int, int]] = []
@@ -41,17 +41,17 @@ class Rig:
 
 
 def widths(text: str, *parameters: int) -> list[int]:
-    """The servo pulses that a script asks for."""
+    """Return the servo pulses that a script requests."""
     return [width for _, _, width in Rig(text, *parameters).run().pulses]
 
 
 @pytest.mark.parametrize("jump", ["jz", "jnz", "jmp"])
 @pytest.mark.parametrize("value", [-1, 0, 1])
 def test_jumps_look_at_the_flag_alone(jump: str, value: int) -> None:
-    # The load after the comparison must leave the flag alone.
-    found = widths(f"LDA p0 cmp 0 lda 5 {jump} 1 s 18 1500 tag 1", value)
+    # The load after the comparison must not change the flag.
+    pulses = widths(f"LDA p0 cmp 0 lda 5 {jump} 1 s 18 1500 tag 1", value)
     jumps = {"jz": value == 0, "jnz": value != 0, "jmp": True}[jump]
-    assert found == ([] if jumps else [1500])
+    assert pulses == ([] if jumps else [1500])
 
 
 @pytest.mark.parametrize("step", ["s 18 1500", "mils 1"])

@@ -1,4 +1,4 @@
-"""The fish between pulses and volts, checked against the plant itself."""
+"""Fish between pulses and volts, checked against the plant itself."""
 
 import math
 import statistics
@@ -24,7 +24,7 @@ def width(angle: float) -> float:
 
 
 class Rig:
-    """A tank without noise, and a pin that its servo is wired to."""
+    """Tank without noise, and a pin for its servo."""
 
     def __init__(self, *, noise: float = 0.0, start: float = 0.0, **settings: Any) -> None:
         self.pin = PulseTrain()
@@ -44,7 +44,7 @@ class Rig:
 
 
 def fish_at(*stretches: tuple[float | None, float]) -> TetheredFish:
-    """The plant after (angle, seconds), (angle, seconds) ..."""
+    """Return the plant after (angle, seconds), (angle, seconds) ..."""
     fish = TetheredFish(PlantParameters())
     for angle, seconds in stretches:
         fish.advance(angle, seconds, 1)

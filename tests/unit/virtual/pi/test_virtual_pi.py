@@ -1,4 +1,4 @@
-"""Pulses to forces and a button to a pin, with the true drivers on the virtual Pi."""
+"""Pulses to forces and a button to a pin, with the real drivers on the virtual Pi."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""What the simulated servo draws: figures of its data sheet come back, and energy is conserved."""
+"""Power of the simulated servo: values of its data sheet, and conservation of energy."""
 
 import math
 
@@ -52,7 +52,7 @@ def test_a_beat_costs_what_the_equations_say_integrated_on_their_own() -> None:
     fish = TetheredFish(plant, motor=motor)
     half = [0.42] * 6 + [-0.42] * 6
     mean_power(fish, half * 10)  # it has settled
-    found = mean_power(fish, half)
+    power = mean_power(fish, half)
 
     resistance = motor.voltage / motor.stall_current
     emf = (motor.voltage - resistance * motor.no_load_current) / plant.servo_speed
@@ -80,7 +80,7 @@ def test_a_beat_costs_what_the_equations_say_integrated_on_their_own() -> None:
             rate += (-plant.xi * plant.omega0 * rate + plant.omega0**2 * bend) * dt
         speed_before = speed
     expected = energy / 0.6 + motor.voltage * motor.idle_current
-    assert found == pytest.approx(expected, rel=1e-3)
+    assert power == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("fault", [{"backlash": 0.05}, {"cable_slack": 0.05}])

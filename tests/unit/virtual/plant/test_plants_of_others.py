@@ -1,4 +1,4 @@
-"""What a plant of another package may get wrong, and what fishd then says."""
+"""Errors of plants of other packages, and the messages of fishd."""
 
 from collections.abc import Iterator
 from pathlib import Path

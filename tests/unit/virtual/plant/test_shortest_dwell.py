@@ -1,4 +1,4 @@
-"""The shortest dwell that a fish's own servo and fin give."""
+"""Shortest dwell from the servo and the fin of a fish."""
 
 import math
 

@@ -31,7 +31,7 @@ FISHES = {
 }
 
 REACTION_TIME = 0.01
-"""In which the mount passes the servo's reaction on [s]."""
+"""Time constant of the mount that transmits the servo's reaction [s]."""
 
 angles = st.floats(-1.5, 1.5)
 states = st.builds(PlantState, angles, st.floats(-0.5, 0.5), st.floats(-5.0, 5.0))
@@ -47,7 +47,7 @@ def dead_band(angle: float, slack: float) -> float:
 def integrate(
     p: PlantParameters, state: PlantState, command: float | None, duration: float, samples: int
 ) -> tuple[PlantState, FinWindow]:
-    """The equations as they stand, given to an adaptive solver."""
+    """Integrate the equations with an adaptive solver."""
     from scipy.integrate import solve_ivp  # takes long to load, in every worker of pytest
 
     if command is not None:  # the wheel stops at the edge of the dead zone
@@ -104,7 +104,7 @@ def integrate(
 
 
 def natural_scales(p: PlantParameters) -> tuple[list[float], list[float]]:
-    """What φ, α, α̇ and what F_x, F_y, sampled F_x, sampled F_y are small or large against."""
+    """Return typical sizes of φ, α, α̇ and of F_x, F_y, sampled F_x, sampled F_y."""
     alpha, rate = 0.5, max(4.0, 0.5 * p.omega0)
     acceleration = p.xi * p.omega0 * rate + p.omega0**2 * alpha
     thrust = p.thrust_coefficient * alpha * acceleration
@@ -226,13 +226,13 @@ def test_windows_that_are_prepared_between_ticks_are_the_same_and_cost_the_tick_
     computed: list[float] = []
     swim = HeldWindowMatrices.swim
 
-    def counted(
+    def count_call(
         self: HeldWindowMatrices, state: PlantState, target: float, lag: float
     ) -> HeldWindows:
         computed.append(target)
         return swim(self, state, target, lag)
 
-    monkeypatch.setattr(HeldWindowMatrices, "swim", counted)
+    monkeypatch.setattr(HeldWindowMatrices, "swim", count_call)
     prepared, plain = TetheredFish(PlantParameters()), TetheredFish(PlantParameters())
     for tick in range(100):
         request = (0.4 if tick // 6 % 2 else -0.3, 0.05, 10)
@@ -254,7 +254,7 @@ def test_an_instruction_far_beyond_the_servo_lag_does_not_overflow() -> None:
 def turning_point(
     p: PlantParameters, start: PlantState, tail: float, command: float, duration: float
 ) -> float:
-    """The fin angle where the fin turns, within a window in which it does."""
+    """Return the fin angle at the reversal within a window."""
     low, high = 0.0, duration
     for _ in range(12):
         middle = 0.5 * (low + high)
@@ -269,7 +269,7 @@ def turning_point(
 
 
 _STEPS = 100
-"""Of slow motion in a window; no fin turns twice in one."""
+"""Number of steps of slow motion in a window; no fin turns twice in one step."""
 
 
 @example(PlantParameters(omega0=60.0, xi=4.0), PlantState(0.0, 0.34375, 3.0), 0.0, 0.171875)

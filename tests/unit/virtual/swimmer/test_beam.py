@@ -1,4 +1,4 @@
-"""The body by itself: it bends as the theory of beams says, however far."""
+"""Body alone: its bend agrees with the theory of beams, also for large bends."""
 
 import numpy as np
 import pytest
@@ -14,12 +14,12 @@ def even(value: float) -> Profile:
 
 
 def beam(*, clamped: bool = False, segments: int = 40) -> Beam:
-    """Even along its length."""
+    """Return a uniform beam."""
     return Beam(LENGTH, even(HALF), even(EI), segments, 1e-3, density=DENSITY, clamped=clamped)
 
 
 def mass(body: Beam) -> Array:
-    """Mass matrix of a straight beam in vacuum."""
+    """Return the mass matrix of a straight beam in vacuum."""
     moves = body.motion(np.zeros(body.slices)).reshape(-1, body.size)
     return moves.T @ (body.excess.ravel()[:, None] * moves)
 

@@ -1,4 +1,4 @@
-"""What a body covers of the faces: its own area, and half of a cell that its surface cuts."""
+"""Coverage of faces by a body: its area, and half of a cell at its surface."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ PX, PY = np.arange(-0.02, 0.05, H), np.arange(-0.03, 0.03, H)
 def bar(
     half: float, *, angle: float = 0.0, length: float = 0.03, y: float = 0.0, clamped: bool = False
 ) -> Covered:
-    """Of a straight body from the origin."""
+    """Return the coverage by a straight body from the origin."""
     along = np.arange(0.25 * H, length, 0.5 * H)
     direction = np.array([np.cos(angle), np.sin(angle)])
     places: Array = along[:, None] * direction + np.array([0.0, y])

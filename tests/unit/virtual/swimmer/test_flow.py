@@ -1,4 +1,4 @@
-"""The water alone: it keeps its volume and its momentum, and vortices age as they should."""
+"""Water alone: conservation of volume and momentum, and decay of vortices."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ NU = 1e-3
 
 
 def box(cells: int, stretched: bool = False) -> Grid:
-    """A square of 1 m."""
+    """Return the flow in a square of 1 m."""
     if stretched:
         x = edges(0.0, 1.0, (0.3, 0.7), 1.0 / cells, 1.08)
         return Grid(x, x.copy())
@@ -24,7 +24,7 @@ def divergence(flow: Flow) -> Array:
 
 
 def put_vortex(flow: Flow, x: float, y: float, age: float, stream: float = 0.0) -> None:
-    """A vortex of Taylor's (1918), an exact solution: u_θ ~ r/t² exp(−r²/4νt), 0.3 m/s at most."""
+    """Add a Taylor vortex (1918), an exact solution: u_θ ~ r/t² exp(−r²/4νt), up to 0.3 m/s."""
     grid = flow.grid
     core = 4.0 * NU * age
     strength = 0.3 * np.sqrt(2.0 * np.e / core)
@@ -65,7 +65,7 @@ def test_a_vortex_ages_at_the_right_rate() -> None:
 
 
 def lost_way(cells: int) -> float:
-    """How wrong a vortex is that a stream carried along, relative."""
+    """Return the relative error of a vortex after advection by a stream."""
     dt = 0.2 / cells
     flow, right = Flow(box(cells), NU, "slip"), Flow(box(cells), NU, "slip")
     put_vortex(flow, 0.4, 0.5, age=1.5, stream=0.25)

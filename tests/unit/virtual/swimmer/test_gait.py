@@ -1,4 +1,4 @@
-"""What a track tells: means over whole beats, and an interval that holds."""
+"""Gait of a track: means over whole beats, and coverage of the interval."""
 
 import numpy as np
 import pytest
@@ -13,27 +13,27 @@ SETTINGS = SwimmerSettings()
 
 
 def track(seconds: float, speed: Array | float = 0.1, **columns: float) -> dict[str, Array]:
-    """Of a fish that beats at 2.5 Hz. speed: in each tick, or in all of them [m/s]"""
+    """Return the track of a fish that beats at 2.5 Hz; speed: of each tick, or of all [m/s]"""
     ticks = round(seconds / TICK)
     time = TICK * np.arange(1, ticks + 1)
     phase = np.arange(ticks) % round(PERIOD / TICK)
-    found = {name: np.full(ticks, columns.get(name, 0.0)) for name in COLUMNS}
+    track_columns = {name: np.full(ticks, columns.get(name, 0.0)) for name in COLUMNS}
     x = -np.cumsum(np.broadcast_to(speed, ticks)) * TICK
     beat = {"time": time, "x": x, "command": np.where(phase < 20, -0.42, 0.42)}
     tail = 0.012 * np.cos(2 * np.pi * phase / 40)
-    return found | beat | {"tail_lowest": tail, "tail_highest": tail}
+    return track_columns | beat | {"tail_lowest": tail, "tail_highest": tail}
 
 
 def test_means_are_those_of_whole_beats() -> None:
-    found = gait(track(4.2, muscle_power=0.06, thrust_power=0.01, lateral_power=0.03), SETTINGS)
-    assert found.beats == 9  # from the first upward reversal, at 0.2 s, to that at 3.8 s
-    assert found.frequency == pytest.approx(1 / PERIOD)
-    assert found.speed == pytest.approx(0.1)
-    assert found.tail_width == pytest.approx(0.24)
-    assert found.strouhal == pytest.approx(2.5 * 0.024 / 0.1)
-    assert found.froude_efficiency == pytest.approx(0.25)
-    assert found.cost_of_transport == pytest.approx(0.06 / (mass(SETTINGS) * 0.1))
-    assert found.reynolds == pytest.approx(1e4)
+    result = gait(track(4.2, muscle_power=0.06, thrust_power=0.01, lateral_power=0.03), SETTINGS)
+    assert result.beats == 9  # from the first upward reversal, at 0.2 s, to that at 3.8 s
+    assert result.frequency == pytest.approx(1 / PERIOD)
+    assert result.speed == pytest.approx(0.1)
+    assert result.tail_width == pytest.approx(0.24)
+    assert result.strouhal == pytest.approx(2.5 * 0.024 / 0.1)
+    assert result.froude_efficiency == pytest.approx(0.25)
+    assert result.cost_of_transport == pytest.approx(0.06 / (mass(SETTINGS) * 0.1))
+    assert result.reynolds == pytest.approx(1e4)
 
 
 def test_a_ripple_within_the_beat_is_no_uncertainty() -> None:
@@ -49,15 +49,15 @@ def test_a_fish_that_does_not_beat_or_get_on_has_no_efficiency() -> None:
 
 
 def rising(by: float, seconds: float = 20.0) -> Array:
-    """Speeds of a fish that is faster by this share after each second, from 0.1 m/s on."""
+    """Return the speeds of a fish that gains this fraction per second, from 0.1 m/s on."""
     return 0.1 * (1.0 + by * TICK * np.arange(round(seconds / TICK)))
 
 
 def test_a_fish_that_still_speeds_up_is_said_to_and_the_interval_widens_too_little() -> None:
-    found = gait(track(20.0, rising(0.01)), SETTINGS)
-    assert found.speed_trend == pytest.approx(0.01 / 1.1, rel=0.02)
-    assert found.speed_error
-    assert found.speed_error < 0.12 - found.speed
+    result = gait(track(20.0, rising(0.01)), SETTINGS)
+    assert result.speed_trend == pytest.approx(0.01 / 1.1, rel=0.02)
+    assert result.speed_error
+    assert result.speed_error < 0.12 - result.speed
     slower = gait(track(20.0, rising(-0.01)), SETTINGS)
     assert slower.speed_trend
     assert slower.speed_trend < 0.0
@@ -83,7 +83,7 @@ def test_the_interval_covers_the_mean_although_beats_are_alike() -> None:
         wander, noise = np.zeros(3000), rng.normal(size=3000)
         for index in range(1, 3000):  # correlated over 0.5 s
             wander[index] = 0.98 * wander[index - 1] + noise[index]
-        found = gait(track(30.0, 0.1 + 0.002 * wander), SETTINGS)
-        assert found.speed_error
-        held += abs(found.speed - 0.1) <= found.speed_error
+        result = gait(track(30.0, 0.1 + 0.002 * wander), SETTINGS)
+        assert result.speed_error
+        held += abs(result.speed - 0.1) <= result.speed_error
     assert 180 <= held <= 199

@@ -1,4 +1,4 @@
-"""The grid: small cells where they are asked for, growing slowly towards the ends."""
+"""Grid with small cells in its fine part, growing slowly towards the ends."""
 
 import numpy as np
 import pytest

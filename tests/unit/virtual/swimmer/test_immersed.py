@@ -1,4 +1,4 @@
-"""Bodies in the water: momentum is handed on, light ones are no harder, and none locks."""
+"""Bodies in the water: conservation of momentum, light bodies, and bending without locking."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ EI = 2e-3
 def swimmer(
     *, cell: float = CELL, excess: float = 0.0, clamped: bool = False, stream: float = 0.0
 ) -> Immersed:
-    """A bar in a small tank, its head at (0.1, 0.06)."""
+    """Return a bar in a small tank, with its head at (0.1, 0.06)."""
     grid = Grid(edges(0.0, 0.3, (0.07, 0.2), cell, 1.1), edges(0.0, 0.12, (0.02, 0.1), cell, 1.1))
     flow = Flow(grid, 1e-6, "slip", inlet=np.full(grid.ny, stream))
     flow.u[:] = stream
@@ -42,7 +42,7 @@ def bend(body: Immersed, curvature: float) -> Array:
 
 
 def momentum(body: Immersed) -> float:
-    """Along x, of the water and of what the body weighs more [kg m/s per metre]."""
+    """Return the momentum along x of the water and of the body's excess mass [kg m/s per metre]."""
     return body.density * body.flow.momentum() + float(
         beam_of(body).excess[:, 0] @ body.velocity[:, 0]
     )
@@ -52,7 +52,7 @@ def momentum(body: Immersed) -> float:
 def test_water_and_body_together_keep_their_momentum(excess: float) -> None:
     body = swimmer(excess=excess)
     forces = bend(body, 6.0)
-    forces[0] = 2.0  # from outside, to have some
+    forces[0] = 2.0  # an external force
     for _ in range(20):
         before = momentum(body)
         body.step(2e-3, forces)
@@ -61,7 +61,7 @@ def test_water_and_body_together_keep_their_momentum(excess: float) -> None:
 
 
 def swung(steps: int) -> float:
-    """By how much it has bent after 0.1 s [rad]."""
+    """Return the bend after 0.1 s [rad]."""
     body = swimmer()
     forces = bend(body, 10.0)
     for _ in range(steps):
@@ -106,7 +106,7 @@ def test_a_clamped_root_stays_where_it_is() -> None:
 
 
 def circle_in_stream(steps: int) -> tuple[Immersed, float]:
-    """After 0.6 s; and its drag [N/m]."""
+    """Return the flow after 0.6 s, and the drag [N/m]."""
     grid = Grid(np.linspace(0.0, 0.3, 61), np.linspace(0.0, 0.2, 41))
     flow = Flow(grid, 1e-4, "slip", inlet=np.full(grid.ny, 0.1))
     flow.u[:] = 0.1

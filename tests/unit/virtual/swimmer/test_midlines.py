@@ -1,4 +1,4 @@
-"""Midlines of a swim: few places of each, in the laboratory."""
+"""Midlines of a swim: few points of each, in the laboratory."""
 
 from pathlib import Path
 
@@ -17,8 +17,8 @@ def test_midlines_are_where_the_body_was_in_the_laboratory() -> None:
     for tick in range(1, 31):
         robot.read(0.01 * tick)
         kept.add(robot)
-    found = kept.arrays()
-    time, lines = found["midline_time"], found["midlines"]
+    arrays = kept.arrays()
+    time, lines = arrays["midline_time"], arrays["midlines"]
     assert time == pytest.approx(0.01 * np.arange(1, 31))
     assert lines.shape == (30, POINT_COUNT, 2)
     fish = robot.fish
@@ -43,6 +43,6 @@ def test_only_midlines_of_the_same_swim_are_put_before(tmp_path: Path) -> None:
         (tmp_path / "none.npz", rows, 0),
         (Path(__file__), rows, 0),
     ):
-        found = Midlines()
-        found.put_before(file, track)
-        assert len(found) == count
+        midlines = Midlines()
+        midlines.put_before(file, track)
+        assert len(midlines) == count

@@ -1,4 +1,4 @@
-"""The pressure equation is solved exactly, and its solution is of second order."""
+"""Exact solution of the pressure equation, of second order."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from fishd.virtual.swimmer.poisson import Poisson
 
 
 def laplacian(grid: Grid, phi: Array) -> Array:
-    """∇²φ of the cells, with φ = 0 at the right side and dφ/dn = 0 at the others."""
+    """Return ∇²φ of the cells, with φ = 0 at the right side and dφ/dn = 0 at the others."""
     along = np.zeros((grid.nx + 1, grid.ny))
     along[1:-1] = np.diff(phi, axis=0) / np.diff(grid.xc)[:, None]
     along[-1] = -2.0 * phi[-1] / grid.dx[-1]
@@ -36,7 +36,7 @@ def test_even_and_odd_numbers_of_cells_across_are_alike(rows: int) -> None:
 
 
 def error(cells: int) -> float:
-    """Of a smooth solution, at most."""
+    """Return the largest error of a smooth solution."""
     grid = Grid(np.linspace(0.0, 2.0, 2 * cells + 1), np.linspace(0.0, 1.0, cells + 1))
     a, b = 0.25 * np.pi, 2.0 * np.pi
     phi = np.cos(a * grid.xc)[:, None] * np.cos(b * grid.yc)

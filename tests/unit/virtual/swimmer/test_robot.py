@@ -1,4 +1,4 @@
-"""The free swimmer as the loop sees it: what moves it, what it tells, and what it is to be lost."""
+"""Free swimmer as a robot of the loop: its commands, its measurements, and its failure."""
 
 import math
 from typing import NoReturn
@@ -55,7 +55,7 @@ def test_with_a_servo_the_muscles_follow_its_wheel() -> None:
     for index, angle in enumerate([PHI, PHI, PHI, -PHI, -PHI], 1):
         fish.write(angle)
         fish.read(index * TICK)
-        other.advance(angle, TICK - half, 1)  # as in the middle of the last step
+        other.advance(angle, TICK - half, 1)  # value in the middle of the last step
         assert fish.truth().phi == pytest.approx(other.state.phi, abs=1e-9)
         other.advance(angle, half, 1)
 
@@ -88,7 +88,7 @@ def test_a_fish_goes_on_from_its_state_to_the_last_bit() -> None:
     swum(fish, 20)
     other.restore(fish.state())
     swum(fish, 5, first=21)
-    swum(other, 5)  # its loop may begin to count anew
+    swum(other, 5)  # its loop may restart its count
     assert other.motion == fish.motion
     assert other.work == fish.work
     for name, array in fish.state().items():

@@ -1,4 +1,4 @@
-"""What a configuration says of a swimmer: what is refused, and that nothing heavy is loaded."""
+"""Configuration of a swimmer: its errors, and that it loads no heavy modules."""
 
 import sys
 from pathlib import Path
