@@ -67,7 +67,6 @@ async def _draw(fish: AsyncFish) -> None:
     from fishd.cli.watch_screen import View
 
     view = View(await fish.status())
-    fish.telemetry_address = view.status.telemetry
     events = asyncio.create_task(view.collect(fish.events()))
     drawn = -math.inf
     try:

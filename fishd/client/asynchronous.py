@@ -1,36 +1,49 @@
 """`AsyncFish`: the client for asyncio programs."""
 
 import asyncio
+import functools
 import sys
-from collections.abc import AsyncIterator, Callable
+import threading
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager, closing
-from functools import partial
-from typing import Any, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 import zmq.asyncio
 
-from fishd.client.connection import (
-    DEFAULT_IDLE_LIMIT_S,
-    DEFAULT_TIMEOUT_S,
-    ESTOP_FALLBACK_DELAY_S,
-    LATE_ANSWER_WAIT_MS,
-    Connection,
-    answer_deadlines,
-)
-from fishd.client.lease import LeaseRenewal, lease_arguments, report_unreturned
+from fishd.client.connection import DEFAULT_IDLE_LIMIT_S, DEFAULT_TIMEOUT_S, LATE_ANSWER_WAIT_MS
+from fishd.client.lease import LeaseRenewal, report_unreturned
 from fishd.client.synchronous import Fish
-from fishd.client.zmq_sockets import connect_dealer, connect_subscriber, milliseconds_until
-from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
+from fishd.client.zmq_sockets import connect_subscriber
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted
-from fishd.core.protocol import LOADING_TIMEOUT_S, Calibrations, Grant, PolicyInfo, State
-from fishd.core.signals import ControllerInfo, Event, Status, Tick
+from fishd.core.errors import FishError, LeaseLost
+from fishd.core.protocol import State
+from fishd.core.signals import Event, Tick
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
-class AsyncFish(Connection):
-    """`Fish` for asyncio: the same requests, to be awaited; `Fish` has more details on each."""
+def _awaited(
+    method: Callable[Concatenate[Fish, P], T],
+) -> Callable[Concatenate["AsyncFish", P], Coroutine[Any, Any, T]]:
+    """Return a method of `AsyncFish` that runs one of `Fish` in a thread."""
+
+    async def call(self: "AsyncFish", /, *args: P.args, **kwargs: P.kwargs) -> T:
+        def run() -> T:
+            with self._lock:
+                return method(self._fish, *args, **kwargs)
+
+        return await asyncio.to_thread(run)
+
+    functools.update_wrapper(call, method)
+    return call
+
+
+class AsyncFish:
+    """`Fish` for asyncio: the same requests, to be awaited; those of several tasks take turns.
+
+    A request whose task is cancelled ends in its thread.
+    """
 
     def __init__(
         self,
@@ -40,9 +53,9 @@ class AsyncFish(Connection):
         telemetry: str | None = None,
     ) -> None:
         """The arguments are those of `Fish`."""
-        super().__init__(endpoint, timeout, telemetry)
+        self._fish = Fish(endpoint, timeout=timeout, telemetry=telemetry)
+        self._lock = threading.Lock()
         self._context = zmq.asyncio.Context()
-        self._socket: zmq.asyncio.Socket | None = None
 
     async def __aenter__(self) -> Self:
         return self
@@ -52,97 +65,36 @@ class AsyncFish(Connection):
 
     def close(self) -> None:
         """Disconnect; may be called twice."""
-        if self.held:
-            self.held.stop()
+        with self._lock:
+            self._fish.close()
         self._context.destroy(linger=0)
 
-    async def status(self) -> Status:
-        """Return a snapshot of the daemon."""
-        return await self._call(Status, "status")
-
-    async def controllers(self) -> list[ControllerInfo]:
-        """Return the controllers of the daemon, with their parameters."""
-        return await self._call(list[ControllerInfo], "controllers")
-
-    async def policies(self) -> list[PolicyInfo]:
-        """Return the named policies that the daemon finds, with the metadata of their files."""
-        return await self._call(list[PolicyInfo], "policies", patience=LOADING_TIMEOUT_S)
-
-    async def config(self) -> dict[str, Any]:
-        """Return the configuration that the daemon was started with, defaults included."""
-        return await self._call(dict[str, Any], "config")
-
-    async def set_controller(self, name: str, /, **parameters: Any) -> State:
-        """Activate a controller; omitted parameters take their defaults."""
-        return await self._call(
-            State, "set-controller", patience=LOADING_TIMEOUT_S, name=name, parameters=parameters
-        )
-
-    async def set_parameters(self, **parameters: Any) -> State:
-        """Change parameters of the active controller, all at once or none."""
-        return await self._call(State, "set-parameter", parameters=parameters)
-
-    async def stop(self) -> State:
-        """Fade to neutral and stay there."""
-        return await self._call(State, "stop")
+    status = _awaited(Fish.status)
+    controllers = _awaited(Fish.controllers)
+    policies = _awaited(Fish.policies)
+    config = _awaited(Fish.config)
+    set_controller = _awaited(Fish.set_controller)
+    set_parameters = _awaited(Fish.set_parameters)
+    stop = _awaited(Fish.stop)
+    clear_fault = _awaited(Fish.clear_fault)
+    mark = _awaited(Fish.mark)
+    calibrations = _awaited(Fish.calibrations)
+    sample_force = _awaited(Fish.sample_force)
+    tare = _awaited(Fish.tare)
+    calibrate_force = _awaited(Fish.calibrate_force)
+    calibrate_thrust = _awaited(Fish.calibrate_thrust)
+    calibrate_servo = _awaited(Fish.calibrate_servo)
+    _take_lease = _awaited(Fish.take_lease)
+    _end_lease = _awaited(Fish.end_lease)
 
     async def estop(self, message: str = "requested by a client") -> State:
-        """Stop the servo's pulses at once, like `Fish.estop`."""
-        try:
-            state = await self._call(
-                State, "estop", patience=ESTOP_FALLBACK_DELAY_S - self.timeout, message=message
-            )
-        except Untrusted:
-            raise
-        except NoDaemon:
-            if answer := await asyncio.to_thread(self.estop_without_gateway, message):
-                return answer
-            state = await self._call(State, "estop", message=message)
-        self.estop_taken_by = "control"
-        return state
+        """Stop the servo's pulses at once, like `Fish.estop`, before requests that wait."""
 
-    async def clear_fault(self) -> State:
-        """Leave mode fault or estop."""
-        return await self._call(State, "clear-fault")
+        def stop() -> State:
+            with Fish(self._fish.endpoint, timeout=self._fish.timeout) as fish:
+                return fish.estop(message)
 
-    async def mark(self, text: str) -> State:
-        """Publish a mark in the event stream."""
-        return await self._call(State, "mark", text=text)
-
-    async def calibrations(self) -> Calibrations:
-        """Return the active calibrations of force sensor and servo."""
-        return await self._call(Calibrations, "calibrations")
-
-    async def sample_force(self, seconds: float = 2.0) -> ForceSample:
-        """Measure for this time [s]; refused while a controller other than `hold` is active."""
-        return await self._call(ForceSample, "sample-force", patience=seconds, seconds=seconds)
-
-    async def tare(self, seconds: float = 2.0) -> Calibrations:
-        """Measure for this time [s] and set the mean as zero force; refused unless all is still."""
-        sample = await self.sample_force(seconds)
-        return await self._call(
-            Calibrations, "tare", patience=LOADING_TIMEOUT_S, sample=sample.number
-        )
-
-    async def calibrate_force(self, calibration: ForceCalibration) -> Calibrations:
-        """Apply and save a calibration of the force sensor."""
-        return await self._call(
-            Calibrations, "calibrate-force", patience=LOADING_TIMEOUT_S, calibration=calibration
-        )
-
-    async def calibrate_thrust(self, factor: float, error: float) -> State:
-        """Set the factor of the displayed thrust, like `Fish.calibrate_thrust`."""
-        return await self._call(State, "calibrate-thrust", factor=factor, error=error)
-
-    async def calibrate_servo(self, calibration: ServoCalibration, *, save: bool) -> Calibrations:
-        """Apply a calibration of the servo, and save it if requested."""
-        return await self._call(
-            Calibrations,
-            "calibrate-servo",
-            patience=LOADING_TIMEOUT_S if save else 0.0,
-            calibration=calibration,
-            save=save,
-        )
+        return await asyncio.to_thread(stop)
 
     @asynccontextmanager
     async def lease(
@@ -154,16 +106,17 @@ class AsyncFish(Connection):
         idle_limit: float | None = DEFAULT_IDLE_LIMIT_S,
     ) -> AsyncIterator[LeaseRenewal]:
         """Hold the lease of the fish, like `Fish.lease`."""
-        grant = await self._call(Grant, "take-lease", **lease_arguments(name, take, seconds))
-        self.held = renewal = LeaseRenewal(partial(Fish, self.endpoint), grant, idle_limit)
+        grant = await self._take_lease(name, take, seconds)
+        connect = functools.partial(Fish, self._fish.endpoint)
+        self._fish.held = renewal = LeaseRenewal(connect, grant, idle_limit)
         try:
             yield renewal
         finally:
-            pending, self.held = sys.exception(), None
+            pending, self._fish.held = sys.exception(), None
             await asyncio.to_thread(renewal.stop)
             try:
                 if not renewal.returned:
-                    await self._call(State, "end-lease", lease=renewal.token)
+                    await self._end_lease(renewal.token)
             except LeaseLost:
                 pass
             except FishError as error:
@@ -177,37 +130,13 @@ class AsyncFish(Connection):
         """Yield every event from the first iteration on; wait without limit."""
         return self._subscribe(b"event", Event)
 
-    async def _call(self, kind: type[T], op: str, *, patience: float = 0.0, **args: Any) -> T:
-        """Send a request and return its result; tasks that share this object must take turns.
-
-        patience: time that the answer may take in addition to the timeout [s]
-        """
-        if self._socket is None:
-            self.check_endpoint()
-            self._socket = connect_dealer(self._context, self.endpoint)
-        identity, request = self.request(op, args)
-        poll_event = zmq.POLLOUT
-        for deadline in answer_deadlines(self.timeout + patience, again=patience >= 0.0):
-            while await self._socket.poll(
-                milliseconds_until(deadline),
-                poll_event,  # type: ignore[call-arg]  # which the stubs forget
-            ):
-                if poll_event == zmq.POLLOUT:
-                    await self._socket.send(request)
-                    poll_event = zmq.POLLIN
-                    continue
-                frames = await self._socket.recv_multipart()
-                result = self.result(frames, identity, kind)
-                if result is not None:
-                    return result
-        raise self.no_answer_error(patience)
-
     async def _subscribe(self, topic: bytes, kind: type[T]) -> AsyncIterator[T]:
-        address = self.telemetry_address or (await self.status()).telemetry
-        patience = -1 if kind is Event else int(self.timeout * 1e3)
+        fish = self._fish
+        address = fish.telemetry_address or (await self.status()).telemetry
+        patience = -1 if kind is Event else int(fish.timeout * 1e3)
         decode: Callable[[bytes], T] = decoder(kind)
         with closing(connect_subscriber(self._context, address, topic)) as socket:
             while await socket.poll(patience) or await socket.poll(LATE_ANSWER_WAIT_MS):
-                self.check_lease()
-                yield self.read(decode, await socket.recv_multipart())
-        raise self.no_telemetry_error()
+                fish.check_lease()
+                yield fish.read(decode, await socket.recv_multipart())
+        raise fish.no_telemetry_error()

@@ -98,7 +98,7 @@ class Fish(Connection):
             State, "set-controller", patience=LOADING_TIMEOUT_S, name=name, parameters=parameters
         )
 
-    def set_parameters(self, **parameters: Any) -> State:
+    def set_parameters(self, /, **parameters: Any) -> State:
         """Change parameters of the active controller, all at once or none."""
         return self._call(State, "set-parameter", parameters=parameters)
 
@@ -195,9 +195,9 @@ class Fish(Connection):
         idle_limit: time without a request or a tick, while the fish swims and this thread does not
             compute, after which the program counts as hung [s]; None for no limit
         """
-        from fishd.client.lease import LeaseRenewal, lease_arguments, report_unreturned
+        from fishd.client.lease import LeaseRenewal, report_unreturned
 
-        grant = self._call(Grant, "take-lease", **lease_arguments(name, take, seconds))
+        grant = self.take_lease(name, take, seconds)
         connect = partial(Fish, self.endpoint)
         self.held = renewal = LeaseRenewal(connect, grant, idle_limit)
         try:
@@ -212,6 +212,12 @@ class Fish(Connection):
                 pass  # another request has taken the fish, or it rests already
             except FishError as error:
                 report_unreturned(error, pending)
+
+    def take_lease(self, name: str, take: bool, seconds: float | None) -> Grant:
+        """Take the lease of the fish without renewing it; `lease` has these arguments, too."""
+        from fishd.client.lease import lease_arguments
+
+        return self._call(Grant, "take-lease", **lease_arguments(name, take, seconds))
 
     def renew_lease(self, lease: str) -> State:
         """Restart the full duration of a lease; `lease` does so automatically."""

@@ -219,7 +219,7 @@ def status(**fields: Any) -> Status:
     return Status(
         **dict.fromkeys(Status.__struct_fields__, 0)
         | {"mode": "running", "reason": None, "controller": "swing", "parameters": {"C": 0.6}}
-        | {"timing": timing, "tick": 0.05, "fallback": None, "force_unit": "N"}
+        | {"timing": timing, "tick": 0.05, "fallback": None, "force_unit": "N", "robot": "pi"}
         | fields
     )
 
