@@ -1,1 +1,1 @@
-"""The controller `ppo`: learned policies, their files, and where named ones are found."""
+"""Controller `ppo`: learned policies, their files, and the search for named ones."""

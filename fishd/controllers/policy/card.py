@@ -1,7 +1,7 @@
-"""The card of a policy file, and how an observation becomes the network's input.
+"""The card of a policy file, and the conversion of observations to the network's input.
 
-The card travels inside the ONNX file, so that a network is never run without its normalisation, at
-another tick, for another amplitude or on other pictures than it was trained for.
+The card is part of the ONNX file, so that a network never runs without its normalisation, at
+another tick, for another amplitude or on other pictures than those of its training.
 """
 
 import math
@@ -27,26 +27,26 @@ FORMAT = 3
 """Version of the card; a file with another one is refused."""
 
 MAX_CARD_CHARACTERS = MAX_SETTINGS_BYTES
-"""Of a card as text; that of a training has some two thousand [characters]."""
+"""Maximum length of a card as text; that of a training has about two thousand [characters]."""
 
 TICK_TOLERANCE_S = 1e-9
-"""Largest difference between two ticks that are the same [s]."""
+"""Largest difference of two ticks that count as equal [s]."""
 
 FeatureName = Literal[
     "fx", "fy", "fy_rate", "fin_velocity", "instruction_angle", "previous_angle", "side_time"
 ]
-"""Fields of `Observation` that a policy may see."""
+"""Fields of `Observation` that a policy may use."""
 
 COMMAND_FEATURES = ("instruction_angle", "previous_angle", "side_time")
-"""Those that are known without any sensor."""
+"""Features that are known without a sensor."""
 
 MAX_HISTORY_TICKS = 64
-"""[ticks]"""
+"""Maximum length of the history [ticks]."""
 
 _TOO_DEEP = "its card is JSON that is nested too deeply"
 
 Positive = Annotated[float, Meta(ge=1e-30, le=1e30)]
-"""In the range of a float32, as its inverse is."""
+"""Positive number in the range of a float32, like its inverse."""
 
 
 class Feature(Struct, frozen=True, forbid_unknown_fields=True):
@@ -54,11 +54,11 @@ class Feature(Struct, frozen=True, forbid_unknown_fields=True):
 
     name: FeatureName
     scale: Positive
-    """The value that the network sees as 1, in the unit of the observation's field."""
+    """Value that becomes 1 in the network's input, in the unit of the observation's field."""
 
 
 class Layout:
-    """Turns observations into the network's input: each feature divided by its scale."""
+    """Conversion of an observation to the network's input: each feature divided by its scale."""
 
     def __init__(self, features: tuple[Feature, ...]) -> None:
         self.features = features
@@ -68,23 +68,23 @@ class Layout:
         ]
 
     def vector(self, observation: Observation) -> NDArray[np.float32]:
-        """The input, shape (number of features,), dimensionless."""
+        """Return the input, shape (number of features,), dimensionless."""
         row = np.empty(len(self._inputs), np.float32)
         self.write(observation, row)
         return row
 
     def write(self, observation: Observation, row: NDArray[np.float32]) -> None:
-        """The same into an existing array, which is faster."""
+        """Write the input to an existing array, which is faster."""
         for place, value, factor in self._inputs:
             row[place] = value(observation) * factor
 
 
 class Window(Struct, frozen=True):
-    """Of which ticks a network is given the features."""
+    """Window of ticks whose features are the input of a network."""
 
     ticks: int = 1
     span: float = 0.0
-    """That many of them [s]."""
+    """Duration of the window [s]."""
 
 
 ONE_TICK = Window()
@@ -93,9 +93,9 @@ ONE_TICK = Window()
 class History:
     """The network's input from the latest ticks: the features of the newest first.
 
-    Ticks from before the beginning are like the first one. A tick that comes again is the same one,
-    and one that is older than the latest, or so much newer that nothing of the history is left,
-    begins anew: after a reset, a pause or a gap nobody has to tell.
+    Ticks before the beginning equal the first one. A tick with the time of the latest replaces it.
+    A tick that is older, or newer by more than the window, restarts the history, such as after a
+    reset, a pause or a gap.
     """
 
     def __init__(
@@ -105,58 +105,58 @@ class History:
         row: NDArray[np.float32] | None = None,
     ) -> None:
         """
-        window: of which ticks
-        row: where the input goes, shape (ticks × features,); by default to an array of its own
+        window: window of ticks
+        row: array for the input, shape (ticks × features,); by default a new one
         """
         self._layout = Layout(features)
         self._window = window
         self.row = np.zeros(window.ticks * len(features), np.float32) if row is None else row
-        """The input, dimensionless."""
+        """Input of the network, dimensionless."""
         self._given = self.row.reshape(window.ticks, len(features))
         self._time = -math.inf
         self.push: Callable[[Observation], None] = self._only if window.ticks == 1 else self._next
-        """Take the observation of a tick."""
+        """Method that adds the observation of a tick."""
 
     def forget(self) -> None:
-        """Begin anew with the next observation."""
+        """Restart the history with the next observation."""
         self._time = -math.inf
 
     def _only(self, observation: Observation) -> None:
         self._layout.write(observation, self.row)
 
     def _next(self, observation: Observation) -> None:
-        seen, passed = self._given, observation.time - self._time
-        if passed > 0.0:
-            seen[1:] = seen[:-1]
-        self._layout.write(observation, seen[0])
-        if not 0.0 <= passed < self._window.span:
-            seen[1:] = seen[0]
+        rows, elapsed = self._given, observation.time - self._time
+        if elapsed > 0.0:
+            rows[1:] = rows[:-1]
+        self._layout.write(observation, rows[0])
+        if not 0.0 <= elapsed < self._window.span:
+            rows[1:] = rows[0]
         self._time = observation.time
 
 
 class Provenance(Struct, frozen=True, kw_only=True):
-    """Where a policy comes from; for people only."""
+    """Provenance of a policy, for information only."""
 
     created: str
-    """ISO 8601."""
+    """Date and time of the export, ISO 8601."""
     fishd: str
     """Version of fishd that wrote the file."""
     algorithm: str
     on: str
-    """What swam: simulation or robot."""
+    """Environment of the training: simulation or robot."""
     steps: int
-    """Control steps of training."""
+    """Number of control steps of the training."""
     seed: int
     settings: dict[str, Any]
     """Hyper-parameters of the training."""
     plant: dict[str, Any]
-    """The fish of the configuration: the one that swam, or that the scales are made for."""
+    """Fish of the configuration: the one in the training, or the one of the scales."""
     libraries: dict[str, str]
-    """Versions of what trained it."""
+    """Versions of the libraries of the training."""
     relative_thrust: float | None = None
-    """Share of the best square wave's thrust in a deterministic evaluation; None if unknown.
+    """Thrust over that of the best square wave, in a deterministic evaluation; None if unknown.
 
-    A sealed file of an older version has it under the key `efficiency`.
+    Files of an older version have it under the key `efficiency`.
     """
     frequency: float | None = None
     """Tail-beat frequency in that evaluation [Hz]."""
@@ -164,41 +164,41 @@ class Provenance(Struct, frozen=True, kw_only=True):
 
 
 class Card(Struct, frozen=True, kw_only=True):
-    """What must be known to run a policy, and where it comes from."""
+    """Data that are needed to run a policy, and its provenance."""
 
     format: int = FORMAT
     observation: tuple[Feature, ...]
-    """The numbers that the network is given, in order."""
+    """Features of the network's input, in order."""
     history: Annotated[int, Meta(ge=1, le=MAX_HISTORY_TICKS)] = 1
-    """Of how many ticks it is given these numbers, the newest first."""
+    """Number of ticks whose features are the input, the newest first."""
     pictures: StackSettings | None = None
-    """The frames that it is given; None where it sees none."""
+    """Settings of the frames of a camera; None without a camera."""
     tick: Positive
-    """Period of the loop that it was trained in [s]."""
+    """Period of the loop in the training [s]."""
     amplitude: Positive
     """Φ: an output of ±1 is an instruction angle of ±Φ [rad]."""
     provenance: Provenance
 
     @property
     def numbers(self) -> int:
-        """How many numbers the network is given, beside pictures."""
+        """Number of inputs of the network besides pictures."""
         return len(self.observation) * self.history
 
     @property
     def window(self) -> Window:
-        """Of which ticks."""
+        """Window of ticks in the input."""
         return Window(self.history, self.history * self.tick)
 
     @property
     def sees(self) -> str:
-        """What it is shown of the fish, in a word or two; the command is no sight of it."""
+        """Inputs that depend on the fish: `forces`, `pictures` or both; commands do not count."""
         forces = any(feature.name not in COMMAND_FEATURES for feature in self.observation)
         if self.pictures is None:
             return "forces"
         return "forces, pictures" if forces else "pictures"
 
     def check_fit(self, tick: float, amplitude: float) -> None:
-        """Raises `PolicyError` unless it can run on a robot with this tick [s] and Φ [rad]."""
+        """Raise `PolicyError` unless it can run on a robot with this tick [s] and Φ [rad]."""
         if abs(self.tick - tick) > TICK_TOLERANCE_S:
             raise PolicyError(
                 f"it was trained at a tick of {self.tick * 1e3:g} ms, this robot's is "
@@ -212,14 +212,16 @@ class Card(Struct, frozen=True, kw_only=True):
 
 
 def encode(card: Card) -> str:
-    """The card as JSON."""
+    """Return the card as JSON."""
     return msgspec.json.encode(card).decode()
 
 
 def decode(text: str) -> Card:
-    """The card in `text`; raises `PolicyError` that names what is missing or wrong."""
+    """Return the card in `text`; raise `PolicyError` with the problem."""
     if len(text) > MAX_CARD_CHARACTERS:
-        raise PolicyError(f"its card has {len(text)} letters; {MAX_CARD_CHARACTERS} are the most")
+        raise PolicyError(
+            f"its card has {len(text)} characters; at most {MAX_CARD_CHARACTERS} are permitted"
+        )
     try:
         data = msgspec.json.decode(text)
     except RecursionError:
@@ -230,17 +232,17 @@ def decode(text: str) -> Card:
         raise PolicyError("its card is not a JSON object")
     if nested_too_deeply(data):
         raise PolicyError(_TOO_DEEP)
-    found = data.get("format")
-    if found != FORMAT:
-        older = isinstance(found, int) and found < FORMAT
+    version = data.get("format")
+    if version != FORMAT:
+        older = isinstance(version, int) and version < FORMAT
         advice = ": it was written by an older fishd; train and export it again" if older else ""
         raise PolicyError(
-            f"its card has format {format_literal(found)[:60]}; this fishd reads format "
+            f"its card has format {format_literal(version)[:60]}; this fishd reads format "
             f"{FORMAT}{advice}"
         )
-    past = data.get("provenance")
-    if isinstance(past, dict) and "efficiency" in past:  # as sealed files of before call it
-        past["relative_thrust"] = past.pop("efficiency")
+    provenance = data.get("provenance")
+    if isinstance(provenance, dict) and "efficiency" in provenance:  # key of older files
+        provenance["relative_thrust"] = provenance.pop("efficiency")
     try:
         card = convert(data, Card)
     except Problem as problem:

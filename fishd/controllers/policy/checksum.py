@@ -1,4 +1,4 @@
-"""The checksum of a policy file: a file of which any byte was changed is refused."""
+"""Checksum of a policy file, which refuses a file with a changed byte."""
 
 import hashlib
 from typing import TYPE_CHECKING
@@ -9,46 +9,52 @@ if TYPE_CHECKING:
     from onnx import ModelProto
 
 CHECKSUM_KEY = "fishd.sha256"
-"""Its key in the metadata of an ONNX file."""
+"""Key of the checksum in the metadata of an ONNX file."""
 
 _BLANK = "0" * 64
 
 
 def seal(model: "ModelProto") -> bytes:
-    """The file of a model, with its checksum, which replaces an existing one."""
+    """Return the file of a model with its checksum, which replaces an existing one."""
     kept = [(entry.key, entry.value) for entry in model.metadata_props if entry.key != CHECKSUM_KEY]
     del model.metadata_props[:]
     for key, value in kept:
         model.metadata_props.add(key=key, value=value)
-    place = hashlib.sha256(model.SerializeToString()).hexdigest()  # does not occur in it
-    model.metadata_props.add(key=CHECKSUM_KEY, value=place)
+    placeholder = hashlib.sha256(
+        model.SerializeToString()
+    ).hexdigest()  # a placeholder that does not occur in the model
+    model.metadata_props.add(key=CHECKSUM_KEY, value=placeholder)
     content: bytes = model.SerializeToString()
-    return content.replace(place.encode(), _digest(content, place).encode())
+    return content.replace(placeholder.encode(), _digest(content, placeholder).encode())
 
 
 def check(content: bytes, model: "ModelProto") -> None:
-    """Raises `PolicyError` unless the content of a file fits its checksum."""
-    found = [entry.value for entry in model.metadata_props if entry.key == CHECKSUM_KEY]
-    if not found:
+    """Raise `PolicyError` unless the content of a file matches its checksum."""
+    checksums = [entry.value for entry in model.metadata_props if entry.key == CHECKSUM_KEY]
+    if not checksums:
         raise PolicyError(
             f"its metadata lacks {CHECKSUM_KEY}, the checksum; export it again with 'fishctl learn "
             "export'"
         )
-    if len(found) > 1 or len(found[0]) != len(_BLANK) or found[0] != _digest(content, found[0]):
+    if (
+        len(checksums) > 1
+        or len(checksums[0]) != len(_BLANK)
+        or checksums[0] != _digest(content, checksums[0])
+    ):
         raise PolicyError(
-            "it is damaged: its content does not fit its checksum; copy it here again, or export "
+            "it is damaged: its content does not match its checksum; copy it again, or export "
             "it again with 'fishctl learn export'"
         )
 
 
 def has_checksum(model: "ModelProto") -> bool:
-    """Does the model have a checksum?"""
+    """Return whether the model has a checksum."""
     return any(entry.key == CHECKSUM_KEY for entry in model.metadata_props)
 
 
 def _digest(content: bytes, checksum: str) -> str:
-    """SHA-256, in hexadecimal, of the file with zeros in place of its checksum."""
-    place = checksum.encode()
-    if content.count(place) != 1:
+    """Return the hexadecimal SHA-256 of the file with zeros in place of its checksum."""
+    encoded = checksum.encode()
+    if content.count(encoded) != 1:
         return ""
-    return hashlib.sha256(content.replace(place, _BLANK.encode())).hexdigest()
+    return hashlib.sha256(content.replace(encoded, _BLANK.encode())).hexdigest()

@@ -13,7 +13,7 @@ from fishd.core.errors import ParameterError, PolicyError
 from fishd.core.schema import PRINTABLE, unit
 from fishd.core.signals import Observation
 
-if TYPE_CHECKING:  # numbers and onnxruntime are loaded with the first policy
+if TYPE_CHECKING:  # numpy and onnxruntime are imported with the first policy
     from fishd.controllers.policy.card import Card
     from fishd.controllers.policy.runtime import Network
 
@@ -27,7 +27,7 @@ class PpoParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         str,
         unit(
             "1",
-            "What to follow; 'fishctl policies' lists those that have a name.",
+            "Name or file of the policy; 'fishctl policies' lists the named ones.",
             min_length=1,
             max_length=4096,
             pattern=PRINTABLE,
@@ -39,20 +39,20 @@ class PpoParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class Ppo(Controller[PpoParameters]):
     """Follow a learned policy: a small network chooses each instruction angle.
 
-    It is what `fishctl learn export` writes: an ONNX model with the card that says what it must be
-    shown, at which tick, and what its output means. Reversals that come sooner than `chatter.dwell`
-    are held back; a policy that insists on them is replaced by another controller.
+    The policy file is written by `fishctl learn export`: an ONNX model with a card that describes
+    its input, tick and output. Reversals sooner than `chatter.dwell` are held back; a policy that
+    keeps commanding them is replaced by another controller.
     """
 
     Parameters = PpoParameters
-    action: float = quantity("1", "What the network put out, before it is cut to -1 to 1.")
-    held: float = quantity("1", "In what share of the latest ticks a reversal was held back.")
+    action: float = quantity("1", "Output of the network, before it is clipped to [-1, 1].")
+    held: float = quantity("1", "Fraction of the latest ticks in which a reversal was held back.")
 
     def __init__(self, parameters: PpoParameters, limits: Limits) -> None:
-        """Reads, checks and warms up the policy."""
+        """Read, check and warm up the policy."""
         from fishd.controllers.policy.card import History
 
-        self.parameters = parameters  # without super(), which would do all of it twice
+        self.parameters = parameters  # without super(), which would read the policy twice
         self.limits = limits
         card, self._network = _open(parameters, limits)
         self._history = History(card.observation, card.window, self._network.row)
@@ -66,7 +66,7 @@ class Ppo(Controller[PpoParameters]):
         _open(parameters, limits)
 
     def activate(self, observation: Observation) -> None:
-        """Take over as if the tail had reversed just now."""
+        """Take over as if the tail had just reversed."""
         self._limit.activate(observation.instruction_angle)
         self._history.forget()
         self._latest = observation
@@ -75,21 +75,22 @@ class Ppo(Controller[PpoParameters]):
         """Refuse: another policy must be loaded and warmed up outside the loop."""
         if parameters != self.parameters:
             raise ParameterError(
-                "policy: it cannot change in flight; start the controller again, with another one"
+                "policy: it cannot change while ppo is active; activate ppo again with another "
+                "policy"
             )
 
     def warm_up(self) -> None:
-        """Choose as in the latest tick, a few times: the first brings the network to the caches."""
+        """Run the network on the latest observation a few times, which loads it into the caches."""
         for _ in range(_WARM_UPS):
             self._choose(self._latest)
 
     def update(self, observation: Observation) -> float:
-        """Return Φ times the network's output, which is cut to ±1 [rad].
+        """Return Φ times the network's output, clipped to ±1 [rad].
 
-        A network with left-right symmetry returns zero where all its inputs are zero, as at rest
-        without noise; the fish is then pushed to plus.
-        An output that is not finite is returned as it is, which is the fault `controller-error`.
-        Raises `ControllerFault` with the code `chatter`; see `DwellLimit`.
+        A network with left-right symmetry returns zero if all its inputs are zero, such as at rest
+        without noise; the fish is then pushed to plus. An output that is not finite is returned
+        unchanged, which causes the fault `controller-error`.
+        Raise `ControllerFault` with the code `chatter`; see `DwellLimit`.
         """
         self._latest = observation
         self.action = action = self._choose(observation)
@@ -102,7 +103,7 @@ class Ppo(Controller[PpoParameters]):
         return angle
 
     def _choose(self, observation: Observation) -> float:
-        """What the network puts out."""
+        """Return the output of the network."""
         network = self._network
         self._history.push(observation)
         return network.run()
@@ -116,7 +117,7 @@ def _open(parameters: PpoParameters, limits: Limits) -> "tuple[Card, Network]":
         policy = opening.read(parameters.policy, limits)
         if policy.card.pictures:
             raise PolicyError(
-                f"{policy.path}: it sees pictures, which this loop does not have; let it swim with "
+                f"{policy.path}: it needs pictures, which this loop does not have; run it with "
                 f"'fishctl agent {parameters.policy}', or in simulation with 'fishctl compare'"
             )
         return policy.card, Network(policy)

@@ -1,7 +1,7 @@
-"""Reads a policy file; refuses other files, damaged ones, and those that could run code or hang.
+"""Reader of policy files; refuses other files, damaged ones, and those that could run code or hang.
 
-A policy file is an ONNX model with a card (`card.Card`) in its metadata. Messages are for the
-person who named the file: why it is refused, and what to do.
+A policy file is an ONNX model with a card (`card.Card`) in its metadata. Messages state why a file
+is refused, and the remedy.
 """
 
 import os
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
 
 INPUT, FRAMES, OUTPUT = "observation", "frames", "action"
 MAX_FILE_BYTES = 16 * 2**20
-"""Longer files are not read: a policy has some ten thousand weights [bytes]."""
+"""Maximum size of a file; a policy has about ten thousand weights [bytes]."""
 MISSING_PACKAGE = (
     "is not installed: install fishd[policy], or onnx and onnxruntime, which have no build for "
     "32-bit ARM"
 )
 
 _HIDDEN_FOLDERS = ("/home/", "/root/", "/run/user/")
-"""What systemd's ProtectHome= hides from a service."""
+"""Folders that systemd's ProtectHome= hides from a service."""
 
 
 class PolicyFile(NamedTuple):
@@ -41,7 +41,7 @@ class PolicyFile(NamedTuple):
 
 
 def read(path: Path) -> PolicyFile:
-    """The policy in a file; raises `PolicyError` that names it."""
+    """Return the policy in a file; raise `PolicyError` with its name."""
     try:
         content = files.read(path, MAX_FILE_BYTES, "a policy")
         return PolicyFile(path, content, parse(content))
@@ -52,19 +52,19 @@ def read(path: Path) -> PolicyFile:
 
 
 def parse(content: bytes) -> Card:
-    """The card of a policy file whose content is valid; raises `PolicyError`."""
+    """Check the content of a policy file and return its card; raise `PolicyError`."""
     _refuse_pickles(content)
     size_check.check(content)
     model = _load_model(content)
     try:
         return _check_model(content, model)
-    except (AttributeError, TypeError, UnicodeError):  # text that is not UTF-8 comes as bytes
+    except (AttributeError, TypeError, UnicodeError):  # text that is not UTF-8 is bytes in onnx
         raise PolicyError(f"this is not a complete ONNX model; {EXPORT_REMEDY}") from None
 
 
 def _check_model(content: bytes, model: "ModelProto") -> Card:
     text = _card_text(model)
-    if checksum.has_checksum(model):  # else a damaged card would be blamed
+    if checksum.has_checksum(model):  # first, for the right error about a damaged card
         checksum.check(content, model)
     card = decode(text)
     checksum.check(content, model)
@@ -79,7 +79,8 @@ def _why_hidden(path: Path) -> str:
     if not (state and str(path).startswith(_HIDDEN_FOLDERS)):
         return ""
     return (
-        f": this fishd is a service that sees no home folders; put the file into {state}/policies "
+        ": this fishd is a service without access to home folders; put the file into "
+        f"{state}/policies "
         "and give its name"
     )
 
@@ -101,9 +102,9 @@ def _load_model(content: bytes) -> "ModelProto":
         raise PolicyError(f"it cannot be checked: onnx {MISSING_PACKAGE}") from None
     try:
         model = onnx.load_model_from_string(content)
-    except Exception:  # protobuf has classes of its own
+    except Exception:  # protobuf has its own error classes
         model = None
-    # Almost any bytes are some message of protobuf, with fields that nobody knows.
+    # Almost any bytes are a valid protobuf message with unknown fields.
     if model is None or not (model.ir_version and model.opset_import and model.graph.node):
         raise PolicyError(NOT_ONNX)
     return model
@@ -113,7 +114,7 @@ def _card_text(model: "ModelProto") -> str:
     cards = [entry.value for entry in model.metadata_props if entry.key == CARD_KEY]
     if not cards:
         raise PolicyError(
-            "this ONNX file does not say for which observation, tick and Φ it was trained: its "
+            "this ONNX file does not contain the observation, tick and Φ of its training: its "
             f"metadata lacks {CARD_KEY}; {EXPORT_REMEDY}"
         )
     if len(cards) > 1:
@@ -122,37 +123,37 @@ def _card_text(model: "ModelProto") -> str:
 
 
 def _check_ends(graph: "GraphProto", card: Card) -> None:
-    given = {tensor.name for tensor in graph.initializer}
-    inputs = [value for value in graph.input if value.name not in given]
+    weights = {tensor.name for tensor in graph.initializer}
+    inputs = [value for value in graph.input if value.name not in weights]
     _check_values("inputs", inputs, network_inputs(card))
     _check_values("outputs", list(graph.output), [(OUTPUT, "float32", (1, 1))])
 
 
 _TensorForm = tuple[str, str, tuple[int | str, ...]]
-"""Name, type and dimensions; a dimension that is left open is its name, or `?`."""
+"""Name, type and dimensions of a tensor; an open dimension is its name, or `?`."""
 
 
 def network_inputs(card: Card) -> list[_TensorForm]:
-    """What the network of a policy is given: frames where it sees any, then its other numbers."""
-    found: list[_TensorForm] = []
+    """Return the inputs of the network of a policy: frames if it uses any, then other numbers."""
+    inputs: list[_TensorForm] = []
     if card.pictures:
-        found.append((FRAMES, "uint8", (1, *card.pictures.shape)))
+        inputs.append((FRAMES, "uint8", (1, *card.pictures.shape)))
     if card.observation:
-        found.append((INPUT, "float32", (1, card.numbers)))
-    return found
+        inputs.append((INPUT, "float32", (1, card.numbers)))
+    return inputs
 
 
-def _check_values(what: str, found: "list[ValueInfoProto]", wanted: list[_TensorForm]) -> None:
-    forms = [_tensor_form(value) for value in found]
-    if len(forms) == len(wanted) and set(forms) == set(wanted):
+def _check_values(what: str, values: "list[ValueInfoProto]", required: list[_TensorForm]) -> None:
+    forms = [_tensor_form(value) for value in values]
+    if len(forms) == len(required) and set(forms) == set(required):
         return
-    shown = ", ".join(map(_format_form, forms)) or "none"
+    actual = ", ".join(map(_format_form, forms)) or "none"
     needed = " and ".join(
         f"one {kind} {what[:-1]} of shape [{', '.join(map(str, dims))}] named '{name}'"
-        for name, kind, dims in wanted
+        for name, kind, dims in required
     )
-    verb = "is" if len(wanted) == 1 else "are"
-    raise PolicyError(f"its {what}: {shown}; {needed} {verb} needed; {EXPORT_REMEDY}")
+    verb = "is" if len(required) == 1 else "are"
+    raise PolicyError(f"its {what}: {actual}; {needed} {verb} needed; {EXPORT_REMEDY}")
 
 
 def _tensor_form(value: "ValueInfoProto") -> _TensorForm:
@@ -176,7 +177,7 @@ def _format_form(form: _TensorForm) -> str:
 
 
 def _check_numbers(graph: "GraphProto") -> None:
-    """Every number of the model is in this file and finite."""
+    """Check that every number of the model is in this file and finite."""
     for tensor in graph.initializer:
         _check_tensor(tensor)
     if graph.sparse_initializer:
@@ -203,11 +204,11 @@ def _check_tensor(tensor: "TensorProto") -> None:
         raise PolicyError(f"its {what} are in another file; save the model as a single file")
     if tensor.data_type == TensorProto.STRING:
         raise PolicyError(f"its {what} are text; a network computes numbers")
-    if tensor.data_type == TensorProto.UNDEFINED:  # an attribute without one
+    if tensor.data_type == TensorProto.UNDEFINED:  # an attribute without a tensor
         return
     try:
         array = numpy_helper.to_array(tensor)
-    except Exception as error:  # a tensor may contradict itself in many ways
+    except Exception as error:  # a tensor may be inconsistent in many ways
         raise PolicyError(f"its {what} cannot be read: {describe_error(error)}") from None
     numbers = array if array.dtype.kind in "biufc" else array.astype(np.float32)
     if not np.isfinite(numbers).all():
@@ -216,5 +217,6 @@ def _check_tensor(tensor: "TensorProto") -> None:
 
 def _not_finite(what: str) -> str:
     return (
-        f"its {what} are not all finite numbers: the training blew up; export an earlier checkpoint"
+        f"its {what} are not all finite numbers: the training diverged; export an earlier "
+        "checkpoint"
     )

@@ -1,4 +1,4 @@
-"""Named policies: which exist, and which file a name stands for.
+"""Named policies, and the files that their names refer to.
 
 `swim42` is the file `swim42.onnx` in the first of these folders that has one: those of
 $FISHD_POLICIES, `policies` in the state folder, /etc/fishd/policies, and what comes with fishd.
@@ -20,10 +20,10 @@ _SYSTEM = Path("/etc/fishd/policies")
 
 
 def folders() -> list[Path]:
-    """Where policies are looked for, in this order; some may not exist."""
-    given = os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep)
+    """Return the folders of policies in the order of the search; some may not exist."""
+    configured = os.environ.get(FOLDERS_VARIABLE, "").split(os.pathsep)
     return [
-        *(files.expand_user(folder).absolute() for folder in given if folder),
+        *(files.expand_user(folder).absolute() for folder in configured if folder),
         _state_folder() / "policies",
         _SYSTEM,
         _shipped_folder(),
@@ -31,12 +31,12 @@ def folders() -> list[Path]:
 
 
 def names() -> list[str]:
-    """All names, sorted."""
+    """Return all names, sorted."""
     return sorted(_list_files())
 
 
 def find(text: str) -> Path:
-    """The file of a policy: `text` is its name, or a path, as it has a slash or ends in .onnx.
+    """Return the file of a policy: `text` is a path, with a slash or .onnx at its end, or a name.
 
     Raises `PolicyError` for an unknown name, and for the folder of a training.
     """
@@ -54,25 +54,25 @@ def find(text: str) -> Path:
 
 
 def describe_training_folder(path: Path) -> str:
-    """What to say of the folder of a training, or of one of its checkpoints; else nothing."""
+    """Return a message if the path is a folder of a training or of a checkpoint; else empty."""
     if not (path.is_dir() and any((at / "settings.yaml").is_file() for at in (path, path.parent))):
         return ""
     return (
-        "is the folder of a training, no policy file; export it first: fishctl learn export "
+        "is the folder of a training, not a policy file; export it first: fishctl learn export "
         f"{shlex.quote(str(path))}"
     )
 
 
 def describe_all(tick: float | None = None, amplitude: float | None = None) -> list[PolicyInfo]:
-    """`describe` each named policy."""
+    """Describe each named policy; see `describe`."""
     return [describe(name, tick, amplitude) for name in names()]
 
 
 def describe(name: str, tick: float | None = None, amplitude: float | None = None) -> PolicyInfo:
     """Describe a policy, by name or path.
 
-    tick, amplitude: those of the robot [s], [rad]; a policy that does not fit them has a problem
-    Raises `PolicyError` for an unknown name.
+    tick, amplitude: period [s] and Φ [rad] of the robot; a policy that does not fit has a problem
+    Raise `PolicyError` for an unknown name.
     """
     import msgspec
 
@@ -95,29 +95,29 @@ def describe(name: str, tick: float | None = None, amplitude: float | None = Non
 
 
 def _list_files() -> dict[str, Path]:
-    """The file of each name."""
-    found: dict[str, Path] = {}
+    """Return the file of each name."""
+    file_of_name: dict[str, Path] = {}
     for folder in folders():
         try:
             paths = sorted(folder.glob("*" + SUFFIX))
-        except OSError:  # one that this user may not read must not hide the others
+        except OSError:  # an unreadable folder must not hide the others
             continue
         for path in paths:
             if path.stem and not path.stem.startswith(".") and path.stem.isprintable():
-                found.setdefault(path.stem, path)
-    return found
+                file_of_name.setdefault(path.stem, path)
+    return file_of_name
 
 
 def unknown_name_message(name: str, known: list[str]) -> str:
-    """The message about a name that is not among the known ones."""
+    """Return the message about an unknown name."""
     if not known:
         return (
-            f"no policy is named '{name}', and no other was found; put one into {folders()[0]}, or "
+            f"no policy is named '{name}', and there is no other; put one into {folders()[0]}, or "
             f"give the path of a {SUFFIX} file"
         )
     hint = suggest(name, known)
-    there_are = f" There are: {', '.join(known)}" if hint.startswith("did") else ""
-    return f"no policy is named '{name}'; {hint}{there_are}"
+    available = f" There are: {', '.join(known)}" if hint.startswith("did") else ""
+    return f"no policy is named '{name}'; {hint}{available}"
 
 
 def _state_folder() -> Path:
@@ -128,7 +128,7 @@ def _state_folder() -> Path:
 
 
 def _shipped_folder() -> Path:
-    """In the package once it is installed, else in the checkout."""
+    """Return the folder of fishd's policies: in the installed package, else in the checkout."""
     package = Path(__file__).parent
     installed = package / "shipped"
     return installed if installed.is_dir() else package.parents[2] / "config" / "policies"

@@ -1,4 +1,4 @@
-"""Writes a policy file: a network and its card, as one ONNX model."""
+"""Writer of a policy file: a network and its card, as one ONNX model."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
@@ -15,13 +15,13 @@ Layer = tuple[NDArray[Any], NDArray[Any]]
 """Weights, shape (outputs, inputs), and biases, shape (outputs,)."""
 
 OPSET, IR_VERSION = 13, 7
-"""Old enough for every onnxruntime that fishd runs with."""
+"""Versions that every supported onnxruntime can read."""
 
 _OPERATORS = {"tanh": "Tanh", "relu": "Relu"}
 
 
 class Sight(NamedTuple):
-    """How the inputs of a policy that sees become what its first layer is given."""
+    """Operators that convert the inputs of a policy with a camera to those of its first layer."""
 
     nodes: Sequence[Any]
     """Operators, from `frames` and `observation` to `out`."""
@@ -30,7 +30,7 @@ class Sight(NamedTuple):
     width: int
     """`out` is float32 of shape (1, width); with its mirror image, (2, width)."""
     mirrored: bool = False
-    """The mirror image is beside it; the last layer is given what came of both, side by side."""
+    """Whether `out` includes the mirror image; the last layer gets the features of both."""
 
 
 def to_onnx(
@@ -39,14 +39,14 @@ def to_onnx(
     card: Card,
     sight: Sight | None = None,
 ) -> bytes:
-    """The file: layers with the activation between them, and the last output clipped to [-1, 1].
+    """Return a policy file: layers with activations, and the last output clipped to [-1, 1].
 
-    Inputs `frames` (uint8, 1 × frames × size × size; where the card has pictures) and `observation`
-    (float32, 1 × features of all ticks; where it has any), output `action` (float32, 1 × 1).
+    Inputs `frames` (uint8, 1 × frames × size × size; if the card has pictures) and `observation`
+    (float32, 1 × features of all ticks; if it has any), output `action` (float32, 1 × 1).
 
-    sight: needed for a card with pictures
+    sight: required for a card with pictures
 
-    Raises `PolicyError` where the layers do not fit one another or the card, or are not finite.
+    Raise `PolicyError` if the layers do not fit one another or the card, or are not finite.
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
@@ -92,7 +92,7 @@ def _add_layers(
     activation: Literal["tanh", "relu"],
     sight: Sight,
 ) -> int:
-    """Add operators and constants of the layers; how many numbers the last one gives."""
+    """Add operators and constants of the layers; return the number of outputs of the last one."""
     from onnx import helper
 
     if not layers:

@@ -1,4 +1,4 @@
-"""The operators that the network of a policy may use; none of them can run for ever.
+"""Operators that the network of a policy may use; all of them run in bounded time.
 
 Time and memory of each follow from the shapes, and both are bounded before onnxruntime loads the
 model.
@@ -41,23 +41,23 @@ OPSETS = range(11, 27)
 """Supported versions of these operators."""
 MAX_NODES = 1000
 MAX_VALUES = 4 * 2**20
-"""Numbers that all operators together may output in one run."""
+"""Maximum number of outputs of all operators together in one run."""
 MAX_MULTIPLICATIONS = 10**8
-"""Multiplications in one run, more or less: 0.1 s on a slow robot."""
+"""Maximum number of multiplications in one run, approximately: 0.1 s on a slow robot."""
 
 _NAMES = frozenset(name for names in PERMITTED.values() for name in names)
 _ONNX_DOMAINS = ("", "ai.onnx")
 _COUNT_ATTRIBUTES = ("dilations", "group", "kernel_shape", "strides")
-"""Attributes that must not be 0: some operator divides by them."""
+"""Attributes that must not be 0, since operators divide by them."""
 
 Shapes = Mapping[str, tuple[int, ...] | None]
-"""Of each value in a model; None where it is left open."""
+"""Shape of each value in a model; None if it is open."""
 
 
 def check(model: "ModelProto") -> None:
-    """Raises `PolicyError` for a model with other operators, or one that computes too much."""
+    """Raise `PolicyError` for a model with other operators, or with too much computation."""
     if model.functions:
-        raise PolicyError(f"it defines an operator of its own, {quoted(model.functions[0].name)}")
+        raise PolicyError(f"it defines a custom operator, {quoted(model.functions[0].name)}")
     if model.training_info:
         raise PolicyError("it is a model that trains itself; export it for inference")
     versions = [entry.version for entry in model.opset_import if entry.domain in _ONNX_DOMAINS]
@@ -80,11 +80,11 @@ def _check_node(node: "NodeProto") -> None:
     if node.domain not in _ONNX_DOMAINS or node.op_type not in _NAMES:
         name = f"{node.domain}.{node.op_type}" if node.domain not in _ONNX_DOMAINS else node.op_type
         raise PolicyError(
-            f"its operator {quoted(name)} is not permitted; what is: {', '.join(sorted(_NAMES))}"
+            f"its operator {quoted(name)} is not permitted; permitted: {', '.join(sorted(_NAMES))}"
         )
     for attribute in node.attribute:
         if attribute.HasField("g") or attribute.graphs:
-            raise PolicyError(f"its {node.op_type} holds a graph of its own")
+            raise PolicyError(f"its {node.op_type} contains a graph")
         counts = [attribute.i] if attribute.type == attribute.INT else attribute.ints
         if attribute.name in _COUNT_ATTRIBUTES and min(counts, default=0) < 1:
             raise PolicyError(
@@ -93,41 +93,41 @@ def _check_node(node: "NodeProto") -> None:
 
 
 def _check_size(model: "ModelProto") -> None:
-    """Bound what one run computes and keeps, from the shape of every value."""
+    """Bound computation and memory of one run, from the shape of every value."""
     shapes = _infer_shapes(model)
     values = work = 0
     for node in model.graph.node:
-        given = [shapes.get(name) for name in node.output if name]
-        taken = [shapes.get(name) for name in node.input if name]
-        if None in given or None in taken:
+        output_shapes = [shapes.get(name) for name in node.output if name]
+        input_shapes = [shapes.get(name) for name in node.input if name]
+        if None in output_shapes or None in input_shapes:
             raise PolicyError(
-                f"the shapes of its {node.op_type} are not fixed, so what it costs is not known "
+                f"the shapes of its {node.op_type} are not fixed, so its cost is unknown "
                 "before it runs; export it with fixed shapes"
             )
-        out = sum(prod(shape) for shape in given if shape is not None)
-        sizes = [shape for shape in taken if shape is not None]
+        out = sum(prod(shape) for shape in output_shapes if shape is not None)
+        sizes = [shape for shape in input_shapes if shape is not None]
         values += out
         work += out * _factor(node, sizes) or max(out, sum(map(prod, sizes)))
-    for what, found, largest in (
+    for what, count, limit in (
         ("values", values, MAX_VALUES),
         ("multiplications", work, MAX_MULTIPLICATIONS),
     ):
-        if found > largest:
+        if count > limit:
             raise PolicyError(
-                f"its network computes {found:.2g} {what} for one answer; {largest:.2g} are the "
+                f"its network computes {count:.2g} {what} for one answer; {limit:.2g} are the "
                 "most, and a policy needs some ten thousand"
             )
 
 
 def _factor(node: "NodeProto", taken: list[tuple[int, ...]]) -> int:
-    """Multiplications for each output number; 0 where a node reads each input once."""
+    """Return the multiplications per output; 0 if a node reads each input once."""
     if node.op_type in ("Gemm", "MatMul"):
         return max(taken[0], default=1)
     return prod(taken[1][1:]) if node.op_type == "Conv" else 0
 
 
 def _infer_shapes(model: "ModelProto") -> Shapes:
-    """Inferred from inputs and weights; shapes that the model itself states are ignored."""
+    """Return shapes inferred from inputs and weights; stated shapes in the model are ignored."""
     import onnx
     from onnx import TensorProto
 
@@ -136,7 +136,7 @@ def _infer_shapes(model: "ModelProto") -> Shapes:
     del bare.graph.value_info[:]
     try:
         graph = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=True).graph
-    except Exception as error:  # of its own, of protobuf, and ValueError
+    except Exception as error:  # onnx's and protobuf's errors, and ValueError
         raise PolicyError(f"its network contradicts itself: {error_message(error)}") from None
     shapes: dict[str, tuple[int, ...] | None] = {
         tensor.name: tuple(tensor.dims) for tensor in graph.initializer

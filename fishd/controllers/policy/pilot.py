@@ -1,6 +1,6 @@
-"""A policy that swims outside of fishd's loop: what is observed in, instruction angle out.
+"""A policy outside of fishd's loop: observation in, instruction angle out.
 
-For `fishctl agent` and for comparisons; within the loop the controller `ppo` does the same.
+For `fishctl agent` and for comparisons; within the loop, the controller `ppo` does the same.
 """
 
 import math
@@ -15,45 +15,41 @@ from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 
 HOLD_TIME_S = 0.25
-"""So long the last angle is held where frames are missing; then neutral, until they are back [s].
-
-Before the first of them it is neutral, too.
-
-Half a beat of the default fish lasts 0.3 s: what a policy held for longer would not be swimming.
-"""
+"""Time for which the last angle is held without frames; then, and before the first frame, the angle
+is neutral [s]. Half a beat of the default fish lasts 0.3 s, so a longer hold is not swimming."""
 
 
 class Pilot:
-    """Follows a policy file, tick by tick, for one fish."""
+    """Runner of a policy file, tick by tick, for one fish."""
 
     def __init__(self, policy: str, limits: Limits) -> None:
         """
         policy: name or path
-        limits: what the robot grants, among it the shortest dwell between two reversals
+        limits: limits of the robot, including the shortest time between two reversals
 
         Raises `PolicyError` for a policy that does not fit, or does not run here.
         """
-        found = opening.read(policy, limits)
-        self.card = found.card
-        self._network = Network(found)
+        policy_file = opening.read(policy, limits)
+        self.card = policy_file.card
+        self._network = Network(policy_file)
         self._history = History(self.card.observation, self.card.window, self._network.row)
         self._limit = DwellLimit(limits.dwell, limits, self.card.amplitude)
         self._angle = 0.0
         self._begun = False
         self.blind = 0.0
-        """How long frames have been missing [s]."""
+        """Time since the last frames [s]."""
 
     @property
     def waits(self) -> bool:
-        """Is it at neutral, for want of frames?"""
+        """Whether it is at neutral because frames are missing."""
         return self.blind > HOLD_TIME_S
 
     def angle(self, observation: Observation, stack: Stack | None = None) -> float:
-        """The angle that answers an observation [rad].
+        """Return the angle for an observation [rad].
 
-        stack: None where the camera has not shown all of it
+        stack: frames; None if they are incomplete
 
-        Raises `ControllerFault` with the code `chatter`, see `DwellLimit`, and `PolicyError` for
+        Raise `ControllerFault` with the code `chatter`, see `DwellLimit`, and `PolicyError` for
         frames of another size and for an output that is not finite.
         """
         if not self._begun:
@@ -75,7 +71,7 @@ class Pilot:
             self._show(stack)
         action = network.run()
         if not math.isfinite(action):
-            raise PolicyError(f"what the policy puts out is not finite: {action}")
+            raise PolicyError(f"the output of the policy is not finite: {action}")
         return self.card.amplitude * max(-1.0, min(1.0, action))
 
     def _show(self, stack: Stack) -> None:
@@ -84,7 +80,7 @@ class Pilot:
         if sizes != [place.shape for place in places]:
             count, height, width = places.shape
             raise PolicyError(
-                f"it sees {count} frames of {height} x {width} pixels; frames of {sizes} came"
+                f"it needs {count} frames of {height} x {width} pixels, but got frames of {sizes}"
             )
         for place, frame in zip(places, stack, strict=True):
             place[:] = frame

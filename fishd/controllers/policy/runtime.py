@@ -1,4 +1,4 @@
-"""Runs the network of a policy file with onnxruntime, in the calling thread."""
+"""Execution of the network of a policy file with onnxruntime, in the calling thread."""
 
 import contextlib
 import math
@@ -16,19 +16,19 @@ from fishd.core.errors import PolicyError
 from fishd.core.text import describe_error
 
 _PROBE_COUNT = 64
-"""Inputs on which a network is tried, which warms it up as well."""
+"""Number of inputs on which a network is tested, which also warms it up."""
 _LARGEST_PROBE = 1e3
-"""In units of a feature's scale."""
+"""Largest test input, in units of a feature's scale."""
 _TIMED_PROBES = 8
-"""Number of probes, of which the fastest must be fast enough."""
+"""Number of first tests of which the fastest must be fast enough."""
 _MAX_TICK_FRACTION = 0.5
-"""Share of the tick that one run may take."""
+"""Maximum time of one run, as a fraction of the tick."""
 
 
 def load() -> Any:
-    """The package onnxruntime, quiet; raises ImportError.
+    """Return the package onnxruntime without logs and telemetry; raise ImportError.
 
-    Without that, newer versions store an identifier of the device and send telemetry.
+    By default, newer versions store an identifier of the device and send telemetry.
     """
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime
@@ -38,27 +38,27 @@ def load() -> Any:
 
 
 def preload() -> None:
-    """Load onnxruntime, where it is installed.
+    """Import onnxruntime, if it is installed.
 
-    Its import blocks all threads for longer than a tick, so do it before the first one.
+    The import blocks all threads for longer than a tick, so call this before the first tick.
     """
     with contextlib.suppress(ImportError):
         load()
 
 
 class Network:
-    """The network, ready to run: write to `frames` and `row`, `run`, read what it gives."""
+    """A network that is ready to run: write to `frames` and `row`, then call `run`."""
 
     def __init__(self, policy: PolicyFile) -> None:
-        """Loads and warms it up; raises `PolicyError` where it does not run."""
+        """Load and warm up the network; raise `PolicyError` if it does not run."""
         card = policy.card
         pictures = card.pictures.shape if card.pictures else (0, 0, 0)
         frames = np.zeros((1, *pictures), np.uint8)
         inputs = np.zeros((1, card.numbers), np.float32)
         self.frames: NDArray[np.uint8] = frames[0]
-        """The pictures, shape (frames, size, size), newest first; of none where it sees none."""
+        """Input pictures, shape (frames, size, size), newest first; empty without a camera."""
         self.row: NDArray[np.float32] = inputs[0]
-        """The other numbers, shape (`card.numbers`,)."""
+        """Other inputs, shape (`card.numbers`,)."""
         self._output = np.zeros((1, 1), np.float32)
         try:
             self._session = _create_session(policy.content)
@@ -66,18 +66,18 @@ class Network:
             self._try(card.tick)
         except PolicyError as error:
             raise PolicyError(f"{policy.path}: {error}") from None
-        except Exception as error:  # onnxruntime has a class of its own for each kind of error
+        except Exception as error:  # onnxruntime has a separate class for each kind of error
             raise PolicyError(
                 f"{policy.path}: onnxruntime cannot run it: {describe_error(error)}"
             ) from None
 
     def run(self) -> float:
-        """The output for what is in `frames` and `row`."""
+        """Return the output for the inputs `frames` and `row`."""
         self._session.run_with_iobinding(self._binding)
         return float(self._output[0, 0])
 
     def _bound(self, inputs: Mapping[str, NDArray[Any]]) -> Any:
-        """Inputs and output in fixed places, which takes half the time of an ordinary run."""
+        """Bind inputs and output to fixed memory, which halves the time of a run."""
         value = load().OrtValue.ortvalue_from_numpy
         binding = self._session.io_binding()
         for name, array in inputs.items():
@@ -87,20 +87,20 @@ class Network:
         return binding
 
     def _try(self, tick: float) -> None:
-        """Raise `PolicyError` where an output is not finite, or all of several runs are too slow.
+        """Raise `PolicyError` if an output is not finite, or all of several runs are too slow.
 
-        Inputs of every size are tried, and pictures of every contrast. The time is the processor's
-        in this thread, so a busy machine refuses nothing; tick: [s]
+        Inputs of all magnitudes are tested, and pictures of all contrasts. The time is the CPU time
+        of this thread, which does not depend on other load; tick: [s]
         """
-        rng = random.Random(0)  # numpy.random would be 2 MB at the start of each fishd
+        rng = random.Random(0)  # numpy.random would take 2 MB in each fishd
         sizes = np.geomspace(1e-3, _LARGEST_PROBE, _PROBE_COUNT)
         fastest = math.inf
         for number, size in enumerate(sizes, 1):
             self.row[:] = [rng.gauss(0.0, size) for _ in self.row]
             self.frames[:] = _random_picture(rng, self.frames.shape)
-            began = time.thread_time()
+            start = time.thread_time()
             output = self.run()
-            fastest = min(fastest, time.thread_time() - began)
+            fastest = min(fastest, time.thread_time() - start)
             if not np.isfinite(output):
                 what = f"the input {np.array2string(self.row)}" if self.row.size else "a picture"
                 raise PolicyError(
@@ -115,7 +115,7 @@ class Network:
 
 
 def _random_picture(rng: random.Random, shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """Return noise about any grey level, from none at all to black and white."""
+    """Return noise around a random grey level, with a contrast from zero to black and white."""
     grey, contrast = rng.uniform(0.0, 255.0), rng.choice((0.0, 10.0, 300.0))
     noise = np.frombuffer(rng.randbytes(math.prod(shape)), np.uint8).reshape(shape) / 127.5 - 1.0
     return np.clip(grey + contrast * noise, 0.0, 255.0).astype(np.uint8)

@@ -1,8 +1,8 @@
-"""How much of a policy file is anything but the weights of its network, measured without protobuf.
+"""Size of the parts of a policy file other than weights, measured without protobuf.
 
-protobuf allocates some ninety bytes for each message, however short, and blocks all other threads
-meanwhile: parsing a file of the permitted length could take gigabytes. Weights, as raw data, take
-only their own size.
+protobuf allocates about ninety bytes for each message, however short, and blocks all other threads
+while it parses: a file of the permitted size could take gigabytes. Weights, as raw data, take only
+their size.
 """
 
 from collections.abc import Iterator
@@ -12,20 +12,20 @@ from fishd.core.errors import PolicyError
 EXPORT_REMEDY = "export it with 'fishctl learn export'"
 NOT_ONNX = f"this is not an ONNX model; {EXPORT_REMEDY}"
 MAX_OVERHEAD_BYTES = 256 * 2**10
-"""Largest size of everything but weights: the card, the names, the layers [bytes]."""
+"""Maximum size of everything except weights: the card, the names, the layers [bytes]."""
 
 _GRAPH, _INITIALIZER, _RAW_DATA = 7, 5, 9
-"""Numbers of the fields that lead to the weights: of a model, of a graph, of a tensor."""
+"""Field numbers of the path to the weights: in a model, in a graph, in a tensor."""
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _FIXED = {_FIXED64: 8, _FIXED32: 4}
 
 
 def check(content: bytes) -> None:
-    """Raises `PolicyError` for more than MOST, and for what is not a protobuf message."""
-    left = MAX_OVERHEAD_BYTES
+    """Raise `PolicyError` for more than `MAX_OVERHEAD_BYTES`, or for invalid protobuf."""
+    remaining = MAX_OVERHEAD_BYTES
     for size in _overheads(content, 0, len(content), (_GRAPH, _INITIALIZER, _RAW_DATA)):
-        left -= size
-        if left < 0:
+        remaining -= size
+        if remaining < 0:
             raise PolicyError(
                 f"more than {MAX_OVERHEAD_BYTES // 2**10} kB of it are not raw weights, far more "
                 "than a policy "
@@ -34,7 +34,7 @@ def check(content: bytes) -> None:
 
 
 def _overheads(content: bytes, begin: int, end: int, path: tuple[int, ...]) -> Iterator[int]:
-    """Size of each field of a message, without what the field numbers in `path` lead to [bytes]."""
+    """Yield the size of each field of a message, without the fields at `path` [bytes]."""
     for number, first, last, size in _fields(content, begin, end):
         if number != path[0]:
             yield size
@@ -45,10 +45,10 @@ def _overheads(content: bytes, begin: int, end: int, path: tuple[int, ...]) -> I
 
 
 def _fields(content: bytes, begin: int, end: int) -> Iterator[tuple[int, int, int, int]]:
-    """Number, begin and end of the value, and total size of each field of a message."""
-    at = begin
-    while at < end:
-        key, value = _varint(content, at, end)
+    """Yield number, begin and end of the value, and total size of each field of a message."""
+    position = begin
+    while position < end:
+        key, value = _varint(content, position, end)
         number, kind = key >> 3, key & 7
         if kind == _VARINT:
             _, stop = _varint(content, value, end)
@@ -61,19 +61,19 @@ def _fields(content: bytes, begin: int, end: int) -> Iterator[tuple[int, int, in
             raise PolicyError(NOT_ONNX)
         if stop > end:
             raise PolicyError(NOT_ONNX)
-        yield number, value, stop, stop - at
-        at = stop
+        yield number, value, stop, stop - position
+        position = stop
 
 
-def _varint(content: bytes, at: int, end: int) -> tuple[int, int]:
-    """A number, and where it ends."""
+def _varint(content: bytes, position: int, end: int) -> tuple[int, int]:
+    """Return a number, and the position after it."""
     number = 0
     for shift in range(0, 70, 7):
-        if at >= end:
+        if position >= end:
             raise PolicyError(NOT_ONNX)
-        byte = content[at]
-        at += 1
+        byte = content[position]
+        position += 1
         number |= (byte & 0x7F) << shift
         if byte < 0x80:
-            return number, at
+            return number, position
     raise PolicyError(NOT_ONNX)

@@ -32,7 +32,7 @@ def test_a_run_folder_in_place_of_a_policy_is_to_be_exported_first(
     (tmp_path / "settings.yaml").touch()
     line = one_line(fishctl(*verb, f"{tmp_path}{inner}"))
     assert line.endswith(
-        f"{tmp_path}{inner}: is the folder of a training, no policy file; export it first: "
+        f"{tmp_path}{inner}: is the folder of a training, not a policy file; export it first: "
         f"fishctl learn export {tmp_path}{inner}\n"
     )
 
@@ -46,7 +46,8 @@ def test_the_name_of_a_run_folder_is_known_without_a_slash_too(
     for verb in (("learn", "look"), ("compare",)):
         line = one_line(fishctl(*verb, "first"))
         assert line == (
-            "fishctl: first is the folder of a training, no policy file; export it first: fishctl "
+            "fishctl: first is the folder of a training, not a policy file; export it first: "
+            "fishctl "
             "learn export first\n"
         )
 

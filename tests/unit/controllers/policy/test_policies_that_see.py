@@ -104,7 +104,7 @@ def test_the_loop_of_fishd_refuses_it_and_names_who_lets_it_swim(tmp_path: Path)
     with pytest.raises(ParameterError) as caught:
         registry.create("ppo", {"policy": str(path)}, Limits(0.42, 0.05))
     assert str(caught.value) == (
-        f"ppo: policy: {path}: it sees pictures, which this loop does not have; let it swim with "
+        f"ppo: policy: {path}: it needs pictures, which this loop does not have; run it with "
         f"'fishctl agent {path}', or in simulation with 'fishctl compare'"
     )
 

@@ -123,7 +123,7 @@ def test_a_bad_card_is_refused_with_the_key_to_blame(values: dict[str, Any], mes
         ("[1]", "is not a JSON object"),
         ("[" * 50_000, "is JSON that is nested too deeply"),
         ('{"provenance":' * 100 + "1" + "}" * 100, "is JSON that is nested too deeply"),
-        (" " * 100_000, "has 100000 letters; 65536 are the most"),
+        (" " * 100_000, "has 100000 characters; at most 65536 are permitted"),
     ],
 )
 def test_a_card_that_is_not_json_or_no_object_is_refused(text: str, why: str) -> None:
@@ -178,7 +178,7 @@ def test_weights_that_are_not_finite_are_refused_behind_a_tanh(bad: float, layer
         tensor.CopyFrom(numpy_helper.from_array(array, tensor.name))
 
     assert refusal(changed(spoil, content)) == (
-        f"its weights 'weight_{layer}' are not all finite numbers: the training blew up; "
+        f"its weights 'weight_{layer}' are not all finite numbers: the training diverged; "
         "export an earlier checkpoint"
     )
 
@@ -241,7 +241,7 @@ def test_a_service_says_where_a_file_it_cannot_see_belongs(monkeypatch: pytest.M
     with pytest.raises(PolicyError) as caught:
         file.read(Path("/home/nobody-here/swim.onnx"))
     assert str(caught.value) == (
-        "/home/nobody-here/swim.onnx: no such file: this fishd is a service that sees no home "
+        "/home/nobody-here/swim.onnx: no such file: this fishd is a service without access to home "
         "folders; put the file into /var/lib/fishd/policies and give its name"
     )
 

@@ -133,7 +133,7 @@ def test_a_policy_must_be_given() -> None:
 def test_the_policy_does_not_change_in_flight(tmp_path: Path) -> None:
     rig = Rig().start("ppo", policy=str(write(tmp_path)))
     rig.run()
-    with pytest.raises(ParameterError, match="it cannot change in flight"):
+    with pytest.raises(ParameterError, match="it cannot change while ppo is active"):
         rig.retune(policy=str(write(tmp_path, name="other")))
     assert rig.mode == "running"
 
@@ -177,6 +177,6 @@ def test_what_runs_the_network_leaves_nothing_in_the_users_folder(tmp_path: Path
 
 def test_a_policy_that_never_saw_a_velocity_in_rad_per_second_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, to_onnx(linear(1.0), "tanh", card(("fin_velocity", 0.002))))
-    assert "trained to see fin_velocity as estimator.kind: lateral_force gives it" in refusal(
+    assert "trained with the fin_velocity of estimator.kind: lateral_force" in refusal(
         path, replace(LIMITS, scaled=True)
     )
