@@ -115,7 +115,9 @@ def test_a_policy_that_cannot_be_used_is_refused_in_one_line(daemon: Daemon) -> 
 def test_a_policy_does_not_change_in_flight(daemon: Daemon) -> None:
     daemon.fishctl("set-controller", "ppo", "--policy", "flip")
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        with pytest.raises(Refused, match="ppo: policy: it cannot change while ppo is active") as caught:
+        with pytest.raises(
+            Refused, match="ppo: policy: it cannot change while ppo is active"
+        ) as caught:
             fish.set_parameters(policy="flip")
         assert fish.status().controller == "ppo"
     assert caught.value.code == "bad-parameter"
