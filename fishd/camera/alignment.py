@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fishd.camera.axis import Axis, Floats, Motion, find_axis, likeness
+from fishd.camera.axis import Axis, Floats, Motion, compute_likeness, find_axis
 from fishd.camera.settings import CameraSettings, Square
 
 MAX_OFFSET_PX = 0.5
@@ -110,7 +110,9 @@ def _needed_turn(motion: Motion) -> int:
     """Return the clockwise turn of the picture that puts the head at the left [degrees]."""
     energy = motion.energy
     upright = find_axis(np.ascontiguousarray(energy.T))
-    if likeness(energy.T, upright) > _UPRIGHT_LIKENESS_RATIO * likeness(energy, motion.axis):
+    if compute_likeness(energy.T, upright) > _UPRIGHT_LIKENESS_RATIO * compute_likeness(
+        energy, motion.axis
+    ):
         return 270 if _tail_is_right(energy.T) else 90
     return 0 if _tail_is_right(energy) else 180
 

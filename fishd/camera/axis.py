@@ -79,7 +79,7 @@ def find_motion(pictures: NDArray[np.uint8]) -> Motion:
             "looks at its tail"
         )
     axis = find_axis(energy)
-    if likeness(energy, axis) < _MIN_LIKENESS:
+    if compute_likeness(energy, axis) < _MIN_LIKENESS:
         raise NoMotion(
             "what moves in these pictures is not a swinging tail, but perhaps light on the water; "
             "let the fish swim, and see that the camera looks at its tail"
@@ -88,7 +88,7 @@ def find_motion(pictures: NDArray[np.uint8]) -> Motion:
     return Motion(energy, axis, centre, _is_inside(axis, len(energy)))
 
 
-def likeness(energy: Floats, axis: Axis) -> float:
+def compute_likeness(energy: Floats, axis: Axis) -> float:
     """Return how closely motion equals its mirror image about an axis, 0 to 1."""
     height, width = energy.shape
     rows = np.arange(height)[:, None]

@@ -7,7 +7,7 @@ from typing import Self
 import zmq
 
 from fishd.camera import messages
-from fishd.camera.clock_offset import ClockOffset, Offset, Reading, clock_of
+from fishd.camera.clock_offset import ClockOffset, Offset, Reading, clock_reader
 from fishd.camera.messages import (
     BadMessage,
     CameraState,
@@ -96,7 +96,7 @@ class CameraClient:
             self.state = self.status()
             self._session = self.state.session
             self._camera_clock = ClockOffset(self._read_clock)
-            self._fishd_clock = ClockOffset(clock_of(fish)) if fish else None
+            self._fishd_clock = ClockOffset(clock_reader(fish)) if fish else None
             self._subscribe(
                 frames or resolve_frames_address(self.state.frames, self.endpoint), views
             )

@@ -52,7 +52,7 @@ Ask = Callable[[float | None], Reading]
 """Function that reads a program's clock; its argument is the timeout [s], None for its default."""
 
 
-def clock_of(fish: Fish) -> Ask:
+def clock_reader(fish: Fish) -> Ask:
     """Return a function that reads the clock of a fishd."""
 
     def ask(timeout: float | None) -> Reading:

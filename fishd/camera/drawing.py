@@ -28,7 +28,7 @@ def to_colours(pixels: Pixels) -> Colours:
     return np.repeat(pixels[:, :, np.newaxis], 3, axis=2)
 
 
-def motion_colours(energy: Floats) -> Colours:
+def draw_motion(energy: Floats) -> Colours:
     """Return a picture of motion, from black where nothing moves to yellow where most moves."""
     strength = np.sqrt(energy / max(float(np.quantile(energy, 0.995)), 1e-12))
     levels = np.asarray(np.clip(255.0 * strength, 0.0, 255.0), np.uint8)

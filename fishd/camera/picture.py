@@ -11,13 +11,13 @@ from fishd.core.camera_frames import Pixels
 _TURNS = {90: cv2.ROTATE_90_CLOCKWISE, 180: cv2.ROTATE_180, 270: cv2.ROTATE_90_COUNTERCLOCKWISE}
 
 
-def turned(picture: Pixels, settings: PictureSettings) -> Pixels:
+def rotate(picture: Pixels, settings: PictureSettings) -> Pixels:
     """Return the picture turned so that the fish's head is at the left."""
     turn = _TURNS.get(settings.rotate)
     return picture if turn is None else np.asarray(cv2.rotate(picture, turn), np.uint8)
 
 
-def cropped(picture: Pixels, settings: PictureSettings) -> tuple[Pixels, Crop]:
+def crop(picture: Pixels, settings: PictureSettings) -> tuple[Pixels, Crop]:
     """Return the square of a turned picture that frames show, and its place."""
     height, width = picture.shape
     side = max(1, round(settings.crop.side * min(height, width)))
@@ -27,13 +27,13 @@ def cropped(picture: Pixels, settings: PictureSettings) -> tuple[Pixels, Crop]:
     return picture[top : top + side, left : left + side], place
 
 
-def frame(picture: Pixels, settings: PictureSettings) -> Pixels:
+def make_frame(picture: Pixels, settings: PictureSettings) -> Pixels:
     """Return the frame for learners from a turned picture, shape (size, size)."""
-    part, _ = cropped(picture, settings)
-    return scaled(part, settings.size, settings.size)
+    part, _ = crop(picture, settings)
+    return resize(part, settings.size, settings.size)
 
 
-def scaled(picture: Pixels, width: int, height: int) -> Pixels:
+def resize(picture: Pixels, width: int, height: int) -> Pixels:
     """Return the picture in another size [px]: averaged over areas, or with larger pixels."""
     if picture.shape[:2] == (height, width):
         return picture
@@ -42,13 +42,13 @@ def scaled(picture: Pixels, width: int, height: int) -> Pixels:
     return np.asarray(cv2.resize(picture, (width, height), interpolation=interpolation), np.uint8)
 
 
-def jpeg(picture: Pixels, settings: PublishSettings) -> tuple[bytes, int, int]:
+def encode_jpeg(picture: Pixels, settings: PublishSettings) -> tuple[bytes, int, int]:
     """Return a turned picture as JPEG for people, and its width and height [px]."""
     height, width = picture.shape
     scale = settings.view_width / width
     if scale > 1.0:  # larger pixels, in whole steps
         scale = float(int(scale))
-    shown = scaled(picture, max(1, round(width * scale)), max(1, round(height * scale)))
+    shown = resize(picture, max(1, round(width * scale)), max(1, round(height * scale)))
     grey = np.ascontiguousarray(shown)[:, :, np.newaxis]
     data: bytes = simplejpeg.encode_jpeg(grey, settings.view_quality, colorspace="GRAY")
     return data, shown.shape[1], shown.shape[0]

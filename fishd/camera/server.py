@@ -168,8 +168,8 @@ class Server:
         if len(self._queue) > _MAX_QUEUED_JOBS:
             self.lost(dropped=1)
             return
-        turned = picture.turned(shot.picture, self._settings.picture)
-        pixels = picture.frame(turned, self._settings.picture)
+        turned = picture.rotate(shot.picture, self._settings.picture)
+        pixels = picture.make_frame(turned, self._settings.picture)
         shot = shot._replace(picture=turned)
         self._enqueue(lambda: self._publish(shot, pixels))
 
@@ -238,8 +238,8 @@ class Server:
         if not rate or now < self._next_view or not self._publisher.views_wanted:
             return
         self._next_view = now + 1.0 / rate
-        jpeg, width, height = picture.jpeg(shot.picture, self._settings.publish)
-        _, crop = picture.cropped(shot.picture, self._settings.picture)
+        jpeg, width, height = picture.encode_jpeg(shot.picture, self._settings.publish)
+        _, crop = picture.crop(shot.picture, self._settings.picture)
         header = ViewHeader(
             session=self._monitor.session,
             seq=self._monitor.seq,

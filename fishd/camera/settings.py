@@ -178,7 +178,7 @@ def load(
         raise ConfigError(problem.message_with_place(sources)) from None
 
 
-def simulated(path: str | os.PathLike[str] | None = None) -> SimulatedSettings:
+def load_simulated(path: str | os.PathLike[str] | None = None) -> SimulatedSettings:
     """Return the simulated camera in a file, or the default one.
 
     Raises `ConfigError` as `load` does, and for a file with another source and for an address.

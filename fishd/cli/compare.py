@@ -152,7 +152,7 @@ def _swim(task: _Task, settle: float) -> _Outcome:
     from fishd.lab.compare import comparison
     from fishd.lab.compare.contestants import is_missing, parse, refusal
 
-    config, camera = task.fish.load(), cameras.simulated(task.camera)
+    config, camera = task.fish.load(), cameras.load_simulated(task.camera)
     check_tethered(config.robot, "compare")
     chosen = [parse(text) for text in task.texts] or _default_contestants(config)
     _check_camera(task.camera, chosen)

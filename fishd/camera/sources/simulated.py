@@ -15,7 +15,7 @@ import msgspec
 import zmq
 from msgspec import UNSET, Struct, UnsetType
 
-from fishd.camera.clock_offset import ClockOffset, clock_of
+from fishd.camera.clock_offset import ClockOffset, clock_reader
 from fishd.camera.settings import SimulatedSettings
 from fishd.camera.simulated.camera import SimulatedCamera, Tail
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
@@ -139,7 +139,7 @@ class SimulatedSource:
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
             socket = connect_subscriber(context, status.telemetry, b"tick")
-            offset = ClockOffset(clock_of(fish))
+            offset = ClockOffset(clock_reader(fish))
             view.ahead = offset.update().seconds
             last_tick_time, last_seq = time.monotonic(), 0
             while not stopping(0.0):

@@ -170,9 +170,9 @@ def _draw_alignment(alignment: "Alignment", png: Path | None, as_json: bool) -> 
     from fishd.camera import drawing
 
     energy, axis = alignment.motion.energy, alignment.motion.axis
-    colours = drawing.draw_axis(drawing.motion_colours(energy), axis, len(energy))
+    colours = drawing.draw_axis(drawing.draw_motion(energy), axis, len(energy))
     if png:
-        large = drawing.enlarge(drawing.motion_colours(energy))
+        large = drawing.enlarge(drawing.draw_motion(energy))
         drawing.write_png(png, drawing.draw_axis(large, axis, len(energy)))
         echo(f"{png}: what moves, and the axis", err=as_json)
     if not as_json and sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown"):

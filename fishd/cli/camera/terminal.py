@@ -7,7 +7,7 @@ from rich.segment import Segment
 from rich.style import Style
 
 from fishd.camera.drawing import Colours
-from fishd.camera.picture import scaled
+from fishd.camera.picture import resize
 
 _SHADES = " ░▒▓█"
 _COLOUR_STEP = 8
@@ -26,7 +26,7 @@ class TerminalPicture:
         max_rows = 2 * max(1, (options.height or console.height) - 4)
         scale = min(1.0, options.max_width / width, max_rows / height)
         columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
-        scaled_picture = scaled(self._colours, columns, rows)
+        scaled_picture = resize(self._colours, columns, rows)
         is_grey = console.color_system is None or console.no_color
         for upper, lower in zip(scaled_picture[::2], scaled_picture[1::2], strict=True):
             yield from _draw_shades(upper, lower) if is_grey else _draw_blocks(upper, lower)

@@ -42,7 +42,7 @@ def look(
 
     if picture:
         drawing.check(picture)
-    config, camera_settings = load(file, overrides), cameras.simulated(camera)
+    config, camera_settings = load(file, overrides), cameras.load_simulated(camera)
     result = looking.look(policy, config, camera_settings, seconds)
     if as_json:
         print_json({"policy": policy, "share": result.share, "area": result.area})

@@ -224,7 +224,7 @@ def _add_camera(job: "Job", camera: str | None) -> "Job":
         return replace(job, camera_endpoint=camera)
     if job.resume:
         return replace(job, camera=runs.read_camera(job.folder))
-    return replace(job, camera=cameras.simulated(camera))
+    return replace(job, camera=cameras.load_simulated(camera))
 
 
 def _train(job: "Job", as_json: bool) -> int:

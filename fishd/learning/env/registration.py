@@ -48,7 +48,7 @@ def swim(
     fish = load(config, overrides)
     chosen = training.load(settings)
     eye = make_eye(chosen)
-    sight = Camera(cameras.simulated(camera), chosen.camera.stack) if eye else None
+    sight = Camera(cameras.load_simulated(camera), chosen.camera.stack) if eye else None
     metered = bool(chosen.seen.power_price)
     link = SimulatedLink(fish, chosen.randomisation, sight, metered=metered)
     env = SwimEnv(link, fish, chosen.seen, eye)
