@@ -1,4 +1,4 @@
-"""The controllers: waveforms, take-over without a bump, and how they are found."""
+"""The controllers: waveforms, take-over without a bump, and their registry."""
 
 import math
 from itertools import pairwise
@@ -18,25 +18,25 @@ in_force = st.floats(-0.42, 0.42)
 smooth = st.sampled_from(["sine", "triangle"])
 
 
-def made(name: str, limits: Limits = LIMITS, **parameters: object) -> registry.Controller:
+def create(name: str, limits: Limits = LIMITS, **parameters: object) -> registry.Controller:
     return registry.create(name, parameters, limits)
 
 
 def test_a_square_wave_spends_half_its_period_on_either_side() -> None:
-    assert commands(made("square", frequency=2.5), 9) == [0.42] * 4 + [-0.42] * 4 + [0.42]
+    assert commands(create("square", frequency=2.5), 9) == [0.42] * 4 + [-0.42] * 4 + [0.42]
 
 
 @given(frequencies)
 def test_a_frequency_off_the_grid_is_right_on_average(frequency: float) -> None:
-    given_ = commands(made("square", frequency=frequency), 1000)
+    given_ = commands(create("square", frequency=frequency), 1000)
     reversals = sum(a != b for a, b in pairwise(given_))
     assert reversals / 2 / (999 * 0.05) == pytest.approx(frequency, abs=0.5 / (999 * 0.05))
 
 
 def test_sine_and_triangle_have_the_shapes_of_their_names() -> None:
     limits = Limits(amplitude=0.4, tick=0.01)
-    sine = made("sine", limits, frequency=1.0)
-    triangle = made("triangle", limits, frequency=1.0)
+    sine = create("sine", limits, frequency=1.0)
+    triangle = create("triangle", limits, frequency=1.0)
     for controller in (sine, triangle):
         controller.activate(observe(dt=0.01))
     for k in range(200):
@@ -51,7 +51,7 @@ def test_sine_and_triangle_have_the_shapes_of_their_names() -> None:
 def test_sine_and_triangle_begin_with_the_angle_in_force(
     name: str, frequency: float, angle: float, amplitude: float
 ) -> None:
-    controller = made(name, frequency=frequency, amplitude=amplitude)
+    controller = create(name, frequency=frequency, amplitude=amplitude)
     assert commands(controller, 1, angle)[0] == pytest.approx(angle, abs=1e-12)
 
 
@@ -59,7 +59,7 @@ def test_sine_and_triangle_begin_with_the_angle_in_force(
 def test_after_a_start_beyond_their_amplitude_they_return_into_it_without_a_jump(
     name: str, frequency: float, angle: float, amplitude: float
 ) -> None:
-    controller = made(name, frequency=frequency, amplitude=amplitude)
+    controller = create(name, frequency=frequency, amplitude=amplitude)
     given_ = commands(controller, 600, angle)
     top_speed = math.tau * frequency * amplitude * 0.05
     assert all(abs(b - a) <= 2 * top_speed + 1e-9 for a, b in pairwise(given_))
@@ -70,7 +70,7 @@ def test_after_a_start_beyond_their_amplitude_they_return_into_it_without_a_jump
     st.sampled_from(["square", "sine", "triangle"]), frequencies, frequencies, st.integers(1, 99)
 )
 def test_a_new_frequency_keeps_phase(name: str, before: float, after: float, ticks: int) -> None:
-    changed, steady = made(name, frequency=before), made(name, frequency=before)
+    changed, steady = create(name, frequency=before), create(name, frequency=before)
     commands(changed, ticks)
     commands(steady, ticks)
     changed.retune(type(changed.parameters)(frequency=after))
@@ -81,7 +81,7 @@ def test_a_new_frequency_keeps_phase(name: str, before: float, after: float, tic
 
 @given(smooth, st.floats(0.05, 0.42), st.floats(0.05, 0.42), st.integers(1, 99))
 def test_a_new_amplitude_makes_no_jump(name: str, before: float, after: float, ticks: int) -> None:
-    controller = made(name, frequency=1.0, amplitude=before)
+    controller = create(name, frequency=1.0, amplitude=before)
     last = commands(controller, ticks)[-1]
     controller.retune(type(controller.parameters)(frequency=1.0, amplitude=after))
     assert controller.update(observe(dt=1e-9)) == pytest.approx(last, abs=1e-6)
@@ -89,9 +89,9 @@ def test_a_new_amplitude_makes_no_jump(name: str, before: float, after: float, t
 
 def test_an_amplitude_beyond_the_robots_limit_is_refused() -> None:
     with pytest.raises(ParameterError, match=r"square: amplitude: 0\.5 rad is beyond .* 0\.42 rad"):
-        made("square", amplitude=0.5)
+        create("square", amplitude=0.5)
     with pytest.raises(ParameterError, match=r"hold: angle: -0\.5 rad is beyond"):
-        made("hold", angle=-0.5)
+        create("hold", angle=-0.5)
 
 
 @pytest.mark.parametrize(
@@ -107,19 +107,19 @@ def test_a_wave_too_fast_for_the_tick_is_refused_with_the_highest_frequency(
 ) -> None:
     limits = replace(LIMITS, tick=tick)
     with pytest.raises(ParameterError) as caught:
-        made(name, limits, frequency=frequency)
+        create(name, limits, frequency=frequency)
     assert str(caught.value) == (
         f"{name}: frequency: {frequency:g} Hz is too fast for ticks of {tick:g} s: {possible} "
         "possible"
     )
-    slower = made(name, limits, frequency=1.0)
+    slower = create(name, limits, frequency=1.0)
     with pytest.raises(ParameterError, match="too fast"):
         registry.merge_parameters(slower, name, {"frequency": frequency})
 
 
 @pytest.mark.parametrize(("tick", "frequency"), [(0.05, 10.0), (0.07, 7.14286)])
 def test_a_square_wave_may_reverse_in_every_tick(tick: float, frequency: float) -> None:
-    controller = made("square", replace(LIMITS, tick=tick), frequency=frequency)
+    controller = create("square", replace(LIMITS, tick=tick), frequency=frequency)
     controller.activate(observe())
     given_ = [controller.update(observe(dt=tick)) for _ in range(1000)]
     assert given_ == [0.42, -0.42] * 500
@@ -129,7 +129,7 @@ def test_a_wrong_name_gets_the_nearest_right_one() -> None:
     with pytest.raises(
         UnknownController, match=r"no controller is named 'squre'; did you mean 'sq"
     ):
-        made("squre")
+        create("squre")
 
 
 @pytest.mark.parametrize(
@@ -147,7 +147,7 @@ def test_a_wrong_name_gets_the_nearest_right_one() -> None:
 )
 def test_a_wrong_parameter_is_told_what_is_right(values: dict[str, object], message: str) -> None:
     with pytest.raises(ParameterError, match=message):
-        made("swing", **values)
+        create("swing", **values)
 
 
 def test_every_installed_controller_describes_itself_and_its_parameters() -> None:

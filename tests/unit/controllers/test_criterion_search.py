@@ -19,7 +19,7 @@ def relative_thrust(
 
 
 def fixed(*overrides: str) -> float:
-    """Where nothing is searched for, it swims evenly within seconds."""
+    """Return the relative thrust with a fixed C, which is steady within seconds."""
     return relative_thrust(0.6, *overrides, seconds=30.0, settle=10.0)
 
 
@@ -49,11 +49,11 @@ def test_where_the_best_half_beat_lies_between_two_numbers_of_ticks_the_sides_ta
     config = load(None, harsh(318).overrides)
     squares = [simulate(config, "square", {"frequency": 10 / n}, 30.0) for n in (3, 4, 5, 6)]
     whole = [square.relative_thrust for square in squares]
-    found = simulate(config, "swing", {"C": "auto"}, 90.0, 60.0)
+    result = simulate(config, "swing", {"C": "auto"}, 90.0, 60.0)
     assert max(whole) < 0.91
-    assert found.relative_thrust > 0.95
-    assert found.quantities["halfway"] == 1.0
-    assert found.half_beats == (4, 5)
+    assert result.relative_thrust > 0.95
+    assert result.quantities["halfway"] == 1.0
+    assert result.half_beats == (4, 5)
 
 
 @pytest.mark.slow

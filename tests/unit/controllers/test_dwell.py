@@ -18,7 +18,7 @@ PATIENT = ChatterSettings(patience=600.0)
 def limited(
     wanted: list[float], dwell: float = 0.2, tick: float = 0.05, limits: Limits = LIMITS
 ) -> list[float]:
-    """What becomes of the angles that a controller wants, tick by tick, from neutral."""
+    """Return the limited commands for the angles that a controller wants, from neutral."""
     limit = DwellLimit(dwell, replace(limits, tick=tick), limits.amplitude)
     limit.activate(0.0)
     return [limit.apply(angle, tick) for angle in wanted]

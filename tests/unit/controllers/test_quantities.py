@@ -1,4 +1,4 @@
-"""What a controller shows of its inside reaches telemetry, and can do no harm there."""
+"""Quantities of controllers: they reach telemetry, and invalid ones do no harm there."""
 
 from typing import Any
 
@@ -14,8 +14,8 @@ from fishd.core.dataframes import ticks_to_frame
 from fishd.core.signals import Observation
 
 
-class Showing(Scripted):
-    """Shows what a test tells it to."""
+class QuantityController(Scripted):
+    """Controller with a quantity whose value a test sets."""
 
     shown: float = quantity("Hz", "What the test says.")
     never: float = quantity("1", "Is never assigned.")
@@ -61,12 +61,12 @@ def test_nothing_is_shown_once_the_controller_is_out_of_command() -> None:
 
 @pytest.mark.parametrize("number", [2, np.float32(0.5), np.array([0.25])])
 def test_any_real_number_can_be_shown(number: Any) -> None:
-    rig = Rig().start(Showing(number))
+    rig = Rig().start(QuantityController(number))
     assert rig.run(2)[-1].quantities == {"shown": float(np.asarray(number).item())}
 
 
 class Poisoned:
-    """Ends whoever asks what it is."""
+    """Value that ends the program when its type is asked for."""
 
     @property
     def item(self) -> Any:
@@ -75,7 +75,7 @@ class Poisoned:
 
 @pytest.mark.parametrize("shown", [*BAD.values(), Poisoned()], ids=[*BAD, "poisoned"])
 def test_what_is_no_finite_number_is_left_out_and_the_fish_swims_on(shown: Any) -> None:
-    rig = Rig().start(Showing(shown))
+    rig = Rig().start(QuantityController(shown))
     tick = rig.run(3)[-1]
     assert (tick.mode, tick.phi_c) == ("running", 0.1)
     assert b"quantities" not in msgspec.json.encode(tick)

@@ -26,14 +26,14 @@ def true_thrust(ticks: Sequence[Tick], coefficient: float = K) -> float:
     return coefficient * sum(float(tick.alpha_rate) ** 2 for tick in beats) / len(beats)  # type: ignore[arg-type]
 
 
-def shown(ticks: Sequence[Tick]) -> dict[str, float]:
-    found = ticks[-1].quantities
-    assert isinstance(found, dict)
-    return found
+def last_quantities(ticks: Sequence[Tick]) -> dict[str, float]:
+    quantities = ticks[-1].quantities
+    assert isinstance(quantities, dict)
+    return quantities
 
 
 def rested(*overrides: str, factor: float | None = FACTOR) -> Rig:
-    """A fish that rests; factor: that somebody has measured."""
+    """Return the rig of a fish at rest; factor: measured thrust factor [N]."""
     rig = Rig(*RIG, *overrides)
     rig.run_for(3)
     if factor is not None:
@@ -55,7 +55,7 @@ def test_with_nothing_known_it_goes_by_the_ripple_and_says_how_badly_it_knows() 
     rig.run_for(10)
     ticks = rig.run_for(20)
     assert true_thrust(ticks) == pytest.approx(0.010, rel=0.08)
-    error = shown(ticks)["held_error"] / shown(ticks)["held_thrust"]
+    error = last_quantities(ticks)["held_error"] / last_quantities(ticks)["held_thrust"]
     assert 0.1 < error < 0.3
 
 
@@ -74,28 +74,28 @@ def test_another_target_is_held_within_five_seconds_and_the_factor_stays_known()
     rig.run_for(5)
     ticks = rig.run_for(10)
     assert true_thrust(ticks) == pytest.approx(0.006, rel=0.03)
-    assert shown(ticks)["held_error"] < 0.2 * 0.006
+    assert last_quantities(ticks)["held_error"] < 0.2 * 0.006
 
 
 def test_more_than_the_amplitude_limit_gives_is_held_there_and_told() -> None:
     rig = rested()
     rig.start("thrust", target=0.040)
     ticks = rig.run_for(15)
-    assert shown(ticks)["saturated"] == 1.0
+    assert last_quantities(ticks)["saturated"] == 1.0
     assert abs(ticks[-1].phi_c) == rig.config.amplitude_limit
     rig.retune(target=0.010)
-    assert shown(rig.run_for(10))["saturated"] == 0.0
+    assert last_quantities(rig.run_for(10))["saturated"] == 0.0
     rig.retune(target=0.020, amplitude=0.2)
     ticks = rig.run_for(8)
     assert max(abs(tick.phi_c) for tick in ticks) == 0.2
-    assert shown(ticks)["saturated"] == 1.0
+    assert last_quantities(ticks)["saturated"] == 1.0
 
 
 def test_less_than_the_smallest_amplitude_gives_is_held_there_and_told() -> None:
     rig = rested()
     rig.start("thrust", target=1e-6)
     ticks = rig.run_for(15)
-    assert shown(ticks)["saturated"] == -1.0
+    assert last_quantities(ticks)["saturated"] == -1.0
     assert abs(ticks[-1].phi_c) == pytest.approx(
         MIN_AMPLITUDE_FRACTION * rig.config.amplitude_limit
     )

@@ -1,4 +1,4 @@
-"""What a program says in a terminal as it ends."""
+"""The messages of a program in a terminal at its end."""
 
 import errno
 from collections.abc import Callable

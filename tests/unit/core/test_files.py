@@ -64,22 +64,22 @@ READERS: dict[str, Callable[[Path], object]] = {
 }
 
 
-def said(read: Callable[[Path], object], path: Path) -> str:
-    """What a reader complains, in time."""
-    found: list[str] = []
+def complaint(read: Callable[[Path], object], path: Path) -> str:
+    """Return the complaint of a reader, which must come in time."""
+    complaints: list[str] = []
 
     def run() -> None:
         try:
             read(path)
         except (ConfigError, PolicyError, FishdError, click.ClickException) as error:
-            found.append(str(error))
+            complaints.append(str(error))
 
     reader = threading.Thread(target=run, daemon=True)
     reader.start()
     reader.join(PATIENCE)
-    assert found, "it does not end, or accepts it"
-    assert "\n" not in found[0]
-    return found[0]
+    assert complaints, "it does not end, or accepts it"
+    assert "\n" not in complaints[0]
+    return complaints[0]
 
 
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
@@ -88,7 +88,9 @@ def test_what_is_no_file_is_one_line(
     tmp_path: Path, name: str, plant: Callable[[Path], None]
 ) -> None:
     plant(tmp_path / name)
-    assert said(READERS[name], tmp_path / name).startswith(f"{tmp_path / name}: {PLANTS[plant]}")
+    assert complaint(READERS[name], tmp_path / name).startswith(
+        f"{tmp_path / name}: {PLANTS[plant]}"
+    )
 
 
 def test_a_file_that_the_kernel_makes_up_is_read_no_further_than_is_permitted() -> None:

@@ -1,4 +1,4 @@
-"""Plug-ins of a table and of other packages: how they are found, and what is said where not."""
+"""Plug-ins of a table and of other packages: their discovery, and the errors of broken ones."""
 
 import sys
 from abc import ABC, abstractmethod
@@ -82,13 +82,13 @@ def test_a_package_installed_later_is_found(
     gadgets: Plugins[Gadget], install: Callable[[str, str], None]
 ) -> None:
     assert gadgets.names() == ["key", "lost", "shapeless", "text", "unfinished"]
-    install("broken_package", "this line is no entry point")
+    install("broken_package", "this line is not an entry point")
     install("late_package", "late = late_package:Gadget\nkey = late_package:Gadget")
     assert gadgets.names() == ["key", "late", "lost", "shapeless", "text", "unfinished"]
     assert gadgets.find("late") is Gadget
     assert "package broken_package cannot be read" in gadgets.problems["broken_package"]
     assert gadgets.package("late") == "late_package 1.0"
-    assert gadgets.package("key") == "fishd", "one that is built in is replaced by nobody"
+    assert gadgets.package("key") == "fishd", "a built-in plug-in is never replaced"
 
 
 def test_a_package_in_an_archive_is_found(

@@ -13,7 +13,7 @@ KEEP = 600_000
 
 
 def fill(box: BlackBox, folder: Path, files: int) -> None:
-    """Record until so many files were begun."""
+    """Record until this number of files was begun."""
     ticks = swum(10.0).recorder.ticks
     for _ in range(files):
         writer = box.open()

@@ -71,9 +71,9 @@ def test_pixels_and_times_are_given_back(
     path: Path, ticks: list[Tick], frames: list[Frame]
 ) -> None:
     run = open_run(path)
-    found = list(run.frames())
-    assert len(found) == len(frames) == len(run.frame_heads)
-    for number, (frame, sent) in enumerate(zip(found, frames, strict=True), start=1):
+    recorded = list(run.frames())
+    assert len(recorded) == len(frames) == len(run.frame_heads)
+    for number, (frame, sent) in enumerate(zip(recorded, frames, strict=True), start=1):
         assert (frame.pixels == sent.pixels).all()
         assert (frame.time, frame.available) == (sent.time, sent.available)
         exposure = 0.01 if number % 2 else None
@@ -85,9 +85,9 @@ def test_pixels_and_times_are_given_back(
 def test_viewers_find_the_schema_that_they_know(path: Path, frames: list[Frame]) -> None:
     with path.open("rb") as file:
         reader = make_reader(file)
-        found = list(reader.iter_messages(topics=["camera"], log_time_order=False))
-    assert len(found) == len(frames)
-    for (schema, channel, message), sent in zip(found, frames, strict=True):
+        messages = list(reader.iter_messages(topics=["camera"], log_time_order=False))
+    assert len(messages) == len(frames)
+    for (schema, channel, message), sent in zip(messages, frames, strict=True):
         assert schema is not None
         assert (schema.name, schema.encoding) == ("foxglove.CompressedImage", "jsonschema")
         assert channel.message_encoding == "json"
@@ -138,10 +138,10 @@ def test_a_recording_that_was_cut_off_is_finished_with_its_frames(
     copy = tmp_path / "cut.mcap"
     copy.write_bytes(part.read_bytes()[:-20000])
     run = recover(copy)
-    found = list(run.frames())
-    assert len(frames) > len(found) > len(frames) / 2
-    assert all((a.pixels == b.pixels).all() for a, b in zip(found, frames, strict=False))
-    assert run.summary.frames == len(found)
+    recorded = list(run.frames())
+    assert len(frames) > len(recorded) > len(frames) / 2
+    assert all((a.pixels == b.pixels).all() for a, b in zip(recorded, frames, strict=False))
+    assert run.summary.frames == len(recorded)
 
 
 def test_frames_are_exported_as_one_array_with_a_table_of_their_times(

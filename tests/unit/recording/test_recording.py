@@ -1,4 +1,4 @@
-"""What is written is what is read, whatever happened to the writer."""
+"""Recordings: they are read as they were written, whatever happened to the writer."""
 
 import errno
 import os
@@ -340,11 +340,11 @@ def test_what_is_no_recording_is_one_line(
 
 def test_what_is_no_regular_file_is_no_recording_of_a_folder(tmp_path: Path) -> None:
     path = recorded(swum(0.2), tmp_path / "run")
-    os.mkfifo(tmp_path / "pipe.mcap")  # which opens for nobody
+    os.mkfifo(tmp_path / "pipe.mcap")  # opening it would block
     os.mkfifo(tmp_path / "pipe.mcap.part")
     (tmp_path / "folder.mcap").mkdir()
     (tmp_path / "link.mcap").symlink_to(path)
-    assert {found.name for found in list_recordings(tmp_path)} == {"run.mcap", "link.mcap"}
+    assert {recording.name for recording in list_recordings(tmp_path)} == {"run.mcap", "link.mcap"}
     assert len(list(read_overviews(tmp_path))) == 2
 
 

@@ -96,7 +96,7 @@ def test_a_swim_before_the_recording_began_has_an_unknown_past(tmp_path: Path) -
     (stretch,) = result.stretches
     assert not stretch.from_start
     assert not result.estimates.from_start
-    assert stretch.ticks == 299  # of the first one, nobody knows how long ago the one before was
+    assert stretch.ticks == 299  # without the first, whose time since the previous tick is unknown
     assert stretch.equal >= 295  # from its first reversal on, swing remembers nothing of before
 
 

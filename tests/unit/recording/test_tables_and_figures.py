@@ -27,10 +27,10 @@ def test_a_table_has_every_bit_of_every_tick(path: Path, tmp_path: Path, form: s
     done = fishctl("export", str(path), f"--{form}", "--to", str(tmp_path))
     table, events = map(Path, done.stdout.split())
     reader = {"csv": pandas.read_csv, "parquet": pandas.read_parquet}[form]
-    found = reader(table)
-    assert list(found.columns) == list(open_run(path).frame().columns)
+    exported = reader(table)
+    assert list(exported.columns) == list(open_run(path).frame().columns)
     for name in ("t", "fx", "fin_velocity", "phi_c", "thrust"):
-        assert found[name].tolist() == [getattr(tick, name) for tick in open_run(path).ticks]
+        assert exported[name].tolist() == [getattr(tick, name) for tick in open_run(path).ticks]
     assert reader(events)["kind"].tolist() == ["controller", "mode", "parameters"]
     again = fishctl("export", str(path), f"--{form}", "--to", str(tmp_path))
     assert "already exists; use --force to replace it" in one_line(again)

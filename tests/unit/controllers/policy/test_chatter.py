@@ -122,11 +122,11 @@ def test_a_policy_takes_over_as_if_the_tail_had_reversed_just_then(tmp_path: Pat
 @pytest.mark.parametrize("name", ["swing", "square"])
 def test_controllers_that_know_when_to_reverse_are_not_limited(name: str) -> None:
     parameters = {"square": {"frequency": 4.0}, "swing": {"C": 1.0}}[name]
-    found = []
+    commands = []
     for dwell in (0.0, 2.0):
         rig = Rig(*NOISY, f"chatter.dwell={dwell}").start(name, **parameters)
-        found.append([tick.phi_c for tick in rig.run_for(10.0)])
-    assert found[0] == found[1]
+        commands.append([tick.phi_c for tick in rig.run_for(10.0)])
+    assert commands[0] == commands[1]
 
 
 @pytest.mark.slow

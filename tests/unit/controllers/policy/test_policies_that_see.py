@@ -38,13 +38,13 @@ def test_a_network_is_given_frames_and_numbers(tmp_path: Path) -> None:
     about = seeing_card(("instruction_angle", 0.42), ("fy", 0.1))
     weights = np.zeros((2, 32, 32))
     weights[0, 3, 4], weights[1, 30, 31] = 0.001, -0.002
-    found = network(tmp_path, of_pixels(weights, about, 0.5, 0.25))
-    assert found.frames.shape == (2, 32, 32)
-    assert found.row.shape == (2,)
-    found.frames[:] = 7
-    found.frames[0, 3, 4], found.frames[1, 30, 31] = 255, 100
-    found.row[:] = 0.4, -0.2
-    assert found.run() == pytest.approx(0.255 - 0.2 + 0.2 - 0.05)
+    policy = network(tmp_path, of_pixels(weights, about, 0.5, 0.25))
+    assert policy.frames.shape == (2, 32, 32)
+    assert policy.row.shape == (2,)
+    policy.frames[:] = 7
+    policy.frames[0, 3, 4], policy.frames[1, 30, 31] = 255, 100
+    policy.row[:] = 0.4, -0.2
+    assert policy.run() == pytest.approx(0.255 - 0.2 + 0.2 - 0.05)
 
 
 def test_a_card_says_in_a_word_what_is_seen() -> None:
@@ -110,7 +110,7 @@ def test_the_loop_of_fishd_refuses_it_and_names_who_lets_it_swim(tmp_path: Path)
 
 
 def test_a_description_says_what_it_sees(tmp_path: Path) -> None:
-    found = library.describe(str(write(tmp_path, FOLLOWER, "eye")))
-    assert (found.problem, found.sees) == ("", "pictures")
-    assert found.card
-    assert found.card["pictures"]["frames"] == 2
+    description = library.describe(str(write(tmp_path, FOLLOWER, "eye")))
+    assert (description.problem, description.sees) == ("", "pictures")
+    assert description.card
+    assert description.card["pictures"]["frames"] == 2

@@ -1,4 +1,4 @@
-"""What is no policy file, or would be dangerous as one, is refused with one line that says why."""
+"""Refusal of files that are not policy files, or are dangerous, with the reason in one line."""
 
 import io
 import os
@@ -152,7 +152,7 @@ _OUT = "one float32 output of shape [1, 1] named 'action' is needed"
 
 
 @pytest.mark.parametrize(
-    ("change", "found", "wanted"),
+    ("change", "actual", "wanted"),
     [
         (rename_input, "its inputs: float32 of shape [1, 1] named 'obs'", _IN),
         (open_batch, "its inputs: float32 of shape [batch, 1] named 'observation'", _IN),
@@ -161,9 +161,11 @@ _OUT = "one float32 output of shape [1, 1] named 'action' is needed"
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_wrong_ends_are_refused_with_what_is_right(change: Change, found: str, wanted: str) -> None:
+def test_wrong_ends_are_refused_with_what_is_right(
+    change: Change, actual: str, wanted: str
+) -> None:
     message = refusal(changed(change))
-    assert found in message
+    assert actual in message
     assert wanted in message
 
 
@@ -254,5 +256,5 @@ def test_a_file_that_is_far_too_large_is_refused_before_it_is_read(tmp_path: Pat
 
 
 def test_a_good_file_is_read_whole(tmp_path: Path) -> None:
-    found = file.read(write(tmp_path))
-    assert (found.content, found.card) == (FLIP, card())
+    policy = file.read(write(tmp_path))
+    assert (policy.content, policy.card) == (FLIP, card())

@@ -23,8 +23,8 @@ def test_onnx_agrees_with_numpy(
     layers = random_layers(4, *hidden, 1)
     session = onnxruntime.InferenceSession(to_onnx(layers, activation, card(*FEATURES)))
     for inputs in np.random.default_rng(1).normal(0.0, 1.5, (200, 4)).astype(np.float32):
-        (found,) = session.run(["action"], {"observation": inputs[np.newaxis]})
-        assert found.item() == pytest.approx(answer(layers, activation, inputs), abs=1e-6)
+        (output,) = session.run(["action"], {"observation": inputs[np.newaxis]})
+        assert output.item() == pytest.approx(answer(layers, activation, inputs), abs=1e-6)
 
 
 def test_the_card_comes_back_as_it_was() -> None:

@@ -149,7 +149,7 @@ def test_a_network_that_would_take_all_memory_or_hours_is_refused_at_once(
 
 
 def test_a_size_that_the_file_only_claims_does_not_count() -> None:
-    """What a file says of values in the middle of it is not believed."""
+    """Shapes that a file states for inner values are not trusted."""
     nodes = [make("Add", ["a", "b"], ["c"]), make("ReduceMean", ["c"], ["action"])]
     content = of_nodes(nodes, [floats("a", 100_000, 1), floats("b", 1, 100_000)])
     model = onnx.load_model_from_string(content)

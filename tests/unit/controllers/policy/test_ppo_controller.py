@@ -21,7 +21,7 @@ from fishd.controllers.policy.network import to_onnx
 from fishd.core.errors import ConfigError, ParameterError
 
 
-def made(path: Path, limits: Limits = LIMITS) -> Controller[Any]:
+def create_policy(path: Path, limits: Limits = LIMITS) -> Controller[Any]:
     return registry.create("ppo", {"policy": str(path)}, limits)
 
 
@@ -64,7 +64,7 @@ def test_a_policy_for_a_smaller_amplitude_stays_within_it(tmp_path: Path) -> Non
 def test_a_warm_up_changes_nothing(tmp_path: Path) -> None:
     layers = random_layers(1, 8, 1)
     path = write(tmp_path, to_onnx(layers, "tanh", card()))
-    warmed, plain = made(path), made(path)
+    warmed, plain = create_policy(path), create_policy(path)
     warmed.warm_up()
     for angle in (0.1, -0.3, 0.42):
         assert warmed.update(observe(angle)) == plain.update(observe(angle))
@@ -114,7 +114,7 @@ def test_another_tick_is_refused(tmp_path: Path) -> None:
         f"ppo: policy: {path}: it was trained at a tick of 50 ms, this robot's is 20 ms; "
         "set tick: 0.05, or train one at this tick"
     )
-    made(path, Limits(amplitude=0.42, tick=0.05 + 1e-12))
+    create_policy(path, Limits(amplitude=0.42, tick=0.05 + 1e-12))
 
 
 def test_an_amplitude_beyond_the_robots_is_refused(tmp_path: Path) -> None:
@@ -140,7 +140,7 @@ def test_the_policy_does_not_change_in_flight(tmp_path: Path) -> None:
 
 def test_what_is_run_is_what_was_checked(tmp_path: Path) -> None:
     path = write(tmp_path)
-    policy = made(path)
+    policy = create_policy(path)
     path.write_bytes(b"something else by now")
     assert policy.update(observe(0.42)) == -0.42
 
