@@ -20,14 +20,12 @@ from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.estimators.observer import Observer
 from fishd.control.guard import Guard
 from fishd.control.loop import ControlLoop
-from fishd.control.reporting import Publisher
-from fishd.controllers import registry
 from fishd.core import files
 from fishd.core.addresses import virtual_pi_socket
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.clock import Clock, SystemClock, VirtualClock
 from fishd.core.errors import MissingPackage, SensorError
-from fishd.core.signals import Truth
+from fishd.core.signals import Publisher, Truth
 from fishd.hardware import ownership, release_recipe
 from fishd.hardware.base import CalibratedParts, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
@@ -424,6 +422,11 @@ def build_estimator(config: Config) -> Estimator:
     return LateralForceEstimator(config.estimator)
 
 
+def build_guard(config: Config) -> Guard:
+    """Return a guard with the limits of the configuration."""
+    return Guard(config.amplitude_limit, config.tick, config.slew_limit, config.fade_time)
+
+
 def build_loop(
     config: Config,
     robot: Robot,
@@ -437,7 +440,7 @@ def build_loop(
     notify: function called at the end of every tick with the time of its start [s, monotonic]
     Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.
     """
-    guard = Guard(config.amplitude_limit, config.tick, config.slew_limit, config.fade_time)
+    guard = build_guard(config)
     if robot.calibrated:
         guard.restrict(*robot.calibrated.servo.reach)
     loop = ControlLoop(
@@ -452,10 +455,9 @@ def build_loop(
         lateral_sign=LateralSign(config.estimator.reversed_fy),
     )
     start = config.start
-    if start.controller is not None:
-        controller = registry.create(start.controller, start.parameters, config.limits)
+    if created := start.create_controller(config.limits):
         if start.rest:
-            loop.set_controller_after(start.rest, start.controller, controller)
+            loop.set_controller_after(start.rest, *created)
         else:
-            loop.set_controller(start.controller, controller)
+            loop.set_controller(*created)
     return loop

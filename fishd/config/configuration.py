@@ -15,10 +15,17 @@ from msgspec import Meta, Struct
 
 from fishd.config import consistency as checks
 from fishd.config import drivers
-from fishd.control.estimators.base import EstimatorSettings
-from fishd.controllers.base import DEFAULT_DWELL_S, MAX_DWELL_S, ChatterSettings, Limits
+from fishd.controllers import registry
+from fishd.controllers.base import (
+    DEFAULT_DWELL_S,
+    MAX_DWELL_S,
+    ChatterSettings,
+    Controller,
+    Limits,
+)
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
+from fishd.core.estimation import EstimatorSettings
 from fishd.core.overrides import apply_overrides
 from fishd.core.protocol import DEFAULT_LEASE_S, MAX_LEASE_S, MIN_LEASE_S
 from fishd.core.robots import ROBOTS, RobotKind
@@ -79,6 +86,15 @@ class Start(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             usual=600,
         ),
     ] = 0.0
+
+    def create_controller(self, limits: Limits) -> tuple[str, Controller[Any]] | None:
+        """Return name and controller, or None if none is set.
+
+        Raises `UnknownController` and `ParameterError`.
+        """
+        if self.controller is None:
+            return None
+        return self.controller, registry.create(self.controller, self.parameters, limits)
 
 
 class TelemetrySettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

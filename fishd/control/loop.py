@@ -18,7 +18,7 @@ from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.lease import Lease
-from fishd.control.reporting import Publisher, Reporter
+from fishd.control.reporting import Reporter
 from fishd.control.servo_output import ServoOutput
 from fishd.control.servo_power import ServoPower
 from fishd.control.statistics import Statistics
@@ -29,7 +29,7 @@ from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock, Slot
 from fishd.core.errors import ControllerFault, FishLost, Refused, SensorError
 from fishd.core.foreign_code import call_foreign
-from fishd.core.signals import Measurement, Observation, Tick
+from fishd.core.signals import Measurement, Observation, Publisher, Tick
 from fishd.hardware.base import Robot
 
 if TYPE_CHECKING:

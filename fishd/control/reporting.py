@@ -1,27 +1,17 @@
-"""The output of the loop to the outside: its publisher, and the report of events."""
+"""The reports of the loop to the outside: events, logged and published."""
 
 import logging
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 from fishd.control.supervisor import Mode
 from fishd.core import text
 from fishd.core.clock import Clock
 from fishd.core.errors import FishdError
 from fishd.core.schema import format_values
-from fishd.core.signals import Event, EventKind, Level, Reason, Tick
+from fishd.core.signals import Event, EventKind, Level, Publisher, Reason
 
 log = logging.getLogger(__name__)
-
-
-class Publisher(Protocol):
-    """The receiver of ticks and events; must not block."""
-
-    def tick(self, tick: Tick) -> None:
-        """Publish one tick."""
-
-    def event(self, event: Event) -> None:
-        """Publish one event."""
 
 
 class Reporter:

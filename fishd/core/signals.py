@@ -5,7 +5,7 @@ unchanged over telemetry and the control channel, so their field names are the p
 The tables of docs/reference/protocol.md are generated from the declarations here (`make docs`).
 """
 
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, Protocol, get_args
 
 from msgspec import UNSET, Struct, UnsetType
 
@@ -398,6 +398,16 @@ class Timing(Struct, frozen=True):
             "Durations of the phases of a tick: `read`, `estimate`, `update`, `write`, `publish`."
         ),
     ]
+
+
+class Publisher(Protocol):
+    """The receiver of ticks and events; must not block."""
+
+    def tick(self, tick: Tick) -> None:
+        """Publish one tick."""
+
+    def event(self, event: Event) -> None:
+        """Publish one event."""
 
 
 class Status(Struct, frozen=True):

@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import UNSET
 
-from fishd.control.estimators.live_thrust import SWIM_SETTLE_TIME_S
 from fishd.core import text
 from fishd.core.beats import upward_reversals
 from fishd.core.calibration import ForceCalibration
+from fishd.core.estimation import SWIM_SETTLE_TIME_S
 from fishd.core.signals import Tick
 from fishd.lab.statistics import Z95
 

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import UNSET, Struct
 
-from fishd.control.estimators.live_thrust import PIECE_S, REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
 from fishd.core.beats import upward_reversals
 from fishd.core.errors import ParameterError
+from fishd.core.estimation import PIECE_S, REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
 from fishd.core.signals import Tick
 from fishd.lab import error_budget
 from fishd.lab.disturbances import RESPONSE_TIMES_S, Disturbance

@@ -13,9 +13,8 @@ from typing import Any, TypeVar
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
-from fishd.assembly import build_estimator
+from fishd.assembly import build_estimator, build_guard
 from fishd.config import Config, adopt
-from fishd.control.guard import Guard
 from fishd.controllers import registry
 from fishd.controllers.base import Controller
 from fishd.core import text
@@ -194,10 +193,7 @@ class _Rerun:
         )
         self._estimator = build_estimator(self._config)
         self.estimates.from_start &= tick.seq == 1
-        config = self._config
-        self._guard = Guard(
-            config.amplitude_limit, config.tick, config.slew_limit, config.fade_time
-        )
+        self._guard = build_guard(self._config)
         description = next(
             (daemon for daemon in self._run.daemons if daemon.get("number") == str(self._number)),
             {},

@@ -13,7 +13,6 @@ import msgspec
 from fishd.client import Fish
 from fishd.client.lease import LeaseRenewal
 from fishd.config import Config, adopt, check_tethered
-from fishd.control.reporting import Publisher
 from fishd.core import text
 from fishd.core.calibration import EXACT, ForceCalibration
 from fishd.core.errors import (
@@ -25,7 +24,7 @@ from fishd.core.errors import (
     UnknownController,
 )
 from fishd.core.robots import ROBOTS
-from fishd.core.signals import Event, Reason, Tick
+from fishd.core.signals import Event, Publisher, Reason, Tick
 from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:

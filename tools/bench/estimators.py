@@ -18,9 +18,9 @@ from bench.identification import VARIED
 from common.report import Options, Report, table
 from fishd.assembly import build_loop
 from fishd.config import Config
-from fishd.control.estimators.base import EstimatorSettings
 from fishd.controllers import registry
 from fishd.core.clock import VirtualClock, virtual_slots
+from fishd.core.estimation import EstimatorSettings
 from fishd.lab.simulation import Beats, EncodingPublisher
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import SimulationSettings

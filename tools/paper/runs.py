@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from common.report import DOCS
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config
-from fishd.control.estimators.base import EstimatorSettings
+from fishd.core.estimation import EstimatorSettings
 from fishd.lab.compare.contestants import Contestant, build
 from fishd.lab.compare.seeing import SeeingController
 from fishd.lab.simulation import KeepingPublisher, Report, VirtualRun, judge

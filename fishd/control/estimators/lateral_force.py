@@ -7,8 +7,9 @@ sensor would integrate to a drift; a slow average of the force estimates and sub
 
 import math
 
-from fishd.control.estimators.base import DEFAULT_LEAK_S, Estimator, EstimatorSettings
+from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.leak_search import LeakSearch
+from fishd.core.estimation import DEFAULT_LEAK_S, EstimatorSettings
 from fishd.core.signals import Measurement
 
 

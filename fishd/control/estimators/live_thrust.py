@@ -18,16 +18,11 @@ from collections.abc import Iterable, Sequence
 
 from fishd.control.estimators.thrust_factor import DRIFT_LAG_S, Drift, Factor, Level, Wave
 from fishd.core.calibration import Z95
+from fishd.core.estimation import PIECE_S, REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
 from fishd.core.signals import Observation
 
-SWIM_SETTLE_TIME_S = 1.5
-"""Time until a fin that has begun to swim swims steadily [s]."""
-REST_SETTLE_TIME_S = 1.0
-"""Time until a fin hangs still, fading to neutral included [s]."""
 REST_DELAY_S = 2.5
 """Time without a movement of the tail after which it rests, whichever controller is active [s]."""
-PIECE_S = 0.5
-"""Length of the pieces that a rest is cut into, and shortest block of whole beats [s]."""
 SHOWN_SPAN_S = 4.0
 """Longest time over which the shown thrust is averaged, in whole beats [s]."""
 MAX_BEAT_S = 10.0

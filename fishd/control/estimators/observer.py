@@ -14,8 +14,9 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from fishd.control.estimators.base import Estimator, EstimatorSettings
+from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.lateral_sign import SETTLE_TIME_S
+from fishd.core.estimation import EstimatorSettings
 from fishd.core.signals import Measurement
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import TetheredFish

@@ -11,8 +11,7 @@ from msgspec.structs import replace
 
 from fishd.camera.simulated.settings import SimulatedCameraSettings
 from fishd.config import Config, Start
-from fishd.control.reporting import Publisher
-from fishd.core.signals import Tick
+from fishd.core.signals import Publisher, Tick
 from fishd.lab.compare.contestants import Contestant, build, parse, refusal
 from fishd.lab.compare.seeing import SeeingController, may_see_pictures
 from fishd.lab.ranking import (

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
-from fishd.control.estimators.base import MAX_LEAK_S
+from fishd.core.estimation import MAX_LEAK_S
 from fishd.lab.identification.response import Array
 
 UNITS = {

@@ -4,8 +4,8 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from fishd.control.estimators.live_thrust import SWIM_SETTLE_TIME_S
 from fishd.core.errors import ConfigError, ParameterError
+from fishd.core.estimation import SWIM_SETTLE_TIME_S
 from fishd.core.schema import Field
 from fishd.core.signals import Tick
 from fishd.lab.error_budget import visible_rotation

@@ -10,10 +10,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from fishd.config import Config
-from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.core.errors import ParameterError
-from fishd.core.signals import Reason
+from fishd.core.signals import Publisher, Reason
 from fishd.lab.simulation.report import count_ticks
 from fishd.lab.simulation.virtual_run import EncodingPublisher, VirtualRun
 from fishd.virtual.swimmer import checkpoint

@@ -10,11 +10,10 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from fishd.config import Config, check_tethered
-from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.controllers.base import Controller, amplitude_of
 from fishd.core.errors import ParameterError
-from fishd.core.signals import Reason
+from fishd.core.signals import Publisher, Reason
 from fishd.lab.simulation.beats import Beats
 from fishd.lab.simulation.virtual_run import (
     VirtualRun,

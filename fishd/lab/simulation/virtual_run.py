@@ -10,11 +10,10 @@ from msgspec.structs import replace
 from fishd import __version__
 from fishd.assembly import build_loop, open_fish_in_virtual_time
 from fishd.config import Config
-from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.errors import ParameterError
-from fishd.core.signals import Event, Tick
+from fishd.core.signals import Event, Publisher, Tick
 from fishd.virtual.plant.base import TrueWindow
 
 MAX_RUN_S = 1e8

@@ -8,9 +8,9 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fishd.config import Config, Start
-from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.core.beats import Reversals
+from fishd.core.signals import Publisher
 from fishd.lab.simulation import VirtualRun
 from fishd.lab.statistics import student95
 from fishd.lab.sweep.grid import Lengths, Point

@@ -9,11 +9,11 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from fishd.config import Config, Start
-from fishd.control.reporting import Publisher
 from fishd.controllers import registry
 from fishd.controllers.base import amplitude_of
 from fishd.core.errors import FishdError
 from fishd.core.process.interruption import on_signal
+from fishd.core.signals import Publisher
 from fishd.lab.measurement import measure
 from fishd.lab.parallel import Stop, workers
 from fishd.lab.session import Session, concerns_one_controller

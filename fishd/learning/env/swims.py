@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from msgspec import Struct
 
-from fishd.control.estimators.live_thrust import REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
 from fishd.controllers.dwell import DwellLimit
 from fishd.core.errors import ControllerFault
+from fishd.core.estimation import REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
 from fishd.lab.measurement import Block, Sample, average_phase
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Decide, beat_frequency, is_stalled
