@@ -4,7 +4,6 @@ import contextlib
 import os
 import socket as sockets
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -13,10 +12,12 @@ from typing import Any, Self
 import msgspec
 import zmq
 
+from common import processes
 from common.in_process import fishctl
-from common.processes import FISHCTL, FISHD, PATIENCE, Process, call, sets, wait_until
+from common.processes import FISHCTL, FISHD, PATIENCE, call, sets, wait_until
 from fishd.client import Fish, NoDaemon
 from fishd.core.signals import Status
+from rigs import preloaded
 
 __all__ = [
     "EXPERIMENT", "FISHCTL", "FISHD", "LEASE", "PATIENCE", "Daemon", "Process", "Subscriber",
@@ -39,10 +40,16 @@ START: tuple[str, ...] = (FISHD,)
 EXPERIMENT: tuple[str, ...] = (FISHCTL,)
 """Command that starts a separate fishctl, for an experiment on a fishd."""
 if not os.environ.get("JUDGES_REAL_TIME"):
-    _unhurried = (sys.executable, "-P", str(Path(__file__).with_name("unhurried.py")))
     # Without the warm-up, the load is half.
-    START = (*_unhurried, "fishd", *sets("realtime.warm_up=false", f"control.lease={LEASE:g}"))
-    EXPERIMENT = (*_unhurried, "fishctl")
+    _settings = sets("realtime.warm_up=false", f"control.lease={LEASE:g}")
+    START = (*preloaded.UNHURRIED, "fishd", *_settings)
+    EXPERIMENT = (*preloaded.UNHURRIED, "fishctl")
+
+
+class Process(processes.Process):
+    """A program that runs beside this one."""
+
+    start = staticmethod(preloaded.start)
 
 
 def addresses(folder: Path) -> list[str]:

@@ -43,10 +43,12 @@ def wait_until(true: Callable[[], bool]) -> None:
 class Process:
     """Program that runs beside this one; as a context manager it has ended afterwards."""
 
+    start = staticmethod(subprocess.Popen)
+
     def __init__(self, *command: str, **options: Any) -> None:
         """options: those of `subprocess.Popen`"""
         usual = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        self.process: subprocess.Popen[str] = subprocess.Popen(command, **(usual | options))
+        self.process: subprocess.Popen[str] = self.start(command, **(usual | options))
 
     @property
     def pid(self) -> int:
