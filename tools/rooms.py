@@ -12,6 +12,7 @@ import ast
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 from common.report import DOCS, between, put, table
@@ -45,6 +46,7 @@ def arrows() -> set[tuple[str, str]]:
     return {(names[one], names[other]) for one, other in pairs if one != other and one in names}
 
 
+@cache
 def imports() -> dict[str, set[str]]:
     """Return the other modules of fishd that each module imports, anywhere in its file."""
     files = {_module_name(path): path for path in FISHD.rglob("*.py")}

@@ -49,7 +49,9 @@ def _find_program(command: Sequence[str]) -> tuple[str, bool, list[str]] | None:
 
 
 def _variables() -> dict[str, str]:
-    return {name: value for name, value in os.environ.items() if name.startswith(READ_AT_START)}
+    found = {name: value for name, value in os.environ.items() if name.startswith(READ_AT_START)}
+    found.pop("PYTHONSAFEPATH", None)  # which the commands set in any case
+    return found
 
 
 class _Server:
@@ -141,7 +143,7 @@ def serve(connection: socket.socket) -> Callable[[], None]:
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(variables)
-    __main__._leave_working_directory_out()
+    os.environ["PYTHONSAFEPATH"] = "1"  # as `fishd.__main__` does where it is loaded
     for number, stream in enumerate(streams):
         os.dup2(stream, number)
         os.close(stream)

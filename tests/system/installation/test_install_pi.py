@@ -1,5 +1,6 @@
 """make install-pi and uninstall-pi, into a folder: what they put, keep and take away."""
 
+import contextlib
 import io
 import os
 import re
@@ -12,6 +13,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from hatchling.build import build_wheel
 from rigs.documents import ROOT as CHECKOUT
 from rigs.once import once
 from rigs.processes import call
@@ -23,10 +25,8 @@ AS_INSTALLED = "opt/fishd/fishd.yaml.installed"
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     def make(folder: Path) -> Path:
-        pip = [sys.executable, "-m", "pip", "--quiet", "wheel", "--no-deps"]
-        words = [*pip, "--no-build-isolation", f"--wheel-dir={folder}", CHECKOUT]
-        subprocess.run(words, check=True, capture_output=True)
-        return next(folder.glob("fishd-*.whl"))
+        with contextlib.chdir(CHECKOUT):
+            return folder / build_wheel(str(folder))
 
     return once(tmp_path_factory, "wheel", make)
 

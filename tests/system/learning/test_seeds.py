@@ -199,12 +199,12 @@ def test_the_seed_of_a_killed_process_is_resumed(tmp_path: Path) -> None:
     done = while_it_trains(
         lambda: list((run / "seed-0").glob("step-*")),
         lambda: os.kill(trainers(os.getpid())[0], signal.SIGKILL),
-        *command(tmp_path, "--seeds", "2", "--jobs", "2", steps=512),
+        *command(tmp_path, "--seeds", "2", "--jobs", "2", steps=256),
     )
     assert done.returncode == 0, done.stderr
     assert "latest policies of 2 seeds" in done.stdout
     assert [evaluation.steps for evaluation in read_evaluations(run / "seed-0")] == list(
-        range(64, 513, 64)
+        range(64, 257, 64)
     )
 
 

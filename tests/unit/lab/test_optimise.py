@@ -129,7 +129,7 @@ def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
     words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
     kept, stops = "", 0
     while True:
-        left = int(generator.integers(1, 300)) if stops < 8 else 0
+        left = int(generator.integers(1, 300)) if stops < 3 else 0
         done = fishctl(*words)
         words = ["optimise", "--resume", str(folder)]
         content = table.read_text()
@@ -141,7 +141,7 @@ def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
         assert done.returncode == 130
         assert done.stderr.startswith("fishctl: interrupted, ")
         assert done.stderr.endswith(f"; resume with: fishctl {' '.join(words)}\n")
-    assert stops == 8
+    assert stops == 3
     assert "best frequency of square: 1.667 Hz" in done.stdout
     rows = [row.split(",") for row in kept.splitlines()[1:]]
     seconds = sum(len(read(path)) for path in folder.glob("search*.mcap")) * 0.05
