@@ -16,7 +16,7 @@ from fishd.camera.messages import PublishedFrame
 
 @pytest.fixture(scope="module")
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[V4l2Rig]:
-    with v4l2_rig(tmp_path_factory.mktemp("camera"), "v4l2.rate=60") as process:
+    with v4l2_rig(tmp_path_factory.mktemp("camera"), "v4l2.rate=30") as process:
         yield process
 
 

@@ -60,8 +60,8 @@ def test_the_free_swimmer_begins_to_swim_as_it_did_for_figure_6() -> None:
     """Steady beats, which the figure is of, come after 6 s only."""
     track = free_swim.swim(figure_6.config(2.0), "square", {"frequency": 3.0}, 0.6, 0.1).track
     distance, speed = -track.rows()[:, 1], track.rows()[:, 3]
-    assert distance[[166, 249]] == pytest.approx([6.496e-3, 9.810e-3], rel=5e-3)
-    assert speed[249] == pytest.approx(20.90e-3, rel=1e-2)
+    assert distance[[166, 249]] == pytest.approx([6.4958e-3, 9.8098e-3], rel=1e-3)
+    assert speed[249] == pytest.approx(20.900e-3, rel=3e-3)
 
 
 @pytest.mark.slow
