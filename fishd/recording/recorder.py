@@ -4,22 +4,21 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import Any, NamedTuple, Protocol, Self
 
 import msgspec
 import zmq
 
 from fishd.client import Fish
 from fishd.core import addresses, text
+from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishError, RecordingError, Refused
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status
+from fishd.recording.images import FrameHead
 from fishd.recording.schemas import CHANNELS
 from fishd.recording.summary import TickHead
 from fishd.recording.writer import RunWriter
-
-if TYPE_CHECKING:
-    from fishd.recording.camera_tap import CameraTap
 
 DRAIN_INTERVAL_S = 0.2
 """Interval at which messages are read from their queue, to wake up rarely [s]."""
@@ -51,6 +50,27 @@ MAX_WAITING_MESSAGES = 20000
 TAKEOVER_MESSAGE = "another fishd has taken over: the recording continues with it"
 
 
+class NewFrames(NamedTuple):
+    """News and frames of a camera since the previous call."""
+
+    news: list[str]
+    """One line for the user per change of the camera's state."""
+    frames: list[tuple[FrameHead, Pixels]]
+
+
+class FrameSource(Protocol):
+    """A camera whose frames are recorded; its errors never end the recording."""
+
+    def set_time(self, t: float, monotonic: float) -> None:
+        """Set the clock offset from the times of a tick: unix, and on fishd's clock [s]."""
+
+    def take(self) -> NewFrames:
+        """Return the news and frames since the previous call."""
+
+    def close(self) -> None:
+        """Disconnect; may be called twice."""
+
+
 class Recorder:
     """Recorder of all telemetry of a fishd until it is stopped, across restarts of fishd."""
 
@@ -62,7 +82,7 @@ class Recorder:
         tell: Callable[[str], None],
         progress: Callable[[RunWriter], None] = lambda writer: None,
         due: Callable[[RunWriter], bool] = lambda writer: False,
-        camera: "CameraTap | None" = None,
+        camera: FrameSource | None = None,
     ) -> None:
         """
         endpoint: control socket of fishd; None for that of this machine
@@ -153,7 +173,7 @@ class Recorder:
                 received = now
                 self._look_for_fishd()
 
-    def _take_frames(self, camera: "CameraTap") -> None:
+    def _take_frames(self, camera: FrameSource) -> None:
         news, frames = camera.take()
         for line in news:
             self._tell(line)

@@ -30,7 +30,7 @@ def record(
     record --camera`. If the camera is lost, the
     recording goes on; the loss is reported and counted.
     """
-    from fishd.recording.camera_tap import CameraTap
+    from fishd.lab.camera_tap import CameraTap
 
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     with CameraTap(address, endpoint) as camera:

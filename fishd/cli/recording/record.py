@@ -25,7 +25,7 @@ from fishd.recording.folder import ensure_folder, new_path, recording_path, runs
 from fishd.recording.recorder import Recorder
 
 if TYPE_CHECKING:
-    from fishd.recording.camera_tap import CameraTap
+    from fishd.lab.camera_tap import CameraTap
 
 F = TypeVar("F", bound=Callable[..., Any])
 UNIT_BYTES = {"MB": 10**6, "GB": 10**9}
@@ -140,7 +140,7 @@ def record(
     if camera is None:
         record_one(run, endpoint, folder, begin, seconds, as_json)
         return
-    from fishd.recording.camera_tap import CameraTap
+    from fishd.lab.camera_tap import CameraTap
 
     with CameraTap(camera or None, endpoint) as tap:
         record_one(run, endpoint, folder, begin, seconds, as_json, tap)

@@ -1,28 +1,21 @@
 """Source of the frames of a running camera for a recording; reports when they stop and return."""
 
 import time
-from typing import NamedTuple, Self
+from typing import Self
 
 from fishd.camera.client import CameraClient
 from fishd.camera.messages import FrameHeader
 from fishd.client import Fish
 from fishd.core import text
-from fishd.core.camera_frames import Frame, Pixels
+from fishd.core.camera_frames import Frame
 from fishd.core.errors import FishError
 from fishd.recording.images import FrameHead
+from fishd.recording.recorder import NewFrames
 
 CAMERA_TIMEOUT_S = 2.0
 """Time without a frame after which the camera counts as lost [s]."""
 _MAX_WAITING_FRAMES = 1000
 """Maximum number of frames that wait for the first tick; older ones are dropped."""
-
-
-class TapOutput(NamedTuple):
-    """News and frames since the previous call."""
-
-    news: list[str]
-    """One line for the user per change of the camera's state."""
-    frames: list[tuple[FrameHead, Pixels]]
 
 
 class CameraTap:
@@ -64,7 +57,7 @@ class CameraTap:
         if monotonic:
             self._ahead = t - monotonic
 
-    def take(self) -> TapOutput:
+    def take(self) -> NewFrames:
         """Return the news and frames since the previous call; raise no error of the camera."""
         news: list[str] = []
         while frames := self._poll():
@@ -80,9 +73,9 @@ class CameraTap:
             news.append(f"no frames come from the camera: {self._why()}; the recording continues")
         if self._ahead is None:
             self._waiting = self._waiting[-_MAX_WAITING_FRAMES:]
-            return TapOutput(news, [])
+            return NewFrames(news, [])
         waiting, self._waiting = self._waiting, []
-        return TapOutput(news, [(self._head(*pair), pair[1].pixels) for pair in waiting])
+        return NewFrames(news, [(self._head(*pair), pair[1].pixels) for pair in waiting])
 
     def _poll(self) -> list[tuple[FrameHeader, Frame]]:
         try:
