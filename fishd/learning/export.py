@@ -21,10 +21,10 @@ from fishd.controllers.policy.runtime import Network
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.files import write_atomically
+from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
 from fishd.learning.env.perception import Perception
-from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.eyes.making import random_angles
 from fishd.learning.picture_networks import PictureExtractor, network_nodes
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of

@@ -7,9 +7,9 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from fishd.camera.simulated.settings import DEFAULT
 from fishd.config import Config
 from fishd.controllers.policy.card import Card, Window
+from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import features
 from fishd.learning.env.perception import Perception
-from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.eyes import making
 from fishd.learning.ppo import make_policy
 from fishd.learning.run_folder.runs import make_card

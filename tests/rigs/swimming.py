@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from fishd.config import load
 from fishd.core.signals import Observation
-from fishd.learning.env.link import LinkLost, StepResult
-from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.lab.links.link import LinkLost, StepResult
+from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
 from fishd.learning.train.jobs import Job
 from rigs.processes import fishctl

@@ -26,7 +26,7 @@ from rooms import arrows, imports, layers, purpose, rooms
 
 ROOMS = rooms()
 MAX_ROOMS = 14
-MAX_ARROWS_PER_ROOM = 5
+MAX_ARROWS_PER_ROOM = 4
 """Largest mean number of other rooms that a room imports."""
 
 

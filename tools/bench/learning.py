@@ -48,11 +48,11 @@ from fishd.config import Config, load
 from fishd.controllers import registry
 from fishd.lab.compare.contestants import best_on_grid, parse
 from fishd.lab.compare.survey import survey
+from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.lab.other_fish import CHANGES, FIRST_SEED, HARSH_FISH_COUNT, harsh_fish, mild
 from fishd.lab.other_fish import harsh as harsh_of_seed
 from fishd.lab.simulation import simulate
 from fishd.learning.env.environment import SwimEnv, best_thrust
-from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.settings import TrainingSettings
 from fishd.virtual.plant.optimum import best_square_wave
 

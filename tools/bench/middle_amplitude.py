@@ -13,8 +13,8 @@ from msgspec.structs import replace
 from bench.trainings import Row, rig, settings_of, several, to_reach
 from common.report import progress, spread, table
 from fishd.config import Config
+from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv, best_thrust
-from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.run_folder.checkpoints import list_all, load_policy
 from fishd.learning.run_folder.tables import best_so_far, read_evaluations
 from fishd.learning.train.jobs import Job

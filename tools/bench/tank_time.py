@@ -22,9 +22,9 @@ from fishd.controllers.dwell import DwellLimit
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
+from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.lab.measurement import Sample, evaluate, plan
 from fishd.learning.env.evaluation import Evaluation, beat_frequency, is_stalled, judge
-from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder.tables import read_evaluations
 from fishd.learning.train.jobs import Job

@@ -27,7 +27,7 @@ from fishd.controllers.policy.card import Feature, FeatureName, Window
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
-from fishd.learning.env.link import Link, LinkLost
+from fishd.lab.links.link import Link, LinkLost
 from fishd.learning.env.perception import Perception
 from fishd.learning.eyes.base import Eye
 from fishd.learning.eyes.making import random_angles

@@ -41,8 +41,9 @@ def swim(
     Raises `ConfigError`.
     """
     from fishd.camera import settings as cameras
+    from fishd.lab.links.simulated_link import Camera, SimulatedLink
     from fishd.learning.env.environment import SwimEnv
-    from fishd.learning.env.simulated_link import Camera, SimulatedLink
+    from fishd.learning.env.fish_variation import episode_fish
     from fishd.learning.eyes.making import make_eye
 
     fish = load(config, overrides)
@@ -50,7 +51,7 @@ def swim(
     eye = make_eye(chosen)
     sight = Camera(cameras.load_simulated(camera), chosen.camera.stack) if eye else None
     metered = bool(chosen.seen.power_price)
-    link = SimulatedLink(fish, chosen.randomisation, sight, metered=metered)
+    link = SimulatedLink(fish, episode_fish(chosen.randomisation), sight, metered=metered)
     env = SwimEnv(link, fish, chosen.seen, eye)
     if eye and not eye.is_fitted:
         env.reset(seed=0)
@@ -80,8 +81,8 @@ def swim_on_daemon(
 
     Raises `ConfigError`, also where tick or Φ differ from those of fishd, and `FishError`.
     """
+    from fishd.lab.links.fishd_link import FishdLink, config_of
     from fishd.learning.env.environment import SwimEnv
-    from fishd.learning.env.fishd_link import FishdLink, config_of
     from fishd.learning.eyes.making import make_eye
 
     chosen = training.load(settings)

@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from fishd.core.errors import FishdError
+from fishd.lab.links.fishd_link import FishdLink
+from fishd.lab.links.link import Link, LinkLost
+from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env import evaluation
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
-from fishd.learning.env.fishd_link import FishdLink
-from fishd.learning.env.link import Link, LinkLost
-from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.env.fish_variation import episode_fish
 from fishd.learning.eyes import making as eyes
 from fishd.learning.imitation import Imitation
 from fishd.learning.ppo import (
@@ -74,7 +75,7 @@ def train(
     else:
         link = SimulatedLink(
             job.config,
-            job.settings.randomisation,
+            episode_fish(job.settings.randomisation),
             job.simulated_camera,
             metered=bool(job.settings.environment.power_price),
         )

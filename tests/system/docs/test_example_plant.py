@@ -12,8 +12,9 @@ from rigs.processes import running, sets, wait_until
 
 from fishd.client import Fish
 from fishd.config import load, to_yaml
+from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.lab.simulation import simulate
-from fishd.learning.env.simulated_link import SimulatedLink
+from fishd.learning.env.fish_variation import episode_fish
 from fishd.learning.settings import Randomisation
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.registry import open_plant
@@ -84,7 +85,7 @@ def test_it_swims_behind_the_drivers_of_a_virtual_pi() -> None:
 
 @pytest.mark.usefixtures("_installed")
 def test_an_agent_learns_on_it_and_on_fish_like_it() -> None:
-    link = SimulatedLink(load(None, [MODEL]), Randomisation(omega0=0.3))
+    link = SimulatedLink(load(None, [MODEL]), episode_fish(Randomisation(omega0=0.3)))
     for seed in (1, 2):
         link.reset(seed=seed)
         forces = [link.step(0.4 * (-1) ** (k // 7)).observation.fx for k in range(70)]

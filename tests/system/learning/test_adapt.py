@@ -36,7 +36,7 @@ from fishd.learning.adapt.state import (
     Tried,
 )
 from fishd.learning.adapt.verdict import judge
-from fishd.learning.env.simulated_link import draw_edge_fish, draw_fish
+from fishd.learning.env.fish_variation import draw_edge_fish, draw_fish
 from fishd.learning.settings import Randomisation
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import square_wave

@@ -15,9 +15,9 @@ import fishd.learning  # noqa: F401 (registers the environments)
 from fishd.client import Fish
 from fishd.config import load
 from fishd.core.errors import ConfigError, NoDaemon
+from fishd.lab.links.link import StepResult
+from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.link import StepResult
-from fishd.learning.env.simulated_link import SimulatedLink
 from fishd.learning.settings import EnvironmentSettings
 
 STILL = ("simulation.noise=0.0",)

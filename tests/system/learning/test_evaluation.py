@@ -14,7 +14,7 @@ from fishd.core.signals import Observation
 from fishd.lab.compare.contestants import best_on_grid
 from fishd.lab.simulation import simulate
 from fishd.learning.env.evaluation import evaluate_in_simulation, judge, worst_on_others
-from fishd.learning.env.simulated_link import draw_edge_fish, draw_fish
+from fishd.learning.env.fish_variation import draw_edge_fish, draw_fish
 from fishd.learning.settings import (
     EvaluationSettings,
     Randomisation,

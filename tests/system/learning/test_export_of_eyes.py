@@ -22,9 +22,9 @@ from fishd.controllers.policy.runtime import Network
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
 from fishd.lab.compare import compare
+from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.export import export, export_model
 from fishd.learning.eyes.making import random_angles
 from fishd.learning.look import look

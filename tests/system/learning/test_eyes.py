@@ -13,9 +13,9 @@ from fishd.camera.axis import NoMotion
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import Stack, StackSettings
+from fishd.lab.links.link import StepResult
+from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.link import StepResult
-from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.eyes.base import Eye
 from fishd.learning.eyes.making import make_eye, random_angles
 from fishd.learning.settings import EnvironmentSettings, TrainingSettings, VisionSettings
@@ -49,7 +49,7 @@ def swim_with(
         env.advance(float(angle))
         assert env.stack
         stacks.append(env.stack)
-        fins.append(link._loop.robot.truth().alpha)
+        fins.append(link._swimming().loop.robot.truth().alpha)
     return stacks, np.array(fins), angles
 
 

@@ -17,7 +17,7 @@ from fishd.cli.learn.ppo import print_outcome
 from fishd.cli.main import fishctl as commands
 from fishd.client import Fish
 from fishd.config import load
-from fishd.learning.env import fishd_link
+from fishd.lab.links import fishd_link
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.train.jobs import Outcome

@@ -17,9 +17,9 @@ from fishd.camera.axis import NoMotion
 from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import StackSettings
+from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env import environment
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.env.simulated_link import Camera, SimulatedLink
 from fishd.learning.eyes.base import Eye
 from fishd.learning.eyes.making import make_eye
 from fishd.learning.run_folder import checkpoints, runs
