@@ -247,7 +247,7 @@ def test_with_a_good_fit_few_noisy_waves_do_not_move_the_maximum() -> None:
         search.observe({"frequency": frequency}, thrust, 2e-3)
     tried = [
         Tried(*measurement, 0, 0.0)
-        for measurement in zip(*search.measured("frequency"), strict=True)
+        for measurement in zip(*search.read_measurements("frequency"), strict=True)
     ]
     assert steps.best_of(search, tried, fitted(GOOD), PHI) == (pytest.approx(10 / 6), True)
 
