@@ -12,11 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.camera.tail import find_tails
+from fishd.camera.axis import Floats, find_motion
 from fishd.core.camera_frames import Frame
 from fishd.core.errors import FishdError
-
-Floats = NDArray[np.float64]
 
 MAX_DELAY_S, MIN_DELAY_S = 0.5, -0.1
 """Largest and smallest delay that is searched [s]."""
@@ -32,6 +30,11 @@ _STEP_S = 5e-3
 """Step of the integration [s]."""
 _RATE_RANGE = (0.3, 30.0)
 """Range in which K_d/K is searched [1/s]."""
+_TAIL_THRESHOLD = 0.25
+"""Difference from the median picture above which a pixel shows the tail, as a fraction of the 99 %
+quantile of the differences."""
+_MOTION_THRESHOLD = 0.05
+"""Energy above which a pixel belongs to the motion, as a fraction of the largest energy."""
 _MIN_AGREEMENT = 0.8
 """Smallest agreement of pictures and forces that belong to the same tail."""
 
@@ -91,7 +94,7 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
     if len(inside) < 100:
         raise NoDelay(f"{len(inside)} frames are too few to measure a delay; 100 are needed")
     times = np.array([frame.time for frame in inside])
-    position = find_tails(np.stack([frame.pixels for frame in inside])).positions
+    position = find_tail_positions(np.stack([frame.pixels for frame in inside]))
     position /= position.std()
     fit = _Fit(angle, times, position)
     delay, log_rate = fit.best()
@@ -228,3 +231,30 @@ def _interpolate_spline(at: Floats, x: Floats, y: Floats) -> Floats:
     rise = y[index + 1] - y[index]
     square, cube = 3.0 * rise - 2.0 * left - right, left + right - 2.0 * rise
     return np.asarray(y[index] + s * (left + s * (square + s * cube)))
+
+
+def find_tail_positions(pictures: NDArray[np.uint8]) -> Floats:
+    """Return the tail's deflection towards the higher rows [px], in ten or more pictures.
+
+    pictures: shape (number, height, width)
+
+    The tail consists of the pixels that differ from the median picture, towards dark or light,
+    whichever differs more. Its position is the mean distance of its pixels from the axis of motion.
+    Raises `NoMotion`.
+    """
+    motion = find_motion(pictures)
+    height, width = motion.energy.shape
+    moving = motion.energy > _MOTION_THRESHOLD * motion.energy.max()
+    rows, columns = np.nonzero(moving)
+    values = pictures[:, rows, columns].astype(np.float32)
+    light = pictures.mean(axis=(1, 2), dtype=np.float32)
+    values *= (float(light.mean()) / np.maximum(light, 1.0))[:, None]
+    values -= np.median(values, axis=0)
+    if float(np.einsum("ij,ij,ij->", values, values, values, dtype=np.float64)) < 0.0:
+        values = -values
+    values -= _TAIL_THRESHOLD * float(np.quantile(values, 0.99))
+    np.maximum(values, 0.0, out=values)
+    distance = (rows - motion.axis.rows(height, width)[columns]).astype(np.float32)
+    mass = values.sum(axis=1)
+    positions: Floats = (values @ distance / np.maximum(mass, 1e-6)).astype(np.float64)
+    return positions

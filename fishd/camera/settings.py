@@ -9,7 +9,7 @@ import msgspec
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.core import strict_yaml, text
 from fishd.core.addresses import find_connect_problem, find_listen_problem
 from fishd.core.errors import ConfigError

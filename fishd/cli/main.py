@@ -28,7 +28,7 @@ VERBS = {
         ),
         "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
         "agent": Verb("agent", "agent", "Let a policy outside fishd swim the fish."),
-        "policies": Verb("policies", "policies", "List the named policies, or show one."),
+        "policies": Verb("control", "policies", "List the named policies, or show one."),
     },
     "Experiment": {
         "measure": Verb("measure", "measure", "Measure a controller's thrust, with its interval."),

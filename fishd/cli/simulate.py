@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import fish_options
-from fishd.cli.free_swim_options import DEFAULT_SETTLE_S, SwimmerOptions, swimmer_options
+from fishd.cli.free_swim import DEFAULT_SETTLE_S, SwimmerOptions, swim, swimmer_options
 from fishd.cli.options import ControllerGroup, for_option, json_option
 from fishd.cli.output import (
     echo,
@@ -91,8 +91,6 @@ def _simulate(
             writer = stack.enter_context(_open_recording(recording))
             on_start = partial(_describe, writer, config)
         if is_swimmer:
-            from fishd.cli.free_swim import swim
-
             run_arguments = (config, name, parameters, seconds, settle, writer, on_start)
             return swim(run_arguments, swimmer_options_given, as_json)
         report = run(config, name, parameters, seconds, settle, writer, on_start)

@@ -12,7 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config, adopt
 from fishd.controllers.policy.card import Card
 from fishd.controllers.policy.file import FRAMES, INPUT, PolicyFile

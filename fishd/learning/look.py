@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.camera.axis import find_motion
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.controllers.policy import opening
 from fishd.controllers.policy.card import Card, History

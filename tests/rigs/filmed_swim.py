@@ -3,8 +3,7 @@
 from itertools import pairwise
 
 from fishd.camera.latency import Force
-from fishd.camera.simulated.camera import SimulatedCamera, Tail
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCamera, SimulatedCameraSettings, Tail
 from fishd.cli.camera.latency import force_windows
 from fishd.config import load
 from fishd.core.camera_frames import Frame

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.policies import ActorCriticPolicy
 
-from fishd.camera.simulated.settings import DEFAULT
+from fishd.camera.simulated import DEFAULT
 from fishd.config import Config
 from fishd.controllers.policy.card import Card, Window
 from fishd.lab.links.simulated_link import Camera, SimulatedLink

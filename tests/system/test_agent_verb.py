@@ -22,7 +22,7 @@ from rigs.processes import (
     wait_until,
 )
 
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.client import Fish
 from fishd.config import Config
 from fishd.core.camera_frames import StackSettings

@@ -21,8 +21,7 @@ from common.daemon import Fishd
 from common.machine import machine_in_short
 from common.processes import BIN
 from common.report import Options, Report, progress, quantile, table
-from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
-from fishd.camera.simulated.tail_painter import TailPainter
+from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings, TailPainter
 
 DOCUMENT = "how-to/camera.md"
 MAX_AGE_S = 10e-3

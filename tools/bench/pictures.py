@@ -20,7 +20,7 @@ from msgspec.structs import replace
 from bench.learning_curves import learning_curves
 from bench.trainings import Row, Trained, rig, settings_of, several
 from common.report import DOCS, Options, Report, progress, table
-from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.lab.compare.contestants import best_on_grid
 from fishd.lab.links.simulated_link import Camera, SimulatedLink

@@ -12,7 +12,7 @@ import joblib
 from msgspec.structs import replace
 
 from common.report import DOCS, progress, spread
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config, load
 from fishd.learning import settings as training
 from fishd.learning.env.evaluation import Evaluation, judge

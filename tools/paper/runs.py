@@ -9,7 +9,7 @@ import joblib
 from msgspec.structs import replace
 
 from common.report import DOCS
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.estimation import EstimatorSettings
 from fishd.lab.compare.contestants import Contestant, build

@@ -17,7 +17,7 @@ from msgspec import UNSET, Struct, UnsetType
 
 from fishd.camera.clock_offset import ClockOffset, clock_reader
 from fishd.camera.settings import SimulatedSettings
-from fishd.camera.simulated.camera import SimulatedCamera, Tail
+from fishd.camera.simulated import SimulatedCamera, Tail
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.client import Fish
 from fishd.client.connection import LATE_ANSWER_WAIT_MS

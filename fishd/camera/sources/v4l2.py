@@ -7,12 +7,14 @@ import select
 import time
 from collections.abc import Callable
 
+import numpy as np
+import simplejpeg
 from linuxpy.video.device import Frame
 
 from fishd.camera.settings import V4l2Settings
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
-from fishd.camera.sources.decoding import Broken, decode_grey
 from fishd.camera.sources.v4l2_device import BUFFERS, OpenCamera, explain_error, open_camera
+from fishd.core.camera_frames import Pixels
 from fishd.core.clock import read_boot_id
 
 RETRY_PERIOD_S = 1.0
@@ -34,6 +36,10 @@ _ARRIVAL = (
     "the driver's time stamps are not those of the monotonic clock: times are those of arrival, "
     "which include the camera's delay"
 )
+
+
+class Broken(ValueError):
+    """A frame cannot be decoded."""
 
 
 class V4l2Source:
@@ -168,3 +174,40 @@ class _Stream:
         if has_valid_stamp and flags & _SOURCE_MASK == _START_OF_EXPOSURE:
             half = -half
         return (stamp if has_valid_stamp else arrived) - half - self._settings.delay
+
+
+def decode_grey(data: bytes, fourcc: str, width: int, height: int, line: int) -> Pixels:
+    """Return the picture, shape (height, width); raises `Broken`.
+
+    fourcc: MJPG, YUYV or GREY; line: bytes per line of an uncompressed format
+    """
+    if fourcc == "MJPG":
+        picture = _decode_jpeg(data)
+        if picture.shape != (height, width):
+            raise Broken(f"the picture has {picture.shape[1]} x {picture.shape[0]} px")
+        return picture
+    step = 2 if fourcc == "YUYV" else 1
+    line = max(line, step * width)
+    if len(data) < line * (height - 1) + step * width:
+        raise Broken(f"the frame has only {len(data)} bytes")
+    lines = np.zeros(height * line, np.uint8)
+    received = np.frombuffer(data, np.uint8)[: height * line]
+    lines[: len(received)] = received
+    return np.ascontiguousarray(lines.reshape(height, line)[:, : step * width : step])
+
+
+def _decode_jpeg(data: bytes) -> Pixels:
+    try:
+        pixels = _run_decoder(data, strict=True)
+    except ValueError as error:
+        if "extraneous" not in str(error).lower():  # harmless, and many cameras send such bytes
+            raise Broken(str(error)) from None
+        pixels = _run_decoder(data, strict=False)
+    return pixels
+
+
+def _run_decoder(data: bytes, *, strict: bool) -> Pixels:
+    pixels = simplejpeg.decode_jpeg(
+        data, colorspace="GRAY", fastdct=True, fastupsample=True, strict=strict
+    )
+    return np.asarray(pixels, np.uint8)[:, :, 0]

@@ -6,8 +6,8 @@ from fishd.cli.verbs import Verb, Verbs
 
 VERBS = {
     "Draw": {
-        "wake": Verb("swimmer.wake", "wake", "Draw the water around it, from a checkpoint."),
-        "midlines": Verb("swimmer.midlines", "midlines", "Draw how its body moves in a beat."),
+        "wake": Verb("swimmer.draw", "wake", "Draw the water around it, from a checkpoint."),
+        "midlines": Verb("swimmer.draw", "midlines", "Draw how its body moves in a beat."),
     },
 }
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from msgspec import Struct
 from msgspec.structs import replace
 
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config, Start
 from fishd.core.signals import Publisher, Tick
 from fishd.lab.compare.contestants import Contestant, build, parse, refusal

@@ -2,8 +2,7 @@
 
 from typing import Any
 
-from fishd.camera.simulated.settings import SimulatedCameraSettings
-from fishd.camera.simulated.sight import SimulatedSight
+from fishd.camera.simulated import SimulatedCameraSettings, SimulatedSight
 from fishd.controllers.base import Controller, Limits
 from fishd.controllers.policy import file, library, opening
 from fishd.controllers.policy.controller import PpoParameters

@@ -7,7 +7,7 @@ from typing import Any
 
 from msgspec import Struct
 
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.beats import Reversals
 from fishd.core.signals import Event, Tick

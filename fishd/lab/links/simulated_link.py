@@ -6,8 +6,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from fishd.assembly import build_loop, simulated_fish
-from fishd.camera.simulated.settings import SimulatedCameraSettings
-from fishd.camera.simulated.sight import SimulatedSight
+from fishd.camera.simulated import SimulatedCameraSettings, SimulatedSight
 from fishd.config import Config, Start, check_tethered
 from fishd.controllers.base import Controller
 from fishd.core.camera_frames import Stack, StackSettings

@@ -8,7 +8,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from fishd.camera.simulated.sight import SimulatedSight
+from fishd.camera.simulated import SimulatedSight
 from fishd.config import Config, Start
 from fishd.controllers.dwell import DwellLimit
 from fishd.core.camera_frames import Stack

@@ -11,7 +11,7 @@ from msgspec import Struct
 from fishd import __version__
 from fishd import config as configuration
 from fishd.camera import settings as cameras
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.controllers.policy.card import Card, Feature, Provenance
 from fishd.core import strict_yaml

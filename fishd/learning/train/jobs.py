@@ -6,7 +6,7 @@ from typing import Literal
 
 from msgspec import Struct
 
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.errors import ConfigError
 from fishd.lab.experiment import On

@@ -12,7 +12,7 @@ from rigs.processes import call, one_line
 
 from fishd.camera import main
 from fishd.camera.settings import CameraSettings, SimulatedSettings, hide_secrets, load
-from fishd.camera.simulated.settings import WEB
+from fishd.camera.simulated import WEB
 from fishd.core.errors import ConfigError
 
 

@@ -13,8 +13,7 @@ from rigs.virtual_pi_process import virtual_pi
 
 from fishd.camera.client import CameraLost
 from fishd.camera.messages import FrameHeader
-from fishd.camera.simulated.camera import SimulatedCamera, Tail
-from fishd.camera.simulated.settings import SimulatedCameraSettings
+from fishd.camera.simulated import SimulatedCamera, SimulatedCameraSettings, Tail
 from fishd.client import Agent, Fish
 from fishd.core.camera_frames import TIME_TOLERANCE_S, Frame, Stack, StackSettings
 from fishd.core.signals import Tick

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 from rigs.seeing_policies import babbled
 from stable_baselines3 import PPO
 
-from fishd.camera.simulated.settings import DEFAULT
+from fishd.camera.simulated import DEFAULT
 from fishd.cli.main import fishctl
 from fishd.config import Config
 from fishd.controllers.policy import file

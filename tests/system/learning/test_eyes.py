@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 pytest.importorskip("stable_baselines3", reason="install the extra 'learn'")
 
 from fishd.camera.axis import NoMotion
-from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import Stack, StackSettings
 from fishd.lab.links.link import StepResult

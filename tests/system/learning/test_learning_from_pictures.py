@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from rigs.swimming import brief_job, rows
 
 from fishd.camera.axis import NoMotion
-from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
+from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import StackSettings
 from fishd.lab.links.simulated_link import Camera, SimulatedLink

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from rigs.policy_files import FLIP, of_pixels, seeing_card, velocity_follower, write
 
 from fishd.camera.axis import NoMotion
-from fishd.camera.simulated.settings import DEFAULT
+from fishd.camera.simulated import DEFAULT
 from fishd.cli.main import fishctl
 from fishd.config import Config
 from fishd.core.errors import FishdError, ParameterError, PolicyError

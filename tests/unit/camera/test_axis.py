@@ -7,8 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from fishd.camera.axis import NoMotion, find_motion
-from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
-from fishd.camera.simulated.tail_painter import TailPainter
+from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings, TailPainter
 from fishd.core.camera_frames import Pixels
 
 BAD = replace(WEB, contrast=50.0, noise=10.0, light_drift=0.3)

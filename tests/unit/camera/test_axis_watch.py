@@ -9,7 +9,7 @@ from rigs import filmed_swim
 from rigs.filmed_swim import filmed
 
 from fishd.camera.axis_watch import SEARCH_PERIOD_S, AxisWatch
-from fishd.camera.simulated.settings import DEFAULT, WEB
+from fishd.camera.simulated import DEFAULT, WEB
 from fishd.core.camera_frames import Frame
 
 swum = cache(filmed_swim.swum)  # ticks are immutable

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fishd.camera.simulated.camera import Tail
+from fishd.camera.simulated import Tail
 from fishd.camera.sources.simulated import Foresight, Swimmer, TickTruth
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import SimulationSettings

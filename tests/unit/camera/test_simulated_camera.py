@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from fishd.camera.simulated.camera import SimulatedCamera, Tail
-from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
-from fishd.camera.simulated.tail_painter import TailPainter
+from fishd.camera.simulated import (
+    DEFAULT,
+    WEB,
+    SimulatedCamera,
+    SimulatedCameraSettings,
+    Tail,
+    TailPainter,
+)
 from fishd.core.camera_frames import Frame
 
 CLEAR = replace(DEFAULT, noise=0.0)

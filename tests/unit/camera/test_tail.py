@@ -8,8 +8,8 @@ from msgspec.structs import replace
 from rigs import filmed_swim
 from rigs.filmed_swim import filmed
 
-from fishd.camera.simulated.settings import DEFAULT, WEB, SimulatedCameraSettings
-from fishd.camera.tail import find_tails
+from fishd.camera.latency import find_tail_positions
+from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 
 swum = cache(filmed_swim.swum)  # ticks are immutable
 
@@ -22,14 +22,14 @@ def test_its_position_follows_the_fin_angle(
     ticks = swum(10.0)
     camera = replace(camera, rate=None, latency=0.0, jitter=0.0)
     pictures = np.stack([frame.pixels for frame in filmed(ticks, camera)])
-    tails = find_tails(255 - pictures if light_tail else pictures)
+    positions = find_tail_positions(255 - pictures if light_tail else pictures)
     angles = [float(tick.alpha) for tick in ticks[1:]]  # type: ignore[arg-type]
-    assert np.corrcoef(tails.positions, angles)[0, 1] > 0.985
+    assert np.corrcoef(positions, angles)[0, 1] > 0.985
 
 
 def test_it_lies_to_the_side_of_the_higher_rows_where_it_is_bent_to_them() -> None:
     ticks = swum(20.0)
     frames = filmed(ticks, replace(DEFAULT, rate=None, latency=0.0))
-    positions = find_tails(np.stack([frame.pixels for frame in frames])).positions
+    positions = find_tail_positions(np.stack([frame.pixels for frame in frames]))
     most = int(np.argmax([float(tick.alpha) for tick in ticks[1:]]))  # type: ignore[arg-type]
     assert 3.0 < positions[most] < 20.0

@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 from rigs.policy_files import seeing_card, velocity_follower, write
 
-from fishd.camera.simulated.settings import DEFAULT, WEB
+from fishd.camera.simulated import DEFAULT, WEB
 from fishd.config import Config, load
 from fishd.core.errors import ParameterError
 from fishd.lab.compare import compare

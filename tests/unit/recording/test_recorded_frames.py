@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from rigs.filmed_swim import filmed, swum
 from rigs.harness import Rig
 
-from fishd.camera.simulated.settings import DEFAULT
+from fishd.camera.simulated import DEFAULT
 from fishd.core.camera_frames import Frame
 from fishd.core.errors import RecordingError
 from fishd.core.signals import Tick

@@ -1,1 +1,0 @@
-"""Simulated camera, which draws the tail for a fin angle and a light."""
