@@ -221,7 +221,7 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
 
 def _check_camera(camera: str | None, chosen: "list[Contestant]") -> None:
     """Raise `UsageError` for a camera if no contestant sees pictures."""
-    from fishd.lab.compare.seeing import may_see_pictures
+    from fishd.lab.compare.contestants import may_see_pictures
 
     policies = (
         contestant.parameters.get("policy")

@@ -173,7 +173,7 @@ def _write_config(target: Path, text: str) -> None:
 
 
 def _print_result(identification: "Identification") -> None:
-    from fishd.lab.identification.formatting import format_estimate, format_if_ratio_holds
+    from fishd.lab.identification.figure import format_estimate, format_if_ratio_holds
 
     echo(identification.headline)
     echo()

@@ -39,10 +39,9 @@ from fishd.core.schema import Field, format_values, suggest, units_of
 if TYPE_CHECKING:
     from fishd.core.calibration import ForceCalibration
     from fishd.lab.experiment import Experiment
-    from fishd.lab.optimise.aim import Aim
     from fishd.lab.optimise.least_power import LeastPower
     from fishd.lab.optimise.search import Proposal, Range, Search
-    from fishd.lab.optimise.trials import Trial
+    from fishd.lab.optimise.trials import Aim, Trial
     from fishd.lab.session import Session
 
 
@@ -120,8 +119,7 @@ def _optimise(
 ) -> int:
     from fishd.lab import drawing
     from fishd.lab.measurement import MEAN_REST_S
-    from fishd.lab.optimise.aim import Aim
-    from fishd.lab.optimise.trials import trial_durations
+    from fishd.lab.optimise.trials import Aim, trial_durations
 
     drawing.check_installed()
     if picture:

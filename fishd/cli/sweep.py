@@ -28,9 +28,8 @@ from fishd.core.signals import ControllerInfo
 if TYPE_CHECKING:
     from fishd.lab.experiment import Experiment
     from fishd.lab.sweep.curves import Best, WholeTicks
-    from fishd.lab.sweep.folder import SweepFolder
     from fishd.lab.sweep.grid import Point
-    from fishd.lab.sweep.results import PointResult, Quantity
+    from fishd.lab.sweep.results import PointResult, Quantity, SweepFolder
 
 DEFAULT_POINT_S = 30.0
 
@@ -227,7 +226,7 @@ class _Sweep:
 
     def _open_folder(self, experiment: "Experiment") -> "SweepFolder":
         """Open the table, and print how many points it already has."""
-        from fishd.lab.sweep.folder import SweepFolder
+        from fishd.lab.sweep.results import SweepFolder
 
         columns = dict.fromkeys(name for point in self.points for name in point.columns())
         folder = SweepFolder(experiment, list(columns))

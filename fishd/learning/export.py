@@ -25,7 +25,7 @@ from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
 from fishd.learning.env.perception import Perception
-from fishd.learning.eyes.making import random_angles
+from fishd.learning.eyes import random_angles
 from fishd.learning.picture_networks import PictureExtractor, network_nodes
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs

@@ -8,9 +8,9 @@ from fishd.camera.simulated import DEFAULT
 from fishd.config import Config
 from fishd.controllers.policy.card import Card, Window
 from fishd.lab.links.simulated_link import Camera, SimulatedLink
+from fishd.learning import eyes
 from fishd.learning.env.environment import features
 from fishd.learning.env.perception import Perception
-from fishd.learning.eyes import making
 from fishd.learning.ppo import make_policy
 from fishd.learning.run_folder.runs import make_card
 from fishd.learning.settings import TrainingSettings
@@ -21,12 +21,12 @@ SPREAD = 30.0
 
 def babbled(settings: TrainingSettings) -> tuple[Card, ActorCriticPolicy, Perception]:
     """Return the state of a training after its babble."""
-    config, eye = Config(), making.make_eye(settings)
+    config, eye = Config(), eyes.make_eye(settings)
     assert eye
     link = SimulatedLink(config, camera=Camera(DEFAULT, eye.stack))
     link.reset()
     frames, angles = [], []
-    for angle in making.random_angles(settings.seed, 200, config.amplitude_limit).tolist():
+    for angle in eyes.random_angles(settings.seed, 200, config.amplitude_limit).tolist():
         link.step(angle)
         if (stack := link.look()) is not None:
             frames.append(stack[0])

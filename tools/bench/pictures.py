@@ -25,7 +25,7 @@ from fishd.config import Config
 from fishd.lab.compare.contestants import best_on_grid
 from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.eyes.making import make_eye
+from fishd.learning.eyes import make_eye
 from fishd.learning.settings import TrainingSettings
 from fishd.virtual.plant.optimum import best_square_wave
 

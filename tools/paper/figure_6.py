@@ -14,9 +14,8 @@ from fishd.config import Config, load
 from fishd.lab import drawing
 from fishd.lab.drawing import BLACK, BLUE, GREEN, ORANGE, PURPLE
 from fishd.lab.simulation import EncodingPublisher
-from fishd.lab.sweep.free_swimming import swim_freely
 from fishd.lab.sweep.grid import Point
-from fishd.lab.sweep.measuring import Lengths
+from fishd.lab.sweep.measuring import Lengths, swim_freely
 from fishd.lab.sweep.results import SpeedResult
 from paper.runs import FOLDER, Row, column, read, write
 

@@ -12,8 +12,7 @@ from common.report import DOCS
 from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.estimation import EstimatorSettings
-from fishd.lab.compare.contestants import Contestant, build
-from fishd.lab.compare.seeing import SeeingController
+from fishd.lab.compare.contestants import Contestant, SeeingController, build
 from fishd.lab.simulation import KeepingPublisher, Report, VirtualRun, judge
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters

@@ -8,9 +8,8 @@ import click
 from fishd.cli.options import F, FiniteRange, json_option
 from fishd.cli.output import echo, format_count, print_json, print_paths
 from fishd.core import text
-from fishd.lab.swimmer import midline_figure, view, wake_figure
-from fishd.lab.swimmer.envelope import compute_envelope
-from fishd.lab.swimmer.files import read_midlines, restore_fish
+from fishd.lab.swimmer import wake as water
+from fishd.lab.swimmer.midlines import compute_envelope, draw_midlines, read_midlines
 from fishd.recording.folder import check_new_files
 from fishd.virtual.swimmer import checkpoint
 
@@ -64,7 +63,7 @@ def midlines(
     beats = len(envelope.periods)
     frequency = beats / float(envelope.periods.sum())
     title = f"{text.line(file.stem)}: midlines of the last of {format_count(beats, 'beat')}, "
-    midline_figure.draw_midlines(envelope, f"{title}{frequency:.2f} Hz".replace("$", r"\$"), path)
+    draw_midlines(envelope, f"{title}{frequency:.2f} Hz".replace("$", r"\$"), path)
     tail = float(envelope.amplitudes[:, -1].mean())
     if as_json:
         gait = {"beats": beats, "frequency": frequency, "tail": tail}
@@ -79,7 +78,7 @@ def midlines(
 @click.option(
     "--field",
     "fields",
-    type=click.Choice(view.QUANTITIES),
+    type=click.Choice(water.QUANTITIES),
     multiple=True,
     default=("vorticity", "speed"),
     show_default=True,
@@ -98,7 +97,7 @@ def midlines(
 @json_option
 def wake(
     file: Path,
-    fields: tuple[view.Quantity, ...],
+    fields: tuple[water.Quantity, ...],
     whole: bool,
     limit: float | None,
     target: Path,
@@ -118,9 +117,9 @@ def wake(
         )
     paths = {field: target / f"{file.stem}-{field}.{form}" for field in fields}
     check_new_files(paths.values(), replace=force)
-    fish = restore_fish(checkpoint.load(file))
-    window = (view.whole_window if whole else view.window_around)(fish.settings)
+    fish = water.restore_fish(checkpoint.load(file))
+    window = (water.whole_window if whole else water.window_around)(fish.settings)
     for field, path in paths.items():
-        scene = view.take_view(fish, field, window, wake_figure.COLUMNS)
-        wake_figure.draw_wake(scene, limit or view.choose_colour_limit(fish.settings, field), path)
+        scene = water.take_view(fish, field, window, water.COLUMNS)
+        water.draw_wake(scene, limit or water.choose_colour_limit(fish.settings, field), path)
     print_paths(paths.values(), as_json)

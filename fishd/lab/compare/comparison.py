@@ -12,8 +12,14 @@ from msgspec.structs import replace
 from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config, Start
 from fishd.core.signals import Publisher, Tick
-from fishd.lab.compare.contestants import Contestant, build, parse, refusal
-from fishd.lab.compare.seeing import SeeingController, may_see_pictures
+from fishd.lab.compare.contestants import (
+    Contestant,
+    SeeingController,
+    build,
+    may_see_pictures,
+    parse,
+    refusal,
+)
 from fishd.lab.ranking import (
     Candidate,
     complexity,

@@ -13,7 +13,7 @@ from fishd.controllers.base import Limits
 from fishd.controllers.policy.pilot import Pilot
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.signals import Tick
-from fishd.lab.compare.seeing import sees_pictures
+from fishd.lab.compare.contestants import sees_pictures
 from fishd.lab.session import Disturbed, LiveSession
 
 CAMERA_TIMEOUT_S = 2.0

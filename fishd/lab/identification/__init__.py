@@ -3,8 +3,7 @@
 `identify` fits recordings; `experiment` swims a fish with an informative command.
 """
 
-from fishd.lab.identification.estimation import DEFAULT, check, identify
-from fishd.lab.identification.experiment import experiment
+from fishd.lab.identification.estimation import DEFAULT, check, experiment, identify
 from fishd.lab.identification.passages import Unidentifiable
 from fishd.lab.identification.result import Channel, Estimate, Fit, Identification
 

@@ -5,6 +5,7 @@ and K_d λ. The assumption K_y = K separates K and λ. Its uncertainty is part o
 unless `lateral_inertia_ratio` is not in `fit`.
 """
 
+import math
 import os
 from collections.abc import Sequence
 from itertools import product
@@ -14,6 +15,7 @@ import msgspec
 import numpy as np
 
 from fishd.core import text
+from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
 from fishd.core.schema import suggest
 from fishd.lab.identification import misfit
@@ -30,11 +32,13 @@ from fishd.lab.identification.result import (
     Identification,
 )
 from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, summarise
+from fishd.lab.session import Session
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
 
 DEFAULT = (
     *("omega0", "xi", "quadratic_drag", "coupling", "servo_speed", "servo_lag"),
@@ -60,6 +64,10 @@ _ROUGH_STEPS = 12
 """Largest number of steps of a rough fit, which compares start values."""
 _STARTS = tuple(product((1.0, 0.5, 2.0), (0.01, 0.06, 0.12)))
 """Start values: natural frequency, as a multiple of that of the given fish, and delay [s]."""
+REST_S = 4.0
+"""Length of the rest before the swim [s]: the tail stands still, so its state is known."""
+MIN_EXPERIMENT_S = 30.0
+"""Length of the shortest experiment; a shorter one determines too little [s]."""
 
 
 def identify(
@@ -225,3 +233,19 @@ def _settling_time(values: dict[str, float]) -> float:
     omega0, xi = values["omega0"], values["xi"]
     slowest = 0.5 * omega0 * (xi - np.sqrt(max(0.0, xi * xi - 4.0)))
     return float(min(_SETTLE_TIME_CONSTANTS / slowest, _MAX_SETTLE_S))
+
+
+def experiment(session: Session, seconds: float = 180.0) -> "DataFrame":
+    """Rest, then swim `excitation` at the full amplitude of the rig; return one row per tick.
+
+    seconds: length of the experiment, rest included [s]
+    Raises `ParameterError` for less than `MIN_EXPERIMENT_S` or an infinite time, `Disturbed` where
+    another client takes the fish, and the errors of the session.
+    """
+    if not MIN_EXPERIMENT_S <= seconds < math.inf:
+        raise ParameterError(
+            f"an experiment of {seconds:g} s: {MIN_EXPERIMENT_S:g} s or more are needed"
+        )
+    ticks = session.rest(REST_S)
+    ticks += session.swim("excitation", {}, seconds - REST_S)
+    return ticks_to_frame(ticks)

@@ -1,6 +1,6 @@
 """Bayesian optimisation of noisy measurements: the next candidate, and the best parameters.
 
-A Gaussian process models the objective as a function of the parameters (`fishd.lab.optimise.aim`
+A Gaussian process models the objective as a function of the parameters (`fishd.lab.optimise.trials`
 names the objectives; the default is the thrust). Each measurement has its own error. The next
 candidate is the place of the largest expected improvement (Jones et al., J. Glob. Optim. 13 (1998)
 455). As measurements are noisy, the improvement is over the best predicted mean of the measured

@@ -1,8 +1,11 @@
-"""Measurement of a search's candidates on a rig: the fish swims with each, and rests between."""
+"""Measurement of a search's candidates on a rig, and the aim that they are judged by.
+
+The fish swims with each candidate, and rests between.
+"""
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 from fishd.core.errors import ConfigError, ParameterError
 from fishd.core.estimation import SWIM_SETTLE_TIME_S
@@ -14,6 +17,7 @@ from fishd.lab.measurement import MEAN_REST_S, Step, evaluate, to_samples
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.session import Session, refuse_lost
+from fishd.lab.statistics import per_watt
 
 MIN_STEADY_S = 1.5
 """Shortest measured time of each candidate, after it has settled [s]."""
@@ -222,3 +226,41 @@ def _read_bounds(field: Field) -> tuple[float, float]:
     if len(parts) != 2:
         return -math.inf, math.inf
     return float(parts[0]), float(parts[1])
+
+
+class Aim(NamedTuple):
+    """Objective or target of a search."""
+
+    objective: Literal["thrust", "thrust-per-watt"] = "thrust"
+    """Quantity to maximise; ignored if there is a target."""
+    target: float | None = None
+    """Thrust to reach at the least power [N]."""
+
+    def make_search(self, ranges: Sequence[Range], seed: int) -> Search | LeastPower:
+        """Return a new search with this aim; raises `ParameterError`."""
+        if self.target is not None:
+            return LeastPower(ranges, self.target, seed)
+        return Search(ranges, seed)
+
+    def observe(self, search: Search | LeastPower, trial: Trial) -> None:
+        """Add a measured candidate to a search, with the quantity of this aim.
+
+        Raises `ParameterError` if the aim needs the power, and the power is unknown.
+        """
+        thrust = trial.thrust, trial.error
+        if self.objective == "thrust" and self.target is None:
+            assert isinstance(search, Search)
+            search.observe(trial.parameters, *thrust)
+            return
+        if not (math.isfinite(trial.power) and trial.power > 0.0):
+            raise ParameterError(
+                "this needs the power of the servo, and the fish has no power meter that can be "
+                "read: set power_meter in its configuration, see docs/how-to/power.md"
+            )
+        if isinstance(search, LeastPower):
+            search.observe(trial.parameters, thrust, (trial.power, trial.power_error))
+            return
+        value, error = per_watt(*thrust, trial.power, trial.power_error)
+        assert value is not None
+        assert error is not None
+        search.observe(trial.parameters, value, error)

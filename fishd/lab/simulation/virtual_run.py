@@ -1,20 +1,26 @@
-"""The control loop of fishd on a simulated fish in virtual time, and publishers of its ticks."""
+"""The control loop of fishd on a simulated fish in virtual time; its ticks, also as a table."""
 
+import os
 from collections.abc import Mapping
 from contextlib import ExitStack
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 from msgspec.structs import replace
 
 from fishd import __version__
 from fishd.assembly import build_loop, open_fish_in_virtual_time
-from fishd.config import Config
+from fishd.config import Config, adopt, load
 from fishd.controllers import registry
 from fishd.core.clock import VirtualClock, virtual_slots
+from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Event, Publisher, Tick
 from fishd.virtual.plant.base import TrueWindow
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
 
 MAX_RUN_S = 1e8
 """Upper limit of the length of a run [s]: three years."""
@@ -113,3 +119,39 @@ def check_length(what: str, seconds: float) -> None:
             f"a {what} of {seconds:g} s is not possible: a number from 0 to {MAX_RUN_S:g} s is "
             "needed"
         )
+
+
+def run(
+    config: Config | str | os.PathLike[str] | None = None,
+    controller: str = "swing",
+    parameters: Mapping[str, Any] | None = None,
+    seconds: float = 60.0,
+    *,
+    overrides: Mapping[str, Any] | None = None,
+) -> "DataFrame":
+    """Swim a simulated fish with a controller; return its ticks as a table, see `ticks_to_frame`.
+
+    config: path of a YAML file, or result of `fishd.config.load`; None for the defaults
+    overrides: values by dotted key, such as `{"plant.xi": 0.9}`
+
+    A controller that fails ends in mode `fault`, as on a robot: the column `mode` says so.
+    Raises `ConfigError`, `UnknownController`, `ParameterError`, and `MissingPackage` without
+    pandas (extra: lab).
+    """
+    check_length("run", seconds)
+    settings = [f"{key}={_to_yaml(value)}" for key, value in (overrides or {}).items()]
+    if isinstance(config, Config):
+        config = adopt(msgspec.to_builtins(config), settings) if settings else config
+    else:
+        config = load(config, settings)
+    publisher = KeepingPublisher()
+    with VirtualRun(config, publisher) as virtual:
+        virtual.set_controller(controller, parameters or {})
+        for _ in range(max(1, round(seconds / config.tick))):
+            virtual.tick()
+    return ticks_to_frame(publisher.ticks)
+
+
+def _to_yaml(value: Any) -> str:
+    """Return a value, possibly a numpy number, as YAML text."""
+    return msgspec.json.encode(value.item() if hasattr(value, "item") else value).decode()

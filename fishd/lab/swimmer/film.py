@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.core.errors import FishdError, MissingPackage
-from fishd.lab.swimmer.view import (
+from fishd.lab.swimmer.wake import (
+    COLOURS,
     SIGNED_QUANTITIES,
     UNITS,
     Quantity,
@@ -21,7 +22,6 @@ from fishd.lab.swimmer.view import (
     take_view,
     window_around,
 )
-from fishd.lab.swimmer.wake_figure import COLOURS
 from fishd.virtual.swimmer.fish import Fish
 from fishd.virtual.swimmer.settings import SwimmerSettings
 

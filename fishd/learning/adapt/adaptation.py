@@ -15,7 +15,6 @@ from fishd.lab.measurement import MEAN_REST_S, measure
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import simulate
 from fishd.learning.adapt import steps as do
-from fishd.learning.adapt.practice import MAX_TRAININGS, simulated_config, train_policy
 from fishd.learning.adapt.state import (
     FISH,
     POLICY,
@@ -26,6 +25,7 @@ from fishd.learning.adapt.state import (
     Trained,
     Tried,
 )
+from fishd.learning.adapt.steps import MAX_TRAININGS, simulated_config, train_policy
 from fishd.learning.adapt.verdict import SQUARE, judge
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from fishd.lab import error_budget
 from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, open_figure
+from fishd.lab.identification.figure import format_estimate
 from fishd.lab.identification.fit import LOGARITHMIC
-from fishd.lab.identification.formatting import format_estimate
 from fishd.lab.identification.result import Estimate
 from fishd.lab.ranking import format_ratio
 from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State, Verdict

@@ -1,6 +1,11 @@
-"""The steps of an adaptation that need the fish: excitation, swing's search, square waves."""
+"""The steps of an adaptation: with the fish, then the training in simulation.
+
+Excitation, swing's search and square waves need the fish; the policy is trained on the cloud of
+fish that agree with the fit.
+"""
 
 import math
+import shutil
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +15,11 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from fishd.config import Config, Start
+from fishd.core.errors import PolicyError
 from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
+from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC
+from fishd.lab.identification.result import RIG_PARAMETERS
 from fishd.lab.measurement import MEAN_REST_S, MEAN_SWIM_S
 from fishd.lab.measurement import plan as plan_of
 from fishd.lab.optimise.search import Range, Search
@@ -21,7 +30,6 @@ from fishd.lab.optimise.trials import (
     trial_durations,
 )
 from fishd.lab.session import Session
-from fishd.learning.adapt.cloud import draw_cloud, identified_fish
 from fishd.learning.adapt.prior import (
     combine,
     correlation_of_waves,
@@ -29,9 +37,22 @@ from fishd.learning.adapt.prior import (
     is_rejected,
     model_of,
 )
-from fishd.learning.adapt.state import Fitted, Rung, Tried
+from fishd.learning.adapt.state import POLICY, TRAINING, Fitted, Rung, Trained, Tried
+from fishd.learning.export import export
+from fishd.learning.settings import (
+    EnvironmentSettings,
+    EvaluationSettings,
+    ImitationSettings,
+    PpoSettings,
+    Randomisation,
+    TrainingSettings,
+)
+from fishd.learning.train.jobs import Job, Outcome
+from fishd.learning.train.progress import Display
+from fishd.learning.train.training import train
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.optimum import best_square_wave, square_wave
+from fishd.virtual.plant.parameters import PlantParameters
 
 FITTED = (*DEFAULT, "lateral_quadratic_drag", "servo_dead_zone", "servo_reaction")
 """Fitted parameters: all that a fit can find except slack, which backlash represents."""
@@ -45,6 +66,21 @@ BUDGET = {"excitation": 0.2, "swing": 0.14, "search": 0.2}
 """Shares of the tank time; the comparison uses the remainder."""
 MIN_TANK_TIME_S = 150.0
 """Shortest tank time [s]: its excitation takes 30 s, the shortest that a fit accepts."""
+CLOUD_SIZE = 32
+"""Number of fish in the cloud."""
+EPISODE = 128
+"""Steps per episode; each episode swims one fish of the cloud."""
+MAX_NOISE = 0.3
+"""Largest noise of a tick in the training, as a share of the best thrust; more would hide the
+reward."""
+GOOD_MERIT, MAX_TRAININGS = 0.97, 3
+"""Merit with which a policy is good enough, as a share of the best square wave on its worst fish;
+and the largest number of trainings."""
+IMITATION_ROUNDS, IMITATION_FISH = 2, 64
+"""Rounds of imitation before PPO, and draws from the cloud in each round. PPO alone may stay at a
+wave that is one tick too short or too long."""
+EVALUATION_INTERVAL, OTHER_FISH = 5, 3
+"""Updates per evaluation, and number of fish of the cloud evaluated beside the identified one."""
 
 
 def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, Fitted]:
@@ -177,3 +213,128 @@ def min_measurement_time(parameters: Mapping[str, Any]) -> float:
     seconds = 2.0 * swim + 3.0 * MEAN_REST_S
     plan_of(seconds + 1e-6, parameters)
     return seconds + 1e-6
+
+
+def draw_cloud(
+    identification: Identification, seed: int = 0, count: int = CLOUD_SIZE
+) -> tuple[PlantParameters, ...]:
+    """Return fish that agree with the data; the first is the identified one itself.
+
+    They are drawn from the joint normal distribution of the errors, of logarithms for parameters
+    that are fitted as such, within the bounds of the fit. The errors include those of a misfit.
+    K_y/K is that of the identified fish: no force depends on it as long as the parameters that it
+    scales change with it.
+    """
+    centre = [_mean_of_draws(identification, name) for name in identification.names]
+    draws = np.random.default_rng(seed).multivariate_normal(
+        centre, identification.covariance, count - 1, method="eigh", check_valid="ignore"
+    )
+    fitted = identified_fish(identification)
+    return (fitted, *(_fish(fitted, identification.names, z.tolist()) for z in draws))
+
+
+def identified_fish(identification: Identification) -> PlantParameters:
+    """Return the identified fish."""
+    return msgspec.convert(identification.plant, PlantParameters)
+
+
+def _mean_of_draws(identification: Identification, name: str) -> float:
+    """Return the mean of a fitted parameter, or of its logarithm if that is fitted."""
+    value = identification[name].value
+    return float(np.log(value)) if name in LOGARITHMIC else value
+
+
+def _fish(fitted: PlantParameters, names: tuple[str, ...], z: list[float]) -> PlantParameters:
+    drawn = {}
+    for name, value in zip(names, z, strict=True):
+        low, high = BOUNDS[name]
+        plain = float(np.exp(value)) if name in LOGARITHMIC else value
+        if name not in RIG_PARAMETERS:
+            drawn[name] = min(high, max(low, plain))
+    return replace(fitted, **drawn)
+
+
+def training_settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings:
+    """Return the settings of the training."""
+    return TrainingSettings(
+        steps=steps,
+        seed=seed,
+        checkpoint_every=max(1, steps),
+        environment=EnvironmentSettings(episode=EPISODE),
+        randomisation=Randomisation(fish=fitted.cloud, offset=min(10.0, fitted.offset)),
+        imitation=ImitationSettings(rounds=IMITATION_ROUNDS, fish=IMITATION_FISH),
+        ppo=PpoSettings(decay_steps=max(1, steps)),
+        evaluation=EvaluationSettings(every=EVALUATION_INTERVAL, others=OTHER_FISH, patience=None),
+    )
+
+
+def simulated_config(config: Config, fitted: Fitted) -> Config:
+    """Return the configuration of the identified fish on its rig, with the real fish's loop."""
+    best = best_square_wave(fitted.plant, config.amplitude_limit).thrust
+    rig = replace(fitted.rig, noise=min(fitted.rig.noise, MAX_NOISE * best))
+    return replace(config, robot="simulated", plant=fitted.plant, simulation=rig, start=Start())
+
+
+def train_policy(
+    config: Config,
+    fitted: Fitted,
+    folder: Path,
+    steps: int,
+    seed: int,
+    progress: Callable[[int], None],
+) -> Trained:
+    """Train, and write the policy that did best on its worst fish into the folder.
+
+    Where its merit is less than `GOOD_MERIT`, the training is repeated with the next seed. There
+    are at most `MAX_TRAININGS` trainings, and the best of all policies is taken.
+
+    config: tick, Φ and limits of the fish; its plant and rig are not used
+    folder: folder of the adaptation; an interrupted training in it is restarted
+    progress: called with the number of finished steps
+    """
+    best: Outcome | None = None
+    display = _Steps(progress)
+    message = "it swam in no evaluation"
+    for index in range(MAX_TRAININGS):
+        place = folder / (TRAINING if index == 0 else f"{TRAINING}-{index + 1}")
+        if place.exists():
+            shutil.rmtree(place)
+        task = training_settings(fitted, steps, (seed + index) % 2**32)
+        outcome = train(
+            Job(config=simulated_config(config, fitted), settings=task, folder=place), display
+        )
+        message = outcome.message or message
+        if outcome.best and (best is None or _merit(outcome) > _merit(best)):
+            best = outcome
+        if best and _merit(best) >= GOOD_MERIT:
+            break
+    if best is None or best.best is None or best.best_evaluation is None:
+        return Trained(steps=display.steps, refused=f"the training gave no policy: {message}")
+    try:
+        export(best.best, folder / POLICY, note="of fishctl adapt")
+    except PolicyError as error:
+        return Trained(steps=display.steps, refused=str(error))
+    evaluation = best.best_evaluation
+    return Trained(
+        steps=display.steps,
+        folder=best.folder.name,
+        relative_thrust=evaluation.relative_thrust,
+        worst=evaluation.worst,
+    )
+
+
+def _merit(outcome: Outcome) -> float:
+    return outcome.best_evaluation.merit if outcome.best_evaluation else 0.0
+
+
+class _Steps(Display):
+    """A display that counts the steps of all trainings."""
+
+    def __init__(self, progress: Callable[[int], None]) -> None:
+        self._progress = progress
+        self.steps = 0
+
+    def step(self, tank_time: float) -> None:
+        """Count one step."""
+        self.steps += 1
+        self._progress(self.steps)

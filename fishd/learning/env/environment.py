@@ -29,8 +29,7 @@ from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
 from fishd.lab.links.link import Link, LinkLost
 from fishd.learning.env.perception import Perception
-from fishd.learning.eyes.base import Eye
-from fishd.learning.eyes.making import random_angles
+from fishd.learning.eyes import Eye, random_angles
 from fishd.learning.settings import EnvironmentSettings
 from fishd.virtual.plant.optimum import best_square_wave
 

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from fishd.controllers.policy.card import ONE_TICK, Feature, History, Window
 from fishd.core.camera_frames import Stack
 from fishd.core.signals import Observation
-from fishd.learning.eyes.base import Eye
+from fishd.learning.eyes import Eye
 
 
 class Perception:

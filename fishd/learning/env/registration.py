@@ -44,7 +44,7 @@ def swim(
     from fishd.lab.links.simulated_link import Camera, SimulatedLink
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.env.fish_variation import episode_fish
-    from fishd.learning.eyes.making import make_eye
+    from fishd.learning.eyes import make_eye
 
     fish = load(config, overrides)
     chosen = training.load(settings)
@@ -83,7 +83,7 @@ def swim_on_daemon(
     """
     from fishd.lab.links.fishd_link import FishdLink, config_of
     from fishd.learning.env.environment import SwimEnv
-    from fishd.learning.eyes.making import make_eye
+    from fishd.learning.eyes import make_eye
 
     chosen = training.load(settings)
     fish = load(config, overrides) if config else adopt(config_of(endpoint), overrides)

@@ -23,10 +23,10 @@ from fishd.controllers.policy.card import Card, decode, encode
 from fishd.core import files
 from fishd.core.errors import FishdError, PolicyError
 from fishd.lab.experiment import On
+from fishd.learning import eyes
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.perception import Perception
-from fishd.learning.eyes import making as eyes
-from fishd.learning.eyes.base import Eye
+from fishd.learning.eyes import Eye
 from fishd.learning.settings import TrainingSettings
 
 # Modules that import torch are imported where they are used: most functions need no networks.

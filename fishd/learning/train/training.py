@@ -22,11 +22,11 @@ from fishd.core.errors import FishdError
 from fishd.lab.links.fishd_link import FishdLink
 from fishd.lab.links.link import Link, LinkLost
 from fishd.lab.links.simulated_link import SimulatedLink
+from fishd.learning import eyes
 from fishd.learning.env import evaluation
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.fish_variation import episode_fish
-from fishd.learning.eyes import making as eyes
 from fishd.learning.imitation import Imitation
 from fishd.learning.ppo import (
     DeterministicPolicy,
@@ -38,11 +38,11 @@ from fishd.learning.ppo import (
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.thrust_signal import ThrustSignal
+from fishd.learning.train.candidates import TankEvaluations
 from fishd.learning.train.jobs import Ended, Job, Outcome
 from fishd.learning.train.progress import NOT_COUNTED, Display, format_minutes
 from fishd.learning.train.recorder import RunRecorder
 from fishd.learning.train.rollouts import Rollouts
-from fishd.learning.train.tank import TankEvaluations
 
 _WHERE = {"live": "on the fish of fishd", "simulation": "in simulation"}
 

@@ -19,10 +19,9 @@ from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.rerun import rerun
 from fishd.lab.session import Disturbed, VirtualSession
 from fishd.lab.sweep.curves import WholeTicks, find_best_of_whole_ticks, make_curves
-from fishd.lab.sweep.folder import SweepFolder
 from fishd.lab.sweep.grid import MAX_POINTS, Lengths, Point
 from fishd.lab.sweep.measuring import measure_all, swim
-from fishd.lab.sweep.results import Result, select_quantity
+from fishd.lab.sweep.results import Result, SweepFolder, select_quantity
 from fishd.recording import open_run
 
 DRIFTS = ("simulation.noise=0.001", "simulation.drift=0.005", "simulation.offset_y=0.01")

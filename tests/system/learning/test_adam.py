@@ -5,7 +5,7 @@ import sys
 
 import torch
 
-from fishd.learning.adam import BETAS, EPSILON, Adam
+from fishd.learning.ppo import BETAS, EPSILON, Adam
 
 
 def parameters() -> list[torch.nn.Parameter]:

@@ -22,8 +22,6 @@ from fishd.lab.ranking import format_ratio
 from fishd.lab.session import LiveSession, VirtualSession
 from fishd.learning.adapt import adaptation, report, steps
 from fishd.learning.adapt.adaptation import Adaptation
-from fishd.learning.adapt.cloud import draw_cloud
-from fishd.learning.adapt.practice import train_policy
 from fishd.learning.adapt.prior import MODEL_ERROR, model_of
 from fishd.learning.adapt.state import (
     TRAINING,
@@ -35,6 +33,7 @@ from fishd.learning.adapt.state import (
     Trained,
     Tried,
 )
+from fishd.learning.adapt.steps import draw_cloud, train_policy
 from fishd.learning.adapt.verdict import judge
 from fishd.learning.env.fish_variation import draw_edge_fish, draw_fish
 from fishd.learning.settings import Randomisation

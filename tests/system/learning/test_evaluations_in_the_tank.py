@@ -25,10 +25,10 @@ from fishd.learning.env.swims import REST_TIME_S, Swims
 from fishd.learning.ppo import make_learner
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.settings import EnvironmentSettings, PpoSettings, TrainingSettings
-from fishd.learning.train import tank as tank_evaluations
+from fishd.learning.train import candidates as tank_evaluations
+from fishd.learning.train.candidates import TankEvaluations
 from fishd.learning.train.jobs import Job
 from fishd.learning.train.progress import Display
-from fishd.learning.train.tank import TankEvaluations
 from fishd.learning.train.training import Training, train
 from fishd.virtual.plant.optimum import square_wave
 

@@ -26,7 +26,7 @@ from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.export import export, export_model
-from fishd.learning.eyes.making import random_angles
+from fishd.learning.eyes import random_angles
 from fishd.learning.look import look
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.settings import (

@@ -16,8 +16,7 @@ from fishd.core.camera_frames import Stack, StackSettings
 from fishd.lab.links.link import StepResult
 from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.eyes.base import Eye
-from fishd.learning.eyes.making import make_eye, random_angles
+from fishd.learning.eyes import Eye, make_eye, random_angles
 from fishd.learning.settings import EnvironmentSettings, TrainingSettings, VisionSettings
 
 CONFIG = Config()

@@ -20,8 +20,7 @@ from fishd.core.camera_frames import StackSettings
 from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env import environment
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.eyes.base import Eye
-from fishd.learning.eyes.making import make_eye
+from fishd.learning.eyes import Eye, make_eye
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import (

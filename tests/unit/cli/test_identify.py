@@ -56,7 +56,7 @@ def test_a_folder_that_cannot_be_made_is_reported_before_the_fish_swims(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     swum: list[object] = []
-    monkeypatch.setattr("fishd.lab.identification.experiment", lambda *_: swum.append(1))
+    monkeypatch.setattr("fishd.lab.identification.estimation", lambda *_: swum.append(1))
     (tmp_path / "file").touch()
     done = invoke("--experiment", "--folder", str(tmp_path / "file/run"))
     assert isinstance(done.exception, ConfigError)

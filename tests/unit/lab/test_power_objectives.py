@@ -15,10 +15,9 @@ from fishd.core.errors import ParameterError
 from fishd.lab.compare.comparison import compare
 from fishd.lab.compare.live import LiveComparison
 from fishd.lab.measurement import measure, summarise
-from fishd.lab.optimise.aim import Aim
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range
-from fishd.lab.optimise.trials import Trial
+from fishd.lab.optimise.trials import Aim, Trial
 from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
 from fishd.lab.statistics import per_watt

@@ -7,8 +7,8 @@ import pytest
 from rigs.documents import ROOT
 
 from fishd.core.errors import ParameterError
+from fishd.lab.sweep.curves import find_peak
 from fishd.lab.sweep.grid import Point, expand_values, find_axis, make_points, parse_value
-from fishd.lab.sweep.peak import find_peak
 
 
 def test_a_range_has_both_ends_and_decimals_that_are_exact() -> None:

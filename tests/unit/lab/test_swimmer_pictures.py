@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from fishd.core.errors import FishdError
-from fishd.lab.swimmer import midline_figure, view, wake_figure
-from fishd.lab.swimmer.envelope import compute_envelope
+from fishd.lab.swimmer import midlines, wake
 from fishd.lab.swimmer.film import MAX_FRAMES, Film
+from fishd.lab.swimmer.midlines import compute_envelope
 from fishd.virtual.swimmer.fish import Fish
 from fishd.virtual.swimmer.settings import Numerics, SwimmerSettings
 
@@ -27,7 +27,7 @@ def fish() -> Fish:
 
 
 def test_a_view_shows_the_water_where_it_is_in_the_laboratory(fish: Fish) -> None:
-    shown = view.take_view(fish, "speed", view.window_around(COARSE), 300)
+    shown = wake.take_view(fish, "speed", wake.window_around(COARSE), 300)
     window = shown.window
     assert window.left == pytest.approx(-0.09 + fish.travelled)
     assert shown.x == fish.motion().x
@@ -44,26 +44,26 @@ def test_between_the_nodes_of_a_stretched_grid_a_view_is_linear(fish: Fish) -> N
     grid = fish.flow.grid
     before = fish.flow.p.copy()
     fish.flow.p[:] = 3.0 * grid.xc[:, None] + 2.0 * grid.yc[None]
-    shown = view.take_view(fish, "pressure", view.window_around(COARSE), 50)
+    shown = wake.take_view(fish, "pressure", wake.window_around(COARSE), 50)
     fish.flow.p[:] = before
     midpoints = shown.window.left - fish.travelled + 0.3 * (np.arange(50) + 0.5) / 50
     assert shown.values.mean(axis=0) == pytest.approx(3e3 * midpoints)
 
 
 def test_the_colours_end_at_a_round_value_of_the_size_that_occurs(fish: Fish) -> None:
-    for quantity in view.QUANTITIES:
-        limit = view.choose_colour_limit(COARSE, quantity)
-        shown = view.take_view(fish, quantity, view.window_around(COARSE), 300)
+    for quantity in wake.QUANTITIES:
+        limit = wake.choose_colour_limit(COARSE, quantity)
+        shown = wake.take_view(fish, quantity, wake.window_around(COARSE), 300)
         assert f"{limit:.0e}"[0] in "1235"
         assert 0.1 * limit < np.abs(shown.values).max() < 10.0 * limit
 
 
-@pytest.mark.parametrize("quantity", view.QUANTITIES)
+@pytest.mark.parametrize("quantity", wake.QUANTITIES)
 def test_a_picture_of_the_wake_is_written(
-    fish: Fish, quantity: view.Quantity, tmp_path: Path
+    fish: Fish, quantity: wake.Quantity, tmp_path: Path
 ) -> None:
-    shown = view.take_view(fish, quantity, view.whole_window(COARSE), 200)
-    wake_figure.draw_wake(shown, view.choose_colour_limit(COARSE, quantity), tmp_path / "wake.png")
+    shown = wake.take_view(fish, quantity, wake.whole_window(COARSE), 200)
+    wake.draw_wake(shown, wake.choose_colour_limit(COARSE, quantity), tmp_path / "wake.png")
     with Image.open(tmp_path / "wake.png") as picture:
         assert picture.width > 2 * picture.height  # as long as the tank is
 
@@ -155,7 +155,7 @@ def test_a_tail_that_does_not_beat_has_no_midlines_of_a_beat() -> None:
 
 
 def test_a_picture_of_midlines_is_written(tmp_path: Path) -> None:
-    midline_figure.draw_midlines(
+    midlines.draw_midlines(
         compute_envelope(*make_midlines(3.5)), "a sine of 2 Hz", tmp_path / "midlines.png"
     )
     with Image.open(tmp_path / "midlines.png") as picture:

@@ -1,14 +1,22 @@
 """View of the water around a free swimmer, on square pixels, for pictures and films."""
 
 import math
-from typing import Literal, NamedTuple, get_args
+import os
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from fishd.lab.drawing import BLACK, open_figure
+from fishd.virtual.swimmer.checkpoint import Checkpoint, CheckpointError
 from fishd.virtual.swimmer.feasibility import estimate
 from fishd.virtual.swimmer.fish import Fish
 from fishd.virtual.swimmer.settings import SwimmerSettings
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 Array = NDArray[np.float64]
 Positions = NDArray[np.floating]
@@ -20,6 +28,13 @@ SIGNED_QUANTITIES = ("vorticity", "pressure")
 MAX_LEAD_LENGTHS, BEHIND, BESIDE = 0.9, 2.1, 0.55
 """Distances from the centre of the grid to the edges of the window [body lengths]."""
 _ROUND_DIGITS = (1, 2, 3, 5, 10)
+COLUMNS = 1200
+"""Width of the water in a picture [pixels]."""
+COLOURS = {"vorticity": "RdBu_r", "speed": "YlGnBu", "pressure": "PuOr_r"}
+BODY_COLOUR = "0.25"
+_WIDTH_IN = 7.2
+_SIDE_MARGIN_IN = 1.35
+_TOP_MARGIN_IN = 0.75
 
 
 class Window(NamedTuple):
@@ -47,6 +62,20 @@ class View(NamedTuple):
     """Forward speed of the fish [m/s]."""
     x: float
     """Position of its centre of mass in the laboratory frame; it swims towards −x [m]."""
+
+
+def restore_fish(checkpoint: Checkpoint) -> Fish:
+    """Return the fish of a checkpoint, in the state of the checkpoint; raises `CheckpointError`."""
+    try:
+        settings = msgspec.convert(checkpoint.settings["swimmer"], SwimmerSettings)
+        fish = Fish(settings)
+        checkpoint.check_state(fish.state())
+        fish.restore(checkpoint.state)
+    except (KeyError, ValueError) as error:
+        raise CheckpointError(
+            f"{checkpoint.path}: it was written by an incompatible version of fishd ({error})"
+        ) from None
+    return fish
 
 
 def window_around(settings: SwimmerSettings) -> Window:
@@ -138,3 +167,74 @@ def _locate(nodes: Array, places: Positions) -> tuple[NDArray[np.intp], Position
     first = np.clip(np.searchsorted(nodes, places) - 1, 0, len(nodes) - 2)
     share = (places - nodes[first]) / (nodes[first + 1] - nodes[first])
     return first, np.clip(share, 0.0, 1.0)
+
+
+def draw_wake(scene: View, limit: float, path: str | os.PathLike[str]) -> None:
+    """Write the picture as PNG, PDF or SVG; raises `FishdError` and `MissingPackage`.
+
+    limit: value at which the colours end
+    """
+    window = scene.window
+    height = (
+        (_WIDTH_IN - _SIDE_MARGIN_IN) * (window.top - window.bottom) / (window.right - window.left)
+    )
+    with open_figure(path, (_WIDTH_IN, height + _TOP_MARGIN_IN)) as figure:
+        axes = figure.subplots()
+        image = axes.imshow(
+            scene.values,
+            origin="lower",
+            extent=(
+                100.0 * window.left,
+                100.0 * window.right,
+                100.0 * window.bottom,
+                100.0 * window.top,
+            ),
+            cmap=COLOURS[scene.quantity],
+            vmin=-limit if scene.quantity in SIGNED_QUANTITIES else 0.0,
+            vmax=limit,
+            interpolation="bilinear",
+        )
+        axes.fill(*(100.0 * scene.outline).T, color=BODY_COLOUR, linewidth=0.0)
+        axes.set_xlim(100.0 * window.left, 100.0 * window.right)
+        axes.set_ylim(100.0 * window.bottom, 100.0 * window.top)
+        axes.set_xlabel("x (cm)")
+        axes.set_ylabel("y (cm)")
+        axes.set_title(
+            f"{scene.quantity} at {scene.time:.2f} s; the fish swims to the left with "
+            f"{1e3 * scene.speed:.1f} mm/s",
+            fontweight="normal",
+        )
+        extend = _find_exceeded_ends(scene, limit)
+        bar_axes = axes.inset_axes((1.02, 0.0, 0.025, 1.0))
+        bar = figure.colorbar(image, cax=bar_axes, extend=extend)
+        bar.set_label(f"{scene.quantity} ({UNITS[scene.quantity]})")
+        _draw_scale_bar(axes, window)
+
+
+def _find_exceeded_ends(scene: View, limit: float) -> str:
+    """Return the ends of the colour bar that values exceed, as matplotlib names them."""
+    low = scene.quantity in SIGNED_QUANTITIES and float(np.min(scene.values)) < -limit
+    high = float(np.max(scene.values)) > limit
+    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[low, high]
+
+
+def _draw_scale_bar(axes: "Axes", window: Window) -> None:
+    width, height = window.right - window.left, window.top - window.bottom
+    length = round_number(0.12 * width)
+    right, low = window.right - 0.03 * width, window.bottom + 0.06 * height
+    axes.plot(
+        [100.0 * (right - length), 100.0 * right],
+        [100.0 * low] * 2,
+        color=BLACK,
+        linewidth=2.0,
+        solid_capstyle="butt",
+    )
+    axes.text(
+        100.0 * (right - 0.5 * length),
+        100.0 * (low + 0.03 * height),
+        f"{100.0 * length:g} cm",
+        ha="center",
+        va="bottom",
+        fontsize=8,
+        color=BLACK,
+    )

@@ -1,17 +1,28 @@
 """Motion of the body in a tail beat: midlines relative to the mean, and their amplitudes."""
 
+import io
+import os
+import zipfile
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fishd.core import files
 from fishd.core.errors import FishdError
+from fishd.lab.drawing import BLACK, GREY, open_figure
+from fishd.virtual.swimmer.track import MAX_FILE_BYTES
 
 Array = NDArray[np.float64]
 PHASE_COUNT = 64
 """Number of midlines of each beat."""
+LINE_COUNT = 16
+"""Number of midlines drawn of a beat."""
+_COLOURS, _DARKENING = "twilight", 0.85
+"""Cyclic colour map, and the factor that darkens it for a white page."""
 
 
 class Envelope(NamedTuple):
@@ -32,6 +43,30 @@ class Envelope(NamedTuple):
     """Amplitude of each position across the axis; shape (beats, slices)."""
     periods: Array
     """Periods of the beats [s]; shape (beats,)."""
+
+
+def read_midlines(path: Path) -> tuple[Array, Array]:
+    """Read the times, shape (n,) [s], and the midlines, shape (n, points, 2) [m].
+
+    path: file written by `fishctl simulate --save`
+    Raises `FishdError`.
+    """
+    needed = "a swim that fishctl simulate --save FILE.npz has written"
+    try:
+        content = files.read(path, MAX_FILE_BYTES, "a swim")
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+            time, lines = (
+                np.asarray(arrays[name], np.float64) for name in ("midline_time", "midlines")
+            )
+    except files.FileProblem as problem:
+        raise FishdError(f"{path}: {problem}; {needed} is needed") from None
+    except KeyError:
+        raise FishdError(f"{path}: it contains no midlines; {needed} is needed") from None
+    except (ValueError, TypeError, EOFError, OSError, zipfile.BadZipFile, AttributeError):
+        raise FishdError(f"{path}: not an NPZ file of arrays; {needed} is needed") from None
+    if lines.ndim != 3 or lines.shape[1] < 10 or lines.shape[2] != 2 or len(time) != len(lines):
+        raise FishdError(f"{path}: its midlines have the wrong shape; {needed} is needed")
+    return time, lines
 
 
 def compute_envelope(time: Array, midlines: Array, since: float = 0.0) -> Envelope:
@@ -101,3 +136,47 @@ def _to_body_frame(beat: Array) -> Array:
     direction = (centred[:, -1] - centred[:, 0]).mean(axis=0)
     c, s = direction / np.hypot(*direction)
     return np.asarray(centred @ np.array([[c, -s], [s, c]]))
+
+
+def draw_midlines(envelope: Envelope, title: str, path: str | os.PathLike[str]) -> None:
+    """Write the picture as PNG, PDF or SVG; raises `FishdError` and `MissingPackage`."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+
+    mean = envelope.amplitudes.mean(axis=0)
+    spread = envelope.amplitudes.std(axis=0, ddof=1) if len(envelope.amplitudes) > 1 else 0.0 * mean
+    phases_of_lines = np.arange(LINE_COUNT) / LINE_COUNT
+    colours = _DARKENING * colormaps[_COLOURS](phases_of_lines)[:, :3]
+    with open_figure(path, (7.2, 5.0)) as figure:
+        upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        for line, colour in zip(
+            envelope.midlines[:: PHASE_COUNT // LINE_COUNT], colours, strict=True
+        ):
+            upper.plot(*line.T, color=colour, linewidth=1.0)
+        upper.set_ylabel("y/L (1)")
+        upper.set_aspect("equal", adjustable="datalim")
+        upper.set_title(title, fontweight="normal")
+        phases = ScalarMappable(
+            BoundaryNorm(np.arange(LINE_COUNT + 1) / LINE_COUNT, LINE_COUNT),
+            ListedColormap(colours),
+        )
+        bar = figure.colorbar(phases, cax=upper.inset_axes((1.01, 0.0, 0.018, 1.0)))
+        bar.set_label("phase of the beat (1)")
+        bar.set_ticks([0.0, 0.25, 0.5, 0.75, 1.0])
+        bar.minorticks_off()
+        lower.fill_between(
+            envelope.along, mean - spread, mean + spread, color="0.85", linewidth=0.0
+        )
+        lower.plot(envelope.along, mean, color=BLACK)
+        lower.set_ylim(bottom=0.0)
+        lower.set_xlim(-0.05, 1.05)
+        lower.set_xlabel("x/L (1), from the head on")
+        lower.set_ylabel("amplitude/L (1)")
+        beats = len(envelope.amplitudes)
+        spread_note = f", and how {beats} beats differ (standard deviation)" if beats > 1 else ""
+        lower.set_title(
+            f"amplitude along the body{spread_note}; at the tail {mean[-1]:.3f} L",
+            fontweight="normal",
+            color=GREY,
+        )

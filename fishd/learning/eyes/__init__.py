@@ -1,1 +1,0 @@
-"""Eyes, which convert pictures of the tail to inputs of the network of a policy."""
