@@ -102,9 +102,7 @@ def open_swimmer(config: Config) -> "Swimmer":
         from fishd.virtual.swimmer.robot import Swimmer
     except ModuleNotFoundError as error:
         package = (error.name or "").partition(".")[0]
-        raise MissingPackage(
-            f"robot: swimmer needs the package {package}; with pip: pip install 'fishd[swimmer]'"
-        ) from None
+        raise MissingPackage.of_extra("robot: swimmer", package, "swimmer") from None
     return Swimmer(config.swimmer, config.plant, config.amplitude_limit, config.tick)
 
 

@@ -17,7 +17,7 @@ from fishd.cli.progress import show_progress
 from fishd.config import Config, check_tethered
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
-from fishd.core.errors import FishdError, ParameterError
+from fishd.core.errors import FishdError, ParameterError, install
 from fishd.core.process.interruption import raise_on_first_signal
 
 if TYPE_CHECKING:
@@ -240,9 +240,8 @@ def _default_contestants(config: Config) -> "list[Contestant]":
     named = library.names()
     if named and not (find_spec("onnx") and find_spec("onnxruntime")):
         echo(
-            f"fishctl: left out, as the extra 'policy' is missing: {', '.join(named)}; where the "
-            "sources of fishd are: pip install --constraint tools/constraints.txt --editable "
-            "'.[policy]'",
+            f"fishctl: left out, as the extra 'policy' is missing: {', '.join(named)}; "
+            f"{install('policy')}",
             err=True,
         )
     return default_contestants(config)

@@ -14,7 +14,7 @@ from fishd.cli.output import echo, echo_rows, format_controller, print_json
 from fishd.cli.progress import show_progress
 from fishd.core import files, text
 from fishd.core.console import INTERRUPTED
-from fishd.core.errors import FishdError, MissingPackage, ParameterError
+from fishd.core.errors import FishdError, ParameterError
 from fishd.core.process.interruption import on_signal
 
 if TYPE_CHECKING:
@@ -123,16 +123,11 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
     arguments: configuration, controller, parameters, seconds, settle time, publisher, begun
     Raises `FishdError` and OSError.
     """
-    try:
-        from fishd.lab.simulation.free_swim import CheckpointSettings
-        from fishd.lab.simulation.free_swim import swim as run
-        from fishd.virtual.swimmer import checkpoint, track
-        from fishd.virtual.swimmer.midlines import Midlines
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        raise MissingPackage(
-            f"robot: swimmer needs the package {package}; with pip: pip install 'fishd[swimmer]'"
-        ) from None
+    from fishd.lab.simulation.free_swim import CheckpointSettings
+    from fishd.lab.simulation.free_swim import swim as run
+    from fishd.virtual.swimmer import checkpoint, track
+    from fishd.virtual.swimmer.midlines import Midlines
+
     if options.save:
         track.check_name(options.save)
     options.check()

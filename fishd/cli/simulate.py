@@ -20,7 +20,6 @@ from fishd.cli.output import (
 )
 from fishd.config import Config, load
 from fishd.core.console import format_power
-from fishd.core.errors import MissingPackage
 
 if TYPE_CHECKING:
     from fishd.lab.simulation import Report, VirtualRun
@@ -117,13 +116,8 @@ def _describe(writer: "RunWriter", config: Config, run: "VirtualRun") -> None:
 
 
 def _open_recording(path: Path) -> "RunWriter":
-    try:
-        from fishd.recording import RunWriter
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        raise MissingPackage(
-            f"--record needs the package {package}; with pip: pip install 'fishd[record]'"
-        ) from None
+    from fishd.recording import RunWriter
+
     return RunWriter(path, source="simulation")
 
 

@@ -10,6 +10,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from fishd.core.console import complain
+from fishd.core.errors import install
 
 _EXTRAS = {
     "aiohttp": "camera",
@@ -81,12 +82,7 @@ class Verbs(click.Group):
             package = (error.name or "").partition(".")[0]
             if package not in _EXTRAS:
                 raise
-            complain(
-                "fishctl",
-                f"{package} is not installed; where the sources of fishd are: pip install "
-                f"--constraint tools/constraints.txt --editable '.[{_EXTRAS[package]}]'",
-                1,
-            )
+            complain("fishctl", f"{package} is not installed; {install(_EXTRAS[package])}", 1)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all verbs, in the order of help."""

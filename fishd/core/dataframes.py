@@ -20,7 +20,5 @@ def ticks_to_frame(ticks: Sequence[Tick]) -> "DataFrame":
     try:
         import pandas
     except ImportError:
-        raise MissingPackage(
-            "a table needs the package pandas; install it with: pip install 'fishd[lab]'"
-        ) from None
+        raise MissingPackage.of_extra("a table", "pandas", "lab") from None
     return pandas.json_normalize([msgspec.to_builtins(tick) for tick in ticks])

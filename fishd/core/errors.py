@@ -3,7 +3,7 @@
 Each message is one line that says what is wrong, where, and what would be right.
 """
 
-from typing import Any
+from typing import Any, Self
 
 
 class FishdError(Exception):
@@ -58,7 +58,20 @@ class StartupError(FishdError, RuntimeError):
 
 
 class MissingPackage(StartupError):
-    """A driver's library is not installed, or cannot be imported."""
+    """A library of a driver or of an extra is not installed, or cannot be imported."""
+
+    @classmethod
+    def of_extra(cls, purpose: str, package: str, extra: str) -> Self:
+        """Return the error for a purpose whose package comes with an extra of fishd."""
+        return cls(f"{purpose} needs the package {package}; {install(extra)}")
+
+
+def install(extra: str) -> str:
+    """Return where and how an extra of fishd is installed."""
+    return (
+        "where the sources of fishd are: pip install --constraint tools/constraints.txt "
+        f"--editable '.[{extra}]'"
+    )
 
 
 class SensorError(FishdError, OSError):

@@ -17,7 +17,6 @@ DOTS_PER_INCH = 200
 MAX_LABEL_CHARS = 120
 """Length of the longest label in a figure that comes from user input [characters]."""
 FORMATS = (".pdf", ".png", ".svg")
-_MISSING = "a figure needs matplotlib, which is not installed: pip install 'fishd[lab]'"
 BLACK, BLUE, ORANGE, GREEN, PURPLE = "#1a1a1a", "#0072b2", "#d55e00", "#009e73", "#aa4499"
 """Colours that differ in grey and for the colour-blind (Okabe and Ito), darkest first."""
 YELLOW = "#e69f00"
@@ -45,7 +44,7 @@ _STYLE: dict[Any, Any] = {
 def check_installed() -> None:
     """Raise `MissingPackage` without matplotlib (extra: lab)."""
     if find_spec("matplotlib") is None:
-        raise MissingPackage(_MISSING)
+        raise MissingPackage.of_extra("a figure", "matplotlib", "lab")
 
 
 def check(path: str | os.PathLike[str]) -> None:

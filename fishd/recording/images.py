@@ -198,7 +198,6 @@ def _cv2() -> Any:
     try:
         import cv2
     except ImportError:
-        raise MissingPackage(
-            "frames of a camera need opencv-python-headless: pip install 'fishd[camera]'"
-        ) from None
+        purpose = "a recorded frame of a camera"
+        raise MissingPackage.of_extra(purpose, "opencv-python-headless", "camera") from None
     return cv2

@@ -210,9 +210,7 @@ def check(path: str | os.PathLike[str]) -> None:
     """Raise `FishdError` if a film cannot be written to this path; call before the swim."""
     for package in ("matplotlib", "PIL"):
         if find_spec(package) is None:
-            raise MissingPackage(
-                f"a film needs {package}, which is not installed: pip install 'fishd[swimmer]'"
-            )
+            raise MissingPackage.of_extra("a film", package, "swimmer")
     file = Path(path)
     if file.suffix.lower() not in FORMATS:
         kind = file.suffix or "without a suffix"

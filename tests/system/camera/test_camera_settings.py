@@ -65,7 +65,7 @@ def test_a_package_that_is_missing_is_said_in_one_line(tmp_path: Path, module: s
     env = os.environ | {"PYTHONPATH": str(tmp_path)}
     said = one_line(call(*COMMAND, "--set", "source=v4l2", env=env))
     assert module in said
-    assert said.endswith("install the extra: pip install 'fishd[camera]'\n")
+    assert said.endswith("--editable '.[camera]'\n")
 
 
 @pytest.mark.parametrize(

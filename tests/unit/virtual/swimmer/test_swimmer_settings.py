@@ -86,8 +86,8 @@ def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, progr
     own = addresses(tmp_path) if program == FISHD else ()
     done = call(program, *simulates, *OPTIONS, *own, env={"PYTHONPATH": str(tmp_path)})
     assert done.returncode == 1
-    line = "robot: swimmer needs the package numba; with pip: pip install 'fishd[swimmer]'\n"
-    assert done.stderr.endswith(line)
+    assert "numba" in done.stderr
+    assert done.stderr.endswith("--editable '.[swimmer]'\n")
     assert done.stderr.count("\n") == 1
 
 
