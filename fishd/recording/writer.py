@@ -3,16 +3,23 @@
 docs/how-to/recording.md describes its layout.
 """
 
+import getpass
+import platform
+import socket
+import subprocess
 import time
 from collections.abc import Callable, Mapping
+from datetime import datetime
+from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import msgspec
 import numpy as np
 from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
+from fishd import __version__
 from fishd.config import Config, to_yaml
 from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
@@ -21,7 +28,6 @@ from fishd.core.signals import Event, Status, Tick
 from fishd.recording import images
 from fishd.recording.images import FrameHead
 from fishd.recording.part_file import SUFFIX, PartFile
-from fishd.recording.provenance import Source, provenance
 from fishd.recording.schemas import CHANNELS, json_schema, schema_name
 from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
 
@@ -31,6 +37,11 @@ MAX_TIME_S = 1e10
 """Largest time of a message: MCAP counts nanoseconds in 64 bits [s, unix]."""
 CONFIG_ATTACHMENT, CALIBRATIONS_ATTACHMENT = "config.yaml", "calibrations.json"
 """Names of attachments."""
+FORMAT = "1"
+"""Version of the layout of a recording."""
+
+Source = Literal["fishd", "simulation"]
+"""Origin of the ticks: a running fishd, whatever its robot, or a run in virtual time."""
 
 
 class RunWriter:
@@ -250,3 +261,45 @@ _DECODERS: dict[str, Callable[[bytes], TickHead | Event | Status]] = {
     "event": decoder(Event),
     "status": decoder(Status),
 }
+
+
+def provenance(
+    run: str, source: Source, operator: str, subject: str, note: str, extra: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the metadata `fishd.run` of a recording that begins now."""
+    return {
+        **extra,
+        "run": run,
+        "format": FORMAT,
+        "source": source,
+        "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
+        "operator": operator or _user(),
+        "subject": subject,
+        "note": note,
+        "version": __version__,
+        "git_commit": git_commit(),
+        "host": socket.gethostname(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+    }
+
+
+@cache
+def git_commit() -> str:
+    """Return the commit of fishd's sources, with `-dirty` for changed ones; empty without git."""
+    folder = Path(__file__).resolve().parents[2]
+    if not (folder / ".git").exists():
+        return ""
+    command = ("git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--dirty")
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout.strip()
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a user without a name
+        return ""

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from fishd.camera.axis_watch import AxisWatch
+from fishd.camera.axis import AxisWatch
 from fishd.camera.client import CameraClient
 from fishd.core.errors import FishError
 

@@ -16,7 +16,7 @@ from fishd.cli.output import echo
 from fishd.core.errors import FishdError
 
 if TYPE_CHECKING:
-    from fishd.camera.axis_watch import AxisWatch
+    from fishd.camera.axis import AxisWatch
     from fishd.camera.client import CameraClient
     from fishd.camera.drawing import Colours
 
@@ -41,7 +41,7 @@ def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole:
     seconds. If standard output is not a terminal, a line is printed instead; with --follow, one a
     second.
     """
-    from fishd.camera.axis_watch import AxisWatch
+    from fishd.camera.axis import AxisWatch
     from fishd.camera.client import CameraClient
 
     check_png(png)

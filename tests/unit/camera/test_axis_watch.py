@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from rigs import filmed_swim
 from rigs.filmed_swim import filmed
 
-from fishd.camera.axis_watch import SEARCH_PERIOD_S, AxisWatch
+from fishd.camera.axis import SEARCH_PERIOD_S, AxisWatch
 from fishd.camera.simulated import DEFAULT, WEB
 from fishd.core.camera_frames import Frame
 
