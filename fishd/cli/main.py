@@ -26,9 +26,9 @@ VERBS = {
         "release": Verb(
             "release", "release", "Last resort without the daemon: neutral, then no pulses."
         ),
-        "controllers": Verb("control", "controllers", "List the controllers and their parameters."),
+        "controllers": Verb("listing", "controllers", "List the controllers and their parameters."),
         "agent": Verb("agent", "agent", "Let a policy outside fishd swim the fish."),
-        "policies": Verb("control", "policies", "List the named policies, or show one."),
+        "policies": Verb("listing", "policies", "List the named policies, or show one."),
     },
     "Experiment": {
         "measure": Verb("measure", "measure", "Measure a controller's thrust, with its interval."),

@@ -20,13 +20,7 @@ from fishd.cli.experiment_options import (
     fish_choice,
     folder_options,
 )
-from fishd.cli.options import (
-    FiniteRange,
-    ParameterType,
-    json_option,
-    plot_option,
-    seed_option,
-)
+from fishd.cli.options import FiniteRange, ParameterType, json_option, plot_option, seed_option
 from fishd.cli.output import echo, format_count, print_json, warn_of_fin
 from fishd.cli.progress import show_progress
 from fishd.controllers import registry

@@ -19,18 +19,9 @@ from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
 from fishd.core.schema import suggest
 from fishd.lab.identification import misfit
-from fishd.lab.identification.fit import (
-    BOUNDS,
-    FURTHER,
-    LOGARITHMIC,
-    QUADRATIC,
-    Problem,
-    solve,
-)
+from fishd.lab.identification.fit import BOUNDS, FURTHER, LOGARITHMIC, QUADRATIC, Problem, solve
 from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifiable, passages
-from fishd.lab.identification.result import (
-    Identification,
-)
+from fishd.lab.identification.result import Identification
 from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, summarise
 from fishd.lab.session import Session
 from fishd.virtual.imperfections import SimulationSettings

@@ -16,10 +16,7 @@ from fishd.controllers.base import Controller, amplitude_of
 from fishd.core.beats import Reversals
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Publisher, Reason
-from fishd.lab.simulation.virtual_run import (
-    VirtualRun,
-    check_length,
-)
+from fishd.lab.simulation.virtual_run import VirtualRun, check_length
 from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.optimum import best_square_wave
 

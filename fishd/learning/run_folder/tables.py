@@ -8,11 +8,7 @@ from typing import Any
 import msgspec
 
 from fishd.core.errors import ConfigError
-from fishd.core.files import (
-    FileProblem,
-    NoFile,
-    write_atomically,
-)
+from fishd.core.files import FileProblem, NoFile, write_atomically
 from fishd.lab import tables
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder.checkpoints import CheckpointError

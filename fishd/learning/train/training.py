@@ -28,13 +28,7 @@ from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.fish_variation import episode_fish
 from fishd.learning.imitation import Imitation
-from fishd.learning.ppo import (
-    DeterministicPolicy,
-    Rollout,
-    is_finite,
-    learning_rate,
-    make_learner,
-)
+from fishd.learning.ppo import DeterministicPolicy, Rollout, is_finite, learning_rate, make_learner
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.thrust_signal import ThrustSignal
