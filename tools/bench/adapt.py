@@ -142,9 +142,9 @@ def measure(options: Namespace) -> Report:
     with ProcessPoolExecutor(options.jobs) as pool:
         results = list(pool.map(adapted, tasks))
     head = (
-        "fish | best square wave, mN | verdict | true thrust of the chosen gait, % of that | of "
-        "the square wave results, % of that | chosen gait over the square wave results, % | its "
-        "truth, % | tank time, s"
+        "fish | best square wave, mN | verdict | true thrust of the chosen gait, % of the best | "
+        "of the square wave found, % of the best | chosen gait ÷ square wave found, measured, % | "
+        "the same, true, % | tank time, s"
     )
     rows = [row(each) for each in results]
     names = {"bench adapt": table(head, rows), "bench adapt summary": summary(results)}
@@ -161,7 +161,7 @@ def row(one: Adapted) -> list[str]:
         f"{one.chosen} wins" if one.decided else _undecided(one),
         percent(one.share),
         percent(one.of_square),
-        f"{value} [{low}, {high}]" if own else "100, itself",
+        f"{value} [{low}, {high}]" if own else "100, the same gait",
         percent(own[3]) if own else "100",
         f"{one.tank_time:.0f}",
     ]
@@ -189,28 +189,31 @@ def summary(results: list[Adapted]) -> str:
         for each in results
     ]
     rows = [
-        ["chosen gait, of the best square wave, median", f"{percent(statistics.median(shares))} %"],
-        ["chosen gait, of the best square wave, worst", f"{percent(min(shares))} %"],
+        [
+            "chosen gait, % of the best square wave, median",
+            f"{percent(statistics.median(shares))} %",
+        ],
+        ["chosen gait, % of the best square wave, worst", f"{percent(min(shares))} %"],
         ["policies that took part", f"{len(policies)} of {len(results)}"],
         ["verdicts that name a winner", f"{len(decided)} of {len(results)}"],
         [
-            "of these, winners that are truly the best of the three",
+            "winners that are truly the best of the three",
             f"{sum(kept[results.index(each)] for each in decided)} of {len(decided)}",
         ],
         [
-            "verdicts whose gaits include the truly best one",
+            "verdicts that include the truly best gait",
             f"{sum(kept)} of {len(results)}",
         ],
         [
-            "chosen gait below the truly best of the three, median",
+            "loss of the chosen gait against the truly best, median",
             f"{percent(statistics.median(lost))} %",
         ],
         ["the same, worst", f"{percent(max(lost))} %"],
-        ["interval of the chosen gait's relative thrust covers the truth", _covered(claims)],
-        ["the same, of every gait but the square wave", _covered(every)],
+        ["interval of the chosen gait's relative thrust contains the true value", _covered(claims)],
+        ["the same, all gaits except the square wave", _covered(every)],
         *(
             [
-                f"{name} of a thrust covers the truth",
+                f"{name} of a thrust contains the true value",
                 f"{sum(abs(each[0] - each[3]) <= each[column] for each in thrusts)} of "
                 f"{len(thrusts)}",
             ]
@@ -220,9 +223,9 @@ def summary(results: list[Adapted]) -> str:
     ]
     if policies:
         middle = f"{percent(statistics.median(policies))} %"
-        rows.insert(2, ["policy, of the best square wave, median", middle])
-        rows.insert(3, ["policy, of the best square wave, worst", f"{percent(min(policies))} %"])
-    return table("what | measured", rows)
+        rows.insert(2, ["policy, % of the best square wave, median", middle])
+        rows.insert(3, ["policy, % of the best square wave, worst", f"{percent(min(policies))} %"])
+    return table("quantity | measured", rows)
 
 
 def _largest(one: Adapted) -> float:

@@ -1,4 +1,4 @@
-"""How often the interval of `fishctl measure` holds the thrust of a wrongly calibrated sensor.
+"""Coverage of the interval of `fishctl measure` for a sensor that is calibrated wrongly.
 
 Each run calibrates the sensor of the default fish, turned by 0.05 rad, with loads that are not what
 they are said to be, and measures `swing` with its defaults. The truth is the fish's own thrust.
@@ -45,7 +45,7 @@ class Case(NamedTuple):
 
 
 CASES = {
-    "nothing": Case(),
+    "none": Case(),
     "each load by 2 %": Case(weight=0.02),
     "each load by 2 %, five loads": Case(weight=0.02, loads=MIN_LOADS),
     "each load by 2 %, each thread by 2°": Case(weight=0.02, thread=np.radians(2.0)),
@@ -118,12 +118,12 @@ def measure(options: Namespace) -> Report:
                 )
             )
     head = (
-        "what is wrong, rms | error, rms | statistical, median | calibration, median | "
-        "statistical holds the truth | total holds it"
+        "error of the loads, rms | rms error | median statistical | median calibration | "
+        "statistical contains the true thrust | total contains it"
     )
     text = (
         f"True thrust {truth:.2f} mN, {options.runs} runs of {RUN_SECONDS:g} s of each kind, seeds "
-        f"from {FIRST_SEED}; nine loads of {LOAD_N:g} N and `--load-error 0.01` where nothing else "
-        "is said.\n\n"
+        f"from {FIRST_SEED}; nine loads of {LOAD_N:g} N and `--load-error 0.01` unless the row "
+        "has another value.\n\n"
     )
     return Report({"calibration": text + table(head, rows)}, figures)

@@ -174,7 +174,7 @@ def measure(options: Namespace) -> Report:
         ["lateness of fishd alone, p50 / p99", _us(without), f"{len(without)} ticks", ""],
         ["beside camera, learner and page", _us(beside), f"{len(beside)} ticks", ""],
         [
-            "p99 with over without",
+            "p99 beside camera ÷ p99 alone",
             f"{ratio:.2f} (median of rounds {statistics.median(each):.2f})",
             f"≤ {MAX_LATENESS_RATIO:g}",
             _verdict(ratio <= MAX_LATENESS_RATIO),
@@ -191,7 +191,7 @@ def measure(options: Namespace) -> Report:
             for name, rate in rates.items()
         ),
     ]  # fmt: skip
-    text = table("what | measured | goal | met", rows)
+    text = table("quantity | measured | goal | met", rows)
     about = f"{options.rounds} rounds of twice {options.seconds:g} s; {RATE:g} frames a second."
     figures = {"ratio": ratio, "rounds": each, "rates": rates, "ages": len(ages)}
     return Report({"bench camera": f"{text}\n\n{about} {machine_in_short()}"}, figures)

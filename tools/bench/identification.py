@@ -181,11 +181,14 @@ def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
 
 
 SUMMARY = (
-    "fish | intervals that hold | those that K_y/K does not scale | withheld | with K_y/K known | "
-    "error, median | warned in the first line | furthest off, in half-widths | "
-    "more than 2 off and not warned"
+    "fish | intervals that contain the true value | the same, not scaled by K_y/K | withheld | "
+    "the same, K_y/K known | median error | fits with a warning | largest error, half-widths | "
+    "errors above 2 half-widths without a warning"
 )
-HEAD = "quantity | error, median | error, largest | half of the 95 % interval | it covers the truth"
+HEAD = (
+    "quantity | median error | largest error | half-width of the 95 % interval | "
+    "contains the true value"
+)
 OPTIONS: Options = {
     "--seeds": {
         "type": int,

@@ -85,7 +85,7 @@ def relative_thrust(options: Namespace) -> str:
         "Φ = 0.8 rad": Row(rig(0.8), plain),
         SIMULATED: Row(load(CONFIG / "simulated.yaml"), plain),
         "`config/harsh.yaml`": Row(load(CONFIG / "harsh.yaml"), plain),
-        "Φ = 0.42 rad, without the mirror": Row(rig(), blind),
+        "Φ = 0.42 rad, without symmetry": Row(rig(), blind),
         "Φ = 0.42 rad, as in the paper": Row(rig(), paper),
     }
     trainings = several(rows, UNTOUCHED[: options.seeds], options.jobs)
@@ -122,7 +122,7 @@ def relative_thrust(options: Namespace) -> str:
             ]
         )
     shape_heads = (
-        "at the end | mean \\|φ_c\\|/Φ | frequency (Hz) | best on the grid (Hz) | "
+        "fish | mean \\|φ_c\\|/Φ | frequency (Hz) | best whole-tick wave (Hz) | "
         "its relative thrust (%) | stalled"
     )
     return "\n\n".join(
@@ -130,12 +130,11 @@ def relative_thrust(options: Namespace) -> str:
             f"Steps until the best policy so far has that relative thrust, median [lowest – "
             f"highest] of {options.seeds} seeds:",
             table(REACHED, reached),
-            "Relative thrust (%) of the best policy that a seed has had until then, which is "
-            "exported:",
+            "Relative thrust (%) of the best policy of a seed so far, the one that `export` takes:",
             table(heads, best),
-            "And of the policy as it stands after so many control steps:",
+            "The same for the newest policy instead of the best one:",
             table(heads, learned),
-            "The commands that were learned:",
+            "Commands of the newest policy at the end:",
             table(shape_heads, shape),
         )
     )
@@ -153,13 +152,15 @@ def choices(options: Namespace) -> str:
             ppo=replace(ppo, n_steps=2 * ppo.n_steps),
             evaluation=replace(plain.evaluation, every=plain.evaluation.every // 2),
         ),
-        "ten passes over them": replace(plain, ppo=replace(ppo, n_epochs=10)),
-        "exploration of 2 Φ at first": replace(plain, ppo=replace(ppo, log_std_init=math.log(2))),
-        "`side_time` not seen": replace(plain, environment=replace(seen, observation=others)),
-        "F_x as it is (`clean_rewards: false`)": replace(
+        "ten passes over each rollout": replace(plain, ppo=replace(ppo, n_epochs=10)),
+        "initial exploration of 2 Φ": replace(plain, ppo=replace(ppo, log_std_init=math.log(2))),
+        "without the input `side_time`": replace(
+            plain, environment=replace(seen, observation=others)
+        ),
+        "F_x uncorrected (`clean_rewards: false`)": replace(
             plain, ppo=replace(ppo, clean_rewards=False)
         ),
-        "no shortest dwell": replace(plain, environment=replace(seen, dwell=False)),
+        "without the shortest dwell": replace(plain, environment=replace(seen, dwell=False)),
     }
     fish = {
         "Φ = 0.2 rad": (rig(0.2), GOOD_RELATIVE_THRUST),
@@ -220,9 +221,10 @@ def transfer(options: Namespace) -> str:
         ]
         for row, runs in shares.items()
     ]
-    heads = f"what swims | worst of 16 fish | median of 16 fish | all ≥ {100 * GOOD:.0f} %"
+    heads = f"controller | worst of 16 fish | median of 16 fish | all ≥ {100 * GOOD:.0f} %"
     of_seeds = (
-        f"Relative thrust in %, of policies median [lowest – highest] of {options.seeds} seeds:"
+        "Relative thrust in %; for policies the median [lowest – highest] of "
+        f"{options.seeds} seeds:"
     )
     return f"{of_seeds}\n\n{table(heads, lines)}"
 
@@ -248,13 +250,14 @@ def harsh(options: Namespace) -> str:
             )
         first += len(group)
     lost = [sum(swum.fallback is not None for swum in one.fish) for one in results]
-    rows.append(["another took over, runs", *map(str, lost)])
+    rows.append(["runs in which another controller took over", *map(str, lost)])
     shaken = [max(swum.shaken for swum in one.fish) for one in results]
-    rows.append(["reversals in consecutive ticks, at most, s", *(f"{s:.1f}" for s in shaken)])
+    longest = "longest time of reversals in consecutive ticks, s"
+    rows.append([longest, *(f"{s:.1f}" for s in shaken)])
     heads = " | ".join(["fish", *(f"`{one.contestant}`" for one in results)])
     return "\n\n".join(
         (
-            "Relative thrust in %, of a minute whose first 10 s do not count:",
+            "Relative thrust in % over a minute without its first 10 s:",
             table(heads, rows),
             f"`{SHIPPED}` on {len(MANY_SEEDS)} more fish of each kind, seeds {MANY_SEEDS[0]} to "
             f"{MANY_SEEDS[-1]}:",
@@ -277,8 +280,8 @@ def on_many_fish() -> str:
         low = (f"{sum(share < limit for share in shares)}" for limit in (0.95, 0.9))
         rows.append([kind, *(f"{100 * share:.1f}" for share in cells), *low])
     heads = (
-        "fish | median | 10 % quantile | 5 % quantile | worst | "
-        "best whole-tick wave: median | worst | below 95 % | below 90 %"
+        "fish | median | 10 % quantile | 5 % quantile | worst | best whole-tick wave, median | "
+        "best whole-tick wave, worst | fish below 95 % | fish below 90 %"
     )
     return table(heads, rows)
 

@@ -295,8 +295,8 @@ OPTIONS: Options = {
     "--jobs": {"type": int, "default": os.cpu_count(), "help": "processes"},
 }
 HEAD = (
-    "{} | true thrust, mN | ticks whose interval holds it | worst run | half-width, mN: median | "
-    "largest | mean error, mN | drift of the error per hour"
+    "{} | true thrust, mN | ticks whose interval contains it | the same, worst run | "
+    "median half-width, mN | largest half-width, mN | mean error, mN | drift of the error per hour"
 )
 
 
@@ -326,8 +326,8 @@ def measure(options: Namespace) -> Report:
         for marker, (kind, ways) in zip(names, results.items(), strict=True)
     }
     head = (
-        "target, mN | true thrust over it, less 1 | `held_thrust`: stated ± | ticks whose interval "
-        "holds the truth | shown thrust: ticks whose interval holds the truth"
+        "target, mN | true thrust ÷ target − 1 | `held_thrust`: half-width | ticks whose interval "
+        "contains the true thrust | the same for the shown thrust"
     )
     rows = [
         (

@@ -170,8 +170,8 @@ def measure(options: Namespace) -> Report:
                 )
                 progress(*rows[-1])
     head = (
-        "length | drift | error, rms | statistical interval, mean | interval, mean "
-        "| holds the truth | named / flagged | plain mean, rms"
+        "length | drift | rms error | mean statistical interval | mean total interval "
+        "| contains the true thrust | named / careful | rms error of the plain mean"
     )
     text = (
         f"True thrust {1e3 * truth:.2f} mN, {options.runs} runs of each kind, seeds from "

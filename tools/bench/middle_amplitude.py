@@ -92,7 +92,7 @@ def exploration(options: Namespace) -> str:
         cells = (each.steps, share, f"{each.half_beat:g}", f"{each.stay:.0e}")
         rows.append([str(cell) for cell in cells])
         progress(f"seed {seed}", *rows[-1])
-    heads = "steps | relative thrust (%) | half beat (ticks) | delays a reversal with probability"
+    heads = "steps | relative thrust (%) | half beat (ticks) | probability of a delayed reversal"
     return f"Seed {seed}, best policy after {LONG_STEPS} steps {100 * best:.1f} %:\n\n" + table(
         heads, rows
     )

@@ -53,7 +53,7 @@ def steps(options: Namespace) -> str:
         "`modes`, rig web": Row(rig(), MODES, WEB),
         "`cnn`, rig default": Row(rig(), CNN),
         "`cnn`, rig web": Row(rig(), CNN, WEB),
-        "`cnn`, default, without the mirror": Row(rig(), blind),
+        "`cnn`, default, without symmetry": Row(rig(), blind),
         "force": Row(rig(), FORCE),
     }
     trainings = several(rows, range(UNUSED, UNUSED + options.seeds), options.jobs)
@@ -69,7 +69,7 @@ def steps(options: Namespace) -> str:
         )
     lines = [[name, *summary(runs)] for name, runs in trainings.items()]
     heads = (
-        "what it sees with | steps to 97 %, median | lowest – highest | seeds that reach it | "
+        "input | median steps to 97 % | lowest – highest | seeds that reach it | "
         "best at the end (%) | processor (s for 1000 steps)"
     )
     return table(heads, lines)
@@ -125,7 +125,7 @@ def optimum(options: Namespace) -> str:
             low, high = (pick(end.frequency for end in ends) for pick in (min, max))
             cells.append(f"{frequency:.2f} [{low:.2f} – {high:.2f}] / {share:.1f}")
         lines.append(cells)
-    heads = " | ".join(("Φ (rad)", "best on the grid of ticks", *kinds))
+    heads = " | ".join(("Φ (rad)", "best whole-tick wave", *kinds))
     return (
         f"Frequency (Hz), median [lowest – highest] of {len(seeds)} seeds, and relative thrust "
         f"(%), of the best policy of {longer} steps, `cnn` {TRAINING_STEPS}:\n\n"

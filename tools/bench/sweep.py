@@ -102,9 +102,9 @@ def measure(options: Namespace) -> Report:
     first, stays, ends, shares, covers = zip(*searches, strict=True)
     rows = [
         ["ticks until the proposal gives 97 % of the best", *_spread(first)],
-        ["ticks until all later proposals do, too", *_spread(stays)],
-        ["ticks until it ended by itself", *_spread(ends)],
-        ["true thrust of what it proposed then, % of the best", *_spread(shares, 100.0)],
+        ["ticks until all later proposals give that, too", *_spread(stays)],
+        ["ticks until the search ended", *_spread(ends)],
+        ["true thrust of the final proposal, % of the best", *_spread(shares, 100.0)],
     ]
     text = table(f"search of the frequency, {len(searches)} seeds | median | range", rows)
     return Report(

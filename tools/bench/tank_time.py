@@ -165,14 +165,14 @@ def tank(options: Namespace) -> str:
         )
     heads = " | ".join(
         (
-            "fish | the best is chosen by | seeds | tank time to 97 % (s)",
+            "fish | rule that chooses the best | seeds | tank time to 97 % (s)",
             *(f"after {seconds / 60:g} min" for seconds in AFTER),
-            f"after {STEPS} steps | below the best candidate | whole tank time (s)",
+            f"after {STEPS} steps | % below the best candidate | total tank time (s)",
         )
     )
     return (
-        "True relative thrust (%) of the policy that the training calls its best, median [lowest – "
-        f"highest] of {len(seeds)} seeds:\n\n{table(heads, lines)}"
+        "True relative thrust (%) of the policy that the rule chooses as the best, median "
+        f"[lowest – highest] of {len(seeds)} seeds:\n\n{table(heads, lines)}"
     )
 
 

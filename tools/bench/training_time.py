@@ -39,8 +39,8 @@ def training_time(options: Namespace) -> str:
     """Return the table of times of trainings, one process after the other."""
     runs = [_timed(seed) for seed in range(FIRST_SEED, FIRST_SEED + options.seeds)]
     heads = (
-        "default settings | 97 % are shown after (s) | the run ends after (s) | processor time (s) "
-        "| steps | best policy (%)"
+        "default settings | time until 97 % is reached (s) | time until the run ends (s) "
+        "| processor time (s) | steps | best policy (%)"
     )
     row = [
         f"{len(runs)} seeds, {FIRST_SEED} to {FIRST_SEED + len(runs) - 1}",
