@@ -16,7 +16,7 @@ from fishd.cli.output import (
 )
 from fishd.client import Fish
 from fishd.core.console import format_power, format_thrust
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import find_kind
 from fishd.core.schema import format_values
 from fishd.core.signals import Percentiles, Status
 
@@ -99,7 +99,7 @@ def _timing_rows(status: Status) -> list[tuple[str, str]]:
     timing = status.timing
     scheduling = "real-time" if status.realtime else "normal"
     loop = ("loop", f"tick {status.seq} of {status.tick * 1e3:g} ms, {scheduling} scheduling")
-    if not ROBOTS[status.robot].is_real_time:
+    if not find_kind(status.robot).is_real_time:
         return [loop, ("", "in slow motion no tick is late")]
     return [
         loop,

@@ -15,7 +15,7 @@ from rich.text import Text
 from fishd.cli.output import format_controller, format_quantities, format_time_of_day
 from fishd.core import text
 from fishd.core.console import format_power, format_thrust
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Status, Tick
 
 TRACE_SPAN_S = 5.0
@@ -132,7 +132,7 @@ class View:
             "thrust": format_thrust(current),
             **({} if power is None else {"power": format_power(power)}),
             "tail beat": f"{tick.frequency:.2f} Hz",
-            **(self._timing_figures() if ROBOTS[self.status.robot].is_real_time else {}),
+            **(self._timing_figures() if find_kind(self.status.robot).is_real_time else {}),
             "lost": f"{self._lost}",
         }
         table = Table.grid(padding=(0, 3, 0, 0))

@@ -28,7 +28,7 @@ from fishd.core.errors import ConfigError
 from fishd.core.estimation import EstimatorSettings
 from fishd.core.overrides import apply_overrides
 from fishd.core.protocol import DEFAULT_LEASE_S, MAX_LEASE_S, MIN_LEASE_S
-from fishd.core.robots import ROBOTS, RobotKind
+from fishd.core.robots import RobotKind, find_kind
 from fishd.core.schema import (
     Problem,
     convert,
@@ -241,7 +241,7 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     @property
     def kind(self) -> RobotKind:
         """Properties of the robot."""
-        return ROBOTS[self.robot]
+        return find_kind(self.robot)
 
     @property
     def driver_settings(self) -> drivers.DriverSettings:
@@ -331,7 +331,7 @@ def _warn_of_values(config: Config, sources: Mapping[tuple[str, ...], str]) -> N
 
 def check_tethered(robot: str, what: str) -> None:
     """Raise `ConfigError` if the fish swims freely; what: name of what needs a tethered fish."""
-    if not ROBOTS[robot].is_tethered:
+    if not find_kind(robot).is_tethered:
         raise ConfigError(
             f"robot: swimmer is not valid for {what}, which needs the thrust of a tethered fish; "
             "set robot: simulated, or use 'fishctl simulate' for a swimmer"

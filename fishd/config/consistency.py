@@ -14,7 +14,7 @@ from fishd.core import files
 from fishd.core.addresses import ADDRESS_FORM, find_listen_problem, is_local
 from fishd.core.errors import ParameterError, UnknownController
 from fishd.core.process.unix_sockets import check_length
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import find_kind
 from fishd.core.schema import Problem
 from fishd.hardware.driver import Claim
 from fishd.hardware.servo import pulses
@@ -160,7 +160,7 @@ def check_i2c_addresses(settings: Mapping[str, Any]) -> None:
 
 def check_lockstep(robot: str, lockstep: bool) -> None:
     """Check that lockstep is used only with a simulated fish, whose time can stand still."""
-    if lockstep and not ROBOTS[robot].is_real_time:
+    if lockstep and not find_kind(robot).is_real_time:
         raise Problem(
             ("lockstep",),
             "true is not valid with robot: swimmer, whose time is always virtual and whose ticks "
@@ -176,13 +176,13 @@ def check_lockstep(robot: str, lockstep: bool) -> None:
 
 def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
     """Check that an observer has a model of the fish, and that a fin sensor exists."""
-    if kind == "observer" and not ROBOTS[robot].is_tethered:
+    if kind == "observer" and not find_kind(robot).is_tethered:
         raise Problem(
             ("estimator", "kind"),
             "observer is not valid with robot: swimmer, since its model is of a tethered fish; "
             "sensor or lateral_force is needed",
         )
-    if kind == "sensor" and ROBOTS[robot].is_tethered:
+    if kind == "sensor" and find_kind(robot).is_tethered:
         raise Problem(
             ("estimator", "kind"),
             f"sensor is not valid with robot: {robot}, which has no fin sensor; "

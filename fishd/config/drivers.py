@@ -15,7 +15,7 @@ from fishd.core import text
 from fishd.core.errors import UnknownDriver, UnknownPlant
 from fishd.core.foreign_code import call_foreign
 from fishd.core.plugins import Plugins
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import find_kind
 from fishd.core.schema import Problem, UnknownKey, convert, fields_of, format_excerpt, suggest
 from fishd.hardware.driver import Claim, Driver
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
@@ -118,7 +118,7 @@ def check_drivers(robot: str, tick: float, driver_settings: DriverSettings) -> N
 
     tick: period of the loop [s]
     """
-    if not ROBOTS[robot].has_hardware:  # their loop may be faster than the hardware permits
+    if not find_kind(robot).has_hardware:  # their loop may be faster than the hardware permits
         tick = math.inf
     for section, settings in driver_settings.sections().items():
         driver: type[Driver[Any]] = find_driver(section, settings.driver)

@@ -23,3 +23,8 @@ ROBOTS = {
     "swimmer": RobotKind(is_tethered=False, is_real_time=False, extra="swimmer"),
 }
 """Kind of each robot, by its name in the configuration and in `Status.robot`."""
+
+
+def find_kind(name: str) -> RobotKind:
+    """Return the kind of a robot; that of a simulated fish for a name that is unknown here."""
+    return ROBOTS.get(name, RobotKind())

@@ -23,7 +23,7 @@ from fishd.core.errors import (
     Refused,
     UnknownController,
 )
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Publisher, Reason, Tick
 from fishd.lab.simulation import VirtualRun
 
@@ -280,7 +280,7 @@ class LiveSession(Session):
         check_tethered(status.robot, "a measurement of thrust")
         self.name = status.robot
         self.unit = status.force_unit
-        has_hardware = ROBOTS[status.robot].has_hardware
+        has_hardware = find_kind(status.robot).has_hardware
         self.calibration = fish.calibrations().force if has_hardware else EXACT
         self.tick = status.tick
         self.amplitude = status.amplitude_limit

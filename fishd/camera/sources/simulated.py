@@ -26,7 +26,7 @@ from fishd.core.addresses import find_control_address
 from fishd.core.camera_frames import TIME_TOLERANCE_S
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import find_kind
 from fishd.core.schema import Problem, convert
 from fishd.core.signals import Status
 from fishd.virtual.plant.base import PlantState
@@ -193,7 +193,7 @@ class _View:
 
         status: status of the fishd that has ticked
         """
-        if not ROBOTS[status.robot].is_tethered or not isinstance(tick.alpha, float):
+        if not find_kind(status.robot).is_tethered or not isinstance(tick.alpha, float):
             raise _no_sight(status.robot)
         if math.isnan(tick.time):
             raise Trouble(

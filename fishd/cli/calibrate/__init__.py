@@ -7,7 +7,7 @@ from fishd.cli.output import echo, print_json
 from fishd.cli.verbs import Verb, Verbs
 from fishd.client import Fish
 from fishd.core import text
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import find_kind
 
 VERBS = {
     "Verbs": {
@@ -33,7 +33,7 @@ def tare(seconds: float, endpoint: str | None, as_json: bool) -> None:
     Ctrl-C during the measurement, nothing changes.
     """
     with Fish(endpoint) as fish:
-        has_hardware = ROBOTS[fish.status().robot].has_hardware
+        has_hardware = find_kind(fish.status().robot).has_hardware
         before = fish.calibrations().force if has_hardware else None
         after = fish.tare(seconds)
     if as_json:

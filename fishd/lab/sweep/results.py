@@ -9,7 +9,7 @@ from msgspec import Struct
 from msgspec.structs import fields
 
 from fishd.core.errors import ConfigError
-from fishd.core.robots import ROBOTS
+from fishd.core.robots import find_kind
 from fishd.lab.experiment import ROWS, Experiment
 from fishd.lab.sweep.grid import Point
 
@@ -98,7 +98,7 @@ class Quantity(NamedTuple):
 
 def select_quantity(on: str, config: Mapping[str, Any], force_unit: str) -> Quantity:
     """Return the quantity that a sweep of this fish measures; config: as plain data."""
-    if on == "simulation" and not ROBOTS[config["robot"]].is_tethered:
+    if on == "simulation" and not find_kind(config["robot"]).is_tethered:
         return Quantity("speed", "m/s", SpeedResult)
     return Quantity("thrust", force_unit, Result)
 
