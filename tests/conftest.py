@@ -1,4 +1,4 @@
-"""What holds for every test: which are fast, what may be reported, how many threads compute."""
+"""Settings of all tests: which are fast, what is reported, how many threads compute."""
 
 import contextlib
 import gc
@@ -15,18 +15,18 @@ import pytest
 from _pytest.runner import runtestprotocol
 from hypothesis import HealthCheck, settings
 
-# One process per core computes; before numpy or torch is loaded, here and in what tests start.
+# Each process computes with one thread; set before numpy or torch is loaded, here or in a child.
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
-for variable in ("COLUMNS", "LINES"):  # which workers have; a terminal says itself how large it is
+for variable in ("COLUMNS", "LINES"):  # which workers set; a terminal reports its size itself
     os.environ.pop(variable, None)
-os.environ["FISHD_CONFIG"] = ""  # nor is the configuration of a service on this machine used
+os.environ["FISHD_CONFIG"] = ""  # ignores the configuration of a service on this machine
 
-# Little of what is loaded until the first test begins is ever garbage.
+# Hardly any object that is loaded before the first test becomes garbage.
 gc.disable()
 
-# How long an example takes says something of the machine only; the examples are the same in each
-# run, so that a suite that passes goes on to pass, unless new ones are asked for.
+# The time of an example depends on the machine, so it has no deadline. The examples are the same in
+# each run, so that a suite that passes keeps passing; RANDOM_EXAMPLES selects new ones.
 settings.register_profile(
     "fishd",
     deadline=None,
@@ -37,8 +37,8 @@ settings.load_profile("fishd")
 
 UNIT = Path(__file__).parent / "unit"
 
-LOST = 0.03
-"""A test of real time that fails is repeated if the machine lost so much time meanwhile [s]."""
+MAX_LOST_S = 0.03
+"""Lost time of the machine [s] above which a failed test of real time is repeated."""
 STALLS = """
 import time
 before = time.monotonic()
@@ -49,12 +49,12 @@ while True:
         print(f"{{now - before - 0.01:.3f}}", flush=True)
     before = now
 """
-"""Prints by how much it was woken late, each time that this was long [s]."""
+"""Program that prints each delay of its wake-up that is longer than a limit [s]."""
 
 
 @pytest.fixture
 def sigint_ignored() -> Iterator[None]:
-    """As in the daemon, where a KeyboardInterrupt can only be raised by somebody's code."""
+    """Ignore SIGINT, as the daemon does: a KeyboardInterrupt then comes only from a `raise`."""
     before = signal.signal(signal.SIGINT, lambda number, frame: None)
     yield
     signal.signal(signal.SIGINT, before)
@@ -77,9 +77,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """What has none of the tests that are asked for is not even imported.
+    """Skip files that hold none of the selected tests, without an import.
 
-    With --fast, these are all but tests/unit; single slow tests there are marked `slow`.
+    With --fast, these are all files outside tests/unit; single slow tests in it are marked `slow`.
     """
     fast, realtime = config.option.fast, config.option.realtime
     if not (fast or realtime) or not collection_path.match("test_*.py"):
@@ -90,7 +90,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def refuse_processes(event: str, what: tuple[Any, ...]) -> None:
-    """A fast test starts none but those with which recordings ask for commit and machine."""
+    """Refuse the processes of fast tests, except those that read commit and machine."""
     if event != "subprocess.Popen" or "PYTEST_CURRENT_TEST" not in os.environ:
         return
     if Path(what[0]).name not in {"git", "uname"}:
@@ -98,32 +98,32 @@ def refuse_processes(event: str, what: tuple[Any, ...]) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The slow modules first: the many short tests then share the end evenly among the workers."""
+    """Run slow modules first: the many short tests then spread evenly over the workers."""
     items.sort(key=lambda item: item.path.is_relative_to(UNIT))
 
 
 def pytest_collection_finish() -> None:
-    """Keep the collector away from modules and tests: looking at all of them takes 0.2 s."""
+    """Exclude modules and tests from garbage collection, which would take 0.2 s for them."""
     gc.freeze()
     gc.enable()
 
 
 class LostTime:
-    """Processor time that neither fishd nor a test had any use of."""
+    """Measurement of the time that the machine lost: taken by its host, or in a stall."""
 
     def __init__(self) -> None:
-        limit = LOST + 0.01
+        limit = MAX_LOST_S + 0.01
         self._watch = subprocess.Popen(
             [sys.executable, "-S", "-E", "-c", STALLS.format(limit=limit)], stdout=subprocess.PIPE
         )
         assert self._watch.stdout
         self._pipe = self._watch.stdout.fileno()
         os.set_blocking(self._pipe, False)
-        self._stolen = stolen()
+        self._stolen = read_stolen_time()
 
     def since_last(self) -> float:
-        """Return the time that was lost since the call before [s]."""
-        before, self._stolen = self._stolen, stolen()
+        """Return the time lost since the previous call [s]."""
+        before, self._stolen = self._stolen, read_stolen_time()
         stalls = b""
         with contextlib.suppress(BlockingIOError):
             stalls = os.read(self._pipe, 65536)
@@ -137,17 +137,17 @@ class LostTime:
 LOST_TIME = pytest.StashKey[LostTime]()
 
 
-def stolen() -> float:
-    """Return the processor time, of all cores, that the host has given to others [s]."""
+def read_stolen_time() -> float:
+    """Return the processor time of all cores that the host gave to other machines [s]."""
     return int(Path("/proc/stat").read_text().split()[8]) / os.sysconf("SC_CLK_TCK")
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
-    """Repeat a test of real time once, and say so, if it fails while the machine loses time.
+    """Repeat a failed test of real time once, and report it, if the machine lost time meanwhile.
 
-    The host of a virtual machine has taken the processor away, or everything stood still: that
-    says nothing of fishd. No other test is ever tried twice.
+    The host of a virtual machine took the processor away, or the machine stalled: the failure is
+    not evidence against fishd. No other test is repeated.
     """
     lost_time = item.config.stash.get(LOST_TIME, None)
     if lost_time is None:
@@ -156,7 +156,7 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
     lost_time.since_last()
     reports = runtestprotocol(item, log=False, nextitem=nextitem)
     lost = lost_time.since_last()
-    if lost > LOST and any(report.failed for report in reports):
+    if lost > MAX_LOST_S and any(report.failed for report in reports):
         if terminal := item.config.pluginmanager.get_plugin("terminalreporter"):
             failures = "\n".join(report.longreprtext for report in reports if report.failed)
             message = f"failed while the machine lost {lost:.2f} s: repeated once"
@@ -180,7 +180,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    """Say how many tests were skipped, by what would enable them."""
+    """Print how many tests were skipped, by reason."""
     reports = terminalreporter.stats.get("skipped", [])
     reasons = Counter(str(report.longrepr[2]).removeprefix("Skipped: ") for report in reports)
     if reasons:
@@ -191,15 +191,15 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_report_to_serializable() -> Iterator[Any]:
-    """Captured output may hold what no UTF-8 can carry from a worker to the one that reports."""
+    """Replace characters of captured output that UTF-8 cannot carry from a worker."""
     return _encodable((yield))
 
 
-def _encodable(found: Any) -> Any:
-    if isinstance(found, str):
-        return found.encode("utf-8", "backslashreplace").decode()
-    if isinstance(found, dict):
-        return {key: _encodable(value) for key, value in found.items()}
-    if isinstance(found, list | tuple):
-        return type(found)(_encodable(item) for item in found)
-    return found
+def _encodable(data: Any) -> Any:
+    if isinstance(data, str):
+        return data.encode("utf-8", "backslashreplace").decode()
+    if isinstance(data, dict):
+        return {key: _encodable(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return type(data)(_encodable(item) for item in data)
+    return data

@@ -72,7 +72,7 @@ def with_config(good: Good, yaml: bytes) -> bytes:
 
 def with_messages(good: Good, channel: int, messages: Iterable[Any]) -> bytes:
     """Return the good file with more messages, each plain data or bytes."""
-    payloads = (each if isinstance(each, bytes) else json.dumps(each).encode() for each in messages)
+    payloads = (data if isinstance(data, bytes) else json.dumps(data).encode() for data in messages)
     return with_more(good, chunk(b"".join(message(channel, payload) for payload in payloads)))
 
 

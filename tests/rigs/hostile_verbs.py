@@ -17,10 +17,16 @@ from rigs.hostile_recordings import FILES
 MAX_ADDRESSES = 4 * 2**30
 """Limit of the address space of the process [bytes]."""
 TEXTS_AND_NUMBERS = {"texts-that-are-commands", "numbers-that-no-fish-has"}
-MANY = {"ten-thousand-quantities", "thousands-of-events"}
+LARGE_RECORDINGS = {"ten-thousand-quantities", "thousands-of-events"}
 FILES_OF = {
-    "export --parquet": {"aliases", "a-number-of-400-digits", "good", *TEXTS_AND_NUMBERS, *MANY},
-    "plot --html": {*TEXTS_AND_NUMBERS, *MANY},
+    "export --parquet": {
+        "aliases",
+        "a-number-of-400-digits",
+        "good",
+        *TEXTS_AND_NUMBERS,
+        *LARGE_RECORDINGS,
+    },
+    "plot --html": {*TEXTS_AND_NUMBERS, *LARGE_RECORDINGS},
     "plot --png": TEXTS_AND_NUMBERS,
 }
 """Files for a verb; it reads the others like `export --csv`.

@@ -20,15 +20,15 @@ from pathlib import Path
 from typing import Any
 
 BIN = Path(sys.executable).parent
-UNHURRIED = (sys.executable, "-P", str(Path(__file__).with_name("unhurried.py")))
+UNHURRIED_COMMAND = (sys.executable, "-P", str(Path(__file__).with_name("unhurried.py")))
 PROGRAMS = {
     (str(BIN / "fishd"),): ("fishd", False),
     (str(BIN / "fishctl"),): ("fishctl", False),
     (str(BIN / "fishd-camera"),): ("fishd_camera", False),
-    (*UNHURRIED, "fishd"): ("fishd", True),
-    (*UNHURRIED, "fishctl"): ("fishctl", True),
+    (*UNHURRIED_COMMAND, "fishd"): ("fishd", True),
+    (*UNHURRIED_COMMAND, "fishctl"): ("fishctl", True),
 }
-"""Beginning of a command, to the function that runs it, and whether it is unhurried."""
+"""Function and patience of each program, by the beginning of its command."""
 READ_AT_START = ("PYTHON", "LC_", "LANG", "LD_", "MALLOC_", "OMP_", "OPENBLAS_")
 """Beginnings of the names of variables that take effect while a process starts."""
 PR_SET_CHILD_SUBREAPER = 36
@@ -49,9 +49,11 @@ def _find_program(command: Sequence[str]) -> tuple[str, bool, list[str]] | None:
 
 
 def _variables() -> dict[str, str]:
-    found = {name: value for name, value in os.environ.items() if name.startswith(READ_AT_START)}
-    found.pop("PYTHONSAFEPATH", None)  # which the commands set in any case
-    return found
+    variables = {
+        name: value for name, value in os.environ.items() if name.startswith(READ_AT_START)
+    }
+    variables.pop("PYTHONSAFEPATH", None)  # which the commands set in any case
+    return variables
 
 
 class _Server:
@@ -63,7 +65,7 @@ class _Server:
         self._lock = threading.Lock()
 
     def can_start(self, options: dict[str, Any]) -> bool:
-        """Return whether a fork of the server is what a start would be."""
+        """Return whether a fork of the server behaves as a new process would."""
         return (
             options.keys() <= {"stdin", "stdout", "stderr", "text"}
             and _variables() == self._variables
@@ -112,7 +114,7 @@ class _Forked(subprocess.Popen[Any]):
 
     def _execute_child(self, args: Sequence[str], *rest: Any) -> None:
         sys.audit("subprocess.Popen", args[0], args, None, None)
-        pipes = rest[9:15]  # that of the child and that of this process, of each stream
+        pipes = rest[9:15]  # for each stream, the end of the child and that of this process
         ends = (pipes[0], pipes[3], pipes[5])
         streams = [own if own >= 0 else usual for usual, own in enumerate(ends)]
         self.pid = _SERVER.fork(args, streams)
@@ -121,7 +123,7 @@ class _Forked(subprocess.Popen[Any]):
 
 
 def serve(connection: socket.socket) -> Callable[[], None]:
-    """Fork at each request; return what the fork is to run."""
+    """Fork at each request; return, in the fork, the function that it is to run."""
     while True:
         message, streams, _, _ = socket.recv_fds(connection, 200_000, 3)
         if not message:
@@ -136,7 +138,7 @@ def serve(connection: socket.socket) -> Callable[[], None]:
                 os.close(stream)
         elif child := os.fork():
             connection.send(b"%d" % child)
-            os._exit(0)  # from now on, its child is one of the test process
+            os._exit(0)  # the test process then adopts the child
         else:
             break
     connection.close()

@@ -42,8 +42,8 @@ EXPERIMENT: tuple[str, ...] = (FISHCTL,)
 if not os.environ.get("JUDGES_REAL_TIME"):
     # Without the warm-up, the load is half.
     _settings = sets("realtime.warm_up=false", f"control.lease={LEASE:g}")
-    START = (*preloaded.UNHURRIED, "fishd", *_settings)
-    EXPERIMENT = (*preloaded.UNHURRIED, "fishctl")
+    START = (*preloaded.UNHURRIED_COMMAND, "fishd", *_settings)
+    EXPERIMENT = (*preloaded.UNHURRIED_COMMAND, "fishctl")
 
 
 class Process(processes.Process):

@@ -55,7 +55,7 @@ class Faults(msgspec.Struct, frozen=True):
     skip: int = 0
     """Number of frames of which one is lost between camera and kernel; 0: none."""
     no_video: bool = False
-    """Whether the device is one for metadata."""
+    """Whether the device is for metadata."""
 
 
 class Control:
@@ -201,15 +201,15 @@ class V4l2Camera:
         argument.m1.name = {1: b"Manual Mode", 3: b"Aperture Priority Mode"}[argument.index]
 
     def _g_ext_ctrls(self, argument: Any) -> None:
-        each = argument.controls[0]
-        each.m1.value = self._controls[each.id].value
+        control = argument.controls[0]
+        control.m1.value = self._controls[control.id].value
 
     def _s_ext_ctrls(self, wanted: Any) -> None:
-        each = wanted.controls[0]
+        control = wanted.controls[0]
         auto = self._controls[int(raw.ControlID.EXPOSURE_AUTO)].value
-        if each.id == int(raw.ControlID.EXPOSURE_ABSOLUTE) and auto != 1:
+        if control.id == int(raw.ControlID.EXPOSURE_ABSOLUTE) and auto != 1:
             raise OSError(errno.EACCES, "Permission denied")
-        self._controls[each.id].value = each.m1.value
+        self._controls[control.id].value = control.m1.value
 
     def _reqbufs(self, wanted: Any) -> None:
         if wanted.count and self.faults.busy:

@@ -1,4 +1,4 @@
-"""A policy file with any damaged byte, or one that would fill the memory, is refused."""
+"""Refusal of policy files with a damaged byte, or that would fill the memory."""
 
 import random
 

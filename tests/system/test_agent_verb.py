@@ -1,4 +1,4 @@
-"""`fishctl agent`: a policy swims a true fishd, and sees it through a true fishd-camera."""
+"""`fishctl agent`: a policy controls a real fishd and sees through a real fishd-camera."""
 
 import re
 import signal
@@ -49,14 +49,14 @@ def eye(tmp_path: Path) -> str:
 
 
 class AgentProcess(Process):
-    """A running `fishctl agent`, which is to see through a camera."""
+    """A running `fishctl agent` that sees through a camera."""
 
     def __init__(self, daemon: Daemon, camera: CameraProcess, *words: str) -> None:
         own = ("--endpoint", daemon.endpoint, "--camera", camera.endpoint)
         super().__init__(FISHCTL, "agent", *own, *words)
 
-    def says(self, wanted: str) -> None:
-        """Wait for this line on standard error, whatever comes before."""
+    def wait_for_line(self, wanted: str) -> None:
+        """Wait for this line on standard error, after any other lines."""
         assert self.process.stderr
         for line in self.process.stderr:
             if line == f"{wanted}\n":
@@ -64,12 +64,13 @@ class AgentProcess(Process):
         raise AssertionError(f"it has ended without '{wanted}'")
 
 
-def said(done: tuple[int, str, str]) -> list[tuple[float, ...]]:
-    """Time [s], frequency [Hz], thrust [mN] and |φ_c| [% of Φ] of each line."""
-    return [tuple(map(float, found.groups())) for found in LINE.finditer(done[1])]
+def read_rows(done: tuple[int, str, str]) -> list[tuple[float, ...]]:
+    """Return time [s], frequency [Hz], thrust [mN] and |φ_c| [% of Φ] of each line."""
+    return [tuple(map(float, match.groups())) for match in LINE.finditer(done[1])]
 
 
-def refused(done: subprocess.CompletedProcess[str]) -> str:
+def check_refused(done: subprocess.CompletedProcess[str]) -> str:
+    """Check that a command was check_refused in one line; return it."""
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.count("\n") == 1, done.stderr
     return done.stderr
@@ -84,7 +85,7 @@ def test_a_policy_swims_in_real_time_by_what_the_camera_shows(
     assert (done[0], done[2]) == (0, ""), done
     assert done[1].startswith(f"{eye} swims; it sees pictures; Ctrl-C ends it\n")
     assert done[1].endswith("the fish rests, after 8 s\n")
-    lines = said(done)
+    lines = read_rows(done)
     assert 6 <= len(lines) <= 8
     assert lines[-1][1] > 0.6
     assert lines[-1][2] > 8.0
@@ -144,8 +145,8 @@ def test_a_camera_that_dies_ends_it_at_neutral_with_a_clear_line(
     waits, lost = err.splitlines()[-2:]
     assert waits == "no frames: the fish waits at neutral"
     assert lost.startswith(f"fishctl: no camera at {camera.endpoint}: no answer within 2 s")
-    found = daemon.status()
-    assert (found.mode, found.reason) == ("idle", None)
+    state = daemon.status()
+    assert (state.mode, state.reason) == ("idle", None)
 
 
 @pytest.mark.realtime
@@ -158,10 +159,10 @@ def test_a_camera_that_pauses_is_waited_for(tmp_path: Path, daemon: Daemon, eye:
         ):
             ticks.until(controller="remote", mode="running", phi_c=0.42)
             camera.process.send_signal(signal.SIGSTOP)
-            agent.says("no frames: the fish waits at neutral")
+            agent.wait_for_line("no frames: the fish waits at neutral")
             ticks.until(controller="remote", mode="running", phi_c=0.0)
             camera.process.send_signal(signal.SIGCONT)
-            agent.says("frames are back: it swims on")
+            agent.wait_for_line("frames are back: it swims on")
             ticks.until(controller="remote", mode="running", phi_c=0.42)
             status, _, err = agent.end(signal.SIGINT)
     assert status == 0
@@ -198,8 +199,8 @@ def test_a_policy_that_insists_on_chatter_gives_way_to_swing(
     assert "wanted to reverse sooner than 0.2 s after its last reversal; swing swims on" in (
         done.stderr
     )
-    found = daemon.status()
-    assert (found.mode, found.controller) == ("running", "swing")
+    state = daemon.status()
+    assert (state.mode, state.controller) == ("running", "swing")
 
 
 def test_frames_of_another_size_or_rate_are_refused_before_anything_moves(
@@ -210,7 +211,7 @@ def test_frames_of_another_size_or_rate_are_refused_before_anything_moves(
         path = str(write(tmp_path, content, "other"))
         done = daemon.fishctl("agent", path, "--camera", camera.endpoint)
         assert daemon.status().mode == "idle"
-        return refused(done)
+        return check_refused(done)
 
     assert refusal(StackSettings(size=48, frames=2)) == (
         f"fishctl: {tmp_path}/other.onnx: frames of 48 x 48 pixels are needed (camera.stack.size), "
@@ -236,9 +237,9 @@ def test_frames_of_another_size_or_rate_are_refused_before_anything_moves(
 
 
 def test_without_a_camera_it_says_how_to_start_one(daemon: Daemon, eye: str) -> None:
-    nobody = "tcp://127.0.0.1:9"
-    line = refused(daemon.fishctl("agent", eye, "--camera", nobody))
-    assert line.startswith(f"fishctl: no camera at {nobody}: ")
+    unused = "tcp://127.0.0.1:9"
+    line = check_refused(daemon.fishctl("agent", eye, "--camera", unused))
+    assert line.startswith(f"fishctl: no camera at {unused}: ")
     assert "start one with 'fishd-camera'" in line
     assert daemon.status().mode == "idle"
 
@@ -253,8 +254,8 @@ def test_a_live_comparison_lets_it_swim_through_the_camera(
     row = done.stdout.splitlines()[2]
     assert row.startswith(eye)
     assert float(row.split()[1]) > 5.0
-    found = daemon.status()
-    assert (found.mode, found.reason) == ("idle", None)
+    state = daemon.status()
+    assert (state.mode, state.reason) == ("idle", None)
 
 
 @pytest.mark.realtime
@@ -285,5 +286,5 @@ def test_a_camera_that_dies_ends_a_live_comparison_with_the_fish_at_rest(
             status, out, err = comparing.finish()
     assert (status, out.count("\n")) == (1, 1)
     assert err.startswith(f"fishctl: {eye}: no camera at {camera.endpoint}: no answer within 2 s")
-    found = daemon.status()
-    assert (found.mode, found.reason) == ("idle", None)
+    state = daemon.status()
+    assert (state.mode, state.reason) == ("idle", None)

@@ -1,4 +1,4 @@
-"""What the shell offers for a half-typed command line of fishctl."""
+"""Completions that the shell offers for an incomplete command line of fishctl."""
 
 import os
 import shutil
@@ -9,8 +9,8 @@ import pytest
 from rigs.processes import FISHCTL, Daemon, call, wait_until
 
 
-def offered(*words: str) -> list[str]:
-    """What bash would be told for these words, of which the last is not complete."""
+def complete(*words: str) -> list[str]:
+    """Return the completions that bash gets for these words, the last of which is incomplete."""
     shell = {"_FISHCTL_COMPLETE": "bash_complete", "COMP_CWORD": str(len(words))}
     shell["COMP_WORDS"] = "\n".join(("fishctl", *words))
     done = call(FISHCTL, env=os.environ | shell, check=True)
@@ -27,25 +27,25 @@ def test_set_parameter_offers_the_parameters_of_the_running_controller(daemon: D
         (("set-parameter", *to, "C", "0.3", "am"), ["plain,amplitude"]),
         ((*to, "set-parameter", "C", ""), ["plain,auto"]),
     ):
-        # The shell waits for fishd a moment only, and offers nothing where that is too short.
-        wait_until(lambda words=words, expected=expected: offered(*words) == expected)
+        # The shell waits for fishd only briefly, and offers nothing if that is too short.
+        wait_until(lambda words=words, expected=expected: complete(*words) == expected)
 
 
 def test_set_parameter_offers_nothing_without_a_daemon(tmp_path: Path) -> None:
-    assert offered("--endpoint", f"ipc://{tmp_path}/nobody", "set-parameter", "") == []
+    assert complete("--endpoint", f"ipc://{tmp_path}/nobody", "set-parameter", "") == []
 
 
 def test_set_offers_keys_of_the_configuration() -> None:
-    keys = offered("simulate", "swing", "--set", "plant.")
+    keys = complete("simulate", "swing", "--set", "plant.")
     assert "plain,plant.omega0=" in keys
     assert all(key.startswith("plain,plant.") for key in keys)
-    assert "plain,plant=" not in offered("config", "show", "--set", "pl")
+    assert "plain,plant=" not in complete("config", "show", "--set", "pl")
 
 
 def test_compare_offers_controllers_and_policies() -> None:
-    assert offered("compare", "sw") == ["file,sw", "plain,swing"]
-    assert "plain,default-fish" in offered("compare", "swing", "def")
-    assert "plain,remote" not in offered("compare", "")
+    assert complete("compare", "sw") == ["file,sw", "plain,swing"]
+    assert "plain,default-fish" in complete("compare", "swing", "def")
+    assert "plain,remote" not in complete("compare", "")
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="no bash")

@@ -121,7 +121,7 @@ def test_a_signal_fades_to_neutral_and_exits_with_0(tmp_path: Path, number: int)
 
 
 def refused(folder: Path, *settings: str) -> str:
-    """What a fishd says that cannot start with these settings."""
+    """Return the error messages of a fishd that cannot start with these settings."""
     status, out, errors = Daemon(folder, *sets(*settings)).finish()
     assert (status, out) == (1, "")
     assert "Traceback" not in errors
@@ -155,7 +155,7 @@ def test_a_second_daemon_on_the_same_address_says_so_and_exits(
     assert line.endswith(f" --set telemetry.address={host}:{int(port) + 1}\n")
 
 
-@pytest.mark.parametrize("host", ["nohost.invalid", "192.0.2.1"])  # which is nobody's
+@pytest.mark.parametrize("host", ["nohost.invalid", "192.0.2.1"])  # reserved for examples
 def test_a_telemetry_address_of_another_machine_is_one_line_with_what_would_be_right(
     tmp_path: Path, host: str
 ) -> None:
@@ -233,12 +233,12 @@ resource.getrlimit = lambda _: (51, 51)
 logging.basicConfig()
 assert not realtime.enter(60, False)
 """
-"""What a service with LimitRTPRIO=51 does; not every machine lets a test raise that limit."""
+"""Program with LimitRTPRIO=51, emulated, as not every machine lets a test raise that limit."""
 
 
 def test_a_priority_above_what_is_permitted_is_told_with_the_limit() -> None:
-    told = call(sys.executable, "-c", ABOVE).stderr
-    assert "; let LimitRTPRIO= of its service be 61, not 51, or set realtime.priority: 0" in told
+    message = call(sys.executable, "-c", ABOVE).stderr
+    assert "; let LimitRTPRIO= of its service be 61, not 51, or set realtime.priority: 0" in message
 
 
 def test_what_is_not_asked_for_is_not_missed(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The Python examples of the documentation, run as they are, and ended with Ctrl-C."""
+"""The Python examples of the documentation, run without changes, and ended with Ctrl-C."""
 
 import os
 import signal

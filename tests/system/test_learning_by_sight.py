@@ -36,7 +36,7 @@ class Rig(NamedTuple):
     daemon: Daemon
     camera: CameraProcess
     words: tuple[str, ...]
-    """Of a training on it."""
+    """Command line of a training on the rig."""
     folder: Path
 
 

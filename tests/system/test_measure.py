@@ -1,4 +1,4 @@
-"""`fishctl measure` on a real fishd: what it finds, what it tells fishd, and how it ends."""
+"""`fishctl measure` on a real fishd: its result, its effect on fishd, and how it ends."""
 
 import math
 import signal
@@ -22,32 +22,32 @@ def daemon(drifting: Daemon) -> Daemon:
     return drifting.at_rest()
 
 
-def begun(daemon: Daemon) -> Process:
-    """A measurement whose fish has begun to swim."""
-    found = Process(*EXPERIMENT, "--endpoint", daemon.endpoint, "measure", "swing", "--for", "60")
+def start_measurement(daemon: Daemon) -> Process:
+    """Start a measurement; return its process when the fish swims."""
+    process = Process(*EXPERIMENT, "--endpoint", daemon.endpoint, "measure", "swing", "--for", "60")
     wait_until(lambda: daemon.status().mode == "running")
-    return found
+    return process
 
 
 def test_it_finds_the_thrust_and_fishd_shows_it_from_then_on(daemon: Daemon) -> None:
     ended = daemon.fishctl("measure", "swing", "--for", "21", "--json")
     assert ended.returncode == 0, ended.stderr
-    found = msgspec.json.decode(ended.stdout)
-    assert found["thrust"] == pytest.approx(25.74e-3, abs=1.5e-3)
-    assert 0.0 < found["error"] < 1.5e-3
+    result = msgspec.json.decode(ended.stdout)
+    assert result["thrust"] == pytest.approx(25.74e-3, abs=1.5e-3)
+    assert 0.0 < result["error"] < 1.5e-3
     assert daemon.status().mode == "idle"
     daemon.fishctl("set-controller", "swing")
 
     def is_shown() -> bool:
         status = daemon.status()
         ci95 = status.thrust_error or math.inf
-        return ci95 < 2e-3 and abs(status.thrust - found["thrust"]) <= ci95
+        return ci95 < 2e-3 and abs(status.thrust - result["thrust"]) <= ci95
 
     wait_until(is_shown)
 
 
 def test_another_controller_in_the_middle_ends_it_and_swims_on(daemon: Daemon) -> None:
-    measuring = begun(daemon)
+    measuring = start_measurement(daemon)
     assert daemon.fishctl("set-controller", "square").returncode == 0
     status, out, err = measuring.finish()
     assert (status, out.count("\n")) == (1, 1)
@@ -60,7 +60,7 @@ def test_another_controller_in_the_middle_ends_it_and_swims_on(daemon: Daemon) -
 
 def test_another_parameter_in_the_middle_ends_it_too(daemon: Daemon) -> None:
     with Subscriber(daemon.telemetry, b"tick") as ticks:
-        measuring = begun(daemon)
+        measuring = start_measurement(daemon)
         ticks.until(controller="swing", mode="running")
     assert daemon.fishctl("set-parameter", "C=0.1").returncode == 0
     status, _, err = measuring.finish()
@@ -70,14 +70,14 @@ def test_another_parameter_in_the_middle_ends_it_too(daemon: Daemon) -> None:
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_whoever_ends_it_leaves_the_fish_at_rest(daemon: Daemon, how: signal.Signals) -> None:
-    status, out, err = begun(daemon).end(how)
+    status, out, err = start_measurement(daemon).end(how)
     assert (status, out.count("\n")) == (130, 1)
     assert err == "fishctl: interrupted: the fish rests, nothing is measured\n"
     assert daemon.status().mode == "idle"
 
 
 def test_an_emergency_stop_ends_it_and_says_so(daemon: Daemon) -> None:
-    measuring = begun(daemon)
+    measuring = start_measurement(daemon)
     daemon.fishctl("estop")
     status, _, err = measuring.finish()
     assert status == 1

@@ -15,7 +15,7 @@ from fishd.controllers.policy.network import to_onnx
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder of policies that the daemon and fishctl both look into."""
+    """Folder of policies for the daemon and fishctl."""
     folder = tmp_path_factory.mktemp("fishd") / "policies"
     write(folder, FLIP, "flip")
     write(folder, to_onnx(linear(1.0), "tanh", card(tick=0.02)), "quick")
@@ -27,8 +27,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 @pytest.fixture(scope="module")
 def shared_daemon(folder: Path) -> Iterator[Daemon]:
-    with running(folder.parent, "--set", "chatter.dwell=0") as found:
-        yield found
+    with running(folder.parent, "--set", "chatter.dwell=0") as daemon:
+        yield daemon
 
 
 @pytest.mark.realtime
@@ -39,12 +39,12 @@ def test_a_policy_that_shakes_the_servo_loses_command_and_everyone_is_told(
         with running(tmp_path) as daemon, Fish(daemon.endpoint, timeout=PATIENCE) as fish:
             return shaken(daemon, fish)
 
-    # What costs a tick costs it each time; a machine that stands still for a moment does not.
+    # A real cost of ticks recurs each time; a short stall of the machine does not.
     assert any(missed() == 0 for _ in range(3))
 
 
 def shaken(daemon: Daemon, fish: Fish) -> int:
-    """Let a policy shake the servo until swing takes over; how many slots that has cost."""
+    """Let a policy shake the servo until swing takes over; return the number of missed slots."""
     with (
         Subscriber(daemon.telemetry, b"event") as events,
         Subscriber(daemon.telemetry, b"tick") as ticks,
@@ -95,7 +95,7 @@ def test_a_policy_that_loads_costs_no_tick(folder: Path, tmp_path: Path) -> None
             after = ticks.until(controller="ppo")
         return int(after["missed"] - before["missed"])
 
-    # What costs a tick costs it each time; a machine that stands still for a moment does not.
+    # A real cost of ticks recurs each time; a short stall of the machine does not.
     assert any(missed() == 0 for _ in range(3))
 
 
@@ -202,5 +202,5 @@ def test_a_running_fishd_warms_up_its_controller(tmp_path: Path) -> None:
     ):
         daemon.fishctl("set-controller", "warming")
         ticks.until(controller="warming")
-        while ticks.message()["phi_c"] < 5.5e-3:  # where there is no time, it is left out
+        while ticks.message()["phi_c"] < 5.5e-3:  # the warm-up is left out if time is short
             pass

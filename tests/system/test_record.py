@@ -36,27 +36,27 @@ class Recording(Process):
         )
 
     def wait_for_ticks(self, enough: Callable[[int], bool] = lambda seq: seq > 0) -> None:
-        """Until a tick of such a number is in the file."""
+        """Wait until the file holds a tick of such a number."""
         wait_until(lambda: any(enough(tick.seq) for tick in ticks_in(self.folder)))
 
 
 def ticks_in(folder: Path) -> list[Tick]:
-    """Those of the recording that is being written, if it is there already."""
-    run = begun_in(folder)
+    """Return the ticks of the recording that is being written, none if it does not exist yet."""
+    run = open_unfinished(folder)
     return run.ticks if run else []
 
 
-def begun_in(folder: Path) -> Run | None:
-    """The recording that is being written, as far as it goes, if it is there already."""
+def open_unfinished(folder: Path) -> Run | None:
+    """Return the recording that is being written, None if it does not exist yet."""
     try:
         return open_run(next(folder.glob("*.part")))
     except (StopIteration, RecordingError):
         return None
 
 
-def whose(folder: Path) -> int:
-    """How many fishds the recording that is being written has asked who they are."""
-    run = begun_in(folder)
+def count_daemons(folder: Path) -> int:
+    """Return the number of fishds of which the recording in progress holds the configuration."""
+    run = open_unfinished(folder)
     return len(run.configs) if run else 0
 
 
@@ -121,7 +121,7 @@ def test_a_kill_of_fishd_loses_nothing_and_the_next_one_is_recorded_too(
         wait_until(lambda: first.status().seq > 150)
         first.kill()
     with running(tmp_path, "--set", "start.controller=square"):
-        wait_until(lambda: whose(runs) == 2)
+        wait_until(lambda: count_daemons(runs) == 2)
         _, _, complaints = recording.end()
     run = open_run(runs / "run.mcap")
     assert "another fishd has taken over: the recording continues with it" in complaints

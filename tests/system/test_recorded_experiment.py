@@ -23,13 +23,13 @@ def test_what_a_live_rig_does_is_rerun_to_the_last_bit(daemon: Daemon, tmp_path:
     assert run.about["source"] == "fishd"
     assert run.daemons[0]["robot"] == "simulated"
     assert run.gaps == []
-    found = rerun(run).stretches
-    assert [each.recorded for each in found] == ["swing", "square"]
-    assert all(each.from_start and each.equal == each.ticks >= 30 for each in found)
+    stretches = rerun(run).stretches
+    assert [stretch.recorded for stretch in stretches] == ["swing", "square"]
+    assert all(stretch.from_start and stretch.equal == stretch.ticks >= 30 for stretch in stretches)
 
 
-def excited_in(part: Path) -> int:
-    """How many ticks of the excitation a recording that is being written has so far."""
+def count_excitation_ticks(part: Path) -> int:
+    """Return the number of ticks of the excitation in a recording that is being written."""
     try:
         return open_run(part).summary.swimming.get("excitation", 0)
     except RecordingError:
@@ -44,7 +44,7 @@ def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
     words = ("identify", "--experiment", "--on", "live", "--for", "40", "--folder", str(folder))
     swims = Process(*EXPERIMENT, "--endpoint", daemon.endpoint, *words)
     wait_until(lambda: daemon.status().mode == "running")
-    wait_until(lambda: excited_in(path.with_name("identify.mcap.part")) >= 15)
+    wait_until(lambda: count_excitation_ticks(path.with_name("identify.mcap.part")) >= 15)
     status, out, err = swims.end(signal.SIGTERM)
     assert status == 130
     assert out == f"fish: the fish of fishd at {daemon.endpoint}\n"

@@ -19,15 +19,15 @@ def test_an_agent_swims_the_virtual_pi(tmp_path: Path) -> None:
             in_time = 0
             for step in range(40):
                 angle = 0.3 if step % 12 < 6 else -0.3
-                found, lost, _ = link.step(angle)
+                observation, lost, _ = link.step(angle)
                 if not lost:
                     in_time += 1
-                    assert abs(found.instruction_angle - angle) < 1e-6
+                    assert abs(observation.instruction_angle - angle) < 1e-6
             assert in_time > 20
             link.pause(10.0)
             time.sleep(0.5)
             rested = link.resume()
-            assert rested.time > found.time + 0.4
+            assert rested.time > observation.time + 0.4
             assert rested.instruction_angle == 0.0
         finally:
             link.close()

@@ -102,8 +102,8 @@ def shared_daemon(site: Path) -> Iterator[Daemon]:
     """A daemon on a machine with these packages."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(site))
-        with running(site.parent) as found:
-            yield found
+        with running(site.parent) as daemon:
+            yield daemon
 
 
 def test_the_good_ones_are_listed_beside_the_built_in_ones(daemon: Daemon) -> None:
@@ -177,7 +177,7 @@ def test_one_that_loads_slowly_costs_no_tick(daemon: Daemon) -> None:
         assert after["seq"] - before["seq"] > 15
         return int(after["missed"] - before["missed"])
 
-    # What costs a tick costs it each time; a machine that stands still for a moment does not.
+    # A real cost of ticks recurs each time; a short stall of the machine does not.
     assert any(missed() == 0 for _ in range(3))
 
 
@@ -186,13 +186,13 @@ def test_one_that_is_still_loading_is_not_held_up_by_a_request_that_is_refused(
 ) -> None:
     with (
         ThreadPoolExecutor() as threads,
-        Fish(daemon.endpoint, timeout=PATIENCE) as one,
-        Fish(daemon.endpoint, timeout=PATIENCE) as other,
+        Fish(daemon.endpoint, timeout=PATIENCE) as first,
+        Fish(daemon.endpoint, timeout=PATIENCE) as second,
     ):
-        loading = threads.submit(one.set_controller, "slow")
+        loading = threads.submit(first.set_controller, "slow")
         while not loading.done():
             with pytest.raises(Refused, match="swnig"):
-                other.set_controller("swnig")
+                second.set_controller("swnig")
         assert loading.result().controller == "slow"
 
 

@@ -1,4 +1,4 @@
-"""The daemon on a virtual Pi in a process of its own, as the README shows it."""
+"""The daemon on a virtual Pi in a separate process, as the README shows it."""
 
 from collections.abc import Iterator
 

@@ -1,4 +1,4 @@
-"""The verb that runs a virtual Pi as a process of its own, and those that break it."""
+"""Verb that runs a virtual Pi in a separate process, and verbs that inject faults."""
 
 import contextlib
 import json
@@ -22,20 +22,20 @@ CONFIG = [Write(b"\x01"), Read(2)]
 
 @pytest.fixture
 def own_pi(tmp_path: Path) -> Iterator[Pi]:
-    """For a test of its start, its pulses or its end."""
-    with virtual_pi(tmp_path) as found:
-        yield found
+    """Virtual Pi for a test of its start, its pulses or its end."""
+    with virtual_pi(tmp_path) as own:
+        yield own
 
 
 @pytest.fixture(scope="module")
 def shared_pi(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Pi]:
-    with virtual_pi(tmp_path_factory.mktemp("pi")) as found:
-        yield found
+    with virtual_pi(tmp_path_factory.mktemp("pi")) as shared:
+        yield shared
 
 
 @pytest.fixture
 def pi(shared_pi: Pi) -> Pi:
-    """One for all tests of a module, without a fault."""
+    """Virtual Pi for all tests of a module, without a fault."""
     shared_pi.control("clear")
     return shared_pi
 
@@ -59,7 +59,7 @@ def test_it_says_where_it_listens_and_answers_there(own_pi: Pi) -> None:
 def test_a_pulse_moves_the_fish(own_pi: Pi) -> None:
     with contextlib.closing(Client("127.0.0.1", own_pi.port, PATIENCE)) as client:
         client.set_servo_pulsewidth(18, 1740)
-    with RemotePi(own_pi.path) as remote:  # nobody reads the sensor, and still the fish swims
+    with RemotePi(own_pi.path) as remote:  # the fish swims even if no client reads the sensor
         wait_until(lambda: remote.state().truth.alpha > 0.15)
     text = own_pi.control("status")
     assert "pulses      1740 µs, +0.400 rad" in text

@@ -1,6 +1,6 @@
-"""What a tick and a start-up may cost: committed numbers, so that speed is not lost bit by bit.
+"""Permitted costs of a tick and a start-up, committed so that speed is not lost in small steps.
 
-A change that needs more renews them with `python tools/budget.py --write`, and says why.
+A change that needs more updates them with `python tools/budget.py --write`, and gives the reason.
 """
 
 import pytest

@@ -1,4 +1,4 @@
-"""The loop of `fishd-camera`, above a driver that does what none should."""
+"""Loop of `fishd-camera` with a faulty driver."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -56,7 +56,7 @@ class Hangs:
 
 
 class TwoTicks:
-    """In lockstep; each tick comes once it is let."""
+    """Source in lockstep, whose ticks come when a test releases them."""
 
     device = "a camera"
 
@@ -81,8 +81,8 @@ def serving(
     stopping = threading.Event()
     endpoint = f"ipc://{folder}/r"
     pairs = (f"publish.requests={endpoint}", f"publish.frames=ipc://{folder}/f")
-    with Server(load(None, pairs), source) as each:
-        thread = threading.Thread(target=each.run, args=(stopping.is_set,))
+    with Server(load(None, pairs), source) as camera_server:
+        thread = threading.Thread(target=camera_server.run, args=(stopping.is_set,))
         thread.start()
         try:
             with CameraClient(endpoint, stack=stack, timeout=PATIENCE) as client:

@@ -1,4 +1,4 @@
-"""What strangers send to the sockets of `fishd-camera` does it no harm."""
+"""Sockets of `fishd-camera`, which survive any input from unknown programs."""
 
 import json
 import os
@@ -50,15 +50,15 @@ Make = Callable[[int], "zmq.Socket[bytes]"]
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Return what makes bare sockets, which end with the test."""
+    """Return a function that makes bare sockets, which are closed after the test."""
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     sockets = []
 
-    def made(kind: int) -> "zmq.Socket[bytes]":
+    def make_socket(kind: int) -> "zmq.Socket[bytes]":
         sockets.append(context.socket(kind))
         return sockets[-1]
 
-    yield made
+    yield make_socket
     context.destroy(linger=0)
 
 
@@ -100,10 +100,10 @@ def test_a_flood_of_garbage_is_survived_while_frames_go_on(
             with socket.socket(socket.AF_UNIX) as raw:
                 raw.connect(address.removeprefix("ipc://"))
                 raw.send(os.urandom(2000))
-        before, found = client.status().seq, 0
-        while found < 30:
+        before, newer = client.status().seq, 0
+        while newer < 30:
             new = client.poll_with_headers(5.0)
-            found += sum(header.seq > before for header, _ in new)
+            newer += sum(header.seq > before for header, _ in new)
 
 
 def wait_for_view(client: CameraClient, after: float) -> None:
@@ -137,7 +137,7 @@ def test_subscriptions_to_unknown_topics_take_no_memory_and_viewers_come_back(
 
 
 def resident(camera: CameraProcess) -> float:
-    """Memory of its process [MB]."""
+    """Return the memory of the process of a camera [MB]."""
     statm = Path(f"/proc/{camera.process.pid}/statm").read_text()
     return int(statm.split()[1]) * resource.getpagesize() / 2**20
 
@@ -198,9 +198,9 @@ def test_the_doctor_says_how_the_camera_is(
 ) -> None:
     context = Context(Config())
     monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
-    found = service.camera(context)
-    assert found
-    assert (found.level, found.message[:5]) == ("ok", "120.0")
+    check = service.camera(context)
+    assert check
+    assert (check.level, check.message[:5]) == ("ok", "120.0")
     monkeypatch.setenv("FISHD_CAMERA", f"ipc://{tmp_path}/nobody")
     assert service.camera(context) is None
 

@@ -55,13 +55,13 @@ def test_from_another_machine_the_offset_is_estimated(
     ):
         camera.is_in("streaming")
         with camera.client(fish=fish) as client:
-            found: list[tuple[FrameHeader, Frame]] = []
-            while len(found) < 5:
-                found += client.poll_with_headers(PATIENCE)
+            received: list[tuple[FrameHeader, Frame]] = []
+            while len(received) < 5:
+                received += client.poll_with_headers(PATIENCE)
             offset = client.offset()
     assert 0.0 < offset.uncertainty < 1.0
     assert abs(offset.seconds) <= offset.uncertainty  # it is one clock in truth
-    sent, frame = found[-1]
+    sent, frame = received[-1]
     assert frame.time == pytest.approx(sent.time, abs=offset.uncertainty)
 
 
@@ -104,8 +104,8 @@ class Lockstep:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for each in (self.client, self.agent, self.fish):
-            each.close()
+        for connection in (self.client, self.agent, self.fish):
+            connection.close()
 
     def swim(self, ticks: int) -> list[Stack | None]:
         seen: list[Stack | None] = []

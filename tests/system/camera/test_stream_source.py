@@ -38,7 +38,7 @@ def test_a_file_is_played_at_its_own_rate_again_and_again(tmp_path: Path, video:
             frames += client.poll(PATIENCE)
         state = client.status()
     levels = [round(float(np.median(frame.pixels[:, 5:35])) / 10) * 10 for frame in frames]
-    numbers = [(each - level(0)) // 10 for each in levels]
+    numbers = [(grey - level(0)) // 10 for grey in levels]
     assert all(after == (before + 1) % 12 for before, after in pairwise(numbers))
     # After a stop of the machine it catches up: the longest time of 30 frames is judged.
     longest = max(b.time - a.time for a, b in zip(frames[:-29], frames[29:], strict=True))
@@ -64,7 +64,7 @@ def test_a_file_that_is_no_video_is_said(tmp_path: Path, content: bytes) -> None
 
 @contextmanager
 def serving(folder: Path, port: int = 0) -> Iterator[int]:
-    """The files of a folder, over HTTP; gives the port."""
+    """Serve the files of a folder over HTTP; yield the port."""
     handler = partial(SimpleHTTPRequestHandler, directory=str(folder))
     with ThreadingHTTPServer(("127.0.0.1", port), handler) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.05,))

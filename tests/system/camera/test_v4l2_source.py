@@ -29,19 +29,20 @@ def good(rig: V4l2Rig) -> V4l2Rig:
 
 
 def published(client: CameraClient, number: int) -> list[PublishedFrame]:
-    found: list[PublishedFrame] = []
-    while len(found) < number:
+    """Return the next frames, a number of them."""
+    frames: list[PublishedFrame] = []
+    while len(frames) < number:
         if client.poll(5.0) and client.latest:
-            found.append(client.latest)
-    return found
+            frames.append(client.latest)
+    return frames
 
 
 def test_frames_come_with_the_times_of_the_kernel(good: V4l2Rig) -> None:
     with good.client() as client:
-        frames = [each.header for each in published(client, 10)]
+        headers = [frame.header for frame in published(client, 10)]
         state = client.status()
-    assert all(0.0 < b.time - a.time < 30.0 for a, b in pairwise(frames))
-    assert 0.0 < time.monotonic() - frames[-1].time < 30.0
+    assert all(0.0 < b.time - a.time < 30.0 for a, b in pairwise(headers))
+    assert 0.0 < time.monotonic() - headers[-1].time < 30.0
     assert state.degraded == ()
     assert (state.picture_width, state.picture_height, state.width) == (640, 480, 84)
     assert (state.source, state.device) == ("v4l2", "/dev/video7")
@@ -82,7 +83,7 @@ def test_a_camera_that_sends_only_broken_frames_does_not_stream_and_is_opened_an
     assert "/dev/video7 has sent only broken frames for 2 s (" in state.problem
     assert "another cable or port" in state.remedy
     assert (state.rate, state.latency) == (0.0, None)
-    good.until(lambda later: later.broken > state.broken + 3)  # it is open again
+    good.until(lambda later: later.broken > state.broken + 3)  # the camera is open again
     assert good.status().state == "stalled"
     good.set()
     good.is_in("streaming")
@@ -99,7 +100,7 @@ def test_a_client_is_told_that_the_camera_is_unplugged(good: V4l2Rig) -> None:
         published(client, 2)
         good.set(unplugged=True)
         good.is_in("unplugged")
-        client._timeout = 0.5  # of silence only: an answer may take as long as it likes
+        client._timeout = 0.5  # limits silence, not the time of an answer
         with pytest.raises(CameraLost, match=r"has been unplugged for \d+ s: /dev/video7: there"):
             for _ in client.frames():
                 pass
@@ -152,13 +153,13 @@ def test_frames_that_have_waited_in_the_driver_are_dropped_and_counted(good: V4l
     before = good.until(lambda state: not state.degraded)
     with good.client() as client:
         good.set(late=4)
-        found = published(client, 1)
-        while found[-1].header.dropped < before.dropped + 4:
-            found += published(client, 1)
+        frames = published(client, 1)
+        while frames[-1].header.dropped < before.dropped + 4:
+            frames += published(client, 1)
         after = client.status()
     assert (after.session, after.degraded) == (before.session, ())
-    assert all(each.header.available - each.header.time < 3.0 for each in found)
-    assert all(a.header.time < b.header.time for a, b in pairwise(found))
+    assert all(frame.header.available - frame.header.time < 3.0 for frame in frames)
+    assert all(a.header.time < b.header.time for a, b in pairwise(frames))
 
 
 def test_controls_are_set_and_tell_the_exposure(tmp_path: Path) -> None:
@@ -195,6 +196,6 @@ def test_the_time_is_that_of_the_middle_of_the_exposure(
         v4l2_rig(tmp_path, *controls, "v4l2.delay=0.1", end_of_frame=end) as rig,
         rig.client() as client,
     ):
-        delays = [each.header.available - each.header.time for each in published(client, 20)]
+        delays = [f.header.available - f.header.time for f in published(client, 20)]
     # The emulation says that an exposure has ended 5 ms before its frame is there.
     assert 0.1 + 0.005 + 0.005 <= min(delays) < 0.1 + 0.005 + 0.005 + 0.05

@@ -1,4 +1,4 @@
-"""What is an address, and where fishd listens: what is written, and nothing else."""
+"""Addresses: valid ones, and those on which fishd listens, exactly as written."""
 
 import socket
 from pathlib import Path

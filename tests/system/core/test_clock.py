@@ -17,15 +17,15 @@ async def slots(
     nap_before: Mapping[int, float] | None = None,
     warm_up: Callable[[], None] | None = None,
 ) -> list[Slot]:
-    """Slots of a real ticker; the body of a turn takes as long as `nap_before` says."""
+    """Return slots of a real ticker; `nap_before` holds the time that the body of a turn takes."""
     ticker = Ticker(PERIOD, warm_up)
-    found: list[Slot] = []
+    collected: list[Slot] = []
     try:
         async for slot in ticker:
-            found.append(slot)
-            if len(found) == count:
-                return found
-            time.sleep((nap_before or {}).get(len(found), 0.0))
+            collected.append(slot)
+            if len(collected) == count:
+                return collected
+            time.sleep((nap_before or {}).get(len(collected), 0.0))
     finally:
         ticker.close()
     raise AssertionError("a ticker never ends")
@@ -38,26 +38,26 @@ def test_virtual_time_is_never_late_and_moves_its_clock() -> None:
 
 
 def test_a_long_turn_costs_whole_slots_which_are_counted_and_not_caught_up() -> None:
-    found = asyncio.run(slots(20, {4: 3.5 * PERIOD, 9: 0.031}))
-    assert found[4].missed >= 2
-    for before, after in pairwise(found):
+    collected = asyncio.run(slots(20, {4: 3.5 * PERIOD, 9: 0.031}))
+    assert collected[4].missed >= 2
+    for before, after in pairwise(collected):
         assert after.index - before.index == after.missed + 1
         assert 0.0 <= after.now - after.deadline < PERIOD
-        elapsed = after.deadline - found[0].deadline
-        assert elapsed == pytest.approx((after.index - found[0].index) * PERIOD, abs=1e-9)
+        elapsed = after.deadline - collected[0].deadline
+        assert elapsed == pytest.approx((after.index - collected[0].index) * PERIOD, abs=1e-9)
 
 
 def test_the_asyncio_loop_is_served_between_ticks_even_under_overload() -> None:
     async def run() -> int:
         served = 0
 
-        async def other() -> None:
+        async def count_turns() -> None:
             nonlocal served
             while True:
                 served += 1
                 await asyncio.sleep(0)
 
-        task = asyncio.create_task(other())
+        task = asyncio.create_task(count_turns())
         await slots(5, dict.fromkeys(range(5), 1.5 * PERIOD))
         task.cancel()
         return served
@@ -96,6 +96,6 @@ def test_one_warm_up_during_which_the_machine_stood_still_does_not_end_them() ->
         if len(warmed) == 3:
             time.sleep(10 * PERIOD)
 
-    # The one after it may take a few ms on a busy machine, and leave out some more.
+    # The next warm-up may take a few ms on a busy machine, and leave out some more.
     asyncio.run(slots(100, warm_up=stopped_once))
     assert len(warmed) >= 8

@@ -51,11 +51,11 @@ def test_a_lock_that_its_holder_removed_while_another_opened_it_is_no_lock(
     path = tmp_path / "agent"
 
     def late(name: Path, flags: int, mode: int = 0o777) -> int:
-        found = really(name, flags, mode)
+        descriptor = really(name, flags, mode)
         if not removed:
             removed.append(name)
             lock_path(path).unlink()  # as a holder does that ends now
-        return found
+        return descriptor
 
     removed: list[Path] = []
     really = os.open

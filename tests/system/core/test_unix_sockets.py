@@ -1,4 +1,4 @@
-"""A client asks nobody but the fishd of its user, of root, or the service."""
+"""Trust of a client in sockets: only those of its user, of root, or of the service."""
 
 import os
 import shutil
@@ -17,13 +17,13 @@ from fishd.core import addresses
 from fishd.core.errors import Untrusted
 from fishd.core.process.unix_sockets import find_trust_problem
 
-USER, OTHER = 60101, 60102
+USER, OTHER_USER = 60101, 60102
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be two other users")
 
 
 @contextmanager
 def user(number: int) -> Iterator[None]:
-    """While this lasts, this process belongs to somebody."""
+    """Let this process belong to another user."""
     os.setresuid(number, number, 0)
     try:
         yield
@@ -47,7 +47,7 @@ def no_endpoint(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Listener:
-    """Somebody who listens at a socket, and remembers what he is told."""
+    """Process of another user that listens at a socket and keeps what it receives."""
 
     def __init__(self, path: Path, number: int) -> None:
         with user(number):
@@ -56,7 +56,7 @@ class Listener:
             self.socket.bind(str(path))
             self.socket.listen()
         path.chmod(0o777)
-        self.told: list[bytes] = []
+        self.received: list[bytes] = []
         threading.Thread(target=self._serve, daemon=True).start()
 
     def _serve(self) -> None:
@@ -66,7 +66,7 @@ class Listener:
             except OSError:  # closed
                 return
             with connection:
-                self.told.append(connection.recv(64))
+                self.received.append(connection.recv(64))
 
     def __enter__(self) -> "Listener":
         return self
@@ -81,20 +81,20 @@ class Listener:
 def test_an_estop_is_not_sent_to_a_folder_that_another_user_planted(
     shared: Path, monkeypatch: pytest.MonkeyPatch, victim: int
 ) -> None:
-    with user(OTHER):
+    with user(OTHER_USER):
         (shared / "session").mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(shared / "session"))
     path = shared / "session" / "fishd" / "control"
-    with Listener(path, OTHER) as planted, user(victim):
+    with Listener(path, OTHER_USER) as planted, user(victim):
         with Fish(timeout=0.5) as fish, pytest.raises(Untrusted) as caught:
             fish.estop()
-        assert not any(planted.told)  # a connection that says nothing, at most
+        assert not any(planted.received)  # at most a connection without data
         with Fish(f"ipc://{path}", timeout=0.5) as fish, pytest.raises(NoDaemon, match="no answer"):
-            fish.estop()  # which is the user's own word
-        wait_until(lambda: any(planted.told))
+            fish.estop()  # the user has named this address
+        wait_until(lambda: any(planted.received))
     assert str(caught.value) == (
         f"the process that listens at ipc://{path} is not trusted: {path.parent} belongs to "
-        f"user {OTHER}; if you trust it, name it with --endpoint or $FISHD_ENDPOINT"
+        f"user {OTHER_USER}; if you trust it, name it with --endpoint or $FISHD_ENDPOINT"
     )
 
 
@@ -106,17 +106,20 @@ def test_a_planted_folder_hides_no_service(shared: Path, monkeypatch: pytest.Mon
     os.chown(run / "fishd", USER, USER)
     monkeypatch.setattr(addresses, "_SERVICE_SOCKET", run / "fishd" / "control")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(session))
-    with user(OTHER):
+    with user(OTHER_USER):
         session.mkdir()
-    with Listener(run / "fishd" / "control", USER), Listener(session / "fishd" / "control", OTHER):
+    with (
+        Listener(run / "fishd" / "control", USER),
+        Listener(session / "fishd" / "control", OTHER_USER),
+    ):
         assert addresses.find_control_address() == f"ipc://{run}/fishd/control"
         with Fish(timeout=0.2) as fish, pytest.raises(NoDaemon, match="no answer within"):
-            fish.status()  # so it was asked
+            fish.status()  # the service was asked
 
 
 @as_root
 def test_a_stranger_is_told_by_folder_rights_and_by_who_listens(shared: Path) -> None:
-    def judged(name: str, owner: int, listener: int, mode: int = 0o755) -> str:
+    def find_problem(name: str, owner: int, listener: int, mode: int = 0o755) -> str:
         folder = shared / name
         folder.mkdir()
         os.chown(folder, owner, owner)
@@ -126,14 +129,17 @@ def test_a_stranger_is_told_by_folder_rights_and_by_who_listens(shared: Path) ->
             with user(USER):
                 return find_trust_problem(folder / "control").replace(str(folder), "FOLDER")
 
-    assert judged("mine", USER, USER) == ""
-    assert judged("deserted", USER, 0) == ""
-    assert judged("roots", 0, USER) == ""
-    assert judged("his", OTHER, OTHER) == f"FOLDER belongs to user {OTHER}"
-    assert judged("his-with-me", OTHER, USER) == f"FOLDER belongs to user {OTHER}"
-    assert judged("open", USER, USER, 0o777) == "other users may write to FOLDER"
-    assert judged("group", USER, USER, 0o770) == "other users may write to FOLDER"
-    assert judged("slipped-in", USER, OTHER) == f"a process of user {OTHER} listens there"
+    assert find_problem("mine", USER, USER) == ""
+    assert find_problem("deserted", USER, 0) == ""
+    assert find_problem("roots", 0, USER) == ""
+    assert find_problem("his", OTHER_USER, OTHER_USER) == f"FOLDER belongs to user {OTHER_USER}"
+    assert find_problem("his-with-me", OTHER_USER, USER) == f"FOLDER belongs to user {OTHER_USER}"
+    assert find_problem("open", USER, USER, 0o777) == "other users may write to FOLDER"
+    assert find_problem("group", USER, USER, 0o770) == "other users may write to FOLDER"
+    assert (
+        find_problem("slipped-in", USER, OTHER_USER)
+        == f"a process of user {OTHER_USER} listens there"
+    )
     (shared / "link").symlink_to(shared / "mine")
     with user(USER):
         assert (

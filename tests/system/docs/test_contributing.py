@@ -32,9 +32,9 @@ def apply(section: str, folder: Path) -> None:
 
 def replaced(source: str, old: list[str], new: list[str]) -> str:
     """Replace lines, indented as in the source."""
-    found = re.search(rf"^( *){re.escape(old[0].lstrip())}$", source, re.MULTILINE)
-    assert found, old[0]
-    indent = " " * (len(found[1]) - len(old[0]) + len(old[0].lstrip()))
+    match = re.search(rf"^( *){re.escape(old[0].lstrip())}$", source, re.MULTILINE)
+    assert match, old[0]
+    indent = " " * (len(match[1]) - len(old[0]) + len(old[0].lstrip()))
     before, after = (
         "\n".join(f"{indent}{line}".rstrip() for line in lines) for lines in (old, new)
     )

@@ -39,7 +39,7 @@ PAGE = ROOT / "docs" / "how-to" / "writing-a-driver.md"
 EXAMPLES = ROOT / "docs" / "example-drivers"
 VOLTS = {"x": 1e-3, "y": -2e-3}
 THRUST = 0.026
-"""Of a square wave of 1.7 Hz on the default fish [N]."""
+"""Mean thrust of a square wave of 1.7 Hz on the default fish [N]."""
 
 
 @pytest.fixture(scope="module")
@@ -58,13 +58,13 @@ def _installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def options(*settings: str) -> list[str]:
-    return [word for each in settings for word in ("--set", each)]
+    return [word for setting in settings for word in ("--set", setting)]
 
 
 def doctor(site: Path, folder: Path, *settings: str) -> dict[str, dict[str, str]]:
     mine = options(*settings, f"state_folder={folder}", f"telemetry.address=ipc://{folder}/t")
     done = fishctl(site, "--endpoint", f"ipc://{folder}/nobody", "doctor", "--json", *mine)
-    return {found["check"]: found for found in json.loads(done.stdout)}
+    return {line["check"]: line for line in json.loads(done.stdout)}
 
 
 class LoadCells:
@@ -82,7 +82,7 @@ class LoadCells:
         self._make = lambda: driver.Hx711(driver.Hx711Settings(**settings), self.clock)
 
     def run(self, seconds: float) -> list[Pair]:
-        """What comes in, in so long a time."""
+        """Return the pairs that arrive during a time [s]."""
         self.sampler.samples.clear()
         until = self.clock.now + seconds
         while self.clock.now < until:
@@ -260,7 +260,7 @@ class ServoBoard:
 
     @property
     def width(self) -> float:
-        """The pulse from the next frame on [µs]."""
+        """Pulse width from the next frame on [µs]."""
         self.clock.sleep(0.03)
         return self.chip.width(self.clock.now)
 
@@ -392,15 +392,15 @@ def test_pca9685_a_fish_swims_on_it_beside_the_force_sensor_on_its_bus(tmp_path:
 
 def test_doctor_names_both_with_their_checks_and_release_works(site: Path, tmp_path: Path) -> None:
     servo = ["robot=pi", "servo.driver=pca9685", f"servo.bus={BUS}"]
-    found = doctor(site, tmp_path, "force_sensor.driver=hx711", *servo)
-    assert found["drivers"]["message"] == (
+    checks = doctor(site, tmp_path, "force_sensor.driver=hx711", *servo)
+    assert checks["drivers"]["message"] == (
         "force_sensor hx711 of fishd-hx711 0.1.0, servo pca9685 of fishd-pca9685 0.1.0"
     )
-    assert found["load cells"]["message"] == "±16.8 mV at a gain of 128, 80 per second"
-    assert found["force"]["level"] == "FAIL"  # there are no pins on this machine
-    assert "adc" not in found
-    assert found["pca9685"]["level"] == "FAIL"
-    assert f"/dev/i2c-{BUS} does not exist" in found["pca9685"]["message"]
+    assert checks["load cells"]["message"] == "±16.8 mV at a gain of 128, 80 per second"
+    assert checks["force"]["level"] == "FAIL"  # this machine has no GPIO pins
+    assert "adc" not in checks
+    assert checks["pca9685"]["level"] == "FAIL"
+    assert f"/dev/i2c-{BUS} does not exist" in checks["pca9685"]["message"]
     done = fishctl(site, "release", *options(*servo, f"state_folder={tmp_path}"))
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith(f"fishctl: /dev/i2c-{BUS} does not exist")

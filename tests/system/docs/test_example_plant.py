@@ -24,7 +24,7 @@ pytestmark = pytest.mark.slow  # it starts processes
 PAGE = ROOT / "docs" / "how-to" / "writing-a-plant.md"
 MODEL = "plant.model=two-segments"
 THRUST = 0.01495
-"""Of `swing` with C = 0.6 [N]."""
+"""Mean thrust of `swing` with C = 0.6 [N]."""
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_it_swims_in_simulate_and_in_a_sweep_of_its_own_key(tmp_path: Path) -> N
     done = processes.fishctl("simulate", "swing", "--C", "0.6", "--set", MODEL, *brief)
     report = json.loads(done.stdout)
     assert report["mean_thrust"] == pytest.approx(THRUST, rel=0.01)
-    assert 0.95 < report["relative_thrust"] <= 1.01  # of its own best square wave
+    assert 0.95 < report["relative_thrust"] <= 1.01  # of the best square wave of this plant
     sweep = ["sweep", "square", "--frequency", "1.4", "--vary", "plant.tip_share=0.1,0.3"]
     out = ["--periods", "3", "--jobs", "1", "--settle", "2", "--folder", str(tmp_path / "sweep")]
     done = processes.fishctl(*sweep, *out, "--set", MODEL)

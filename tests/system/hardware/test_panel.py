@@ -30,21 +30,21 @@ def pins() -> Iterator[Pins]:
 
 @pytest.fixture
 def make(pins: Pins) -> Iterator[Make]:
-    """Panels that are closed in the end."""
+    """Return a function that makes panels, which are closed after the test."""
     panels = []
 
-    def made(settings: PanelSettings) -> RpiGpioPanel:
+    def make_panel(settings: PanelSettings) -> RpiGpioPanel:
         panels.append(RpiGpioPanel(settings, VirtualClock()))
         return panels[-1]
 
-    yield made
+    yield make_panel
     for panel in panels:
         panel.close()
 
 
 @pytest.fixture
 def panel(pins: Pins, make: Make) -> RpiGpioPanel:
-    """One whose button is released: its contact is closed."""
+    """Panel whose button is released: its contact is closed."""
     pins.set_level(BUTTON, GROUND)
     return make(OPENS)
 
@@ -124,8 +124,10 @@ def test_without_edges_polls_do(pins: Pins, make: Make, caplog: pytest.LogCaptur
     assert len(caplog.messages) == 1
 
 
-def shown(pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, seconds: float) -> list[int]:
-    """The light after each tick."""
+def record_light(
+    pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, seconds: float
+) -> list[int]:
+    """Return the level of the light after each tick."""
     levels = []
     for index in range(round(seconds / tick)):
         panel.update(mode, 100.0 + index * tick)
@@ -133,8 +135,8 @@ def shown(pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, seconds: floa
     return levels
 
 
-def flashes(levels: list[int]) -> int:
-    """How many times the light went on."""
+def count_flashes(levels: list[int]) -> int:
+    """Return how often the light went on."""
     return sum(after > before for before, after in zip([0, *levels], levels, strict=False))
 
 
@@ -142,8 +144,8 @@ def flashes(levels: list[int]) -> int:
 def test_the_light_flashes_each_second_in_idle(
     pins: Pins, panel: RpiGpioPanel, tick: float
 ) -> None:
-    levels = shown(pins, panel, "idle", tick, 10.0)
-    assert flashes(levels) == 10
+    levels = record_light(pins, panel, "idle", tick, 10.0)
+    assert count_flashes(levels) == 10
     assert sum(levels) == pytest.approx(0.2 * len(levels), abs=0.05 * len(levels))
 
 
@@ -152,8 +154,8 @@ def test_the_light_flashes_each_second_in_idle(
 def test_the_light_flickers_after_a_fault(
     pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, rate: float
 ) -> None:
-    levels = shown(pins, panel, mode, tick, 10.0)
-    assert flashes(levels) == pytest.approx(10.0 * rate, rel=0.15)
+    levels = record_light(pins, panel, mode, tick, 10.0)
+    assert count_flashes(levels) == pytest.approx(10.0 * rate, rel=0.15)
 
 
 def test_close_ends_the_light_and_gives_back_only_its_pins(pins: Pins, panel: RpiGpioPanel) -> None:

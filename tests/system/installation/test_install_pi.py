@@ -1,4 +1,4 @@
-"""make install-pi and uninstall-pi, into a folder: what they put, keep and take away."""
+"""make install-pi and uninstall-pi, into a folder: files they write, keep and remove."""
 
 import contextlib
 import io
@@ -39,14 +39,14 @@ class Pi:
         self._wheel = wheel
 
     def run(self, *words: str, **variables: str) -> list[str]:
-        """Run a script, or one step of the installation, without a network; what it says."""
+        """Run a script, or one step of the installation, without a network; return its output."""
         done = self.attempt(*words, **variables)
         assert done.returncode == 0, done.stderr
         assert done.stderr == ""
         return done.stdout.splitlines()
 
     def attempt(self, *words: str, **variables: str) -> subprocess.CompletedProcess[str]:
-        """words: the name of a script, or of a function of install_pi.sh and its arguments"""
+        """Run a script, or a function of install_pi.sh with arguments; it may fail."""
         environment = {**os.environ, "DESTDIR": str(self.disk), "PYTHON": sys.executable}
         environment |= {"FISHD_WHEEL": str(self._wheel), "PIP_NO_INDEX": "1", "PIP_NO_DEPS": "1"}
         environment |= {"FISHD_GPIO": "none", "PIP_COMPILE": "0", "PIP_NO_CACHE_DIR": "1"}
@@ -64,11 +64,11 @@ class Pi:
         )
 
     def copy(self, folder: Path) -> "Pi":
-        shutil.copytree(self.disk, folder, symlinks=True, copy_function=self._copied)
+        shutil.copytree(self.disk, folder, symlinks=True, copy_function=self._copy_or_link)
         return Pi(folder, self._wheel)
 
-    def _copied(self, source: str, target: str) -> None:
-        """pip and Python replace the files of packages, and never write into one."""
+    def _copy_or_link(self, source: str, target: str) -> None:
+        """Copy a file, or link it in packages, whose files pip and Python only replace."""
         copy = os.link if "/site-packages/" in source else shutil.copy2
         copy(source, target)
 
@@ -92,14 +92,14 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Pi:
 
 @pytest.fixture
 def pi(installed: Pi, tmp_path: Path) -> Pi:
-    """A copy of it."""
+    """Return a copy of the installation for one test."""
     return installed.copy(tmp_path / "pi")
 
 
 def files(disk: Path) -> set[str]:
-    """All that is no folder; what Python compiles by itself does not count."""
-    found = (path for path in disk.rglob("*") if path.is_symlink() or path.is_file())
-    return {str(path.relative_to(disk)) for path in found if "__pycache__" not in path.parts}
+    """Return all files and links, except the files that Python compiles by itself."""
+    paths = (path for path in disk.rglob("*") if path.is_symlink() or path.is_file())
+    return {str(path.relative_to(disk)) for path in paths if "__pycache__" not in path.parts}
 
 
 def test_what_is_installed_is_where_the_units_look_for_it(installed: Pi) -> None:
@@ -130,7 +130,7 @@ def test_the_settings_of_the_camera_are_not_for_every_user(pi: Pi) -> None:
     said = "\n".join(pi.run("install_config"))
     assert camera.stat().st_mode & 0o777 == 0o640
     assert "camera.yaml: for root and group fishd only, as it may hold a camera's password" in said
-    # Its group, once there is one.
+    # The group that it gets when that exists.
     lines = (pi.disk / "etc/tmpfiles.d/fishd.conf").read_text().splitlines()
     assert "z /etc/fishd/camera.yaml 0640 root fishd -" in lines
 
@@ -215,8 +215,8 @@ def test_without_root_and_without_a_folder_nothing_is_done() -> None:
         assert "needs root: run it with sudo" in done.stderr
 
 
-def said_by(function: str, *arguments: str) -> str:
-    """What a function of the script says; sourced, the script only defines them."""
+def run_function(function: str, *arguments: str) -> str:
+    """Return the output of a function of the script, which only defines functions if sourced."""
     script = f'source {CHECKOUT}/tools/install_pi.sh; {function} "$@"'
     return call("bash", "-c", script, "bash", *arguments, check=True).stdout.strip()
 
@@ -235,11 +235,11 @@ def said_by(function: str, *arguments: str) -> str:
     ],
 )
 def test_the_gpio_package_suits_the_pi(model: str, debian: str, kernel: str, extra: str) -> None:
-    assert said_by("gpio_extra", model, debian, kernel) == extra
+    assert run_function("gpio_extra", model, debian, kernel) == extra
 
 
 def wheel_of(folder: Path, name: str) -> Path:
-    """A built package that provides RPi."""
+    """Build a package that provides RPi; return its path."""
     path = folder / f"{name}-0.6-py3-none-any.whl"
     info = f"{name}-0.6.dist-info/"
     files = {
@@ -255,7 +255,7 @@ def wheel_of(folder: Path, name: str) -> Path:
 
 
 def sdist(folder: Path, name: str, build: str, requires: str = "") -> None:
-    """Sources of that package, whose build does this, and needs that, a quoted name."""
+    """Write sources of that package: `build` is code of its build, `requires` a quoted name."""
     folder.mkdir(exist_ok=True)
     built = wheel_of(folder.parent, name)
     backend = f"""
@@ -284,8 +284,8 @@ def test_a_gpio_package_is_built_as_its_sources_want_and_only_then_the_other_goe
 ) -> None:
     sources, install = tmp_path / "sources", ("install_gpio", "rpi-lgpio")
     (site,) = (pi.disk / "opt/fishd/lib").glob("python3*/site-packages")
-    with zipfile.ZipFile(wheel_of(tmp_path, "RPi.GPIO")) as other:
-        other.extractall(site)
+    with zipfile.ZipFile(wheel_of(tmp_path, "RPi.GPIO")) as archive:
+        archive.extractall(site)
     sdist(sources, "rpi_lgpio", 'raise SystemExit("error: swig failed")')
     pi.run(*install, PIP_FIND_LINKS=str(sources))
     assert (site / "RPi.GPIO-0.6.dist-info").exists()
@@ -295,15 +295,15 @@ def test_a_gpio_package_is_built_as_its_sources_want_and_only_then_the_other_goe
     assert "rpi-lgpio: installed, for E-stop button and status light" in said
     assert not (site / "RPi.GPIO-0.6.dist-info").exists()
     subprocess.run([pi.disk / "opt/fishd/bin/python", "-I", "-c", "import RPi"], check=True)
-    # The second time it is there, and is neither fetched nor built.
+    # The second time it is installed already, and is neither fetched nor built.
     assert "rpi-lgpio: there, for E-stop button and status light" in pi.run(*install)
 
 
 def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi, tmp_path: Path) -> None:
     install = ("install_gpio", "rpi-lgpio")
-    with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))  # bound, but nobody listens: connections are refused
-        index = f"http://127.0.0.1:{nobody.getsockname()[1]}/simple"
+    with socket.socket() as bound:
+        bound.bind(("127.0.0.1", 0))  # bound but not listening: connections are refused
+        index = f"http://127.0.0.1:{bound.getsockname()[1]}/simple"
         options = {"PIP_NO_INDEX": "0", "PIP_INDEX_URL": index, "PIP_EXTRA_INDEX_URL": ""}
         options |= {"PIP_FIND_LINKS": "", "PIP_RETRIES": "1", "PIP_CONFIG_FILE": os.devnull}
         optional = "\n".join(pi.run(*install, **options))
@@ -332,7 +332,7 @@ def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi, tmp_pa
 def test_policies_and_recordings_are_for_a_python_of_64_bits(
     bits: str, platform: str, extras: str
 ) -> None:
-    assert said_by("core_extras", bits, platform) == extras
+    assert run_function("core_extras", bits, platform) == extras
 
 
 def test_it_is_the_interpreter_that_is_asked_for_its_bits(tmp_path: Path) -> None:
@@ -340,7 +340,7 @@ def test_it_is_the_interpreter_that_is_asked_for_its_bits(tmp_path: Path) -> Non
     narrow = "import struct, sys; struct.calcsize = lambda form: 4; exec(sys.argv.pop(2))"
     python.write_text(f"#!/bin/sh\nexec {sys.executable} -c '{narrow}' \"$@\"\n")
     python.chmod(0o755)
-    assert said_by("about_python", str(python)).startswith("32 linux-")
+    assert run_function("about_python", str(python)).startswith("32 linux-")
 
 
 def test_no_driver_brings_a_gpio_package_along_by_itself(wheel: Path) -> None:

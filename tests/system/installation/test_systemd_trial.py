@@ -1,5 +1,5 @@
-"""The trial under a real systemd, as far as it can be tried without one: what it takes inside, and
-whether fishd says what the trial expects.
+"""The trial under a real systemd, without one: the packages it takes along, and the messages of
+fishd that it expects.
 """
 
 import os
@@ -25,7 +25,7 @@ CHECKOUT = ROOT
 def test_the_trial_collects_what_the_installation_inside_will_ask_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There is no network inside."""
+    """The trial runs without a network."""
     collected: list[str] = []
     run = subprocess.run
 
@@ -72,7 +72,7 @@ def test_the_trial_finds_the_scheduling_in_the_output_of_its_command(
 
 def test_the_trial_knows_a_fault_in_the_log(tmp_path: Path) -> None:
     with running(tmp_path, "--set", "start.controller=remote") as daemon:
-        wait_until(lambda: daemon.status().mode == "fault")  # there is no agent
+        wait_until(lambda: daemon.status().mode == "fault")  # no agent answers
         log = daemon.end()[2]
     assert trials.FAULT in log
 

@@ -1,4 +1,4 @@
-"""What systemd itself says about the files of systemd/: units, users, folders, udev rules."""
+"""The files of systemd/, verified by systemd: units, users, folders, udev rules."""
 
 import json
 import os
@@ -17,8 +17,8 @@ from fishd.config import Config, load
 SYSTEMD = ROOT / "systemd"
 ON_THE_ROBOT = ("fishd.service", "fishd-failure.service")
 UNITS = (*ON_THE_ROBOT, "fishd-recorder.service", "fishd-camera.service")
-MOST_EXPOSED = 2.0
-"""`systemd-analyze security`: 0 is shut, 10 is open."""
+MAX_EXPOSURE = 2.0
+"""Largest exposure level of `systemd-analyze security`: 0 is closed, 10 is open."""
 SHIPPED_UNITS = Path("/usr/lib/systemd/system")
 
 PIGPIOD = """\
@@ -40,7 +40,7 @@ def need(tool: str, package: str) -> None:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """A root folder with the units of fishd among those of systemd, and what they start."""
+    """Return a root folder with the units of fishd and systemd, and the programs they start."""
     need("systemd-analyze", "systemd")
     own = tmp_path / "etc/systemd/system"
     shutil.copytree(SYSTEMD, own)
@@ -62,41 +62,41 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def complaints(root: Path, *units: str) -> str:
-    """All that `systemd-analyze verify` says; its exit status is 0 for many mistakes."""
+def verify(root: Path, *units: str) -> str:
+    """Return the output of `systemd-analyze verify`, whose exit status is 0 for many mistakes."""
     return call("systemd-analyze", "verify", "--man=no", f"--root={root}", *units).stderr
 
 
 def setting(unit: str, key: str) -> list[str]:
-    """The values of a key, in order."""
+    """Return the values of a key, in order."""
     return re.findall(rf"^{key}=(.*)$", (SYSTEMD / unit).read_text(), flags=re.MULTILINE)
 
 
 @pytest.mark.parametrize("unit", [*UNITS, "pigpiod.service"])
 def test_systemd_has_nothing_to_say_against_a_unit(root: Path, unit: str) -> None:
-    assert complaints(root, unit) == ""
+    assert verify(root, unit) == ""
 
 
 def test_a_misspelt_key_would_be_found(root: Path) -> None:
     unit = root / "etc/systemd/system/fishd.service"
     unit.write_text(unit.read_text().replace("WatchdogSec=", "WatchdogSeconds="))
-    assert "WatchdogSeconds" in complaints(root, "fishd.service")
+    assert "WatchdogSeconds" in verify(root, "fishd.service")
 
 
 def test_a_pi_without_pigpiod_is_no_error(root: Path) -> None:
     (root / "usr/lib/systemd/system/pigpiod.service").unlink()
-    assert complaints(root, "fishd.service") == ""
+    assert verify(root, "fishd.service") == ""
 
 
 @pytest.mark.parametrize("unit", UNITS)
 def test_a_unit_is_hardly_exposed(unit: str) -> None:
     need("systemd-analyze", "systemd")
-    threshold = f"--threshold={MOST_EXPOSED * 10:.0f}"
+    threshold = f"--threshold={MAX_EXPOSURE * 10:.0f}"
     command = ["systemd-analyze", "security", "--offline=true", "--no-pager", threshold]
     done = call(*command, SYSTEMD / unit)
     score = re.search(r"Overall exposure level for \S+: ([0-9.]+)", done.stdout)
     assert score, done.stderr
-    assert float(score[1]) <= MOST_EXPOSED
+    assert float(score[1]) <= MAX_EXPOSURE
     assert done.returncode == 0
 
 
@@ -146,7 +146,7 @@ def test_the_servo_is_released_however_the_daemon_ends() -> None:
     [("fishd.service", "TimeoutStopSec"), ("fishd-failure.service", "TimeoutStartSec")],
 )
 def test_a_release_on_a_slow_pi_has_the_time_that_it_takes(unit: str, limit: str) -> None:
-    """TimeoutStopSec= limits ExecStopPost= as well; 3 s on a Zero 2 W when nothing else runs."""
+    """TimeoutStopSec= also limits ExecStopPost=, which takes 3 s on an idle Zero 2 W."""
     assert float(setting(unit, limit)[0]) >= 20
 
 
@@ -158,7 +158,7 @@ def test_clients_and_controllers_cannot_take_what_the_pi_needs() -> None:
 
 
 def test_only_fishd_itself_is_asked_to_stop() -> None:
-    """Its processes carry telemetry and requests, which it still needs while it fades."""
+    """The other processes carry telemetry and requests, which fishd needs while it fades."""
     assert setting("fishd.service", "KillMode") == ["mixed"]
 
 
@@ -185,7 +185,9 @@ def test_the_camera_gives_way_to_fishd_and_reaches_video_devices_only() -> None:
 def test_the_daemon_and_the_unit_agree_on_real_time() -> None:
     priority = int(setting("fishd.service", "LimitRTPRIO")[0])
     assert priority == timing.SERVICE_PRIORITY_LIMIT
-    assert priority > Config().realtime.priority  # one above it ends a fishd that hangs
+    assert (
+        priority > Config().realtime.priority
+    )  # the watchdog thread, one above, ends a fishd that hangs
     assert int(setting("pigpiod.service.d/fishd.conf", "CPUSchedulingPriority")[0]) > priority
 
 
@@ -242,7 +244,7 @@ def test_each_subsystem_of_the_robot_has_a_rule() -> None:
 
 
 def test_the_pwm_rule_hands_a_channel_to_the_group(tmp_path: Path) -> None:
-    """The rule's own command, on a folder like that of a chip with an exported channel."""
+    """Run the rule's command on a folder like that of a chip with an exported channel."""
     text = (SYSTEMD / "udev/rules.d/60-fishd.rules").read_text()
     command = re.search(r"RUN\+=\"/bin/sh -c '([^']+)'\"", text)
     assert command

@@ -1,4 +1,4 @@
-"""Computations on several processes, and who hears a Ctrl-C meanwhile."""
+"""Computations on several processes, and the process that a Ctrl-C reaches."""
 
 import os
 import signal
@@ -22,8 +22,8 @@ def test_its_processes_leave_ctrl_c_and_hang_up_to_the_one_that_has_begun_them(
     tmp_path: Path,
 ) -> None:
     with workers(tmp_path / "stop", jobs=2) as crew:
-        for _, found in crew.run(blocked, range(3)):
-            assert found == {signal.SIGINT, signal.SIGHUP}
+        for _, signals in crew.run(blocked, range(3)):
+            assert signals == {signal.SIGINT, signal.SIGHUP}
     assert not blocked(0)
 
 
@@ -31,7 +31,7 @@ def test_a_cluster_has_one_connection_which_is_closed(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 
     def connections() -> int:
-        return sum(one.status != "closed" for one in distributed.Client._instances)
+        return sum(client.status != "closed" for client in distributed.Client._instances)
 
     here = {"host": "127.0.0.1", "protocol": "tcp://", "local_directory": str(tmp_path)}
     alone = {"processes": False, "n_workers": 1, "threads_per_worker": 1}

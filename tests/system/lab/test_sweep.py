@@ -29,7 +29,9 @@ MEASURED = select_quantity("live", {}, "N").measured
 SQUARES = [Point("square", {"frequency": value}) for value in (1.25, 5.0 / 3.0, 2.0)]
 
 
-class Dropped:
+class DroppingPublisher:
+    """Publisher that drops ticks and events."""
+
     def tick(self, tick: Tick) -> None:
         pass
 
@@ -37,17 +39,17 @@ class Dropped:
         pass
 
 
-def nothing(*_: object) -> None:
+def do_nothing(*_: object) -> None:
     pass
 
 
-def opened(
+def open_folder(
     path: Path,
     config: Config | None = None,
     seconds: float = 21.0,
     columns: Sequence[str] = ("controller", "parameters.frequency"),
 ) -> SweepFolder:
-    """The folder of a sweep: begun, or resumed where it is there."""
+    """Create the folder of a sweep, or open it again if it exists."""
     settings = {"lengths": {"seconds": seconds}}
     plain = msgspec.to_builtins(config or load())
     header = Header(kind="sweep", on="live", config=plain, settings=settings)
@@ -55,46 +57,48 @@ def opened(
         return SweepFolder(experiment, columns)
 
 
-def measured(folder: SweepFolder, found: Sequence[Point], session: VirtualSession) -> None:
+def measure(folder: SweepFolder, points: Sequence[Point], session: VirtualSession) -> None:
     with session:
-        measure_all(folder, found, session, 21.0, nothing)
+        measure_all(folder, points, session, 21.0, do_nothing)
 
 
 def test_a_simulated_fish_is_judged_by_its_true_thrust_whatever_its_sensor_says() -> None:
     for frequency, millinewtons in ((1.0, 15.234453), (2.0, 23.829169)):  # of tests/reference
         point = Point("square", {"frequency": frequency})
-        found = swim(point, load(None, DRIFTS), Lengths(), Dropped())
-        assert found.thrust == pytest.approx(millinewtons * 1e-3, rel=1e-4)
-        assert found.error == pytest.approx(0.0, abs=1e-9)
+        result = swim(point, load(None, DRIFTS), Lengths(), DroppingPublisher())
+        assert result.thrust == pytest.approx(millinewtons * 1e-3, rel=1e-4)
+        assert result.error == pytest.approx(0.0, abs=1e-9)
 
 
 def test_half_beats_that_are_no_whole_ticks_show_in_the_error() -> None:
-    found = swim(Point("square", {"frequency": 1.709}), Config(), Lengths(), Dropped())
-    assert found.thrust is not None
-    assert found.error is not None
-    assert 1e-6 < found.error < 1e-3
-    assert found.thrust == pytest.approx(25.6e-3, abs=found.error)
+    result = swim(Point("square", {"frequency": 1.709}), Config(), Lengths(), DroppingPublisher())
+    assert result.thrust is not None
+    assert result.error is not None
+    assert 1e-6 < result.error < 1e-3
+    assert result.thrust == pytest.approx(25.6e-3, abs=result.error)
 
 
 def test_a_rig_that_drifts_is_measured_point_by_point_and_recorded(tmp_path: Path) -> None:
     config = load(None, DRIFTS)
-    folder = opened(tmp_path, config)
+    folder = open_folder(tmp_path, config)
     with VirtualSession(config) as session:
-        measure_all(folder, SQUARES, session, 30.0, nothing)
+        measure_all(folder, SQUARES, session, 30.0, do_nothing)
     for point, truth in zip(SQUARES, (20.57e-3, 25.74e-3, 23.83e-3), strict=True):
-        found = folder.results[folder.key(point)]
-        assert found.thrust is not None
-        assert found.error is not None
-        assert found.thrust == pytest.approx(truth, abs=2.0 * found.error)
-        assert found.error < 1.5e-3
+        result = folder.results[folder.key(point)]
+        assert result.thrust is not None
+        assert result.error is not None
+        assert result.thrust == pytest.approx(truth, abs=2.0 * result.error)
+        assert result.error < 1.5e-3
     recordings = sorted((tmp_path / "ticks").glob("*.mcap"))
-    for each in recordings:
-        run = open_run(each)
+    for path in recordings:
+        run = open_run(path)
         assert abs(len(run.ticks) - 600) <= 2
         assert all(part.from_start and part.equal == part.ticks for part in rerun(run).stretches)
 
 
-class Taken(VirtualSession):
+class TakenSession(VirtualSession):
+    """Session in which another client takes the fish at 2 Hz."""
+
     def swim(self, controller: str, parameters: Mapping[str, Any], seconds: float) -> list[Tick]:
         if parameters["frequency"] == 2.0:
             raise Disturbed("the fish was to swim square, but sine swims")
@@ -103,25 +107,25 @@ class Taken(VirtualSession):
 
 def test_a_fish_that_somebody_else_takes_loses_one_point_only(tmp_path: Path) -> None:
     with pytest.raises(Disturbed):
-        measured(opened(tmp_path), SQUARES, Taken(Config()))
-    assert len(opened(tmp_path).results) == 2
+        measure(open_folder(tmp_path), SQUARES, TakenSession(Config()))
+    assert len(open_folder(tmp_path).results) == 2
 
 
 def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured(
     tmp_path: Path,
 ) -> None:
     pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
-    found = [
+    points = [
         Point("square", {"frequency": 50.0}),
         Point("ppo", {"policy": str(write(tmp_path))}),
         Point("hold", {}),
         Point("square", {"frequency": 1.5}),
     ]
     columns = ["controller", "parameters.frequency", "parameters.policy"]
-    folder = opened(tmp_path / "sweep", columns=columns)
-    measured(folder, found, VirtualSession(Config()))
-    kept = opened(tmp_path / "sweep", columns=columns).results
-    troubles = [kept[folder.key(point)].trouble for point in found]
+    folder = open_folder(tmp_path / "sweep", columns=columns)
+    measure(folder, points, VirtualSession(Config()))
+    kept = open_folder(tmp_path / "sweep", columns=columns).results
+    troubles = [kept[folder.key(point)].trouble for point in points]
     assert "frequency" in troubles[0]
     assert "ppo gave up" in troubles[1]
     assert troubles[2:] == ["", ""]
@@ -130,17 +134,17 @@ def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured
 
 @pytest.mark.parametrize("key", ["estimator.zero_drift", "a_key_of_then"])
 def test_a_folder_of_an_older_fishd_is_refused_with_what_differs(tmp_path: Path, key: str) -> None:
-    opened(tmp_path)
-    begun = tmp_path / "experiment.json"
-    data = msgspec.json.decode(begun.read_bytes())
+    open_folder(tmp_path)
+    header = tmp_path / "experiment.json"
+    data = msgspec.json.decode(header.read_bytes())
     if key == "a_key_of_then":
         data["config"][key] = 1
     else:
         del data["config"]["estimator"]["zero_drift"]
-    begun.write_bytes(msgspec.json.encode(data | {"version": "0.0.1"}))
+    header.write_bytes(msgspec.json.encode(data | {"version": "0.0.1"}))
     has = "has" if key == "a_key_of_then" else "has no"
     with pytest.raises(ConfigError, match=f"fishd 0.0.1, whose configuration {has} config.{key}"):
-        opened(tmp_path)
+        open_folder(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -156,36 +160,36 @@ def test_a_folder_of_an_older_fishd_is_refused_with_what_differs(tmp_path: Path,
 def test_a_table_with_other_columns_is_refused_with_what_differs(
     tmp_path: Path, head: str, named: str
 ) -> None:
-    opened(tmp_path)
+    open_folder(tmp_path)
     (tmp_path / "rows.csv").write_text(head + "\n")
     with pytest.raises(ConfigError, match=named):
-        opened(tmp_path)
+        open_folder(tmp_path)
 
 
 def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
-    folder = opened(tmp_path)
+    folder = open_folder(tmp_path)
     for point in SQUARES:
         folder.add_result(point, Result(thrust=0.02, error=1e-4), b"a recording")
     table = tmp_path / "rows.csv"
     table.write_bytes(table.read_bytes()[:-30])
-    assert len(opened(tmp_path).results) == 2
+    assert len(open_folder(tmp_path).results) == 2
     assert table.read_text().count("\n") == 3
 
 
 def test_a_row_that_is_cut_in_its_last_column_is_measured_again(tmp_path: Path) -> None:
-    folder = opened(tmp_path)
+    folder = open_folder(tmp_path)
     for point in SQUARES:
         folder.add_result(point, Result(thrust=0.02, error=1e-4), b"a recording")
     table = tmp_path / "rows.csv"
     whole = table.read_bytes()
     table.write_bytes(whole[:-1])
-    assert len(opened(tmp_path).results) == 2
+    assert len(open_folder(tmp_path).results) == 2
     assert table.read_bytes() == b"".join(whole.splitlines(keepends=True)[:-1])
 
 
 @pytest.mark.slow
 def test_a_sweep_of_as_many_points_as_are_permitted_is_gone_on_with(tmp_path: Path) -> None:
-    opened(tmp_path)
+    open_folder(tmp_path)
     table = tmp_path / "rows.csv"
     third = 1.0 / 3.0
     result = Result(third, third, third, third, third, third, third, third, third)
@@ -193,7 +197,7 @@ def test_a_sweep_of_as_many_points_as_are_permitted_is_gone_on_with(tmp_path: Pa
     rows = (f"square,{third + k},{values},ticks/{k}-square.mcap\n" for k in range(MAX_POINTS))
     with table.open("a", encoding="utf-8") as file:
         file.writelines(rows)
-    folder = opened(tmp_path)
+    folder = open_folder(tmp_path)
     assert len(folder.results) == MAX_POINTS
     folder.sort([Point("square", {"frequency": third + k}) for k in range(MAX_POINTS)])
 
@@ -204,18 +208,18 @@ def test_a_table_that_cannot_be_written_says_that_the_points_before_are_kept(
     def full(*_: object) -> None:
         raise OSError(ENOSPC, "No space left on device", "rows.csv")
 
-    folder = opened(tmp_path)
+    folder = open_folder(tmp_path)
     monkeypatch.setattr("fishd.lab.tables.Table.add", full)
     with pytest.raises(FishdError, match="No space left on device; earlier results are k"):
         folder.add_result(SQUARES[0], Result(), b"a recording")
 
 
 def test_a_table_that_cannot_be_read_says_why(tmp_path: Path) -> None:
-    opened(tmp_path)
+    open_folder(tmp_path)
     (tmp_path / "rows.csv").unlink()
     (tmp_path / "rows.csv").mkdir()
     with pytest.raises(ConfigError, match="is a folder; a regular file is needed"):
-        opened(tmp_path)
+        open_folder(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -225,26 +229,28 @@ def test_a_table_that_cannot_be_read_says_why(tmp_path: Path) -> None:
 def test_a_folder_is_not_gone_on_with_by_another_fish_or_for_another_time(
     tmp_path: Path, settings: Sequence[str], seconds: float, named: str
 ) -> None:
-    opened(tmp_path)
-    opened(tmp_path, load(None, ["telemetry.address=tcp://127.0.0.1:1"]))  # which is no matter
+    open_folder(tmp_path)
+    open_folder(
+        tmp_path, load(None, ["telemetry.address=tcp://127.0.0.1:1"])
+    )  # makes no difference
     with pytest.raises(ConfigError, match=named):
-        opened(tmp_path, load(None, settings), seconds)
+        open_folder(tmp_path, load(None, settings), seconds)
 
 
 def test_a_curve_tells_the_best_frequency_of_whole_ticks_and_one_that_is_missing(
     tmp_path: Path,
 ) -> None:
-    folder = opened(tmp_path)
+    folder = open_folder(tmp_path)
     thrusts = {1.4: 0.0227, 1.6: 0.0251, 1.8: 0.0252, 2.0: 0.0238, 2.2: 0.0216, 2.5: 0.0176}
-    found = [Point("square", {"frequency": value}) for value in thrusts]
-    for point, thrust in zip(found, thrusts.values(), strict=True):
+    points = [Point("square", {"frequency": value}) for value in thrusts]
+    for point, thrust in zip(points, thrusts.values(), strict=True):
         folder.add_result(point, Result(thrust=thrust, error=1e-4), b"a recording")
-    (curve,) = make_curves(folder, found)
-    told = find_best_of_whole_ticks(folder, curve)
-    assert told == WholeTicks(2.0, 0.0238, 1e-4, pytest.approx(10 / 6))
+    (curve,) = make_curves(folder, points)
+    whole_ticks = find_best_of_whole_ticks(folder, curve)
+    assert whole_ticks == WholeTicks(2.0, 0.0238, 1e-4, pytest.approx(10 / 6))
     best = Point("square", {"frequency": 1.66667})
     folder.add_result(best, Result(thrust=0.02574, error=1e-4), b"a recording")
-    (curve,) = make_curves(folder, [*found, best])
+    (curve,) = make_curves(folder, [*points, best])
     assert find_best_of_whole_ticks(folder, curve) == WholeTicks(1.66667, 0.02574, 1e-4, None)
 
 
@@ -252,11 +258,11 @@ def test_a_curve_tells_the_best_frequency_of_whole_ticks_and_one_that_is_missing
 def test_a_value_that_is_no_number_is_a_line_of_its_own_beside_the_curve(
     tmp_path: Path, word: str | None, shown: str
 ) -> None:
-    folder = opened(tmp_path, columns=["controller", "parameters.C"])
-    found = [Point("swing", {"C": value}) for value in (word, 0.3, 0.6)]
-    for point in found:
+    folder = open_folder(tmp_path, columns=["controller", "parameters.C"])
+    points = [Point("swing", {"C": value}) for value in (word, 0.3, 0.6)]
+    for point in points:
         folder.add_result(point, Result(thrust=0.02, error=1e-4), b"a recording")
-    shapes = [(curve.label, curve.over, curve.x) for curve in make_curves(folder, found)]
+    shapes = [(curve.label, curve.over, curve.x) for curve in make_curves(folder, points)]
     assert shapes == [(f"swing C={shown}", "", []), ("swing", "C", [0.3, 0.6])]
 
 
@@ -299,10 +305,10 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     assert second.returncode == 0
     assert "20 points, 16 of them measured already" in second.stderr
     best = msgspec.json.decode(second.stdout)
-    assert [(each["controller"], each["keys"]) for each in best] == [
+    assert [(curve["controller"], curve["keys"]) for curve in best] == [
         (name, {"plant.xi": xi}) for xi in (0.9, 1.2) for name in ("square", "sine")
     ]
-    assert all(each["x_low"] < each["x"] < each["x_high"] for each in best)
+    assert all(curve["x_low"] < curve["x"] < curve["x_high"] for curve in best)
     with (folder / "rows.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["parameters.frequency"] for row in rows[:5]] == ["1.2", "1.4", "1.6", "1.8", "2.0"]
@@ -311,20 +317,20 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     assert (folder / "thrust.svg").stat().st_size > 10_000
 
 
-def swept(folder: Path, *words: str) -> CompletedProcess[str]:
+def run_sweep(folder: Path, *words: str) -> CompletedProcess[str]:
     brief = ("--periods", "3", "--settle", "1", "--jobs", "1", "--folder", str(folder))
     return fishctl("sweep", words[0], *brief, *words[1:])
 
 
 @pytest.mark.usefixtures("_no_worker_stays")
 def test_points_without_an_axis_are_a_line_each(tmp_path: Path) -> None:
-    one = swept(tmp_path / "one", "swing")
-    assert (one.returncode, one.stderr) == (0, "")
-    assert "\nswing: 25.7" in one.stdout
+    single = run_sweep(tmp_path / "one", "swing")
+    assert (single.returncode, single.stderr) == (0, "")
+    assert "\nswing: 25.7" in single.stdout
     assert not (tmp_path / "one" / "thrust.png").exists()
-    two = swept(tmp_path / "two", "square,sine", "--frequency", "1.7", "--json")
-    best = msgspec.json.decode(two.stdout)
-    assert [(each["controller"], each["over"], each["x"]) for each in best] == [
+    pair = run_sweep(tmp_path / "two", "square,sine", "--frequency", "1.7", "--json")
+    best = msgspec.json.decode(pair.stdout)
+    assert [(curve["controller"], curve["over"], curve["x"]) for curve in best] == [
         ("square", "", None),
         ("sine", "", None),
     ]
@@ -334,7 +340,7 @@ def test_points_without_an_axis_are_a_line_each(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("_no_worker_stays")
 def test_a_curve_over_a_key_of_the_configuration_is_drawn(tmp_path: Path) -> None:
     vary = ("--vary", "plant.servo_speed=8,10,12", "--amplitude", "0.3")
-    done = swept(tmp_path / "run", "square", "--frequency", "1.7", *vary)
+    done = run_sweep(tmp_path / "run", "square", "--frequency", "1.7", *vary)
     assert (done.returncode, done.stderr) == (0, "")
     assert "\nsquare: best measured at plant.servo_speed 12, " in done.stdout
     assert (tmp_path / "run" / "thrust.png").stat().st_size > 10_000
@@ -342,7 +348,7 @@ def test_a_curve_over_a_key_of_the_configuration_is_drawn(tmp_path: Path) -> Non
 
 @pytest.mark.usefixtures("_no_worker_stays")
 def test_a_word_among_the_numbers_is_swept_with_them(tmp_path: Path) -> None:
-    done = swept(tmp_path / "run", "swing", "--amplitude", "default,0.2,0.4")
+    done = run_sweep(tmp_path / "run", "swing", "--amplitude", "default,0.2,0.4")
     assert (done.returncode, done.stderr) == (0, "")
     assert "\nswing amplitude=default: 25.7" in done.stdout
     assert "\nswing: best measured at amplitude 0.4 rad, " in done.stdout
@@ -354,7 +360,7 @@ def test_a_sweep_without_a_single_thrust_says_why_and_draws_nothing(tmp_path: Pa
     pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
     from rigs.policy_files import write
 
-    done = swept(tmp_path / "run", "ppo", "--policy", str(write(tmp_path)), "--settle", "15")
+    done = run_sweep(tmp_path / "run", "ppo", "--policy", str(write(tmp_path)), "--settle", "15")
     assert done.returncode == 1
     assert "no thrust: ppo gave up" in done.stdout
     assert done.stdout.endswith("rows.csv\n")
@@ -378,7 +384,7 @@ def test_what_is_best_is_printed_though_its_picture_fails(
         raise FishdError("thrust.png: the figure cannot be written: No space left on device")
 
     monkeypatch.setattr("fishd.lab.sweep.figure.draw", full)
-    done = swept(tmp_path / "run", "square", "--frequency", "1.5,1.7,1.9")
+    done = run_sweep(tmp_path / "run", "square", "--frequency", "1.5,1.7,1.9")
     assert "\nsquare: best frequency 1.7" in done.stdout
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert "No space left" in done.stderr
@@ -396,7 +402,7 @@ def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
         done = fishctl(*there, "--cluster", cluster.scheduler_address)
     assert (done.returncode, done.stderr) == (0, "")
     assert fishctl(*words, "--folder", str(tmp_path / "here"), "--jobs", "1").returncode == 0
-    tables = [(tmp_path / each / "rows.csv").read_text() for each in ("here", "there")]
+    tables = [(tmp_path / name / "rows.csv").read_text() for name in ("here", "there")]
     here, there = ([row.rpartition(",")[0] for row in text.splitlines()] for text in tables)
     assert here == there
 

@@ -18,7 +18,7 @@ def swinging(settings: SimulatedCameraSettings, *, amplitude: float = 0.2) -> Pi
     ticks = 0.05 * np.arange(200)
     angles = amplitude * np.sin(math.tau * 1.3 * ticks + settings.seed)
     rates = amplitude * math.tau * 1.3 * np.cos(math.tau * 1.3 * ticks + settings.seed)
-    return np.stack([painter.paint(*one) for one in zip(angles, rates, ticks, strict=True)])
+    return np.stack([painter.paint(*state) for state in zip(angles, rates, ticks, strict=True)])
 
 
 @pytest.mark.slow

@@ -61,8 +61,8 @@ def test_the_next_tick_is_known_to_the_last_bit(
     believed = Tail(0.0, 0.0, 0.0)
     for number in range(40):
         tick = swim.tick(released=number in (20, 21))
-        # What was under way to the servo at first has arrived, and the tail has been taken along to
-        # both sides: where it had been within its play, nobody knows.
+        # By then, the commands sent before the first tick have arrived, and the wheel has moved the
+        # tail to both sides: its first place within the play was unknown.
         if number > 12:
             assert believed == (tick.time, tick.alpha, tick.alpha_rate)
         ((_, believed),) = ahead.follow(tick)

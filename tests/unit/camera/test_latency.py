@@ -48,10 +48,10 @@ def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_ar
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "other", ["plant.omega0=9", "plant.servo_delay=0.05", "simulation.rotation=0.05"]
+    "setting", ["plant.omega0=9", "plant.servo_delay=0.05", "simulation.rotation=0.05"]
 )  # fmt: skip
-def test_no_parameter_of_the_fish_is_needed(other: str) -> None:
-    ticks = swum(40.0, other)
+def test_no_parameter_of_the_fish_is_needed(setting: str) -> None:
+    ticks = swum(40.0, setting)
     latency = find_latency(filmed(ticks, WEB), felt(ticks))
     assert latency.stamps == pytest.approx(0.0, abs=3e-3)
 
@@ -75,7 +75,7 @@ def test_frames_of_another_swim_are_refused() -> None:
     frames = film(DEFAULT)
     pixels = [frame.pixels for frame in frames]
     random.Random(1).shuffle(pixels)
-    mixed = [frame._replace(pixels=one) for frame, one in zip(frames, pixels, strict=True)]
+    mixed = [frame._replace(pixels=image) for frame, image in zip(frames, pixels, strict=True)]
     with pytest.raises(NoDelay, match=r"agree by .* only: is it the same fish"):
         find_latency(mixed, felt(swum(40.0)))
 

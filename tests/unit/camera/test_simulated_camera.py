@@ -66,13 +66,13 @@ def test_each_imperfection_shows(change: dict[str, float]) -> None:
 
 
 def test_the_same_seed_gives_the_same_pictures() -> None:
-    one, other = frames_of(WEB, 10), frames_of(WEB, 10)
+    first, second = frames_of(WEB, 10), frames_of(WEB, 10)
     assert all(
         np.array_equal(a.pixels, b.pixels) and a[:2] == b[:2]
-        for a, b in zip(one, other, strict=True)
+        for a, b in zip(first, second, strict=True)
     )
     third = frames_of(replace(WEB, seed=1), 10)
-    assert not np.array_equal(one[0].pixels, third[0].pixels)
+    assert not np.array_equal(first[0].pixels, third[0].pixels)
 
 
 def test_a_camera_in_phase_has_a_frame_there_when_each_tick_begins() -> None:

@@ -157,7 +157,7 @@ def test_beats_that_are_old_because_of_suspect_forces_are_not_shown() -> None:
     rig.run_for(3.0)
     rig.start("square", frequency=5.0 / 3.0)
     thrust = rig.run_for(5.0)[-1].thrust
-    for _ in range(15):  # there is no whole beat between the suspect ticks
+    for _ in range(15):  # too short for a whole beat between the suspect ticks
         clip(rig, robot, 0.1)
         ticks = rig.run_for(0.8)
     assert ticks[-1].thrust != thrust

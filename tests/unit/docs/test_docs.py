@@ -35,12 +35,12 @@ _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
 @cache
 def anchors_of(document: Path) -> frozenset[str]:
-    """The anchors of its headings, as Git hosts make them."""
-    found: list[str] = []
+    """Return the anchors of a document's headings, as Git hosts make them."""
+    anchors: list[str] = []
     for heading in re.findall(r"^#+ (.+)$", prose_of(document), re.MULTILINE):
         plain = re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
-        found.append(plain + (f"-{found.count(plain)}" if plain in found else ""))
-    return frozenset(found)
+        anchors.append(plain + (f"-{anchors.count(plain)}" if plain in anchors else ""))
+    return frozenset(anchors)
 
 
 @each_document
@@ -56,8 +56,8 @@ def test_every_relative_link_leads_somewhere(document: Path) -> None:
     assert not broken
 
 
-def complaint(command: click.Command, words: list[str]) -> str | None:
-    """What is wrong with a command line; None where every verb and option of it exists."""
+def find_mistake(command: click.Command, words: list[str]) -> str | None:
+    """Return the first mistake of a command line; None if all its verbs and options exist."""
     path = command.name or ""
     context = click.Context(command)
     flags = {"--help": True, "--version": True} | flags_of(command)
@@ -71,19 +71,19 @@ def complaint(command: click.Command, words: list[str]) -> str | None:
                 next(rest, None)
         elif isinstance(command, click.Group):
             try:
-                found = command.get_command(context, word)
+                subcommand = command.get_command(context, word)
             except UnknownController:
                 return None  # of a package that is not installed here
-            if found is None:
+            if subcommand is None:
                 return None if re.fullmatch(r"[A-Z|.]+", word) else f"{path} has no verb {word}"
-            command, path = found, f"{path} {word}"
+            command, path = subcommand, f"{path} {word}"
             context = click.Context(command, parent=context)
             flags |= flags_of(command)
     return None
 
 
 def flags_of(command: click.Command) -> dict[str, bool]:
-    """Its options, and whether they take no value."""
+    """Return the options of a command, and whether each takes no value."""
     return {
         name: bool(getattr(param, "is_flag", False))
         for param in command.params
@@ -92,7 +92,7 @@ def flags_of(command: click.Command) -> dict[str, bool]:
 
 
 def command_lines(document: Path, program: str) -> Iterator[list[str]]:
-    """The words after each call of a program."""
+    """Yield the words after each call of a program."""
     for line in code_of(document):
         for call in re.split(r"[|;&#$(]", line):
             words = call.split()
@@ -105,13 +105,13 @@ def command_lines(document: Path, program: str) -> Iterator[list[str]]:
 
 
 @each_document
-@pytest.mark.parametrize("program", [fishctl, fishd, camera], ids=lambda each: each.name)
+@pytest.mark.parametrize("program", [fishctl, fishd, camera], ids=lambda command: command.name)
 def test_each_verb_and_option_of_a_command_exists(document: Path, program: click.Command) -> None:
     lines = command_lines(document, program.name or "")
     problems = [
-        found
+        mistake
         for words in lines
-        if not ADDED_BY_EXAMPLES & set(words) and (found := complaint(program, words))
+        if not ADDED_BY_EXAMPLES & set(words) and (mistake := find_mistake(program, words))
     ]
     assert not problems
 
@@ -126,9 +126,9 @@ def options_of(command: click.Command, context: click.Context) -> Iterator[str]:
         yield from (*param.opts, *param.secondary_opts)
     if isinstance(command, click.Group):
         for name in command.list_commands(context):
-            found = command.get_command(context, name)
-            assert found
-            yield from options_of(found, click.Context(found, parent=context))
+            subcommand = command.get_command(context, name)
+            assert subcommand
+            yield from options_of(subcommand, click.Context(subcommand, parent=context))
 
 
 @pytest.mark.parametrize("document", OPERATORS, ids=lambda path: path.name)
@@ -143,7 +143,7 @@ def test_every_configuration_key_that_is_named_exists(document: Path) -> None:
     known = set(keys())
     sections = "|".join(field.name for field in fields_of(Config) if field.kind == "section")
     key = re.compile(rf"(?<![\w./-])(?:{sections})(?:\.[a-z_0-9]+)+(?![\w/(])")
-    named = {found for code in code_of(document) for found in key.findall(code)}
+    named = {key_path for code in code_of(document) for key_path in key.findall(code)}
     modules = {f"{field.name}.py" for field in fields_of(Config)}
     wrong = {
         name
@@ -158,7 +158,7 @@ def test_every_configuration_key_that_is_named_exists(document: Path) -> None:
 
 
 def configurations() -> Iterator[tuple[str, str]]:
-    """The YAML blocks that are, or could be, a configuration."""
+    """Yield a name and the text of each YAML block that is, or could be, a configuration."""
     keys = {field.name for field in fields_of(Config)}
     for document in DOCS:
         if document.name == "writing-a-controller.md":
@@ -182,13 +182,13 @@ def test_the_table_of_faults_has_each_fault_of_the_virtual_pi_in_its_order() -> 
 
 def test_the_table_of_checks_has_each_check_of_doctor_in_its_order() -> None:
     table = first_cells(ROOT / "docs" / "how-to" / "troubleshooting.md", "Lines of doctor")
-    every = set()
+    all_names = set()
     for driver in ("pigpio", "sysfs-pwm", "rpi-gpio"):
         config = load(None, ["robot=pi", f"servo.driver={driver}"])
         names = [check.name for check in checks(Context(config))]
         assert [name for name in table if name in names] == names
-        every |= set(names)
-    assert {name for name in table if " " not in name} <= every
+        all_names |= set(names)
+    assert {name for name in table if " " not in name} <= all_names
 
 
 DOCUMENT = ROOT / "docs" / "reference" / "policies.md"
@@ -231,7 +231,7 @@ def test_installing_lists_all_files_and_groups_that_come_onto_a_pi() -> None:
     users = (ROOT / "systemd/sysusers.d/fishd.conf").read_text()
     table = text_of(ROOT / "docs/how-to/installing.md").split("What it brings:")[1].split("\n\n")[1]
     files = re.findall(r"(?m)^\w*CONFIG=(\S+)|^ +\"\S+ (/\S+)\"$", layout)
-    wanted = {f"`{name or other}`" for name, other in files}
+    wanted = {f"`{name or path}`" for name, path in files}
     assert len(wanted) > 10
     wanted |= {f"`/usr/local/bin/{name}`" for name in ("fishd", "fishctl", "fishd-camera")}
     wanted |= set(re.findall(r"(?m)^m fishd (\w+)$", users))

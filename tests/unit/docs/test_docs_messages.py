@@ -1,4 +1,4 @@
-"""What the documentation says that fishd prints: every reason, and every message word by word."""
+"""Messages in the documentation, word by word, against the sources; and every reason."""
 
 import ast
 import errno
@@ -21,7 +21,7 @@ def sources() -> Iterator[str]:
 
 def test_every_fault_that_fishd_latches_is_in_the_table_and_no_other() -> None:
     code = re.compile(r"(?:\bfail\(|_fail\(|\.check\(|ControllerFault\()\s*\"([a-z-]+)\"")
-    assert {found for text in sources() for found in code.findall(text)} == FAULTS.keys()
+    assert {fault for text in sources() for fault in code.findall(text)} == FAULTS.keys()
 
 
 def test_troubleshooting_has_a_section_for_each_fault_and_no_other() -> None:
@@ -32,12 +32,12 @@ def test_troubleshooting_has_a_section_for_each_fault_and_no_other() -> None:
 
 Template = tuple[str, ...]
 """A message of the sources: its literal parts, with a gap for a value between each two."""
-ENOUGH = 7
-"""Letters that the literal parts of a template must have, to be a message."""
+MIN_LETTERS = 7
+"""Smallest number of letters in the literal parts of a message."""
 
 
 def template_of(node: ast.expr) -> Template | None:
-    """What a string expression spells; None where it is no string that can be seen."""
+    """Return the template of a string expression, or None for any other expression."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return tuple(re.split(r"\{\w+\}|%[sdg]", node.value))
     if isinstance(node, ast.JoinedStr):
@@ -59,19 +59,19 @@ def template_of(node: ast.expr) -> Template | None:
 
 @cache
 def templates() -> tuple[Template, ...]:
-    """Every message of the sources, docstrings left out; and what Linux says."""
-    found: set[Template] = {(os.strerror(number),) for number in errno.errorcode}
+    """Return every message of the sources, without docstrings, and those of Linux."""
+    literals: set[Template] = {(os.strerror(number),) for number in errno.errorcode}
     for source in sources():
         nodes = list(ast.walk(ast.parse(source)))
-        about = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
+        docs = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
         for node in nodes:
-            if isinstance(node, ast.expr) and id(node) not in about and (t := template_of(node)):
-                found.add(t)
-    return tuple(t for t in found if len(re.findall(r"[a-zA-Z]", "".join(t))) >= ENOUGH)
+            if isinstance(node, ast.expr) and id(node) not in docs and (t := template_of(node)):
+                literals.add(t)
+    return tuple(t for t in literals if len(re.findall(r"[a-zA-Z]", "".join(t))) >= MIN_LETTERS)
 
 
 def quoted_messages() -> list[str]:
-    """What troubleshooting.md says that fishd prints: tables of messages and lines, text blocks."""
+    """Return the messages in troubleshooting.md: tables of messages and lines, text blocks."""
     document = text_of(ROOT / "docs" / "how-to" / "troubleshooting.md")
     blocks = [block for kind, block in FENCE.findall(document) if kind == "text"]
     table = re.compile(r"^\| (?:message|line) \|.*\n\|[-|]+\n((?:\|.*\n)+)", re.MULTILINE)
@@ -82,25 +82,25 @@ def quoted_messages() -> list[str]:
 
 @cache
 def templates_by_ends() -> defaultdict[tuple[str, str], list[Template]]:
-    """By their first and last two letters, or none where a gap may be there."""
-    found = defaultdict(list)
+    """Return the templates by their first and last two letters, "" where a gap may be there."""
+    by_ends = defaultdict(list)
     for template in templates():
         first, last = template[0][:2], template[-1][-2:]
-        found[first if len(first) == 2 else "", last if len(last) == 2 else ""].append(template)
-    return found
+        by_ends[first if len(first) == 2 else "", last if len(last) == 2 else ""].append(template)
+    return by_ends
 
 
 UNITS = "µs|ms|s|N|V|rad|Hz|mN rms|mN"
 VALUE = re.compile(
     rf"(?:…|[^ ]*[/…:@][^ ]*|'[^']*'|load \d|[+-]?\d[^ ]*(?: (?:{UNITS}))?|[\w.\[\]-]+)"
 )
-"""What stands in a gap: a number, a name, a path, a quoted text, or `…`."""
+"""Pattern of the text in a gap: a number, a name, a path, a quoted text, or `…`."""
 JOINED = re.compile(r"(?:, | and | or | to )")
 
 
 @cache
 def is_value(text: str) -> bool:
-    """Is it one value, several in a list, or another message?"""
+    """Return whether a text is one value, a list of values, or another message."""
     if not text or VALUE.fullmatch(text) or (text[0] == "(" and text[-1] == ")"):
         return True
     parts = JOINED.split(text)
@@ -111,8 +111,8 @@ def is_value(text: str) -> bool:
 
 @cache
 def is_message(text: str) -> bool:
-    """Is it just what some expression of the sources spells, with values in its gaps?"""
-    if len(re.findall(r"[a-zA-Z]", text)) < ENOUGH:
+    """Return whether a text is a string of the sources, with values in its gaps."""
+    if len(re.findall(r"[a-zA-Z]", text)) < MIN_LETTERS:
         return False
     candidates = templates_by_ends()[text[:2], ""] + templates_by_ends()["", text[-2:]]
     candidates += templates_by_ends()[text[:2], text[-2:]] + templates_by_ends()["", ""]
@@ -124,7 +124,7 @@ def is_message(text: str) -> bool:
     path, _, tail = text.partition(" ")
     if path.startswith("/") and is_message(tail):
         return True
-    places = [found.start() for found in re.finditer("; ", text)]
+    places = [match.start() for match in re.finditer("; ", text)]
     return any(is_hint(text[place:]) and is_message(text[:place]) for place in places)
 
 
@@ -134,12 +134,12 @@ def hints() -> tuple[Template, ...]:
 
 
 def is_hint(text: str) -> bool:
-    """Is it what may follow a message, such as `; reconnecting`?"""
+    """Return whether a text may follow a message, such as `; reconnecting`."""
     return any(fits(template, text) for template in hints())
 
 
 def could_fit(template: Template, text: str) -> bool:
-    """A quick look, for the many that do not: much of a message is not values."""
+    """Return False, quickly, for most templates that do not fit, or where most would be values."""
     return (
         text.startswith(template[0])
         and text.endswith(template[-1])
@@ -149,7 +149,7 @@ def could_fit(template: Template, text: str) -> bool:
 
 
 def fits(template: Template, text: str) -> bool:
-    """Is a text this template, with a value or nothing in each gap?"""
+    """Return whether a text is this template, with a value or nothing in each gap."""
     first, *rest = template
     if not text.startswith(first):
         return False
@@ -183,16 +183,16 @@ IN_GAPS = (
     "load 2",
     "servo driver",
 )
-"""Words that stand in gaps, so that other words could."""
+"""Phrases that fill gaps, where other words would be as correct."""
 
 
-def falsified(line: str) -> Iterator[str]:
-    """A line with a word dropped that is no value, or made to say the contrary."""
+def falsify(line: str) -> Iterator[str]:
+    """Yield a line with one word dropped that is not a value, or with its meaning negated."""
     gaps = {
         place
         for phrase in IN_GAPS
-        for found in re.finditer(re.escape(phrase), line)
-        for place in range(found.start(), found.end())
+        for match in re.finditer(re.escape(phrase), line)
+        for place in range(match.start(), match.end())
     }
     for word in re.finditer(r"(?<!\S)[a-zA-Z]{2,}(?!\S) ", line):
         if word.start() not in gaps:
@@ -206,4 +206,4 @@ def falsified(line: str) -> Iterator[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize("line", quoted_messages())
 def test_a_dropped_word_or_a_negation_is_noticed(line: str) -> None:
-    assert [wrong for wrong in falsified(line) if is_message(wrong)] == []
+    assert [wrong for wrong in falsify(line) if is_message(wrong)] == []

@@ -1,4 +1,4 @@
-"""What the pages say of the paper's figures and numbers, against the tables, equations and loop."""
+"""Figures and numbers of the paper on the pages, against the tables, equations and loop."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -22,12 +22,12 @@ def test_the_page_about_the_criterion_says_what_the_map_gives() -> None:
 
 
 def row(name: str, **having: str | float) -> dict[str, Any]:
-    (found,) = read(name, **having)
-    return found
+    (match,) = read(name, **having)
+    return match
 
 
 def assert_same(report: Report, row: Mapping[str, Any]) -> None:
-    """As in a table, but for what other libraries round otherwise."""
+    """Check a report against a row of a table, within the rounding of other libraries."""
     if "thrust_mN" in row:
         assert 1e3 * report.mean_thrust == pytest.approx(row["thrust_mN"], rel=5e-3)
     else:
@@ -57,7 +57,7 @@ def test_figure_6_has_every_swim_and_at_least_ten_beats_of_each() -> None:
 
 @pytest.mark.slow
 def test_the_free_swimmer_begins_to_swim_as_it_did_for_figure_6() -> None:
-    """Steady beats, which the figure is of, come after 6 s only."""
+    """Check the first 5 s; the steady beats of the figure begin only after 6 s."""
     track = free_swim.swim(figure_6.config(2.0), "square", {"frequency": 3.0}, 0.6, 0.1).track
     distance, speed = -track.rows()[:, 1], track.rows()[:, 3]
     assert distance[[166, 249]] == pytest.approx([6.4958e-3, 9.8098e-3], rel=1e-3)

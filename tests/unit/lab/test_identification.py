@@ -73,7 +73,7 @@ def test_it_finds_the_fish_and_the_rig_from_forces_and_commands_alone(
         assert identification[name].low < identification[name].value < identification[name].high
     assert identification["servo_delay"].value == pytest.approx(0.04, abs=5e-4)
     assert identification["backlash"].value == pytest.approx(0.02, abs=1e-3)
-    # As configured: forces do not determine it.
+    # Its configured value, as forces do not determine it.
     assert identification["lateral_inertia_ratio"].value == 1.0
     assert identification.remarks == ()
     assert identification.failed_assumptions == ()

@@ -1,4 +1,4 @@
-"""Recordings: they are read as they were written, whatever happened to the writer."""
+"""Recordings: all written data can be read, even after a failure of the writer."""
 
 import errno
 import os

@@ -1,4 +1,4 @@
-"""config/harsh.yaml: a rig with everything that rigs do."""
+"""config/harsh.yaml: a rig with every imperfection that fishd simulates."""
 
 import msgspec
 import pytest
@@ -11,7 +11,7 @@ from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
 FILE = ROOT / "config" / "harsh.yaml"
-ELSEWHERE = {
+KEYS_AS_DEFAULT = {
     "plant": {
         "model",
         "omega0",
@@ -24,7 +24,7 @@ ELSEWHERE = {
     },
     "simulation": {"drift_period", "drift_rate", "hum_frequency", "motor", "sample_rate", "seed"},
 }
-"""What is no imperfection, or belongs to one that is there."""
+"""Keys that are not imperfections, or that belong to an imperfection of the rig."""
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ def test_it_has_every_imperfection_that_there_is(section: str, defaults: msgspec
     same = {
         name for name in harsh.__struct_fields__ if getattr(harsh, name) == getattr(defaults, name)
     }
-    assert same == ELSEWHERE[section]
+    assert same == KEYS_AS_DEFAULT[section]
 
 
 @pytest.mark.slow
@@ -58,4 +58,4 @@ def test_a_square_wave_swims_on_it_as_well_as_its_frequency_permits(robot: str) 
     best = simulate(config, "square", {"frequency": 1.6}, 5.0, 3.0)
     assert best.mode == "running"
     assert 0.9 < best.relative_thrust < 1.03
-    assert best.best_square_thrust < 0.5 * 0.0258  # of a fish without any of it
+    assert best.best_square_thrust < 0.5 * 0.0258  # of a fish without imperfections

@@ -1,4 +1,4 @@
-"""Runs in virtual time: repeatable to the last bit, and their figures are the plant's truth."""
+"""Runs in virtual time: repeatable to the last bit, with figures from the true plant."""
 
 import json
 import math
@@ -27,10 +27,10 @@ REALISTIC = ["simulation.offset_y=0.02", "simulation.drift=0.02", "simulation.ro
 def test_the_same_seed_drifts_in_the_same_way_whenever_it_starts(start: float) -> None:
     config = load(None, ["simulation.drift=0.02", "simulation.noise=0", "simulation.seed=3"])
     fish = simulated_fish(config)
-    found = [fish.read(start + 0.05 * n).fx for n in range(1, 200)]
+    forces = [fish.read(start + 0.05 * n).fx for n in range(1, 200)]
     drift = Imperfections(config.simulation, config.tick)
     wanted = [drift.apply(0.0, 0.0, 0.05 * n, 0.05)[0] for n in range(1, 200)]
-    assert found == pytest.approx(wanted, abs=1e-9)
+    assert forces == pytest.approx(wanted, abs=1e-9)
 
 
 def test_figures_are_those_of_the_plant_and_not_of_the_sensor() -> None:
@@ -86,12 +86,12 @@ def test_the_loop_runs_at_any_tick(tick: float) -> None:
 def test_only_whole_beats_are_counted() -> None:
     beats = Beats()
     beats.add(1.0, TrueWindow(0.5, 9.0, 0.9))
-    assert math.isnan(beats.means().thrust_deviation)  # there are no two beats
+    assert math.isnan(beats.means().thrust_deviation)  # needs two beats
     for angle, thrust in [(1.0, 9.0)] * 2 + [(-1.0, 1.0), (1.0, 2.0)] * 4 + [(-1.0, 9.0)]:
         beats.add(angle, TrueWindow(0.5, thrust, 0.1 * thrust))
-    found = beats.means()
-    assert found[:3] == pytest.approx((1.5, 1.0, 0.15))
-    assert (beats.count, found.thrust_deviation) == (3, 0.0)
+    means = beats.means()
+    assert means[:3] == pytest.approx((1.5, 1.0, 0.15))
+    assert (beats.count, means.thrust_deviation) == (3, 0.0)
     for thrust in (3.0, 2.0, 1.0, 2.0):  # beats of other thrust
         beats.add(1.0, TrueWindow(0.5, thrust, 0.1))
         beats.add(-1.0, TrueWindow(0.5, 1.0, 0.1))

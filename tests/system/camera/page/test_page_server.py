@@ -27,11 +27,11 @@ async def served() -> AsyncIterator[tuple[PageServer, aiohttp.ClientSession]]:
 
 
 def run(test: Test) -> None:
-    async def whole() -> None:
+    async def run_all() -> None:
         async with asyncio.timeout(20.0), served() as (server, session):
             await test(server, session)
 
-    asyncio.run(whole())
+    asyncio.run(run_all())
 
 
 async def news_of(sock: aiohttp.ClientWebSocketResponse) -> tuple[Any, bytes]:
@@ -127,7 +127,7 @@ def test_a_page_from_elsewhere_does_not_get_the_picture(origin: str) -> None:
 
 @pytest.mark.realtime
 def test_an_end_does_not_wait_for_pages_that_never_read_or_connections_that_never_ask() -> None:
-    async def whole() -> float:
+    async def run_all() -> float:
         async with asyncio.timeout(20.0), PageServer("127.0.0.1", 0) as server:
             host, port = "127.0.0.1", int(server.url.rsplit(":", 1)[1].strip("/"))
             deaf = socket.socket()
@@ -151,7 +151,7 @@ def test_an_end_does_not_wait_for_pages_that_never_read_or_connections_that_neve
             writer.close()
         return ended
 
-    assert asyncio.run(whole()) < 1.5
+    assert asyncio.run(run_all()) < 1.5
 
 
 UPGRADE = (
@@ -216,10 +216,10 @@ async def connect(
     return reader, writer
 
 
-WHOLE = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: keep-alive\r\n\r\n"
+COMPLETE_REQUEST = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: keep-alive\r\n\r\n"
 
 
-@pytest.mark.parametrize("sent", [HALF_ASKED[0], HALF_ASKED[3], WHOLE])
+@pytest.mark.parametrize("sent", [HALF_ASKED[0], HALF_ASKED[3], COMPLETE_REQUEST])
 def test_no_client_keeps_the_page_from_others(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_server, "REQUEST_TIMEOUT_S", 120.0)
 

@@ -40,7 +40,7 @@ def swimming(rig: Rig, agent: Agent, ticks: int) -> Iterator[list[Tick]]:
     try:
         yield swum
     finally:
-        agent.close()  # whatever happened, the loop must not wait for ever
+        agent.close()  # the loop must not wait for the agent, even after a failure
         thread.join(PATIENCE)
 
 
@@ -51,7 +51,7 @@ def test_it_takes_observations_and_answers_each(agent: Agent) -> None:
             agent.act(0.01 * seen.seq)
             if seen.seq == 20:
                 break
-        assert agent.poll(PATIENCE) is None  # as soon as fishd says that this was all
+        assert agent.poll(PATIENCE) is None  # None as soon as fishd reports the end
         assert not agent.active
     assert [tick.phi_c for tick in ticks] == pytest.approx([0.01 * n for n in range(1, 21)])
 
@@ -75,9 +75,9 @@ def test_the_newest_of_several_observations_counts(agent: Agent) -> None:
     rig = Rig("tick=0.02")
     rig.start("remote", agent=agent.address)
     connected(rig)
-    rig.run(20)  # nobody answers
+    rig.run(20)  # no agent answers
     taken, lost = 0, 0
-    while lost < 19:  # of all that it took at once; some may still be on their way
+    while lost < 19:  # `lost` counts observations taken at once; some may still be in transit
         latest = agent.observe()
         taken, lost = taken + 1, lost + agent.lost
     assert latest.time == pytest.approx(19 * 0.02)

@@ -167,7 +167,7 @@ def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> No
 
 def test_virtual_time_stands_still_in_a_pause(still: Rig, agent: ScriptedAgent) -> None:
     def pausing(seen: dict[str, Any]) -> dict[str, Any] | None:
-        if agent.seen.count(seen) == 1:  # and once more after the pause
+        if agent.seen.count(seen) == 1:  # and again after the pause
             agent.send(agent.pause(30.0))
             agent.send(agent.pause(0.0))
             return None

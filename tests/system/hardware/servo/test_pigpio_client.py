@@ -97,7 +97,7 @@ def test_a_link_that_is_closed_while_it_connects_asks_for_nothing_more(
     asked: list[Client] = []
 
     class Held(Client):
-        """It has a connection, and nobody knows of it yet."""
+        """Client that has a connection, but is not yet known to the link."""
 
         def __init__(self, *given: Any) -> None:
             super().__init__(*given)

@@ -28,11 +28,11 @@ class Swimming(Bench):
         self.swimmer = self.servo()
 
     def settings(self) -> PigpioSettings:
-        """With the longest limit that is permitted: a busy machine is no fault."""
+        """Return the settings with the longest timeout, as a busy machine is not a fault."""
         return replace(super().settings(), timeout=0.01)
 
     def write(self, angle: float) -> str | None:
-        """Write; the error if there is one."""
+        """Write an angle; return the error message, or None."""
         try:
             self.swimmer.write(angle)
         except ServoError as error:
@@ -40,14 +40,14 @@ class Swimming(Bench):
         return None
 
     def write_until_it_works(self, angle: float) -> None:
-        """Until pigpiod has taken one: one whose answer is late is forgiven, but not all sent."""
+        """Write until pigpiod answers in time; an angle whose answer is late may not be sent."""
 
-        def taken() -> bool:
+        def is_taken() -> bool:
             late = self.swimmer.driver.counters()["servo_late_answers"]
             failed = self.write(angle)
             return not failed and self.swimmer.driver.counters()["servo_late_answers"] == late
 
-        eventually(taken)
+        eventually(is_taken)
 
 
 @pytest.fixture

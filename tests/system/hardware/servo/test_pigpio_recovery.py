@@ -1,4 +1,4 @@
-"""What the pigpio servo does about a past: killed predecessors, a lost pigpiod, a last resort."""
+"""Recovery of the pigpio servo: killed predecessors, a lost pigpiod, a last resort."""
 
 import time
 from typing import Any
@@ -183,7 +183,7 @@ def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(benc
 
 
 def leave_pulses_of_the_peripheral(bench: Bench, width: float = 1740.0) -> None:
-    """As a fishd of old with hardware PWM, or another program, when it was killed."""
+    """Leave pulses of hardware PWM, as a killed fishd of an old version or another program does."""
     with bench.client() as client:
         client.hardware_PWM(GPIO, 50, round(width * 50))
     bench.wait(0.1)

@@ -1,4 +1,4 @@
-"""A virtual Pi behind its socket: what goes through, what fails, and what survives."""
+"""A virtual Pi behind its socket: transfers, errors, and recovery."""
 
 import contextlib
 import errno
@@ -30,7 +30,7 @@ CONFIG = [Write(b"\x01"), Read(2)]
 
 
 def virtual_pi() -> VirtualPi:
-    """On a virtual clock, so that the bus takes no time."""
+    """Return a virtual Pi on a virtual clock, so that the bus takes no time."""
     return VirtualPi(
         VirtualPiSettings(pigpio_port=0),
         PlantParameters(),
@@ -52,11 +52,11 @@ def pi(path: Path) -> Iterator[VirtualPi]:
         yield pi
 
 
-def wait_until_equal(found: list[object], wanted: object) -> None:
+def wait_until_equal(events: list[object], wanted: object) -> None:
     deadline = time.monotonic() + PATIENCE
-    while found[-1:] != [wanted] and time.monotonic() < deadline:
+    while events[-1:] != [wanted] and time.monotonic() < deadline:
         time.sleep(0.005)
-    assert found[-1:] == [wanted]
+    assert events[-1:] == [wanted]
 
 
 def test_a_transfer_over_the_link_is_one_on_the_bus(pi: VirtualPi, path: Path) -> None:

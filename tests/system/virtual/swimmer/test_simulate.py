@@ -1,4 +1,4 @@
-"""`fishctl simulate` of a swimmer: what it tells, its files, and how it is cut off and goes on."""
+"""`fishctl simulate` of a swimmer: its output, its files, and its interruption and resumption."""
 
 import json
 import os
@@ -22,20 +22,20 @@ from fishd.virtual.swimmer import checkpoint
 from fishd.virtual.swimmer.track import COLUMNS
 
 
-def simulated(*words: str | Path) -> "subprocess.CompletedProcess[str]":
+def simulate(*words: str | Path) -> "subprocess.CompletedProcess[str]":
     return fishctl("simulate", *map(str, words), *OPTIONS)
 
 
 def report(*words: str) -> dict[str, Any]:
-    done = simulated(*words, "--json")
+    done = simulate(*words, "--json")
     assert done.returncode == 0, done.stderr
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
+    figures: dict[str, Any] = json.loads(done.stdout)
+    return figures
 
 
 def table(path: Path) -> dict[str, np.ndarray[Any, Any]]:
-    with np.load(path) as found:
-        return {name: found[name] for name in found.files}
+    with np.load(path) as archive:
+        return {name: archive[name] for name in archive.files}
 
 
 @pytest.fixture(scope="module")
@@ -48,27 +48,27 @@ def swum(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path
 
 
 def test_the_figures_agree_with_one_another(swum: tuple[dict[str, Any], Path]) -> None:
-    found, folder = swum
+    figures, folder = swum
     track = table(folder / "track.npz")
-    assert found["frequency"] == pytest.approx(2.5)
-    assert found["beats"] == 6
-    assert 0.0 < found["speed"] < 0.2
-    assert 0.0 < found["speed_error"] < found["speed"]
-    assert 0.1 < found["tail_width"] < 0.4
-    assert 0.0 < found["froude_efficiency"] < 1.0
-    assert 0.0 < found["water_power"] <= found["muscle_power"]
-    width = found["tail_width"] * 0.1
-    assert found["strouhal"] == pytest.approx(2.5 * width / found["speed"])
+    assert figures["frequency"] == pytest.approx(2.5)
+    assert figures["beats"] == 6
+    assert 0.0 < figures["speed"] < 0.2
+    assert 0.0 < figures["speed_error"] < figures["speed"]
+    assert 0.1 < figures["tail_width"] < 0.4
+    assert 0.0 < figures["froude_efficiency"] < 1.0
+    assert 0.0 < figures["water_power"] <= figures["muscle_power"]
+    width = figures["tail_width"] * 0.1
+    assert figures["strouhal"] == pytest.approx(2.5 * width / figures["speed"])
     assert list(track) == [*COLUMNS, "midline_time", "midlines"]
-    assert len(track["time"]) == found["ticks"] == 400
+    assert len(track["time"]) == figures["ticks"] == 400
     assert set(track["activation"]) == {0.0, 1.0, -1.0}
     settled = track["time"] > 1.0
     speed = -np.polyfit(track["time"][settled], track["x"][settled], 1)[0]
-    assert speed == pytest.approx(found["speed"], rel=0.15)
+    assert speed == pytest.approx(figures["speed"], rel=0.15)
 
 
 def test_a_person_gets_the_same_in_a_few_lines() -> None:
-    out = simulated("swing", "--seconds", "1.5", "--settle", "0.5").stdout
+    out = simulate("swing", "--seconds", "1.5", "--settle", "0.5").stdout
     for word in ("speed", "frequency", "heading", "tail", "power", "cost", "Strouhal", "Froude"):
         assert f"\n{word} " in out
     assert "whole beats" in out
@@ -77,21 +77,21 @@ def test_a_person_gets_the_same_in_a_few_lines() -> None:
 def test_a_table_is_a_row_for_each_tick_in_either_form(tmp_path: Path) -> None:
     for name in ("a.csv", "b.npz"):
         words = ("sine", "--seconds", "0.3", "--settle", "0.1", "--save", tmp_path / name)
-        assert simulated(*words).returncode == 0
+        assert simulate(*words).returncode == 0
     rows = np.genfromtxt(tmp_path / "a.csv", delimiter=",", names=True)
-    other = table(tmp_path / "b.npz")
+    arrays = table(tmp_path / "b.npz")
     for name in COLUMNS:
-        assert rows[name] == pytest.approx(other[name], rel=1e-6, abs=1e-9)
+        assert rows[name] == pytest.approx(arrays[name], rel=1e-6, abs=1e-9)
 
 
 def test_a_swim_goes_on_from_a_checkpoint_to_the_last_bit(tmp_path: Path) -> None:
     hold = ("hold", "--angle", "0.3", "--settle", "0.1")
     files = [("--save", str(tmp_path / f"{name}.npz")) for name in ("whole", "part", "rest")]
     kept = str(tmp_path / "kept")
-    assert simulated(*hold, "--seconds", "0.6", *files[0]).returncode == 0
-    simulated(*hold, "--seconds", "0.4", *files[1], "--checkpoint", kept)
-    found = report(*hold, "--seconds", "0.6", *files[2], "--resume", kept)
-    assert found["resumed"] == pytest.approx(0.4)
+    assert simulate(*hold, "--seconds", "0.6", *files[0]).returncode == 0
+    simulate(*hold, "--seconds", "0.4", *files[1], "--checkpoint", kept)
+    resumed = report(*hold, "--seconds", "0.6", *files[2], "--resume", kept)
+    assert resumed["resumed"] == pytest.approx(0.4)
     whole, rest = table(tmp_path / "whole.npz"), table(tmp_path / "rest.npz")
     for name in COLUMNS:
         assert np.array_equal(whole[name], rest[name]), name
@@ -104,9 +104,9 @@ def test_a_swim_that_is_as_long_already_leaves_its_files_alone(
     saved.write_text("precious")
     words = ("square", "--frequency", "2.5", "--seconds", "4", "--settle", "1")
     files = ("--resume", str(swum[1] / "end"), "--save", str(saved))
-    line = one_line(simulated(*words, *files))
-    told = "the checkpoint is of 4.00 s already; give more --seconds"
-    assert line == f"fishctl: {swum[1]}/end: {told}\n"
+    line = one_line(simulate(*words, *files))
+    problem = "the checkpoint is of 4.00 s already; give more --seconds"
+    assert line == f"fishctl: {swum[1]}/end: {problem}\n"
     assert saved.read_text() == "precious"
 
 
@@ -122,14 +122,14 @@ def test_a_checkpoint_of_another_fish_is_refused_with_the_key_that_differs(
     swum: tuple[dict[str, Any], Path], override: str, complaint: str
 ) -> None:
     kept = str(swum[1] / "end")
-    line = one_line(simulated("swing", "--resume", kept, "--set", override))
+    line = one_line(simulate("swing", "--resume", kept, "--set", override))
     assert line.startswith(f"fishctl: {kept}: it is of a swim with {complaint}")
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nor this"])
 def test_what_is_no_checkpoint_is_said_to_be_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "kept").write_bytes(content)
-    line = one_line(simulated("swing", "--resume", str(tmp_path / "kept")))
+    line = one_line(simulate("swing", "--resume", str(tmp_path / "kept")))
     assert line == f"fishctl: {tmp_path}/kept: it is no checkpoint of a swimmer\n"
 
 
@@ -162,7 +162,7 @@ def test_a_damaged_checkpoint_is_said_to_be_with_the_array_that_is(
     arrays = table(swum[1] / "end")
     damaged = tmp_path / "kept.npz"
     np.savez(damaged, **arrays | {name: np.asarray(change(arrays[name]))})
-    line = one_line(simulated("sine", "--seconds", "0.2", "--settle", "0.1", "--resume", damaged))
+    line = one_line(simulate("sine", "--seconds", "0.2", "--settle", "0.1", "--resume", damaged))
     assert re.match(rf"fishctl: {damaged}: it is damaged: {complaint}", line)
 
 
@@ -172,7 +172,7 @@ def test_a_checkpoint_that_would_fill_the_memory_is_not_unpacked(
     bomb = tmp_path / "bomb.npz"
     with zipfile.ZipFile(bomb, "w") as archive:
         archive.writestr("state.u.npy", b"")
-        # What it unpacks to is said in the directory, which is all that may be read of it.
+        # The directory holds the unpacked size, and no more than the directory may be read.
         archive.getinfo("state.u.npy").file_size = 2**30 + 1
     with pytest.raises(checkpoint.CheckpointError, match="it would be longer than 1024 MB"):
         checkpoint.load(bomb)
@@ -190,7 +190,7 @@ def test_a_checkpoint_whose_track_has_other_columns_is_said_to_be_of_another_ver
 
 
 def test_a_swim_that_is_not_steady_is_said_to_need_a_longer_settle() -> None:
-    out = simulated("square", "--frequency", "2.5", "--seconds", "2.5", "--settle", "0").stdout
+    out = simulate("square", "--frequency", "2.5", "--seconds", "2.5", "--settle", "0").stdout
     assert "\n            still speeding up by " in out
     assert " %/s: a longer --settle is needed\n" in out
 
@@ -201,12 +201,12 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
     kept = tmp_path / "kept"
     keeps = ("--checkpoint", str(kept), "--checkpoint-every", "0.1")
     narrow = sets("swimmer.numerics.fine_width=0.5", "swimmer.steering=0")
-    done = simulated("square", "--frequency", "2.5", *narrow, *keeps)
+    done = simulate("square", "--frequency", "2.5", *narrow, *keeps)
     line = one_line(done)
     assert done.returncode == 1
     assert "the swimmer cannot go on at" in line
-    found = checkpoint.load(kept)
-    assert line.endswith(f"its last checkpoint is at {found.time:.2f} s: --resume {kept}\n")
+    last = checkpoint.load(kept)
+    assert line.endswith(f"its last checkpoint is at {last.time:.2f} s: --resume {kept}\n")
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
 def test_what_cannot_be_done_is_said_before_it_swims(
     words: tuple[str, ...], complaint: str
 ) -> None:
-    assert complaint in one_line(simulated("swing", *words))
+    assert complaint in one_line(simulate("swing", *words))
 
 
 def test_a_checkpoint_of_another_swim_is_not_written_over(
@@ -231,7 +231,7 @@ def test_a_checkpoint_of_another_swim_is_not_written_over(
 ) -> None:
     kept = swum[1] / "end"
     before = kept.read_bytes()
-    line = one_line(simulated("swing", "--checkpoint", kept))
+    line = one_line(simulate("swing", "--checkpoint", kept))
     assert line == f"fishctl: {kept} exists: --resume it, or remove it\n"
     assert kept.read_bytes() == before
 
@@ -250,7 +250,7 @@ def test_a_folder_that_goes_away_costs_its_files_and_not_the_swim(
     monkeypatch.setattr(checkpoint, "save", save_and_go)
     files = ("--checkpoint", gone / "kept", "--checkpoint-every", "0.5", "--save")
     files = (*files, gone / "track.csv")
-    done = simulated("swing", "--seconds", "2", "--settle", "0.5", *files)
+    done = simulate("swing", "--seconds", "2", "--settle", "0.5", *files)
     assert (tmp_path / "elsewhere" / "kept").exists()
     assert done.returncode == 1
     assert "\nspeed " in done.stdout
@@ -276,7 +276,7 @@ def test_ctrl_c_keeps_what_was_swum_and_the_bar_shows_the_speed(tmp_path: Path) 
     try:
         while chunk := os.read(ours, 4096):
             seen += chunk
-    except OSError:  # nobody writes there any more
+    except OSError:  # the other end is closed
         pass
     os.close(ours)
     assert swimming.wait(PATIENCE) == 130
@@ -289,7 +289,7 @@ def test_ctrl_c_keeps_what_was_swum_and_the_bar_shows_the_speed(tmp_path: Path) 
 def test_a_recording_has_where_the_fish_was(tmp_path: Path) -> None:
     path = tmp_path / "swim.mcap"
     words = ("--seconds", "0.3", "--settle", "0.1", "--record", str(path))
-    assert simulated("square", *words).returncode == 0
+    assert simulate("square", *words).returncode == 0
     done = fishctl("export", str(path), "--csv", "--to", str(tmp_path))
     assert done.returncode == 0
     header = (tmp_path / "swim.csv").read_text().partition("\n")[0].split(",")

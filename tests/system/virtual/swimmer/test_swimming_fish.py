@@ -1,4 +1,4 @@
-"""A fish in its tank: no energy comes from nowhere, and without muscles it comes to rest."""
+"""A fish in its tank: its energy is conserved, and without muscles it comes to rest."""
 
 import numpy as np
 import pytest
@@ -8,13 +8,13 @@ from fishd.virtual.swimmer.fish import Fish, Work
 
 
 def swim(fish: Fish, seconds: float, frequency: float) -> None:
-    """A square wave, or with 0 Hz relaxed muscles."""
+    """Swim with a square wave, or with relaxed muscles if the frequency is 0 Hz."""
     for _ in range(round(seconds / fish.dt)):
         fish.step((1.0 if fish.time * frequency % 1.0 < 0.5 else -1.0) if frequency else 0.0)
 
 
 def kinetic_energy(fish: Fish) -> float:
-    """Of all that moves on the grid, the body included [J/m]."""
+    """Return the kinetic energy of all that moves on the grid, the body included [J/m]."""
     flow, grid = fish.flow, fish.flow.grid
     u, v = 0.5 * (flow.u[1:] + flow.u[:-1]), 0.5 * (flow.v[:, 1:] + flow.v[:, :-1])
     return float(500.0 * grid.dx @ (u**2 + v**2) @ grid.dy)

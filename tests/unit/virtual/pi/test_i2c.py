@@ -125,10 +125,10 @@ def test_the_device_file_exists_only_while_it_is_installed(board: Board) -> None
 
 
 def test_each_open_device_file_has_an_address_of_its_own(board: Board) -> None:
-    other = Ads1115Chip(board.clock, lambda *_: 0.0, board.faults)
-    board.bus.attach(0x49, other)
-    with smbus.SMBus(ABSENT_BUS) as one, smbus.SMBus(ABSENT_BUS) as two:
-        one.write_i2c_block_data(0x48, 0x02, b"\x11\x11")
-        two.write_i2c_block_data(0x49, 0x02, b"\x22\x22")
-        assert one._device.fileno() != two._device.fileno()
-        assert (one._device.read(2), two._device.read(2)) == (b"\x11\x11", b"\x22\x22")
+    second_chip = Ads1115Chip(board.clock, lambda *_: 0.0, board.faults)
+    board.bus.attach(0x49, second_chip)
+    with smbus.SMBus(ABSENT_BUS) as first, smbus.SMBus(ABSENT_BUS) as second:
+        first.write_i2c_block_data(0x48, 0x02, b"\x11\x11")
+        second.write_i2c_block_data(0x49, 0x02, b"\x22\x22")
+        assert first._device.fileno() != second._device.fileno()
+        assert (first._device.read(2), second._device.read(2)) == (b"\x11\x11", b"\x22\x22")

@@ -50,49 +50,49 @@ def test_muscles_relax_when_the_servo_is_released() -> None:
 
 
 def test_with_a_servo_the_muscles_follow_its_wheel() -> None:
-    fish, other = swimmer("swimmer.muscle.servo=true"), TetheredFish(PlantParameters())
+    fish, tethered = swimmer("swimmer.muscle.servo=true"), TetheredFish(PlantParameters())
     half = fish.fish.dt / 2
     for index, angle in enumerate([PHI, PHI, PHI, -PHI, -PHI], 1):
         fish.write(angle)
         fish.read(index * TICK)
-        other.advance(angle, TICK - half, 1)  # value in the middle of the last step
-        assert fish.truth().phi == pytest.approx(other.state.phi, abs=1e-9)
-        other.advance(angle, half, 1)
+        tethered.advance(angle, TICK - half, 1)  # value in the middle of the last step
+        assert fish.truth().phi == pytest.approx(tethered.state.phi, abs=1e-9)
+        tethered.advance(angle, half, 1)
 
 
 def test_a_positive_command_moves_the_tail_to_positive_angles() -> None:
     fish = swimmer()
     fish.write(PHI)
     swum(fish, 6)
-    truth, told = fish.truth(), fish.read(7 * TICK).fin_velocity
+    truth, fin_velocity = fish.truth(), fish.read(7 * TICK).fin_velocity
     assert truth.alpha > 0.01
     assert truth.alpha_rate > 1.0
-    assert told is not None
-    assert told > 1.0
+    assert fin_velocity is not None
+    assert fin_velocity > 1.0
 
 
-@pytest.mark.parametrize(("time", "told"), [(0.0, 2.0), (0.02, 2.0 * (1.0 - math.exp(-1.0)))])
-def test_the_fin_velocity_is_the_rate_of_the_tail_low_passed(time: float, told: float) -> None:
+@pytest.mark.parametrize(("time", "expected"), [(0.0, 2.0), (0.02, 2.0 * (1.0 - math.exp(-1.0)))])
+def test_the_fin_velocity_is_the_rate_of_the_tail_low_passed(time: float, expected: float) -> None:
     fish = swimmer(f"swimmer.sensor_time={time}")
     turning = fish.motion._replace(tail_rate=2.0)
     fish.fish.step = lambda activation: None  # type: ignore[method-assign]
     fish.fish.motion = lambda: turning  # type: ignore[method-assign]
     fish.read(TICK)
-    assert fish.read(2 * TICK).fin_velocity == pytest.approx(told)
+    assert fish.read(2 * TICK).fin_velocity == pytest.approx(expected)
     assert fish.truth().alpha_rate == 2.0
 
 
 def test_a_fish_goes_on_from_its_state_to_the_last_bit() -> None:
-    fish, other = swimmer(), swimmer()
+    fish, restored = swimmer(), swimmer()
     fish.write(PHI)
     swum(fish, 20)
-    other.restore(fish.state())
+    restored.restore(fish.state())
     swum(fish, 5, first=21)
-    swum(other, 5)  # its loop may restart its count
-    assert other.motion == fish.motion
-    assert other.work == fish.work
+    swum(restored, 5)  # its loop may restart its count
+    assert restored.motion == fish.motion
+    assert restored.work == fish.work
     for name, array in fish.state().items():
-        assert np.array_equal(array, other.state()[name], equal_nan=True), name
+        assert np.array_equal(array, restored.state()[name], equal_nan=True), name
 
 
 def diverges(_: float) -> NoReturn:
