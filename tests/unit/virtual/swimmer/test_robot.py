@@ -129,5 +129,5 @@ def test_the_loop_swims_it_and_latches_a_fault_of_its_own_where_it_is_lost() -> 
 
 
 def test_nothing_judges_a_swimmer_as_if_it_were_tethered() -> None:
-    with pytest.raises(ConfigError, match="robot: simulated is needed"):
+    with pytest.raises(ConfigError, match="set robot: simulated"):
         simulate(coarse(), "swing", {}, 2.0, 1.0)

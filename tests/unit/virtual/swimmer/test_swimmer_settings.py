@@ -104,4 +104,4 @@ def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, progr
 def test_verbs_about_the_thrust_of_a_tethered_fish_refuse_a_swimmer(words: tuple[str, ...]) -> None:
     complaint = one_line(fishctl(*words, "--config", str(FILE)))
     assert "robot: swimmer is not valid for" in complaint
-    assert "robot: simulated is needed" in complaint
+    assert "set robot: simulated" in complaint
