@@ -286,8 +286,8 @@ class Operations:
             if field.file and field.name in values:  # a tick must not wait for a file
                 name, option = loop.active.name, field.name.replace("_", "-")
                 raise ParameterError(
-                    f"{name}: {field.name}: it cannot change in flight; start the controller "
-                    f"again: 'fishctl set-controller {name} --{option} …'"
+                    f"{name}: {field.name}: it cannot change while {name} is active; start the "
+                    f"controller again: 'fishctl set-controller {name} --{option} …'"
                 )
         return registry.merge_parameters(loop.active.controller, loop.active.name, values)
 

@@ -240,7 +240,7 @@ def test_a_controller_that_was_to_begin_after_a_rest_does_not_begin_in_a_lease_o
     run_story(rig, story)
     warnings = [event for event in rig.recorder.events if event.level == "warning"]
     assert [event.message for event in warnings if event.kind == "calibration"] == [
-        "square does not begin by itself any more: the servo has another calibration"
+        "square will not start by itself: the servo has another calibration now"
     ]
 
 
