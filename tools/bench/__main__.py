@@ -7,28 +7,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 
 from common.report import run  # noqa: E402
 
-NAMES = (
-    "tick",
-    "sampler",
-    "policy",
-    "remote",
-    "learning",
-    "pictures",
-    "chatter",
-    "measurement",
-    "calibration",
-    "live_thrust",
-    "sweep",
-    "identification",
-    "estimators",
-    "swing",
-    "lateral_sign",
-    "adapt",
-    "harsh",
-    "thrust",
-    "camera",
-    "swimmer",
-)
+NAMES = ("tick", "swims", "coverage", "identification", "adapt", "learning", "swimmer")
 
 if __name__ == "__main__":
     sys.exit(run("bench", NAMES))

@@ -1,37 +1,34 @@
 """Quality of the choice and of the claim of `fishctl adapt`, on harsh fish that differ from the
 model.
 
-The fish are like those of the bench `swing`, with other seeds and with all effects of a real rig,
-in random sizes. `adapt` runs on each in virtual time, by default for five minutes of tank time. The
-truth is the mean thrust of the simulated fish, which `adapt` does not use.
+The fish are like those of `tools/bench swims swing`, with other seeds and with all effects of a
+real rig, in random sizes. `adapt` runs on each in virtual time, by default for five minutes of tank
+time. The truth is the mean thrust of the simulated fish, which `adapt` does not use.
 """
 
-import os
 import statistics
 from argparse import Namespace
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import msgspec
 from msgspec import Struct
 from msgspec.structs import replace
 
-from bench.swing import percent
-from common.report import Options, Report, progress, table
+from common.report import JOBS, Options, Report, percent, progress, run_cases, table
 from fishd.config import Start, load
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.other_fish import harsh
 from fishd.lab.session import VirtualSession
 from fishd.learning.adapt.adaptation import Adaptation
-from fishd.learning.adapt.state import AdaptFolder, Contender
+from fishd.learning.adapt.state import AdaptFolder, Contender, Verdict
 from fishd.learning.adapt.verdict import SQUARE
 from fishd.virtual.plant.optimum import best_square_wave
 
-DOCUMENT = "how-to/adapt.md"
 FIRST_SEED = 900
 """First seed of the harsh fish; other seeds were used during development."""
-FISH = 10
+EQUAL = 0.9999
+"""Ratio of thrusts from which two gaits count as equal."""
 
 
 class Adapted(Struct, frozen=True):
@@ -40,26 +37,32 @@ class Adapted(Struct, frozen=True):
     seed: int
     best: float
     """Thrust of the best square wave [N]."""
-    chosen: str
-    decided: bool
-    """Whether the measurement alone shows that the chosen gait is the best one."""
-    undecided: list[str]
-    """Gaits that may be the best one according to the measurement."""
-    explained: float
-    """Fraction of the variance that the identified fish explains, for the worse explained force."""
-    share: float
-    """True thrust of the chosen gait over `best`."""
-    of_square: float
-    """True thrust of the square wave of the search, over `best`."""
-    claimed: tuple[float, float, float]
-    """Thrust of the chosen gait relative to the square wave of the search, and its interval."""
-    claims: dict[str, tuple[float, float, float, float]]
-    """`claimed` with the true value, for each gait except the square wave."""
-    thrusts: dict[str, tuple[float, float, float, float]]
-    """Measured thrust, half-widths of its statistical and total 95 % confidence intervals, and true
-    thrust, by gait [N]."""
+    verdict: Verdict
+    contenders: dict[str, Contender]
+    """Measured and true thrusts, by gait."""
     tank_time: float
     """Duration of the adaptation [s]."""
+
+    def truth(self, gait: str) -> float:
+        """Return the true thrust of a gait [N]."""
+        thrust = self.contenders[gait].true_thrust
+        assert thrust is not None
+        return thrust
+
+    @property
+    def largest(self) -> float:
+        """Largest true thrust of the gaits [N]."""
+        return max(map(self.truth, self.contenders))
+
+    @property
+    def includes_best(self) -> bool:
+        """Whether the gaits that may be the best include the truly best one."""
+        return max(map(self.truth, self.verdict.undecided)) > EQUAL * self.largest
+
+    def covers(self, gait: str) -> bool:
+        """Return whether the interval of a gait's relative thrust contains the true one."""
+        _, low, high = self.verdict.others[gait]
+        return low <= self.truth(gait) / self.truth(SQUARE) <= high
 
 
 class _Silent:
@@ -88,151 +91,102 @@ def adapted(task: tuple[int, int, float]) -> Adapted:
         run = AdaptFolder(experiment)
         state = Adaptation(session, run, tank_time, steps, 0, _Silent()).run()
     assert state.verdict
-    assert state.fitted
-    contenders = {one.name: one for one in state.contenders}
+    progress(f"fish {seed}", state.verdict.claim)
     best = best_square_wave(config.plant, config.amplitude_limit).thrust
-    verdict, square = state.verdict, contenders[SQUARE]
-    progress(f"fish {seed}", verdict.claim)
-    return Adapted(
-        seed=seed,
-        best=best,
-        chosen=verdict.chosen,
-        decided=verdict.decided,
-        undecided=verdict.undecided,
-        explained=state.fitted.model.explained,
-        share=truth(contenders[verdict.chosen]) / best,
-        of_square=truth(square) / best,
-        claimed=(verdict.relative_thrust, verdict.low, verdict.high),
-        claims={
-            name: (*claim, truth(contenders[name]) / truth(square))
-            for name, claim in verdict.others.items()
-        },
-        thrusts={
-            one.name: (
-                one.thrust,
-                one.error,
-                one.error if one.total_ci95 is None else one.total_ci95,
-                truth(one),
-            )
-            for one in state.contenders
-        },
-        tank_time=state.tank_time,
-    )
+    contenders = {contender.name: contender for contender in state.contenders}
+    return Adapted(seed, best, state.verdict, contenders, state.tank_time)
 
 
-def truth(one: Contender) -> float:
-    """Return the true thrust [N]."""
-    assert one.true_thrust is not None
-    return one.true_thrust
+def row(result: Adapted) -> list[str]:
+    """Return the row of the table for one fish."""
+    verdict = result.verdict
+    chosen = verdict.chosen
+    bold = (f"**{gait}**" if gait == chosen else gait for gait in verdict.undecided)
+    claim = ["100, itself", "100"]
+    if chosen in verdict.others:
+        value, low, high = map(percent, verdict.others[chosen])
+        truth = percent(result.truth(chosen) / result.truth(SQUARE))
+        claim = [f"{value} [{low}, {high}]", truth]
+    return [
+        str(result.seed),
+        f"{1e3 * result.best:.2f}",
+        f"{chosen} wins" if verdict.decided else ", ".join(bold),
+        *(percent(result.truth(gait) / result.best) for gait in (chosen, SQUARE)),
+        *claim,
+        f"{result.tank_time:.0f}",
+    ]
+
+
+def summary(results: list[Adapted]) -> str:
+    """Return medians, worst values and coverage."""
+    chosen = [result.truth(result.verdict.chosen) for result in results]
+    shares = [thrust / result.best for thrust, result in zip(chosen, results, strict=True)]
+    lost = [1.0 - thrust / result.largest for thrust, result in zip(chosen, results, strict=True)]
+    decided = [result for result in results if result.verdict.decided]
+    policies = [r.truth("policy") / r.best for r in results if "policy" in r.contenders]
+    claims = [result for result in results if result.verdict.chosen in result.verdict.others]
+    gaits = [(result, gait) for result in results for gait in result.verdict.others]
+    thrusts = [contender for result in results for contender in result.contenders.values()]
+    off = [abs(one.thrust - (one.true_thrust or 0.0)) for one in thrusts]
+    total = [one.error if one.total_ci95 is None else one.total_ci95 for one in thrusts]
+    rows = [
+        ["chosen gait, of the best square wave", *_middle_and_worst(shares, min)],
+        ["policy, of the best square wave", *_middle_and_worst(policies, min)],
+        ["policies that took part", _count(["policy" in r.contenders for r in results])],
+        ["verdicts that name a winner", _count([r.verdict.decided for r in results])],
+        ["of these, winners that are truly the best", _count([r.includes_best for r in decided])],
+        ["verdicts whose gaits include the best one", _count([r.includes_best for r in results])],
+        ["chosen gait below the truly best one", *_middle_and_worst(lost, max)],
+        [
+            "interval of the chosen gait's relative thrust covers the truth",
+            _count([result.covers(result.verdict.chosen) for result in claims]),
+        ],
+        [
+            "the same, of every gait but the square wave",
+            _count([result.covers(gait) for result, gait in gaits]),
+        ],
+        [
+            "statistical interval of a thrust covers the truth",
+            _count([a <= one.error for a, one in zip(off, thrusts, strict=True)]),
+        ],
+        [
+            "total interval of a thrust covers the truth",
+            _count([a <= b for a, b in zip(off, total, strict=True)]),
+        ],
+        ["longest tank time", f"{max(result.tank_time for result in results):.0f} s"],
+    ]
+    return table("what | measured | worst", [[*cells, ""][:3] for cells in rows])
+
+
+def _count(values: list[bool]) -> str:
+    return f"{sum(values)} of {len(values)}"
+
+
+def _middle_and_worst(shares: list[float], worst: Callable[[list[float]], float]) -> list[str]:
+    if not shares:
+        return ["–", "–"]
+    return [f"{percent(statistics.median(shares))} %", f"{percent(worst(shares))} %"]
 
 
 OPTIONS: Options = {
-    "--jobs": {"type": int, "default": os.cpu_count(), "help": "processes"},
+    **JOBS,
     "--first": {"type": int, "default": FIRST_SEED, "help": "seed of the first fish"},
-    "--fish": {"type": int, "default": FISH, "help": "how many"},
-    "--steps": {"type": int, "default": 6400, "help": "of each training"},
-    "--budget": {"type": float, "default": 300.0, "help": "of each fish [s]"},
+    "--fish": {"type": int, "default": 10, "help": "number of fish"},
+    "--steps": {"type": int, "default": 6400, "help": "steps of each training"},
+    "--budget": {"type": float, "default": 300.0, "help": "tank time of each fish [s]"},
 }
 
 
 def measure(options: Namespace) -> Report:
     """Return two tables; takes half a minute per fish."""
     seeds = range(options.first, options.first + options.fish)
-    tasks = [(seed, options.steps, options.tank_time) for seed in seeds]
-    with ProcessPoolExecutor(options.jobs) as pool:
-        results = list(pool.map(adapted, tasks))
+    tasks = [(seed, options.steps, options.budget) for seed in seeds]
+    results = run_cases(adapted, tasks, options.jobs)
     head = (
-        "fish | best square wave, mN | verdict | true thrust of the chosen gait, % of the best | "
-        "of the square wave found, % of the best | chosen gait ÷ square wave found, measured, % | "
-        "the same, true, % | tank time, s"
+        "fish | best square wave, mN | verdict | true thrust of the chosen gait, % of that | of "
+        "the square wave of the search, % of that | chosen gait over that square wave, % | its "
+        "truth, % | tank time, s"
     )
-    rows = [row(each) for each in results]
-    names = {"bench adapt": table(head, rows), "bench adapt summary": summary(results)}
-    return Report(names, [msgspec.to_builtins(each) for each in results])
-
-
-def row(one: Adapted) -> list[str]:
-    """Return the row of the table for one fish."""
-    value, low, high = map(percent, one.claimed)
-    own = one.claims.get(one.chosen)
-    return [
-        str(one.seed),
-        f"{1e3 * one.best:.2f}",
-        f"{one.chosen} wins" if one.decided else _undecided(one),
-        percent(one.share),
-        percent(one.of_square),
-        f"{value} [{low}, {high}]" if own else "100, the same gait",
-        percent(own[3]) if own else "100",
-        f"{one.tank_time:.0f}",
-    ]
-
-
-def _undecided(one: Adapted) -> str:
-    """Return the undecided gaits, with the chosen one in bold."""
-    return ", ".join(f"**{name}**" if name == one.chosen else name for name in one.undecided)
-
-
-def summary(results: list[Adapted]) -> str:
-    """Return medians, worst values and coverage."""
-    shares = [each.share for each in results]
-    claims = [each.claims[each.chosen] for each in results if each.chosen in each.claims]
-    every = [claim for each in results for claim in each.claims.values()]
-    policies = [
-        each.thrusts["policy"][3] / each.best for each in results if "policy" in each.thrusts
-    ]
-    thrusts = [thrust for each in results for thrust in each.thrusts.values()]
-    decided = [each for each in results if each.decided]
-    lost = [1.0 - each.thrusts[each.chosen][3] / _largest(each) for each in results]
-    # Differences by rounding between equal gaits are ignored.
-    kept = [
-        max(each.thrusts[k][3] for k in each.undecided) > 0.9999 * _largest(each)
-        for each in results
-    ]
-    rows = [
-        [
-            "chosen gait, % of the best square wave, median",
-            f"{percent(statistics.median(shares))} %",
-        ],
-        ["chosen gait, % of the best square wave, worst", f"{percent(min(shares))} %"],
-        ["policies that took part", f"{len(policies)} of {len(results)}"],
-        ["verdicts that name a winner", f"{len(decided)} of {len(results)}"],
-        [
-            "winners that are truly the best of the three",
-            f"{sum(kept[results.index(each)] for each in decided)} of {len(decided)}",
-        ],
-        [
-            "verdicts that include the truly best gait",
-            f"{sum(kept)} of {len(results)}",
-        ],
-        [
-            "loss of the chosen gait against the truly best, median",
-            f"{percent(statistics.median(lost))} %",
-        ],
-        ["the same, worst", f"{percent(max(lost))} %"],
-        ["interval of the chosen gait's relative thrust contains the true value", _covered(claims)],
-        ["the same, all gaits except the square wave", _covered(every)],
-        *(
-            [
-                f"{name} of a thrust contains the true value",
-                f"{sum(abs(each[0] - each[3]) <= each[column] for each in thrusts)} of "
-                f"{len(thrusts)}",
-            ]
-            for column, name in enumerate(("statistical interval", "total interval"), 1)
-        ),
-        ["longest tank time", f"{max(each.tank_time for each in results):.0f} s"],
-    ]
-    if policies:
-        middle = f"{percent(statistics.median(policies))} %"
-        rows.insert(2, ["policy, % of the best square wave, median", middle])
-        rows.insert(3, ["policy, % of the best square wave, worst", f"{percent(min(policies))} %"])
-    return table("quantity | measured", rows)
-
-
-def _largest(one: Adapted) -> float:
-    """Return the largest true thrust of the three [N]."""
-    return max(true for *_, true in one.thrusts.values())
-
-
-def _covered(claims: list[tuple[float, float, float, float]]) -> str:
-    covered = sum(low <= true <= high for _, low, high, true in claims)
-    return f"{covered} of {len(claims)}"
+    sections = {"bench adapt": table(head, map(row, results))}
+    sections["bench adapt summary"] = summary(results)
+    return Report(sections, results)

@@ -1,366 +1,418 @@
 """Results of learning: learning curves, policies on unknown fish, and speed.
 
-Trainings are those of `fishctl learn ppo`, in a temporary folder. Relative thrust is the thrust
-over that of the best square wave of the same fish and amplitude.
+Trainings are those of `fishctl learn ppo`, in a temporary folder, with seeds that no setting was
+chosen with. Relative thrust is the thrust over that of the best square wave of the same fish.
 
-    relative_thrust  learning curves: several fish and settings; draws learning-curves.png
-    amplitude        Φ = 0.3 rad, where two waves of whole ticks are nearly as good
-    exploration      why one of these seeds goes to five ticks and stays there
-    choices          what each of the default settings is worth
-    transfer         policies for one fish on sixteen others
-    tank             tank time of trainings on a robot, evaluations included
-    harsh            the policy that is shipped, and swing, on rigs that delay, play and react
-    speed            environment and inference, on one core
-    time             whole runs of `fishctl learn ppo`, one at a time
+    curves     several fish and settings, from forces; draws learning-curves.png
+    pictures   several feature extractors and cameras; draws camera-learning.png
+    optimum    frequency and thrust that are learned at four amplitudes, from forces and pictures
+    transfer   policies for one fish on sixteen others
+    speed      steps of the environment, and inference, on one core
 """
 
 import itertools
 import math
 import statistics
+import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Callable
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
 
 import joblib
 import numpy as np
 from msgspec.structs import replace
 
 from bench.learning_curves import learning_curves
-from bench.middle_amplitude import amplitude, exploration
-from bench.policy import policy_file
-from bench.tank_time import tank
-from bench.training_time import training_time
-from bench.trainings import (
-    CONFIG,
-    SECONDS,
-    SETTLE,
-    UNTOUCHED,
-    Row,
-    Trained,
-    fish_that_are_off,
-    rig,
-    settings_of,
-    several,
-    to_reach,
-)
 from common.report import DOCS, Options, Report, progress, spread, table
+from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config, load
 from fishd.controllers import registry
 from fishd.lab.compare.contestants import best_on_grid, parse
-from fishd.lab.compare.survey import survey
-from fishd.lab.links.simulated_link import SimulatedLink
-from fishd.lab.other_fish import CHANGES, FIRST_SEED, HARSH_FISH_COUNT, harsh_fish, mild
-from fishd.lab.other_fish import harsh as harsh_of_seed
+from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.lab.simulation import simulate
+from fishd.learning import settings as training
 from fishd.learning.env.environment import SwimEnv, best_thrust
+from fishd.learning.env.evaluation import Evaluation, judge
+from fishd.learning.eyes import make_eye
+from fishd.learning.ppo import DeterministicPolicy
+from fishd.learning.run_folder.checkpoints import load_policy
+from fishd.learning.run_folder.tables import best_so_far, read_evaluations
 from fishd.learning.settings import TrainingSettings
-from fishd.virtual.plant.optimum import best_square_wave
+from fishd.learning.train.jobs import Job
+from fishd.learning.train.training import train
 
-DOCUMENT = "how-to/learning.md"
-FIGURE = DOCS / "figures" / "learning-curves.png"
+CONFIG = DOCS.parent / "config"
+SEEDS, PICTURE_SEEDS = range(240, 250), range(230, 240)
+"""Seeds of the trainings from forces and from pictures."""
+PAPER_STEPS, PICTURE_STEPS, PAPER_PICTURE_STEPS, LONG_STEPS = 20_000, 4096, 15_360, 8064
+"""Control steps of trainings whose length is not the default one."""
 MILESTONES = (500, 1000, 2000, 4000, 8000, 20_000)
 """Numbers of control steps at which learning curves are reported."""
-PAPER_STEPS, CHOICE_STEPS = 20_000, 3000
-CHOOSING = range(300, 310)
-"""Seeds with which settings were compared."""
-SHIPPED, SWINGS = "default-fish", ("swing:C=0.6", "swing:C=auto")
-MANY_SEEDS = range(1000, 1040)
-"""Seeds of mild and harsh fish that no policy was trained or chosen with."""
-GOOD = 0.95
-"""Goal for the relative thrust of a policy on each of sixteen fish."""
-SIMULATED = "`config/simulated.yaml`"
-NEARLY, GOOD_RELATIVE_THRUST = 0.95, 0.97
-REACHED = f" | {100 * NEARLY:.0f} % | seeds | {100 * GOOD_RELATIVE_THRUST:.0f} % | seeds"
-STALLED = 0.5
-"""Relative thrust below which a policy counts as stalled."""
+NEARLY, GOOD = 0.95, 0.97
+"""Relative thrusts whose steps are reported."""
+AMPLITUDES = (0.2, 0.31, 0.42, 0.8)
+"""Amplitudes Φ of the part `optimum` [rad]."""
+PARAMETER_CHANGE = 0.15
+"""Relative change of each of four parameters of a fish, up or down."""
+SECONDS, SETTLE = 60.0, 10.0
+"""Length of an evaluation on other fish, and of its ignored start [s]."""
 
 
-def relative_thrust(options: Namespace) -> str:
-    """Draw learning curves of the default settings on several fish, and of two other settings."""
-    plain, paper = settings_of(None), settings_of("learning-paper.yaml", PAPER_STEPS)
-    blind = replace(plain, ppo=replace(plain.ppo, symmetric=False))
+class Row(NamedTuple):
+    """Training with several seeds."""
+
+    config: Config
+    settings: TrainingSettings
+    camera: SimulatedCameraSettings = SimulatedCameraSettings()
+    """Camera, where the settings require pictures."""
+
+
+class Trained(NamedTuple):
+    """Result of one training."""
+
+    points: list[Evaluation]
+    best: list[float]
+    """Relative thrust of the best policy up to each step."""
+    others: list[float]
+    """Relative thrusts of its best policy on changed fish, if requested."""
+    cost: float
+    """Processor time for 1000 steps, including evaluations [s]."""
+
+    def steps_to(self, relative_thrust: float) -> float:
+        """Return the steps until the first evaluation with that relative thrust; inf without."""
+        reached = zip(self.points, self.best, strict=True)
+        return next((point.steps for point, best in reached if best >= relative_thrust), math.inf)
+
+    @property
+    def exported(self) -> Evaluation:
+        """Evaluation of its best policy."""
+        return max(self.points, key=lambda point: point.relative_thrust)
+
+
+def rig(amplitude: float = 0.42) -> Config:
+    """Return a fish with 1 mN of noise and an offset of 5 mN on F_y."""
+    keys = ("simulation.noise=0.001", "simulation.offset_y=0.005")
+    return load(None, [f"amplitude_limit={amplitude}", *keys])
+
+
+def settings_of(name: str | None = None, steps: int | None = None) -> TrainingSettings:
+    """Return the settings in a file of config/, or the defaults, with another number of steps.
+
+    A training runs all steps, so that learning curves can be compared.
+    """
+    chosen = training.load(CONFIG / name if name else None)
+    evaluation = replace(chosen.evaluation, patience=None)
+    return replace(chosen, steps=steps or chosen.steps, evaluation=evaluation)
+
+
+def without_symmetry(settings: TrainingSettings) -> TrainingSettings:
+    """Return the settings of a policy that does not know that left and right are alike."""
+    return replace(settings, ppo=replace(settings.ppo, symmetric=False))
+
+
+def trained(row: Row, seed: int, others: bool) -> Trained:
+    """Train once, in a separate process."""
+    fish = replace(row.config, simulation=replace(row.config.simulation, seed=seed))
+    with tempfile.TemporaryDirectory() as temporary:
+        job = Job(
+            config=fish,
+            settings=replace(row.settings, seed=seed),
+            folder=Path(temporary) / "run",
+            camera=replace(row.camera, seed=seed),
+        )
+        start = time.process_time()
+        outcome = train(job)
+        seconds = time.process_time() - start
+        points = read_evaluations(job.folder)
+        shares = swim_others(outcome.best, row.config) if others and outcome.best else []
+        return Trained(points, best_so_far(points), shares, 1000.0 * seconds / outcome.steps)
+
+
+def swim_others(checkpoint: Path, config: Config) -> list[float]:
+    """Return the relative thrust of a policy on each changed fish."""
+    shares = []
+    for changed in changed_fish(config):
+        decide = DeterministicPolicy(*load_policy(checkpoint), config.amplitude_limit)
+        shares.append(judge(changed, decide, SECONDS, SETTLE).relative_thrust)
+    return shares
+
+
+def changed_fish(config: Config) -> Iterator[Config]:
+    """Return sixteen fish with each of four parameters changed up or down."""
+    plant = config.plant
+    values = (plant.omega0, plant.xi, plant.servo_speed, plant.coupling)
+    for signs in itertools.product((-1.0, 1.0), repeat=4):
+        omega0, xi, speed, coupling = (
+            value * (1.0 + PARAMETER_CHANGE * sign)
+            for value, sign in zip(values, signs, strict=True)
+        )
+        changed = replace(plant, omega0=omega0, xi=xi, servo_speed=speed, coupling=coupling)
+        yield replace(config, plant=changed, simulation=replace(config.simulation, seed=1000))
+
+
+def train_all(
+    rows: Mapping[str, Row], seeds: Sequence[int], options: Namespace, others: bool = False
+) -> dict[str, list[Trained]]:
+    """Train all seeds of all rows in parallel."""
+    if options.steps:
+        rows = {
+            name: row._replace(settings=replace(row.settings, steps=options.steps))
+            for name, row in rows.items()
+        }
+    tasks = [(row, seed) for row in rows for seed in seeds]
+    trainings: dict[str, list[Trained]] = {row: [] for row in rows}
+    with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        parallel = joblib.Parallel(n_jobs=options.jobs, batch_size=1, return_as="generator")
+        work = parallel(joblib.delayed(trained)(rows[row], seed, others) for row, seed in tasks)
+        for (row, seed), result in zip(tasks, work, strict=True):
+            trainings[row].append(result)
+            last = result.points[-1]
+            progress(f"{row}, seed {seed}: {last.relative_thrust:.1%}, best {result.best[-1]:.1%}")
+    return trainings
+
+
+def curves(options: Namespace) -> Report:
+    """Train the default settings on several fish, and two other settings."""
+    plain, paper = settings_of(), settings_of("learning-paper.yaml", PAPER_STEPS)
     rows = {
         "Φ = 0.42 rad": Row(rig(), plain),
         "Φ = 0.2 rad": Row(rig(0.2), plain),
         "Φ = 0.8 rad": Row(rig(0.8), plain),
-        SIMULATED: Row(load(CONFIG / "simulated.yaml"), plain),
+        "`config/simulated.yaml`": Row(load(CONFIG / "simulated.yaml"), plain),
         "`config/harsh.yaml`": Row(load(CONFIG / "harsh.yaml"), plain),
-        "Φ = 0.42 rad, without symmetry": Row(rig(), blind),
+        "Φ = 0.42 rad, without symmetry": Row(rig(), without_symmetry(plain)),
         "Φ = 0.42 rad, as in the paper": Row(rig(), paper),
     }
-    trainings = several(rows, UNTOUCHED[: options.seeds], options.jobs)
-    picture = {
-        row.replace("`", ""): [
-            ([p.steps for p in one.points], [p.relative_thrust for p in one.points]) for one in runs
-        ]
-        for row, runs in trainings.items()
-        if row != SIMULATED
+    trainings = train_all(rows, SEEDS[: options.seeds], options)
+    shown = [row for row in rows if "simulated" not in row]
+    draw(options, "learning-curves.png", trainings, shown)
+    return Report({"bench learning relative_thrust": summary(rows, trainings)}, None)
+
+
+def pictures(options: Namespace) -> Report:
+    """Train each feature extractor with each camera, and from forces."""
+    modes = replace(settings_of(None, PICTURE_STEPS), see="camera")
+    cnn = settings_of("learning-cnn.yaml", PICTURE_STEPS)
+    paper = settings_of("learning-camera-paper.yaml", PAPER_PICTURE_STEPS)
+    rows = {
+        "`modes`, rig default": Row(rig(), modes),
+        "`modes`, rig web": Row(rig(), modes, WEB),
+        "`cnn`, rig default": Row(rig(), cnn),
+        "`cnn`, rig web": Row(rig(), cnn, WEB),
+        "`cnn`, default, without symmetry": Row(rig(), without_symmetry(cnn)),
+        "force": Row(rig(), settings_of(None, PICTURE_STEPS)),
     }
+    trainings = train_all(rows, PICTURE_SEEDS[: options.seeds], options)
+    slow = {"as in the paper": Row(rig(), paper)}
+    trainings |= train_all(slow, PICTURE_SEEDS[: few(options)], options)
+    shown = ("`modes`, rig default", "`cnn`, rig default", "as in the paper", "force")
+    draw(options, "camera-learning.png", trainings, shown)
+    return Report({"bench pictures steps": summary(rows | slow, trainings)}, None)
+
+
+def few(options: Namespace) -> int:
+    """Return the number of seeds of slow trainings."""
+    return max(1, round(0.3 * options.seeds))
+
+
+def draw(
+    options: Namespace, name: str, trainings: Mapping[str, list[Trained]], shown: Sequence[str]
+) -> None:
+    """Draw the learning curves of some trainings into docs/figures/, for --write."""
     if options.write:
-        learning_curves(FIGURE, picture, GOOD_RELATIVE_THRUST)
-    heads = " | ".join(["", "seeds", *(f"{steps} steps" for steps in MILESTONES)])
-    reached, learned, best, shape = [], [], [], []
-    for row, runs in trainings.items():
-        reached.append([row, *to_reach(runs, NEARLY), *to_reach(runs, GOOD_RELATIVE_THRUST)])
-        learned.append(
-            [row, str(len(runs)), *curve_of(runs, lambda one, k: one.points[k].relative_thrust)]
-        )
-        best.append([row, str(len(runs)), *curve_of(runs, lambda one, k: one.best[k])])
-        config = rows[row].config
+        drawn = {
+            row.replace("`", ""): [
+                ([p.steps for p in run.points], [p.relative_thrust for p in run.points])
+                for run in trainings[row]
+            ]
+            for row in shown
+        }
+        learning_curves(DOCS / "figures" / name, drawn, GOOD)
+
+
+def summary(rows: Mapping[str, Row], trainings: Mapping[str, list[Trained]]) -> str:
+    """Return tables of the steps to a good policy, of the best policies, and of their commands."""
+    reached, best, commands = [], [], []
+    for name, runs in trainings.items():
+        config = rows[name].config
+        reached.append([name, *steps_to(runs, NEARLY), *steps_to(runs, GOOD)])
+        reached[-1].append(f"{statistics.median(run.cost for run in runs):.1f}")
+        best.append([name, str(len(runs)), *curve(runs)])
         grid = best_on_grid(config)
-        limit = grid.thrust / best_square_wave(config.plant, config.amplitude_limit).thrust
-        ends = [one.points[-1] for one in runs]
-        stalled = sum(end.relative_thrust < STALLED for end in ends)
-        shape.append(
+        ends = [run.exported for run in runs]
+        commands.append(
             [
-                row,
+                name,
+                spread([end.relative_thrust for end in ends]),
                 spread([end.fullness for end in ends], 1.0, 3),
                 spread([end.frequency for end in ends], 1.0, 3),
                 f"{grid.frequency:.3f}",
-                f"{100.0 * limit:.1f}",
-                f"{stalled} of {len(ends)}",
+                f"{100.0 * grid.thrust / best_thrust(config):.1f}",
             ]
         )
-    shape_heads = (
-        "fish | mean \\|φ_c\\|/Φ | frequency (Hz) | best whole-tick wave (Hz) | "
-        "its relative thrust (%) | stalled"
-    )
+    goals = " | ".join(f"{100 * share:.0f} % | seeds" for share in (NEARLY, GOOD))
+    milestones = " | ".join(f"{steps} steps" for steps in MILESTONES)
     return "\n\n".join(
         (
-            f"Steps until the best policy so far has that relative thrust, median [lowest – "
-            f"highest] of {options.seeds} seeds:",
-            table(REACHED, reached),
-            "Relative thrust (%) of the best policy of a seed so far, the one that `export` takes:",
-            table(heads, best),
-            "The same for the newest policy instead of the best one:",
-            table(heads, learned),
-            "Commands of the newest policy at the end:",
-            table(shape_heads, shape),
+            "Steps until the best policy so far has that relative thrust, median [lowest – "
+            "highest] of the seeds, and processor time for 1000 steps:",
+            table(f" | {goals} | s", reached),
+            "Relative thrust (%) of the best policy that a seed has had until then, which is "
+            "exported:",
+            table(f" | seeds | {milestones}", best),
+            "The best policies:",
+            table(
+                " | relative thrust (%) | mean \\|φ_c\\|/Φ | frequency (Hz) | best on the grid "
+                "(Hz) | its relative thrust (%)",
+                commands,
+            ),
         )
     )
 
 
-def choices(options: Namespace) -> str:
-    """Return the effect of each of the default settings, on two fish where it matters."""
-    plain = settings_of(None, CHOICE_STEPS)
-    ppo, seen = plain.ppo, plain.environment
-    others = tuple(name for name in seen.observation if name != "side_time")
-    variants = {
-        "default settings": plain,
-        "128 steps between updates": replace(
-            plain,
-            ppo=replace(ppo, n_steps=2 * ppo.n_steps),
-            evaluation=replace(plain.evaluation, every=plain.evaluation.every // 2),
-        ),
-        "ten passes over each rollout": replace(plain, ppo=replace(ppo, n_epochs=10)),
-        "initial exploration of 2 Φ": replace(plain, ppo=replace(ppo, log_std_init=math.log(2))),
-        "without the input `side_time`": replace(
-            plain, environment=replace(seen, observation=others)
-        ),
-        "F_x uncorrected (`clean_rewards: false`)": replace(
-            plain, ppo=replace(ppo, clean_rewards=False)
-        ),
-        "without the shortest dwell": replace(plain, environment=replace(seen, dwell=False)),
-    }
-    fish = {
-        "Φ = 0.2 rad": (rig(0.2), GOOD_RELATIVE_THRUST),
-        "`config/harsh.yaml`": (load(CONFIG / "harsh.yaml"), NEARLY),
-    }
-    rows = {
-        f"{one}, {name}": Row(config, chosen)
-        for name, chosen in variants.items()
-        for one, (config, _) in fish.items()
-    }
-    trainings = several(rows, CHOOSING[: options.seeds], options.jobs)
-    table_rows = [
-        [
-            name,
-            *itertools.chain.from_iterable(
-                to_reach(trainings[f"{one}, {name}"], share) for one, (_, share) in fish.items()
-            ),
-        ]
-        for name in variants
-    ]
-    heads = " | ".join(
-        ["", *(f"{one}: steps to {100 * share:.0f} % | seeds" for one, (_, share) in fish.items())]
-    )
-    return table(heads, table_rows)
+def steps_to(runs: list[Trained], share: float) -> list[str]:
+    """Return the cells of a row: steps to that relative thrust, and number of seeds with it."""
+    steps = [run.steps_to(share) for run in runs]
+    reached = sum(map(math.isfinite, steps))
+    return [spread(steps, 1.0, 0).replace("inf", "never"), f"{reached} of {len(runs)}"]
 
 
-def curve_of(runs: list[Trained], figure: Callable[[Trained, int], float]) -> list[str]:
+def curve(runs: list[Trained]) -> list[str]:
     """Return the cells of a row: one for each milestone until the training's end."""
     cells = []
     for steps in MILESTONES:
-        known = [sum(point.steps <= steps for point in one.points) for one in runs]
-        over = steps > max(one.points[-1].steps for one in runs)
-        shares = [figure(one, count - 1) for one, count in zip(runs, known, strict=True) if count]
-        cells.append("" if over or not shares else spread(shares))
+        counts = [sum(point.steps <= steps for point in run.points) for run in runs]
+        is_over = steps > max(run.points[-1].steps for run in runs)
+        shares = [run.best[count - 1] for run, count in zip(runs, counts, strict=True) if count]
+        cells.append("" if is_over or not shares else spread(shares))
     return cells
 
 
-def transfer(options: Namespace) -> str:
+def optimum(options: Namespace) -> Report:
+    """Return frequency and thrust of the best policies, from forces and from pictures."""
+    long = settings_of(None, LONG_STEPS)
+    kinds = {
+        "force": long,
+        "`modes`": replace(long, see="camera"),
+        "`cnn`": settings_of("learning-cnn.yaml", PICTURE_STEPS),
+    }
+    rows = {f"{phi} {name}": Row(rig(phi), kinds[name]) for phi in AMPLITUDES for name in kinds}
+    trainings = train_all(rows, PICTURE_SEEDS[: few(options)], options)
+    lines = []
+    for phi in AMPLITUDES:
+        config = rig(phi)
+        grid = best_on_grid(config)
+        share = 100.0 * grid.thrust / best_thrust(config)
+        cells = [f"{phi}", f"{grid.frequency:.2f} / {share:.1f}"]
+        for name in kinds:
+            ends = [run.exported for run in trainings[f"{phi} {name}"]]
+            share = statistics.median(100.0 * end.relative_thrust for end in ends)
+            cells.append(f"{spread([end.frequency for end in ends], 1.0, 2)} / {share:.1f}")
+        lines.append(cells)
+    heads = " | ".join(("Φ (rad)", "best on the grid of ticks", *kinds))
+    about = (
+        f"Frequency (Hz), median [lowest – highest] of {few(options)} seeds, and relative thrust "
+        f"(%), of the best policy of {LONG_STEPS} steps, `cnn` {PICTURE_STEPS}:"
+    )
+    return Report({"bench pictures optimum": f"{about}\n\n{table(heads, lines)}"}, None)
+
+
+def transfer(options: Namespace) -> Report:
     """Return results of randomised and plain trainings, and of swing, on unknown fish."""
     rows = {
         "`learning-transfer.yaml`": Row(rig(), settings_of("learning-transfer.yaml")),
-        "default settings": Row(rig(), settings_of(None)),
+        "default settings": Row(rig(), settings_of()),
     }
-    trainings = several(rows, UNTOUCHED[: options.seeds], options.jobs, others=True)
-    shares = {row: [one.others for one in runs] for row, runs in trainings.items()}
-    for text in SWINGS:
+    trainings = train_all(rows, SEEDS[: options.seeds], options, others=True)
+    shares = {row: [run.others for run in runs] for row, runs in trainings.items()}
+    for text in ("swing:C=0.6", "swing:C=auto"):
         _, name, parameters = parse(text)
-        fish = fish_that_are_off(rig())
-        shares[f"`{text}`"] = [
-            [simulate(one, name, parameters, SECONDS, SETTLE).relative_thrust for one in fish]
-        ]
+        reports = [simulate(one, name, parameters, SECONDS, SETTLE) for one in changed_fish(rig())]
+        shares[f"`{text}`"] = [[report.relative_thrust for report in reports]]
     lines = [
         [
             row,
             spread([min(values) for values in runs]),
             spread([statistics.median(values) for values in runs]),
-            f"{sum(min(values) >= GOOD for values in runs)} of {len(runs)}",
+            f"{sum(min(values) >= NEARLY for values in runs)} of {len(runs)}",
         ]
         for row, runs in shares.items()
     ]
-    heads = f"controller | worst of 16 fish | median of 16 fish | all ≥ {100 * GOOD:.0f} %"
-    of_seeds = (
-        "Relative thrust in %; for policies the median [lowest – highest] of "
-        f"{options.seeds} seeds:"
-    )
-    return f"{of_seeds}\n\n{table(heads, lines)}"
+    heads = f"what swims | worst of 16 fish | median of 16 fish | all ≥ {100 * NEARLY:.0f} %"
+    about = f"Relative thrust in %, of policies median [lowest – highest] of {options.seeds} seeds:"
+    return Report({"bench learning transfer": f"{about}\n\n{table(heads, lines)}"}, shares)
 
 
-def harsh(options: Namespace) -> str:
-    """Return the results of `fishctl learn evaluate --fish harsh`, and of mild fish."""
-    changes, random = list(CHANGES), list(harsh_fish())
-    clean = [mild(FIRST_SEED + number) for number in range(HARSH_FISH_COUNT)]
-    configs = [(fish, load(None, fish.overrides)) for fish in (*changes, *random, *clean)]
-    contestants = [parse(text) for text in (SHIPPED, *SWINGS)]
-    results = survey(configs, contestants, SECONDS, SETTLE)
-    rows = [
-        [fish.name, *(f"{100 * one.fish[row].relative_thrust:.1f}" for one in results)]
-        for row, fish in enumerate(changes)
-    ]
-    first = len(changes)
-    for kind, group in (("harsh", random), ("mild", clean)):
-        groups = [one.fish[first : first + len(group)] for one in results]
-        for name, pick in (("median", statistics.median), ("worst", min)):
-            figures = [pick(swum.relative_thrust for swum in row) for row in groups]
-            rows.append(
-                [f"{len(group)} {kind} fish, {name}", *(f"{100 * share:.1f}" for share in figures)]
-            )
-        first += len(group)
-    lost = [sum(swum.fallback is not None for swum in one.fish) for one in results]
-    rows.append(["runs in which another controller took over", *map(str, lost)])
-    shaken = [max(swum.shaken for swum in one.fish) for one in results]
-    longest = "longest time of reversals in consecutive ticks, s"
-    rows.append([longest, *(f"{s:.1f}" for s in shaken)])
-    heads = " | ".join(["fish", *(f"`{one.contestant}`" for one in results)])
-    return "\n\n".join(
-        (
-            "Relative thrust in % over a minute without its first 10 s:",
-            table(heads, rows),
-            f"`{SHIPPED}` on {len(MANY_SEEDS)} more fish of each kind, seeds {MANY_SEEDS[0]} to "
-            f"{MANY_SEEDS[-1]}:",
-            on_many_fish(),
-        )
-    )
-
-
-def on_many_fish() -> str:
-    """Return the table of the shipped policy on many mild and harsh fish."""
-    rows = []
-    for kind, fish_of_seed in (("mild", mild), ("harsh", harsh_of_seed)):
-        fish = [fish_of_seed(seed) for seed in MANY_SEEDS]
-        configs = [load(None, each.overrides) for each in fish]
-        (result,) = survey(list(zip(fish, configs, strict=True)), [parse(SHIPPED)], SECONDS, SETTLE)
-        shares = [swum.relative_thrust for swum in result.fish]
-        grids = [best_on_grid(config).thrust / best_thrust(config) for config in configs]
-        limits = [statistics.median(shares), *np.quantile(shares, (0.1, 0.05)), min(shares)]
-        cells = [*limits, statistics.median(grids), min(grids)]
-        low = (f"{sum(share < limit for share in shares)}" for limit in (0.95, 0.9))
-        rows.append([kind, *(f"{100 * share:.1f}" for share in cells), *low])
-    heads = (
-        "fish | median | 10 % quantile | 5 % quantile | worst | best whole-tick wave, median | "
-        "best whole-tick wave, worst | fish below 95 % | fish below 90 %"
-    )
-    return table(heads, rows)
-
-
-def speed(options: Namespace) -> str:
+def speed(options: Namespace) -> Report:
     """Return the steps of the environment per second and the time of an inference, on one core."""
-    config = rig()
-    lines = []
-    for name, file in (
-        ("default settings", None),
-        ("`learning-harsh.yaml`", "learning-harsh.yaml"),
-    ):
-        lines.append(f"- environment, {name}, {steps_per_second(config, settings_of(file))}")
-    with policy_file(None) as file:
-        lines.append(f"- the controller `ppo`, default settings, {inference(config, file)}")
-    lines.append(f"- the controller `ppo`, `{SHIPPED}`, {inference(config, SHIPPED)}")
-    return "\n".join(lines)
+    plain, cnn = settings_of(), settings_of("learning-cnn.yaml")
+    cases = {
+        "forces, default settings": (plain, DEFAULT),
+        "forces, `learning-harsh.yaml`": (settings_of("learning-harsh.yaml"), DEFAULT),
+        "`modes`, rig default": (replace(plain, see="camera"), DEFAULT),
+        "`modes`, rig web": (replace(plain, see="camera"), WEB),
+        "`cnn`, rig default": (cnn, DEFAULT),
+        "`cnn`, rig web": (cnn, WEB),
+    }
+    rows = [[name, f"{steps_per_second(*case):.0f}"] for name, case in cases.items()]
+    median, tail = inference_time("default-fish")
+    text = (
+        f"{table('environment | steps/s, best of five', rows)}\n\nThe controller `ppo` with "
+        f"`default-fish`, observation to angle: {median:.1f} µs, p99 {tail:.1f} µs."
+    )
+    return Report({"bench learning speed": text}, rows)
 
 
-def steps_per_second(config: Config, settings: TrainingSettings) -> str:
-    """Return the steps per second with random actions and the configured fish, on one core."""
-    env = SwimEnv(SimulatedLink(config), config, settings.environment)
+def steps_per_second(settings: TrainingSettings, camera: SimulatedCameraSettings) -> float:
+    """Return the steps per second with random actions and the configured fish."""
+    config, eye = rig(), make_eye(settings)
+    link = SimulatedLink(config)
+    if eye:
+        link = SimulatedLink(config, camera=Camera(camera, settings.camera.stack))
+    env = SwimEnv(link, config, settings.seen, eye)
     env.reset(seed=0)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (10_000, 1)).astype(np.float32)
+    if eye:
+        env.babble(0, settings.camera.babble)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (3000, 1)).astype(np.float32)
     rates = []
     for _ in range(5):
-        begun = time.perf_counter()
+        start = time.process_time()
         for action in actions:
             if env.step(action)[3]:
                 env.reset()
-        rates.append(len(actions) / (time.perf_counter() - begun))
-    return (
-        f"full loop in process, one core: {max(rates):.0f} steps/s "
-        f"(best of five times {len(actions)} steps; slowest {min(rates):.0f})"
-    )
+        rates.append(len(actions) / (time.process_time() - start))
+    return max(rates)
 
 
-def inference(config: Config, policy: str) -> str:
-    """Return the time of the controller `ppo` in the tick."""
+def inference_time(policy: str) -> tuple[float, float]:
+    """Return median and 99th percentile of the time of an update of `ppo` [µs]."""
+    config = rig()
     controller = registry.create("ppo", {"policy": policy}, config.limits)
     observation = SimulatedLink(config).reset()
     times = []
     for _ in range(20_000):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         controller.update(observation)
-        times.append(1e6 * (time.perf_counter() - begun))
+        times.append(1e6 * (time.perf_counter() - start))
     median, tail = np.percentile(times, (50, 99))
-    return f"observation to angle: {median:.1f} µs, p99 {tail:.1f} µs"
+    return float(median), float(tail)
 
 
 PARTS = {
-    "relative_thrust": relative_thrust,
-    "amplitude": amplitude,
-    "exploration": exploration,
-    "choices": choices,
+    "curves": curves,
+    "pictures": pictures,
+    "optimum": optimum,
     "transfer": transfer,
-    "tank": tank,
-    "harsh": harsh,
     "speed": speed,
-    "time": training_time,
 }
-
-
 OPTIONS: Options = {
-    "part": {"choices": (*PARTS, "all")},
-    "--seeds": {"type": int, "default": 10, "help": "trainings of each row; default 10"},
+    "--seeds": {"type": int, "default": 10, "help": "trainings of each row; default: 10"},
+    "--steps": {"type": int, "help": "control steps of each training, instead of those of its row"},
     "--jobs": {
         "type": int,
         "default": max(1, joblib.cpu_count() - 1),
-        "help": "processes; default: one per core, less one",
+        "help": "number of processes; default: one less than cores",
     },
 }
-
-
-def measure(options: Namespace) -> Report:
-    """Return the requested parts."""
-    sections = {}
-    for part in PARTS if options.part == "all" else (options.part,):
-        begun = time.perf_counter()
-        sections[f"bench learning {part}"] = PARTS[part](options)
-        progress(part, f"{time.perf_counter() - begun:.0f} s")
-    return Report(sections, sections)

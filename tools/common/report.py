@@ -1,11 +1,14 @@
-"""Command line of measurements, tables in Markdown, and their place in docs/."""
+"""Command line of measurements, tables in Markdown, and their places in docs/."""
 
 import argparse
 import ast
 import importlib
+import os
 import statistics
 import sys
-from collections.abc import Iterable, Sequence
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,10 +18,13 @@ import msgspec
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 Options = dict[str, dict[str, Any]]
 """Options of a command line: arguments of `ArgumentParser.add_argument`, by name."""
+JOBS: Options = {"--jobs": {"type": int, "default": os.cpu_count(), "help": "number of processes"}}
+"""Option of a measurement that runs its cases in parallel."""
+QUICK: Options = {"--quick": {"action": "store_true", "help": "few short cases, as a trial"}}
 
 
 class Report(NamedTuple):
-    """Result of a measurement, returned by its function `measure`."""
+    """Result of a measurement or of one of its parts."""
 
     sections: dict[str, str]
     """Markdown by the name of the markers in the document that enclose it."""
@@ -35,8 +41,8 @@ class BrokenPromise(BaseException):
 def run(package: str, names: Sequence[str]) -> int:
     """Run the measurement of the command line, and return the exit status.
 
-    package: folder below tools/; each of `names` is a module in it with `DOCUMENT`, the file in
-    docs/ with its markers, `OPTIONS` and `measure(options) -> Report`
+    package: folder below tools/; each of `names` is a module in it with `OPTIONS`, and either
+    `measure(options) -> Report` or several such functions by name in `PARTS`
     """
     parser = argparse.ArgumentParser(prog=f"tools/{package}")
     commands = parser.add_subparsers(dest="name", metavar="NAME", required=True)
@@ -50,15 +56,15 @@ def run(package: str, names: Sequence[str]) -> int:
         )
         if name in sys.argv[1:2]:  # other modules may need extras that are not installed
             module = importlib.import_module(f"{package}.{name}")
+            if parts := getattr(module, "PARTS", None):
+                command.add_argument("part", choices=(*parts, "all"))
             for option, settings in module.OPTIONS.items():
                 command.add_argument(option, **settings)
             command.add_argument("--json", action="store_true", help="print all figures as JSON")
-            command.add_argument(
-                "--write", action="store_true", help=f"put the result into docs/{module.DOCUMENT}"
-            )
+            command.add_argument("--write", action="store_true", help="put the result into docs/")
     options = parser.parse_args()
     try:
-        report: Report = module.measure(options)
+        report = _measure_parts(parts, options) if parts else module.measure(options)
     except BrokenPromise as broken:
         print(f"{package} {options.name}: BROKEN: {broken}", file=sys.stderr)
         return 1
@@ -66,8 +72,28 @@ def run(package: str, names: Sequence[str]) -> int:
     print(msgspec.json.encode(report.figures).decode() if options.json else text)
     if options.write:
         for marker, section in report.sections.items():
-            put(DOCS / module.DOCUMENT, marker, section)
+            put(_page_with(marker), marker, section)
     return int(report.broken)
+
+
+def _measure_parts(
+    parts: dict[str, Callable[[argparse.Namespace], Report]], options: argparse.Namespace
+) -> Report:
+    """Return the results of the requested parts together."""
+    reports = {}
+    for name in parts if options.part == "all" else (options.part,):
+        start = time.perf_counter()
+        reports[name] = parts[name](options)
+        progress(name, f"{time.perf_counter() - start:.0f} s")
+    sections = {k: text for report in reports.values() for k, text in report.sections.items()}
+    figures = {name: report.figures for name, report in reports.items()}
+    return Report(sections, figures, any(report.broken for report in reports.values()))
+
+
+def run_cases(function: Callable[[Any], Any], cases: Iterable[Any], jobs: int | None) -> list[Any]:
+    """Return the result of a function for each case, computed in several processes."""
+    with ProcessPoolExecutor(jobs) as pool:
+        return list(pool.map(function, cases))
 
 
 def _docstring(module: str) -> str:
@@ -103,6 +129,36 @@ def between(document: Path, name: str) -> str:
     return _parted(document, name)[1].strip("\n")
 
 
+def write_reference(tool: str, sections: Iterable[tuple[str, str, str]]) -> int:
+    """Print generated sections, write them into docs/, or check them; return the exit status.
+
+    sections: for each the document, the name of its markers, and the text between them
+    """
+    command = f"python tools/{tool}.py --write"
+    parser = argparse.ArgumentParser(prog=f"tools/{tool}.py")
+    parser.add_argument("--write", action="store_true", help="put the result into docs/")
+    parser.add_argument("--check", action="store_true", help="exit with 1 where docs/ differs")
+    options = parser.parse_args()
+    status = 0
+    for document, name, text in sections:
+        if options.write:
+            put(DOCS / document, name, text)
+        elif not options.check:
+            print(f"{document}, {name}:\n\n{text}\n")
+        elif between(DOCS / document, name) != text:
+            print(f"docs/{document}: {name} is out of date: run {command}", file=sys.stderr)
+            status = 1
+    return status
+
+
+def _page_with(name: str) -> Path:
+    """Return the page with the markers of `name`; raises SystemExit where there is none."""
+    for page in sorted(DOCS.rglob("*.md")):
+        if f"<!-- {name}: begin -->" in page.read_text(encoding="utf-8"):
+            return page
+    raise SystemExit(f"{DOCS}: no page has the markers of '{name}'")
+
+
 def _parted(document: Path, name: str) -> tuple[str, str, str]:
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     before, opening, rest = document.read_text(encoding="utf-8").partition(begin)
@@ -123,3 +179,8 @@ def spread(values: Sequence[float], factor: float = 100.0, digits: int = 1) -> s
         f"{factor * function(values):.{digits}f}" for function in (statistics.median, min, max)
     )
     return f"{middle} [{low} – {high}]"
+
+
+def percent(share: float) -> str:
+    """Format a fraction in % with one decimal."""
+    return f"{round(100 * share, 1) + 0.0:.1f}"  # no negative zero
