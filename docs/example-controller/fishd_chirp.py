@@ -53,7 +53,7 @@ class Chirp(Controller[ChirpParameters]):
         self._phase = 0.0 if observation.instruction_angle >= 0 else 0.5
 
     def update(self, observation: Observation) -> float:
-        """Plus or minus the amplitude [rad]."""
+        """Return plus or minus the amplitude [rad]."""
         p = self.parameters
         self._progress = (self._progress + observation.dt / p.sweep_time) % 2.0
         height = 1.0 - abs(1.0 - self._progress)

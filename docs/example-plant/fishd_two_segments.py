@@ -1,4 +1,4 @@
-"""`two-segments`: a tail in two pieces. The servo moves the first; the tip hangs on it by a spring.
+"""`two-segments`: a tail in two pieces. The servo moves the first; a spring holds the tip to it.
 
 With the angle α of the first piece and β of the tip, each against the axis of the fish, and the
 tip's share s of the inertia:
@@ -23,9 +23,9 @@ from fishd.virtual.plant.base import (
     unit,
 )
 
-STEP = 0.003
+MAX_STEP_S = 0.003
 """Longest step of the integration [s]."""
-UNKNOWN = (
+UNSUPPORTED_KEYS = (
     "quadratic_drag",
     "lateral_quadratic_drag",
     "cable_slack",
@@ -34,13 +34,13 @@ UNKNOWN = (
     "servo_dead_zone",
     "servo_reaction",
 )
-"""Keys of every plant that this one makes nothing of."""
+"""Keys of every plant that have no equation in this one."""
 
 Numbers = tuple[float, ...]
 
 
 class TwoSegmentsParameters(PlantParameters, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The tip, beside the keys of every plant."""
+    """Parameters of the tip, in addition to the keys of every plant."""
 
     tip_omega0: Annotated[
         float, unit("rad/s", "Natural angular frequency of the tip, ω_t.", ge=1.0, le=100.0)
@@ -63,18 +63,18 @@ class TwoSegments(Plant[TwoSegmentsParameters]):
 
     @classmethod
     def check(cls, parameters: TwoSegmentsParameters) -> None:
-        """Refuse what it knows nothing of."""
-        for key in UNKNOWN:
+        """Refuse keys that have no equation in this plant."""
+        for key in UNSUPPORTED_KEYS:
             if value := getattr(parameters, key):
                 raise Problem((key,), f"{value:g} is not valid: this plant has none; 0 is needed")
 
     def advance(
         self, instruction_angle: float | None, duration: float, samples: int
     ) -> PlantWindow:
-        """As `Plant.advance`, by the Runge–Kutta method of order 4."""
+        """Implement `Plant.advance` by the Runge–Kutta method of order 4."""
         command = self.state.phi if instruction_angle is None else instruction_angle
-        # An even number of steps to a sample, so that one ends in the middle, where it is taken.
-        steps = 2 * math.ceil(0.5 * duration / samples / STEP)
+        # An even number of steps for each sample, as a sample is taken in the middle.
+        steps = 2 * math.ceil(0.5 * duration / samples / MAX_STEP_S)
         h = duration / samples / steps
         y: Numbers = (*self.state, *self._tip, 0.0, 0.0)
         sampled = [0.0, 0.0]
@@ -92,14 +92,14 @@ class TwoSegments(Plant[TwoSegmentsParameters]):
 
     def _step(self, y: Numbers, command: float, h: float) -> Numbers:
         k1 = self._rates(y, command)
-        k2 = self._rates(_moved(y, k1, 0.5 * h), command)
-        k3 = self._rates(_moved(y, k2, 0.5 * h), command)
-        k4 = self._rates(_moved(y, k3, h), command)
+        k2 = self._rates(_extrapolate(y, k1, 0.5 * h), command)
+        k3 = self._rates(_extrapolate(y, k2, 0.5 * h), command)
+        k4 = self._rates(_extrapolate(y, k3, h), command)
         mean = [(a + 2.0 * (b + c) + d) / 6.0 for a, b, c, d in zip(k1, k2, k3, k4, strict=True)]
-        return _moved(y, mean, h)
+        return _extrapolate(y, mean, h)
 
     def _rates(self, y: Numbers, command: float) -> Numbers:
-        """Of φ, α, α̇, β, β̇; and F_x and F_y, whose integrals are their impulses."""
+        """Return the rates of φ, α, α̇, β, β̇; then F_x and F_y, whose integrals are impulses."""
         p = self.parameters
         phi, alpha, alpha_rate, beta, beta_rate, *_ = y
         turning = p.servo_speed * math.tanh((command - phi) / p.servo_lag)
@@ -113,5 +113,5 @@ class TwoSegments(Plant[TwoSegmentsParameters]):
         return turning, alpha_rate, a, beta_rate, b, fx, fy
 
 
-def _moved(y: Numbers, rates: Numbers, time: float) -> Numbers:
+def _extrapolate(y: Numbers, rates: Numbers, time: float) -> Numbers:
     return tuple(value + time * rate for value, rate in zip(y, rates, strict=True))

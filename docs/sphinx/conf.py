@@ -99,7 +99,7 @@ def _import_verbs(group: click.Group) -> None:
 
 def setup(app: Any) -> None:
     """Import the verbs, and connect the functions above."""
-    with mock(["numba"]):  # which takes long to install, and says nothing here
+    with mock(["numba"]):  # slow to install, and not needed for the pages
         _import_verbs(fishctl)
     app.connect("source-read", _add_contents)
     app.connect("autodoc-process-docstring", _plain_text)

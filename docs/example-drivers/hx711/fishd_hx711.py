@@ -1,10 +1,10 @@
 """`hx711`: two load cells, each on an HX711, with one clock line for both.
 
-What the chip does is from its data sheet: Avia Semiconductor, "HX711, 24-Bit Analog-to-Digital
-Converter (ADC) for Weigh Scales". A falling DOUT says that a conversion is done. Then 24 pulses of
-PD_SCK shift it out, most significant bit first, in two's complement, and one to three more choose
-gain and input of the next one. A PD_SCK that stays high for more than 60 µs switches the chip off;
-when it is low again, the chip starts anew with a gain of 128.
+The protocol is from the data sheet: Avia Semiconductor, "HX711, 24-Bit Analog-to-Digital Converter
+(ADC) for Weigh Scales". DOUT falls when a conversion is complete. Then 24 pulses of PD_SCK shift
+the result out, most significant bit first, in two's complement, and one to three more pulses select
+gain and input of the next conversion. If PD_SCK stays high for more than 60 µs, the chip switches
+off; when PD_SCK is low again, the chip starts with a gain of 128.
 """
 
 from typing import Annotated, Literal
@@ -27,79 +27,81 @@ from fishd.hardware.driver import (
 )
 
 PULSES = {128: 25, 64: 27}
-"""Pulses of PD_SCK that choose a gain of channel A; 26 would choose channel B."""
-SETTLING = {10: 0.4, 80: 0.05}
-"""After a start, output is valid only from then on, by rate [s]."""
-LONGEST_HIGH = 50e-6
-"""PD_SCK may be high for so long; from 60 µs on it is a power-down [s]."""
-POWER_DOWN = 100e-6
+"""Number of pulses of PD_SCK by gain of channel A; 26 would select channel B."""
+SETTLING_S = {10: 0.4, 80: 0.05}
+"""Time from a start to the first valid output, by rate [s]."""
+MAX_HIGH_S = 50e-6
+"""Longest permitted pulse of PD_SCK; 60 µs switch the chip off [s]."""
+POWER_DOWN_S = 100e-6
+"""Length of the pulse of PD_SCK that switches the chips off [s]."""
 STEPS = 1 << 23
-SILENCE = 2.5
-"""So many times the time of a conversion, and none is done: fishd is told before its next ticks."""
-LOOK = 1e-3
-"""Between two looks at DOUT [s]."""
+"""Number of steps from zero to the end of the range."""
+MAX_SILENT_SAMPLES = 2.5
+"""Number of conversion times without a result after which `sample` raises an error."""
+POLL_INTERVAL_S = 1e-3
+"""Time between two reads of DOUT [s]."""
 
 
 class Hx711Settings(ForceSensorSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How the two chips are wired."""
+    """Wiring of the two chips."""
 
     clock: Annotated[Gpio, note("Pin of PD_SCK, of both chips.")] = 5
     data_x: Annotated[Gpio, note("Pin of DOUT of the chip that measures F_x.")] = 6
     data_y: Annotated[Gpio, note("Pin of DOUT of the chip that measures F_y.")] = 13
-    gain: Annotated[Literal[128, 64], note("Of channel A.")] = 128
-    rate: Annotated[Literal[10, 80], unit("1/s", "By pin RATE: 10 at ground, 80 at DVDD.")] = 80
-    supply: Annotated[float, unit("V", "AVDD, which feeds the load cells.", ge=2.6, le=5.5)] = 4.3
+    gain: Annotated[Literal[128, 64], note("Gain of channel A.")] = 128
+    rate: Annotated[Literal[10, 80], unit("1/s", "Set by pin RATE: 10 at ground, 80 at DVDD.")] = 80
+    supply: Annotated[float, unit("V", "Supply AVDD of the load cells.", ge=2.6, le=5.5)] = 4.3
 
 
 class Hx711(ForceSensorDriver[Hx711Settings]):
-    """Two load cells on HX711 chips, bit by bit through RPi.GPIO."""
+    """Driver of two load cells on HX711 chips, which reads them bit by bit through RPi.GPIO."""
 
     Settings = Hx711Settings
     packages = (header.PACKAGE,)
     place = "the HX711 chips"
 
     def __init__(self, settings: Hx711Settings, clock: Clock) -> None:
-        """Raises `StartupError` if RPi.GPIO is missing; opens nothing yet."""
+        """Load RPi.GPIO without opening a pin; raise `StartupError` if it is missing."""
         super().__init__(settings, clock)
         self.names = f"F_x (GPIO {settings.data_x})", f"F_y (GPIO {settings.data_y})"
         self._gpio = header.load()
         self._data = (settings.data_x, settings.data_y)
-        self._volts = 0.5 * settings.supply / settings.gain / STEPS  # of one step, at the input
+        self._volts = 0.5 * settings.supply / settings.gain / STEPS  # input voltage of one step
         self._open = False
 
     def open(self) -> None:
-        """Claim the pins, and start the chips anew."""
+        """Claim the pins and restart the chips."""
         gpio = self._gpio
         for data in self._data:
-            # Without a chip the line is high, as during a conversion that never ends.
+            # Without a chip the line stays high, as during a conversion.
             header.claim(gpio, data, gpio.IN, pull_up_down=gpio.PUD_UP)
         header.claim(gpio, self.settings.clock, gpio.OUT, initial=gpio.LOW)
         self._open = True
         gpio.output(self.settings.clock, gpio.HIGH)
-        self.clock.sleep(POWER_DOWN)
+        self.clock.sleep(POWER_DOWN_S)
         gpio.output(self.settings.clock, gpio.LOW)
-        self._started()
+        self._begin_settling()
 
     def sample(self) -> Pair | None:
-        """A pair, once both chips have one; looks once, and waits a millisecond where not."""
+        """Return a pair if both chips have one; otherwise wait a millisecond and return None."""
         now = self.clock.monotonic()
         waiting = [data for data in self._data if self._gpio.input(data)]
         if waiting:
-            if now - max(self._latest, self._valid_from) > SILENCE / self.settings.rate:
+            if now - max(self._latest, self._valid_from) > MAX_SILENT_SAMPLES / self.settings.rate:
                 raise TimeoutError(
                     f"no data from the HX711 on GPIO {waiting[0]}: check its power and wires"
                 )
-            self.clock.sleep(LOOK)
+            self.clock.sleep(POLL_INTERVAL_S)
             return None
-        x, y = self._shift()
+        x, y = self._read_codes()
         if not all(map(self._gpio.input, self._data)):
             raise OSError("an HX711 still says that data is ready: is its DOUT shorted to ground?")
         self._latest = now
-        if self._lost:
-            self._started()
+        if self._powered_down:
+            self._begin_settling()
             return None
-        first, self._first = self._first, False
-        if first or now < self._valid_from:  # the first one is of another gain
+        is_first, self._first = self._first, False
+        if is_first or now < self._valid_from:  # the first result has another gain
             return None
         clipped = next(
             (
@@ -112,19 +114,19 @@ class Hx711(ForceSensorDriver[Hx711Settings]):
         return Pair(now - 1 / self.settings.rate, now, x * self._volts, y * self._volts, clipped)
 
     def close(self) -> None:
-        """Let go of the pins."""
+        """Release the pins."""
         if self._open:
             self._open = False
             self._gpio.cleanup([self.settings.clock, *self._data])
 
     @classmethod
     def pair_rate(cls, settings: Hx711Settings) -> float:
-        """The chip's oscillator may be 10 % slow."""
+        """Return 90 % of the rate, as the chip's oscillator may be 10 % slow."""
         return 0.9 * settings.rate
 
     @classmethod
     def check(cls, settings: Hx711Settings, tick: float) -> None:
-        """Three different pins, and a pair in each tick."""
+        """Require different data pins, and time for a pair in each tick."""
         if settings.data_x == settings.data_y:
             raise Problem(("data_y",), f"{settings.data_y} is the pin of data_x already")
         if 1.1 / settings.rate > tick:
@@ -136,7 +138,7 @@ class Hx711(ForceSensorDriver[Hx711Settings]):
 
     @classmethod
     def claims(cls, settings: Hx711Settings) -> tuple[Claim, ...]:
-        """Its three pins."""
+        """Return claims of the three pins."""
         return tuple(
             pin(gpio, f"HX711's {name}", key)
             for name, key, gpio in (
@@ -148,37 +150,37 @@ class Hx711(ForceSensorDriver[Hx711Settings]):
 
     @classmethod
     def checks(cls, settings: Hx711Settings) -> tuple[Check, ...]:
-        """Whether the range fits."""
-        return (Check("load cells", lambda machine: load_cells(machine, settings)),)
+        """Return the check that shows the measuring range."""
+        return (Check("load cells", lambda machine: show_range(machine, settings)),)
 
-    def _started(self) -> None:
-        """The chips have just been started: their gain is 128, and they have to settle."""
+    def _begin_settling(self) -> None:
+        """Start the settling time after a start of the chips, which sets their gain to 128."""
         self._latest = self.clock.monotonic()
-        self._valid_from = self._latest + SETTLING[self.settings.rate]
+        self._valid_from = self._latest + SETTLING_S[self.settings.rate]
         self._first = True
-        self._lost = False
+        self._powered_down = False
 
-    def _shift(self) -> tuple[int, int]:
-        """The codes of both chips; `_lost` where a pulse was so long that it was a power-down."""
+    def _read_codes(self) -> tuple[int, int]:
+        """Return the codes of both chips; set `_powered_down` if a pulse was too long."""
         gpio, clock, sck = self._gpio, self.clock.monotonic, self.settings.clock
         data_x, data_y = self._data
         x = y = 0
         for pulse in range(PULSES[self.settings.gain]):
-            begun = clock()
+            start = clock()
             gpio.output(sck, gpio.HIGH)
             gpio.output(sck, gpio.LOW)
-            self._lost |= clock() - begun > LONGEST_HIGH
+            self._powered_down |= clock() - start > MAX_HIGH_S
             if pulse < 24:
                 x = x << 1 | gpio.input(data_x)
                 y = y << 1 | gpio.input(data_y)
-        return _signed(x), _signed(y)
+        return _to_signed(x), _to_signed(y)
 
 
-def _signed(code: int) -> int:
+def _to_signed(code: int) -> int:
     return code - 2 * STEPS if code >= STEPS else code
 
 
-def load_cells(machine: Machine, settings: Hx711Settings) -> Result:
-    """What the range is, at the input of the chips."""
-    most = 500 * settings.supply / settings.gain
-    return Result("ok", f"±{most:.1f} mV at a gain of {settings.gain}, {settings.rate} per second")
+def show_range(machine: Machine, settings: Hx711Settings) -> Result:
+    """Report the range at the input of the chips."""
+    limit = 500 * settings.supply / settings.gain
+    return Result("ok", f"±{limit:.1f} mV at a gain of {settings.gain}, {settings.rate} per second")
