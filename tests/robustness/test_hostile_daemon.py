@@ -36,7 +36,9 @@ def _evil(kind: inspect.Type, known: dict[str, Any] | None = None) -> Any:
         case inspect.Metadata():
             return _evil(kind.type)
         case inspect.UnionType():
-            return _evil(next(one for one in kind.types if not isinstance(one, inspect.NoneType)))
+            return _evil(
+                next(type_ for type_ in kind.types if not isinstance(type_, inspect.NoneType))
+            )
         case inspect.ListType() | inspect.VarTupleType():
             return [_evil(kind.item_type)]
         case inspect.TupleType():

@@ -67,7 +67,7 @@ def results(folder: Path) -> dict[tuple[str, str], Outcome]:
         result = msgspec.json.decode(done.stdout, type=Result)
         assert result.megabytes < MAX_MEGABYTES, verbs
         outcomes += result.outcomes
-    return {(each.verb, each.file.removesuffix(".mcap")): each for each in outcomes}
+    return {(outcome.verb, outcome.file.removesuffix(".mcap")): outcome for outcome in outcomes}
 
 
 def test_every_verb_ends_with_a_line_and_little_memory(
@@ -87,11 +87,11 @@ def test_every_verb_ends_with_a_line_and_little_memory(
 def test_one_bad_file_does_not_hide_the_others(
     folder: Path, results: dict[tuple[str, str], Outcome]
 ) -> None:
-    listed, as_json = (each for key, each in results.items() if key[0].startswith("runs"))
+    listed, as_json = (value for key, value in results.items() if key[0].startswith("runs"))
     bad = re.findall(r"^fishctl: \S+/(\S+)\.mcap", listed.err, re.MULTILINE)
     assert set(bad) > {"chunks-of-zeros", "empty", "nothing-but-magic"}
     assert listed.err.count("\n") == len(bad)
-    good = {each["name"] for each in json.loads(as_json.out)}
+    good = {recording["name"] for recording in json.loads(as_json.out)}
     assert good | set(bad) == {*FILES, "good"}
     assert not set(bad) & {"good", "aliases", "frame-without-data", "zstd-chunk-of-8-gb"}
     for outcome in (listed, as_json):

@@ -99,8 +99,8 @@ def test_a_second_verb_is_refused_unless_it_takes_the_fish(daemon: Daemon) -> No
 def test_asyncio_programs_hold_the_fish_too(daemon: Daemon) -> None:
     async def lose(fish: AsyncFish) -> None:
         async with fish.lease("a page", seconds=0.5):
-            async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as other:
-                await other.set_controller("sine")
+            async with AsyncFish(daemon.endpoint, timeout=PATIENCE) as intruder:
+                await intruder.set_controller("sine")
             async for _ in fish.ticks():
                 pass
 
@@ -135,8 +135,8 @@ def test_a_fish_that_could_not_be_given_back_is_spoken_of_once(
         monkeypatch.setattr(Fish, "end_lease", silent)
         with pytest.raises(ended_by), fish.lease("a test", take=True):
             raise ended_by
-    said = "the fish could not be returned, and rests once its lease has expired: no answer"
-    assert caplog.messages == [said] * lines
+    message = "the fish could not be returned, and rests once its lease has expired: no answer"
+    assert caplog.messages == [message] * lines
 
 
 class Silent:

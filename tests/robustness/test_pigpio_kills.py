@@ -81,9 +81,9 @@ def start_after_a_kill(bench: Bench) -> None:
 
 def reconnect(bench: Bench) -> None:
     servo = swim(bench)
-    with bench.client() as other:  # so that the pulses are still on, and no countdown ends them
+    with bench.client() as client:  # ends the countdowns, so that the pulses are still on
         for script in range(2):
-            other.update_script(script, [100]) if other.script_status(script)[1] else None
+            client.update_script(script, [100]) if client.script_status(script)[1] else None
     lose_connection(bench, servo)
     connect(servo)
 
@@ -94,8 +94,8 @@ def last_resort(bench: Bench) -> None:
 
 
 def last_resort_on_pulses_of_others(bench: Bench) -> None:
-    with bench.client() as other:
-        other.set_servo_pulsewidth(GPIO, 1800)
+    with bench.client() as client:
+        client.set_servo_pulsewidth(GPIO, 1800)
     bench.last_resort()
 
 

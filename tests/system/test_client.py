@@ -37,7 +37,7 @@ def test_events_arrive_as_they_happen(daemon: Daemon) -> None:
     seen: list[str] = []
     with (
         Fish(daemon.endpoint, timeout=PATIENCE) as listener,
-        Fish(daemon.endpoint, timeout=PATIENCE) as other,
+        Fish(daemon.endpoint, timeout=PATIENCE) as sender,
     ):
         events = listener.events()
         reader = threading.Thread(
@@ -45,8 +45,8 @@ def test_events_arrive_as_they_happen(daemon: Daemon) -> None:
         )
         reader.start()
         for _ in range(1000):  # until the subscription is through
-            other.mark("a wave in the tank")
-            next(other.ticks())
+            sender.mark("a wave in the tank")
+            next(sender.ticks())
             if seen:
                 break
         reader.join(PATIENCE)

@@ -37,13 +37,13 @@ def test_a_policy_that_shakes_the_servo_loses_command_and_everyone_is_told(
 ) -> None:
     def missed() -> int:
         with running(tmp_path) as daemon, Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-            return shaken(daemon, fish)
+            return shake_servo(daemon, fish)
 
     # A real cost of ticks recurs each time; a short stall of the machine does not.
     assert any(missed() == 0 for _ in range(3))
 
 
-def shaken(daemon: Daemon, fish: Fish) -> int:
+def shake_servo(daemon: Daemon, fish: Fish) -> int:
     """Let a policy shake the servo until swing takes over; return the number of missed slots."""
     with (
         Subscriber(daemon.telemetry, b"event") as events,
@@ -52,8 +52,8 @@ def shaken(daemon: Daemon, fish: Fish) -> int:
         events.connected()
         before = fish.status().missed
         fish.set_controller("ppo", policy="flip")
-        told = events.until(kind="fallback")
-        assert (told["data"]["before"], told["data"]["controller"]) == ("ppo", "swing")
+        event = events.until(kind="fallback")
+        assert (event["data"]["before"], event["data"]["controller"]) == ("ppo", "swing")
         assert ticks.until(controller="swing")["mode"] == "running"
         status = fish.status()
         assert (status.mode, status.controller) == ("running", "swing")

@@ -89,11 +89,11 @@ def test_a_signal_finishes_the_file(daemon: Daemon, runs: Path, number: signal.S
         fish.mark("a push")
         swims = fish.status().seq + 30
     recording.wait_for_ticks(lambda seq: seq > swims)
-    status, said, complaints = recording.end(number)
+    status, out, complaints = recording.end(number)
     assert status == 0
-    said_of_rest = "fishctl: the fish is at rest (mode idle); it swims with: fishctl set-controller"
-    assert complaints.splitlines() == [said_of_rest]
-    assert re.search(r"^run\.mcap: [0-9.]+ s, \d+ ticks, 0 lost, \d+ events, \d+ kB$", said, re.M)
+    remark = "fishctl: the fish is at rest (mode idle); it swims with: fishctl set-controller"
+    assert complaints.splitlines() == [remark]
+    assert re.search(r"^run\.mcap: [0-9.]+ s, \d+ ticks, 0 lost, \d+ events, \d+ kB$", out, re.M)
     run = open_run(runs / "run.mcap")
     assert run.finished
     assert run.reason == "stopped"
@@ -161,14 +161,14 @@ def test_a_disk_that_is_full_ends_the_recording_and_fishd_is_told(
         # Python would leave compiled modules that are cut off at the limit, too.
         uncompiled = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
         ended = call("bash", "-c", f"{limit} --folder {runs}", env=uncompiled)
-        told = next(event for event in events if event.kind == "mark")
+        mark = next(event for event in events if event.kind == "mark")
     _, complaint = ended.stderr.splitlines()
     assert (
         "File too large; the written part is readable; free some space, then run fishctl recover"
         in (complaint)
     )
     assert ended.returncode == 1
-    assert told.message.startswith("recording run.mcap ended: ")
+    assert mark.message.startswith("recording run.mcap ended: ")
     assert len(open_run(runs / "run.mcap.part").ticks) > 10
     after = daemon.status()
     assert after.pid == before.pid

@@ -51,9 +51,9 @@ def test_frames_and_forces_are_in_one_file_on_one_clock(
 ) -> None:
     process = recording(daemon, camera)
     wait_until(lambda: len(heads_in(runs)) > 40)
-    status, said, _ = process.end(signal.SIGINT)
+    status, out, _ = process.end(signal.SIGINT)
     assert status == 0
-    assert re.search(r"^run\.mcap: [0-9.]+ s, \d+ ticks, 0 lost, \d+ frames, 0 lost, ", said, re.M)
+    assert re.search(r"^run\.mcap: [0-9.]+ s, \d+ ticks, 0 lost, \d+ frames, 0 lost, ", out, re.M)
     run = open_run(runs / "run.mcap")
     frames = list(run.frames())
     assert run.finished

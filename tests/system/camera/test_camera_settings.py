@@ -63,9 +63,9 @@ def test_a_package_that_is_missing_is_said_in_one_line(tmp_path: Path, module: s
     blocked = f"import sys\nsys.modules[{module!r}] = None\n"
     (tmp_path / "sitecustomize.py").write_text(blocked)
     env = os.environ | {"PYTHONPATH": str(tmp_path)}
-    said = one_line(call(*COMMAND, "--set", "source=v4l2", env=env))
-    assert module in said
-    assert said.endswith("--editable '.[camera]'\n")
+    line = one_line(call(*COMMAND, "--set", "source=v4l2", env=env))
+    assert module in line
+    assert line.endswith("--editable '.[camera]'\n")
 
 
 @pytest.mark.parametrize(

@@ -44,13 +44,13 @@ def test_the_command_prints_json_with_every_run() -> None:
 
 
 def test_a_refused_contestant_does_not_keep_the_others_from_swimming() -> None:
-    other = ("--set", "amplitude_limit=0.31", "--seconds", "15", "--settle", "5")
-    done = run("swing", "default-fish", *other, "--json")
+    options = ("--set", "amplitude_limit=0.31", "--seconds", "15", "--settle", "5")
+    done = run("swing", "default-fish", *options, "--json")
     assert [standing["contestant"] for standing in json.loads(done.stdout)] == ["swing"]
     assert "\nfishctl: default-fish: left out: ppo: policy: " in done.stderr
     assert "0.42 rad" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (1, 2)
-    assert run("default-fish", *other).stderr.startswith("fishctl: ppo: policy: ")
+    assert run("default-fish", *options).stderr.startswith("fishctl: ppo: policy: ")
 
 
 def test_earlier_runs_of_a_controller_that_gives_up_stand_in_the_table(

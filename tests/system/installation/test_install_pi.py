@@ -127,9 +127,9 @@ def test_the_settings_of_the_camera_are_not_for_every_user(pi: Pi) -> None:
     assert camera.stat().st_mode & 0o777 == 0o640
     camera.write_text("source: stream\nstream: {url: 'rtsp://me:secret@host/'}\n")
     camera.chmod(0o644)  # as an older version had installed it
-    said = "\n".join(pi.run("install_config"))
+    text = "\n".join(pi.run("install_config"))
     assert camera.stat().st_mode & 0o777 == 0o640
-    assert "camera.yaml: for root and group fishd only, as it may hold a camera's password" in said
+    assert "camera.yaml: for root and group fishd only, as it may hold a camera's password" in text
     # The group that it gets when that exists.
     lines = (pi.disk / "etc/tmpfiles.d/fishd.conf").read_text().splitlines()
     assert "z /etc/fishd/camera.yaml 0640 root fishd -" in lines
@@ -146,10 +146,10 @@ def test_installing_again_without_the_gpio_package_adds_nothing_and_says_what_is
     before = files(pi.disk)
     sdist(tmp_path / "sources", "rpi_lgpio", 'raise SystemExit("error: swig failed")')
     options = {"FISHD_GPIO": "rpi-lgpio", "PIP_FIND_LINKS": str(tmp_path / "sources")}
-    said = pi.run("install_pi.sh", **options)
+    lines = pi.run("install_pi.sh", **options)
     assert files(pi.disk) == before
-    assert said[0].startswith("/opt/fishd: has Python 3.")
-    text = "\n".join(said)
+    assert lines[0].startswith("/opt/fishd: has Python 3.")
+    text = "\n".join(lines)
     assert "E-stop button and status light are NOT available: no rpi-lgpio" in text
     assert "sudo apt install swig gcc python3-dev; then: sudo make install-pi" in text
     assert "network" not in text
@@ -161,10 +161,10 @@ def test_an_edited_config_is_kept_and_a_new_default_lies_beside_it(pi: Pi, renew
     (pi.disk / CONFIG).write_text("robot: simulated\n")
     if renewed:
         (pi.disk / AS_INSTALLED).write_text("# what an older version had installed\n")
-    (said,) = (line for line in pi.run("install_config") if line.startswith(f"/{CONFIG}: "))
+    (report,) = (line for line in pi.run("install_config") if line.startswith(f"/{CONFIG}: "))
     kept = "/etc/fishd/fishd.yaml: yours, kept"
     news = "; what is new is in /etc/fishd/fishd.yaml.new"
-    assert said == (kept + news if renewed else kept)
+    assert report == (kept + news if renewed else kept)
     assert (pi.disk / CONFIG).read_text() == "robot: simulated\n"
     new = pi.disk / f"{CONFIG}.new"
     assert new.exists() is renewed
@@ -290,9 +290,9 @@ def test_a_gpio_package_is_built_as_its_sources_want_and_only_then_the_other_goe
     pi.run(*install, PIP_FIND_LINKS=str(sources))
     assert (site / "RPi.GPIO-0.6.dist-info").exists()
     sdist(sources, "rpi_lgpio", 'assert os.environ["PYPI"] == "1"')
-    said = pi.run(*install, PIP_FIND_LINKS=str(sources))
-    assert "RPi.GPIO: removed, it excludes rpi-lgpio" in said
-    assert "rpi-lgpio: installed, for E-stop button and status light" in said
+    lines = pi.run(*install, PIP_FIND_LINKS=str(sources))
+    assert "RPi.GPIO: removed, it excludes rpi-lgpio" in lines
+    assert "rpi-lgpio: installed, for E-stop button and status light" in lines
     assert not (site / "RPi.GPIO-0.6.dist-info").exists()
     subprocess.run([pi.disk / "opt/fishd/bin/python", "-I", "-c", "import RPi"], check=True)
     # The second time it is installed already, and is neither fetched nor built.

@@ -116,6 +116,6 @@ def test_a_replay_names_the_command_that_shows_it_and_not_the_live_fish(
     words = ("replay", str(run), "--address", f"ipc://{tmp_path}/telemetry", "--speed", "9")
     assert fishctl(*words).stdout.endswith("watch it with: fishctl watch\n")
     monkeypatch.setenv("FISHD_ENDPOINT", f"ipc://{tmp_path}/live")
-    said = re.search(r"fishctl --endpoint (\S+) watch", fishctl(*words).stdout)
-    assert said
-    assert said[1] == f"ipc://{tmp_path}/fishd/control"
+    match = re.search(r"fishctl --endpoint (\S+) watch", fishctl(*words).stdout)
+    assert match
+    assert match[1] == f"ipc://{tmp_path}/fishd/control"

@@ -1,4 +1,4 @@
-"""Pictures for people."""
+"""Pictures of a camera's view, drawn for the operator."""
 
 from pathlib import Path
 

@@ -23,9 +23,9 @@ def test_it_shows_the_best_square_wave_and_the_limits_of_the_configured_fish() -
     assert "best square 15.366 mN at 1.753 Hz" in done.output
     assert "best square 25.784 mN at 1.709 Hz" in done.output
     assert "slow servo  91.825 mN" in done.output
-    other = json.loads(invoke("--set", "plant.servo_speed=11.6", "--json").output)
-    assert other["saturation_amplitude"] == pytest.approx(11.6 / 12.5)
-    assert other["best_square"]["amplitude"] == [0.42]
+    results = json.loads(invoke("--set", "plant.servo_speed=11.6", "--json").output)
+    assert results["saturation_amplitude"] == pytest.approx(11.6 / 12.5)
+    assert results["best_square"]["amplitude"] == [0.42]
 
 
 @pytest.mark.slow

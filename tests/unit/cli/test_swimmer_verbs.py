@@ -10,10 +10,10 @@ from rigs.processes import fishctl, one_line
 
 @pytest.fixture(scope="module")
 def swum(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what 0.8 s of swimming leave."""
+    """Folder with the files of a swim of 0.8 s."""
     folder = tmp_path_factory.mktemp("swum")
     files = ["--checkpoint", "end.npz", "--save", "swim.npz", "--film", "wake.webp"]
-    paths = [str(folder / each) if "." in each else each for each in files]
+    paths = [str(folder / word) if "." in word else word for word in files]
     lengths = ("--seconds", "0.8", "--settle", "0.2")
     done = fishctl("simulate", "square", "--frequency", "4", *lengths, *OPTIONS, *paths)
     assert (done.returncode, done.stderr) == (0, "")
@@ -63,13 +63,13 @@ def test_what_cannot_be_drawn_is_one_line(
     swum: Path, tmp_path: Path, words: list[str], named: str
 ) -> None:
     verb, file, *rest = words
-    said = one_line(fishctl("swimmer", verb, str(swum / file), *rest, "--to", str(tmp_path)))
-    assert named in said
+    line = one_line(fishctl("swimmer", verb, str(swum / file), *rest, "--to", str(tmp_path)))
+    assert named in line
     assert not list(tmp_path.iterdir())
 
 
 def test_a_film_of_a_tethered_fish_or_of_another_kind_is_refused(tmp_path: Path) -> None:
     film = ("--film", str(tmp_path / "wake.mp4"))
     assert "--film is for robot: swimmer" in one_line(fishctl("simulate", "square", *film))
-    said = one_line(fishctl("simulate", "square", *OPTIONS, *film))
-    assert "a film has no format .mp4" in said
+    line = one_line(fishctl("simulate", "square", *OPTIONS, *film))
+    assert "a film has no format .mp4" in line

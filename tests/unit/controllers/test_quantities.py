@@ -113,6 +113,6 @@ def test_to_count_on_from_nothing_is_told_with_what_would_be_right() -> None:
 
 
 def test_what_a_controller_can_show_is_described_with_its_parameters() -> None:
-    shown = {each.name: each for each in registry.describe("swing").quantities}
-    assert shown["since_reversal"].unit == "s"
+    described = {quantity.name: quantity for quantity in registry.describe("swing").quantities}
+    assert described["since_reversal"].unit == "s"
     assert registry.describe("hold").quantities == ()

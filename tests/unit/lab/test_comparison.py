@@ -158,12 +158,12 @@ def test_the_picture_names_each_line_bar_and_whisker_and_the_amplitude(tmp_path:
         for runs in (1, 3):
             standings, traces = compare(CONFIG, contestants, 20.0, 5.0, runs)
             draw(tmp_path / f"{runs}.svg", standings, traces, 0.42)
-    one, three = letters_of(tmp_path / "1.svg"), letters_of(tmp_path / "3.svg")
+    single, triple = letters_of(tmp_path / "1.svg"), letters_of(tmp_path / "3.svg")
     for name in ("command", "finangle", "asmeasured", "truemean", "relativethrust", "Φ=0.42rad"):
-        assert name in one
-        assert name in three
-    assert "lowesttohighestof3runs" in three
-    assert "lowest" not in one
+        assert name in single
+        assert name in triple
+    assert "lowesttohighestof3runs" in triple
+    assert "lowest" not in single
 
 
 def test_the_command_is_not_drawn_beyond_the_time_that_is_shown() -> None:

@@ -161,7 +161,7 @@ def test_delay_and_backlash_are_known_to_10_percent_at_best_where_they_are() -> 
         ticks_to_frame(ticks), start=FISH, fit=("servo_delay", "backlash", "rotation")
     )
     remark = next(
-        each for each in identification.remarks if each.startswith("known to 10 % at best")
+        text for text in identification.remarks if text.startswith("known to 10 % at best")
     )
     assert "servo_delay" in remark
     assert "backlash" in remark

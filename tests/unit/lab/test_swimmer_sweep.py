@@ -167,7 +167,7 @@ def test_a_grid_with_a_fish_that_cannot_be_computed_is_refused_before_anything_i
     tmp_path: Path,
 ) -> None:
     words = ("sweep", "square", "--vary", "swimmer.numerics.cell=0.002,0.02")
-    said = one_line(fishctl(*words, "--config", str(FILE), "--folder", str(tmp_path / "run")))
-    assert "swimmer.numerics.cell" in said
-    assert "too coarse" in said
+    line = one_line(fishctl(*words, "--config", str(FILE), "--folder", str(tmp_path / "run")))
+    assert "swimmer.numerics.cell" in line
+    assert "too coarse" in line
     assert not (tmp_path / "run").exists()

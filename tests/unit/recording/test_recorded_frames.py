@@ -112,8 +112,8 @@ def test_an_hour_of_frames_has_the_size_that_the_docs_say(path: Path, tmp_path: 
                                                           ticks: list[Tick],
                                                           frames: list[Frame]) -> None:  # fmt: skip
     bare = write(tmp_path / "bare.mcap", ticks, [])
-    each = (path.stat().st_size - bare.stat().st_size) / len(frames)
-    assert 4.0e3 < each < 6.0e3
+    frame_bytes = (path.stat().st_size - bare.stat().st_size) / len(frames)
+    assert 4.0e3 < frame_bytes < 6.0e3
 
 
 def test_missing_frames_and_a_new_camera_are_counted_as_gaps(
@@ -125,7 +125,7 @@ def test_missing_frames_and_a_new_camera_are_counted_as_gaps(
             head(frames[0], 1), head(frames[1], 2), head(frames[2], 5),
             head(frames[3], 6, dropped=3), head(frames[4], 1, session="two"),
         ]  # fmt: skip
-        lost = [writer.frame(each, frames[0].pixels) for each in heads]
+        lost = [writer.frame(header, frames[0].pixels) for header in heads]
     assert lost == [0, 0, 2, 3, 0]
     for summary in (open_run(writer.path).summary, read_overview(writer.path).summary):
         assert (summary.frames, summary.frames_lost, summary.frame_gaps) == (5, 5, 3)
@@ -149,10 +149,10 @@ def test_frames_are_exported_as_one_array_with_a_table_of_their_times(
 ) -> None:
     written = export(open_run(path), tmp_path, "csv")
     names = ["run.csv", "run-events.csv", "run-frames.csv", "run-frames.npy"]
-    assert [each.name for each in written] == names
+    assert [file.name for file in written] == names
     array = np.load(tmp_path / "run-frames.npy", mmap_mode="r")
     assert array.shape == (len(frames), 84, 84)
-    assert all((one == frame.pixels).all() for one, frame in zip(array, frames, strict=True))
+    assert all((pixels == frame.pixels).all() for pixels, frame in zip(array, frames, strict=True))
     times = pandas.read_csv(tmp_path / "run-frames.csv")
     assert list(times.time) == [frame.time for frame in frames]
     with pytest.raises(RecordingError, match="use --force to replace it"):

@@ -89,7 +89,7 @@ def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> Non
     for share in (0.3, 0.7, 0.999):
         part = tmp_path / f"cut{share}.mcap.part"
         part.write_bytes(content[: int(share * len(content))])
-        (cut,) = (each for each in read_overviews(tmp_path) if each.path == part)
+        (cut,) = (overview for overview in read_overviews(tmp_path) if overview.path == part)
         assert not cut.finished
         run = recover(part)
         assert run.path == tmp_path / f"cut{share}.mcap"
@@ -235,15 +235,15 @@ def test_a_full_disk_ends_a_recording_of_which_all_stays_readable(
 
 
 def test_messages_from_no_time_are_left_out_and_counted(tmp_path: Path) -> None:
-    said: list[str] = []
+    lines: list[str] = []
     ticks = swum(0.4).recorder.ticks
-    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=said.append)
+    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=lines.append)
     recorder._writer = recorder._open_writer()
     wrong = [replace(ticks[1], t=t) for t in (1e300, -1.0, 1.1e10)]
     for tick in (ticks[0], *wrong, ticks[1]):
         recorder._take("tick", msgspec.json.encode(tick))
     recorder.__exit__(None, None, None)
-    assert said == [
+    assert lines == [
         "a message of topic tick is not fishd's: ignored",
         "messages that are not fishd's, ignored: 3",
     ]
@@ -256,8 +256,8 @@ def test_messages_from_no_time_are_left_out_and_counted(tmp_path: Path) -> None:
 def test_it_is_told_once_that_another_fishd_has_taken_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seq: int
 ) -> None:
-    ticks, said = swum().recorder.ticks, list[str]()
-    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=said.append)
+    ticks, lines = swum().recorder.ticks, list[str]()
+    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=lines.append)
     now = [description_of(ticks[0], pid=1)]
     monkeypatch.setattr(recorder, "_ask", lambda: now[-1])
     recorder._described = now[-1]
@@ -268,12 +268,12 @@ def test_it_is_told_once_that_another_fishd_has_taken_over(
     for tick in ticks[seq:]:
         hear(recorder, tick, pid=2)
     recorder.__exit__(None, None, None)
-    assert [line for line in said if "another fishd" in line] == [
+    assert [line for line in lines if "another fishd" in line] == [
         "another fishd has taken over: the recording continues with it"
     ]
     run = open_run(tmp_path / "run.mcap")
     assert run.summary.restarts == 1
-    assert [each["pid"] for each in run.daemons] == ["1", "2"]
+    assert [daemon["pid"] for daemon in run.daemons] == ["1", "2"]
 
 
 def description_of(tick: Tick, pid: int) -> Description:

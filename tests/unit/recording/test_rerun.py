@@ -62,7 +62,7 @@ def test_a_reversed_force_that_was_corrected_is_corrected_again(tmp_path: Path, 
     rig.run_for(5)
     assert rig.loop.fy_corrected
     result = rerun_of(rig, tmp_path / "run")
-    assert [(each.equal, each.ticks) for each in result.stretches] == [(100, 100)]
+    assert [(stretch.equal, stretch.ticks) for stretch in result.stretches] == [(100, 100)]
     assert result.estimates.equal == result.estimates.ticks == len(rig.recorder.ticks)
 
 
@@ -81,8 +81,8 @@ def test_the_observer_is_rerun_and_sees_another_fish_where_asked(tmp_path: Path)
     run = open_run(recorded(rig, tmp_path / "run"))
     result = rerun(run)
     assert result.stretches[0].equal == result.estimates.equal == 200
-    other = rerun(run, overrides=["plant.omega0=9"])
-    assert other.stretches[0].equal < 200
+    changed = rerun(run, overrides=["plant.omega0=9"])
+    assert changed.stretches[0].equal < 200
 
 
 def test_a_swim_before_the_recording_began_has_an_unknown_past(tmp_path: Path) -> None:

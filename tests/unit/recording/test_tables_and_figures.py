@@ -75,8 +75,8 @@ def test_a_curve_has_breaks_and_events_and_units_are_said(path: Path, tmp_path: 
     drawn = traces(open_run(write(tmp_path / "run", ticks[:20] + ticks[30:])))
     assert len(drawn.time) == 51
     assert [index for index, value in enumerate(drawn.fx) if value != value] == [20]
-    said = ["swing C=0.6 longest_half_period=1 s lead=0 s", "C=0.3"]
-    assert [event.text for event in traces(open_run(path)).events] == said
+    expected = ["swing C=0.6 longest_half_period=1 s lead=0 s", "C=0.3"]
+    assert [event.text for event in traces(open_run(path)).events] == expected
     assert list(drawn.quantities) == ["top_speed (1)", "reversal_speed (1)", "since_reversal (s)"]
 
 

@@ -176,15 +176,15 @@ async def neighbour(server: PageServer) -> AsyncIterator[aiohttp.ClientSession]:
 
 def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone() -> None:
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
-        async with neighbour(server) as other:
+        async with neighbour(server) as second_session:
             socks = [
                 await session.ws_connect("/live")
                 for _ in range(page_server.MAX_VIEWERS_PER_ADDRESS)
             ]
             await refused(session)
             while len(socks) < page_server.MAX_VIEWERS:
-                socks.append(await other.ws_connect("/live"))
-            await refused(other)
+                socks.append(await second_session.ws_connect("/live"))
+            await refused(second_session)
             await socks[0].close()
             while True:
                 try:
@@ -195,8 +195,8 @@ def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone(
             server.show(News(FACTS, b"again"))
             while (await news_of(sock))[1] != b"again":
                 pass
-            for each in (*socks, sock):
-                await each.close()
+            for opened in (*socks, sock):
+                await opened.close()
 
     run(test)
 
@@ -229,8 +229,8 @@ def test_no_client_keeps_the_page_from_others(sent: bytes, monkeypatch: pytest.M
         try:
             while sum(end.done() for end in ends) < 100 - page_server.MAX_ASKING_PER_ADDRESS:
                 await asyncio.sleep(0.01)  # until the server has seen them all
-            async with neighbour(server) as other, asyncio.timeout(60.0):
-                for client in (session, other):
+            async with neighbour(server) as second_session, asyncio.timeout(60.0):
+                for client in (session, second_session):
                     async with client.get("/") as response:
                         assert response.status == 200
         finally:

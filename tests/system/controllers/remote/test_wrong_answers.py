@@ -87,9 +87,9 @@ class RawAgent:
         return self._connection
 
     def close(self) -> None:
-        for each in (self._connection, self._listener):
-            if each:
-                each.close()
+        for sock in (self._connection, self._listener):
+            if sock:
+                sock.close()
 
 
 @pytest.fixture

@@ -187,9 +187,9 @@ def test_a_usual_network_is_fast_enough_for_the_shortest_tick(tmp_path: Path) ->
 @pytest.mark.parametrize("opset", [operators.OPSETS[0], 21])
 def test_what_other_exporters_write_is_permitted(tmp_path: Path, opset: int) -> None:
     """Layers as MatMul and Add, constants in nodes, scaling in the network, squashed Gaussians."""
-    one = numpy_helper.from_array(np.array(0.5, np.float32))
+    half = numpy_helper.from_array(np.array(0.5, np.float32))
     nodes = [
-        make("Constant", [], ["half"], value=one),
+        make("Constant", [], ["half"], value=half),
         make("Flatten", ["observation"], ["flat"]),
         make("Mul", ["flat", "half"], ["scaled"]),
         make("MatMul", ["scaled", "w0"], ["p"]),

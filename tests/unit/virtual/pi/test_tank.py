@@ -103,7 +103,7 @@ def test_sensitivity_crosstalk_and_zero_are_those_of_the_settings() -> None:
     for rig in (plain, wired):
         rig.pin.set(0.0, width(ANGLE_LEFT))
     forces = [plain.tank.volts(X, 0.1, 0.11), plain.tank.volts(Y, 0.11, 0.12)]
-    # In the first conversion F_x is asked for and in the second F_y: compare like with like.
+    # The first conversion is of F_x and the second of F_y: compare each with the plant.
     fish = fish_at((ANGLE_LEFT, 0.1))
     first, second = fish.advance(ANGLE_LEFT, 0.01, 1), fish.advance(ANGLE_LEFT, 0.01, 1)
     assert forces == pytest.approx([first.thrust, second.lateral_force])

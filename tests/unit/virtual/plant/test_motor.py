@@ -24,8 +24,8 @@ def test_a_servo_without_pulses_draws_its_idle_current_only() -> None:
 
 
 def test_the_tail_costs_what_the_water_takes_from_it() -> None:
-    # A motor without losses, whose voltage is its torque: k_e = k_t. What is left is τ φ̇, and on a
-    # slow ramp, where nothing comes back, that is what damping takes and what the spring keeps.
+    # A motor without losses, whose voltage is its torque: k_e = k_t. Its power is τ φ̇; on a slow
+    # ramp, where no power returns, that is the power of the damping and of the spring.
     motor = MotorSettings(
         voltage=6.0,
         stall_current=1e6,

@@ -57,7 +57,7 @@ def integrate(
         return 0.0 if command is None else math.tanh((command - phi) / p.servo_lag) * p.servo_speed
 
     def acceleration(phi: float, alpha: float, rate: float) -> float:
-        # The wheel turns one way all window long, and the tail was where it is.
+        # The wheel turns one way during the whole window, and the tail starts at its place.
         tail = max(phi - p.backlash, min(phi + p.backlash, state.phi))
         drive = p.coupling * dead_band(tail, p.cable_slack)
         braking = p.quadratic_drag * abs(rate) * rate
@@ -203,7 +203,7 @@ def test_a_delayed_servo_does_the_same_later(delay: float) -> None:
 
 
 def test_an_instruction_that_is_held_gives_what_single_windows_give() -> None:
-    # A fish with a reaction of the servo, however small, is never looked ahead of.
+    # The prediction is skipped for a fish with any reaction of the servo, however small.
     held, single = (
         TetheredFish(PlantParameters(servo_reaction=reaction), motor=MotorSettings())
         for reaction in (0.0, 1e-30)
