@@ -48,14 +48,17 @@ def arrows() -> set[tuple[str, str]]:
 
 @cache
 def imports() -> dict[str, set[str]]:
-    """Return the other modules of fishd that each module imports, anywhere in its file."""
+    """Return the other modules of fishd that each module imports, anywhere in its file.
+
+    An import of a module from its package is one of the package, too.
+    """
     files = {_module_name(path): path for path in FISHD.rglob("*.py")}
     del files["fishd"]  # its version, which every module may import
     graph = {}
     for module, path in files.items():
         names = _imported_names(ast.parse(path.read_text(encoding="utf-8")))
-        modules = {name if name in files else name.rpartition(".")[0] for name in names}
-        graph[module] = modules & files.keys() - {module}
+        imported = {part for name in names for part in (name, name.rpartition(".")[0])}
+        graph[module] = imported & files.keys() - {module}
     return graph
 
 

@@ -13,8 +13,29 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-from fishd.config import consistency as checks
-from fishd.config import drivers
+from fishd.config.consistency import (
+    check_addresses,
+    check_estimator,
+    check_i2c_addresses,
+    check_lockstep,
+    check_neutral,
+    check_pins,
+    check_pulses,
+    check_start,
+    check_state_folder,
+    check_swimmer,
+    check_virtual_pi,
+)
+from fishd.config.drivers import (
+    CHOICES,
+    DriverSettings,
+    check_drivers,
+    check_plant,
+    claims_of,
+    convert_driver_sections,
+    driver_keys,
+    settings_of_drivers,
+)
 from fishd.controllers import registry
 from fishd.controllers.base import (
     DEFAULT_DWELL_S,
@@ -244,9 +265,9 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return find_kind(self.robot)
 
     @property
-    def driver_settings(self) -> drivers.DriverSettings:
+    def driver_settings(self) -> DriverSettings:
         """Settings of the drivers."""
-        return drivers.DriverSettings(self.force_sensor, self.servo, self.power_meter)
+        return DriverSettings(self.force_sensor, self.servo, self.power_meter)
 
     @property
     def limits(self) -> Limits:
@@ -341,19 +362,19 @@ def check_tethered(robot: str, what: str) -> None:
 Check = Callable[[Config], None]
 
 CHECKS: tuple[Check, ...] = (
-    lambda c: checks.check_start(c.start.controller, c.start.parameters, c.limits),
-    lambda c: checks.check_addresses(c.telemetry.address, c.control.address),
-    lambda c: checks.check_state_folder(c.state_folder),
-    lambda c: drivers.check_drivers(c.robot, c.tick, c.driver_settings),
-    lambda c: checks.check_neutral(c.servo),
-    lambda c: drivers.check_plant(c.plant),
-    lambda c: checks.check_pulses(c.servo, c.amplitude_limit),
-    lambda c: checks.check_i2c_addresses(c.driver_settings.sections()),
-    lambda c: checks.check_pins(drivers.claims_of(c.driver_settings), c.panel),
-    lambda c: checks.check_lockstep(c.robot, c.lockstep),
-    lambda c: checks.check_estimator(c.robot, c.estimator.kind, c.plant),
-    lambda c: checks.check_virtual_pi(c.virtual_pi),
-    lambda c: checks.check_swimmer(c.swimmer, c.tick) if not c.kind.is_tethered else None,
+    lambda c: check_start(c.start.controller, c.start.parameters, c.limits),
+    lambda c: check_addresses(c.telemetry.address, c.control.address),
+    lambda c: check_state_folder(c.state_folder),
+    lambda c: check_drivers(c.robot, c.tick, c.driver_settings),
+    lambda c: check_neutral(c.servo),
+    lambda c: check_plant(c.plant),
+    lambda c: check_pulses(c.servo, c.amplitude_limit),
+    lambda c: check_i2c_addresses(c.driver_settings.sections()),
+    lambda c: check_pins(claims_of(c.driver_settings), c.panel),
+    lambda c: check_lockstep(c.robot, c.lockstep),
+    lambda c: check_estimator(c.robot, c.estimator.kind, c.plant),
+    lambda c: check_virtual_pi(c.virtual_pi),
+    lambda c: check_swimmer(c.swimmer, c.tick) if not c.kind.is_tethered else None,
 )
 """Checks of keys against each other, in order; each raises `Problem`."""
 
@@ -373,14 +394,14 @@ def adopt(data: dict[str, Any], overrides: Iterable[str] = ()) -> Config:
 
 def convert_sections(data: Mapping[str, Any]) -> Config:
     """Convert and validate each section separately; raise `Problem` for an invalid value."""
-    common = {key: value for key, value in data.items() if key not in drivers.CHOICES}
-    config = convert(common, Config, elsewhere=drivers.keys)
-    return msgspec.structs.replace(config, **drivers.convert_sections(data, keys))
+    common = {key: value for key, value in data.items() if key not in CHOICES}
+    config = convert(common, Config, elsewhere=driver_keys)
+    return msgspec.structs.replace(config, **convert_driver_sections(data, keys))
 
 
 def keys() -> list[str]:
     """Return every key in dotted form, including those of all drivers and plants that load."""
-    return list(dict.fromkeys(list_keys(Config) + drivers.keys()))
+    return list(dict.fromkeys(list_keys(Config) + driver_keys()))
 
 
 def to_yaml(config: Config | dict[str, Any]) -> str:
@@ -390,7 +411,7 @@ def to_yaml(config: Config | dict[str, Any]) -> str:
 
 def json_schema() -> dict[str, Any]:
     """Return the JSON Schema of the configuration, with all drivers and plants that load."""
-    choices = {section: drivers.settings_of_drivers(section) for section in drivers.CHOICES}
+    choices = {section: settings_of_drivers(section) for section in CHOICES}
     types = [Config, *(struct for structs in choices.values() for struct in structs.values())]
     (top, *_), parts = msgspec.json.schema_components(types, ref_template="#/$defs/{name}")
     properties = parts["Config"]["properties"]
@@ -398,7 +419,7 @@ def json_schema() -> dict[str, Any]:
         refs = []
         for struct in dict.fromkeys(structs.values()):
             names = [name for name, settings in structs.items() if settings is struct]
-            parts[struct.__name__]["properties"][drivers.CHOICES[section].key] = {"enum": names}
+            parts[struct.__name__]["properties"][CHOICES[section].key] = {"enum": names}
             refs.append({"$ref": f"#/$defs/{struct.__name__}"})
         default = {key: value for key, value in properties[section].items() if key == "default"}
         properties[section] = {"anyOf": refs, **default}

@@ -66,7 +66,7 @@ class DriverSettings(NamedTuple):
         return {name: section for name, section in self._asdict().items() if section is not None}
 
 
-def convert_sections(
+def convert_driver_sections(
     data: Mapping[str, Any], elsewhere: Callable[[], list[str]] = list
 ) -> dict[str, Any]:
     """Return these sections of a configuration, converted and validated; raise `Problem`.
@@ -103,7 +103,7 @@ def settings_of_drivers(section: str) -> dict[str, type[Struct]]:
     return structs
 
 
-def keys() -> list[str]:
+def driver_keys() -> list[str]:
     """Return the keys of all drivers and plants that load, in dotted form."""
     return [
         f"{section}.{field.name}"

@@ -18,8 +18,8 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import MissingPackage, RecordingError
 from fishd.core.schema import fields_of, note, unit
 
-TOPIC = "camera"
-SCHEMA = "foxglove.CompressedImage"
+IMAGE_TOPIC = "camera"
+IMAGE_SCHEMA = "foxglove.CompressedImage"
 _TYPES = {"number": "number", "integer": "integer", "text": "string", "boolean": "boolean"}
 """JSON types of fields. Viewers do not support null: unknown values are omitted in a message."""
 MAX_PIXELS = 2**24
@@ -64,7 +64,7 @@ class ImageMessage(FrameHead, frozen=True, kw_only=True, gc=False):
     """Message of the channel: foxglove.CompressedImage with the fields of `FrameHead`."""
 
     timestamp: Annotated[Timestamp, note("Same as `t`.")]
-    frame_id: Annotated[str, note("`camera`.")] = TOPIC
+    frame_id: Annotated[str, note("`camera`.")] = IMAGE_TOPIC
     data: Annotated[bytes, note("The picture, PNG in base64.")]
     format: Annotated[str, note("`png`.")] = "png"
 
@@ -86,7 +86,7 @@ class RecordedFrame(NamedTuple):
     """Grey levels, shape (height, width)."""
 
 
-def json_schema() -> bytes:
+def image_json_schema() -> bytes:
     """Return the JSON Schema of the channel: Foxglove's, with additional fields of fishd."""
     properties: dict[str, Any] = {
         "timestamp": {
@@ -104,7 +104,7 @@ def json_schema() -> bytes:
     for field in fields_of(FrameHead):
         description = f"{field.description} [{field.unit}]" if field.unit else field.description
         properties[field.name] = {"type": _TYPES[field.kind], "description": description}
-    return msgspec.json.encode({"title": SCHEMA, "type": "object", "properties": properties})
+    return msgspec.json.encode({"title": IMAGE_SCHEMA, "type": "object", "properties": properties})
 
 
 def encode_frame(head: FrameHead, pixels: NDArray[np.uint8]) -> bytes:

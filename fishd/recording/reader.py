@@ -18,8 +18,7 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
-from fishd.recording import images
-from fishd.recording.images import FrameHead, RecordedFrame
+from fishd.recording.images import IMAGE_TOPIC, FrameHead, RecordedFrame, decode_frame, decode_head
 from fishd.recording.mcap_file import Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 from fishd.recording.schemas import CHANNELS
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-TOPICS = dict(enumerate((*CHANNELS, images.TOPIC), start=1))
+TOPICS = dict(enumerate((*CHANNELS, IMAGE_TOPIC), start=1))
 """Topics by the channel numbers of `RunWriter`, for a file whose channel records are damaged."""
 
 MAX_DIGITS = 9
@@ -208,7 +207,7 @@ class Run:
         """
         for payload in islice(self._images(), len(self.frame_heads)):
             try:
-                yield images.decode_frame(payload)
+                yield decode_frame(payload)
             except RecordingError as error:
                 raise RecordingError(f"{self.path}: {error}") from None
 
@@ -217,7 +216,7 @@ class Run:
         for record in read_records(self.path):
             if isinstance(record, Channel):
                 topics[record.id] = record.topic
-            elif isinstance(record, Message) and topics.get(record.channel_id) == images.TOPIC:
+            elif isinstance(record, Message) and topics.get(record.channel_id) == IMAGE_TOPIC:
                 yield record.data
 
     def frame(self) -> "DataFrame":
@@ -239,7 +238,7 @@ class Run:
             self.finished = isinstance(record, Footer)
             if isinstance(record, Message):
                 topic = topics.get(record.channel_id, "")
-                if topic == images.TOPIC:
+                if topic == IMAGE_TOPIC:
                     self._take_frame(record.data)
                 elif topic in CHANNELS:
                     self.entries.append(Entry(topic, record.data))
@@ -264,7 +263,7 @@ class Run:
 
     def _take_frame(self, payload: bytes) -> None:
         try:
-            self.frame_heads.append(images.decode_head(payload))
+            self.frame_heads.append(decode_head(payload))
         except msgspec.DecodeError as error:
             raise RecordingError(
                 f"{self.path}: a frame of the camera cannot be read: {error}"

@@ -6,7 +6,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from fishd.core.errors import RecordingError
-from fishd.recording import images
+from fishd.recording.images import IMAGE_SCHEMA, image_json_schema
 from fishd.recording.mcap_file import read_records
 from fishd.recording.part_file import (
     PART_SUFFIX,
@@ -93,7 +93,7 @@ def _copy(run: Run, file: PartFile) -> None:
             if topic in CHANNELS:
                 name, schema = schema_name(CHANNELS[topic]), json_schema(CHANNELS[topic])
             else:
-                name, schema = images.SCHEMA, images.json_schema()
+                name, schema = IMAGE_SCHEMA, image_json_schema()
             schema_id = writer.register_schema(name, "jsonschema", schema)
             channels[number] = writer.register_channel(topic, "json", schema_id)
         return channels[number]

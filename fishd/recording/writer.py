@@ -25,8 +25,13 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
-from fishd.recording import images
-from fishd.recording.images import FrameHead
+from fishd.recording.images import (
+    IMAGE_SCHEMA,
+    IMAGE_TOPIC,
+    FrameHead,
+    encode_frame,
+    image_json_schema,
+)
 from fishd.recording.part_file import SUFFIX, PartFile
 from fishd.recording.schemas import CHANNELS, json_schema, schema_name
 from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
@@ -168,13 +173,11 @@ class RunWriter:
         pixels: shape (height, width)
         Raise `MissingPackage` without OpenCV (extra: camera).
         """
-        payload = images.encode_frame(head, pixels)
-        if images.TOPIC not in self._channels:
-            schema = self._writer.register_schema(images.SCHEMA, "jsonschema", images.json_schema())
-            self._channels[images.TOPIC] = self._writer.register_channel(
-                images.TOPIC, "json", schema
-            )
-        self._add(images.TOPIC, head.t, head.seq, payload)
+        payload = encode_frame(head, pixels)
+        if IMAGE_TOPIC not in self._channels:
+            schema = self._writer.register_schema(IMAGE_SCHEMA, "jsonschema", image_json_schema())
+            self._channels[IMAGE_TOPIC] = self._writer.register_channel(IMAGE_TOPIC, "json", schema)
+        self._add(IMAGE_TOPIC, head.t, head.seq, payload)
         return self.tally.frame(head)
 
     def message(self, topic: str, payload: bytes) -> TickHead | Event | Status:

@@ -5,7 +5,8 @@
 3. Imports point down the layers of pyproject.toml (import-linter checks it).
 4. No module imports another that imports it, directly or through others: each can be read, tested
    and moved without the one above it. Imports inside functions and under TYPE_CHECKING count. An
-   import of a module from its package counts as one of the module, not of the package.
+   import of a module from its package counts as one of both, so a module that the `__init__` of
+   its package imports writes `from package.sibling import name`.
 5. Few arrows: a change of one room should concern few others. If a new import exceeds the limit,
    move the code to the room that needs it, or pass the object in as an argument.
 6. The table in docs/explanation/rooms.md is written by `make docs`.

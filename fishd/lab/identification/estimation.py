@@ -18,8 +18,15 @@ from fishd.core import text
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
 from fishd.core.schema import suggest
-from fishd.lab.identification import misfit
-from fishd.lab.identification.fit import BOUNDS, FURTHER, LOGARITHMIC, QUADRATIC, Problem, solve
+from fishd.lab.identification.fit import (
+    BOUNDS,
+    FURTHER,
+    LOGARITHMIC,
+    QUADRATIC,
+    Problem,
+    solve,
+)
+from fishd.lab.identification.misfit import all_white, find_missing_parameters
 from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifiable, passages
 from fishd.lab.identification.result import Identification
 from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, summarise
@@ -162,7 +169,7 @@ def _solve_from_starts(
     problem = Problem(parts, names, _SETTLE_S)
     values = solve(problem, starts[0])
     problem, values = _add_required(parts, problem, values, further)
-    if misfit.all_white(problem, values):
+    if all_white(problem, values):
         return problem, values
     rough_fits = []
     rough_names = tuple(name for name in names if name not in QUADRATIC) or names
@@ -188,13 +195,11 @@ def _add_required(
     others before it is significant. One without an effect would only cost precision.
     """
     while True:
-        white = misfit.all_white(problem, values)
-        find_missing_parameters = misfit.find_missing_parameters(problem, values, further)
-        if not find_missing_parameters or find_missing_parameters[0][1] < (
-            _MIN_FALL if white else MIN_CLEAR_FALL
-        ):
+        white = all_white(problem, values)
+        missing = find_missing_parameters(problem, values, further)
+        if not missing or missing[0][1] < (_MIN_FALL if white else MIN_CLEAR_FALL):
             break
-        name, _, size = find_missing_parameters[0]
+        name, _, size = missing[0]
         wider = Problem(parts, check((*problem.names, name)), _SETTLE_S)
         wider_values = {**values, name: float(np.clip(size, *BOUNDS[name]))}
         wider_values = solve(wider, wider_values)

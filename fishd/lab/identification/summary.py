@@ -7,8 +7,17 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from fishd.lab.identification import misfit
 from fishd.lab.identification.fit import BOUNDS, FURTHER, LOGARITHMIC, QUADRATIC, SIGNED, Problem
+from fishd.lab.identification.misfit import (
+    LAGS,
+    are_free,
+    find_missing_parameters,
+    group_windows,
+    is_at_bound,
+    is_white,
+    misfit_covariance,
+    predict_groups,
+)
 from fishd.lab.identification.passages import Passage
 from fishd.lab.identification.response import Array
 from fishd.lab.identification.result import (
@@ -72,9 +81,9 @@ def summarise(
     innovations = problem.whitened(residuals)
     jacobian = problem.jacobian(values)
     statistical, unknown_direction = _covariance(jacobian, innovations)
-    labels = misfit.group_windows(parts, problem.skips)
-    are_free = misfit.are_free(problem.names, values)
-    predicted = misfit.predict_groups(jacobian[:, :, are_free], innovations, labels)
+    labels = group_windows(parts, problem.skips)
+    free = are_free(problem.names, values)
+    predicted = predict_groups(jacobian[:, :, free], innovations, labels)
     measured = problem.whitened(problem.measured)
     drifts = [_smooth(each, parts[0].tick) for each in residuals]
     channels = tuple(
@@ -84,7 +93,7 @@ def summarise(
             explained_out_of_sample=_explained_share(unseen, whole),
             noise=noise.white,
             drift=float(max(d[k].max() for d in drifts) - min(d[k].min() for d in drifts)),
-            white=misfit.is_white(left),
+            white=is_white(left),
         )
         for k, (name, left, unseen, whole, noise) in enumerate(
             zip(("fx", "fy"), innovations, predicted, measured, problem.noise, strict=True)
@@ -93,11 +102,12 @@ def summarise(
     failed = _failed_assumptions(channels, innovations, predicted)
     covariance, inflation = statistical, 1.0
     if failed:
-        misfit_covariance = misfit.misfit_covariance(jacobian, innovations, labels)
-        covariance = statistical + MISFIT_FACTOR**2 * misfit_covariance
+        covariance = statistical + MISFIT_FACTOR**2 * misfit_covariance(
+            jacobian, innovations, labels
+        )
         inflation = float(np.median(np.sqrt(np.diag(covariance) / np.diag(statistical))))
         rest = [name for name in (*FURTHER, *QUADRATIC, "rotation") if name not in problem.names]
-        candidates = misfit.find_missing_parameters(problem, values, rest)
+        candidates = find_missing_parameters(problem, values, rest)
         failed = [
             *(f"{name} = 0" for name, fall, _ in candidates[:1] if fall > MIN_CLEAR_FALL),
             *failed,
@@ -249,9 +259,9 @@ def _covariance(jacobian: Array, innovations: Array) -> tuple[Array, Array | Non
     inverse = (vectors / np.where(weak, _SINGULAR * values[-1], values)) @ vectors.T
     scores = scaled * innovations[:, :, None]
     meat = np.einsum("cni,cnj->ij", scores, scores)
-    for lag in range(1, misfit.LAGS + 1):
+    for lag in range(1, LAGS + 1):
         product = np.einsum("cni,cnj->ij", scores[:, lag:], scores[:, :-lag])
-        meat += (1.0 - lag / (misfit.LAGS + 1)) * (product + product.T)
+        meat += (1.0 - lag / (LAGS + 1)) * (product + product.T)
     robust = inverse @ meat @ inverse
     wider = np.sqrt(np.maximum(np.diag(robust) / np.diag(inverse), 1.0))
     unscaled = wider / size
@@ -325,7 +335,7 @@ def _remarks(
     at_bounds = [
         f"{name} = {value:.4g}"
         for name, value in ((e.name, e.value) for e in estimates if e.name in BOUNDS)
-        if misfit.is_at_bound(name, value)
+        if is_at_bound(name, value)
     ]
     if at_bounds:
         remarks.append(f"at a bound of the fit: {', '.join(at_bounds)}")

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fishd.config import adopt, load
-from fishd.learning import settings as training
+from fishd.learning.settings import load as load_settings
 
 if TYPE_CHECKING:
     from fishd.learning.env.environment import SwimEnv
@@ -47,7 +47,7 @@ def swim(
     from fishd.learning.eyes import make_eye
 
     fish = load(config, overrides)
-    chosen = training.load(settings)
+    chosen = load_settings(settings)
     eye = make_eye(chosen)
     sight = Camera(cameras.load_simulated(camera), chosen.camera.stack) if eye else None
     metered = bool(chosen.seen.power_price)
@@ -85,7 +85,7 @@ def swim_on_daemon(
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.eyes import make_eye
 
-    chosen = training.load(settings)
+    chosen = load_settings(settings)
     fish = load(config, overrides) if config else adopt(config_of(endpoint), overrides)
     eye = make_eye(chosen)
     stack = chosen.camera.stack if eye else None
