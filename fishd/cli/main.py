@@ -41,11 +41,11 @@ VERBS = {
     "Record": {
         "record": Verb("recording.record", "record", "Record a running fish into a file."),
         "runs": Verb("recording.runs", "runs", "List recordings and experiments."),
-        "plot": Verb("recording.plot", "plot", "Draw a recording, as a picture and a page."),
-        "export": Verb("recording.export", "export", "Write a recording as CSV or Parquet."),
-        "replay": Verb("recording.replay", "replay", "Publish a recording, as if it were live."),
+        "plot": Verb("recording.files", "plot", "Draw a recording, as a picture and a page."),
+        "export": Verb("recording.files", "export", "Write a recording as CSV or Parquet."),
+        "replay": Verb("recording.files", "replay", "Publish a recording, as if it were live."),
         "rerun": Verb("recording.rerun", "rerun", "Run a controller again on a recording."),
-        "recover": Verb("recording.recover", "recover", "Repair a recording that was cut off."),
+        "recover": Verb("recording.files", "recover", "Repair a recording that was cut off."),
     },
     "Camera": {
         "camera": Verb("camera", "camera", "Show the picture of the camera, set it up, record it."),

@@ -6,16 +6,18 @@ from fishd.cli.verbs import Verb, Verbs
 
 VERBS = {
     "Look": {
-        "status": Verb("camera.status", "status", "Show the state of the camera."),
-        "view": Verb("camera.view", "view", "Show its picture in the terminal, or write a PNG."),
-        "page": Verb("camera.page", "page", "Show its picture live on a web page."),
+        "status": Verb("camera.look", "status", "Show the state of the camera."),
+        "view": Verb("camera.look", "view", "Show its picture in the terminal, or write a PNG."),
+        "page": Verb("camera.look", "page", "Show its picture live on a web page."),
     },
     "Set up": {
         "align": Verb("camera.align", "align", "Find the axis of motion, and how to turn it."),
         "latency": Verb("camera.latency", "latency", "Measure the delay of its pictures."),
     },
     "Record": {
-        "record": Verb("camera.record", "record", "Record its frames together with the fish."),
+        "record": Verb(
+            "recording.record", "record_camera", "Record its frames together with the fish."
+        ),
     },
 }
 

@@ -1,4 +1,4 @@
-"""The verb that records a running fish, and the always-on black box."""
+"""The verbs that record a running fish, also with its camera, and the always-on black box."""
 
 import re
 import signal
@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 from msgspec.structs import asdict
 
+from fishd.cli.camera.options import camera_option
 from fishd.cli.options import Utf8Text, endpoint_option, for_option, json_option
 from fishd.cli.output import echo, format_count, print_json
-from fishd.cli.recording.choice import folder_option
+from fishd.cli.recording.files import folder_option
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
@@ -26,6 +27,7 @@ from fishd.recording.recorder import Recorder
 
 if TYPE_CHECKING:
     from fishd.lab.camera_tap import CameraTap
+
 
 F = TypeVar("F", bound=Callable[..., Any])
 UNIT_BYTES = {"MB": 10**6, "GB": 10**9}
@@ -56,7 +58,7 @@ class BlackBoxSize(click.ParamType[int]):
         return round(size)
 
 
-def recording_options(function: F) -> F:
+def _recording_options(function: F) -> F:
     """Add RUN, and the options of every verb that records."""
     for decorate in (
         json_option,
@@ -90,7 +92,7 @@ class _Record(click.Command):
 
 
 @click.command(cls=_Record)
-@recording_options
+@_recording_options
 @click.option(
     "--camera",
     metavar="[ADDRESS]",
@@ -138,15 +140,42 @@ def record(
         _record_endlessly(open_recorder, _StopSignals(), seconds, as_json)
         return
     if camera is None:
-        record_one(run, endpoint, folder, begin, seconds, as_json)
+        _record_one(run, endpoint, folder, begin, seconds, as_json)
         return
     from fishd.lab.camera_tap import CameraTap
 
     with CameraTap(camera or None, endpoint) as tap:
-        record_one(run, endpoint, folder, begin, seconds, as_json, tap)
+        _record_one(run, endpoint, folder, begin, seconds, as_json, tap)
 
 
-def record_one(
+@click.command("record")
+@_recording_options
+@camera_option
+def record_camera(
+    run: str | None,
+    endpoint: str | None,
+    folder: Path | None,
+    operator: str,
+    subject: str,
+    note: str,
+    seconds: float | None,
+    as_json: bool,
+    address: str | None,
+) -> None:
+    """Record a running fish and the frames of the camera above it in one file.
+
+    RUN is a name in the folder of recordings or a path; by default the date and time. As `fishctl
+    record --camera`. If the camera is lost, the recording goes on; the loss is reported and
+    counted.
+    """
+    from fishd.lab.camera_tap import CameraTap
+
+    begin = partial(RunWriter, operator=operator, subject=subject, note=note)
+    with CameraTap(address, endpoint) as camera:
+        _record_one(run, endpoint, folder, begin, seconds, as_json, camera)
+
+
+def _record_one(
     run: str | None,
     endpoint: str | None,
     folder: Path | None,

@@ -8,7 +8,7 @@ import click
 from fishd.cli.config import set_option
 from fishd.cli.options import ParameterType, json_option
 from fishd.cli.output import echo, format_controller, format_count, print_json
-from fishd.cli.recording.choice import folder_option, open_recording
+from fishd.cli.recording.files import folder_option, open_recording
 from fishd.controllers import registry
 from fishd.lab.rerun import Estimates, Stretch
 from fishd.lab.rerun import rerun as choose_again

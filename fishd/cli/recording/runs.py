@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, format_count, print_json
-from fishd.cli.recording.choice import folder_option, format_damage
+from fishd.cli.recording.files import folder_option, format_damage
 from fishd.core import text
 from fishd.core.console import format_power
 from fishd.core.errors import ConfigError, RecordingError

@@ -1,8 +1,11 @@
-"""The verb that shows a camera's picture in the terminal, or writes it into a file."""
+"""The verbs that show a camera: its state, and its picture in the terminal or on a web page."""
 
+import asyncio
+import datetime
 import os
 import signal
 import sys
+import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -12,18 +15,87 @@ import click
 
 from fishd.cli.camera.options import camera_option, check_png, png_option
 from fishd.cli.drawing import open_full_screen
-from fishd.cli.output import echo
-from fishd.core.errors import FishdError
+from fishd.cli.options import json_option
+from fishd.cli.output import (
+    echo,
+    echo_rows,
+    format_count,
+    make_printable,
+    print_json,
+    print_json_line,
+)
+from fishd.core.errors import FishdError, StartupError
+from fishd.core.process.interruption import on_signal
 
 if TYPE_CHECKING:
     from fishd.camera.axis import AxisWatch
     from fishd.camera.client import CameraClient
     from fishd.camera.drawing import Colours
+    from fishd.camera.messages import CameraState
 
+ANSWER_TIMEOUT_S = 2.0
+"""Longest wait for an answer [s]."""
 AXIS_SEARCH_S = 8.0
 """Duration of the search for an axis [s]."""
 REDRAW_INTERVAL_S = 0.2
 """Shortest time from one drawing to the next [s]."""
+DEFAULT_PORT = 9876
+JOIN_TIMEOUT_S = 1.0
+"""Longest wait for the thread of the camera at the end [s]."""
+
+
+@click.command()
+@camera_option
+@json_option
+def status(address: str | None, as_json: bool) -> None:
+    """Show the state of the camera: since when, its rate, the age of frames, and losses."""
+    import zmq
+
+    from fishd.camera.requests import CameraRequests, find_camera
+
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    try:
+        requests = CameraRequests(address or find_camera(), context, ANSWER_TIMEOUT_S)
+        state = requests.status()
+    finally:
+        context.destroy(linger=0)
+    if as_json:
+        print_json(state)
+    else:
+        echo_rows(status_rows(make_printable(state)))
+
+
+def status_rows(state: "CameraState") -> list[tuple[str, str]]:
+    """Return names and values: those of the camera first, those of its process last."""
+    ago = datetime.timedelta(seconds=int(max(0.0, state.t - state.since)))
+    pairs = [("camera", state.device), ("state", f"{state.state} for {ago}")]
+    if state.problem:
+        pairs.append(("", state.problem))
+    if state.remedy:
+        pairs.append(("to do", state.remedy))
+    if state.state == "streaming":
+        pairs.append(("rate", f"{state.rate:.1f} frames a second"))
+    if state.latency is not None:
+        exposure = f", exposed for {state.exposure * 1e3:.1f} ms" if state.exposure else ""
+        pairs.append(("age", f"{state.latency * 1e3:.1f} ms when available{exposure}"))
+    picture_size = f"{state.picture_width} x {state.picture_height} px"
+    source = f", of pictures of {picture_size}" if state.picture_width else ""
+    pairs.append(("frames", f"{state.width} x {state.height} px{source}"))
+    lost = []
+    if state.dropped:
+        lost.append(f"{format_count(state.dropped, 'frame')} that no client got")
+    if state.broken:
+        lost.append(f"{format_count(state.broken, 'frame')} that could not be decoded")
+    if lost:
+        pairs.append(("lost", " and ".join(lost)))
+    pairs += [("degraded", line) for line in state.degraded]
+    if state.virtual:
+        until = "" if state.until is None else f", until {state.until:.3f} s"
+        pairs.append(("clock", f"virtual, that of a fishd in lockstep{until}"))
+    uptime = datetime.timedelta(seconds=int(state.uptime))
+    pairs.append(("process", f"fishd-camera {state.version}, pid {state.pid}, up {uptime}"))
+    pairs.append(("published", state.frames))
+    return pairs
 
 
 @click.command()
@@ -163,3 +235,71 @@ def _write_png(client: "CameraClient", watch: "AxisWatch", whole: bool, png: Pat
 
 def _can_draw() -> bool:
     return sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
+
+
+@click.command()
+@camera_option
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=DEFAULT_PORT,
+    show_default=True,
+    help="Port of the page; 0: any.",
+)
+@click.option(
+    "--host",
+    default="127.0.0.1",
+    show_default=True,
+    metavar="ADDRESS",
+    help="Address of the page. The default is for this machine only; with another one, every "
+    "computer that reaches it can see the pictures.",
+)
+@json_option
+def page(address: str | None, port: int, host: str, as_json: bool) -> None:
+    """Show what the camera sees on a web page, live, with the axis of motion, until Ctrl-C.
+
+    It needs nothing from the internet, and accepts no request that changes anything.
+    """
+    with suppress(KeyboardInterrupt):
+        asyncio.run(_serve(address, host, port, as_json))
+
+
+async def _serve(address: str | None, host: str, port: int, as_json: bool) -> None:
+    from fishd.camera.page.feed import Feed, News
+    from fishd.camera.page.server import PageServer
+
+    loop, ended = asyncio.get_running_loop(), asyncio.Event()
+    failures: list[BaseException] = []
+    server = PageServer(host, port)
+
+    def tell(news: News) -> None:
+        with suppress(RuntimeError):  # the loop has ended
+            loop.call_soon_threadsafe(server.show, news)
+
+    feed = Feed(address, tell)
+
+    def follow() -> None:
+        try:
+            feed.run()
+        except BaseException as error:
+            failures.append(error)
+            with suppress(RuntimeError):
+                loop.call_soon_threadsafe(ended.set)
+
+    thread = threading.Thread(target=follow, name="camera", daemon=True)
+    try:
+        async with server:
+            with on_signal(lambda: loop.call_soon_threadsafe(ended.set)):
+                thread.start()
+                if as_json:
+                    print_json_line({"url": server.url})
+                else:
+                    echo(f"the camera is at {server.url}; Ctrl-C ends it")
+                await ended.wait()
+            feed.stop()
+            await asyncio.to_thread(thread.join, JOIN_TIMEOUT_S)
+    except StartupError:
+        feed.close()
+        raise
+    if failures:
+        raise failures[0]

@@ -1,0 +1,220 @@
+"""The verbs about the file of a recording: export, plot, recover, replay; and its choice."""
+
+import math
+import shlex
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal
+
+import click
+from msgspec.structs import asdict
+
+from fishd.cli.options import FiniteRange, json_option
+from fishd.cli.output import echo, format_count, print_json, print_json_line, print_paths
+from fishd.core.addresses import control_address, find_control_address
+from fishd.core.process.interruption import raise_on_first_signal
+from fishd.recording import Run, open_run
+from fishd.recording.folder import FOLDER_VARIABLE, check_new_files, find_recording
+
+folder_option = click.option(
+    "--folder",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder with recordings, such as that of an experiment; default: "
+    f"${FOLDER_VARIABLE}, else runs in the current folder.",
+)
+DEFAULT_ADDRESS = "tcp://127.0.0.1:9872"
+
+
+def open_recording(name: str, folder: Path | None) -> Run:
+    """Open the recording of a name; print on standard error if it is damaged.
+
+    Raises `RecordingError`.
+    """
+    run = open_run(find_recording(name, folder))
+    if run.is_damaged:
+        echo(f"fishctl: {run.path}: {format_damage(run.damaged, run.damage_reason)}", err=True)
+    return run
+
+
+def format_damage(ticks: int, reason: str = "") -> str:
+    """Return the loss of a damaged file, `damaged: 10 ticks lost`, with the reason if known."""
+    return f"damaged: {format_count(ticks, 'tick')} lost" + (f" ({reason})" if reason else "")
+
+
+@click.command()
+@click.argument("run")
+@click.option("--csv", "form", flag_value="csv", help="Write text, which every program reads.")
+@click.option(
+    "--parquet",
+    "form",
+    flag_value="parquet",
+    help="Write Parquet, which is smaller and faster to read.",
+)
+@click.option(
+    "--to",
+    "target",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path(),
+    help="Folder to write to; default: this one.",
+)
+@click.option("--force", is_flag=True, help="Replace existing files.")
+@folder_option
+@json_option
+def export(
+    run: str,
+    form: Literal["csv", "parquet"] | None,
+    target: Path,
+    force: bool,
+    folder: Path | None,
+    as_json: bool,
+) -> None:
+    """Write a recording as tables: one row a tick, and a second file with its events.
+
+    RUN is a path, a name in the folder of recordings, or 'latest'. All digits of a number are kept.
+    """
+    from fishd.recording.export import export as write
+
+    if form is None:
+        raise click.UsageError("--csv or --parquet is needed")
+    print_paths(write(open_recording(run, folder), target, form, replace=force), as_json)
+
+
+@click.command()
+@click.argument("run")
+@click.option(
+    "--from", "begin", type=FiniteRange(min=0), default=0.0, help="Begin at this time [s]."
+)
+@click.option(
+    "--until", "end", type=FiniteRange(min=0), help="End at this time [s]; default: the end."
+)
+@click.option(
+    "--to",
+    "target",
+    type=click.Path(path_type=Path, file_okay=False, exists=True),
+    default=Path(),
+    help="Folder to write to; default: this one.",
+)
+@click.option("--png", "only", flag_value="png", help="Draw only the picture.")
+@click.option("--html", "only", flag_value="html", help="Draw only the interactive page.")
+@click.option("--force", is_flag=True, help="Replace existing files.")
+@folder_option
+@json_option
+def plot(
+    run: str,
+    begin: float,
+    end: float | None,
+    target: Path,
+    only: str | None,
+    force: bool,
+    folder: Path | None,
+    as_json: bool,
+) -> None:
+    """Draw forces, command, thrust, the controller's own quantities, and a phase portrait.
+
+    RUN is a path, a name in the folder of recordings, or 'latest'. NAME.png is a picture; NAME.html
+    is a page to zoom into, which needs no network.
+    """
+    from fishd.lab.run_figure import draw_run
+    from fishd.lab.run_traces import traces
+
+    recorded = open_recording(run, folder)
+    run_traces = traces(recorded, begin, math.inf if end is None else end)
+    forms = [only] if only else ["png", "html"]
+    paths = {form: target / f"{recorded.name}.{form}" for form in forms}
+    check_new_files(paths.values(), replace=force)
+    if "png" in paths:
+        draw_run(run_traces, paths["png"])
+    if "html" in paths:
+        from fishd.lab.run_page import write_page
+
+        write_page(run_traces, paths["html"])
+    print_paths(paths.values(), as_json)
+
+
+@click.command()
+@click.argument("file")
+@folder_option
+@json_option
+def recover(file: str, folder: Path | None, as_json: bool) -> None:
+    """Repair a recording that was cut off by a kill, a full disk or a power cut, or is damaged.
+
+    FILE is a path, a name in the folder of recordings, or 'latest'. NAME.mcap.part becomes
+    NAME.mcap; a file of another name stays unchanged, and NAME-recovered.mcap is written beside it.
+    """
+    from fishd.recording.recover import recover as finish
+
+    path = find_recording(file, folder)
+    damaged = open_run(path)
+    run = finish(path)
+    summary = run.summary
+    if as_json:
+        lost = damaged.damaged if damaged.is_damaged else None
+        print_json({"path": run.path, "damaged": lost, **asdict(summary)})
+        return
+    frames = f", {format_count(summary.frames, 'frame')}" if summary.frames else ""
+    loss = (
+        f"; {format_damage(damaged.damaged, damaged.damage_reason)}" if damaged.is_damaged else ""
+    )
+    echo(
+        f"{run.path}: {summary.duration:.1f} s, {format_count(summary.ticks, 'tick')}, "
+        f"{summary.lost} lost, {format_count(summary.events, 'event')}{frames}{loss}"
+    )
+
+
+@click.command()
+@click.argument("run")
+@click.option(
+    "--speed",
+    type=FiniteRange(0.01, 1000),
+    default=1.0,
+    show_default=True,
+    help="Factor by which it is faster than the recording.",
+)
+@click.option(
+    "--address",
+    default=DEFAULT_ADDRESS,
+    show_default=True,
+    metavar="ADDRESS",
+    help="Address at which ticks, events and statuses are published.",
+)
+@click.option(
+    "--control",
+    metavar="ADDRESS",
+    help="Control address, for 'fishctl watch'; default: that of fishd.",
+)
+@folder_option
+@json_option
+def replay(
+    run: str,
+    speed: float,
+    address: str,
+    control: str | None,
+    folder: Path | None,
+    as_json: bool,
+) -> None:
+    """Publish a recording as fishd would, so that `fishctl watch` and PlotJuggler show it.
+
+    RUN is a path, a name in the folder of recordings, or 'latest'. It ends with the recording, or
+    with Ctrl-C. A gap of more than 5 s is shortened.
+    """
+    from fishd.recording.replay import Replay
+
+    recorded = open_recording(run, folder)
+    with (
+        suppress(KeyboardInterrupt),
+        raise_on_first_signal(),
+        Replay(recorded, address, control or control_address()) as player,
+    ):
+        seconds = recorded.summary.duration / speed
+        if as_json:
+            addresses = {"telemetry": player.telemetry, "control": player.control}
+            print_json_line({"name": recorded.name, "seconds": seconds, **addresses})
+            player.play(speed)
+            return
+        echo(f"{recorded.name}: {seconds:.0f} s at {player.telemetry}; Ctrl-C ends it")
+        if recorded.frame_heads:
+            echo(f"its {format_count(len(recorded.frame_heads), 'frame')} of a camera are left out")
+        is_default = find_control_address() == player.control
+        endpoint = "" if is_default else f"--endpoint {shlex.quote(player.control)} "
+        echo(f"watch it with: fishctl {endpoint}watch")
+        player.play(speed)
