@@ -102,7 +102,7 @@ def row(result: Adapted) -> list[str]:
     verdict = result.verdict
     chosen = verdict.chosen
     bold = (f"**{gait}**" if gait == chosen else gait for gait in verdict.undecided)
-    claim = ["100, itself", "100"]
+    claim = ["100, the same gait", "100"]
     if chosen in verdict.others:
         value, low, high = map(percent, verdict.others[chosen])
         truth = percent(result.truth(chosen) / result.truth(SQUARE))
@@ -130,32 +130,32 @@ def summary(results: list[Adapted]) -> str:
     off = [abs(one.thrust - (one.true_thrust or 0.0)) for one in thrusts]
     total = [one.error if one.total_ci95 is None else one.total_ci95 for one in thrusts]
     rows = [
-        ["chosen gait, of the best square wave", *_middle_and_worst(shares, min)],
-        ["policy, of the best square wave", *_middle_and_worst(policies, min)],
+        ["chosen gait, % of the best square wave", *_middle_and_worst(shares, min)],
+        ["policy, % of the best square wave", *_middle_and_worst(policies, min)],
         ["policies that took part", _count(["policy" in r.contenders for r in results])],
         ["verdicts that name a winner", _count([r.verdict.decided for r in results])],
-        ["of these, winners that are truly the best", _count([r.includes_best for r in decided])],
-        ["verdicts whose gaits include the best one", _count([r.includes_best for r in results])],
-        ["chosen gait below the truly best one", *_middle_and_worst(lost, max)],
+        ["winners that are truly the best", _count([r.includes_best for r in decided])],
+        ["verdicts that include the best gait", _count([r.includes_best for r in results])],
+        ["loss of the chosen gait against the truly best", *_middle_and_worst(lost, max)],
         [
-            "interval of the chosen gait's relative thrust covers the truth",
+            "interval of the chosen gait's relative thrust contains the true value",
             _count([result.covers(result.verdict.chosen) for result in claims]),
         ],
         [
-            "the same, of every gait but the square wave",
+            "the same, all gaits except the square wave",
             _count([result.covers(gait) for result, gait in gaits]),
         ],
         [
-            "statistical interval of a thrust covers the truth",
+            "statistical interval of a thrust contains the true value",
             _count([a <= one.error for a, one in zip(off, thrusts, strict=True)]),
         ],
         [
-            "total interval of a thrust covers the truth",
+            "total interval of a thrust contains the true value",
             _count([a <= b for a, b in zip(off, total, strict=True)]),
         ],
         ["longest tank time", f"{max(result.tank_time for result in results):.0f} s"],
     ]
-    return table("what | measured | worst", [[*cells, ""][:3] for cells in rows])
+    return table("quantity | measured | worst", [[*cells, ""][:3] for cells in rows])
 
 
 def _count(values: list[bool]) -> str:
@@ -183,9 +183,9 @@ def measure(options: Namespace) -> Report:
     tasks = [(seed, options.steps, options.budget) for seed in seeds]
     results = run_cases(adapted, tasks, options.jobs)
     head = (
-        "fish | best square wave, mN | verdict | true thrust of the chosen gait, % of that | of "
-        "the square wave of the search, % of that | chosen gait over that square wave, % | its "
-        "truth, % | tank time, s"
+        "fish | best square wave, mN | verdict | true thrust of the chosen gait, % of the best | "
+        "of the square wave found, % of the best | chosen gait ÷ square wave found, measured, % | "
+        "the same, true, % | tank time, s"
     )
     sections = {"bench adapt": table(head, map(row, results))}
     sections["bench adapt summary"] = summary(results)

@@ -293,9 +293,9 @@ def report_measurements(
             ]
         )
     head = (
-        "length | what is wrong | error, rms | statistical, mean | calibration, mean | "
-        "total interval, mean | statistical holds the truth | total holds it | named / flagged | "
-        "plain mean, rms"
+        "length | kind of error | rms error | mean statistical interval | mean calibration "
+        "interval | mean total interval | statistical contains the true thrust | total contains it "
+        "| named / careful | rms error of the plain mean"
     )
     about = f"True thrust {1e3 * truth:.2f} mN, {options.runs} runs of each kind, seeds from"
     text = f"{about} {first_seed}.\n\n{table(head, rows)}"
@@ -487,8 +487,8 @@ def report_shown(options: Namespace) -> Report:
     for case, shown in zip(cases, results, strict=True):
         rows.setdefault(case.marker, {}).setdefault(case.name, []).append(shown)
     head = (
-        "swim | true thrust, mN | ticks whose interval holds it | worst run | half-width, mN: "
-        "median | largest | mean error, mN"
+        "swim | true thrust, mN | ticks whose interval contains it | the same, worst run | "
+        "median half-width, mN | largest half-width, mN | mean error, mN"
     )
     sections = {
         marker: table(head, [_row(name, runs) for name, runs in by_name.items()])

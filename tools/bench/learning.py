@@ -259,13 +259,12 @@ def summary(rows: Mapping[str, Row], trainings: Mapping[str, list[Trained]]) -> 
             "Steps until the best policy so far has that relative thrust, median [lowest – "
             "highest] of the seeds, and processor time for 1000 steps:",
             table(f" | {goals} | s", reached),
-            "Relative thrust (%) of the best policy that a seed has had until then, which is "
-            "exported:",
+            "Relative thrust (%) of the best policy of a seed so far, the one that `export` takes:",
             table(f" | seeds | {milestones}", best),
             "The best policies:",
             table(
-                " | relative thrust (%) | mean \\|φ_c\\|/Φ | frequency (Hz) | best on the grid "
-                "(Hz) | its relative thrust (%)",
+                "fish | relative thrust (%) | mean \\|φ_c\\|/Φ | frequency (Hz) | best whole-tick "
+                "wave (Hz) | its relative thrust (%)",
                 commands,
             ),
         )
@@ -311,7 +310,7 @@ def optimum(options: Namespace) -> Report:
             share = statistics.median(100.0 * end.relative_thrust for end in ends)
             cells.append(f"{spread([end.frequency for end in ends], 1.0, 2)} / {share:.1f}")
         lines.append(cells)
-    heads = " | ".join(("Φ (rad)", "best on the grid of ticks", *kinds))
+    heads = " | ".join(("Φ (rad)", "best whole-tick wave", *kinds))
     about = (
         f"Frequency (Hz), median [lowest – highest] of {few(options)} seeds, and relative thrust "
         f"(%), of the best policy of {LONG_STEPS} steps, `cnn` {PICTURE_STEPS}:"
@@ -340,7 +339,7 @@ def transfer(options: Namespace) -> Report:
         ]
         for row, runs in shares.items()
     ]
-    heads = f"what swims | worst of 16 fish | median of 16 fish | all ≥ {100 * NEARLY:.0f} %"
+    heads = f"controller | worst of 16 fish | median of 16 fish | all ≥ {100 * NEARLY:.0f} %"
     about = f"Relative thrust in %, of policies median [lowest – highest] of {options.seeds} seeds:"
     return Report({"bench learning transfer": f"{about}\n\n{table(heads, lines)}"}, shares)
 
