@@ -296,8 +296,8 @@ def assemble(
     if line := _calibration_warning(config, servo):
         log.warning("%s", line)
 
-    def degraded() -> tuple[str, ...]:
-        lines = tuple(servo.driver.degraded)
+    def limitations() -> tuple[str, ...]:
+        lines = tuple(servo.driver.limitations)
         if sensor.calibration.is_unset:
             force = f"the force is not calibrated, and shown in {sensor.unit}"
             lines += (f"{force}: fishctl calibrate force",)
@@ -316,7 +316,7 @@ def assemble(
         panel=panel,
         tared=sensor,
         calibrated=CalibratedParts(sensor, servo, write_recipes),
-        degraded=degraded,
+        limitations=limitations,
         counters=lambda: {
             **sensor.counters(),
             **read_counters(servo.driver),

@@ -349,4 +349,4 @@ class CameraClient:
             raise CameraLost(
                 f"the camera at {self.endpoint} does not tell its clock yet: it is {state.state}"
             )
-        return Reading(state.clock, state.boot)
+        return Reading(state.clock, state.boot_id)

@@ -57,7 +57,7 @@ def clock_reader(fish: Fish) -> Ask:
 
     def ask(timeout: float | None) -> Reading:
         status = fish.status(timeout)
-        return Reading(status.clock, status.boot)
+        return Reading(status.clock, status.boot_id)
 
     return ask
 

@@ -16,7 +16,7 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
 from fishd.core.schema import note, unit
 
-VERSION = 1
+VERSION = 2
 FRAME, VIEW, STATE, UNTIL = b"frame", b"view", b"state", b"until"
 """Topics of the messages."""
 MAX_FRAME_SIZE_PX = 256
@@ -28,7 +28,7 @@ negative, because `delay` of a camera's settings moves the time of a frame [s]."
 _TIME_RANGE = {"ge": -1e9, "le": 1e9}
 """Range of valid times, 30 years, in which a clock has a good resolution [s]."""
 
-_Version = Annotated[int, note("Version of these messages: 1.")]
+_Version = Annotated[int, note("Version of these messages: 2.")]
 _Session = Annotated[
     str,
     note(
@@ -66,7 +66,7 @@ class FrameHeader(Struct, frozen=True, kw_only=True, gc=False):
         unit("s", "Time at which the frame became available, on the same clock.", **_TIME_RANGE),
     ]
     exposure: Annotated[float | None, unit("s", "Exposure time; null where it is unknown.")] = None
-    dropped: Annotated[
+    dropped_frames: Annotated[
         int, note("Number of frames that were taken but not delivered, since start.", ge=0)
     ] = 0
     virtual: Annotated[bool, note("True where the clock is the virtual one of a lockstep.")] = False
@@ -137,7 +137,7 @@ class CameraState(Struct, frozen=True, kw_only=True):
     since: Annotated[float, unit("s", "Start of the condition, Unix time.")]
     problem: Annotated[str, note("Reason in one line; empty while frames arrive.")] = ""
     remedy: Annotated[str, note("Instruction that solves the problem.")] = ""
-    degraded: Annotated[
+    limitations: Annotated[
         tuple[str, ...], note("Reasons why the times or pictures are worse than possible.")
     ] = ()
     rate: Annotated[float, unit("1/s", "Recent frames per second; 0.0 where none arrive.")] = 0.0
@@ -147,10 +147,12 @@ class CameraState(Struct, frozen=True, kw_only=True):
     ] = None
     exposure: Annotated[float | None, unit("s", "Exposure time; null: unknown.")] = None
     seq: Annotated[int, note("Number of the latest frame; 0: none yet.")] = 0
-    dropped: Annotated[
+    dropped_frames: Annotated[
         int, note("Number of frames that were taken but not delivered, since start.")
     ] = 0
-    broken: Annotated[int, note("Number of frames that could not be decoded, since start.")] = 0
+    broken_frames: Annotated[
+        int, note("Number of frames that could not be decoded, since start.")
+    ] = 0
     width: Annotated[int, unit("px", "Width of frames.")]
     height: Annotated[int, unit("px", "Height of frames.")]
     picture_width: Annotated[int, unit("px", "Width of the camera's whole pictures; 0: none yet.")]
@@ -164,7 +166,7 @@ class CameraState(Struct, frozen=True, kw_only=True):
         Annotated[float, Meta(**_TIME_RANGE)] | None,
         unit("s", "Current time of the camera's clock; null where virtual, or unknown yet."),
     ] = None
-    boot: Annotated[
+    boot_id: Annotated[
         str, note("Identifier of the boot of the machine from which that clock counts.")
     ] = ""
     frames: Annotated[str, note("Address of the PUB socket.")]

@@ -47,7 +47,7 @@ class Monitor:
         self.condition: Condition = "starting"
         self.since = time.time()
         self.timeline = Timeline(False, "", None)
-        self.degraded: tuple[str, ...] = ()
+        self.limitations: tuple[str, ...] = ()
         self.session = ""
         self.seq = self.dropped = self.broken = 0
         self.until: float | None = None
@@ -60,9 +60,9 @@ class Monitor:
         remedy = f"; {self._trouble.remedy}" if self._trouble.remedy else ""
         return f"{self.condition}: {self._trouble}{remedy}"
 
-    def begin(self, session: str, timeline: Timeline, degraded: tuple[str, ...]) -> None:
+    def begin(self, session: str, timeline: Timeline, limitations: tuple[str, ...]) -> None:
         """Start a new session."""
-        self.session, self.timeline, self.degraded = session, timeline, degraded
+        self.session, self.timeline, self.limitations = session, timeline, limitations
         self.seq, self.until = 0, None
         self._recent.clear()
 
@@ -108,13 +108,13 @@ class Monitor:
             since=self.since,
             problem=str(self._trouble) if self._trouble else "",
             remedy=self._trouble.remedy if self._trouble else "",
-            degraded=self.degraded,
+            limitations=self.limitations,
             rate=self._rate(),
             latency=self._latency(),
             exposure=self._exposure,
             seq=self.seq,
-            dropped=self.dropped,
-            broken=self.broken,
+            dropped_frames=self.dropped,
+            broken_frames=self.broken,
             width=size,
             height=size,
             picture_width=self._picture[1],
@@ -122,7 +122,7 @@ class Monitor:
             virtual=timeline.virtual,
             until=self.until,
             clock=timeline.now() if timeline.now else None,
-            boot=timeline.boot,
+            boot_id=timeline.boot,
             frames=self._frames,
         )
 

@@ -159,9 +159,9 @@ class Server:
 
     # The sink: called by the source in its thread.
 
-    def begin(self, timeline: Timeline, degraded: tuple[str, ...] = ()) -> None:
+    def begin(self, timeline: Timeline, limitations: tuple[str, ...] = ()) -> None:
         """Start a new session."""
-        self._enqueue(lambda: self._monitor.begin(self._new_session(), timeline, degraded))
+        self._enqueue(lambda: self._monitor.begin(self._new_session(), timeline, limitations))
 
     def put(self, shot: Shot) -> None:
         """Convert a shot to a frame, and queue it."""
@@ -222,7 +222,7 @@ class Server:
             time=shot.time,
             available=shot.available,
             exposure=shot.exposure,
-            dropped=monitor.dropped,
+            dropped_frames=monitor.dropped,
             virtual=monitor.timeline.virtual,
             width=pixels.shape[1],
             height=pixels.shape[0],

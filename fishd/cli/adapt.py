@@ -118,7 +118,7 @@ def adapt(
 def _chosen_gait(state: "State") -> "Contender":
     assert state.verdict
     return next(
-        contender for contender in state.contenders if contender.name == state.verdict.chosen
+        contender for contender in state.contenders if contender.name == state.verdict.chosen_gait
     )
 
 

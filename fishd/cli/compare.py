@@ -331,13 +331,13 @@ def _make_table(standings: "list[Standing]", unit: str) -> "Table":
             standing.contestant,
             *cells,
             text.format_measured(
-                standing.thrust, _select_half_width(standing.error, standing.total_ci95)
+                standing.thrust, _select_half_width(standing.thrust_ci95, standing.total_ci95)
             ),
             *([] if simulated else _error_cells(standing)),
             *(_power_cells(standing) if metered else []),
             f"{standing.frequency:.3f}" if standing.frequency else "–",
             f"{standing.fullness:.3f}",
-            f"{standing.squareness:.3f}",
+            f"{standing.form_factor:.3f}",
         )
     return table
 
@@ -345,7 +345,7 @@ def _make_table(standings: "list[Standing]", unit: str) -> "Table":
 def _power_cells(standing: "Standing") -> list[str]:
     """Return the cells of the power and the thrust per watt."""
     half_width = _select_half_width(
-        standing.thrust_per_watt_error, standing.thrust_per_watt_total_ci95
+        standing.thrust_per_watt_ci95, standing.thrust_per_watt_total_ci95
     )
     return [
         f"{standing.power or 0.0:.3f}",
@@ -364,7 +364,7 @@ def _error_cells(standing: "Standing") -> list[str]:
     calibration = (
         "unknown" if calibration_ci95 is None else text.format_half_width(calibration_ci95)
     )
-    return [text.format_half_width(standing.error or 0.0), calibration]
+    return [text.format_half_width(standing.thrust_ci95 or 0.0), calibration]
 
 
 def _describe_best_square(standings: "list[Standing]") -> str | None:

@@ -112,7 +112,7 @@ def _change(endpoint: str | None, as_json: bool, change: "Callable[[client.Fish]
         print_json(state)
         return
     echo(format_state(state))
-    if holder := state.took_from:
+    if holder := state.previous_holder:
         previous = make_printable(holder)
         echo(
             f"fishctl: took the fish from {previous}, which had it for {holder.age:.0f} s", err=True

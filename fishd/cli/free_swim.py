@@ -229,7 +229,7 @@ def _report_rows(report: "SwimReport") -> list[tuple[str, str]]:
     resumed = f", started again at {report.resumed:.2f} s" if report.resumed is not None else ""
     return [
         ("controller", f"{format_controller(report.controller, report.parameters)}{resumed}"),
-        ("speed", f"{text.format_measured(report.speed, report.speed_error, 'm/s')}, {beats}"),
+        ("speed", f"{text.format_measured(report.speed, report.speed_ci95, 'm/s')}, {beats}"),
         *_trend_rows(report),
         ("frequency", f"{report.frequency:.3f} Hz" if report.frequency else "–"),
         ("heading", f"{report.heading:+.3f} rad"),

@@ -156,7 +156,7 @@ def _format_row(info: PolicyInfo) -> tuple[str, ...]:
     relative_thrust = provenance.get("relative_thrust")
     cells = (
         info.name,
-        info.sees or "–",
+        info.inputs or "–",
         f"{card['amplitude']:g}",
         f"{card['tick'] * 1e3:g} ms",
         provenance["on"],

@@ -82,11 +82,11 @@ def _measure(
                 experiment.write_struct("result.json", result)
             if (
                 isinstance(session, LiveSession)
-                and measured.thrust > measured.error
+                and measured.thrust > measured.thrust_ci95
                 and not measured.remark
             ):
                 session.fish.calibrate_thrust(
-                    measured.thrust / measured.power, measured.error / measured.power
+                    measured.thrust / measured.power, measured.thrust_ci95 / measured.power
                 )
     except KeyboardInterrupt:
         echo("fishctl: interrupted: the fish rests, nothing is measured", err=True)
@@ -111,7 +111,7 @@ def _format_result(measured: "ThrustMeasurement") -> str:
     command = format_controller(measured.controller, dict(measured.parameters))
     thrust = error_budget.format_with_budget(
         measured.thrust,
-        measured.error,
+        measured.thrust_ci95,
         measured.calibration_ci95,
         measured.total_ci95,
         measured.unit,
@@ -142,12 +142,12 @@ def _format_power(measured: "ThrustMeasurement") -> str:
     from fishd.lab.statistics import per_watt
 
     thrust_per_watt, error = per_watt(
-        measured.thrust, measured.error, measured.watts, measured.watts_error
+        measured.thrust, measured.thrust_ci95, measured.watts, measured.watts_ci95
     )
     if thrust_per_watt is None or error is None or not measured.watts:
         return ""
     _, total_ci95 = per_watt(
-        measured.thrust, measured.total_ci95, measured.watts, measured.watts_error
+        measured.thrust, measured.total_ci95, measured.watts, measured.watts_ci95
     )
     calibration_ci95 = (
         None if measured.calibration_ci95 is None else measured.calibration_ci95 / measured.watts

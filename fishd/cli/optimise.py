@@ -235,7 +235,7 @@ class _Optimisation:
 
         search, session, experiment = self.search, self.session, self.experiment
         last = self.trials[-1] if self.trials else None
-        before = session.used = last.passed if last else 0.0
+        before = session.used = last.tank_time if last else 0.0
         if last:
             count = format_count(len(self.trials), "candidate")
             echo(f"{experiment.path}: {count} measured already", err=self.as_json)
@@ -258,10 +258,10 @@ class _Optimisation:
                 proposal = search.propose()
                 best = proposal if search.is_warm else None
                 line = _format_trial(search.trials, trial, best, session.unit, self.units)
-                show.done(line, trial.passed)
+                show.done(line, trial.tank_time)
                 if self._is_done(proposal):
                     break
-        passed = (self.trials[-1].passed if self.trials else 0.0) - before
+        passed = (self.trials[-1].tank_time if self.trials else 0.0) - before
         return max(0.0, time.monotonic() - begin - passed)
 
     def _judge(self, proposal: "Proposal", waited: float) -> "Optimum":
@@ -273,7 +273,7 @@ class _Optimisation:
             self.session.calibration,
         )  # fmt: skip
         if self.fish.on == "live":
-            return replace(optimum, thinking=waited)
+            return replace(optimum, choice_time=waited)
         parameters = {**self.fixed, **proposal.parameters}
         truth = simulate(self.fish.load(), self.controller, parameters)
         warn_of_fin(truth.fin_amplitude)
@@ -291,7 +291,7 @@ class _Optimisation:
         if not isinstance(self.search, LeastPower):
             return self.search
         return self.search.with_observations(
-            (t.parameters, t.power, t.power_error) for t in self.trials
+            (t.parameters, t.power, t.power_ci95) for t in self.trials
         )
 
 
@@ -347,30 +347,30 @@ class Optimum(Struct, frozen=True):
 
     controller: str
     parameters: dict[str, float]
-    low: dict[str, float]
+    parameters_ci95_low: dict[str, float]
     """Lower end of the 95 % interval of each parameter."""
-    high: dict[str, float]
+    parameters_ci95_high: dict[str, float]
     """Upper end of that interval."""
     thrust: float
     """Predicted thrust [N]."""
-    error: float
+    thrust_ci95: float
     """Half-width of the 95 % confidence interval of `thrust` [N]."""
     improvement: float
     """Expected improvement by another trial, as a fraction of the objective."""
     trials: int
-    ticks_swum: int
-    seconds: float
+    swim_ticks: int
+    tank_time: float
     """Tank time, rests included [s]."""
     objective: str = "thrust"
     target: float | None = None
     """Thrust to reach [N]; null without --at-least."""
     power: float | None = None
     """Electrical power of the servo [W]; null if unknown."""
-    power_error: float | None = None
+    power_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `power` [W]."""
     thrust_per_watt: float | None = None
     """Thrust per watt of the servo [N/W]."""
-    thrust_per_watt_error: float | None = None
+    thrust_per_watt_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `thrust_per_watt` [N/W]."""
     calibration_ci95: float | None = None
     """Half-width of the 95 % interval of the thrust due to the calibration [N].
@@ -378,14 +378,14 @@ class Optimum(Struct, frozen=True):
     null if the uncertainty of the calibration is unknown.
     """
     total_ci95: float | None = None
-    """Half-width of the 95 % interval by `error` and `calibration_ci95` together [N]."""
+    """Half-width of the 95 % interval by `thrust_ci95` and `calibration_ci95` together [N]."""
     thrust_per_watt_calibration_ci95: float | None = None
     """Half-width of the 95 % interval of `thrust_per_watt` due to the calibration [N/W]."""
     thrust_per_watt_total_ci95: float | None = None
     """Half-width of the whole 95 % interval of `thrust_per_watt` [N/W]."""
     rotation: float = 0.0
     """Remaining rotation of the sensor's axes after calibration; 0 if none is visible [rad]."""
-    thinking: float | None = None
+    choice_time: float | None = None
     """Additional time that a real fish waited for the choice of candidates, this run [s]."""
     true_thrust: float | None = None
     """True thrust of a simulated fish at the best parameters [N]."""
@@ -403,7 +403,7 @@ def _format_trial(
     best: the best candidate, or None while too little was measured
     unit: unit of the force; units: units of the parameters
     """
-    thrust = text.format_measured(trial.thrust, trial.error, unit)
+    thrust = text.format_measured(trial.thrust, trial.thrust_ci95, unit)
     measured = f"{number}: {_format_parameters(trial.parameters, units)}: {thrust}"
     if math.isfinite(trial.power):
         measured += f" for {format_power(trial.power)}"
@@ -430,45 +430,45 @@ def _make_optimum(
     from fishd.lab.statistics import per_watt
 
     last_trial = trials[-1]
-    thrusts = [(trial.parameters, trial.thrust, trial.error) for trial in trials]
+    thrusts = [(trial.parameters, trial.thrust, trial.thrust_ci95) for trial in trials]
     thrust, error = search.with_observations(thrusts).predict(proposal.parameters)
-    power = power_error = None
+    power = power_ci95 = None
     if all(math.isfinite(trial.power) for trial in trials):
-        powers = [(trial.parameters, trial.power, trial.power_error) for trial in trials]
-        power, power_error = search.with_observations(powers).predict(proposal.parameters)
-    per_watt_value, per_watt_error = per_watt(thrust, error, power, power_error)
+        powers = [(trial.parameters, trial.power, trial.power_ci95) for trial in trials]
+        power, power_ci95 = search.with_observations(powers).predict(proposal.parameters)
+    per_watt_value, per_watt_ci95 = per_watt(thrust, error, power, power_ci95)
     if aim.objective == "thrust-per-watt" and aim.target is None:
-        per_watt_value, per_watt_error = proposal.value, proposal.error
+        per_watt_value, per_watt_ci95 = proposal.value, proposal.value_ci95
     rotations = [trial.rotation for trial in trials if trial.rotation]
     rotation = sum(rotations) / len(rotations) if rotations else 0.0
     error_parts = budget(calibration, thrust, error, rotation=rotation)
     per_watt_parts = (
         None
         if per_watt_value is None
-        else budget(calibration, per_watt_value, per_watt_error, rotation=rotation)
+        else budget(calibration, per_watt_value, per_watt_ci95, rotation=rotation)
     )
     return Optimum(
         controller=name,
         parameters=proposal.parameters,
-        low=proposal.low,
-        high=proposal.high,
+        parameters_ci95_low=proposal.parameters_ci95_low,
+        parameters_ci95_high=proposal.parameters_ci95_high,
         thrust=thrust,
-        error=error,
+        thrust_ci95=error,
         improvement=proposal.improvement,
         trials=len(trials),
         objective=aim.objective if aim.target is None else "least-power",
         target=aim.target,
         power=power,
-        power_error=power_error,
+        power_ci95=power_ci95,
         thrust_per_watt=per_watt_value,
-        thrust_per_watt_error=per_watt_error,
+        thrust_per_watt_ci95=per_watt_ci95,
         calibration_ci95=error_parts.calibration_ci95,
         total_ci95=error_parts.total_ci95,
         rotation=rotation,
         thrust_per_watt_calibration_ci95=per_watt_parts and per_watt_parts.calibration_ci95,
         thrust_per_watt_total_ci95=per_watt_parts and per_watt_parts.total_ci95,
-        ticks_swum=last_trial.swum,
-        seconds=last_trial.passed,
+        swim_ticks=last_trial.swim_ticks,
+        tank_time=last_trial.tank_time,
     )
 
 
@@ -478,22 +478,24 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
 
     for name, value in optimum.parameters.items():
         symbol = "" if units[name] in ("", "1") else f" {units[name]}"
-        interval = f"[{optimum.low[name]:.4g}, {optimum.high[name]:.4g}]"
+        interval = (
+            f"[{optimum.parameters_ci95_low[name]:.4g}, {optimum.parameters_ci95_high[name]:.4g}]"
+        )
         echo(f"best {name} of {optimum.controller}: {value:.4g}{symbol} {interval}")
     thrust = error_budget.format_with_budget(
-        optimum.thrust, optimum.error, optimum.calibration_ci95, optimum.total_ci95, unit
+        optimum.thrust, optimum.thrust_ci95, optimum.calibration_ci95, optimum.total_ci95, unit
     )
     echo(f"thrust there: {thrust}")
-    if optimum.power is not None and optimum.power_error is not None:
+    if optimum.power is not None and optimum.power_ci95 is not None:
         per_watt_text = error_budget.format_with_budget(
             optimum.thrust_per_watt or 0.0,
-            optimum.thrust_per_watt_error or 0.0,
+            optimum.thrust_per_watt_ci95 or 0.0,
             optimum.thrust_per_watt_calibration_ci95,
             optimum.thrust_per_watt_total_ci95,
             f"{unit} per W",
         )
         echo(
-            f"power there: {optimum.power * 1e3:.0f} ± {optimum.power_error * 1e3:.0f} mW, "
+            f"power there: {optimum.power * 1e3:.0f} ± {optimum.power_ci95 * 1e3:.0f} mW, "
             f"{per_watt_text}"
         )
     unknown = error_budget.unknown_calibration(optimum.calibration_ci95, unit)
@@ -512,9 +514,11 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
             f"{optimum.relative_thrust:.1%} of the best square wave"
         )
     waiting = (
-        "" if optimum.thinking is None else f"; {optimum.thinking:.0f} s of waiting for candidates"
+        ""
+        if optimum.choice_time is None
+        else f"; {optimum.choice_time:.0f} s of waiting for candidates"
     )
     echo(
-        f"{format_count(optimum.trials, 'candidate')}, {optimum.ticks_swum} ticks of swimming, "
-        f"{optimum.seconds:.0f} s including rests{waiting}"
+        f"{format_count(optimum.trials, 'candidate')}, {optimum.swim_ticks} ticks of swimming, "
+        f"{optimum.tank_time:.0f} s including rests{waiting}"
     )

@@ -137,7 +137,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
         (
             "command",
             f"{report.fullness:.1%} of ±{report.amplitude:g} rad on average, "
-            f"squareness {report.squareness:.3f}",
+            f"form factor {report.form_factor:.3f}",
         ),
         (
             "relative thrust",

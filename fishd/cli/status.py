@@ -51,11 +51,11 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         ]
     if holder := status.lease:
         mode.append(("held by", f"{holder}, for {holder.age:.0f} s"))
-    if expired := status.lease_expired:
+    if expired := status.lease_expiry:
         mode.append(("rests, as", f"{expired.message} ({_REMEDIES_PAGE}, {expired.code})"))
     uptime = datetime.timedelta(seconds=int(status.uptime))
-    errors = {name: count for name, count in status.counters.items() if count}
-    missed = f"slots missed: {status.missed}, overruns: {status.overruns}; see --timing"
+    errors = {name: count for name, count in status.recovered_errors.items() if count}
+    missed = f"slots missed: {status.missed_slots}, overruns: {status.overruns}; see --timing"
     return [
         ("fish", f"{status.name}, {status.robot}"),
         *mode,
@@ -67,9 +67,9 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         *_criterion_rows(status),
         *([("shows", shown)] if (shown := _format_shown(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
-        *(("degraded", line) for line in status.degraded),
-        *([("survived", format_values(errors, {}))] if errors else []),
-        *([("late", missed)] if status.missed or status.overruns else []),
+        *(("limitation", line) for line in status.limitations),
+        *([("recovered errors", format_values(errors, {}))] if errors else []),
+        *([("late", missed)] if status.missed_slots or status.overruns else []),
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),
     ]
@@ -88,7 +88,7 @@ def _thrust_rows(status: Status) -> list[tuple[str, str]]:
     if status.speed is not None:
         return [("speed", f"{status.speed * 1e3:.1f} mm/s at {status.frequency:.2f} Hz")]
     rows = [("thrust", f"{format_thrust(status)} at {status.frequency:.2f} Hz")]
-    if status.thrust_error is None and not status.sensor_lost:
+    if status.thrust_ci95 is None and not status.sensor_lost:
         rows.append(("", _ZERO_UNKNOWN_NOTE))
     if status.power is not None:
         rows.append(("power", f"{format_power(status.power)} into the servo, mean of 2 s"))
@@ -103,9 +103,9 @@ def _timing_rows(status: Status) -> list[tuple[str, str]]:
         return [loop, ("", "in slow motion no tick is late")]
     return [
         loop,
-        ("", f"slots missed: {status.missed}, overruns: {status.overruns}"),
-        ("late", _format_percentiles(timing.lateness)),
-        ("busy", _format_percentiles(timing.busy)),
+        ("", f"slots missed: {status.missed_slots}, overruns: {status.overruns}"),
+        ("lateness", _format_percentiles(timing.lateness)),
+        ("duration", _format_percentiles(timing.duration)),
         *((f"  {phase}", _format_percentiles(times)) for phase, times in timing.phases.items()),
     ]
 
@@ -125,16 +125,16 @@ def _format_angle(status: Status) -> str:
 def _format_range(status: Status) -> str:
     """Return the angles that the tail can be sent to."""
     limit = status.amplitude_limit
-    if (status.lowest, status.highest) == (-limit, limit):
+    if (status.lowest_angle, status.highest_angle) == (-limit, limit):
         return f"within ±{limit:g} rad"
     return (
-        f"within {status.lowest:+.4g} to {status.highest:+.4g} rad, less than ±{limit:g} rad of "
-        "amplitude_limit"
+        f"within {status.lowest_angle:+.4g} to {status.highest_angle:+.4g} rad, less than "
+        f"±{limit:g} rad of amplitude_limit"
     )
 
 
 def _format_percentiles(times: Percentiles) -> str:
     return (
         f"p50 {times.p50:.0f} µs, p99 {times.p99:.0f} µs, "
-        f"worst {times.worst:.0f} µs in tick {times.worst_seq}"
+        f"max {times.max:.0f} µs in tick {times.max_seq}"
     )

@@ -259,7 +259,7 @@ class _Sweep:
             print_json([curves.best_to_builtins(best, quantity) for _, best in bests])
         else:
             for curve, best in bests:
-                unit = self.units.get(best.over, "")
+                unit = self.units.get(best.x_name, "")
                 echo(f"{curve.label}: {_format_best(best, unit, quantity.unit)}")
                 if best.whole_ticks:
                     description = _format_whole_ticks(best.whole_ticks, quantity.unit)
@@ -282,36 +282,36 @@ class _Sweep:
         if ending.is_interrupted:
             done = sum(folder.key(point) in folder.results for point in points)
             return ending.interrupted(f"{done} of {format_count(len(points), 'point')} are kept")
-        return 1 if any(folder.results[folder.key(point)].trouble for point in points) else 0
+        return 1 if any(folder.results[folder.key(point)].failure for point in points) else 0
 
 
 def _format_result(result: "PointResult", quantity: "Quantity") -> str:
     if result.value is None:
-        return f"no {quantity.name}: {result.trouble}"
+        return f"no {quantity.name}: {result.failure}"
     beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""
-    steady = "" if getattr(result, "settled", 0.0) is not None else ", not yet steady"
-    return f"{text.format_measured(result.value, result.error, quantity.unit)}{beats}{steady}"
+    steady = "" if getattr(result, "settled_time", 0.0) is not None else ", not yet steady"
+    return f"{text.format_measured(result.value, result.value_ci95, quantity.unit)}{beats}{steady}"
 
 
 def _format_best(best: "Best", unit: str, unit_of_value: str) -> str:
     symbol = "" if unit in ("", "1") else f" {unit}"
-    value = text.format_measured(best.value, best.error, unit_of_value)
+    value = text.format_measured(best.value, best.value_ci95, unit_of_value)
     if best.x is None:
         return value
     if best.at_edge:
         return (
-            f"best measured at {best.over} {best.x:g}{symbol}, {value}: at the edge of the grid, "
+            f"best measured at {best.x_name} {best.x:g}{symbol}, {value}: at the edge of the grid, "
             "so the best may lie beyond it"
         )
-    if best.x_low is None or best.x_high is None:
-        return f"best measured at {best.over} {best.x:.4g}{symbol}: {value}"
-    interval = f"[{best.x_low:.4g}, {best.x_high:.4g}]"
-    return f"best {best.over} {best.x:.4g}{symbol} {interval}: {value}"
+    if best.x_ci95_low is None or best.x_ci95_high is None:
+        return f"best measured at {best.x_name} {best.x:.4g}{symbol}: {value}"
+    interval = f"[{best.x_ci95_low:.4g}, {best.x_ci95_high:.4g}]"
+    return f"best {best.x_name} {best.x:.4g}{symbol} {interval}: {value}"
 
 
 def _format_whole_ticks(whole_ticks: "WholeTicks", force_unit: str) -> str:
-    thrust = text.format_measured(whole_ticks.thrust, whole_ticks.error, force_unit)
+    thrust = text.format_measured(whole_ticks.thrust, whole_ticks.thrust_ci95, force_unit)
     best = f"best measured at {whole_ticks.frequency:.4g} Hz: {thrust}"
-    if whole_ticks.nearer is None:
+    if whole_ticks.nearest_frequency is None:
         return best
-    return f"{best}; {whole_ticks.nearer:.6g} Hz is nearer the best, and not in the grid"
+    return f"{best}; {whole_ticks.nearest_frequency:.6g} Hz is nearer the best, and not in the grid"

@@ -82,7 +82,7 @@ class View:
         width, height = options.max_width, options.height or console.height
         header = [self._title_line()]
         reason, fallback = self.status.reason, self.status.fallback
-        if cause := reason or fallback or self.status.lease_expired:
+        if cause := reason or fallback or self.status.lease_expiry:
             message = text.line(
                 f"{'took over: ' if cause is fallback else ''}{cause.code}: {cause.message}"
             )
@@ -124,7 +124,7 @@ class View:
         current = replace(
             self.status,
             thrust=tick.thrust,
-            thrust_error=None if tick.thrust_error is UNSET else tick.thrust_error,
+            thrust_ci95=None if tick.thrust_ci95 is UNSET else tick.thrust_ci95,
         )
         speed, power = tick.speed, self.status.power
         figures = {
@@ -146,8 +146,8 @@ class View:
         """Return lateness, busy time and missed slots; not shown in slow motion."""
         return {
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
-            "busy": f"{max(tick.busy_us for tick in self._ticks):.0f} µs",
-            "missed": f"{self._ticks[-1].missed}",
+            "busy": f"{max(tick.busy_time_us for tick in self._ticks):.0f} µs",
+            "missed": f"{self._ticks[-1].missed_slots}",
         }
 
     def _quantity_lines(self) -> list[Text]:

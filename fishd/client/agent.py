@@ -161,7 +161,7 @@ class Agent:
             self.lost = 0
         elif self.latest and message.seq == self.latest.seq:
             return True  # sent again after a pause
-        self.lost += message.lost
+        self.lost += message.lost_ticks
         self._peer, self.latest, self.active = peer, message, True
         return True
 

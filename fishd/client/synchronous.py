@@ -228,12 +228,12 @@ class Fish(Connection):
         """Return the fish, which fades to neutral."""
         return self._call(State, "end-lease", lease=lease)
 
-    def calibrate_thrust(self, factor: float, error: float) -> State:
+    def calibrate_thrust(self, factor: float, factor_ci95: float) -> State:
         """Set the ratio of the displayed thrust to the mean square of `fin_velocity` [N].
 
-        error: half-width of the 95 % confidence interval of `factor` [N]
+        factor_ci95: half-width of the 95 % confidence interval of `factor` [N]
         """
-        return self._call(State, "calibrate-thrust", factor=factor, error=error)
+        return self._call(State, "calibrate-thrust", factor=factor, factor_ci95=factor_ci95)
 
     def ticks(self) -> Iterator[Tick]:
         """Return an iterator of all ticks from now on; it raises `NoDaemon` after a silence."""

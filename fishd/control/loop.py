@@ -116,7 +116,7 @@ class ControlLoop:
         While the zero of the force is not known, it is the measured thrust, without a half-width.
         """
         if self.thrust.thrust is not None:
-            return self.thrust.thrust, self.thrust.error
+            return self.thrust.thrust, self.thrust.ci95
         return (self.observation.thrust if self.observation else 0.0), None
 
     @property
@@ -173,7 +173,7 @@ class ControlLoop:
         marks = (started, read, estimated, updated, written, self._now())
         late = self.statistics.add(self.seq, slot.now - slot.deadline, slot.missed, marks)
         if late:
-            self.reporter.event("overrun", late, "warning", seq=self.seq, missed=slot.missed)
+            self.reporter.event("overrun", late, "warning", seq=self.seq, missed_slots=slot.missed)
             self.supervisor.note_overrun(self.seq)
         if self._notify:
             self._notify(started)
@@ -365,9 +365,9 @@ class ControlLoop:
             self.thrust.forget()
             known = None
         factor, ci95 = known or (None, None)
-        if factor == observation.thrust_factor and ci95 == observation.thrust_factor_error:
+        if factor == observation.thrust_factor and ci95 == observation.thrust_factor_ci95:
             return observation
-        return replace(observation, thrust_factor=factor, thrust_factor_error=ci95)
+        return replace(observation, thrust_factor=factor, thrust_factor_ci95=ci95)
 
     def _watch_sign(self, observation: Observation, fy: float, suspect: bool) -> None:
         """Check the sign of F_y when the tail starts to move, and report a reversed one.
@@ -480,7 +480,7 @@ class ControlLoop:
         extremes = measurement.extremes
         swims = self.supervisor.mode is Mode.RUNNING
         factor = observation.thrust_factor if swims else None
-        factor_ci95 = observation.thrust_factor_error if swims else None
+        factor_ci95 = observation.thrust_factor_ci95 if swims else None
         truth = self.robot.truth() if self.robot.truth else None
         course = truth.course if truth else None
         corrected = self.fy_corrected
@@ -496,17 +496,17 @@ class ControlLoop:
             phi_c=self.applied,
             servo_on=self.servo.on,
             thrust=thrust,
-            thrust_error=UNSET if thrust_ci95 is None else thrust_ci95,
+            thrust_ci95=UNSET if thrust_ci95 is None else thrust_ci95,
             frequency=observation.frequency,
             samples=measurement.samples,
             fx_min=extremes.fx_min if extremes else UNSET,
             fx_max=extremes.fx_max if extremes else UNSET,
             fy_min=extremes.fy_min if extremes else UNSET,
             fy_max=extremes.fy_max if extremes else UNSET,
-            age_ms=(slot.now - measurement.time) * 1e3,
+            sample_age_ms=(slot.now - measurement.time) * 1e3,
             lateness_us=(slot.now - slot.deadline) * 1e6,
-            busy_us=(now - turn.marks[0]) * 1e6,
-            missed=self.statistics.missed,
+            busy_time_us=(now - turn.marks[0]) * 1e6,
+            missed_slots=self.statistics.missed,
             alpha=truth.alpha if truth else UNSET,
             alpha_rate=truth.alpha_rate if truth else UNSET,
             phi=truth.phi if truth else UNSET,
@@ -517,7 +517,7 @@ class ControlLoop:
             speed=course.speed if course else UNSET,
             heading=course.heading if course else UNSET,
             thrust_factor=UNSET if factor is None else factor,
-            thrust_factor_error=UNSET if factor_ci95 is None else factor_ci95,
+            thrust_factor_ci95=UNSET if factor_ci95 is None else factor_ci95,
             power=UNSET if power is None else power,
             leak=UNSET if self.found_leak is None else self.found_leak,
             fy_corrected=True if corrected else UNSET,

@@ -48,8 +48,8 @@ class Histogram:
         return Percentiles(
             p50=self.quantile(0.50) * 1e6,
             p99=self.quantile(0.99) * 1e6,
-            worst=self._worst * 1e6,
-            worst_seq=self._worst_seq,
+            max=self._worst * 1e6,
+            max_seq=self._worst_seq,
         )
 
 
@@ -117,7 +117,7 @@ class Statistics:
         """Return the distributions since start."""
         return Timing(
             lateness=self._lateness.percentiles(),
-            busy=self._busy.percentiles(),
+            duration=self._busy.percentiles(),
             phases={
                 name: histogram.percentiles()
                 for name, histogram in zip(PHASES, self._phases, strict=True)

@@ -70,7 +70,7 @@ class Thrust(Controller[ThrustParameters]):
     held_thrust: float | None = quantity(
         "N", "Thrust of the latest beats, as used by the controller."
     )
-    held_error: float | None = quantity(
+    held_thrust_ci95: float | None = quantity(
         "N", "Half-width of the 95 % confidence interval of `held_thrust`."
     )
     saturated: float = quantity(
@@ -86,7 +86,7 @@ class Thrust(Controller[ThrustParameters]):
         """Number of half beats since it was far from the target."""
         self._largest = amplitude_of(parameters, limits)
         self.amplitude = START_AMPLITUDE_FRACTION * self._largest
-        self.held_thrust = self.held_error = None
+        self.held_thrust = self.held_thrust_ci95 = None
         self.saturated = 0.0
 
     @classmethod
@@ -127,7 +127,7 @@ class Thrust(Controller[ThrustParameters]):
     def _regulate(self) -> None:
         """Move the amplitude towards the target after a half beat."""
         gauge, target = self._gauge, self.parameters.target
-        self.held_thrust, self.held_error = gauge.thrust, gauge.error
+        self.held_thrust, self.held_thrust_ci95 = gauge.thrust, gauge.ci95
         if gauge.latest is None:
             return
         error = max(-MAX_ERROR, min(MAX_ERROR, math.log(target / max(gauge.latest, 1e-3 * target))))

@@ -64,7 +64,7 @@ class ThrustGauge:
         """Thrust of the latest beat; None while unknown [N]."""
         self.thrust: float | None = None
         """Thrust of the latest beats [N]."""
-        self.error: float | None = None
+        self.ci95: float | None = None
         """Half-width of the 95 % confidence interval of `thrust` [N]."""
         self._coefficient = coefficient
         self._side = 0.0
@@ -120,7 +120,7 @@ class ThrustGauge:
         factor, spread = estimate
         self.latest = factor * power
         self.thrust = factor * _power(list(self._halves)[len(self._halves) % HALF_BEATS_PER_BEAT :])
-        self.error = Z95 * spread * self.thrust
+        self.ci95 = Z95 * spread * self.thrust
 
     def _factor(self, observation: Observation) -> tuple[float, float] | None:
         """Return the factor and its relative standard deviation; None while unknown."""
@@ -142,9 +142,9 @@ class ThrustGauge:
         depends on the factor, so that an error by drift would reinforce itself. Therefore the value
         is kept.
         """
-        if observation.thrust_factor is None or observation.thrust_factor_error is None:
+        if observation.thrust_factor is None or observation.thrust_factor_ci95 is None:
             return None
-        variance = (observation.thrust_factor_error / observation.thrust_factor / Z95) ** 2
+        variance = (observation.thrust_factor_ci95 / observation.thrust_factor / Z95) ** 2
         if self._shown is None or self._awaited:
             self._shown = math.log(observation.thrust_factor), variance
             self._awaited -= 1

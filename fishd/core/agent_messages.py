@@ -13,7 +13,7 @@ from msgspec import Meta, Struct
 from fishd.core.decoding import decoder
 from fishd.core.signals import Observation
 
-VERSION = 1
+VERSION = 2
 MAX_MESSAGE = 65536
 """Maximum size of a message; ZeroMQ closes a connection that sends a longer one [bytes]."""
 
@@ -26,9 +26,9 @@ class Observed(Observation, frozen=True, tag="observation", tag_field="kind", kw
     """Name of one activation of the controller `remote`; each activation has a new one."""
     seq: int
     """Number of this observation in the session, from 1; ticks in a pause are not numbered."""
-    answered: int
+    answered_seq: int
     """Number of the latest observation whose action was applied; 0 for none."""
-    lost: int
+    lost_ticks: int
     """Ticks since the previous observation in which no action was applied."""
     tick: float
     """Period of the loop [s]."""

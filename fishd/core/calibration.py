@@ -53,10 +53,10 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """
     covariance_y: Covariance | None = None
     """Covariance of yx and yy; null if unknown."""
-    load_error: float | None = None
+    load_ci95: float | None = None
     """Half-width of the 95 % confidence interval of the error that all loads share, as a fraction
     of a load; part of both covariances, null if they are null."""
-    tared: str = ""
+    tare_date: str = ""
     """Date of the latest tare, which set x0 and y0, ISO 8601; empty if there was none."""
 
     def forces(self, vx: float, vy: float) -> tuple[float, float]:
@@ -101,7 +101,7 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return squares > determinant * (MAX_CONDITION_NUMBER + 1.0 / MAX_CONDITION_NUMBER)
 
 
-EXACT = ForceCalibration(covariance_x=(0.0, 0.0, 0.0), covariance_y=(0.0, 0.0, 0.0), load_error=0.0)
+EXACT = ForceCalibration(covariance_x=(0.0, 0.0, 0.0), covariance_y=(0.0, 0.0, 0.0), load_ci95=0.0)
 """Calibration of a simulated sensor: its gains are exact."""
 
 

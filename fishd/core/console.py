@@ -39,7 +39,7 @@ def status_line(status: "Status") -> str:
     return (
         f"{what:<16} {status.frequency:5.2f} Hz  {result}{power}  "
         f"late p50 {status.timing.lateness.p50:4.0f} p99 {status.timing.lateness.p99:4.0f} µs  "
-        f"missed {status.missed} of {status.seq + status.missed} ticks{servo}"
+        f"missed {status.missed_slots} of {status.seq + status.missed_slots} ticks{servo}"
     )
 
 
@@ -51,9 +51,9 @@ def format_thrust(status: "Status") -> str:
     unit = f"m{text.quoted(status.force_unit)}"
     if status.sensor_lost:
         return f"– {unit}"
-    if status.thrust_error is None:
+    if status.thrust_ci95 is None:
         return f"{1e3 * status.thrust:.2f} ± ? {unit}"
-    return text.format_measured(status.thrust, status.thrust_error, status.force_unit)
+    return text.format_measured(status.thrust, status.thrust_ci95, status.force_unit)
 
 
 def format_power(power: float) -> str:

@@ -17,7 +17,7 @@ from fishd.core.errors import Refused
 from fishd.core.schema import PRINTABLE, note, unit
 from fishd.core.signals import MODES, LeaseHolder, Reason
 
-VERSION = 1
+VERSION = 2
 MAX_MESSAGE = 16384
 """Maximum size of a message; longer ones are not received [bytes]."""
 
@@ -46,7 +46,7 @@ Line = Annotated[str, Meta(max_length=1000, pattern=PRINTABLE)]
 class Request(Struct, forbid_unknown_fields=True):
     """Request of a client."""
 
-    v: Annotated[int, note("Version of this protocol: 1.")]
+    v: Annotated[int, note("Version of this protocol: 2.")]
     op: Annotated[str, note("Name of the operation.", max_length=64)]
     id: Annotated[RequestId, note("Identifier that the reply repeats; optional.")] = None
     args: Annotated[
@@ -70,7 +70,7 @@ class Failure(Struct, frozen=True):
 class Reply(Struct, frozen=True):
     """Reply: `result` if `ok`, else `error`."""
 
-    v: Annotated[int, note("Version of this protocol: 1.")]
+    v: Annotated[int, note("Version of this protocol: 2.")]
     id: Annotated[RequestId, note("The id of the request; null if it cannot be read.")]
     ok: Annotated[bool, note("Whether the request was carried out.")]
     result: Annotated[msgspec.Raw | UnsetType, note("Result of the operation.")] = UNSET
@@ -85,7 +85,7 @@ class State(Struct, frozen=True):
     reason: Annotated[Reason | None, note("Reason of mode fault or estop; else null.")]
     controller: Annotated[str, note("The active controller.")]
     parameters: Annotated[dict[str, Any], note("All parameters of the controller.")]
-    took_from: Annotated[
+    previous_holder: Annotated[
         LeaseHolder | None,
         note("The experiment whose [lease](#leases) this request has ended; null if none."),
     ] = None
@@ -96,7 +96,7 @@ class Grant(Struct, frozen=True):
 
     lease: Annotated[str, note("Identifier of the lease for the requests of its holder.")]
     seconds: Annotated[float, unit("s", "Duration of the lease from each renewal on.")]
-    took_from: Annotated[
+    previous_holder: Annotated[
         LeaseHolder | None, note("The previous holder, if the fish was taken from one; else null.")
     ] = None
 
@@ -111,7 +111,7 @@ class PolicyInfo(Struct, frozen=True, kw_only=True):
     """Reason why the policy cannot be used, in one line; empty if it can."""
     card: dict[str, Any] | None
     """Metadata in the file, as JSON; None if it is not a policy file."""
-    sees: str = ""
+    inputs: str = ""
     """Inputs of the policy: `forces`, `pictures` or `forces, pictures`."""
 
 
@@ -178,7 +178,7 @@ class CalibrateThrust(Struct, frozen=True, forbid_unknown_fields=True):
     """Arguments of calibrate-thrust: thrust [N] over the mean square of `fin_velocity`."""
 
     factor: Annotated[float, Meta(ge=1e-9, le=1e9)]
-    error: Annotated[float, Meta(ge=1e-12, le=1e9)]
+    factor_ci95: Annotated[float, Meta(ge=1e-12, le=1e9)]
     """Half-width of the 95 % confidence interval of `factor` [N]."""
 
 
@@ -305,14 +305,19 @@ _decode_id: Callable[[bytes], OnlyId] = decoder(OnlyId)
 
 
 def decode_request(payload: bytes) -> Request:
-    """Decode a request; raise `Refused` with code `bad-request` or `version`."""
+    """Decode a request; raise `Refused` with code `bad-request` or `version`.
+
+    An emergency stop is the same in all versions, and accepted from a client of any.
+    """
     try:
         request = _decode_request(payload)
     except msgspec.DecodeError as error:
         raise Refused("bad-request", f"not a request: {error}") from None
-    if request.v != VERSION:
+    if request.v != VERSION and request.op != "estop":
         raise Refused(
-            "version", f"protocol version {request.v} is not supported; use version {VERSION}"
+            "version",
+            f"protocol version {request.v} is not supported, {VERSION} is needed: install the same "
+            "version of fishd for daemon and client",
         )
     return request
 

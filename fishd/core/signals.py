@@ -70,7 +70,7 @@ class Observation(Struct, frozen=True, gc=False):
     thrust_factor: float | None = None
     """Ratio of thrust to the mean square of `fin_velocity`, from rests or a measurement [N]; None
     while unknown."""
-    thrust_factor_error: float | None = None
+    thrust_factor_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `thrust_factor` [N]."""
     side_time: float = 0.0
     """Time since the instruction angle came to its side of neutral, with the sign of the angle; at
@@ -141,13 +141,13 @@ class Tick(Struct, frozen=True, gc=False):
         float, unit("Hz", "Tail-beat frequency, from reversals of `phi_c`; 0.0 without beats.")
     ]
     samples: Annotated[int, note("Pairs of force samples since the previous tick.")]
-    age_ms: Annotated[float, unit("ms", "Age of the newest force sample.")]
+    sample_age_ms: Annotated[float, unit("ms", "Age of the newest force sample.")]
     lateness_us: Annotated[float, unit("µs", "Delay of the start of the tick after its deadline.")]
-    busy_us: Annotated[
+    busy_time_us: Annotated[
         float, unit("µs", "Time from the start of the tick until the servo was driven.")
     ]
-    missed: Annotated[int, note("Number of slots skipped since start.")]
-    thrust_error: Annotated[
+    missed_slots: Annotated[int, note("Number of slots skipped since start.")]
+    thrust_ci95: Annotated[
         float | UnsetType,
         unit(
             "N",
@@ -197,7 +197,7 @@ class Tick(Struct, frozen=True, gc=False):
             "absent while unknown, and while no controller swims.",
         ),
     ] = UNSET
-    thrust_factor_error: Annotated[
+    thrust_factor_ci95: Annotated[
         float | UnsetType,
         unit("N", "Half-width of the 95 % confidence interval of `thrust_factor`."),
     ] = UNSET
@@ -267,7 +267,7 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "overrun",
         "warning",
         "a tick took longer than a period, or slots were skipped",
-        "`seq`, `missed` (skipped just before it)",
+        "`seq`, `missed_slots` (skipped just before it)",
     ),
     (
         "servo",
@@ -383,15 +383,15 @@ class Percentiles(Struct, frozen=True):
 
     p50: Annotated[float, unit("µs", "Median, at most 12 % too high.")]
     p99: Annotated[float, unit("µs", "99th percentile, at most 12 % too high.")]
-    worst: Annotated[float, unit("µs", "Maximum, exact.")]
-    worst_seq: Annotated[int, note("Number of the tick of `worst`.")]
+    max: Annotated[float, unit("µs", "Maximum, exact.")]
+    max_seq: Annotated[int, note("Number of the tick of `max`.")]
 
 
 class Timing(Struct, frozen=True):
     """Timing of the loop."""
 
     lateness: Annotated[Percentiles, note("Delay of the start of a tick after its deadline.")]
-    busy: Annotated[Percentiles, note("Duration of a whole tick, publishing included.")]
+    duration: Annotated[Percentiles, note("Duration of a whole tick, publishing included.")]
     phases: Annotated[
         dict[str, Percentiles],
         note(
@@ -429,18 +429,18 @@ class Status(Struct, frozen=True):
     frequency: Annotated[float, unit("Hz", "As in `tick`.")]
     tick: Annotated[float, unit("s", "Period of the loop.")]
     amplitude_limit: Annotated[float, unit("rad", "Limit Φ of the magnitude of any angle.")]
-    lowest: Annotated[
+    lowest_angle: Annotated[
         float, unit("rad", "Lowest angle that Φ, soft limits and pulse widths permit.")
     ]
-    highest: Annotated[float, unit("rad", "Highest angle that they permit.")]
+    highest_angle: Annotated[float, unit("rad", "Highest angle that they permit.")]
     seq: Annotated[int, note("Number of the latest tick.")]
-    missed: Annotated[int, note("Number of slots skipped since start.")]
+    missed_slots: Annotated[int, note("Number of slots skipped since start.")]
     overruns: Annotated[int, note("Number of ticks that took longer than a period, since start.")]
     timing: Annotated[Timing, note("Timing of the loop since start.")]
     robot: Annotated[str, note("Kind of robot: `simulated`, `pi`, `virtual-pi` or `swimmer`.")]
-    degraded: Annotated[tuple[str, ...], note("Limitations of this robot.")]
-    counters: Annotated[
-        dict[str, int], note("Numbers of disturbances that fishd survived since start, by name.")
+    limitations: Annotated[tuple[str, ...], note("Limitations of this robot.")]
+    recovered_errors: Annotated[
+        dict[str, int], note("Number of errors that fishd recovered from since start, by name.")
     ]
     realtime: Annotated[bool, note("True under real-time scheduling.")]
     telemetry: Annotated[str, note("Address of the telemetry socket.")]
@@ -465,7 +465,7 @@ class Status(Struct, frozen=True):
         str,
         note("Unit of forces and thrust: `N`; `V` or the unit of the driver before a calibration."),
     ] = "N"
-    thrust_error: Annotated[
+    thrust_ci95: Annotated[
         float | None,
         unit(
             "N",
@@ -485,7 +485,7 @@ class Status(Struct, frozen=True):
         float | None,
         unit("W", "Mean of `power` over the last 2 s; null if unknown."),
     ] = None
-    boot: Annotated[
+    boot_id: Annotated[
         str,
         note("Identifier of the boot of fishd's machine, from which its monotonic clock counts."),
     ] = ""
@@ -503,7 +503,7 @@ class Status(Struct, frozen=True):
         LeaseHolder | None,
         note("The experiment that drives the fish under a [lease](#leases); null without one."),
     ] = None
-    lease_expired: Annotated[
+    lease_expiry: Annotated[
         Reason | None,
         note("Reason why the fish rests after a lease that was not renewed; null otherwise."),
     ] = None

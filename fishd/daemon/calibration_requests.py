@@ -167,7 +167,9 @@ class CalibrationRequests:
                 )
             date = self._now().isoformat(timespec="seconds")
             return await self._adopt_force(
-                msgspec.structs.replace(before, x0=before.x0 - fx, y0=before.y0 - fy, tared=date)
+                msgspec.structs.replace(
+                    before, x0=before.x0 - fx, y0=before.y0 - fy, tare_date=date
+                )
             )
 
     async def _calibrate_force(self, request: CalibrateForce) -> Calibrations:

@@ -262,8 +262,10 @@ def _clock(config: Config) -> Clock:
 
 
 def _with_slow_motion(robot: Robot, slow: SlowMotion) -> Robot:
-    """Return the robot with a line about slow motion in its `degraded`."""
-    return dataclasses.replace(robot, degraded=lambda: (*robot.degraded(), slow.degraded()))
+    """Return the robot with a line about slow motion in its `limitations`."""
+    return dataclasses.replace(
+        robot, limitations=lambda: (*robot.limitations(), slow.limitations())
+    )
 
 
 async def swim(

@@ -117,19 +117,19 @@ class Operations:
             parameters=loop.active.parameters,
             servo_on=loop.servo.on,
             thrust=thrust,
-            thrust_error=error,
+            thrust_ci95=error,
             frequency=observation.frequency if observation else 0.0,
             tick=loop.limits.tick,
             amplitude_limit=loop.limits.amplitude,
-            lowest=loop.guard.lowest,
-            highest=loop.guard.highest,
+            lowest_angle=loop.guard.lowest,
+            highest_angle=loop.guard.highest,
             seq=loop.seq,
-            missed=loop.statistics.missed,
+            missed_slots=loop.statistics.missed,
             overruns=loop.statistics.overruns,
             timing=loop.statistics.timing(),
             robot=loop.robot.name,
-            degraded=self._degraded(),
-            counters={**loop.robot.counters(), **self._counters()},
+            limitations=self._limitations(),
+            recovered_errors={**loop.robot.counters(), **self._counters()},
             realtime=self._realtime,
             telemetry=self._telemetry,
             servo_lost=loop.servo.lost,
@@ -142,19 +142,19 @@ class Operations:
             quantities=loop.active.quantities,
             quantity_units=loop.active.quantity_units,
             clock=self._clock.monotonic(),
-            boot=self._boot,
+            boot_id=self._boot,
             speed=self._speed(),
             power=loop.power.mean,
             fy_reversed=loop.lateral_sign.reversed,
             leak=loop.found_leak,
             lease=loop.lease.holder,
-            lease_expired=loop.lease.expired,
+            lease_expiry=loop.lease.expired,
         )
 
-    def _degraded(self) -> tuple[str, ...]:
+    def _limitations(self) -> tuple[str, ...]:
         loop = self._loop
         return (
-            *loop.robot.degraded(),
+            *loop.robot.limitations(),
             *filter(None, [loop.power.trouble, loop.lateral_sign.complaint]),
         )
 
@@ -313,7 +313,7 @@ class Operations:
         return self._state()
 
     async def _calibrate_thrust(self, request: protocol.CalibrateThrust) -> State:
-        self._loop.thrust.calibrate(request.factor, request.error)
+        self._loop.thrust.calibrate(request.factor, request.factor_ci95)
         return self._state()
 
     def _dispose(self, controller: Controller[Any]) -> None:
@@ -325,7 +325,7 @@ class Operations:
         self._arrivals += 1
         return self._arrivals
 
-    def _state(self, took_from: LeaseHolder | None = None) -> State:
+    def _state(self, previous_holder: LeaseHolder | None = None) -> State:
         loop = self._loop
         return State(
             seq=loop.seq + 1,
@@ -333,7 +333,7 @@ class Operations:
             reason=loop.supervisor.reason,
             controller=loop.active.name,
             parameters=loop.active.parameters,
-            took_from=took_from,
+            previous_holder=previous_holder,
         )
 
 

@@ -70,7 +70,7 @@ class SlowMotion:
             return self._factor
         return (self._latest[-1] - self._latest[0]) / ((len(self._latest) - 1) * self._period)
 
-    def degraded(self) -> str:
+    def limitations(self) -> str:
         """Return the line about slow motion for the status."""
         line = f"slow motion: a second of the fish takes {self.pace:.3g} s"
         if self.pace > MAX_PACE_RATIO * self._factor:

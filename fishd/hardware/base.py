@@ -78,7 +78,7 @@ class Robot:
     """The force sensor, if it can be tared."""
     calibrated: "CalibratedParts | None" = None
     """Parts that can be calibrated; None for a simulated fish, whose forces can only be tared."""
-    degraded: Callable[[], tuple[str, ...]] = tuple
+    limitations: Callable[[], tuple[str, ...]] = tuple
     """Reasons why this robot is not as good as it could be now, a line each."""
     counters: Callable[[], dict[str, int]] = dict
     """Numbers of recovered errors since start, such as failed I2C transfers."""

@@ -104,7 +104,7 @@ def check(calibration: C) -> C:
     for key, value in msgspec.structs.asdict(calibration).items():
         if isinstance(value, float) and not math.isfinite(value):
             raise Problem((key,), f"{value} is not a finite number")
-        if key in ("date", "tared") and value and not _is_date(value):
+        if key in ("date", "tare_date") and value and not _is_date(value):
             raise Problem((key,), f"'{value}' is not a date: one in ISO 8601 is needed")
     if isinstance(calibration, ForceCalibration):
         if calibration.is_singular:
@@ -131,8 +131,8 @@ def _check_uncertainty(calibration: ForceCalibration) -> None:
                 f"{list(covariance)} is not a covariance: variance, covariance and variance of "
                 "two gains are needed",
             )
-    if calibration.load_error is not None and calibration.load_error < 0.0:
-        raise Problem(("load_error",), f"{calibration.load_error:g} is negative")
+    if calibration.load_ci95 is not None and calibration.load_ci95 < 0.0:
+        raise Problem(("load_ci95",), f"{calibration.load_ci95:g} is negative")
 
 
 def _is_dated(name: str) -> bool:
@@ -161,6 +161,10 @@ def _load(data: Any, kind: type[C]) -> C:
         raise Problem((), "the file is empty")
     if not isinstance(data, dict):
         raise Problem((), "a mapping of keys to values is needed")
+    if not set(data) <= set(kind.__struct_fields__):
+        from fishd.core.old_names import rename_keys  # seldom needed
+
+        data = rename_keys("calibration", data)
     missing = [key for key in _REQUIRED[kind] if key not in data]
     if missing:
         raise Problem((), f"{', '.join(missing)} missing: fishd fills in no default")

@@ -231,7 +231,7 @@ class LastResort(NamedTuple):
 class ServoDriver(Driver[V]):
     """Driver that sends pulses. `write`, `off` and `close` may be called from any thread."""
 
-    degraded: tuple[str, ...] = ()
+    limitations: tuple[str, ...] = ()
     """Reasons why its pulses are not as good as they could be, a line each."""
     countdown: float = math.inf
     """Time for which the servo continues without a write [s]; infinite without such a limit.

@@ -100,5 +100,5 @@ class CameraTap:
             seq=header.seq,
             session=header.session,
             exposure=header.exposure,
-            dropped=header.dropped,
+            dropped_frames=header.dropped_frames,
         )

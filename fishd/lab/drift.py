@@ -58,7 +58,7 @@ class Fit(NamedTuple):
 
     force: float
     """Force that swimming adds [N]."""
-    error: float
+    force_ci95: float
     """Half-width of the 95 % confidence interval of `force` [N]."""
     drift: Array
     """Force that each block would have without swimming [N]."""
@@ -81,7 +81,7 @@ def fit(blocks: Blocks) -> Fit:
     fits = [_fit(Blocks(*fit_of_part)) for fit_of_part in zip(*pieces, strict=True)]
     if parts == 1:
         return fits[0]
-    weights = np.array([fit_of_part.error**-2 for fit_of_part in fits])
+    weights = np.array([fit_of_part.force_ci95**-2 for fit_of_part in fits])
     return Fit(
         float(weights @ [fit_of_part.force for fit_of_part in fits] / weights.sum()),
         float(weights.sum() ** -0.5),

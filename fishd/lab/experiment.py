@@ -18,6 +18,7 @@ from fishd import __version__
 from fishd.core import files
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
+from fishd.core.old_names import rename_columns
 from fishd.core.process.lockfile import LockHeld, NotALock, locked
 from fishd.lab import tables
 from fishd.lab.tables import Table
@@ -92,11 +93,12 @@ class Experiment:
                 head, *rows = tables.read(path, MAX_TABLE_BYTES)
             except (FileProblem, ValueError) as problem:
                 raise ConfigError(f"{path}: {problem or 'it is empty'}; {_OTHER_FOLDER}") from None
+            head = rename_columns(self.header.kind, head)
             if head != expected:
                 raise ConfigError(
                     f"{path}: {_describe_difference(head, expected)}; {_OTHER_FOLDER}"
                 )
-            rows = [row for row in rows if len(row) == len(head)]
+            rows = [row for row in rows if len(row) == len(expected)]
             complete = tables.lines([head, *rows])
             if path.read_bytes() != complete.encode():
                 self.write(ROWS, complete)

@@ -66,7 +66,7 @@ class ThrustMeasurement(NamedTuple):
     parameters: Mapping[str, Any]
     thrust: float
     """Mean thrust while the fish swims [N]."""
-    error: float
+    thrust_ci95: float
     """Half-width of the 95 % confidence interval of `thrust`, statistical only [N]."""
     frequency: float
     """Frequency of the tail beat [Hz]; 0 where the tail does not beat."""
@@ -86,7 +86,7 @@ class ThrustMeasurement(NamedTuple):
     """Reason why the thrust may be wrong by more than its error; empty where there is none."""
     watts: float | None = None
     """Electrical power of the servo while the fish swims [W]; None where unknown."""
-    watts_error: float | None = None
+    watts_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `watts`, from the spread of beats [W]."""
     steps: Sequence["Step"] = ()
     """Differences between neighbouring beats."""
@@ -96,7 +96,7 @@ class ThrustMeasurement(NamedTuple):
     None where the uncertainty of the calibration is unknown.
     """
     total_ci95: float | None = None
-    """Half-width of the 95 % interval from `error` and `calibration_ci95` together [N]."""
+    """Half-width of the 95 % interval from `thrust_ci95` and `calibration_ci95` together [N]."""
     rotation: float = 0.0
     """Rotation of the sensor's axes that remains after calibration; 0 where none is seen [rad]."""
     lateral: float = 0.0
@@ -146,7 +146,7 @@ def measure(
     rotation = error_budget.visible_rotation(ticks)
     lateral = error_budget.lateral_force(ticks)
     budget = error_budget.budget(
-        session.calibration, measurement.thrust, measurement.error, lateral, rotation
+        session.calibration, measurement.thrust, measurement.thrust_ci95, lateral, rotation
     )
     return measurement._replace(
         controller=controller,
@@ -185,7 +185,7 @@ class Summary(Struct, frozen=True):
     parameters: dict[str, Any]
     thrust: float
     """Mean thrust while the fish swims [N]."""
-    error: float
+    thrust_ci95: float
     """Half-width of the 95 % confidence interval of `thrust`, statistical only [N]."""
     frequency: float
     """Frequency of the tail beat [Hz]."""
@@ -198,11 +198,11 @@ class Summary(Struct, frozen=True):
     remark: str
     power: float | None = None
     """Electrical power of the servo while the fish swims [W]; null where unknown."""
-    power_error: float | None = None
+    power_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `power` [W]."""
     thrust_per_watt: float | None = None
     """Thrust over electrical power [N/W]."""
-    thrust_per_watt_error: float | None = None
+    thrust_per_watt_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `thrust_per_watt`, statistical only [N/W]."""
     calibration_ci95: float | None = None
     """Half-width of the 95 % interval of the thrust that the calibration alone causes [N].
@@ -210,7 +210,7 @@ class Summary(Struct, frozen=True):
     null where the uncertainty of the calibration is unknown.
     """
     total_ci95: float | None = None
-    """Half-width of the 95 % interval from `error` and `calibration_ci95` together [N]."""
+    """Half-width of the 95 % interval from `thrust_ci95` and `calibration_ci95` together [N]."""
     rotation: float = 0.0
     """Rotation of the sensor's axes that remains after calibration; 0 where none is seen [rad]."""
     thrust_per_watt_total_ci95: float | None = None
@@ -224,14 +224,14 @@ def summarise(measurement: ThrustMeasurement, tick: float) -> Summary:
 
     tick: period of the loop [s]
     """
-    ratio, ratio_error = per_watt(
-        measurement.thrust, measurement.error, measurement.watts, measurement.watts_error
+    ratio, ratio_ci95 = per_watt(
+        measurement.thrust, measurement.thrust_ci95, measurement.watts, measurement.watts_ci95
     )
     return Summary(
         measurement.controller,
         dict(measurement.parameters),
         measurement.thrust,
-        measurement.error,
+        measurement.thrust_ci95,
         measurement.frequency,
         measurement.thrust / measurement.power if measurement.power else 0.0,
         measurement.swims,
@@ -239,14 +239,14 @@ def summarise(measurement: ThrustMeasurement, tick: float) -> Summary:
         measurement.unit,
         measurement.remark,
         measurement.watts,
-        measurement.watts_error,
+        measurement.watts_ci95,
         ratio,
-        ratio_error,
+        ratio_ci95,
         measurement.calibration_ci95,
         measurement.total_ci95,
         measurement.rotation,
         per_watt(
-            measurement.thrust, measurement.total_ci95, measurement.watts, measurement.watts_error
+            measurement.thrust, measurement.total_ci95, measurement.watts, measurement.watts_ci95
         )[1],
         list(measurement.disturbances),
     )
@@ -347,7 +347,7 @@ def evaluate(
         controller="",
         parameters={},
         thrust=result.force,
-        error=result.error,
+        thrust_ci95=result.force_ci95,
         frequency=sum(block.beats for block in swimming) / swimming_time,
         power=sum(block.power * block.duration for block in swimming) / swimming_time,
         swims=sum(phase[0].swims for phase in phases),
@@ -407,7 +407,7 @@ def _mean_power(swimming: Sequence["Block"], spread: float) -> dict[str, float]:
     mean = sum(block.watts * block.duration for block in swimming) / duration
     if not math.isfinite(mean):
         return {}
-    return {"watts": mean, "watts_error": Z95 * math.sqrt(spread / duration)}
+    return {"watts": mean, "watts_ci95": Z95 * math.sqrt(spread / duration)}
 
 
 def _merge_blocks(blocks_of_phases: Sequence[list["Block"]]) -> list[list["Block"]]:

@@ -39,7 +39,9 @@ def draw(measurement: ThrustMeasurement, tick: float, path: str | os.PathLike[st
         margin = 0.35 * (extremes.max() - extremes.min()) + 1.0
         above.set_ylim(extremes.min() - margin, extremes.max() + margin)
         above.legend(ncols=4, loc="upper center", bbox_to_anchor=(0.5, 1.2))
-        half_width = measurement.error if measurement.total_ci95 is None else measurement.total_ci95
+        half_width = (
+            measurement.thrust_ci95 if measurement.total_ci95 is None else measurement.total_ci95
+        )
         level, error = 1e3 * measurement.thrust, 1e3 * half_width
         below.axhspan(level - error, level + error, color=BLUE, alpha=0.2, linewidth=0)
         below.axhline(level, color=BLUE, linewidth=0.8)

@@ -88,7 +88,7 @@ def rerun(
 
     Raises `RecordingError`, and the errors of the controller for its parameters.
     """
-    if "remote" in (name, *run.summary.swimming):
+    if "remote" in (name, *run.summary.swim_ticks):
         raise RecordingError(
             f"{run.path}: 'remote' has no rerun: its commands came from another program"
         )
@@ -170,7 +170,7 @@ class _Rerun:
             last = None
         whole = last is not None or tick.seq == 1
         applied = last.phi_c if last else 0.0
-        dt = (1 + tick.missed - (last.missed if last else 0)) * self._config.tick
+        dt = (1 + tick.missed_slots - (last.missed_slots if last else 0)) * self._config.tick
         if not whole:  # time and angle of the tick before are unknown
             applied, dt = tick.phi_c, self._config.tick
         seen = self._observe(tick, applied, dt)
@@ -198,9 +198,11 @@ class _Rerun:
             (daemon for daemon in self._run.daemons if daemon.get("number") == str(self._number)),
             {},
         )
-        if "lowest" in description:
+        if "lowest_angle" in description:
             try:
-                self._guard.restrict(float(description["lowest"]), float(description["highest"]))
+                self._guard.restrict(
+                    float(description["lowest_angle"]), float(description["highest_angle"])
+                )
             except (KeyError, ValueError):
                 raise RecordingError(
                     f"{self._run.path}: the angle limits of fishd {self._number} are not numbers"
@@ -209,7 +211,7 @@ class _Rerun:
     def _observe(self, tick: Tick, applied: float, dt: float) -> Observation:
         """Return the observation of the controller in this tick."""
         measurement = Measurement(
-            tick.t - 1e-3 * tick.age_ms,
+            tick.t - 1e-3 * tick.sample_age_ms,
             tick.fx,
             tick.fy,
             tick.samples,
@@ -236,7 +238,7 @@ class _Rerun:
             estimated,
             previous_angle=self._before,
             thrust_factor=_none_if_unset(tick.thrust_factor),
-            thrust_factor_error=_none_if_unset(tick.thrust_factor_error),
+            thrust_factor_ci95=_none_if_unset(tick.thrust_factor_ci95),
             **recorded,
         )
 

@@ -84,8 +84,8 @@ def _command(axis: "Axes", traces: Traces) -> None:
 def _thrust(axis: "Axes", traces: Traces) -> None:
     axis.axhline(0.0, color="0.85", linewidth=0.6)
     axis.plot(traces.time, traces.thrust, color=BLUE, label="thrust over whole beats")
-    low, high = traces.thrust - traces.thrust_error, traces.thrust + traces.thrust_error
-    if np.isfinite(traces.thrust_error).any():
+    low, high = traces.thrust - traces.thrust_ci95, traces.thrust + traces.thrust_ci95
+    if np.isfinite(traces.thrust_ci95).any():
         axis.fill_between(traces.time, low, high, color=BLUE, alpha=0.2, linewidth=0, label="95 %")
     axis.set_ylim(*limits(MIN_FORCE_SPAN, traces.thrust, low, high))
     axis.set_ylabel(f"thrust ({traces.unit})")

@@ -114,14 +114,14 @@ def _add_lines(figure: Figure, traces: Traces) -> None:
     if traces.alpha is not None:
         add(2, "true fin angle α (rad)", traces.alpha, GREEN)
     add(3, f"thrust over whole beats ({traces.unit})", traces.thrust, BLUE)
-    known = np.isfinite(traces.thrust_error).any()
+    known = np.isfinite(traces.thrust_ci95).any()
     for sign in (-1, 1) if known else ():
-        edge = traces.thrust + sign * traces.thrust_error
+        edge = traces.thrust + sign * traces.thrust_ci95
         add(3, f"{'−+'[sign > 0]} 95 %", edge, BLUE, dash="dot")
     for row, (name, values) in enumerate(traces.quantities.items(), start=4):
         add(row, name, values, GREEN)
         figure.update_yaxes(range=limits(MIN_QUANTITY_SPAN, values), row=row, col=1)
-    error = traces.thrust_error
+    error = traces.thrust_ci95
     angles = [traces.phi_c] if traces.alpha is None else [traces.phi_c, traces.alpha]
     axes = (
         (traces.unit, limits(MIN_FORCE_SPAN, traces.fx, traces.fy)),

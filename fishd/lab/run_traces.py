@@ -64,7 +64,7 @@ class Traces(NamedTuple):
     """Command φ_c [rad]."""
     thrust: Array
     """Mean thrust over whole beats, as fishd published it [`unit`]."""
-    thrust_error: Array
+    thrust_ci95: Array
     """Half-width of the 95 % interval of `thrust`; NaN while the zero is unknown [`unit`]."""
     frequency: Array
     """Frequency of the tail beat [Hz]."""
@@ -121,7 +121,7 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         fy=1e3 * column("fy"),
         phi_c=column("phi_c"),
         thrust=1e3 * column("thrust"),
-        thrust_error=1e3 * column("thrust_error"),
+        thrust_ci95=1e3 * column("thrust_ci95"),
         frequency=column("frequency"),
         fin_velocity=column("fin_velocity"),
         alpha=column("alpha") if simulated else None,
@@ -217,6 +217,6 @@ def _swims(tick: Tick) -> bool:
 def _title(run: Run) -> str:
     about = (run.about.get("subject", ""), run.about.get("note", ""))
     summary = run.summary
-    lost = f", ticks lost: {summary.lost}" if summary.lost else ""
+    lost = f", ticks lost: {summary.lost_ticks}" if summary.lost_ticks else ""
     what = "; ".join((run.name, *filter(None, about)))
-    return f"{what} ({', '.join(summary.swimming) or 'at rest'}{lost})"
+    return f"{what} ({', '.join(summary.swim_ticks) or 'at rest'}{lost})"

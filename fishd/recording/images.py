@@ -55,7 +55,7 @@ class FrameHead(Struct, frozen=True, gc=False):
     exposure: Annotated[
         float | None, unit("s", "Duration of the exposure; omitted if unknown.")
     ] = None
-    dropped: Annotated[
+    dropped_frames: Annotated[
         int, note("Number of frames that the camera took but did not deliver, since its start.")
     ] = 0
 

@@ -16,6 +16,7 @@ from fishd.core import strict_yaml, text
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, RecordingError
+from fishd.core.old_names import rename_keys, rename_message
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.images import IMAGE_TOPIC, FrameHead, RecordedFrame, decode_frame, decode_head
@@ -23,7 +24,7 @@ from fishd.recording.mcap_file import Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 from fishd.recording.schemas import CHANNELS
 from fishd.recording.summary import Gap, Summary, Tally, from_metadata
-from fishd.recording.writer import CALIBRATIONS_ATTACHMENT, CONFIG_ATTACHMENT
+from fishd.recording.writer import CALIBRATIONS_ATTACHMENT, CONFIG_ATTACHMENT, FORMAT
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -45,7 +46,7 @@ class Entry(NamedTuple):
     topic: str
     """`tick`, `event` or `status`."""
     payload: bytes
-    """JSON, exactly as fishd sent it."""
+    """JSON, exactly as fishd sent it; that of an older fishd has the present names."""
 
 
 class Run:
@@ -239,9 +240,10 @@ class Run:
             if isinstance(record, Message):
                 topic = topics.get(record.channel_id, "")
                 if topic == IMAGE_TOPIC:
-                    self._take_frame(record.data)
+                    self._take_frame(self._with_present_names("frame", record.data))
                 elif topic in CHANNELS:
-                    self.entries.append(Entry(topic, record.data))
+                    payload = self._with_present_names(topic, record.data)
+                    self.entries.append(Entry(topic, payload))
                     ticks += topic == "tick"
             elif isinstance(record, Damaged):
                 self._damages.append(ticks)
@@ -261,6 +263,10 @@ class Run:
             why = f": {self.damage_reason}" if self.damage_reason else ""
             raise RecordingError(f"{self.path} is an MCAP file, but not a recording of fishd{why}")
 
+    def _with_present_names(self, kind: str, payload: bytes) -> bytes:
+        """Return a message; one with old names gets the present ones."""
+        return payload if self.about.get("format") == FORMAT else rename_message(kind, payload)
+
     def _take_frame(self, payload: bytes) -> None:
         try:
             self.frame_heads.append(decode_head(payload))
@@ -273,7 +279,7 @@ class Run:
         if name == "fishd.run":
             self.about = data
         elif name == "fishd.daemon":
-            self.daemons.append(data)
+            self.daemons.append(rename_keys("daemon", data))
         elif name == "fishd.end":
             self.reason, self._ended = data.get("reason", ""), from_metadata(data)
 
@@ -284,7 +290,8 @@ class Run:
                 raise ValueError("the number of its fishd is unknown")
             self._yaml[int(number)] = data
         elif name == CALIBRATIONS_ATTACHMENT:
-            self.calibrations.append(decoder(Calibrations)(data))
+            payload = self._with_present_names("calibrations", data)
+            self.calibrations.append(decoder(Calibrations)(payload))
 
     def _decoded(self, topic: str, kind: type[T]) -> list[T]:
         decode = decoder(kind)

@@ -37,8 +37,8 @@ STATUS_FIELDS = (
     "robot",
     "tick",
     "amplitude_limit",
-    "lowest",
-    "highest",
+    "lowest_angle",
+    "highest_angle",
     "force_unit",
     "realtime",
 )

@@ -6,6 +6,7 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
 from fishd.core.decoding import decoder
+from fishd.core.old_names import rename_keys
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.images import FrameHead
 
@@ -33,16 +34,16 @@ class Summary(Struct, frozen=True):
     marks: int = 0
     gaps: int = 0
     """Number of gaps."""
-    lost: int = 0
+    lost_ticks: int = 0
     """Number of missing ticks in all gaps."""
-    missed: int = 0
+    missed_slots: int = 0
     """Number of slots that fishd itself skipped, without a tick."""
     restarts: int = 0
     """Number of times that another fishd took over."""
     thrust: float | None = None
     """Mean `thrust` while the tail beat and the sensor's zero was known; if it never was, mean
     measured F_x while a controller swam; None if none swam [N]."""
-    thrust_error: float | None = None
+    thrust_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `thrust`; None if the zero was never known [N].
 
     It is the mean of those of the ticks: all ticks share the error of one zero, which does not
@@ -50,7 +51,7 @@ class Summary(Struct, frozen=True):
     """
     power: float | None = None
     """Mean electrical power of the servo while a controller swam; None if unknown [W]."""
-    swimming: dict[str, int] = {}
+    swim_ticks: dict[str, int] = {}
     """Number of ticks in mode running, by controller."""
     force_unit: str = "N"
     """Unit of the forces: `N` if all are in newtons, else the other unit."""
@@ -58,7 +59,7 @@ class Summary(Struct, frozen=True):
     """Number of frames of a camera."""
     frame_gaps: int = 0
     """Number of places with missing frames, or with a restart of the camera."""
-    frames_lost: int = 0
+    lost_frames: int = 0
     """Known number of missing frames: not delivered by the camera, or lost on the way."""
 
     @property
@@ -75,10 +76,10 @@ class TickHead(Struct, frozen=True, gc=False):
     mode: str
     controller: str
     fx: float
-    missed: int
+    missed_slots: int
     thrust: float
     frequency: float
-    thrust_error: float | UnsetType = UNSET
+    thrust_ci95: float | UnsetType = UNSET
     power: float | UnsetType = UNSET
     time: float = 0.0
 
@@ -121,10 +122,10 @@ class Tally:
         self._ticks += 1
         if tick.mode == "running":
             self._impulse += tick.fx
-            if tick.thrust_error is not UNSET and tick.frequency:
+            if tick.thrust_ci95 is not UNSET and tick.frequency:
                 self._known_ticks += 1
                 self._thrust += tick.thrust
-                self._error += tick.thrust_error
+                self._error += tick.thrust_ci95
             if tick.power is not UNSET:
                 self._energy += tick.power
                 self._metered += 1
@@ -137,7 +138,7 @@ class Tally:
         if tick.seq > before + 1:
             self.gaps.append(Gap(last.t, before + 1, tick.seq - before - 1))
         if is_same_fishd:
-            self._missed += max(0, tick.missed - last.missed)
+            self._missed += max(0, tick.missed_slots - last.missed_slots)
         else:
             self._restarts += 1
         return is_same_fishd
@@ -167,7 +168,7 @@ class Tally:
         if frame.session != last.session:
             self._frame_gaps += 1
             return 0
-        lost = max(0, frame.seq - last.seq - 1) + max(0, frame.dropped - last.dropped)
+        lost = max(0, frame.seq - last.seq - 1) + max(0, frame.dropped_frames - last.dropped_frames)
         self._frames_lost += lost
         self._frame_gaps += lost > 0
         return lost
@@ -197,17 +198,17 @@ class Tally:
             events=self._events,
             marks=self._marks,
             gaps=len(self.gaps),
-            lost=sum(gap.lost for gap in self.gaps),
-            missed=self._missed,
+            lost_ticks=sum(gap.lost for gap in self.gaps),
+            missed_slots=self._missed,
             restarts=self._restarts,
             thrust=thrust,
-            thrust_error=error,
+            thrust_ci95=error,
             power=self._energy / self._metered if self._metered else None,
-            swimming=dict(self._swimming),
+            swim_ticks=dict(self._swimming),
             force_unit=self._force_unit,
             frames=self._frames,
             frame_gaps=self._frame_gaps,
-            frames_lost=self._frames_lost,
+            lost_frames=self._frames_lost,
         )
 
 
@@ -224,6 +225,7 @@ _decode = decoder(Any)
 
 def from_metadata(data: dict[str, str]) -> Summary | None:
     """Return the summary in the metadata of a recording; None if it has none."""
+    data = rename_keys("summary", data)
     known = {name: data[name] for name in Summary.__struct_fields__ if name in data}
     try:
         raw = {name: _decode(value.encode()) for name, value in known.items()}

@@ -42,8 +42,8 @@ MAX_TIME_S = 1e10
 """Largest time of a message: MCAP counts nanoseconds in 64 bits [s, unix]."""
 CONFIG_ATTACHMENT, CALIBRATIONS_ATTACHMENT = "config.yaml", "calibrations.json"
 """Names of attachments."""
-FORMAT = "1"
-"""Version of the layout of a recording."""
+FORMAT = "2"
+"""Version of the layout of a recording; before 2, fields have the names of `OLD_NAMES`."""
 
 Source = Literal["fishd", "simulation"]
 """Origin of the ticks: a running fishd, whatever its robot, or a run in virtual time."""

@@ -176,7 +176,9 @@ def frame_with_damaged_pixels(good: Good) -> bytes:
 
 @file
 def numbers_that_no_fish_has(good: Good) -> bytes:
-    changes = [{name: 1e308 * sign} for name in ("fx", "phi_c", "age_ms", "t") for sign in (1, -1)]
+    changes = [
+        {name: 1e308 * sign} for name in ("fx", "phi_c", "sample_age_ms", "t") for sign in (1, -1)
+    ]
     return with_messages(
         good, TICK, [tick_of(good, seq=61 + i, **c) for i, c in enumerate(changes)]
     )
@@ -276,12 +278,14 @@ FILES |= {
         good,
         metadata("fishd.daemon", {}),
         attachment("config.yaml", b"tick: 0.05"),
-        metadata("fishd.daemon", {"number": "9" * 5000, "lowest": "nan", "highest": ODD}),
+        metadata(
+            "fishd.daemon", {"number": "9" * 5000, "lowest_angle": "nan", "highest_angle": ODD}
+        ),
         attachment("config.yaml", b"tick: 0.05"),
         attachment("calibrations.json", b"[" * 100_000),
     ),
     "limits-that-are-no-numbers": lambda good: with_more(
-        good, metadata("fishd.daemon", {"number": "0", "lowest": ODD})
+        good, metadata("fishd.daemon", {"number": "0", "lowest_angle": ODD})
     ),
     "empty": lambda good: b"",
     "nothing-but-magic": lambda good: MAGIC,

@@ -58,12 +58,12 @@ class ScriptedAgent:
     def action(self, angle: float, **changes: Any) -> dict[str, Any]:
         """Return an action for the latest observation."""
         latest = next(m for m in reversed(self.seen) if m["kind"] == "observation")
-        own = {"kind": "action", "v": 1, "session": latest["session"], "seq": latest["seq"]}
+        own = {"kind": "action", "v": 2, "session": latest["session"], "seq": latest["seq"]}
         return {**own, "phi_c": angle, **changes}
 
     def pause(self, seconds: float) -> dict[str, Any]:
         session = self.seen[-1]["session"]
-        return {"kind": "pause", "v": 1, "session": session, "seconds": seconds}
+        return {"kind": "pause", "v": 2, "session": session, "seconds": seconds}
 
     @contextmanager
     def answering(self, answer: Callable[[dict[str, Any]], Answer]) -> Iterator[None]:

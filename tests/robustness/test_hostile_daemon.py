@@ -97,7 +97,7 @@ class Hostile:
         request = protocol.decode_request(payload)
         if self.refuses:
             failure = protocol.Failure(EVIL, EVIL)
-            return protocol.encode(protocol.Reply(1, request.id, ok=False, error=failure))
+            return protocol.encode(protocol.Reply(2, request.id, ok=False, error=failure))
         infos = [evil(ControllerInfo), evil(ControllerInfo, name="evil", parameters=[])]
         results: dict[str, Any] = {
             "status": evil(Status, telemetry=self._telemetry),
@@ -156,7 +156,7 @@ def test_no_answer_and_no_refusal_says_anything_to_the_terminal(
 
 
 @pytest.mark.parametrize(
-    "rubbish", [b"no JSON", b'{"v":1,"id":"\xff"}', b'{"a":' + 60_000 * b"["], ids=len
+    "rubbish", [b"no JSON", b'{"v":2,"id":"\xff"}', b'{"a":' + 60_000 * b"["], ids=len
 )
 def test_rubbish_is_one_line_that_says_its_origin(hostile: Hostile, rubbish: bytes) -> None:
     with Fish(hostile.endpoint, timeout=PATIENCE) as fish:

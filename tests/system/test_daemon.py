@@ -32,7 +32,7 @@ SHIPPED = str(ROOT / "config" / "simulated.yaml")
 
 EXTREMES = {"fx_min", "fx_max", "fy_min", "fy_max"}  # which a simulated fish leaves out
 OF_A_SWIMMER = {"x", "y", "speed", "heading"}
-KNOWN_THRUST = {"thrust_error", "thrust_factor", "thrust_factor_error"}
+KNOWN_THRUST = {"thrust_ci95", "thrust_factor", "thrust_factor_ci95"}
 """Fields from the first rest on."""
 AT_TIMES = KNOWN_THRUST | {"quantities", "leak", "fy_corrected", "suspect"}
 """Fields that are absent where there is nothing to say."""
@@ -59,7 +59,9 @@ def test_ticks_are_numbered_without_gaps_and_timed_without_drift(daemon: Daemon)
     with Subscriber(daemon.telemetry, b"tick") as subscriber:
         ticks = [subscriber.message() for _ in range(40)]
     assert [t["seq"] for t in ticks] == list(range(ticks[0]["seq"], ticks[0]["seq"] + 40))
-    starts = [t["t"] - t["lateness_us"] * 1e-6 - (t["seq"] + t["missed"]) * 0.05 for t in ticks]
+    starts = [
+        t["t"] - t["lateness_us"] * 1e-6 - (t["seq"] + t["missed_slots"]) * 0.05 for t in ticks
+    ]
     # Each deadline is a whole number of periods after the first, within what a tick takes.
     assert max(starts) - min(starts) < 0.05
 

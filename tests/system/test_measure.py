@@ -34,13 +34,13 @@ def test_it_finds_the_thrust_and_fishd_shows_it_from_then_on(daemon: Daemon) -> 
     assert ended.returncode == 0, ended.stderr
     result = msgspec.json.decode(ended.stdout)
     assert result["thrust"] == pytest.approx(25.74e-3, abs=1.5e-3)
-    assert 0.0 < result["error"] < 1.5e-3
+    assert 0.0 < result["thrust_ci95"] < 1.5e-3
     assert daemon.status().mode == "idle"
     daemon.fishctl("set-controller", "swing")
 
     def is_shown() -> bool:
         status = daemon.status()
-        ci95 = status.thrust_error or math.inf
+        ci95 = status.thrust_ci95 or math.inf
         return ci95 < 2e-3 and abs(status.thrust - result["thrust"]) <= ci95
 
     wait_until(is_shown)

@@ -50,7 +50,7 @@ def shake_servo(daemon: Daemon, fish: Fish) -> int:
         Subscriber(daemon.telemetry, b"tick") as ticks,
     ):
         events.connected()
-        before = fish.status().missed
+        before = fish.status().missed_slots
         fish.set_controller("ppo", policy="flip")
         event = events.until(kind="fallback")
         assert (event["data"]["before"], event["data"]["controller"]) == ("ppo", "swing")
@@ -62,7 +62,7 @@ def shake_servo(daemon: Daemon, fish: Fish) -> int:
         assert "took over: chatter: ppo gave up" in daemon.fishctl("status").stdout
         fish.set_controller("ppo", policy="flip")
         assert fish.status().fallback is None
-        return status.missed - before
+        return status.missed_slots - before
 
 
 def test_a_named_policy_swims(daemon: Daemon) -> None:
@@ -93,7 +93,7 @@ def test_a_policy_that_loads_costs_no_tick(folder: Path, tmp_path: Path) -> None
             before = ticks.message()
             daemon.fishctl("set-controller", "ppo", "--policy", "real")
             after = ticks.until(controller="ppo")
-        return int(after["missed"] - before["missed"])
+        return int(after["missed_slots"] - before["missed_slots"])
 
     # A real cost of ticks recurs each time; a short stall of the machine does not.
     assert any(missed() == 0 for _ in range(3))

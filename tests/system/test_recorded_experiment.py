@@ -31,7 +31,7 @@ def test_what_a_live_rig_does_is_rerun_to_the_last_bit(daemon: Daemon, tmp_path:
 def count_excitation_ticks(part: Path) -> int:
     """Return the number of ticks of the excitation in a recording that is being written."""
     try:
-        return open_run(part).summary.swimming.get("excitation", 0)
+        return open_run(part).summary.swim_ticks.get("excitation", 0)
     except RecordingError:
         return 0
 
@@ -52,5 +52,5 @@ def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
     assert daemon.status().mode == "idle"
     run = open_run(path)
     assert run.reason == "ended by Interrupted"
-    assert run.summary.swimming["excitation"] >= 15
+    assert run.summary.swim_ticks["excitation"] >= 15
     assert "excitation" in [event.data.get("controller") for event in run.events]

@@ -102,7 +102,7 @@ def test_no_late_action_reaches_the_servo(daemon: Daemon, tmp_path: Path) -> Non
         ticks = [telemetry.until(controller="remote")]
         while ticks[-1]["controller"] == "remote":
             ticks.append(telemetry.message())
-    assert sum(seen["lost"] for seen in agent.seen) >= 20
+    assert sum(seen["lost_ticks"] for seen in agent.seen) >= 20
     assert {tick["phi_c"] for tick in ticks[:-1]} == {0.0, -0.1}
 
 
@@ -204,7 +204,7 @@ def test_in_lockstep_fishd_waits_for_its_agent_and_answers_meanwhile(
                     break
             agent.observe()
             assert fish.status().seq == 401
-            assert fish.status().missed == 0
+            assert fish.status().missed_slots == 0
 
 
 @pytest.mark.parametrize("request_", ["stop", "estop", "set-controller swing"])

@@ -175,7 +175,7 @@ def test_one_that_loads_slowly_costs_no_tick(daemon: Daemon) -> None:
             daemon.fishctl("set-controller", "slow")
             after = ticks.until(controller="slow")
         assert after["seq"] - before["seq"] > 15
-        return int(after["missed"] - before["missed"])
+        return int(after["missed_slots"] - before["missed_slots"])
 
     # A real cost of ticks recurs each time; a short stall of the machine does not.
     assert any(missed() == 0 for _ in range(3))

@@ -24,7 +24,7 @@ def test_the_shipped_configuration_swims_through_the_whole_hardware_path(
     assert 1.2 < tick["frequency"] < 2.2
     status = daemon.status()
     assert status.robot == "virtual-pi"
-    assert any("not calibrated" in line for line in status.degraded)
+    assert any("not calibrated" in line for line in status.limitations)
 
 
 def test_a_sensor_that_is_pulled_out_is_a_fault_that_a_clear_ends(

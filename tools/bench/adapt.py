@@ -57,11 +57,11 @@ class Adapted(Struct, frozen=True):
     @property
     def includes_best(self) -> bool:
         """Whether the gaits that may be the best include the truly best one."""
-        return max(map(self.truth, self.verdict.undecided)) > EQUAL * self.largest
+        return max(map(self.truth, self.verdict.undecided_gaits)) > EQUAL * self.largest
 
     def covers(self, gait: str) -> bool:
         """Return whether the interval of a gait's relative thrust contains the true one."""
-        _, low, high = self.verdict.others[gait]
+        _, low, high = self.verdict.relative_thrusts[gait]
         return low <= self.truth(gait) / self.truth(SQUARE) <= high
 
 
@@ -100,17 +100,17 @@ def adapted(task: tuple[int, int, float]) -> Adapted:
 def row(result: Adapted) -> list[str]:
     """Return the row of the table for one fish."""
     verdict = result.verdict
-    chosen = verdict.chosen
-    bold = (f"**{gait}**" if gait == chosen else gait for gait in verdict.undecided)
+    chosen = verdict.chosen_gait
+    bold = (f"**{gait}**" if gait == chosen else gait for gait in verdict.undecided_gaits)
     claim = ["100, the same gait", "100"]
-    if chosen in verdict.others:
-        value, low, high = map(percent, verdict.others[chosen])
+    if chosen in verdict.relative_thrusts:
+        value, low, high = map(percent, verdict.relative_thrusts[chosen])
         truth = percent(result.truth(chosen) / result.truth(SQUARE))
         claim = [f"{value} [{low}, {high}]", truth]
     return [
         str(result.seed),
         f"{1e3 * result.best:.2f}",
-        f"{chosen} wins" if verdict.decided else ", ".join(bold),
+        f"{chosen} wins" if verdict.is_decided else ", ".join(bold),
         *(percent(result.truth(gait) / result.best) for gait in (chosen, SQUARE)),
         *claim,
         f"{result.tank_time:.0f}",
@@ -119,27 +119,31 @@ def row(result: Adapted) -> list[str]:
 
 def summary(results: list[Adapted]) -> str:
     """Return medians, worst values and coverage."""
-    chosen = [result.truth(result.verdict.chosen) for result in results]
+    chosen = [result.truth(result.verdict.chosen_gait) for result in results]
     shares = [thrust / result.best for thrust, result in zip(chosen, results, strict=True)]
     lost = [1.0 - thrust / result.largest for thrust, result in zip(chosen, results, strict=True)]
-    decided = [result for result in results if result.verdict.decided]
+    decided = [result for result in results if result.verdict.is_decided]
     policies = [r.truth("policy") / r.best for r in results if "policy" in r.contenders]
-    claims = [result for result in results if result.verdict.chosen in result.verdict.others]
-    gaits = [(result, gait) for result in results for gait in result.verdict.others]
+    claims = [
+        result
+        for result in results
+        if result.verdict.chosen_gait in result.verdict.relative_thrusts
+    ]
+    gaits = [(result, gait) for result in results for gait in result.verdict.relative_thrusts]
     thrusts = [contender for result in results for contender in result.contenders.values()]
     off = [abs(one.thrust - (one.true_thrust or 0.0)) for one in thrusts]
-    total = [one.error if one.total_ci95 is None else one.total_ci95 for one in thrusts]
+    total = [one.thrust_ci95 if one.total_ci95 is None else one.total_ci95 for one in thrusts]
     rows = [
         ["chosen gait, % of the best square wave", *_middle_and_worst(shares, min)],
         ["policy, % of the best square wave", *_middle_and_worst(policies, min)],
         ["policies that took part", _count(["policy" in r.contenders for r in results])],
-        ["verdicts that name a winner", _count([r.verdict.decided for r in results])],
+        ["verdicts that name a winner", _count([r.verdict.is_decided for r in results])],
         ["winners that are truly the best", _count([r.includes_best for r in decided])],
         ["verdicts that include the best gait", _count([r.includes_best for r in results])],
         ["loss of the chosen gait against the truly best", *_middle_and_worst(lost, max)],
         [
             "interval of the chosen gait's relative thrust contains the true value",
-            _count([result.covers(result.verdict.chosen) for result in claims]),
+            _count([result.covers(result.verdict.chosen_gait) for result in claims]),
         ],
         [
             "the same, all gaits except the square wave",
@@ -147,7 +151,7 @@ def summary(results: list[Adapted]) -> str:
         ],
         [
             "statistical interval of a thrust contains the true value",
-            _count([a <= one.error for a, one in zip(off, thrusts, strict=True)]),
+            _count([a <= one.thrust_ci95 for a, one in zip(off, thrusts, strict=True)]),
         ],
         [
             "total interval of a thrust contains the true value",

@@ -1,7 +1,7 @@
 """Comparison of two checkouts of fishd in turns, for `tick --against`.
 
 It uses only the public interface of both: the programs fishd and fishctl, READY=1, and the fields
-`lateness_us` and `busy_us` of a tick. The checkouts may differ in everything else.
+`lateness_us` and `busy_time_us` of a tick. The checkouts may differ in everything else.
 """
 
 import json
@@ -116,11 +116,12 @@ def take_turn(bin_folder: Path, seconds: float) -> Turn:
             ticks = [json.loads(message) for message in fishd.waiting_messages()]
             memory, total = fishd.memory(), fishd.total_memory()
     virtual, virtual_cpu = virtual_time(bin_folder)
+    busy_time = "busy_time_us" if "busy_time_us" in ticks[0] else "busy_us"  # before protocol 2
     return Turn(
         start_up=start_up * 1e3,
         start_up_cpu=start_up_cpu * 1e3,
         lateness=[tick["lateness_us"] for tick in ticks],
-        busy=[tick["busy_us"] for tick in ticks],
+        busy=[tick[busy_time] for tick in ticks],
         cpu=cpu / len(ticks) * 1e6,
         memory=memory,
         total_memory=total,

@@ -197,7 +197,7 @@ def measure_session(session: VirtualSession, seconds: float) -> Measured:
     assert result.calibration_ci95 is not None
     plain = float(np.mean([tick.fx for tick in result.ticks if tick.mode == "running"]))
     return Measured(
-        *(result.thrust, result.error, result.calibration_ci95, result.total_ci95, plain),
+        *(result.thrust, result.thrust_ci95, result.calibration_ci95, result.total_ci95, plain),
         *(bool(result.disturbances), bool(result.remark)),
     )
 
@@ -221,7 +221,7 @@ class Loads(NamedTuple):
     """Error that all loads share, as a fraction."""
     thread: float = 0.0
     """Error of the direction of each load [rad]."""
-    load_error: float = 0.01
+    load_ci95: float = 0.01
     """Value of `--load-error`."""
     count: int = len(PLAN)
 
@@ -231,7 +231,7 @@ LOADS = {
     "each load by 2 %": Loads(weight=0.02),
     "each load by 2 %, five loads": Loads(weight=0.02, count=MIN_LOADS),
     "each load by 2 %, each thread by 2°": Loads(weight=0.02, thread=math.radians(2.0)),
-    "all loads by the same 2 %, `--load-error 0.04`": Loads(shared=0.02, load_error=0.04),
+    "all loads by the same 2 %, `--load-error 0.04`": Loads(shared=0.02, load_ci95=0.04),
 }
 """Errors are Gaussian: 95 % of those of 2 % rms are within 4 %."""
 
@@ -251,7 +251,7 @@ def calibrate(loads: Loads, seed: int) -> ForceCalibration:
         vx += cos * fx - sin * fy + RIG.offset_x
         vy += sin * fx + cos * fy + RIG.offset_y
         measured.append(Load(LOAD_N * x, LOAD_N * y, vx, vy))
-    return fit(measured, loads.load_error).calibration
+    return fit(measured, loads.load_ci95).calibration
 
 
 def measure_calibrated(case: tuple[str, float, int]) -> Measured:
@@ -319,7 +319,7 @@ WAVES: dict[str, Wave] = {
     "policy default-fish": ("ppo", {"policy": "default-fish"}),
 }
 HELD: dict[str, Wave] = {f"{mN} mN": ("thrust", {"target": 1e-3 * mN}) for mN in (5, 10, 15, 20)}
-"""Targets of the controller `thrust`, judged by its quantities `held_thrust` and `held_error`."""
+"""Targets of the controller `thrust`, judged by its quantities `held_thrust` and `held_thrust_ci95`."""
 
 
 class Shown(NamedTuple):
@@ -463,8 +463,8 @@ def _shown(tick: Tick, is_held: bool) -> tuple[float, float] | None:
         quantities = {} if tick.quantities is UNSET else tick.quantities
         if "held_thrust" not in quantities:
             return None
-        return quantities["held_thrust"], quantities["held_error"]
-    return None if tick.thrust_error is UNSET else (tick.thrust, tick.thrust_error)
+        return quantities["held_thrust"], quantities["held_thrust_ci95"]
+    return None if tick.thrust_ci95 is UNSET else (tick.thrust, tick.thrust_ci95)
 
 
 def report_shown(options: Namespace) -> Report:

@@ -104,7 +104,7 @@ def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Rou
         slewed = _wall_offset() - offset
         ticks = fishd.waiting_ticks()
         late, busy, offsets = zip(*_tick_times(ticks, tick, slewed), strict=True)
-        missed = ticks[-1].missed - ticks[0].missed
+        missed = ticks[-1].missed_slots - ticks[0].missed_slots
         itself = msgspec.structs.replace(
             lateness("fishd", tick, late, offsets),
             missed=missed / (ticks[-1].seq - ticks[0].seq + missed),
@@ -135,9 +135,9 @@ def _tick_times(
     """Return lateness [s], time until sealed [µs] and offset from whole periods [s] of ticks."""
     first = ticks[0]
     for index, tick in enumerate(ticks):
-        slots = tick.seq - first.seq + tick.missed - first.missed
-        began = tick.t - first.t - tick.busy_us * 1e-6 - slewed * index / len(ticks)
-        yield tick.lateness_us * 1e-6, tick.busy_us, began - slots * period
+        slots = tick.seq - first.seq + tick.missed_slots - first.missed_slots
+        began = tick.t - first.t - tick.busy_time_us * 1e-6 - slewed * index / len(ticks)
+        yield tick.lateness_us * 1e-6, tick.busy_time_us, began - slots * period
 
 
 def measure_latency(stressed: bool, priority: int, runs: int) -> Latency:
@@ -149,7 +149,7 @@ def measure_latency(stressed: bool, priority: int, runs: int) -> Latency:
             tick = (
                 fishd.next_tick()
             )  # the very first tick may have been published before the subscription
-            before = (tick.seq - 1 + tick.missed) * fishd.status().tick
+            before = (tick.seq - 1 + tick.missed_slots) * fishd.status().tick
             first_ticks.append(tick.t - before - fishd.started)
             for _ in range(3):
                 began = time.monotonic()
@@ -192,7 +192,7 @@ def markdown(results: Results) -> str:
         [
             *_conditions(round_),
             late.contestant,
-            *(f"{value:.0f}" for value in (late.p50, late.p99, late.worst)),
+            *(f"{value:.0f}" for value in (late.p50, late.p99, late.max)),
             f"{late.missed:.3%}",
             "not known" if late.drift is None else f"{late.drift:+.0f}",
         ]
@@ -203,7 +203,7 @@ def markdown(results: Results) -> str:
         [
             *_conditions(round_),
             *(_percentiles(round_.fishd.timing.phases[phase]) for phase in PHASES),
-            _percentiles(round_.fishd.timing.busy),
+            _percentiles(round_.fishd.timing.duration),
             _percentiles(round_.fishd.sealed),
         ]
         for round_ in rounds
@@ -258,8 +258,8 @@ def goals(results: Results) -> list[list[str]]:
             for p in sorted({round_.priority for round_ in results.rounds})
         ),
         judged("no drift: ≤ 100 µs over a round", 100, us, lambda r: abs(r.lateness[0].drift or 0)),
-        judged("busy time p50 ≤ 100 µs", 100, us, lambda r: r.fishd.timing.busy.p50),
-        judged("busy time p99 ≤ 250 µs", 250, us, lambda r: r.fishd.timing.busy.p99),
+        judged("busy time p50 ≤ 100 µs", 100, us, lambda r: r.fishd.timing.duration.p50),
+        judged("busy time p99 ≤ 250 µs", 250, us, lambda r: r.fishd.timing.duration.p99),
         judged(
             "2 ms tick, < 0.1 % missed", 1e-3, "{:.3%}", lambda r: r.lateness[0].missed, tick=FAST
         ),

@@ -95,7 +95,7 @@ def chunk_content(body: bytes) -> bytes:
 
 def write_good_recording(path: Path, seconds: float = 3.0) -> None:
     """Write a short recording with every kind of content."""
-    config, extra = Config(), {"force_unit": "N", "lowest": "-0.42", "highest": "0.42"}
+    config, extra = Config(), {"force_unit": "N", "lowest_angle": "-0.42", "highest_angle": "0.42"}
     with RunWriter(path.with_name(f"{path.stem}-ticks"), source="simulation") as writer:
         writer.describe(config, extra)
         simulate(config, "swing", {}, seconds, settle=1.0, publisher=writer)

@@ -326,7 +326,7 @@ def refinement() -> Iterator[tuple[str, str, str, str]]:
 
 
 def _speed(row: dict[str, Any]) -> str:
-    return f"{row['speed_mm_per_s']:.2f} ± {row['error_mm_per_s']:.2f}"
+    return f"{row['speed_mm_per_s']:.2f} ± {row['ci95_mm_per_s']:.2f}"
 
 
 def _swum(controller: str) -> list[dict[str, Any]]:

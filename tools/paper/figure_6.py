@@ -68,8 +68,8 @@ def swim(case: Case, lengths: Lengths | None = None) -> SpeedResult:
     lengths = lengths or Lengths.of(fish, None, None)
     result = swim_freely(point, fish, lengths, EncodingPublisher())
     assert result
-    if result.trouble:
-        raise SystemExit(f"{point.label()} at {case.cell:g} mm: {result.trouble}")
+    if result.failure:
+        raise SystemExit(f"{point.label()} at {case.cell:g} mm: {result.failure}")
     return result
 
 
@@ -104,9 +104,9 @@ def _row(case: Case, result: SpeedResult) -> Row:
         "cell_mm": case.cell,
         "frequency_Hz": result.beat_frequency,
         "speed_mm_per_s": 1e3 * (result.speed or 0.0),
-        "error_mm_per_s": 1e3 * (result.error or 0.0),
+        "ci95_mm_per_s": 1e3 * (result.speed_ci95 or 0.0),
         "beats": result.beats,
-        "steady_from_s": NOT_STEADY if result.settled is None else result.settled,
+        "steady_from_s": NOT_STEADY if result.settled_time is None else result.settled_time,
         "seconds": result.seconds,
         "tail_side_to_side_over_L": result.tail_width or 0.0,
         "muscle_power_W_per_m": result.muscle_power or 0.0,
@@ -158,7 +158,7 @@ def _bars(
     axes.errorbar(
         column(rows, over),
         column(rows, "speed_mm_per_s"),
-        yerr=column(rows, "error_mm_per_s"),
+        yerr=column(rows, "ci95_mm_per_s"),
         color=colour, marker=marker, mfc=colour if line else "white", ls=line, lw=1.0,
         elinewidth=0.9, capsize=2, label=label,
     )  # fmt: skip
@@ -174,9 +174,7 @@ def fastest() -> Iterator[tuple[float, str, list[str]]]:
     for frequency in FREQUENCIES:
         rows = {wave: row_of(Case(wave, frequency, CELL)) for wave in WAVES}
         speeds = {
-            wave: (row["speed_mm_per_s"], row["error_mm_per_s"])
-            for wave, row in rows.items()
-            if row
+            wave: (row["speed_mm_per_s"], row["ci95_mm_per_s"]) for wave, row in rows.items() if row
         }
         if not speeds:
             continue

@@ -97,7 +97,7 @@ class Feed:
             facts |= {
                 "seq": header.seq,
                 "size": header.height,
-                "dropped": header.dropped,
+                "dropped": header.dropped_frames,
                 "age": header.available - header.time + time.monotonic() - self._last_frame_time,
             }
             if watch.axis is not None:

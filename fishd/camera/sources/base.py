@@ -43,8 +43,8 @@ class Trouble(FishdError):
 class Sink(Protocol):
     """Receiver of frames; its methods do not block and may be called in any thread."""
 
-    def begin(self, timeline: Timeline, degraded: tuple[str, ...] = ()) -> None:
-        """Start a new session; degraded: reasons why times or pictures are worse than possible."""
+    def begin(self, timeline: Timeline, limitations: tuple[str, ...] = ()) -> None:
+        """Start a new session; limitations: reasons why times or pictures are not better."""
 
     def put(self, shot: Shot) -> None:
         """Publish a frame."""

@@ -239,9 +239,9 @@ class _View:
 
     def _begin(self, status: Status) -> None:
         if self._swimmer.lockstep:
-            self._sink.begin(Timeline(True, status.boot, None))
+            self._sink.begin(Timeline(True, status.boot_id, None))
         else:
-            self._sink.begin(Timeline(False, status.boot, self._now))
+            self._sink.begin(Timeline(False, status.boot_id, self._now))
 
     def _now(self) -> float:
         return time.monotonic() + self.ahead

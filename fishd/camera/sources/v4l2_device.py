@@ -26,7 +26,7 @@ class OpenCamera(NamedTuple):
     format: Format
     exposure: float | None
     """Exposure time, where it is fixed [s]."""
-    degraded: tuple[str, ...]
+    limitations: tuple[str, ...]
     """Differences between the camera's behaviour and its settings."""
 
 
@@ -38,10 +38,10 @@ def open_camera(settings: V4l2Settings) -> Iterator[OpenCamera]:
     try:
         device.open()
         camera_format = _set_format(capture, settings)
-        degraded = _set_rate_and_compare(capture, settings, camera_format)
+        limitations = _set_rate_and_compare(capture, settings, camera_format)
         exposure = _set_controls(device, settings)
         capture.open()
-        yield OpenCamera(capture, camera_format, exposure, degraded)
+        yield OpenCamera(capture, camera_format, exposure, limitations)
     except V4L2Error as error:
         raise _no_camera(settings.device, text.error_message(error)) from None
     finally:

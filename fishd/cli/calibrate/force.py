@@ -70,7 +70,7 @@ _POOR_RESIDUAL = 0.02
 def force(
     unit: str,
     seconds: float,
-    load_error: float,
+    load_ci95: float,
     plan: Path | None,
     record: Path | None,
     replace: bool,
@@ -102,11 +102,11 @@ def force(
         try:
             if measured:
                 names = [f"load {n}" for n in range(1, len(steps) + 1)]
-                fitted = _fit_loads(names, measured, load_error)
+                fitted = _fit_loads(names, measured, load_ci95)
             else:
                 dialogue = Dialogue(fish, unit, seconds, record, limit)
                 dialogue.run([(step.fx, step.fy) for step in steps])
-                fitted = _fit_with_more_loads(dialogue, load_error)
+                fitted = _fit_with_more_loads(dialogue, load_ci95)
             is_reversed = _request_with_help(fish.status, plan if measured else None).fy_reversed
             if doubt := _explain_doubtful_sign(is_reversed, present.force, fitted.calibration):
                 echo(f"warning: {doubt}", err=True)
@@ -163,9 +163,9 @@ def _explain_doubtful_sign(
     )
 
 
-def _fit_loads(names: list[str], loads: list[Load], load_error: float) -> Fit:
+def _fit_loads(names: list[str], loads: list[Load], load_ci95: float) -> Fit:
     """Fit the loads and print the quality of the fit; raise `PoorLoads` if it is bad."""
-    fitted = fit(loads, load_error)
+    fitted = fit(loads, load_ci95)
     _print_fit(names, loads, fitted)
     check(fitted, loads, names)
     largest = max(math.hypot(load.fx, load.fy) for load in loads)
@@ -179,12 +179,12 @@ def _fit_loads(names: list[str], loads: list[Load], load_error: float) -> Fit:
     return fitted
 
 
-def _fit_with_more_loads(dialogue: Dialogue, load_error: float) -> Fit:
+def _fit_with_more_loads(dialogue: Dialogue, load_ci95: float) -> Fit:
     """Fit the measured loads; while the fit is refused, ask for more loads and keep them all."""
     while True:
         dialogue.amend()
         try:
-            return _fit_loads(*dialogue.result(), load_error)
+            return _fit_loads(*dialogue.result(), load_ci95)
         except PoorLoads as error:
             echo(f"\n{error}", err=True)
 
@@ -215,11 +215,11 @@ def _print_fit(names: list[str], loads: list[Load], fitted: Fit) -> None:
             f"{row[0]} ± {Z95 * math.sqrt(first):.2g}, {row[1]} ± {Z95 * math.sqrt(second):.2g} "
             f"N/V (95 %), correlation {correlation:+.2f}"
         )
-    share, load_error = best.thrust_ci95(1.0), best.load_error
+    share, load_ci95 = best.thrust_ci95(1.0), best.load_ci95
     assert share is not None
-    assert load_error is not None
-    scatter = math.sqrt(max(0.0, share**2 - load_error**2))
+    assert load_ci95 is not None
+    scatter = math.sqrt(max(0.0, share**2 - load_ci95**2))
     echo(
         f"a thrust is known to ± {share:.2%}: scatter of the loads ± {scatter:.2%}, "
-        f"--load-error ± {load_error:.2%}"
+        f"--load-error ± {load_ci95:.2%}"
     )

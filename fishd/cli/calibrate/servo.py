@@ -95,7 +95,7 @@ class Tail:
     def reach(self) -> tuple[float, float]:
         """Lowest and highest angle that Φ, limits and pulses permit now [rad]."""
         status = self._fish.status()
-        return status.lowest, status.highest
+        return status.lowest_angle, status.highest_angle
 
     def go_to_neutral(self) -> None:
         """Fade to neutral, and wait until the tail is there."""

@@ -81,7 +81,7 @@ def force_windows(ticks: list["Tick"], period: float) -> list["Force"]:
     forces: list[Force] = []
     for tick in ticks:
         sample_interval = period / max(1, tick.samples)
-        end = tick.time - 1e-3 * tick.age_ms + 0.5 * sample_interval
+        end = tick.time - 1e-3 * tick.sample_age_ms + 0.5 * sample_interval
         adjoins = forces and end - forces[-1].end < _MIN_GAP_PERIODS * period
         forces.append(Force(forces[-1].end if adjoins else end - period, end, tick.fy))
     return forces

@@ -82,13 +82,13 @@ def status_rows(state: "CameraState") -> list[tuple[str, str]]:
     source = f", of pictures of {picture_size}" if state.picture_width else ""
     pairs.append(("frames", f"{state.width} x {state.height} px{source}"))
     lost = []
-    if state.dropped:
-        lost.append(f"{format_count(state.dropped, 'frame')} that no client got")
-    if state.broken:
-        lost.append(f"{format_count(state.broken, 'frame')} that could not be decoded")
+    if state.dropped_frames:
+        lost.append(f"{format_count(state.dropped_frames, 'frame')} that no client got")
+    if state.broken_frames:
+        lost.append(f"{format_count(state.broken_frames, 'frame')} that could not be decoded")
     if lost:
         pairs.append(("lost", " and ".join(lost)))
-    pairs += [("degraded", line) for line in state.degraded]
+    pairs += [("limitation", line) for line in state.limitations]
     if state.virtual:
         until = "" if state.until is None else f", until {state.until:.3f} s"
         pairs.append(("clock", f"virtual, that of a fishd in lockstep{until}"))
@@ -151,8 +151,8 @@ def format_facts(client: "CameraClient", watch: "AxisWatch") -> str:
     if client.state.rate:
         parts.append(f"{client.state.rate:.1f} a second")
     parts.append(f"{(header.available - header.time) * 1e3:.0f} ms old when it came")
-    if header.dropped or client.missed:
-        parts.append(f"lost: {header.dropped + client.missed}")
+    if header.dropped_frames or client.missed:
+        parts.append(f"lost: {header.dropped_frames + client.missed}")
     if watch.axis:
         parts.append(f"axis {watch.axis.offset:+.1f} px, {watch.axis.tilt * 57.29578:+.1f}°")
     return ", ".join(parts)

@@ -183,7 +183,11 @@ def calibrations(context: Context) -> Result:
 def _judge_calibrations(force: ForceCalibration, servo: str) -> Result:
     """Judge the calibrations in use; servo: date of that of the servo, or empty."""
     if force.is_unset:
-        tared = f"tared {force.tared}, but never calibrated" if force.tared else "not calibrated"
+        tared = (
+            f"tared {force.tare_date}, but never calibrated"
+            if force.tare_date
+            else "not calibrated"
+        )
         return warning(f"the force sensor is {tared}: forces are volts", "fishctl calibrate force")
     share = force.thrust_ci95(1.0)
     error = "its uncertainty is unknown" if share is None else f"a thrust is known to ± {share:.2%}"

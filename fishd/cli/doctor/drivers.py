@@ -113,15 +113,19 @@ def _check_force_of_daemon(context: Context) -> Result:
         )
     transport = FORCE_SENSORS.find(context.config.force_sensor.driver).transport
     errors = ", ".join(
-        f"{n} {name}" for name, n in status.counters.items() if name.startswith(transport) and n
+        f"{n} {name}"
+        for name, n in status.recovered_errors.items()
+        if name.startswith(transport) and n
     )
     if tick.samples == 0:
         return warning(
-            f"no new sample in the latest tick, the newest is {tick.age_ms:.0f} ms old",
+            f"no new sample in the latest tick, the newest is {tick.sample_age_ms:.0f} ms old",
             "fishctl watch; check the wires if this goes on",
         )
     return _judge_rate(
-        tick.samples, context, f"the newest {tick.age_ms:.0f} ms old, {errors or 'no errors'}"
+        tick.samples,
+        context,
+        f"the newest {tick.sample_age_ms:.0f} ms old, {errors or 'no errors'}",
     )
 
 

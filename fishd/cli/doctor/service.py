@@ -39,9 +39,9 @@ def daemon(context: Context) -> Result:
             f"{message}: {status.reason.code}: {status.reason.message}",
             "mend the cause, then fishctl clear-fault",
         )
-    if status.degraded:
+    if status.limitations:
         return warning(
-            f"{message}; {'; '.join(status.degraded)}", "see docs/how-to/troubleshooting.md"
+            f"{message}; {'; '.join(status.limitations)}", "see docs/how-to/troubleshooting.md"
         )
     return ok(message)
 
@@ -96,10 +96,14 @@ def camera(context: Context) -> Result | None:
         zmq_context.destroy(linger=0)
     if state.state != "streaming":
         return warning(f"{state.state}: {state.problem}", state.remedy)
-    lost = f", {state.dropped} lost, {state.broken} broken" if state.dropped + state.broken else ""
+    lost = (
+        f", {state.dropped_frames} lost, {state.broken_frames} broken"
+        if state.dropped_frames + state.broken_frames
+        else ""
+    )
     message = f"{state.rate:.1f} frames a second from {state.device}{lost}"
-    if state.degraded:
-        return warning(f"{message}; {'; '.join(state.degraded)}", "see docs/how-to/camera.md")
+    if state.limitations:
+        return warning(f"{message}; {'; '.join(state.limitations)}", "see docs/how-to/camera.md")
     return ok(message)
 
 

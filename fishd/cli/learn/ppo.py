@@ -278,7 +278,9 @@ def print_outcome(outcome: "Outcome", job: "Job", as_json: bool = False) -> int:
     )
     if evaluation := outcome.best_evaluation:
         echo(f"best: {format_evaluation(evaluation).strip()}", err=as_json)
-        relative_error = evaluation.error / evaluation.thrust if evaluation.error else 0.0
+        relative_error = (
+            evaluation.thrust_ci95 / evaluation.thrust if evaluation.thrust_ci95 else 0.0
+        )
         if evaluation.relative_thrust * (1.0 - relative_error) > MAX_RELATIVE_THRUST:
             echo(
                 "careful: that is more than the best square wave of the configured plant; the fish "

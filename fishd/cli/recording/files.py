@@ -157,7 +157,7 @@ def recover(file: str, folder: Path | None, as_json: bool) -> None:
     )
     echo(
         f"{run.path}: {summary.duration:.1f} s, {format_count(summary.ticks, 'tick')}, "
-        f"{summary.lost} lost, {format_count(summary.events, 'event')}{frames}{loss}"
+        f"{summary.lost_ticks} lost, {format_count(summary.events, 'event')}{frames}{loss}"
     )
 
 

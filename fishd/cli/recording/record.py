@@ -286,8 +286,8 @@ def _format_amount(writer: RunWriter) -> str:
         (
             f"{summary.duration:.1f} s",
             format_count(summary.ticks, "tick"),
-            f"{summary.lost} lost",
-            *([frames, f"{summary.frames_lost} lost"] if summary.frames else []),
+            f"{summary.lost_ticks} lost",
+            *([frames, f"{summary.lost_frames} lost"] if summary.frames else []),
             format_count(summary.events, "event"),
             f"{writer.size / 1e3:.0f} kB",
         )

@@ -130,9 +130,9 @@ def _print_recordings(recordings: list[Overview]) -> None:
             _format_thrust(summary),
             "–" if summary.power is None else format_power(summary.power),
             str(summary.ticks),
-            str(summary.lost),
+            str(summary.lost_ticks),
             str(summary.marks),
-            text.line(", ".join(summary.swimming) or "–"),
+            text.line(", ".join(summary.swim_ticks) or "–"),
             text.line("; ".join(_format_remarks(glance))),
         )
     # Nothing is wrapped in a file or a pipe.
@@ -143,11 +143,11 @@ def _format_thrust(summary: Summary) -> str:
     """Return the thrust in mN, or thousandths of another unit, with its interval if known."""
     if summary.thrust is None:
         return "–"
-    error = "?" if summary.thrust_error is None else _format_thousandths(summary.thrust_error)
+    error = "?" if summary.thrust_ci95 is None else _format_thousandths(summary.thrust_ci95)
     unit = "" if summary.force_unit == "N" else f" m{text.quoted(summary.force_unit)}"
     if error == "0.00":  # a thrust without noise
         name = "" if summary.force_unit == "N" else summary.force_unit
-        return text.format_measured(summary.thrust, summary.thrust_error, name)
+        return text.format_measured(summary.thrust, summary.thrust_ci95, name)
     return f"{_format_thousandths(summary.thrust)} ± {error}{unit}"
 
 
@@ -170,8 +170,8 @@ def _format_remarks(glance: Overview) -> list[str]:
 
 def _format_frames(summary: Summary) -> str:
     frames = format_count(summary.frames, "frame")
-    if summary.frames_lost:
-        return f"{frames}, {summary.frames_lost} lost"
+    if summary.lost_frames:
+        return f"{frames}, {summary.lost_frames} lost"
     gaps = format_count(summary.frame_gaps, "gap")
     return f"{frames}, {gaps}" if summary.frame_gaps else frames
 

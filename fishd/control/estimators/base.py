@@ -71,7 +71,7 @@ class Estimator(ABC):
             thrust=self._beat.thrust,
             frequency=self._beat.frequency,
             thrust_factor=factor,
-            thrust_factor_error=ci95,
+            thrust_factor_ci95=ci95,
             side_time=self._beat.side_time,
         )
 

@@ -63,7 +63,7 @@ class LiveThrust:
         """
         self.thrust: float | None = None
         """Thrust of the latest beats; at rest, of its latest piece [N]. None while not known."""
-        self.error = 0.0
+        self.ci95 = 0.0
         """Half-width of the 95 % interval of `thrust` [N]."""
         self.factor: tuple[float, float] | None = None
         """Thrust over the mean square of `fin_velocity`, and the half-width of its interval [N].
@@ -112,14 +112,14 @@ class LiveThrust:
             if self._shown and self._now - self._shown[-1].end > MAX_BEAT_S:
                 self._shown.clear()  # too old to be shown
 
-    def calibrate(self, factor: float, error: float) -> None:
+    def calibrate(self, factor: float, ci95: float) -> None:
         """Set the factor to that of a measurement.
 
         factor: thrust over the mean square of `fin_velocity`
-        error: half-width of its 95 % interval
+        ci95: half-width of its 95 % interval
         """
         size = self._size() or self._factor.size
-        variance = (error / Z95) ** 2
+        variance = (ci95 / Z95) ** 2
         self._factor = Factor(factor, variance, self._now, size, self._factor.wave)
         self._run.used = True  # that change, by the measurement
         if self._shown:
@@ -318,7 +318,7 @@ class LiveThrust:
 
     def _show(self, thrust: float, ci95: float) -> None:
         known = ci95 < MAX_CI95_N
-        self.thrust, self.error = (thrust, ci95) if known else (None, 0.0)
+        self.thrust, self.ci95 = (thrust, ci95) if known else (None, 0.0)
 
     def _show_factor(self) -> None:
         """Renew `factor`, for the shown beats where there are some."""

@@ -90,7 +90,7 @@ def describe(name: str, tick: float | None = None, amplitude: float | None = Non
         file=str(path),
         problem=problem,
         card=None if card is None else msgspec.to_builtins(card),
-        sees="" if card is None else card.sees,
+        inputs="" if card is None else card.sees,
     )
 
 

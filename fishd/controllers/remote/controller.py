@@ -216,8 +216,8 @@ class Remote(Controller[RemoteParameters]):
                 *astuple(o),
                 session=self._session,
                 seq=self._seq + 1,
-                answered=self._answered,
-                lost=self._lost,
+                answered_seq=self._answered,
+                lost_ticks=self._lost,
                 tick=self.limits.tick,
                 amplitude=self.limits.amplitude,
             )

@@ -59,12 +59,12 @@ class PoorLoads(FishdError, ValueError):
     """Loads that do not determine a calibration; the message says what is missing."""
 
 
-def fit(loads: Sequence[Load], load_error: float = 0.0) -> Fit:
+def fit(loads: Sequence[Load], load_ci95: float = 0.0) -> Fit:
     """Return the calibration that fits the loads best, with the covariance of its gains.
 
     Its `residual` is the root mean square of all errors [N], its `condition` the ratio of the
     largest to the smallest spread of the voltages.
-    load_error: half-width of the 95 % confidence interval of the error that all loads share, as a
+    load_ci95: half-width of the 95 % confidence interval of the error that all loads share, as a
         fraction
     Raises `PoorLoads`.
     """
@@ -89,7 +89,7 @@ def fit(loads: Sequence[Load], load_error: float = 0.0) -> Fit:
     errors = design @ solution - forces
     rows = _covariances(design, forces, errors)
     covariance_x, covariance_y = (
-        _with_load_error(row, gains[:, axis], load_error) for axis, row in enumerate(rows)
+        _with_load_error(row, gains[:, axis], load_ci95) for axis, row in enumerate(rows)
     )
     calibration = ForceCalibration(
         xx=float(gains[0, 0]),
@@ -103,7 +103,7 @@ def fit(loads: Sequence[Load], load_error: float = 0.0) -> Fit:
         condition=condition,
         covariance_x=covariance_x,
         covariance_y=covariance_y,
-        load_error=load_error,
+        load_ci95=load_ci95,
     )
     return Fit(calibration, [(float(x), float(y)) for x, y in errors])
 
@@ -143,12 +143,12 @@ def _factor(residual_projection: _Vectors, errors: _Vectors, shape: _Vectors) ->
     return float((weight * errors**2).sum() / expected.sum() * (np.exp(widening) / 1.96) ** 2)
 
 
-def _with_load_error(covariance: _Vectors, gains: _Vectors, load_error: float) -> Covariance:
+def _with_load_error(covariance: _Vectors, gains: _Vectors, load_ci95: float) -> Covariance:
     """Return variance, covariance and variance of two gains, with the error that all loads share.
 
     That error multiplies all gains by the same number.
     """
-    total = covariance + (load_error / 1.96) ** 2 * np.outer(gains, gains)
+    total = covariance + (load_ci95 / 1.96) ** 2 * np.outer(gains, gains)
     return float(total[0, 0]), float(total[0, 1]), float(total[1, 1])
 
 

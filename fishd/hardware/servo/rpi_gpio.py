@@ -24,7 +24,9 @@ class RpiGpio(ServoDriver[RpiGpioSettings]):
 
     Settings = RpiGpioSettings
     packages = (header.PACKAGE,)
-    degraded = ("software PWM: pulses jitter by tens to hundreds of µs; use pigpio or sysfs-pwm",)
+    limitations = (
+        "software PWM: pulses jitter by tens to hundreds of µs; use pigpio or sysfs-pwm",
+    )
 
     def open(self) -> None:
         """Claim the pin, or continue without it and try again in each write.

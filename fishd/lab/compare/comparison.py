@@ -56,13 +56,13 @@ class Standing(Struct, frozen=True, kw_only=True):
     parameters: dict[str, Any]
     thrust: float
     """Mean thrust [N]."""
-    error: float | None
+    thrust_ci95: float | None
     """Half-width of the 95 % interval of `thrust` [N]; None for a single run in simulation."""
     frequency: float
     """Frequency of the tail beat [Hz]."""
     fullness: float
     """Mean |φ_c|/Φ."""
-    squareness: float
+    form_factor: float
     """Mean |φ_c| over the rms of φ_c: square 1, sine 0.900, triangle 0.866."""
     thrusts: list[float]
     """Thrust of each run [N]."""
@@ -78,7 +78,7 @@ class Standing(Struct, frozen=True, kw_only=True):
     """Electrical power of the servo [W]; None where unknown."""
     thrust_per_watt: float | None = None
     """Thrust over electrical power [N/W]."""
-    thrust_per_watt_error: float | None = None
+    thrust_per_watt_ci95: float | None = None
     """Half-width of the 95 % interval of `thrust_per_watt` [N/W]; None for one simulated run."""
     calibration_ci95: float | None = None
     """Half-width of the 95 % interval of the thrust that the calibration alone causes [N].
@@ -86,7 +86,7 @@ class Standing(Struct, frozen=True, kw_only=True):
     None in simulation, where the thrust is exact, and where it is unknown.
     """
     total_ci95: float | None = None
-    """Half-width of the 95 % interval from `error` and `calibration_ci95` together [N]."""
+    """Half-width of the 95 % interval from `thrust_ci95` and `calibration_ci95` together [N]."""
     thrust_per_watt_total_ci95: float | None = None
     """Half-width of the 95 % interval of `thrust_per_watt`, calibration included [N/W]."""
 
@@ -178,18 +178,18 @@ def _standing(label: str, reports: list[Report]) -> Standing:
         controller=reports[0].controller,
         parameters=reports[0].parameters,
         thrust=fmean(thrusts),
-        error=mean_ci95(thrusts),
+        thrust_ci95=mean_ci95(thrusts),
         thrusts=thrusts,
         relative_thrust=fmean(report.relative_thrust for report in reports),
         frequency=fmean(report.frequency for report in reports),
         fullness=fmean(report.fullness for report in reports),
-        squareness=fmean(report.squareness for report in reports),
+        form_factor=fmean(report.form_factor for report in reports),
         faults=[report.reason.message for report in reports if report.reason],
         fallbacks=[report.fallback.message for report in reports if report.fallback],
         runs=reports,
         power=fmean(powers) if powers else None,
         thrust_per_watt=fmean(per_watt) if per_watt else None,
-        thrust_per_watt_error=mean_ci95(per_watt),
+        thrust_per_watt_ci95=mean_ci95(per_watt),
     )
 
 
@@ -212,7 +212,7 @@ def judge_standings(standings: Sequence[Standing], is_random: bool = True) -> Ve
     fair = [item for item in standings if not item.faults and not item.fallbacks]
     if len(fair) < 2:
         return None
-    if any(item.error is None and _depends_on_seed(item, is_random) for item in fair):
+    if any(item.thrust_ci95 is None and _depends_on_seed(item, is_random) for item in fair):
         return Verdict("none: a single run with noise has no interval; use --runs 5", ())
     candidates = [_candidate(item) for item in fair]
     ranking = rank(candidates)
@@ -238,7 +238,7 @@ def _depends_on_seed(standing: Standing, is_random: bool) -> bool:
 
 
 def _candidate(standing: Standing) -> Candidate:
-    error = standing.error or 0.0
+    error = standing.thrust_ci95 or 0.0
     by_runs = mean_ci95(standing.thrusts)
     return Candidate(
         standing.contestant,

@@ -35,7 +35,7 @@ def draw(
     unit = plain(unit)
     rows = len(standings)
     simulated = all(standing.runs for standing in standings)
-    largest = max(standing.thrust + (standing.error or 0.0) for standing in standings)
+    largest = max(standing.thrust + (standing.thrust_ci95 or 0.0) for standing in standings)
     with open_figure(path, (7.6, 0.7 + 1.25 * rows)) as figure:
         axes = figure.subplots(rows, 3, squeeze=False, width_ratios=(3, 3, 1.8))
         forces = [1e3 * force for trace in traces for force in trace.thrust]
@@ -113,7 +113,7 @@ def _draw_relative_thrust(axis: Any, standing: Standing) -> None:
 
 
 def _draw_thrust(axis: Any, standing: Standing, largest: float) -> None:
-    value, error = 1e3 * standing.thrust, 1e3 * (standing.error or 0.0)
+    value, error = 1e3 * standing.thrust, 1e3 * (standing.thrust_ci95 or 0.0)
     _draw_bar(axis, "thrust", value, error, error, "95 %, statistical")
     low = min(0.0, 1.05 * (value - error))
     axis.set_xlim(low, 1.05e3 * max(largest, 1e-9))
@@ -134,10 +134,10 @@ def _draw_bar(
 
 
 def _describe(axis: Any, standing: Standing, unit: str) -> None:
-    half_width = standing.error if standing.total_ci95 is None else standing.total_ci95
+    half_width = standing.thrust_ci95 if standing.total_ci95 is None else standing.total_ci95
     caption = (
         f"{text.format_measured(standing.thrust, half_width, unit)}, {standing.frequency:.2f} Hz\n"
-        f"$|φ_c|/Φ$ {standing.fullness:.2f}, square {standing.squareness:.2f}"
+        f"$|φ_c|/Φ$ {standing.fullness:.2f}, form factor {standing.form_factor:.2f}"
     )
     style = {"va": "top", "fontsize": 6, "color": "0.35", "transform": _across(axis)}
     axis.text(0.0, -0.34, caption, **style)

@@ -75,8 +75,8 @@ def _standing(label: str, runs: list[ThrustMeasurement], session: Session) -> St
     Where runs scatter by more than their errors, the error of the mean uses Student's t.
     """
     thrusts = [run.thrust for run in runs]
-    weights = [1.0 / run.error**2 for run in runs]
-    thrust, error = weighted_mean(thrusts, [run.error for run in runs])
+    weights = [1.0 / run.thrust_ci95**2 for run in runs]
+    thrust, error = weighted_mean(thrusts, [run.thrust_ci95 for run in runs])
     angles = [abs(tick.phi_c) for run in runs for tick in run.ticks if tick.mode == "running"]
     mean = sum(angles) / len(angles)
     rms = math.sqrt(sum(angle**2 for angle in angles) / len(angles))
@@ -85,11 +85,11 @@ def _standing(label: str, runs: list[ThrustMeasurement], session: Session) -> St
         controller=runs[0].controller,
         parameters=dict(runs[0].parameters),
         thrust=thrust,
-        error=error,
+        thrust_ci95=error,
         thrusts=thrusts,
         frequency=float(np.average([run.frequency for run in runs], weights=weights)),
         fullness=mean / session.amplitude,
-        squareness=mean / rms if rms else 0.0,
+        form_factor=mean / rms if rms else 0.0,
     )
     standing = replace(standing, **_power(runs))
     return replace(standing, **_budget(runs, weights, standing, session.calibration))
@@ -98,7 +98,8 @@ def _standing(label: str, runs: list[ThrustMeasurement], session: Session) -> St
 def _power(runs: list[ThrustMeasurement]) -> dict[str, float]:
     """Return power and thrust per watt as fields of a standing; empty if unknown for any run."""
     results = [
-        (run.watts, *per_watt(run.thrust, run.error, run.watts, run.watts_error)) for run in runs
+        (run.watts, *per_watt(run.thrust, run.thrust_ci95, run.watts, run.watts_ci95))
+        for run in runs
     ]
     complete = [
         (watts, thrust_per_watt, error)
@@ -113,7 +114,7 @@ def _power(runs: list[ThrustMeasurement]) -> dict[str, float]:
     return {
         "power": sum(watts for watts, _, _ in complete) / len(complete),
         "thrust_per_watt": mean,
-        "thrust_per_watt_error": ci95,
+        "thrust_per_watt_ci95": ci95,
     }
 
 
@@ -130,13 +131,13 @@ def _budget(
     rotation, lateral = np.average(
         [(run.rotation, run.lateral) for run in runs], axis=0, weights=weights
     ).tolist()
-    total = budget(calibration, standing.thrust, standing.error, lateral, rotation)
+    total = budget(calibration, standing.thrust, standing.thrust_ci95, lateral, rotation)
     fields = total._asdict()
     if standing.power and standing.thrust_per_watt is not None:
         fields["thrust_per_watt_total_ci95"] = budget(
             calibration,
             standing.thrust_per_watt,
-            standing.thrust_per_watt_error,
+            standing.thrust_per_watt_ci95,
             lateral / standing.power,
             rotation,
         ).total_ci95

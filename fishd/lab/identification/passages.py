@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.core.errors import FishdError
+from fishd.core.old_names import OLD_NAMES
 from fishd.lab.identification.response import Array
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-COLUMNS = ("t", "seq", "missed", "fx", "fy", "phi_c", "servo_on", "samples")
+COLUMNS = ("t", "seq", "missed_slots", "fx", "fy", "phi_c", "servo_on", "samples")
 """Columns of a table of ticks that an identification reads."""
 MIN_PASSAGE_S = 5.0
 """Length of the shortest passage that is used [s]."""
@@ -55,7 +56,7 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
     """
     usable = []
     begin = 0.0
-    for table in tables:
+    for table in (table.rename(columns=OLD_NAMES["tick"]) for table in tables):
         missing = [name for name in COLUMNS if name not in table]
         if missing:
             raise Unidentifiable(
@@ -83,7 +84,7 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
 
 def _period(columns: dict[str, Array]) -> float:
     """Return the period of the loop [s], from times of ticks, some of which are late."""
-    slots = np.diff(columns["seq"]) + np.diff(columns["missed"])
+    slots = np.diff(columns["seq"]) + np.diff(columns["missed_slots"])
     good = slots > 0
     intervals = np.diff(columns["t"])[good] / slots[good]
     if not len(intervals) or not (median := float(np.median(intervals))) > 0.0:
@@ -101,7 +102,7 @@ def _unbroken_rows(columns: dict[str, Array]) -> Iterator[slice]:
         & (columns["samples"] > 0)
         & np.isfinite(columns["fx"] + columns["fy"] + columns["phi_c"])
     )
-    slots = 1 + np.diff(columns["missed"])
+    slots = 1 + np.diff(columns["missed_slots"])
     follows = (np.diff(columns["seq"]) == 1) & (slots >= 1) & (slots <= _MAX_WINDOW_SLOTS)
     joined = np.concatenate(([False], follows & usable[1:] & usable[:-1]))
     starts = np.flatnonzero(~joined)
@@ -112,7 +113,7 @@ def _unbroken_rows(columns: dict[str, Array]) -> Iterator[slice]:
 
 def _passage(columns: dict[str, Array], rows: slice, tick: float, begin: float) -> Passage:
     """Return the passage of these rows; begin: time of the first tick of the table [s]."""
-    slots = 1 + np.diff(columns["missed"][rows]).astype(int)
+    slots = 1 + np.diff(columns["missed_slots"][rows]).astype(int)
     phi_c = columns["phi_c"][rows].astype(float)
     # The command of a tick applies until the next one; its forces are means since the last one.
     commands = np.repeat(phi_c[:-1], slots)

@@ -144,7 +144,7 @@ class FishdLink:
         self._agent.act(angle)
         following = self._await_next()
         # The agent does not count a tick of a pause as lost, but its action was not applied.
-        applied = following.answered == observed.seq
+        applied = following.answered_seq == observed.seq
         return StepResult(following, max(self._agent.lost, 0 if applied else 1))
 
     def look(self) -> Stack | None:
@@ -292,8 +292,8 @@ class FishdLink:
             return LinkLost(f"another agent has taken command: {status.parameters['agent']}")
         if status.mode == "running":
             return LinkLost(f"another controller has taken command: {status.controller}")
-        if status.lease_expired:
-            return LinkLost(status.lease_expired.message)
+        if status.lease_expiry:
+            return LinkLost(status.lease_expiry.message)
         return LinkLost("fishd received a request to stop")
 
 

@@ -38,7 +38,10 @@ def draw(
             )  # fmt: skip
             best = proposal.parameters[searched.name]
             axis.axvspan(
-                proposal.low[searched.name], proposal.high[searched.name], color="0.85", zorder=0
+                proposal.parameters_ci95_low[searched.name],
+                proposal.parameters_ci95_high[searched.name],
+                color="0.85",
+                zorder=0,
             )
             axis.axvline(best, color="0.2", linewidth=0.8, label="best, 95 %")
             if searched.is_logarithmic:

@@ -80,16 +80,16 @@ class Proposal(NamedTuple):
     """Possible candidate for which the Gaussian process predicts the largest objective."""
 
     parameters: dict[str, float]
-    low: dict[str, float]
+    parameters_ci95_low: dict[str, float]
     """Lower end of the 95 % interval of each parameter at the maximum.
 
     The maximum lies in the interval in 95 % of the curves that agree with the measurements.
     """
-    high: dict[str, float]
+    parameters_ci95_high: dict[str, float]
     """Upper end of that interval."""
     value: float
     """Predicted objective; [N] for the thrust."""
-    error: float
+    value_ci95: float
     """Half-width of the 95 % interval of `value`."""
     improvement: float
     """Largest expected improvement by another trial, as a fraction of `value`."""
@@ -169,12 +169,12 @@ class Search:
         shares = self._library.suggest()
         return self.parameters_at(np.array([shares[name] for name in self._names]))
 
-    def observe(self, parameters: Mapping[str, float], value: float, error: float) -> None:
+    def observe(self, parameters: Mapping[str, float], value: float, value_ci95: float) -> None:
         """Add the objective of a candidate, with the half-width of its 95 % interval."""
         shares = {
             searched.name: searched.share(parameters[searched.name]) for searched in self.ranges
         }
-        self._variances.append(max(error / Z95, 1e-3 * abs(value), 1e-9) ** 2)
+        self._variances.append(max(value_ci95 / Z95, 1e-3 * abs(value), 1e-9) ** 2)
         with contextlib.redirect_stdout(None):  # the library prints a line for a repeated candidate
             self._library.register(params=shares, target=value)
 

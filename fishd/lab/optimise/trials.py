@@ -42,21 +42,21 @@ class Trial(NamedTuple):
     """Searched parameters."""
     thrust: float
     """Measured thrust [N]."""
-    error: float
+    thrust_ci95: float
     """Half-width of the 95 % confidence interval of `thrust` [N]."""
     power: float
     """Electrical power of the servo [W]; NaN if unknown."""
-    power_error: float
+    power_ci95: float
     """Half-width of the 95 % confidence interval of `power` [W]."""
-    swum: int
+    swim_ticks: int
     """Ticks of swimming from the beginning of the search."""
-    passed: float
+    tank_time: float
     """Tank time from the beginning of the search, rests included [s]."""
     rotation: float = 0.0
     """Rotation of the sensor visible in this swim; 0 for a trial read from a table [rad]."""
 
 
-TRIAL_COLUMNS = ("thrust", "error", "power", "power_error", "swum", "passed")
+TRIAL_COLUMNS = ("thrust", "thrust_ci95", "power", "power_ci95", "swim_ticks", "tank_time")
 """Columns of a table of trials, after the columns of the searched parameters."""
 
 
@@ -74,7 +74,7 @@ def read_trials(experiment: Experiment, names: Iterable[str]) -> list[Trial]:
         except ValueError as error:
             raise ConfigError(f"{experiment.path}: not a table of a search: {error}") from None
         parameters = {name: values.pop(name) for name in names}
-        trials.append(Trial(parameters, **values)._replace(swum=int(values["swum"])))  # type: ignore[arg-type]
+        trials.append(Trial(parameters, **values)._replace(swim_ticks=int(values["swim_ticks"])))  # type: ignore[arg-type]
     return trials
 
 
@@ -107,13 +107,13 @@ def measure_trials(
     """
     rest: list[Tick] = []
     steps: list[Step] = []
-    swum, passed = (before.swum, before.passed) if before else (0, 0.0)
-    passed += MEAN_REST_S
+    swim_ticks, tank_time = (before.swim_ticks, before.tank_time) if before else (0, 0.0)
+    tank_time += MEAN_REST_S
     while True:
         candidate = search.suggest()
         parameters = {**fixed, **candidate}
         settles, length = trial_durations(parameters)
-        if passed + length + MEAN_REST_S > budget:
+        if tank_time + length + MEAN_REST_S > budget:
             return
         if not rest:
             rest = session.rest(MEAN_REST_S)
@@ -123,28 +123,28 @@ def measure_trials(
         refuse_lost(ticks, (MEAN_REST_S, length, MEAN_REST_S), session.tick)
         evaluation = evaluate(to_samples(ticks), session.tick, settles, other_steps=steps)
         steps += evaluation.steps
-        swum += len(swim)
-        passed += length + MEAN_REST_S
-        power, power_error = (
+        swim_ticks += len(swim)
+        tank_time += length + MEAN_REST_S
+        power, power_ci95 = (
             math.nan if value is None else value
-            for value in (evaluation.watts, evaluation.watts_error)
+            for value in (evaluation.watts, evaluation.watts_ci95)
         )
         rotation = visible_rotation(swim, settles)
         trial = Trial(
             candidate,
             evaluation.thrust,
-            evaluation.error,
+            evaluation.thrust_ci95,
             power,
-            power_error,
-            swum,
-            passed,
+            power_ci95,
+            swim_ticks,
+            tank_time,
             rotation,
         )
         if observe:
             observe(trial)
         else:
             assert isinstance(search, Search)
-            search.observe(candidate, trial.thrust, trial.error)
+            search.observe(candidate, trial.thrust, trial.thrust_ci95)
         yield trial
         rest = after
 
@@ -247,7 +247,7 @@ class Aim(NamedTuple):
 
         Raises `ParameterError` if the aim needs the power, and the power is unknown.
         """
-        thrust = trial.thrust, trial.error
+        thrust = trial.thrust, trial.thrust_ci95
         if self.objective == "thrust" and self.target is None:
             assert isinstance(search, Search)
             search.observe(trial.parameters, *thrust)
@@ -258,9 +258,9 @@ class Aim(NamedTuple):
                 "read: set power_meter in its configuration, see docs/how-to/power.md"
             )
         if isinstance(search, LeastPower):
-            search.observe(trial.parameters, thrust, (trial.power, trial.power_error))
+            search.observe(trial.parameters, thrust, (trial.power, trial.power_ci95))
             return
-        value, error = per_watt(*thrust, trial.power, trial.power_error)
+        value, error = per_watt(*thrust, trial.power, trial.power_ci95)
         assert value is not None
         assert error is not None
         search.observe(trial.parameters, value, error)

@@ -42,7 +42,7 @@ class Report(Struct, frozen=True):
     """Mean over half beats of the largest fin angle [rad]."""
     fullness: float
     """Mean |φ_c|/Φ: 1 where the command is always at full amplitude."""
-    squareness: float
+    form_factor: float
     """Mean |φ_c| over the rms of φ_c: square wave 1, sine 0.900, triangle 0.866, no command 0."""
     relative_thrust: float
     """`mean_thrust` over `best_square_thrust`; 0 where no square wave moves the fin."""
@@ -169,7 +169,7 @@ def judge(
         reversals=beats.reversals,
         fin_amplitude=means.fin_amplitude,
         fullness=means.mean_angle / amplitude,
-        squareness=means.squareness,
+        form_factor=means.form_factor,
         relative_thrust=means.thrust / best.thrust if best.thrust > 0.0 else 0.0,
         best_square_thrust=best.thrust,
         best_square_frequency=best.frequency,
@@ -237,7 +237,7 @@ class Beats:
             frequency=frequency,
             fin_amplitude=sums.peaks / sums.halves,
             mean_angle=mean,
-            squareness=mean / rms if rms else 0.0,
+            form_factor=mean / rms if rms else 0.0,
             power=None if math.isnan(sums.energy) else sums.energy / sums.duration,
             half_beats=(sums.shortest, sums.longest) if frequency else (0, 0),
         )
@@ -250,7 +250,7 @@ class BeatMeans(NamedTuple):
     frequency: float  # Hz
     fin_amplitude: float  # rad
     mean_angle: float  # of |φ_c|, rad
-    squareness: float  # mean |φ_c| over rms φ_c
+    form_factor: float  # mean |φ_c| over rms φ_c
     power: float | None  # electrical, of the servo, W; None for a fish without a motor
     half_beats: tuple[int, int]  # shortest and longest, ticks
     thrust_deviation: float  # standard error of the thrust, from the spread of beats, N; or NaN

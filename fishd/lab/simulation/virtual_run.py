@@ -93,8 +93,8 @@ class VirtualRun:
             "robot": loop.robot.name,
             "tick": str(loop.limits.tick),
             "amplitude_limit": str(loop.limits.amplitude),
-            "lowest": str(loop.guard.lowest),
-            "highest": str(loop.guard.highest),
+            "lowest_angle": str(loop.guard.lowest),
+            "highest_angle": str(loop.guard.highest),
             "force_unit": loop.robot.force_unit,
         }
 

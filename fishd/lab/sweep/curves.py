@@ -30,13 +30,13 @@ class Peak(NamedTuple):
 
     x: float
     """Position of the maximum."""
-    x_low: float | None
+    x_ci95_low: float | None
     """Lower end of the 95 % confidence interval of `x`; None if the points do not determine it."""
-    x_high: float | None
+    x_ci95_high: float | None
     """Upper end of that interval."""
     y: float
     """Value at the maximum."""
-    y_error: float | None
+    y_ci95: float | None
     """Half-width of the 95 % confidence interval of `y`."""
     at_edge: bool
     """Whether the highest value is the first or the last, so that the maximum may lie beyond."""
@@ -52,7 +52,7 @@ class Curve(NamedTuple):
     """Thrust or speed as a function of one quantity; all other settings are equal."""
 
     label: str
-    over: str
+    x_name: str
     """Name of the quantity, such as `frequency` or `plant.xi`; empty for a single point."""
     points: list[Point]
     x: list[float]
@@ -68,9 +68,9 @@ class WholeTicks(Struct, frozen=True):
     """Tail beats per second [Hz]."""
     thrust: float
     """Measured thrust [N]."""
-    error: float | None
+    thrust_ci95: float | None
     """Half-width of the 95 % confidence interval of `thrust` [N]."""
-    nearer: float | None
+    nearest_frequency: float | None
     """Frequency of whole ticks nearest the maximum of the curve, if it was not measured [Hz]."""
 
 
@@ -82,17 +82,17 @@ class Best(Struct, frozen=True):
     """Parameters of the highest measured point."""
     keys: dict[str, Any]
     """Keys of the configuration that differ at that point, in dotted form."""
-    over: str
+    x_name: str
     """Name of the quantity along the curve, such as `frequency`; empty for a single point."""
     x: float | None
     """Value of the quantity at the maximum; None if nothing was varied."""
-    x_low: float | None
+    x_ci95_low: float | None
     """Lower end of the 95 % confidence interval of `x`; None if the points do not determine it."""
-    x_high: float | None
+    x_ci95_high: float | None
     """Upper end of that interval."""
     value: float
     """Thrust [N] or speed [m/s] at the maximum."""
-    error: float | None
+    value_ci95: float | None
     """Half-width of the 95 % confidence interval of `value`."""
     at_edge: bool
     """Whether the highest point is at the edge of the grid; the maximum may lie beyond it."""
@@ -136,29 +136,30 @@ def find_best(curve: Curve) -> Best | None:
         controller=point.controller,
         parameters=point.parameters,
         keys=point.keys,
-        over=curve.over,
+        x_name=curve.x_name,
         x=maximum.x if maximum else None,
-        x_low=maximum.x_low if maximum else None,
-        x_high=maximum.x_high if maximum else None,
+        x_ci95_low=maximum.x_ci95_low if maximum else None,
+        x_ci95_high=maximum.x_ci95_high if maximum else None,
         value=maximum.y if maximum else value,
-        error=maximum.y_error if maximum else curve.results[index].error,
+        value_ci95=maximum.y_ci95 if maximum else curve.results[index].value_ci95,
         at_edge=maximum.at_edge if maximum else False,
     )
 
 
 def best_to_builtins(best: Best, quantity: Quantity) -> dict[str, Any]:
     """Return the best point as plain data, its value under the name of the quantity."""
+    names = {"value": quantity.name, "value_ci95": f"{quantity.name}_ci95"}
     fields = msgspec.structs.asdict(best)
-    return {quantity.name if name == "value" else name: value for name, value in fields.items()}
+    return {names.get(name, name): value for name, value in fields.items()}
 
 
 def find_best_of_whole_ticks(folder: SweepFolder, curve: Curve) -> WholeTicks | None:
     """Return the best measured point without dithered half beats; None if there is none."""
-    if curve.over != "frequency" or curve.peak is None or folder.quantity.name != "thrust":
+    if curve.x_name != "frequency" or curve.peak is None or folder.quantity.name != "thrust":
         return None
     tick = float(curve.points[0].keys.get("tick", folder.experiment.header.config["tick"]))
     by_ticks = {
-        round(0.5 / x / tick): (thrust, x, result.error)
+        round(0.5 / x / tick): (thrust, x, result.value_ci95)
         for x, result in zip(curve.x, curve.results, strict=True)
         if (thrust := result.value) is not None and x > 0.0 and _is_whole(0.5 / x / tick)
     }
@@ -185,7 +186,7 @@ def _make_curve(
     results = [folder.results[folder.key(point)] for point in group]
     x = [float(point.columns()[quantity]) for point in group] if quantity else []
     measured = [
-        (position, result.value, result.error)
+        (position, result.value, result.value_ci95)
         for position, result in zip(x, results, strict=False)
         if result.value is not None
     ]
@@ -206,10 +207,10 @@ def _find_constant_columns(points: Sequence[Point]) -> set[str]:
     }
 
 
-def find_peak(x: Sequence[float], y: Sequence[float], error: Sequence[float | None]) -> Peak:
+def find_peak(x: Sequence[float], y: Sequence[float], y_ci95: Sequence[float | None]) -> Peak:
     """Return the maximum of y over x.
 
-    error: half-width of the 95 % confidence interval of each y; None if it is unknown
+    y_ci95: half-width of the 95 % confidence interval of each y; None if it is unknown
 
     The interval is that of the vertex of a weighted least-squares parabola. The variance of a value
     is that of its own error plus the misfit of the parabola, which the residuals show.
@@ -217,13 +218,13 @@ def find_peak(x: Sequence[float], y: Sequence[float], error: Sequence[float | No
     """
     order = np.argsort(x)
     xs, ys = _to_array(x)[order], _to_array(y)[order]
-    deviations = np.array([(half_width or 0.0) / Z95 for half_width in error])[order]
+    deviations = np.array([(half_width or 0.0) / Z95 for half_width in y_ci95])[order]
     if not len(xs):
         raise ValueError("a curve without points has no maximum")
     top = int(np.argmax(ys))
     first, last = _select_points(ys, top)
     selection = slice(first, last + 1)
-    highest = error[int(order[top])]
+    highest = y_ci95[int(order[top])]
     at_edge = top in (0, len(xs) - 1)
     without_parabola = Peak(
         float(xs[top]), None, None, float(ys[top]), highest, at_edge, None, float(xs[top]),
@@ -280,13 +281,13 @@ def _fit_vertex(
     powers = np.array([offset**2, offset, 1.0])
     quantile = student95(degrees) if degrees and misfit_variance > measurement_variance else Z95
     has_interval = degrees > 0 or measurement_variance > 0.0
-    x_error = quantile * math.sqrt(slope @ covariance @ slope)
+    x_ci95 = quantile * math.sqrt(slope @ covariance @ slope)
     return Peak(
         x=centre + offset,
-        x_low=max(float(x[0]), centre + offset - x_error) if has_interval else None,
-        x_high=min(float(x[-1]), centre + offset + x_error) if has_interval else None,
+        x_ci95_low=max(float(x[0]), centre + offset - x_ci95) if has_interval else None,
+        x_ci95_high=min(float(x[-1]), centre + offset + x_ci95) if has_interval else None,
         y=float(powers @ coefficients),
-        y_error=quantile * math.sqrt(powers @ covariance @ powers) if has_interval else None,
+        y_ci95=quantile * math.sqrt(powers @ covariance @ powers) if has_interval else None,
         at_edge=False,
         coefficients=(float(a), float(b), float(c)),
         centre=centre,

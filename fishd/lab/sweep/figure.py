@@ -39,24 +39,24 @@ def draw(
     """
     panels: dict[str, list[Curve]] = {}
     points: list[Curve] = []
-    has_frequencies = any(curve.peak and curve.over == FREQUENCY for curve in curves)
+    has_frequencies = any(curve.peak and curve.x_name == FREQUENCY for curve in curves)
     for curve in curves:
         if has_frequencies and _has_own_frequency(curve):
             points.append(curve)
         elif curve.peak:
-            panels.setdefault(curve.over, []).append(curve)
+            panels.setdefault(curve.x_name, []).append(curve)
     with open_figure(paths[0], (2.0 + 5.0 * len(panels), 4.2)) as figure:
         panel_axes = figure.subplots(1, len(panels), squeeze=False, sharey=True)[0]
-        for axes, (over, group) in zip(panel_axes, panels.items(), strict=True):
+        for axes, (x_name, group) in zip(panel_axes, panels.items(), strict=True):
             for index, curve in enumerate(group):
                 _draw_curve(
                     axes, curve, COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
                 )
-            if over == FREQUENCY:
+            if x_name == FREQUENCY:
                 _draw_points(axes, points, len(group))
             axes.axhline(0.0, color="0.85", linewidth=0.6, zorder=0)
-            unit = units.get(over, "")
-            axes.set_xlabel(plain(f"{over} ({unit})" if unit not in ("", "1") else over))
+            unit = units.get(x_name, "")
+            axes.set_xlabel(plain(f"{x_name} ({unit})" if unit not in ("", "1") else x_name))
             axes.legend()
         panel_axes[0].set_ylabel(plain(f"{quantity.name} (m{quantity.unit})"))
         note = f"bars: 95 % interval of {error_of}; cross: maximum of the fitted parabola"
@@ -76,7 +76,7 @@ def _has_own_frequency(curve: Curve) -> bool:
 
 def _draw_curve(axes: Any, curve: Curve, colour: str, marker: str) -> None:
     values = sorted(
-        (x, 1e3 * result.value, 1e3 * (result.error or 0.0))
+        (x, 1e3 * result.value, 1e3 * (result.value_ci95 or 0.0))
         for x, result in zip(curve.x, curve.results, strict=True)
         if result.value is not None
     )
@@ -97,9 +97,12 @@ def _draw_curve(axes: Any, curve: Curve, colour: str, marker: str) -> None:
         color=colour,
         alpha=0.4,
     )
-    xerr = [[maximum.x - (maximum.x_low or maximum.x)], [(maximum.x_high or maximum.x) - maximum.x]]
+    xerr = [
+        [maximum.x - (maximum.x_ci95_low or maximum.x)],
+        [(maximum.x_ci95_high or maximum.x) - maximum.x],
+    ]
     axes.errorbar(
-        maximum.x, 1e3 * maximum.y, xerr=xerr, yerr=1e3 * (maximum.y_error or 0.0), color="black",
+        maximum.x, 1e3 * maximum.y, xerr=xerr, yerr=1e3 * (maximum.y_ci95 or 0.0), color="black",
         elinewidth=1.2, capsize=0, zorder=5,
     )  # fmt: skip
 
@@ -112,7 +115,7 @@ def _draw_points(axes: Any, curves: Sequence[Curve], used_styles: int) -> None:
             if result.value is None:
                 continue
             axes.errorbar(
-                result.beat_frequency, 1e3 * result.value, yerr=1e3 * (result.error or 0.0),
+                result.beat_frequency, 1e3 * result.value, yerr=1e3 * (result.value_ci95 or 0.0),
                 color=COLOURS[style % len(COLOURS)], marker=MARKERS[style % len(MARKERS)],
                 linestyle="", markersize=6, markerfacecolor="white", elinewidth=0.8, capsize=2,
                 label=point.label(), zorder=6,

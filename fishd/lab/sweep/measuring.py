@@ -124,7 +124,7 @@ def swim(
         reason, fallback = run.loop.supervisor.reason, run.loop.active.fallback
     seconds = (index + 1) * config.tick
     if trouble := reason or fallback:
-        return Result(seconds=seconds, trouble=trouble.message)
+        return Result(seconds=seconds, failure=trouble.message)
     means = beats.means()
     best = best_square_wave(config.plant, amplitude_of(controller.parameters, config.limits))
     error = None
@@ -133,13 +133,13 @@ def swim(
     watts = means.power or math.nan
     return Result(
         thrust=means.thrust,
-        error=error,
+        thrust_ci95=error,
         beat_frequency=means.frequency,
         relative_thrust=means.thrust / best.thrust if best.thrust > 0.0 else None,
         fin_amplitude=means.fin_amplitude,
         power=means.power,
         thrust_per_watt=means.thrust / watts,
-        thrust_per_watt_error=None if error is None else error / watts,
+        thrust_per_watt_ci95=None if error is None else error / watts,
         seconds=seconds,
     )
 
@@ -147,7 +147,7 @@ def swim(
 def measure_point(point: Point, session: Session, seconds: float) -> Result:
     """Return the thrust measured at a point, without the drift of the sensor.
 
-    The result has `trouble` and no thrust if fishd refuses the controller, or if the controller
+    The result has `failure` and no thrust if fishd refuses the controller, or if the controller
     gives up. Errors of `fishd.lab.measurement.measure` that concern other points, too, are raised.
     """
     try:
@@ -155,17 +155,17 @@ def measure_point(point: Point, session: Session, seconds: float) -> Result:
     except FishdError as error:
         if not concerns_one_controller(error):
             raise
-        return Result(trouble=str(error))
-    per_watt_value, per_watt_error = per_watt(
-        measured.thrust, measured.error, measured.watts, measured.watts_error
+        return Result(failure=str(error))
+    per_watt_value, per_watt_ci95 = per_watt(
+        measured.thrust, measured.thrust_ci95, measured.watts, measured.watts_ci95
     )
     return Result(
         thrust=measured.thrust,
-        error=measured.error,
+        thrust_ci95=measured.thrust_ci95,
         beat_frequency=measured.frequency,
         power=measured.watts,
         thrust_per_watt=per_watt_value,
-        thrust_per_watt_error=per_watt_error,
+        thrust_per_watt_ci95=per_watt_ci95,
         seconds=len(measured.ticks) * session.tick,
     )
 
@@ -209,7 +209,7 @@ def measure_all(
 ) -> None:
     """Measure the missing points in a session that the caller has entered.
 
-    If a controller is refused or gives up, its point gets `trouble` and the next one is measured.
+    If a controller is refused or gives up, its point gets `failure` and the next one is measured.
 
     seconds: duration of each point [s]
     Raises `FishdError`; the results of finished points are kept.
@@ -237,7 +237,7 @@ def swim_freely(
 
     The fish swims until the speeds of at least `lengths.periods` beats and `MIN_MEASURED_S` seconds
     show no trend. After `MAX_SWIM_S` seconds the later half is measured, or `lengths.periods` beats
-    if the half has fewer, and `settled` is None.
+    if the half has fewer, and `settled_time` is None.
 
     publisher: receives every tick and every event
     on_start: called before the first tick
@@ -264,7 +264,7 @@ def swim_freely(
             problem = fish.trouble or run.loop.supervisor.reason or run.loop.active.fallback
             if problem:
                 message = getattr(problem, "message", str(problem))
-                return SpeedResult(seconds=len(track) * config.tick, trouble=message)
+                return SpeedResult(seconds=len(track) * config.tick, failure=message)
             track.add(fish, command)
             if reversals.add(command) > 0 and len(track) * config.tick > lengths.settle:
                 beat_starts.append(len(track) - 1)
@@ -316,10 +316,10 @@ def _make_result(
     measured = gait({name: values[row - 1 :] for name, values in columns.items()}, config.swimmer)
     return SpeedResult(
         speed=measured.speed,
-        error=measured.speed_error,
+        speed_ci95=measured.speed_ci95,
         beat_frequency=measured.frequency,
         beats=measured.beats,
-        settled=None if first is None else float(columns["time"][first - 1]),
+        settled_time=None if first is None else float(columns["time"][first - 1]),
         tail_width=measured.tail_width,
         muscle_power=measured.muscle_power,
         cost_of_transport=measured.cost_of_transport,

@@ -22,8 +22,8 @@ class Result(Struct, frozen=True):
     """Thrust at a point; the fields are the measured columns of a sweep's table."""
 
     thrust: float | None = None
-    """Mean thrust over whole tail beats [N]; None if there is `trouble`."""
-    error: float | None = None
+    """Mean thrust over whole tail beats [N]; None if there is `failure`."""
+    thrust_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `thrust` [N]; None if unknown."""
     beat_frequency: float = 0.0
     """Tail beats per second; 0 if the tail does not beat [Hz]."""
@@ -35,11 +35,12 @@ class Result(Struct, frozen=True):
     """Electrical power of the servo [W]; None if unknown."""
     thrust_per_watt: float | None = None
     """Thrust divided by `power` [N/W]."""
-    thrust_per_watt_error: float | None = None
-    """Half-width of its 95 % confidence interval [N/W]; simulated power counts as exact."""
+    thrust_per_watt_ci95: float | None = None
+    """Half-width of the 95 % confidence interval of `thrust_per_watt` [N/W]; simulated power counts
+    as exact."""
     seconds: float = 0.0
     """Duration of swimming and resting [s]."""
-    trouble: str = ""
+    failure: str = ""
     """Reason for a missing thrust; empty if there is a thrust."""
 
     @property
@@ -47,19 +48,24 @@ class Result(Struct, frozen=True):
         """Quantity that curves show."""
         return self.thrust
 
+    @property
+    def value_ci95(self) -> float | None:
+        """Half-width of the 95 % confidence interval of `value`; None if unknown."""
+        return self.thrust_ci95
+
 
 class SpeedResult(Struct, frozen=True):
     """Speed at a point of a freely swimming fish; powers are those of a fish one metre deep."""
 
     speed: float | None = None
-    """Mean forward speed over whole tail beats [m/s]; None if there is `trouble`."""
-    error: float | None = None
+    """Mean forward speed over whole tail beats [m/s]; None if there is `failure`."""
+    speed_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `speed` [m/s]; None if unknown."""
     beat_frequency: float = 0.0
     """Tail beats per second; 0 if the tail does not beat [Hz]."""
     beats: int = 0
     """Number of measured beats."""
-    settled: float | None = None
+    settled_time: float | None = None
     """Time at which the measured beats begin [s]; None if the speed still changed at the end."""
     tail_width: float | None = None
     """Distance of the tail tip from side to side, in body lengths."""
@@ -71,13 +77,18 @@ class SpeedResult(Struct, frozen=True):
     froude_efficiency: float | None = None
     seconds: float = 0.0
     """Duration of the swim [s]."""
-    trouble: str = ""
+    failure: str = ""
     """Reason for a missing speed; empty if there is a speed."""
 
     @property
     def value(self) -> float | None:
         """Quantity that curves show."""
         return self.speed
+
+    @property
+    def value_ci95(self) -> float | None:
+        """Half-width of the 95 % confidence interval of `value`; None if unknown."""
+        return self.speed_ci95
 
 
 PointResult = Result | SpeedResult

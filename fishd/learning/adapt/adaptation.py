@@ -105,7 +105,7 @@ class Adaptation:
         identification, state.fitted = do.fit(path, self._session.amplitude, self._seed)
         self._run.experiment.write(FISH, identification.to_yaml("fishctl adapt"))
         explained = " and ".join(f"{channel.explained:.1%}" for channel in identification.channels)
-        unused = "" if state.fitted.model.error is not None else ": too little to be used"
+        unused = "" if state.fitted.model.standard_error is not None else ": too little to be used"
         self._done(f"fit: explains {explained} of F_x and F_y{unused}")
         for remark in identification.remarks:
             self._show.warn(f"fishctl: careful: {remark}")
@@ -117,7 +117,7 @@ class Adaptation:
             state.swing = do.settle_swing(self._session, seconds)
         rung = state.swing
         lead = f", {rung.lead * 1e3:.0f} ms ahead" if rung.lead else ""
-        unsure = "" if rung.settled else "; its search was not finished"
+        unsure = "" if rung.is_finished else "; its search was not finished"
         self._done(f"swing --C auto: C = {rung.C:g}{lead}{unsure}")
 
     def _search(self, state: State) -> None:
@@ -139,21 +139,21 @@ class Adaptation:
         ):
             do.search_square_waves(self._session, search, budget, tuple(state.trials), add_trial)
         state.square, used = do.best_of(search, state.trials, state.fitted, self._session.amplitude)
-        state.disagrees = not used and state.fitted.model.error is not None
+        state.is_fit_rejected = not used and state.fitted.model.standard_error is not None
         tried = f"{len(state.trials)} square waves tried"
         basis = "in agreement with the fit" if used else "from these waves alone"
-        basis = "they contradict the fit, which is not used" if state.disagrees else basis
+        basis = "they contradict the fit, which is not used" if state.is_fit_rejected else basis
         self._done(f"search: {tried}; best at {state.square:.4g} Hz, {basis}")
 
     def _model(self, state: State) -> Model:
         """Return the model of the fit, marked as rejected where the square waves disagree."""
         assert state.fitted
-        return replace(state.fitted.model, is_rejected=state.disagrees)
+        return replace(state.fitted.model, is_rejected=state.is_fit_rejected)
 
     def _train(self, state: State) -> None:
         assert state.fitted
-        if state.fitted.model.error is None:
-            state.trained = Trained(steps=0, refused="the fit explains too little to train on it")
+        if state.fitted.model.standard_error is None:
+            state.trained = Trained(steps=0, refusal="the fit explains too little to train on it")
             self._done("no policy is trained: the fit explains too little")
             return
 
@@ -166,11 +166,15 @@ class Adaptation:
         state.trained = trained = train_policy(
             self._config, state.fitted, self._run.path, self._steps, self._seed, progress
         )
-        if trained.refused:
+        if trained.refusal:
             self._save()
-            self._show.warn(f"fishctl: careful: no policy takes part: {trained.refused}")
+            self._show.warn(f"fishctl: careful: no policy takes part: {trained.refusal}")
             return
-        worst = "" if trained.worst is None else f", {trained.worst:.1%} on the worst tried"
+        worst = (
+            ""
+            if trained.worst_relative_thrust is None
+            else f", {trained.worst_relative_thrust:.1%} on the worst tried"
+        )
         cloud = f"{len(state.fitted.cloud)} fish within the errors of the fit"
         self._done(f"training on {cloud}: {trained.relative_thrust:.1%} in simulation{worst}")
 
@@ -183,13 +187,13 @@ class Adaptation:
             Gait("swing", "swing", swing),
             Gait(SQUARE, "square", {"frequency": state.square}),
         ]
-        if state.trained and not state.trained.refused:
+        if state.trained and not state.trained.refusal:
             policy = str((self._run.path / POLICY).absolute())
             gaits.insert(0, Gait("policy", "ppo", {"policy": policy}))
         return gaits
 
     def _compare(self, state: State) -> None:
-        known = {contender.name for contender in state.contenders} | set(state.left_out)
+        known = {contender.name for contender in state.contenders} | set(state.exclusions)
         todo = [gait for gait in self.gaits(state) if gait.name not in known]
         left = self._tank_time - self._session.used
         needed = sum(do.min_measurement_time(gait.parameters) for gait in todo)
@@ -215,7 +219,7 @@ class Adaptation:
         except FishdError as error:
             if not concerns_one_controller(error) or gait.name == SQUARE:
                 raise
-            state.left_out[gait.name] = str(error)
+            state.exclusions[gait.name] = str(error)
             self._save()
             self._show.warn(f"fishctl: {gait.name}: left out: {error}")
             return
@@ -225,19 +229,19 @@ class Adaptation:
                 controller=gait.controller,
                 parameters=gait.parameters,
                 thrust=measurement.thrust,
-                error=measurement.error,
+                thrust_ci95=measurement.thrust_ci95,
                 calibration_ci95=measurement.calibration_ci95,
                 total_ci95=measurement.total_ci95,
                 frequency=measurement.frequency,
                 seconds=seconds,
                 remark=measurement.remark,
-                expected=self._simulate_thrusts(state, gait),
+                expected_thrusts=self._simulate_thrusts(state, gait),
                 **_true_thrusts(self._config, self._session, gait),
             )
         )
         measured = error_budget.format_with_budget(
             measurement.thrust,
-            measurement.error,
+            measurement.thrust_ci95,
             measurement.calibration_ci95,
             measurement.total_ci95,
             measurement.unit,
@@ -249,7 +253,7 @@ class Adaptation:
     def _simulate_thrusts(self, state: State, gait: Gait) -> list[float]:
         """Return the thrusts of a gait on the first fish of the cloud [N]; empty if unused."""
         assert state.fitted
-        if state.fitted.model.error is None:
+        if state.fitted.model.standard_error is None:
             return []
         identified = simulated_config(self._config, state.fitted)
         return [
@@ -266,7 +270,7 @@ class Adaptation:
             yield
         finally:
             spent = self._session.used - begun
-            state.spent[step] = state.spent.get(step, 0.0) + spent
+            state.step_times[step] = state.step_times.get(step, 0.0) + spent
             state.tank_time = self._session.used
             self._save()
 

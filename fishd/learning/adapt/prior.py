@@ -42,11 +42,11 @@ def model_of(identification: Identification) -> Model:
     """
     explained = min(channel.explained_out_of_sample for channel in identification.channels)
     if not identification.failed_assumptions:
-        return Model(explained=explained, error=MODEL_ERROR)
+        return Model(explained_fraction=explained, standard_error=MODEL_ERROR)
     if not explained >= MIN_EXPLAINED:
-        return Model(explained=explained, error=None)
+        return Model(explained_fraction=explained, standard_error=None)
     error = math.hypot(MODEL_ERROR, math.sqrt(max(0.0, 1.0 - explained)))
-    return Model(explained=explained, error=error)
+    return Model(explained_fraction=explained, standard_error=error)
 
 
 def deviations(curves: Array, error: float, correlation: Array | None = None) -> Array:

@@ -61,7 +61,7 @@ def _draw_fit(axis: Any, fitted: Fitted) -> None:
     one that is withheld has no bar.
     """
     shown = []
-    for name, estimate in fitted.found["estimates"].items():
+    for name, estimate in fitted.identification["estimates"].items():
         low, high = estimate.get("if_ratio_holds") or (estimate["low"], estimate["high"])
         if estimate.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio":
             width = math.nan if low is None or high is None else high - low
@@ -88,7 +88,7 @@ def _draw_search(axis: Any, state: State, amplitude: float) -> None:
     axis.plot(frequencies, curves[0], color=BLACK, label="identified fish, and its cloud")
     axis.errorbar(
         tried, [1e3 * trial.thrust for trial in state.trials],
-        yerr=[1e3 * trial.error for trial in state.trials], fmt="o", color=ORANGE,
+        yerr=[1e3 * trial.thrust_ci95 for trial in state.trials], fmt="o", color=ORANGE,
         markersize=4, elinewidth=0.8, capsize=2, label="tried, 95 %",
     )  # fmt: skip
     axis.set_xlabel("frequency (Hz)")
@@ -121,7 +121,7 @@ def _draw_contest(axis: Any, state: State) -> None:
     """Draw the thrusts measured on the fish."""
     for place, contender in enumerate(state.contenders):
         axis.errorbar(
-            1e3 * contender.thrust, -place, xerr=1e3 * contender.error, fmt="o", capsize=3,
+            1e3 * contender.thrust, -place, xerr=1e3 * contender.thrust_ci95, fmt="o", capsize=3,
             color=_COLOURS[contender.name],
         )  # fmt: skip
         if contender.true_thrust is not None:
@@ -141,8 +141,8 @@ def page(state: State, picture: bytes, again: str) -> str:
     assert state.fitted
     assert state.verdict
     image = base64.b64encode(picture).decode()
-    remarks = [*state.fitted.found["remarks"]]
-    remarks += [f"{NAMES[name]} was left out: {why}" for name, why in state.left_out.items()]
+    remarks = [*state.fitted.identification["remarks"]]
+    remarks += [f"{NAMES[name]} was left out: {why}" for name, why in state.exclusions.items()]
     if line := error_budget.unknown_calibration(state.contenders[0].calibration_ci95, "N"):
         remarks.append(line)
     remarks += [
@@ -150,9 +150,9 @@ def page(state: State, picture: bytes, again: str) -> str:
         for contender in state.contenders
         if contender.remark
     ]
-    if state.trained and state.trained.refused:
-        remarks.append(f"no policy took part: {state.trained.refused}")
-    minutes = " + ".join(f"{seconds:.0f} s {step}" for step, seconds in state.spent.items())
+    if state.trained and state.trained.refusal:
+        remarks.append(f"no policy took part: {state.trained.refusal}")
+    minutes = " + ".join(f"{seconds:.0f} s {step}" for step, seconds in state.step_times.items())
     parts = [
         "<!doctype html>",
         '<html lang="en"><head><meta charset="utf-8"><title>fishctl adapt</title>',
@@ -190,7 +190,7 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     head = ("gait", "thrust", "Hz", "relative thrust", *(("true thrust",) if known else ()))
     rows = []
     for contender in state.contenders:
-        share = state.verdict.others.get(contender.name)
+        share = state.verdict.relative_thrusts.get(contender.name)
         relative_thrust = "100 %"
         if share:
             relative_thrust = format_ratio(share)
@@ -198,7 +198,7 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
             NAMES[contender.name] + _role(contender.name, state.verdict),
             error_budget.format_with_budget(
                 contender.thrust,
-                contender.error,
+                contender.thrust_ci95,
                 contender.calibration_ci95,
                 contender.total_ci95,
                 "N",
@@ -215,17 +215,17 @@ def _contenders(state: State) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
 
 def _role(name: str, verdict: Verdict) -> str:
     """Return the role of a gait in the verdict, as a suffix to its name."""
-    if name not in verdict.undecided:
+    if name not in verdict.undecided_gaits:
         return ""
-    if verdict.decided:
+    if verdict.is_decided:
         return ", wins"
-    return ", chosen" if name == verdict.chosen else ", undecided"
+    return ", chosen" if name == verdict.chosen_gait else ", undecided"
 
 
 def _estimates(fitted: Fitted) -> list[tuple[str, ...]]:
     """Return the rows of the fitted parameters, as `fishctl identify` prints them."""
     rows = []
-    for name, values in fitted.found["estimates"].items():
+    for name, values in fitted.identification["estimates"].items():
         if values.get("fitted", True):
             # JSON has no infinity: null stands for an end that the data do not determine.
             low = -math.inf if values["low"] is None else values["low"]

@@ -16,9 +16,9 @@ PICTURE, PAGE = "adapt.png", "adapt.html"
 class Model(Struct, frozen=True, kw_only=True):
     """The quality of the identified fish as a model for the choice among gaits."""
 
-    explained: float
+    explained_fraction: float
     """Share of the variance of a force that the model explains; the smaller of both forces."""
-    error: float | None
+    standard_error: float | None
     """Standard error of a thrust of the model, as a fraction; None if it explains too little."""
     is_rejected: bool = False
     """Whether the square waves tried disagree with the model."""
@@ -33,7 +33,7 @@ class Fitted(Struct, frozen=True, kw_only=True):
     """Half-width of the range of the offset of F_y while the fish swims [N]."""
     cloud: tuple[PlantParameters, ...]
     model: Model
-    found: dict[str, Any]
+    identification: dict[str, Any]
     """The estimates with their intervals, and remarks, as `fishctl identify --json` gives them."""
 
 
@@ -43,7 +43,7 @@ class Rung(Struct, frozen=True):
     C: float
     lead: float
     """Lead time [s]."""
-    settled: bool
+    is_finished: bool
     """Whether the search was over."""
 
 
@@ -54,11 +54,11 @@ class Tried(Struct, frozen=True):
     """[Hz]"""
     thrust: float
     """[N]"""
-    error: float
+    thrust_ci95: float
     """Half-width of the 95 % confidence interval of `thrust` [N]."""
-    swum: int
+    swim_ticks: int
     """Ticks of swimming since the beginning of the search."""
-    passed: float
+    tank_time: float
     """Time since the beginning of the search, rests included [s]."""
 
 
@@ -71,9 +71,9 @@ class Trained(Struct, frozen=True, kw_only=True):
     """Folder of the training that the policy is from."""
     relative_thrust: float | None = None
     """Thrust relative to the best square wave of the identified fish."""
-    worst: float | None = None
+    worst_relative_thrust: float | None = None
     """Relative thrust on the worst of the tried fish of the cloud."""
-    refused: str = ""
+    refusal: str = ""
     """Reason why a policy is missing; empty if there is one."""
 
 
@@ -86,7 +86,7 @@ class Contender(Struct, frozen=True, kw_only=True):
     parameters: dict[str, Any]
     thrust: float
     """[N]"""
-    error: float
+    thrust_ci95: float
     """Half-width of the 95 % confidence interval of `thrust` [N]."""
     calibration_ci95: float | None = None
     """Half-width of the 95 % interval of `thrust` due to the calibration of the sensor [N].
@@ -95,13 +95,13 @@ class Contender(Struct, frozen=True, kw_only=True):
     unknown.
     """
     total_ci95: float | None = None
-    """Half-width of the 95 % interval from `error` and `calibration_ci95` together [N]."""
+    """Half-width of the 95 % interval from `thrust_ci95` and `calibration_ci95` together [N]."""
     frequency: float
     """[Hz]"""
     seconds: float
     """Length of the measurement, rests included [s]."""
     remark: str = ""
-    expected: list[float] = []
+    expected_thrusts: list[float] = []
     """Simulated thrusts on fish of the cloud, the identified fish first [N]; empty where the
     cloud is not used."""
     true_thrust: float | None = None
@@ -113,29 +113,29 @@ class Contender(Struct, frozen=True, kw_only=True):
 class Verdict(Struct, frozen=True, kw_only=True):
     """The chosen gait and the reason; thrusts are relative to the best square wave found."""
 
-    chosen: str
-    """Name of the winner, or of the gait chosen from `undecided`."""
-    decided: bool
-    """Whether the measurement alone shows that `chosen` is the best gait."""
-    undecided: list[str]
+    chosen_gait: str
+    """Name of the winner, or of the gait chosen from `undecided_gaits`."""
+    is_decided: bool
+    """Whether the measurement alone shows that `chosen_gait` is the best gait."""
+    undecided_gaits: list[str]
     """Names of the gaits that may be the best according to the measurement, simplest first."""
     relative_thrust: float
     """Relative thrust of the chosen gait."""
-    low: float
+    relative_thrust_ci95_low: float
     """Lower end of the 95 % interval of `relative_thrust`, valid whichever gait is chosen."""
-    high: float
-    others: dict[str, tuple[float, float, float]]
+    relative_thrust_ci95_high: float
+    relative_thrusts: dict[str, tuple[float, float, float]]
     """Relative thrust, and its interval, of each gait except the square wave."""
     claim: str
     """The verdict in a sentence."""
 
 
-class State(Struct, kw_only=True):
+class State(Struct, kw_only=True, forbid_unknown_fields=True):
     """The results of the finished steps; a field that is None belongs to a step still to do."""
 
     tank_time: float = 0.0
     """Time spent in the tank, rests and failed measurements included [s]."""
-    spent: dict[str, float] = {}
+    step_times: dict[str, float] = {}
     """Time in the tank by step [s]."""
     excitation: str | None = None
     """Name of the recording that the fish is fitted to."""
@@ -145,11 +145,11 @@ class State(Struct, kw_only=True):
     """Square waves in the order in which they were tried."""
     square: float | None = None
     """Frequency of the best square wave [Hz]."""
-    disagrees: bool = False
+    is_fit_rejected: bool = False
     """Whether the square waves tried disagree with the identified fish."""
     trained: Trained | None = None
     contenders: list[Contender] = []
-    left_out: dict[str, str] = {}
+    exclusions: dict[str, str] = {}
     """Reason by name of each gait that could not be measured."""
     verdict: Verdict | None = None
 

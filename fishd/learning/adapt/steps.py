@@ -100,7 +100,7 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
     plant = identified_fish(identification)
     model = model_of(identification)
     if not best_square_wave(plant, amplitude).thrust > 0.0:
-        model = replace(model, error=None)
+        model = replace(model, standard_error=None)
     offset, drift = identification["offset_y"], identification.channels[1].drift
     fitted = Fitted(
         plant=plant,
@@ -108,7 +108,7 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
         offset=max(offset.high - offset.value, 0.5 * drift),
         cloud=draw_cloud(identification, seed),
         model=model,
-        found=identification.to_builtins(),
+        identification=identification.to_builtins(),
     )
     return identification, fitted
 
@@ -134,7 +134,7 @@ def square_waves(fitted: Fitted, session: Session, seed: int) -> Search:
     Where the fish explains too little, all frequencies are searched.
     """
     low, high = MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ
-    if fitted.model.error is not None:
+    if fitted.model.standard_error is not None:
         best = best_square_wave(fitted.plant, session.amplitude).frequency
         best = min(MAX_FREQUENCY_HZ / SEARCH_RATIO, max(MIN_FREQUENCY_HZ * SEARCH_RATIO, best))
         low, high = best / SEARCH_RATIO, best * SEARCH_RATIO
@@ -159,15 +159,17 @@ def search_square_waves(
         last = Trial(
             {"frequency": tried.frequency},
             tried.thrust,
-            tried.error,
+            tried.thrust_ci95,
             *power,
-            tried.swum,
-            tried.passed,
+            tried.swim_ticks,
+            tried.tank_time,
         )
-        search.observe(last.parameters, last.thrust, last.error)
+        search.observe(last.parameters, last.thrust, last.thrust_ci95)
     for trial in measure_trials(session, "square", {}, search, budget, last):
         frequency = trial.parameters["frequency"]
-        add_trial(Tried(frequency, trial.thrust, trial.error, trial.swum, trial.passed))
+        add_trial(
+            Tried(frequency, trial.thrust, trial.thrust_ci95, trial.swim_ticks, trial.tank_time)
+        )
 
 
 def best_of(
@@ -180,17 +182,17 @@ def best_of(
     little, or the trials disagree with it, only the search is used.
     """
     frequencies = search.ranges[0].values
-    if fitted.model.error is not None:
+    if fitted.model.standard_error is not None:
         curves = np.array(
             [
                 [square_wave(plant, amplitude, f).thrust for f in frequencies]
                 for plant in fitted.cloud
             ]
         )
-        spread = deviations(curves, fitted.model.error, correlation_of_waves(frequencies))
+        spread = deviations(curves, fitted.model.standard_error, correlation_of_waves(frequencies))
         places = [int(np.argmin(np.abs(np.subtract(frequencies, t.frequency)))) for t in tried]
         measured = np.array([trial.thrust for trial in tried])
-        ci95 = np.array([trial.error for trial in tried])
+        ci95 = np.array([trial.thrust_ci95 for trial in tried])
         if not is_rejected(curves[0], spread, places, measured, ci95):
             thrusts, _ = combine(curves[0], spread, places, measured, ci95)
             return frequencies[int(np.argmax(thrusts))], True
@@ -309,17 +311,17 @@ def train_policy(
         if best and _merit(best) >= GOOD_MERIT:
             break
     if best is None or best.best is None or best.best_evaluation is None:
-        return Trained(steps=display.steps, refused=f"the training gave no policy: {message}")
+        return Trained(steps=display.steps, refusal=f"the training gave no policy: {message}")
     try:
         export(best.best, folder / POLICY, note="of fishctl adapt")
     except PolicyError as error:
-        return Trained(steps=display.steps, refused=str(error))
+        return Trained(steps=display.steps, refusal=str(error))
     evaluation = best.best_evaluation
     return Trained(
         steps=display.steps,
         folder=best.folder.name,
         relative_thrust=evaluation.relative_thrust,
-        worst=evaluation.worst,
+        worst_relative_thrust=evaluation.worst,
     )
 
 

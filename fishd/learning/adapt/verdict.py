@@ -62,20 +62,20 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
             claim += f"; {disuse}"
     relative_thrust, low, high = shares.get(chosen, (1.0, 1.0, 1.0))
     return Verdict(
-        chosen=chosen,
-        decided=ranking.is_decided,
-        undecided=names,
+        chosen_gait=chosen,
+        is_decided=ranking.is_decided,
+        undecided_gaits=names,
         relative_thrust=relative_thrust,
-        low=low,
-        high=high,
-        others=shares,
+        relative_thrust_ci95_low=low,
+        relative_thrust_ci95_high=high,
+        relative_thrusts=shares,
         claim=claim,
     )
 
 
 def _candidate(contender: Contender) -> Candidate:
     return Candidate(
-        contender.name, contender.thrust, contender.error, complexity(contender.controller)
+        contender.name, contender.thrust, contender.thrust_ci95, complexity(contender.controller)
     )
 
 
@@ -88,21 +88,26 @@ def _relative_thrust(
     if share is None:
         raise FishdError(
             f"the best square wave found thrusts {1e3 * square.thrust:.2f} ± "
-            f"{1e3 * square.error:.2f} mN: too little to differ clearly from zero, so no relative "
-            "thrust is known"
+            f"{1e3 * square.thrust_ci95:.2f} mN: too little to differ clearly from zero, so no "
+            "relative thrust is known"
         )
     return share
 
 
 def _not_excluded_by(contenders: Sequence[Contender], names: list[str], model: Model) -> list[str]:
     """Return the undecided gaits that the identified fish does not exclude, in their order."""
-    expected = np.array([contender.expected for contender in contenders]).T
-    if model.error is None or model.is_rejected or not expected.size or expected[0].min() <= 0.0:
+    expected = np.array([contender.expected_thrusts for contender in contenders]).T
+    if (
+        model.standard_error is None
+        or model.is_rejected
+        or not expected.size
+        or expected[0].min() <= 0.0
+    ):
         return names
     places = range(len(contenders))
     measured = np.array([contender.thrust for contender in contenders])
-    ci95 = np.array([contender.error for contender in contenders])
-    spread = deviations(expected, model.error)
+    ci95 = np.array([contender.thrust_ci95 for contender in contenders])
+    spread = deviations(expected, model.standard_error)
     if is_rejected(expected[0], spread, places, measured, ci95):
         return names
     thrusts, covariance = combine(expected[0], spread, places, measured, ci95)
@@ -123,7 +128,7 @@ def _explain_choice(simplest: str, is_simplest: bool, left: int, model: Model) -
     """
     if is_simplest:
         return simplest
-    fish = f"the identified fish, which explains {model.explained:.1%} of its forces"
+    fish = f"the identified fish, which explains {model.explained_fraction:.1%} of its forces"
     if left == 1:
         return f"{fish}, thrusts most with it"
     return f"it is the simplest that {fish}, leaves possible"
@@ -131,10 +136,10 @@ def _explain_choice(simplest: str, is_simplest: bool, left: int, model: Model) -
 
 def _explain_disuse(model: Model) -> str:
     """Return why the identified fish is not used for a choice; empty where it is used."""
-    if model.error is None:
+    if model.standard_error is None:
         return (
-            f"the identified fish explains {max(0.0, model.explained):.0%} of its forces only, so "
-            "it is not used"
+            f"the identified fish explains {max(0.0, model.explained_fraction):.0%} of its forces "
+            "only, so it is not used"
         )
     if model.is_rejected:
         return "the square waves tried disagree with the identified fish, so it is not used"

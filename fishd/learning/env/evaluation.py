@@ -47,7 +47,7 @@ class Evaluation(Struct, frozen=True, kw_only=True):
 
     In a tank it is 0 if the policy stalled.
     """
-    error: float | None = None
+    thrust_ci95: float | None = None
     """Half-width of the 95 % interval of a measured thrust [N]; None for a true one."""
     relative_thrust: float
     """Thrust relative to the best square wave of the configured fish."""

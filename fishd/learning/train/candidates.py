@@ -230,7 +230,7 @@ class TankEvaluations:
             tank_time=self._env.tank_time,
             swam=candidate.swam,
             thrust=thrust,
-            error=None if candidate.stalled else self._candidates.ci95(candidate),
+            thrust_ci95=None if candidate.stalled else self._candidates.ci95(candidate),
             relative_thrust=thrust / self._env.best_thrust,
             frequency=candidate.frequency,
             fullness=candidate.fullness,

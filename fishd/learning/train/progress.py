@@ -69,7 +69,7 @@ class ShownDisplay(Display):
         self._was_evaluated = True
         self._figures = format_summary(evaluation)
         merit = round(evaluation.merit, 3)
-        better = evaluation.best and (evaluation.error is not None or merit > self._best)
+        better = evaluation.best and (evaluation.thrust_ci95 is not None or merit > self._best)
         self._best = merit if better else self._best
         line = format_evaluation(evaluation) + (", the best so far" if better else "")
         self._show.done(line, self._steps)
@@ -95,7 +95,7 @@ def format_summary(evaluation: "Evaluation") -> str:
     """Format the figures of an evaluation, or state that the policy does not swim."""
     if evaluation.stalled:
         return "stalled: it does not swim"
-    error = evaluation.error
+    error = evaluation.thrust_ci95
     return format_figures(
         evaluation.thrust, evaluation.relative_thrust, evaluation.frequency, error
     )

@@ -30,7 +30,7 @@ class Gait(Struct, frozen=True, kw_only=True):
     """Number of whole beats in the means; with 0 they cover the whole time."""
     speed: float
     """Mean speed forwards, along −x [m/s]."""
-    speed_error: float | None
+    speed_ci95: float | None
     """Half-width of the 95 % confidence interval of `speed`, if the swim is steady [m/s]; None for
     fewer than four beats."""
     speed_trend: float | None
@@ -94,7 +94,7 @@ def gait(track: dict[str, Array], settings: SwimmerSettings) -> Gait:
     return Gait(
         beats=beats,
         speed=speed,
-        speed_error=_speed_ci95(means),
+        speed_ci95=_speed_ci95(means),
         speed_trend=_speed_trend(*_group_speeds(time, x, begins, 1)),
         frequency=frequency,
         heading=float(track["heading"][rows].mean()),

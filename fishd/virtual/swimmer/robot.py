@@ -168,13 +168,13 @@ class Swimmer:
             course=Course(motion.x, motion.y, motion.speed, motion.heading),
         )
 
-    def degraded(self) -> tuple[str, ...]:
+    def limitations(self) -> tuple[str, ...]:
         """Return why the simulation has ended, if it has."""
         return (f"{self.trouble}; restart fishd",) if self.trouble else ()
 
     def robot(self) -> Robot:
         """Return the robot of the loop."""
-        return Robot("swimmer", self, self, truth=self.truth, degraded=self.degraded)
+        return Robot("swimmer", self, self, truth=self.truth, limitations=self.limitations)
 
     def state(self) -> dict[str, Array]:
         """Return the complete state by name."""

@@ -66,9 +66,9 @@ def make() -> Iterator[Make]:
     ("request_", "code"),
     [
         (b"", "bad-request"),
-        (b'{"v":1,"op":"stauts"}', "unknown-op"),
+        (b'{"v":2,"op":"stauts"}', "unknown-op"),
         (b'{"v":9,"op":"status"}', "version"),
-        (b'{"v":1,"op":"status","args":{"x":1}}', "bad-arguments"),
+        (b'{"v":2,"op":"status","args":{"x":1}}', "bad-arguments"),
     ],
 )
 def test_a_request_that_is_none_gets_an_error(

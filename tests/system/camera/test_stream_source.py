@@ -43,7 +43,7 @@ def test_a_file_is_played_at_its_own_rate_again_and_again(tmp_path: Path, video:
     # After a stop of the machine it catches up: the longest time of 30 frames is judged.
     longest = max(b.time - a.time for a, b in zip(frames[:-29], frames[29:], strict=True))
     assert longest >= 29 / 50.0 - 0.03
-    assert state.degraded == ("times are those of playback: a file has no times of exposure",)
+    assert state.limitations == ("times are those of playback: a file has no times of exposure",)
     assert (state.picture_width, state.picture_height) == (160, 120)
 
 
@@ -81,7 +81,7 @@ def test_a_network_camera_that_goes_and_comes_back_is_followed(tmp_path: Path, v
         url = f"http://127.0.0.1:{port}/{video.name}"
         with running_camera(tmp_path, "source=stream", f"stream.url={url}") as camera:
             first = camera.until(lambda state: state.seq > 3)
-            assert "times are those of arrival" in first.degraded[0]
+            assert "times are those of arrival" in first.limitations[0]
             state = camera.is_in("stalled")
             assert "it is opened again" in state.problem
             camera.until(lambda state: state.session != first.session)

@@ -43,7 +43,7 @@ def test_frames_come_with_the_times_of_the_kernel(good: V4l2Rig) -> None:
         state = client.status()
     assert all(0.0 < b.time - a.time < 30.0 for a, b in pairwise(headers))
     assert 0.0 < time.monotonic() - headers[-1].time < 30.0
-    assert state.degraded == ()
+    assert state.limitations == ()
     assert (state.picture_width, state.picture_height, state.width) == (640, 480, 84)
     assert (state.source, state.device) == ("v4l2", "/dev/video7")
 
@@ -68,9 +68,9 @@ def test_other_formats_show_the_same(tmp_path: Path, format_: str) -> None:
 
 @pytest.mark.parametrize("fault", ["broken", "garbage"])
 def test_broken_jpegs_are_counted_and_left_out(good: V4l2Rig, fault: str) -> None:
-    before = good.status().broken
+    before = good.status().broken_frames
     good.set(**{fault: True})
-    after = good.until(lambda state: state.broken > before + 3)
+    after = good.until(lambda state: state.broken_frames > before + 3)
     good.set()
     good.until(lambda state: state.seq > after.seq + 3)
 
@@ -83,16 +83,18 @@ def test_a_camera_that_sends_only_broken_frames_does_not_stream_and_is_opened_an
     assert "/dev/video7 has sent only broken frames for 2 s (" in state.problem
     assert "another cable or port" in state.remedy
     assert (state.rate, state.latency) == (0.0, None)
-    good.until(lambda later: later.broken > state.broken + 3)  # the camera is open again
+    good.until(
+        lambda later: later.broken_frames > state.broken_frames + 3
+    )  # the camera is open again
     assert good.status().state == "stalled"
     good.set()
     good.is_in("streaming")
 
 
 def test_frames_that_the_kernel_never_got_are_counted(good: V4l2Rig) -> None:
-    before = good.status().dropped
+    before = good.status().dropped_frames
     good.set(skip=5)
-    good.until(lambda state: state.dropped >= before + 3)
+    good.until(lambda state: state.dropped_frames >= before + 3)
 
 
 def test_a_client_is_told_that_the_camera_is_unplugged(good: V4l2Rig) -> None:
@@ -140,24 +142,24 @@ def test_a_camera_that_cannot_be_used_says_why_and_is_tried_again(
 
 def test_time_stamps_of_another_clock_are_replaced_by_those_of_arrival(good: V4l2Rig) -> None:
     good.set(realtime_stamps=True)
-    state = good.until(lambda state: bool(state.degraded))
-    assert "times are those of arrival" in state.degraded[0]
+    state = good.until(lambda state: bool(state.limitations))
+    assert "times are those of arrival" in state.limitations[0]
     with good.client() as client:
         header = published(client, 1)[0].header
     assert abs(time.monotonic() - header.time) < 30.0
     good.set()
-    good.until(lambda state: not state.degraded)
+    good.until(lambda state: not state.limitations)
 
 
 def test_frames_that_have_waited_in_the_driver_are_dropped_and_counted(good: V4l2Rig) -> None:
-    before = good.until(lambda state: not state.degraded)
+    before = good.until(lambda state: not state.limitations)
     with good.client() as client:
         good.set(late=4)
         frames = published(client, 1)
-        while frames[-1].header.dropped < before.dropped + 4:
+        while frames[-1].header.dropped_frames < before.dropped_frames + 4:
             frames += published(client, 1)
         after = client.status()
-    assert (after.session, after.degraded) == (before.session, ())
+    assert (after.session, after.limitations) == (before.session, ())
     assert all(frame.header.available - frame.header.time < 3.0 for frame in frames)
     assert all(a.header.time < b.header.time for a, b in pairwise(frames))
 
@@ -171,7 +173,7 @@ def test_controls_are_set_and_tell_the_exposure(tmp_path: Path) -> None:
     with v4l2_rig(tmp_path, *controls, rate=15.0) as rig:
         state = rig.is_in("streaming")
         assert state.exposure == pytest.approx(0.01)
-        assert state.degraded == ("it takes 15 frames a second, not 30",)
+        assert state.limitations == ("it takes 15 frames a second, not 30",)
 
 
 @pytest.mark.parametrize(

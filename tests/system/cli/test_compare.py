@@ -40,7 +40,7 @@ def test_the_command_prints_json_with_every_run() -> None:
     assert len(first["runs"]) == 2
     assert first["verdict"] == "wins"
     assert second["verdict"] == "loses"
-    assert {"relative_thrust", "thrust", "frequency", "fullness", "squareness"} <= set(first)
+    assert {"relative_thrust", "thrust", "frequency", "fullness", "form_factor"} <= set(first)
 
 
 def test_a_refused_contestant_does_not_keep_the_others_from_swimming() -> None:

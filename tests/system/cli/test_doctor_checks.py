@@ -56,7 +56,7 @@ MATRIX = "xx: 2.0, xy: 0.0, x0: 0.0, yx: 0.0, yy: 2.0, y0: 0.0, date: '2026-01-0
 FORCE = {"state/pi/force-2026-01-02T000000.000000Z.yaml": f"{{{MATRIX}}}\n"}
 TARED = {
     "state/pi/force-2026-01-02T000000.000000Z.yaml": "{xx: 1.0, xy: 0.0, x0: 0.3, yx: 0.0, "
-    "yy: 1.0, y0: 0.0, date: '2026-01-02', tared: '2026-01-02'}\n"
+    "yy: 1.0, y0: 0.0, date: '2026-01-02', tare_date: '2026-01-02'}\n"
 }
 SERVO = {
     "state/pi/servo-2026-01-03T000000.000000Z.yaml": "{trim: 10.0, direction: 1, scale: 600.0, "

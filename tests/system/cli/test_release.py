@@ -105,7 +105,7 @@ def test_a_fishd_that_drives_the_servo_is_asked_for_an_emergency_stop(pi: Bench)
         )
         pi.wait_for_pulse(0, 0)  # at the end of the pulse that has begun
         assert daemon.status().mode == "estop"
-        assert daemon.status().counters["servo_reconnects"] == 0
+        assert daemon.status().recovered_errors["servo_reconnects"] == 0
 
 
 def test_a_fishd_that_does_not_answer_where_it_should_be_is_named(pi: Bench) -> None:

@@ -26,8 +26,8 @@ def test_status_shows_the_range_and_a_soft_limit_is_no_complaint(
 ) -> None:
     with pi.daemon("--set", f"servo.highest={highest}") as daemon:
         status = json.loads(daemon.fishctl("status", "--json").stdout)
-        assert (status["lowest"], status["highest"]) == (-0.42, min(highest, 0.42))
-        assert not any("servo" in line for line in status["degraded"])
+        assert (status["lowest_angle"], status["highest_angle"]) == (-0.42, min(highest, 0.42))
+        assert not any("servo" in line for line in status["limitations"])
         assert shown in daemon.fishctl("status").stdout
         _, _, err = daemon.end()
     cut = "servo.lowest and servo.highest permit -0.42 to +0.3 rad of ±0.42 rad"
@@ -41,12 +41,12 @@ def test_a_calibration_file_that_cuts_the_range_is_one_line_of_degraded(pi: Benc
     with pi.daemon() as daemon:
         with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
             status = fish.status()
-        (line,) = (line for line in status.degraded if "servo" in line)
+        (line,) = (line for line in status.limitations if "servo" in line)
         assert line == (
             f"the servo's calibration of {saved.date} permits -0.25 to +0.42 rad of ±0.42 rad, "
             "amplitude_limit: fishctl calibrate servo"
         )
-        assert status.lowest == pytest.approx(-0.25)
+        assert status.lowest_angle == pytest.approx(-0.25)
         assert calibrations(daemon).servo.trim == -500.0
         _, _, err = daemon.end()
     assert err.count(line) == 1

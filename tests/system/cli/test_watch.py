@@ -209,7 +209,13 @@ def tick(seq: int, t: float | None = None, **fields: Any) -> Tick:
     """Return a tick of a loop of 50 ms, with a wave on both forces."""
     numbers = {name: 0.0 for name in Tick.__struct_fields__ if name not in ("alpha", "phi")}
     wave = {"fx": 0.02 + 0.02 * math.sin(0.5 * seq), "fy": 0.2 * math.sin(0.25 * seq)}
-    what = {"seq": seq, "mode": "running", "controller": "swing", "servo_on": True, "missed": 0}
+    what = {
+        "seq": seq,
+        "mode": "running",
+        "controller": "swing",
+        "servo_on": True,
+        "missed_slots": 0,
+    }
     return Tick(**numbers | what | wave | {"t": 0.05 * seq if t is None else t} | fields)
 
 
@@ -266,7 +272,7 @@ def test_a_daemon_that_was_restarted_is_not_a_loss() -> None:
 
 def test_late_and_busy_are_the_worst_of_the_ticks_shown() -> None:
     early = tick(1, lateness_us=9999.0)
-    bad = tick(150, lateness_us=777.0, busy_us=888.0)
+    bad = tick(150, lateness_us=777.0, busy_time_us=888.0)
     late = render(view_of([early, *map(tick, range(2, 150)), bad, *map(tick, range(151, 200))]))
     assert "777 µs" in late[2]
     assert "888 µs" in late[2]

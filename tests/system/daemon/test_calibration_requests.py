@@ -75,7 +75,7 @@ def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig
     (after,) = perform(rig, handler, ("tare", BRIEFLY))
     assert after.force.x0 == pytest.approx(-0.2, abs=1e-3)
     assert (after.force.xx, after.force.yy) == (1.0, 1.0)
-    assert after.force.tared
+    assert after.force.tare_date
     assert rig.run_for(0.5)[-1].fx == pytest.approx(0.0, abs=2e-3)
     assert Path(after.force_file).exists()
 
@@ -104,13 +104,13 @@ def test_a_tare_alone_is_no_calibration(rig: LockstepRig, tmp_path: Path) -> Non
     not_calibrated = "the force is not calibrated, and shown in V: fishctl calibrate force"
     handler = calibration_requests(rig)
     perform(rig, handler, ("tare", BRIEFLY))
-    assert not_calibrated in rig.robot.degraded()
+    assert not_calibrated in rig.robot.limitations()
     assert rig.robot.force_unit == "V"
     with lockstep_rig(tmp_path, *ANOTHER_BUS) as again:
-        assert not_calibrated in again.robot.degraded()
+        assert not_calibrated in again.robot.limitations()
     fitted = ForceCalibration(x0=-0.2, loads=5)
     perform(rig, handler, ("calibrate-force", CalibrateForce(fitted)))
-    assert not_calibrated not in rig.robot.degraded()
+    assert not_calibrated not in rig.robot.limitations()
     assert rig.robot.force_unit == "N"
 
 
@@ -334,6 +334,8 @@ def test_a_servo_calibration_is_saved_only_if_the_configuration_would_take_it(
 
 
 def test_a_date_that_a_file_could_not_hold_is_refused(rig: LockstepRig) -> None:
-    request = ("calibrate-force", CalibrateForce(ForceCalibration(tared="today")))
-    with pytest.raises(Refused, match="tared: 'today' is not a date: one in ISO 8601 is needed"):
+    request = ("calibrate-force", CalibrateForce(ForceCalibration(tare_date="today")))
+    with pytest.raises(
+        Refused, match="tare_date: 'today' is not a date: one in ISO 8601 is needed"
+    ):
         perform(rig, calibration_requests(rig), request)

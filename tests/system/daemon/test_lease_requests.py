@@ -64,10 +64,10 @@ def test_a_request_by_hand_takes_the_fish_and_the_answer_says_from_whom(tmp_path
         for op, args in (("set-controller", {"name": "sine"}), ("stop", {})):
             lease = await client.take()
             state = await client.ask("set-controller", name="swing", lease=lease)
-            assert (state.controller, state.took_from) == ("swing", None)
+            assert (state.controller, state.previous_holder) == ("swing", None)
             client.rig.run_for(1.0)
             state = await client.ask(op, **args)
-            holder = state.took_from
+            holder = state.previous_holder
             assert (holder.name, holder.host, holder.pid) == ("measure", "lab", 42)
             assert holder.age == pytest.approx(1.0, abs=0.1)
             for change in ("set-controller", "stop", "renew-lease", "end-lease"):
@@ -84,7 +84,7 @@ def test_a_request_by_hand_takes_the_fish_and_the_answer_says_from_whom(tmp_path
 def test_by_hand_there_is_no_lease(tmp_path: Path) -> None:
     async def story(client: Client) -> None:
         state = await client.ask("set-controller", name="sine")
-        assert state.took_from is None
+        assert state.previous_holder is None
         assert client.rig.run_for(20.0)[-1].controller == "sine"
 
     run_story(tmp_path, story)
@@ -100,14 +100,14 @@ def test_a_second_experiment_is_refused_unless_it_takes_the_fish(tmp_path: Path)
         assert "measure (pid 42 on lab)" in str(refusal)
         assert client.rig.mode == "running"
         grant = await client.ask("take-lease", name="optimise", take=True)
-        assert grant.took_from.name == "measure"
+        assert grant.previous_holder.name == "measure"
         assert client.rig.run_for(1.0)[-1].phi_c == 0.0
         refusal = await client.refused("set-controller", name="swing", lease=first)
         assert "optimise took the fish" in str(refusal)
         await client.ask("set-controller", name="swing", lease=grant.lease)
         assert (await client.ask("status")).lease.name == "optimise"
         state = await client.ask("end-lease", lease=grant.lease)
-        assert (state.mode, state.took_from) == ("idle", None)
+        assert (state.mode, state.previous_holder) == ("idle", None)
         kinds = [
             event.data["lease"] for event in client.rig.recorder.events if "lease" in event.data
         ]

@@ -67,15 +67,15 @@ def test_a_simulated_fish_is_judged_by_its_true_thrust_whatever_its_sensor_says(
         point = Point("square", {"frequency": frequency})
         result = swim(point, load(None, DRIFTS), Lengths(), DroppingPublisher())
         assert result.thrust == pytest.approx(millinewtons * 1e-3, rel=1e-4)
-        assert result.error == pytest.approx(0.0, abs=1e-9)
+        assert result.thrust_ci95 == pytest.approx(0.0, abs=1e-9)
 
 
 def test_half_beats_that_are_no_whole_ticks_show_in_the_error() -> None:
     result = swim(Point("square", {"frequency": 1.709}), Config(), Lengths(), DroppingPublisher())
     assert result.thrust is not None
-    assert result.error is not None
-    assert 1e-6 < result.error < 1e-3
-    assert result.thrust == pytest.approx(25.6e-3, abs=result.error)
+    assert result.thrust_ci95 is not None
+    assert 1e-6 < result.thrust_ci95 < 1e-3
+    assert result.thrust == pytest.approx(25.6e-3, abs=result.thrust_ci95)
 
 
 def test_a_rig_that_drifts_is_measured_point_by_point_and_recorded(tmp_path: Path) -> None:
@@ -86,9 +86,9 @@ def test_a_rig_that_drifts_is_measured_point_by_point_and_recorded(tmp_path: Pat
     for point, truth in zip(SQUARES, (20.57e-3, 25.74e-3, 23.83e-3), strict=True):
         result = folder.results[folder.key(point)]
         assert result.thrust is not None
-        assert result.error is not None
-        assert result.thrust == pytest.approx(truth, abs=2.0 * result.error)
-        assert result.error < 1.5e-3
+        assert result.thrust_ci95 is not None
+        assert result.thrust == pytest.approx(truth, abs=2.0 * result.thrust_ci95)
+        assert result.thrust_ci95 < 1.5e-3
     recordings = sorted((tmp_path / "ticks").glob("*.mcap"))
     for path in recordings:
         run = open_run(path)
@@ -125,7 +125,7 @@ def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured
     folder = open_folder(tmp_path / "sweep", columns=columns)
     measure(folder, points, VirtualSession(Config()))
     kept = open_folder(tmp_path / "sweep", columns=columns).results
-    troubles = [kept[folder.key(point)].trouble for point in points]
+    troubles = [kept[folder.key(point)].failure for point in points]
     assert "frequency" in troubles[0]
     assert "ppo gave up" in troubles[1]
     assert troubles[2:] == ["", ""]
@@ -169,7 +169,7 @@ def test_a_table_with_other_columns_is_refused_with_what_differs(
 def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
     folder = open_folder(tmp_path)
     for point in SQUARES:
-        folder.add_result(point, Result(thrust=0.02, error=1e-4), b"a recording")
+        folder.add_result(point, Result(thrust=0.02, thrust_ci95=1e-4), b"a recording")
     table = tmp_path / "rows.csv"
     table.write_bytes(table.read_bytes()[:-30])
     assert len(open_folder(tmp_path).results) == 2
@@ -179,7 +179,7 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
 def test_a_row_that_is_cut_in_its_last_column_is_measured_again(tmp_path: Path) -> None:
     folder = open_folder(tmp_path)
     for point in SQUARES:
-        folder.add_result(point, Result(thrust=0.02, error=1e-4), b"a recording")
+        folder.add_result(point, Result(thrust=0.02, thrust_ci95=1e-4), b"a recording")
     table = tmp_path / "rows.csv"
     whole = table.read_bytes()
     table.write_bytes(whole[:-1])
@@ -244,12 +244,12 @@ def test_a_curve_tells_the_best_frequency_of_whole_ticks_and_one_that_is_missing
     thrusts = {1.4: 0.0227, 1.6: 0.0251, 1.8: 0.0252, 2.0: 0.0238, 2.2: 0.0216, 2.5: 0.0176}
     points = [Point("square", {"frequency": value}) for value in thrusts]
     for point, thrust in zip(points, thrusts.values(), strict=True):
-        folder.add_result(point, Result(thrust=thrust, error=1e-4), b"a recording")
+        folder.add_result(point, Result(thrust=thrust, thrust_ci95=1e-4), b"a recording")
     (curve,) = make_curves(folder, points)
     whole_ticks = find_best_of_whole_ticks(folder, curve)
     assert whole_ticks == WholeTicks(2.0, 0.0238, 1e-4, pytest.approx(10 / 6))
     best = Point("square", {"frequency": 1.66667})
-    folder.add_result(best, Result(thrust=0.02574, error=1e-4), b"a recording")
+    folder.add_result(best, Result(thrust=0.02574, thrust_ci95=1e-4), b"a recording")
     (curve,) = make_curves(folder, [*points, best])
     assert find_best_of_whole_ticks(folder, curve) == WholeTicks(1.66667, 0.02574, 1e-4, None)
 
@@ -261,8 +261,8 @@ def test_a_value_that_is_no_number_is_a_line_of_its_own_beside_the_curve(
     folder = open_folder(tmp_path, columns=["controller", "parameters.C"])
     points = [Point("swing", {"C": value}) for value in (word, 0.3, 0.6)]
     for point in points:
-        folder.add_result(point, Result(thrust=0.02, error=1e-4), b"a recording")
-    shapes = [(curve.label, curve.over, curve.x) for curve in make_curves(folder, points)]
+        folder.add_result(point, Result(thrust=0.02, thrust_ci95=1e-4), b"a recording")
+    shapes = [(curve.label, curve.x_name, curve.x) for curve in make_curves(folder, points)]
     assert shapes == [(f"swing C={shown}", "", []), ("swing", "C", [0.3, 0.6])]
 
 
@@ -308,7 +308,7 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     assert [(curve["controller"], curve["keys"]) for curve in best] == [
         (name, {"plant.xi": xi}) for xi in (0.9, 1.2) for name in ("square", "sine")
     ]
-    assert all(curve["x_low"] < curve["x"] < curve["x_high"] for curve in best)
+    assert all(curve["x_ci95_low"] < curve["x"] < curve["x_ci95_high"] for curve in best)
     with (folder / "rows.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["parameters.frequency"] for row in rows[:5]] == ["1.2", "1.4", "1.6", "1.8", "2.0"]
@@ -330,7 +330,7 @@ def test_points_without_an_axis_are_a_line_each(tmp_path: Path) -> None:
     assert not (tmp_path / "one" / "thrust.png").exists()
     pair = run_sweep(tmp_path / "two", "square,sine", "--frequency", "1.7", "--json")
     best = msgspec.json.decode(pair.stdout)
-    assert [(curve["controller"], curve["over"], curve["x"]) for curve in best] == [
+    assert [(curve["controller"], curve["x_name"], curve["x"]) for curve in best] == [
         ("square", "", None),
         ("sine", "", None),
     ]

@@ -57,7 +57,12 @@ def identification() -> Identification:
         Estimate("rotation", 0.1, 0.1, 0.1, fitted=False),
     ]
     channel = Channel(
-        "fx", explained=0.99, explained_out_of_sample=0.99, noise=1e-3, drift=0.0, white=True
+        "fx",
+        explained_fraction=0.99,
+        explained_out_of_sample=0.99,
+        noise=1e-3,
+        drift=0.0,
+        white=True,
     )
     errors = np.log([1.02, 1.04]) / 1.96
     empty = np.zeros((2, 0))
@@ -94,23 +99,25 @@ def test_each_episode_of_a_training_swims_a_fish_of_the_cloud() -> None:
 
 
 CONTROLLERS = {"policy": "ppo", "swing": "swing", "square": "square"}
-GOOD = Model(explained=0.995, error=MODEL_ERROR)
-USELESS = Model(explained=0.61, error=None)
+GOOD = Model(explained_fraction=0.995, standard_error=MODEL_ERROR)
+USELESS = Model(explained_fraction=0.61, standard_error=None)
 
 
 def contender(name: str, thrust: float, error: float, *expected: float) -> Contender:
     return Contender(
-        name=name, controller=CONTROLLERS[name], parameters={}, thrust=thrust, error=error,
+        name=name, controller=CONTROLLERS[name], parameters={}, thrust=thrust, thrust_ci95=error,
         frequency=1.7, seconds=46.0, expected=list(expected),
     )  # fmt: skip
 
 
 def test_the_largest_thrust_wins_where_the_measurement_is_decisive() -> None:
     won = judge([contender("swing", 21e-3, 0.2e-3), contender("square", 20e-3, 0.2e-3)], GOOD)
-    assert (won.chosen, won.decided, won.undecided) == ("swing", True, ["swing"])
+    assert (won.chosen_gait, won.is_decided, won.undecided_gaits) == ("swing", True, ["swing"])
     assert won.relative_thrust == pytest.approx(1.05)
     # √2 · 1 % of relative error, for a single comparison
-    assert (won.low, won.high) == pytest.approx((1.0354, 1.0648), abs=5e-4)
+    assert (won.relative_thrust_ci95_low, won.relative_thrust_ci95_high) == pytest.approx(
+        (1.0354, 1.0648), abs=5e-4
+    )
     assert "swing as --C auto has found it wins: it thrusts 105.0 %" in won.claim
 
 
@@ -118,8 +125,8 @@ def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins(
     near = [contender("policy", 20.2e-3, 2e-4), contender("square", 20e-3, 2e-4)]
     swing = contender("swing", 20.1e-3, 2e-4)
     two, three = judge(near, GOOD), judge([swing, *near], USELESS)
-    assert (two.chosen, two.decided, two.relative_thrust) == ("square", False, 1.0)
-    assert three.undecided == ["square", "swing", "policy"]
+    assert (two.chosen_gait, two.is_decided, two.relative_thrust) == ("square", False, 1.0)
+    assert three.undecided_gaits == ["square", "swing", "policy"]
     assert three.claim.startswith(
         "undecided between the best square wave found, swing as --C auto has found it and the "
         "policy; the best square wave found chosen because it is the simplest; thrust relative "
@@ -134,9 +141,9 @@ def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins(
     ("model", "chosen"),
     [
         (GOOD, "policy"),
-        (Model(explained=0.9, error=0.3), "square"),  # as good as no model
+        (Model(explained_fraction=0.9, standard_error=0.3), "square"),  # as good as no model
         (USELESS, "square"),
-        (Model(explained=0.995, error=MODEL_ERROR, is_rejected=True), "square"),
+        (Model(explained_fraction=0.995, standard_error=MODEL_ERROR, is_rejected=True), "square"),
     ],
 )
 def test_the_identified_fish_has_weight_by_how_well_it_explains(model: Model, chosen: str) -> None:
@@ -146,7 +153,7 @@ def test_the_identified_fish_has_weight_by_how_well_it_explains(model: Model, ch
         contender("square", 20e-3, 1.4e-3, 20e-3, 21e-3),
     ]
     verdict = judge(vague, model)
-    assert (verdict.chosen, verdict.decided) == (chosen, False)
+    assert (verdict.chosen_gait, verdict.is_decided) == (chosen, False)
     reason = "because the identified fish, which explains 99.5% of its forces, thrusts most with it"
     assert (reason in verdict.claim) == (chosen == "policy")
 
@@ -156,15 +163,16 @@ def test_an_identified_fish_that_thrusts_contradict_is_not_used() -> None:
         contender("policy", 19.9e-3, 2e-4, 30e-3, 30e-3),
         contender("square", 20e-3, 2e-4, 20e-3, 20e-3),
     ]
-    assert judge(measured, GOOD).chosen == "square"
+    assert judge(measured, GOOD).chosen_gait == "square"
 
 
 def test_intervals_of_two_are_wider_than_that_of_one() -> None:
     square, swing = contender("square", 20e-3, 0.2e-3), contender("swing", 21e-3, 0.2e-3)
     policy = contender("policy", 1e-3, 0.2e-3)
     single, double = judge([swing, square], GOOD), judge([policy, swing, square], GOOD)
-    assert double.high - double.low == pytest.approx(
-        2.2414 / 1.96 * (single.high - single.low), rel=2e-3
+    assert double.relative_thrust_ci95_high - double.relative_thrust_ci95_low == pytest.approx(
+        2.2414 / 1.96 * (single.relative_thrust_ci95_high - single.relative_thrust_ci95_low),
+        rel=2e-3,
     )
 
 
@@ -189,7 +197,7 @@ def test_the_weight_of_a_fit_follows_what_it_explains_out_of_sample(
     fit = dataclasses.replace(fit, channels=(fit.channels[0], vague), failed_assumptions=failed)
     model = model_of(fit)
     assert model.explained == explained
-    assert model.error == (error and pytest.approx(error, rel=1e-3))
+    assert model.standard_error == (error and pytest.approx(error, rel=1e-3))
 
 
 def fitted(model: Model) -> Fitted:
@@ -207,8 +215,8 @@ def test_a_policy_is_not_one_tick_off_the_best_wave_of_a_weakly_damped_fish(tmp_
     )
     fish = msgspec.structs.replace(fitted(GOOD), plant=plant, cloud=(plant,))
     trained = train_policy(Config(), fish, tmp_path, 64, 0, lambda steps: None)
-    assert trained.worst
-    assert trained.worst > 0.98
+    assert trained.worst_relative_thrust
+    assert trained.worst_relative_thrust > 0.98
 
 
 @pytest.mark.parametrize(
@@ -216,7 +224,11 @@ def test_a_policy_is_not_one_tick_off_the_best_wave_of_a_weakly_damped_fish(tmp_
     [
         (GOOD, lambda f: 0.9, True),
         (GOOD, lambda f: f, False),  # the tank disagrees
-        (Model(explained=0.8, error=0.45), lambda f: f, True),  # so uncertain that the tank decides
+        (
+            Model(explained_fraction=0.8, standard_error=0.45),
+            lambda f: f,
+            True,
+        ),  # so uncertain that the tank decides
         (USELESS, lambda f: f, False),
     ],
 )
@@ -235,7 +247,9 @@ def test_the_fit_decides_on_the_best_square_wave_if_it_explains_well(
     assert is_used == used
     assert frequency == pytest.approx(true)
     fastest = max(search.ranges[0].values)
-    assert (fastest > 4.0) == (model.error is None)  # all frequencies are searched without a fit
+    assert (fastest > 4.0) == (
+        model.standard_error is None
+    )  # all frequencies are searched without a fit
 
 
 def test_with_a_good_fit_few_noisy_waves_do_not_move_the_maximum() -> None:
@@ -317,10 +331,10 @@ def test_a_resume_does_not_repeat_measurements(
     assert sum(line.startswith("excitation") for line in show.lines) == 1
     assert any("this test trains no policy" in line for line in show.lines)
     assert {gait.name for gait in state.contenders} == {"swing", "square"}
-    assert state.verdict.chosen == "square"
-    assert state.verdict.undecided == ["square", "swing"]
-    assert all(len(gait.expected) == 2 for gait in state.contenders)
-    for name, (value, low, high) in state.verdict.others.items():
+    assert state.verdict.chosen_gait == "square"
+    assert state.verdict.undecided_gaits == ["square", "swing"]
+    assert all(len(gait.expected_thrusts) == 2 for gait in state.contenders)
+    for name, (value, low, high) in state.verdict.relative_thrusts.items():
         assert 0.95 < value < 1.05, name
         assert low < 1.0 < high
     state.contenders[0] = msgspec.structs.replace(state.contenders[0], true_thrust=0.0257)
@@ -329,7 +343,10 @@ def test_a_resume_does_not_repeat_measurements(
     text = page.read_text(encoding="utf-8")
     assert "fishctl set-controller &lt;swing&gt;" in text
     assert "the best square wave found, chosen" in text
-    assert format_ratio(state.verdict.others["swing"]) in text.partition("<h2>In the tank</h2>")[2]
+    assert (
+        format_ratio(state.verdict.relative_thrusts["swing"])
+        in text.partition("<h2>In the tank</h2>")[2]
+    )
     assert "<td>rad/s</td>" in text
     assert "<td>–</td>" in text
     assert "e-" not in text.partition("<h2>The fish</h2>")[2]

@@ -36,7 +36,7 @@ def test_the_report_of_a_function_is_that_of_an_equal_controller() -> None:
     controller = simulate(CONFIG, "square", {"frequency": 1 / 0.6}, 30.0)
     assert report.relative_thrust == pytest.approx(controller.relative_thrust, rel=1e-6)
     assert report.frequency == pytest.approx(1 / 0.6)
-    assert (report.fullness, report.squareness) == pytest.approx((1.0, 1.0))
+    assert (report.fullness, report.form_factor) == pytest.approx((1.0, 1.0))
     assert report.controller == "policy"
 
 
@@ -56,7 +56,7 @@ def test_a_policy_receives_the_forces_of_the_sensor() -> None:
 def test_half_the_amplitude_is_half_full() -> None:
     report = judge(CONFIG, lambda seen, _: 0.5 * square_of_six_ticks(seen), 30.0, 10.0)
     assert report.fullness == pytest.approx(0.5)
-    assert report.squareness == pytest.approx(1.0)
+    assert report.form_factor == pytest.approx(1.0)
 
 
 def test_robot_and_start_of_the_configuration_are_ignored() -> None:

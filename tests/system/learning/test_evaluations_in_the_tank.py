@@ -181,7 +181,7 @@ def test_a_policy_that_stalls_costs_little_and_never_swims_again(
     tank = Tank(monkeypatch, "noise=0.001")
     before = tank.env.tank_time
     (row,) = tank.evaluate(still)
-    assert (row.stalled, row.best, row.error, row.thrust) == (True, False, None, 0.0)
+    assert (row.stalled, row.best, row.thrust_ci95, row.thrust) == (True, False, None, 0.0)
     assert tank.env.tank_time - before == pytest.approx(2 * REST_TIME_S + 1.5)
     tank.evaluate(square(6))
     tank.evaluate(square(6))
@@ -276,7 +276,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
         ("192", "128", "0", "0"),
     ]
     assert [row["swam"] for row in table] == ["3.5", "3.5", "7.0", "1.5", "7.0"]
-    assert 0.0 < float(table[2]["error"]) < float(table[0]["error"])
+    assert 0.0 < float(table[2]["thrust_ci95"]) < float(table[0]["thrust_ci95"])
     monkeypatch.delattr(exporting, "evaluate_in_simulation")  # the figures are those of the tank
     exported = exporting.export(outcome.best, tmp_path / "best.onnx")
     assert exported.evaluation == best
@@ -398,6 +398,6 @@ def test_a_fishd_in_lockstep_gives_the_same_evaluations_as_a_fish_in_process(
         train(replace(there, endpoint=daemon.endpoint))
         with Fish(daemon.endpoint) as fish:
             assert fish.status().mode == "idle"
-    assert any(row["error"] for row in rows(here.folder / "evaluations.csv"))
+    assert any(row["thrust_ci95"] for row in rows(here.folder / "evaluations.csv"))
     for name in ("progress.csv", "evaluations.csv"):
         assert (here.folder / name).read_text() == (there.folder / name).read_text()

@@ -270,7 +270,7 @@ def test_more_thrust_than_is_possible_is_warned_of(
 ) -> None:
     best = Evaluation(
         thrust=0.028,
-        error=error,
+        thrust_ci95=error,
         relative_thrust=relative_thrust,
         frequency=1.67,
         fullness=1.0,

@@ -38,12 +38,12 @@ def test_no_topic_begins_like_another() -> None:
         ([b"tick", b"{}"], "topic b'tick' is not a topic of a camera"),
         ([b"frame", b"{}"], "a message of topic frame has 3 parts, not 2"),
         ([b"until", b"nonsense"], "a message of topic until that cannot be read"),
-        ([b"until", b'{"v":2}'], "in version 2; version 1 is needed"),
+        ([b"until", b'{"v":3}'], "in version 3; version 2 is needed"),
         (
             [*messages.encode_frame(HEADER, PIXELS)[:2], b"short"],
             "a frame of 4 x 3 px has 12 bytes, not 5",
         ),
-        ([b"frame", b'{"v":1,"width":100000}', b""], "cannot be read"),
+        ([b"frame", b'{"v":2,"width":100000}', b""], "cannot be read"),
         (messages.encode_frame(replace(HEADER, time=1e300, available=1e300), PIXELS), "`$.time`"),
         (messages.encode_frame(replace(HEADER, available=-1e300), PIXELS), "`$.available`"),
         (

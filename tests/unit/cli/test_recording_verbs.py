@@ -72,7 +72,7 @@ def test_a_damaged_recording_is_listed_as_one_and_recovered(damaged: Path) -> No
     folder = str(damaged.parent)
     assert "damaged: 10 ticks lost" in fishctl("runs", "--folder", folder).stdout
     (listed,) = json.loads(fishctl("runs", "--json", "--folder", folder).stdout)
-    assert (listed["damaged"], listed["lost"]) == (10, 10)
+    assert (listed["damaged"], listed["lost_ticks"]) == (10, 10)
     done = fishctl("recover", "run", "--folder", folder)
     assert done.stdout.startswith(f"{folder}/run-recovered.mcap: ")
     assert done.stdout.endswith("; damaged: 10 ticks lost\n")

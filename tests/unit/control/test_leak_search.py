@@ -84,6 +84,6 @@ def test_the_thrust_is_known_again_after_the_scale_of_the_velocity_has_changed()
     assert ticks[0].leak != ticks[-1].leak
     late = ticks[-400:]
     true = sum(tick.fx for tick in late) / len(late) - 0.01
-    thrust, error = late[-1].thrust, late[-1].thrust_error
+    thrust, error = late[-1].thrust, late[-1].thrust_ci95
     assert error is not UNSET
     assert abs(thrust - true) < max(float(error), 0.02 * true)

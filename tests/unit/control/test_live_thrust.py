@@ -21,7 +21,7 @@ def rig(seed: int = 0) -> VirtualSession:
 
 def thrust_and_ci95(ticks: Sequence[Tick]) -> tuple[float, float]:
     """Return the thrust of the last tick, and the half-width of its interval [N]."""
-    error = ticks[-1].thrust_error
+    error = ticks[-1].thrust_ci95
     assert error is not UNSET
     return ticks[-1].thrust, error
 
@@ -29,7 +29,7 @@ def thrust_and_ci95(ticks: Sequence[Tick]) -> tuple[float, float]:
 def test_nothing_is_known_of_a_fish_that_never_rested() -> None:
     with rig() as fish:
         ticks = fish.swim("swing", {}, 30.0)
-        assert {tick.thrust_error for tick in ticks} == {UNSET}
+        assert {tick.thrust_ci95 for tick in ticks} == {UNSET}
         assert ticks[-1].thrust == pytest.approx(TRUTH, abs=8e-3)  # as the sensor shows it
 
 
@@ -92,7 +92,7 @@ def test_a_new_zero_of_the_sensor_is_found_again_and_the_factor_stays() -> None:
         fish._run.loop.thrust.forget_zero()
         assert abs(thrust_and_ci95(fish.swim("swing", {}, 8.0))[0] - TRUTH) < 3e-3
         fish._run.loop.thrust.forget()
-        assert fish.swim("swing", {}, 8.0)[-1].thrust_error is UNSET
+        assert fish.swim("swing", {}, 8.0)[-1].thrust_ci95 is UNSET
 
 
 @pytest.mark.parametrize("leak", [0.1, 0.3, 1.0])
@@ -120,7 +120,7 @@ def test_at_rest_the_interval_includes_the_noise(noise: float) -> None:
         config = replace(CONFIG, simulation=replace(CONFIG.simulation, seed=seed, noise=noise))
         with VirtualSession(config) as fish:
             ticks = fish.rest(20.0)[100:]
-            outside += sum(abs(tick.thrust) > tick.thrust_error for tick in ticks)  # type: ignore[operator]
+            outside += sum(abs(tick.thrust) > tick.thrust_ci95 for tick in ticks)  # type: ignore[operator]
     assert outside < 0.1 * 8 * len(ticks)
 
 
@@ -200,7 +200,7 @@ def test_a_spike_that_is_not_suspect_makes_the_zero_uncertain_not_wrong(
     rig.run(60 - tick)
     rig.start("square", frequency=5.0 / 3.0)
     ticks = rig.run_for(30)
-    if ticks[-1].thrust_error is not UNSET:
+    if ticks[-1].thrust_ci95 is not UNSET:
         thrust, error = thrust_and_ci95(ticks)
         assert abs(thrust - TRUTH) < error
     rig.loop.stop()

@@ -24,8 +24,8 @@ def test_the_worst_is_kept_exactly_with_its_tick() -> None:
     generator = random.Random(1)
     for seq in range(1000):
         histogram.add(0.123456789 if seq == 321 else generator.uniform(0, 0.1), seq)
-    assert histogram.percentiles().worst == 0.123456789 * 1e6
-    assert histogram.percentiles().worst_seq == 321
+    assert histogram.percentiles().max == 0.123456789 * 1e6
+    assert histogram.percentiles().max_seq == 321
 
 
 def test_nothing_and_negative_and_endless_durations_are_no_problem() -> None:
@@ -34,7 +34,7 @@ def test_nothing_and_negative_and_endless_durations_are_no_problem() -> None:
     histogram.add(-1.0, 1)
     assert histogram.quantile(1.0) == 0.0
     histogram.add(1e9, 2)
-    assert histogram.percentiles().worst == 1e15
+    assert histogram.percentiles().max == 1e15
 
 
 def test_each_phase_has_its_own_distribution() -> None:
@@ -42,6 +42,6 @@ def test_each_phase_has_its_own_distribution() -> None:
     statistics.add(1, 5e-6, 0, (0.0, 0.001, 0.003, 0.006, 0.010, 0.015))
     phases = statistics.timing().phases
     assert list(phases) == list(PHASES)
-    worst = [round(phase.worst) for phase in phases.values()]
+    worst = [round(phase.max) for phase in phases.values()]
     assert worst == [1000, 2000, 3000, 4000, 5000]
-    assert round(statistics.timing().busy.worst) == 15000
+    assert round(statistics.timing().duration.max) == 15000

@@ -55,7 +55,7 @@ def test_with_nothing_known_it_goes_by_the_ripple_and_says_how_badly_it_knows() 
     rig.run_for(10)
     ticks = rig.run_for(20)
     assert true_thrust(ticks) == pytest.approx(0.010, rel=0.08)
-    error = last_quantities(ticks)["held_error"] / last_quantities(ticks)["held_thrust"]
+    error = last_quantities(ticks)["held_thrust_ci95"] / last_quantities(ticks)["held_thrust"]
     assert 0.1 < error < 0.3
 
 
@@ -74,7 +74,7 @@ def test_another_target_is_held_within_five_seconds_and_the_factor_stays_known()
     rig.run_for(5)
     ticks = rig.run_for(10)
     assert true_thrust(ticks) == pytest.approx(0.006, rel=0.03)
-    assert last_quantities(ticks)["held_error"] < 0.2 * 0.006
+    assert last_quantities(ticks)["held_thrust_ci95"] < 0.2 * 0.006
 
 
 def test_more_than_the_amplitude_limit_gives_is_held_there_and_told() -> None:
@@ -123,9 +123,9 @@ def test_what_was_measured_of_swing_holds_for_it() -> None:
     rig.start("thrust", target=0.020)
     known = rig.run(1)[-1]
     assert known.thrust_factor == pytest.approx(FACTOR)
-    assert known.thrust_factor_error < 0.05 * FACTOR  # type: ignore[operator]
+    assert known.thrust_factor_ci95 < 0.05 * FACTOR  # type: ignore[operator]
     rig.start("sine", frequency=1.5)
-    assert rig.run(1)[-1].thrust_factor_error > 0.3 * FACTOR  # type: ignore[operator]
+    assert rig.run(1)[-1].thrust_factor_ci95 > 0.3 * FACTOR  # type: ignore[operator]
 
 
 def test_the_mean_is_told_from_the_ripple_alone() -> None:

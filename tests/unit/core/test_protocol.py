@@ -50,15 +50,16 @@ def test_any_json_becomes_a_request_or_a_refusal(value: object) -> None:
     st.dictionaries(st.text(), json_values, max_size=3),
 )
 def test_a_request_arrives_as_sent(op: str, identity: int | str, args: dict[str, object]) -> None:
-    wire = {"v": 1, "op": op, "id": identity, "args": args}
+    wire = {"v": 2, "op": op, "id": identity, "args": args}
     request = protocol.decode_request(msgspec.json.encode(wire))
     assert (request.op, request.id, request.args) == (op, identity, args)
 
 
 def test_another_version_is_refused_by_name() -> None:
-    with pytest.raises(Refused, match="version 2 is not supported; use version 1") as caught:
-        protocol.decode_request(b'{"v":2,"op":"status"}')
+    with pytest.raises(Refused, match="version 3 is not supported, 2 is needed") as caught:
+        protocol.decode_request(b'{"v":3,"op":"status"}')
     assert caught.value.code == "version"
+    assert protocol.decode_request(b'{"v":1,"op":"estop"}').op == "estop"
 
 
 @pytest.mark.parametrize(
@@ -66,11 +67,11 @@ def test_another_version_is_refused_by_name() -> None:
     [
         b"",
         b"[]",
-        b'{"v":1}',
-        b'{"v":1,"op":7}',
-        b'{"v":1,"op":"status","args":[]}',
-        b'{"v":1,"op":"status","speed":3}',
-        b'{"v":1,"op":"set-controller","args":{"name":"swing","parameters":{"C":NaN}}}',
+        b'{"v":2}',
+        b'{"v":2,"op":7}',
+        b'{"v":2,"op":"status","args":[]}',
+        b'{"v":2,"op":"status","speed":3}',
+        b'{"v":2,"op":"set-controller","args":{"name":"swing","parameters":{"C":NaN}}}',
         b"[" * 60_000,
     ],
 )

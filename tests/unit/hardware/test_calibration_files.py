@@ -76,6 +76,14 @@ def error_message(folder: Path, kind: type[ForceCalibration | ServoCalibration],
     return line
 
 
+def test_a_file_of_an_older_fishd_is_read_with_its_old_names(tmp_path: Path) -> None:
+    old = {**FORCE, "load_error": 0.02, "tared": "2026-11-20"}
+    (tmp_path / "force-2027-01-01T000000.000000Z.yaml").write_text(yaml.safe_dump(old))
+    newest = CalibrationFolder(tmp_path).newest(ForceCalibration)
+    assert newest is not None
+    assert (newest[0].load_ci95, newest[0].tare_date) == (0.02, "2026-11-20")
+
+
 @pytest.mark.parametrize("key", ["xy", "date", "scale"])
 def test_a_file_without_one_of_its_keys_is_not_filled_in(tmp_path: Path, key: str) -> None:
     kind, whole = (ForceCalibration, FORCE) if key in FORCE else (ServoCalibration, SERVO)
@@ -118,7 +126,7 @@ def test_a_file_that_is_no_calibration_is_an_error(tmp_path: Path, text: str, wo
         (ForceCalibration, FORCE, {"covariance_x": [-1.0, 0.0, 1.0]}, "is not a covariance"),
         (ForceCalibration, FORCE, {"covariance_y": [1.0, 2.0, 1.0]}, "is not a covariance"),
         (ForceCalibration, FORCE, {"covariance_x": [1.0, 0.0]}, "covariance_x: [1.0, 0.0] is not"),
-        (ForceCalibration, FORCE, {"load_error": -0.1}, "load_error: -0.1 is negative"),
+        (ForceCalibration, FORCE, {"load_ci95": -0.1}, "load_ci95: -0.1 is negative"),
         (ServoCalibration, SERVO, {"highest": 3.15}, "highest: 3.15 is not valid"),
     ],
 )
@@ -212,6 +220,6 @@ def test_a_save_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
 
 def test_volts_count_as_newtons_until_a_matrix_was_found_whatever_was_tared() -> None:
     assert ForceCalibration().is_unset
-    assert ForceCalibration(x0=0.1, tared="2026-11-21", date="2026-11-21").is_unset
+    assert ForceCalibration(x0=0.1, tare_date="2026-11-21", date="2026-11-21").is_unset
     assert not ForceCalibration(loads=5).is_unset
     assert not ForceCalibration(xx=2.0).is_unset

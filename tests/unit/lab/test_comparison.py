@@ -26,7 +26,7 @@ def test_square_beats_sine_beats_triangle_and_each_is_as_square_as_it_is() -> No
     standings = compare_texts(*(f"{name}:frequency=1.7" for name in ("square", "sine", "triangle")))
     relative_thrusts = [standing.relative_thrust for standing in standings]
     assert relative_thrusts == sorted(relative_thrusts, reverse=True)
-    assert [standing.squareness for standing in standings] == pytest.approx(
+    assert [standing.form_factor for standing in standings] == pytest.approx(
         [1.0, 0.900, 0.866], abs=0.003
     )
     assert standings[0].frequency == pytest.approx(1.7, abs=0.02)
@@ -39,7 +39,7 @@ def test_the_runs_of_a_contestant_differ_in_noise_and_give_the_interval_of_their
     assert len(set(thrusts)) > 1
     assert standing.thrust == pytest.approx(thrusts.mean())
     # Student's t of four degrees of freedom, from a table.
-    assert standing.error == pytest.approx(2.776 * thrusts.std(ddof=1) / 5**0.5, rel=1e-3)
+    assert standing.thrust_ci95 == pytest.approx(2.776 * thrusts.std(ddof=1) / 5**0.5, rel=1e-3)
     assert compare(config, ["swing"], 20.0, 5.0)[0][0].error is None
 
 
@@ -53,7 +53,7 @@ def test_it_is_said_that_another_controller_took_over_from_a_policy(tmp_path: Pa
 def standing(contestant: str, controller: str, thrusts: list[float], **given: Any) -> Standing:
     return Standing(
         contestant=contestant, controller=controller, parameters={}, thrust=float(np.mean(thrusts)),
-        error=comparison.mean_ci95(thrusts), frequency=1.7, fullness=1.0, squareness=1.0,
+        thrust_ci95=comparison.mean_ci95(thrusts), frequency=1.7, fullness=1.0, form_factor=1.0,
         thrusts=thrusts, **given,
     )  # fmt: skip
 

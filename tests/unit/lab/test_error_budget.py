@@ -37,9 +37,9 @@ def test_a_gain_error_is_within_the_total_interval_and_its_part_is_named() -> No
         0.03 * measurement.thrust / (1.0 + GAIN_ERROR)
     )
     assert measurement.total_ci95 == pytest.approx(
-        math.hypot(measurement.error, measurement.calibration_ci95)
+        math.hypot(measurement.thrust_ci95, measurement.calibration_ci95)
     )
-    assert measurement.error < abs(measurement.thrust - truth) < measurement.total_ci95
+    assert measurement.thrust_ci95 < abs(measurement.thrust - truth) < measurement.total_ci95
     report = summarise(measurement, 0.05)
     assert report.power is not None
     assert report.thrust_per_watt_total_ci95 == pytest.approx(
@@ -51,7 +51,7 @@ def test_the_sensor_of_a_simulated_fish_is_exact() -> None:
     measurement = measure_swing()
     assert (measurement.calibration_ci95, measurement.total_ci95, measurement.rotation) == (
         0.0,
-        measurement.error,
+        measurement.thrust_ci95,
         0.0,
     )
 
@@ -63,7 +63,9 @@ def test_a_rotation_that_no_load_has_shown_is_seen_in_the_swim_and_covered(angle
     assert measurement.rotation == pytest.approx(angle, abs=0.003)
     assert measurement.total_ci95
     assert truth - measurement.thrust == pytest.approx((1.0 - math.cos(angle)) * truth, rel=0.1)
-    assert measurement.error < truth - measurement.thrust < measurement.total_ci95 < 0.02 * truth
+    assert (
+        measurement.thrust_ci95 < truth - measurement.thrust < measurement.total_ci95 < 0.02 * truth
+    )
 
 
 @pytest.mark.slow
@@ -100,9 +102,9 @@ def test_more_runs_do_not_make_the_part_of_the_calibration_smaller() -> None:
         live.swim(21.0, runs=3)
     (standing,) = live.standings()
     assert standing.calibration_ci95 == pytest.approx(0.03 / 1.02 * standing.thrust, rel=1e-3)
-    assert standing.error is not None
+    assert standing.thrust_ci95 is not None
     assert standing.total_ci95 == pytest.approx(
-        math.hypot(standing.error, standing.calibration_ci95)
+        math.hypot(standing.thrust_ci95, standing.calibration_ci95)
     )
 
 

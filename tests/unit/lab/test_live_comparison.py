@@ -26,9 +26,9 @@ def test_a_drifting_sensor_ranks_by_the_true_thrust_which_lies_in_each_interval(
     true, _ = compare(DRIFTS, names)
     for measured, truth in zip(live.standings(), true, strict=True):
         assert measured.contestant == truth.contestant
-        assert measured.error is not None
-        assert abs(measured.thrust - truth.thrust) < measured.error < 2e-3
-        assert measured.squareness == pytest.approx(truth.squareness, abs=0.01)
+        assert measured.thrust_ci95 is not None
+        assert abs(measured.thrust - truth.thrust) < measured.thrust_ci95 < 2e-3
+        assert measured.form_factor == pytest.approx(truth.form_factor, abs=0.01)
         assert measured.frequency == pytest.approx(truth.frequency, abs=0.03)
 
 
@@ -69,14 +69,14 @@ def test_the_error_of_several_runs_is_what_they_are_known_to_or_how_they_differ(
 ) -> None:
     with VirtualSession(DRIFTS) as rig:
         measurement = measure(rig, "swing", {}, 21.0)
-        runs = [measurement._replace(thrust=thrust, error=0.3e-3) for thrust in thrusts]
+        runs = [measurement._replace(thrust=thrust, thrust_ci95=0.3e-3) for thrust in thrusts]
         monkeypatch.setattr("fishd.lab.compare.live.measure", lambda *_: runs.pop(0))
         live = LiveComparison(rig, ["swing"])
         live.swim(21.0, runs=len(runs))
     (standing,) = live.standings()
     assert standing.thrusts == thrusts
     assert standing.thrust == pytest.approx(20e-3)
-    assert standing.error == pytest.approx(expected, rel=1e-6)
+    assert standing.thrust_ci95 == pytest.approx(expected, rel=1e-6)
 
 
 def test_who_cannot_swim_or_gives_up_is_left_out_and_the_others_go_on(tmp_path: Path) -> None:

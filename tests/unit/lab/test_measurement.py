@@ -73,7 +73,7 @@ def test_a_drift_that_the_plain_average_falls_for_is_taken_off() -> None:
 
 def test_a_fish_that_holds_still_has_no_thrust() -> None:
     measurement = measure_swim(RIG, controller="hold")
-    assert abs(measurement.thrust) < max(measurement.error, 0.3e-3)
+    assert abs(measurement.thrust) < max(measurement.thrust_ci95, 0.3e-3)
     assert measurement.frequency == 0.0
 
 
@@ -117,8 +117,8 @@ def test_a_force_that_is_not_to_be_believed_spoils_no_measurement() -> None:
         for tick in measurement.ticks
     ]
     again = evaluate(to_samples(ticks), RIG.tick)
-    assert again.thrust == pytest.approx(measurement.thrust, abs=measurement.error)
-    assert again.error < 3.0 * measurement.error
+    assert again.thrust == pytest.approx(measurement.thrust, abs=measurement.thrust_ci95)
+    assert again.thrust_ci95 < 3.0 * measurement.thrust_ci95
 
 
 @cache
@@ -152,7 +152,9 @@ def test_a_step_of_the_zero_is_found_and_accounted_for(at: float) -> None:
     ]
     assert step.size == pytest.approx(5e-3, abs=1e-3)
     assert step.time == pytest.approx(at, abs=1.5)
-    assert abs(measurement.thrust - clean.thrust) < measurement.error < 2.0 * clean.error
+    assert (
+        abs(measurement.thrust - clean.thrust) < measurement.thrust_ci95 < 2.0 * clean.thrust_ci95
+    )
     assert measurement.drift[-1] - measurement.drift[0] == pytest.approx(5e-3, abs=1e-3)
     assert "the zero stepped by +" in spell(measurement.disturbances, "N")
 
@@ -166,7 +168,9 @@ def test_a_tick_far_off_is_found_and_hardly_moves_the_thrust(at: float) -> None:
     (outlier,) = measurement.disturbances
     assert outlier.kind == "outlier"
     assert outlier.time == pytest.approx(at, abs=0.6)
-    assert abs(measurement.thrust - clean.thrust) < measurement.error < 1.3 * clean.error
+    assert (
+        abs(measurement.thrust - clean.thrust) < measurement.thrust_ci95 < 1.3 * clean.thrust_ci95
+    )
 
 
 def test_a_zero_that_follows_swimming_is_named_and_not_taken_for_thrust() -> None:
@@ -181,7 +185,7 @@ def test_a_zero_that_follows_swimming_is_named_and_not_taken_for_thrust() -> Non
     (response,) = measurement.disturbances
     assert response.kind == "response"
     assert response.size == pytest.approx(4e-3, rel=0.3)
-    assert abs(measurement.thrust - truth()) < measurement.error < 0.5e-3
+    assert abs(measurement.thrust - truth()) < measurement.thrust_ci95 < 0.5e-3
 
 
 def test_nothing_is_named_where_the_zero_holds_still() -> None:
@@ -227,9 +231,9 @@ def test_where_a_swim_has_one_beat_those_of_others_say_how_sure_its_thrust_and_p
         evaluation = evaluate(make_candidate(generator, 6), 0.05, 0.75, other_steps=alike)
         assert not evaluation.steps  # of one beat
         assert evaluation.watts is not None
-        assert evaluation.watts_error is not None
-        thrust_missed += abs(evaluation.thrust - 0.02) > evaluation.error
-        power_missed += abs(evaluation.watts - 0.5) > evaluation.watts_error
+        assert evaluation.watts_ci95 is not None
+        thrust_missed += abs(evaluation.thrust - 0.02) > evaluation.thrust_ci95
+        power_missed += abs(evaluation.watts - 0.5) > evaluation.watts_ci95
     assert thrust_missed <= 9  # of 60; three are expected
     assert power_missed <= 9
 
@@ -266,4 +270,4 @@ def test_a_long_measurement_is_the_same_and_no_slower_to_judge() -> None:
     assert len(measurement.blocks.time) <= MAX_BLOCKS + 2 * measurement.swims + 1
     assert measurement.total_ci95
     assert abs(measurement.thrust - truth()) < 2.0 * measurement.total_ci95
-    assert 2.0 * measurement.error < 0.2e-3
+    assert 2.0 * measurement.thrust_ci95 < 0.2e-3

@@ -41,8 +41,8 @@ def test_a_few_noisy_measurements_find_a_maximum_and_say_how_well() -> None:
     best = search.propose()
     assert best.parameters == pytest.approx({"frequency": 1.7, "amplitude": 0.3}, rel=0.15)
     for name, truth in (("frequency", 1.7), ("amplitude", 0.3)):
-        assert best.low[name] <= truth <= best.high[name]
-    assert best.value == pytest.approx(0.02, abs=2.0 * best.error)
+        assert best.parameters_ci95_low[name] <= truth <= best.parameters_ci95_high[name]
+    assert best.value == pytest.approx(0.02, abs=2.0 * best.value_ci95)
 
 
 def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> None:
@@ -56,7 +56,7 @@ def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> N
         thrust = 0.0257 - 0.02 * (frequency - 1.74) ** 2  # its maximum is at none of them
         search.observe({"frequency": frequency}, thrust, 0.8e-3)
         best = search.propose()
-        for parameters in (best.parameters, best.low, best.high):
+        for parameters in (best.parameters, best.parameters_ci95_low, best.parameters_ci95_high):
             assert parameters["frequency"] in search.ranges[0].values
     assert best.parameters["frequency"] in tried
     assert best.parameters["frequency"] == pytest.approx(10 / 6)
@@ -70,13 +70,13 @@ def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
     swum = 0
     with VirtualSession(config) as rig:
         for trial in measure_trials(rig, "square", {}, search, 300.0):
-            swum, proposal = trial.swum, search.propose()
+            swum, proposal = trial.swim_ticks, search.propose()
             if search.is_warm and proposal.improvement < 0.01:
                 break
     assert swum <= 360
     truth = simulate(config, "square", proposal.parameters).mean_thrust
     assert truth >= 0.97 * BEST
-    assert proposal.value == pytest.approx(truth, abs=2.0 * proposal.error)
+    assert proposal.value == pytest.approx(truth, abs=2.0 * proposal.value_ci95)
 
 
 @pytest.mark.slow
@@ -88,7 +88,7 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert "the budget of 22 s is used" in done.stderr
     assert "true thrust there" in done.stdout
     rows = (folder / "rows.csv").read_text().splitlines()
-    assert rows[0] == "frequency,thrust,error,power,power_error,swum,passed"
+    assert rows[0] == "frequency,thrust,thrust_ci95,power,power_ci95,swim_ticks,tank_time"
     passed = float(rows[-1].rpartition(",")[2])
     run = open_run(folder / "search.mcap")
     assert len(run.ticks) == round(passed / 0.05)

@@ -32,10 +32,10 @@ def test_a_measurement_tells_power_and_thrust_per_watt_with_their_intervals() ->
     truth = simulate(DRIFTING, "swing", {})
     assert report.power == pytest.approx(truth.mean_power, rel=0.01)
     assert report.thrust_per_watt == pytest.approx(report.thrust / report.power)
-    assert report.thrust_per_watt_error is not None
+    assert report.thrust_per_watt_ci95 is not None
     true_thrust_per_watt = truth.mean_thrust / truth.mean_power
     assert report.thrust_per_watt == pytest.approx(
-        true_thrust_per_watt, abs=2.0 * report.thrust_per_watt_error
+        true_thrust_per_watt, abs=2.0 * report.thrust_per_watt_ci95
     )
 
 
@@ -45,7 +45,7 @@ def test_without_a_power_meter_a_measurement_tells_the_thrust_alone() -> None:
     with VirtualSession(config) as rig:
         report = summarise(measure(rig, "square", {"frequency": 2.0}, 25.0), rig.tick)
     assert report.thrust > 0.0
-    assert (report.power, report.power_error, report.thrust_per_watt) == (None, None, None)
+    assert (report.power, report.power_ci95, report.thrust_per_watt) == (None, None, None)
 
 
 def test_the_error_of_a_ratio_is_that_of_both() -> None:
@@ -68,7 +68,11 @@ def test_the_search_of_the_least_power_ends_where_the_thrust_is_just_reached() -
     proposal = search.propose()
     slowest = 1.7 * math.exp(-math.sqrt(0.5 * math.log(0.025 / 0.015)))  # where it is 15 mN
     assert proposal.parameters["frequency"] == pytest.approx(slowest, rel=0.1)
-    assert proposal.low["frequency"] <= slowest <= proposal.high["frequency"]
+    assert (
+        proposal.parameters_ci95_low["frequency"]
+        <= slowest
+        <= proposal.parameters_ci95_high["frequency"]
+    )
     assert proposal.value == pytest.approx(0.1 + 0.3 * slowest, rel=0.1)
 
 
@@ -104,7 +108,7 @@ def test_optimise_finds_the_frequency_that_gives_most_for_each_watt(tmp_path: Pa
     best = max(swim.mean_thrust / swim.mean_power for swim in swims)
     assert optimum["true_thrust"] / optimum["true_power"] > 0.97 * best
     assert optimum["thrust_per_watt"] == pytest.approx(
-        best, abs=2 * optimum["thrust_per_watt_error"]
+        best, abs=2 * optimum["thrust_per_watt_ci95"]
     )
 
 
@@ -136,7 +140,7 @@ def test_a_comparison_tells_what_each_watt_gave_simulated_and_measured() -> None
         live.swim(25.0)
     for truth, measured in zip((slow, fast), live.standings(), strict=True):
         assert truth.thrust_per_watt is not None
-        assert measured.thrust_per_watt_error is not None
+        assert measured.thrust_per_watt_ci95 is not None
         assert measured.thrust_per_watt == pytest.approx(
-            truth.thrust_per_watt, abs=2.0 * measured.thrust_per_watt_error
+            truth.thrust_per_watt, abs=2.0 * measured.thrust_per_watt_ci95
         )

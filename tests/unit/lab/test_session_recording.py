@@ -66,14 +66,14 @@ def test_what_swam_before_an_interruption_or_a_kill_is_kept(
     def swim() -> None:
         with VirtualSession(Config()) as rig, rig.recorded(path, "") as writer:
             rig.swim("swing", {}, 5.0)
-            assert open_run(writer.part).summary.swimming == {"swing": 100}
+            assert open_run(writer.part).summary.swim_ticks == {"swing": 100}
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         swim()
     run = open_run(path)
     assert run.reason == "ended by KeyboardInterrupt"
-    assert run.summary.swimming == {"swing": 100}
+    assert run.summary.swim_ticks == {"swing": 100}
 
 
 def test_forces_in_volts_are_never_called_newtons(tmp_path: Path) -> None:

@@ -61,9 +61,9 @@ def test_the_best_of_a_noisy_curve_is_within_its_interval_as_often_as_it_says() 
         truth = generator.uniform(1.5, 1.9)
         y = 25e-3 - 20e-3 * (x - truth) ** 2 + generator.normal(0.0, 0.3e-3, len(x))
         peak = find_peak(x.tolist(), y.tolist(), [0.6e-3] * len(x))
-        assert peak.x_low is not None
-        assert peak.x_high is not None
-        hits += peak.x_low <= truth <= peak.x_high
+        assert peak.x_ci95_low is not None
+        assert peak.x_ci95_high is not None
+        hits += peak.x_ci95_low <= truth <= peak.x_ci95_high
     assert 0.92 <= hits / 300 <= 0.99
 
 
@@ -74,11 +74,11 @@ def test_the_best_is_that_of_the_curve_and_not_of_the_grid(waveform: str, freque
     x = [float(row["frequency_Hz"]) for row in rows]
     peak = find_peak(x, [float(row["mean_thrust_mN"]) for row in rows], [None] * len(x))
     assert peak.x == pytest.approx(frequency, abs=0.02)
-    assert peak.x_low is not None
-    assert peak.x_high is not None
-    assert peak.x_low <= frequency <= peak.x_high
+    assert peak.x_ci95_low is not None
+    assert peak.x_ci95_high is not None
+    assert peak.x_ci95_low <= frequency <= peak.x_ci95_high
 
 
 def test_a_best_at_the_edge_is_told_and_has_no_interval() -> None:
     peak = find_peak([1.0, 1.2, 1.4], [1.0, 2.0, 3.0], [0.1, 0.1, 0.1])
-    assert (peak.x, peak.at_edge, peak.x_low) == (1.4, True, None)
+    assert (peak.x, peak.at_edge, peak.x_ci95_low) == (1.4, True, None)

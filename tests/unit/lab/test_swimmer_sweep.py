@@ -65,7 +65,7 @@ def test_a_fish_whose_speed_still_changes_is_judged_by_the_later_half_and_that_i
     monkeypatch.setattr(measuring, "MAX_SWIM_S", 2.0)
     result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
     assert result
-    assert (result.trouble, result.settled, result.seconds) == ("", None, 2.0)
+    assert (result.failure, result.settled_time, result.seconds) == ("", None, 2.0)
     assert result.beats == 2
     assert result.beat_frequency == pytest.approx(3.0, rel=0.03)
     assert result.speed is not None
@@ -79,10 +79,10 @@ def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
     monkeypatch.setattr("fishd.lab.sweep.measuring.STEADY_FRACTION", 0.5)
     result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
     assert result
-    assert result.settled is not None
-    assert 0.3 < result.settled < 1.0
+    assert result.settled_time is not None
+    assert 0.3 < result.settled_time < 1.0
     assert result.beats == 2
-    assert result.seconds == pytest.approx(result.settled + 2.0 / 3.0, abs=0.05)
+    assert result.seconds == pytest.approx(result.settled_time + 2.0 / 3.0, abs=0.05)
 
 
 def test_a_fish_that_is_lost_is_a_point_without_a_speed(
@@ -92,7 +92,7 @@ def test_a_fish_that_is_lost_is_a_point_without_a_speed(
     result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
     assert result
     assert result.speed is None
-    assert "the swimmer cannot go on at 0.04" in result.trouble
+    assert "the swimmer cannot go on at 0.04" in result.failure
 
 
 def test_a_swim_is_stopped_before_its_end(config: Config) -> None:
@@ -114,7 +114,9 @@ def test_a_table_of_speeds_is_gone_on_with_and_swing_is_drawn_among_the_waves(
     points += [Point("swing", {"C": value}) for value in (0.0, 0.6)]
     speeds = (0.02, 0.05, 0.07, 0.06, 0.03, 0.06, 0.07)
     for point, speed in zip(points, speeds, strict=True):
-        result = SpeedResult(speed=speed, error=1e-3, beat_frequency=2.9, settled=4.0, beats=10)
+        result = SpeedResult(
+            speed=speed, speed_ci95=1e-3, beat_frequency=2.9, settled_time=4.0, beats=10
+        )
         folder.add_result(point, result, b"a recording")
     assert open_folder(tmp_path, config).results == folder.results
     curves = make_curves(folder, points)

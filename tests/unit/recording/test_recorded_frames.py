@@ -79,7 +79,7 @@ def test_pixels_and_times_are_given_back(
         exposure = 0.01 if number % 2 else None
         assert (frame.seq, frame.session, frame.exposure) == (number, "one", exposure)
     assert run.ticks == ticks
-    assert (run.summary.frames, run.summary.frames_lost) == (len(frames), 0)
+    assert (run.summary.frames, run.summary.lost_frames) == (len(frames), 0)
 
 
 def test_viewers_find_the_schema_that_they_know(path: Path, frames: list[Frame]) -> None:
@@ -128,7 +128,7 @@ def test_missing_frames_and_a_new_camera_are_counted_as_gaps(
         lost = [writer.frame(header, frames[0].pixels) for header in heads]
     assert lost == [0, 0, 2, 3, 0]
     for summary in (open_run(writer.path).summary, read_overview(writer.path).summary):
-        assert (summary.frames, summary.frames_lost, summary.frame_gaps) == (5, 5, 3)
+        assert (summary.frames, summary.lost_frames, summary.frame_gaps) == (5, 5, 3)
 
 
 def test_a_recording_that_was_cut_off_is_finished_with_its_frames(

@@ -38,7 +38,7 @@ def test_a_recording_gives_back_every_bit_of_a_run(tmp_path: Path) -> None:
     about = ("operator", "subject", "note", "source")
     assert [run.about[key] for key in about] == ["Ada", "fish 3", "stiff fin", "fishd"]
     assert run.finished
-    assert (run.gaps, run.summary.swimming) == ([], {"swing": 60})
+    assert (run.gaps, run.summary.swim_ticks) == ([], {"swing": 60})
     assert list(read(path).fx) == [tick.fx for tick in rig.recorder.ticks]
 
 
@@ -53,7 +53,7 @@ def test_its_thrust_is_the_mean_over_all_its_swimming() -> None:
             impulse += fish.fish.take_window().thrust
     for tick in fish.recorder.ticks:
         tally.tick(tick)
-    thrust, error = tally.summary.thrust, tally.summary.thrust_error
+    thrust, error = tally.summary.thrust, tally.summary.thrust_ci95
     assert thrust is not None
     assert error is not None
     assert thrust == pytest.approx(impulse / 2400, abs=0.2e-3)
@@ -78,7 +78,7 @@ def test_ticks_that_are_missing_are_counted(tmp_path: Path) -> None:
     again = swum(1.0).recorder.ticks
     path = write(tmp_path / "run", [*ticks[:10], *ticks[13:], *again[2:]])
     for summary in (open_run(path).summary, read_overview(path).summary):
-        assert (summary.gaps, summary.lost, summary.restarts) == (2, 5, 1)
+        assert (summary.gaps, summary.lost_ticks, summary.restarts) == (2, 5, 1)
     assert open_run(path).gaps == [Gap(ticks[9].t, 11, 3), Gap(ticks[-1].t, 1, 2)]
 
 
@@ -196,7 +196,7 @@ def test_what_is_recovered_of_a_damaged_recording_is_whole(tmp_path: Path) -> No
     path.write_bytes(content)
     damaged, run = open_run(path), recover(path)
     assert run.path == tmp_path / "run-recovered.mcap"
-    assert (damaged.damaged, run.is_damaged, run.summary.lost) == (10, False, 10)
+    assert (damaged.damaged, run.is_damaged, run.summary.lost_ticks) == (10, False, 10)
     assert run.ticks == damaged.ticks
     assert run.reason == "recovered: the recording was damaged, ticks that could not be read: 10"
     with pytest.raises(RecordingError, match="there is nothing to recover"):

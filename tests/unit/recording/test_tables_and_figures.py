@@ -99,6 +99,6 @@ def test_recordings_are_listed_with_what_is_missing(path: Path, tmp_path: Path) 
     assert re.search(r"^second .* 50 +10 +0  swing", done.stdout, re.MULTILINE)
     assert "broken.mcap is not an MCAP file" in done.stderr
     (listed,) = json.loads(fishctl("runs", "--json", "--folder", str(path.parent)).stdout)
-    assert (listed["name"], listed["state"], listed["lost"]) == ("run", "finished", 0)
+    assert (listed["name"], listed["state"], listed["lost_ticks"]) == ("run", "finished", 0)
     nothing = fishctl("runs", "--folder", str(tmp_path / "none"))
     assert "there is no recording in" in nothing.stdout

@@ -54,7 +54,7 @@ def test_a_fish_that_does_not_beat_has_no_frequency_and_no_thrust() -> None:
     assert (report.frequency, report.mean_thrust) == (0.0, pytest.approx(0.0, abs=1e-9))
     assert report.fin_amplitude == pytest.approx(0.3 * 0.46, rel=1e-3)
     neutral = simulate(load(), "hold", {}, 20)
-    assert (neutral.fullness, neutral.squareness) == (0.0, 0.0)
+    assert (neutral.fullness, neutral.form_factor) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -100,18 +100,18 @@ def test_only_whole_beats_are_counted() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("waveform", "fullness", "squareness"),
+    ("waveform", "fullness", "form_factor"),
     [("square", 1.0, 1.0), ("sine", 2.0 / math.pi, 0.9003), ("triangle", 0.5, 0.8660)],
 )
 def test_fullness_and_squareness_of_waveforms(
-    waveform: str, fullness: float, squareness: float
+    waveform: str, fullness: float, form_factor: float
 ) -> None:
     amplitude = 0.3
     report = simulate(
         load(None, ["tick=0.005"]), waveform, {"frequency": 1.0, "amplitude": amplitude}, 14
     )
     assert report.fullness == pytest.approx(fullness, abs=1e-3)
-    assert report.squareness == pytest.approx(squareness, abs=1e-3)
+    assert report.form_factor == pytest.approx(form_factor, abs=1e-3)
 
 
 run = partial(fishctl, "simulate")

@@ -38,8 +38,8 @@ def test_an_action_is_in_force_in_the_tick_that_it_answers(
         assert (seen["fx"], seen["fy"], seen["fy_rate"]) == (tick.fx, tick.fy, tick.fy_rate)
         assert seen["fin_velocity"] == tick.fin_velocity
         assert (seen["tick"], seen["amplitude"]) == (0.05, 0.42)
-        assert seen["answered"] == seen["seq"] - 1
-        assert seen["lost"] == 0
+        assert seen["answered_seq"] == seen["seq"] - 1
+        assert seen["lost_ticks"] == 0
     assert [seen["instruction_angle"] for seen in agent.seen[1:]] == list(angles.values())[:-1]
 
 
@@ -100,7 +100,7 @@ def test_a_late_action_is_for_no_other_tick(rig: Rig, agent: ScriptedAgent) -> N
         arrived(rig)
         assert rig.run()[-1].phi_c == 0.0
         agent.drain()
-    assert agent.seen[-1]["answered"] == 0
+    assert agent.seen[-1]["answered_seq"] == 0
     rig.run(10)  # the ten ticks have not counted as a first action
     assert rig.mode == "running"
 
@@ -120,8 +120,8 @@ def test_what_was_lost_is_told_with_the_next_observation(rig: Rig, agent: Script
     for before, after in pairwise(seen):
         applied = angles[round(before["time"], 6)] != 0.0
         assert not (applied and before["seq"] in silent)
-        assert after["lost"] == (0 if applied else 1)
-        assert (after["answered"] == before["seq"]) == applied
+        assert after["lost_ticks"] == (0 if applied else 1)
+        assert (after["answered_seq"] == before["seq"]) == applied
 
 
 def test_a_pause_is_neutral_silent_and_ends_when_it_is_told(rig: Rig, agent: ScriptedAgent) -> None:
@@ -137,8 +137,8 @@ def test_a_pause_is_neutral_silent_and_ends_when_it_is_told(rig: Rig, agent: Scr
     rig.run()
     fresh = agent.next()
     assert fresh["seq"] == before["seq"] + 1
-    assert fresh["answered"] == before["seq"]
-    assert fresh["lost"] == 0
+    assert fresh["answered_seq"] == before["seq"]
+    assert fresh["lost_ticks"] == 0
     assert fresh["time"] == pytest.approx((rig.index - 1) * 0.2)
     assert rig.mode == "running"
 
@@ -241,7 +241,7 @@ def test_before_the_first_action_an_agent_that_was_started_again_is_asked(
     with closing(ScriptedAgent(tmp_path)) as successor:
         connected(rig)
         rig.run()
-        assert successor.next()["answered"] == 0
+        assert successor.next()["answered_seq"] == 0
 
 
 def test_a_configuration_is_refused_whose_agent_cannot_be_connected_to() -> None:

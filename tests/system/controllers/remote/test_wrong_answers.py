@@ -37,7 +37,7 @@ def _ended(connection: socket.socket) -> bool:
 
 
 def spoiled(**changes: Any) -> dict[str, Any]:
-    return {"kind": "action", "v": 1, "session": "s", "seq": 1, "phi_c": 0.1, **changes}
+    return {"kind": "action", "v": 2, "session": "s", "seq": 1, "phi_c": 0.1, **changes}
 
 
 @pytest.mark.parametrize(
@@ -46,12 +46,12 @@ def spoiled(**changes: Any) -> dict[str, Any]:
         (b"\xff\x00", "which is neither an action nor a pause"),
         (b'{"kind":"action","session":"\xff","seq":1,"phi_c":0.1}', "can't decode byte 0xff"),
         (b'{"a":' + 60_000 * b"[", "maximum recursion depth exceeded"),
-        (b'{"kind":"action","v":1,"session":"s","seq":1,"phi_c":NaN}', "JSON is malformed"),
+        (b'{"kind":"action","v":2,"session":"s","seq":1,"phi_c":NaN}', "JSON is malformed"),
         (spoiled(phi_c=None), "Expected `float`, got `null` - at `$.phi_c`"),
         (spoiled(speed=1), "Object contains unknown field `speed`"),
         (spoiled(kind="dance"), "Invalid value 'dance' - at `$.kind`"),
-        (spoiled(v=2, angle=1), "a message of version 2; this fishd needs version 1"),
-        ({"kind": "pause", "v": 1, "session": "s", "seconds": -1}, "Expected `float` >= 0"),
+        (spoiled(v=3, angle=1), "a message of version 3; this fishd needs version 2"),
+        ({"kind": "pause", "v": 2, "session": "s", "seconds": -1}, "Expected `float` >= 0"),
     ],
 )
 def test_rubbish_is_a_fault_that_says_what_came(
@@ -166,7 +166,7 @@ def test_heartbeats_of_an_agent_that_never_reads_take_no_memory(rig: Rig, raw: R
 def test_messages_that_come_byte_by_byte_are_put_together(rig: Rig, raw: RawAgent) -> None:
     rig.start("remote", agent=raw.address)
     connection = raw.accept()
-    payload = b'{"kind":"pause","v":1,"session":"s","seconds":1}'
+    payload = b'{"kind":"pause","v":2,"session":"s","seconds":1}'
     for byte in raw.GREETING + raw.READY + b"\x00" + bytes([len(payload)]) + payload:
         connection.sendall(bytes([byte]))
         remote(rig)._wire.state()
@@ -185,7 +185,7 @@ def test_what_is_shown_of_a_bad_message_is_where_it_is_bad(
     rig: Rig, agent: ScriptedAgent, angle: bytes, fill: int, shown: bytes
 ) -> None:
     session = connect(rig, agent)["session"].encode()
-    head = b'{"kind":"action","v":1,' + fill * b" " + b'"session":"' + session + b'","seq":12,'
+    head = b'{"kind":"action","v":2,' + fill * b" " + b'"session":"' + session + b'","seq":12,'
     agent.send(head + b'"phi_c":' + angle + b"}" + fill * b" ")
     arrived(rig)
     rig.run()

@@ -50,7 +50,7 @@ def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 
 def restarts(daemon: Daemon, kind: str) -> float:
-    return daemon.status().counters.get(f"{kind}_restarts", 0)
+    return daemon.status().recovered_errors.get(f"{kind}_restarts", 0)
 
 
 @pytest.mark.realtime
@@ -59,14 +59,14 @@ def test_a_gateway_that_dies_is_started_again_and_its_subscribers_go_on(
 ) -> None:
     before = restarts(shared_daemon, "telemetry")
     with Subscriber(shared_daemon.telemetry) as subscriber:
-        missed = subscriber.until(mode="running")["missed"]
+        missed = subscriber.until(mode="running")["missed_slots"]
         os.kill(both_gateways(shared_daemon)["telemetry"], signal.SIGKILL)
         event = subscriber.until(kind="gateway")
         tick = subscriber.until(mode="running")
     assert event["message"] == (
         "the gateway of telemetry was started again: its process ended with status -9"
     )
-    assert tick["missed"] == missed
+    assert tick["missed_slots"] == missed
     assert restarts(shared_daemon, "telemetry") == before + 1
 
 
@@ -129,7 +129,10 @@ def test_a_gateway_that_hangs_is_replaced_and_costs_no_tick(
     )
     assert gone(hung)
     after = shared_daemon.status()
-    assert after.counters[f"{kind}_restarts"] == before.counters.get(f"{kind}_restarts", 0) + 1
+    assert (
+        after.recovered_errors[f"{kind}_restarts"]
+        == before.recovered_errors.get(f"{kind}_restarts", 0) + 1
+    )
     assert after.mode == "running"
 
 
@@ -140,7 +143,7 @@ def test_a_fork_server_that_hangs_is_replaced_with_its_gateways(daemon: Daemon) 
     wait_until(lambda: gone(hung))
     assert not set(former.values()) & set(both_gateways(daemon).values())
     assert all(gone(pid) for pid in former.values())
-    wait_until(lambda: daemon.status().counters["control_restarts"] == 1)
+    wait_until(lambda: daemon.status().recovered_errors["control_restarts"] == 1)
 
 
 def test_an_estop_is_answered_while_every_gateway_is_stopped(daemon: Daemon) -> None:
@@ -190,7 +193,7 @@ def test_the_socket_for_an_estop_takes_nothing_else(shared_daemon: Daemon) -> No
     assert path.stat().st_mode & 0o777 == 0o660
     with shared_daemon.estop_socket() as client:
         for request, error in (
-            (b'{"v":1,"id":1,"op":"clear-fault"}', "unknown-op"),
+            (b'{"v":2,"id":1,"op":"clear-fault"}', "unknown-op"),
             (b"estop", "bad-request"),
             (bytes(2**16), "bad-request"),
         ):
@@ -271,7 +274,7 @@ def test_a_hundred_thousand_subscriptions_that_leave_cost_no_tick(shared_daemon:
     before = shared_daemon.status()
     attack("subscriptions", shared_daemon, 4.0)
     after = shared_daemon.status()
-    assert (after.mode, after.missed) == ("running", before.missed)
+    assert (after.mode, after.missed_slots) == ("running", before.missed_slots)
     assert memory(shared_daemon) < 150.0
     with Subscriber(shared_daemon.telemetry, b"tick") as subscriber:
         assert subscriber.message()["mode"] == "running"
@@ -296,7 +299,7 @@ def test_a_thousand_idle_connections_end_nothing(tmp_path: Path) -> None:
         before = daemon.status()
         attack("idle-telemetry", daemon, 3.0)
         after = daemon.status()
-        assert (after.mode, after.missed) == ("running", before.missed)
+        assert (after.mode, after.missed_slots) == ("running", before.missed_slots)
         with Subscriber(daemon.telemetry, b"tick") as subscriber:
             assert subscriber.message()["mode"] == "running"
 
@@ -319,7 +322,7 @@ def test_a_client_that_asks_faster_than_it_is_answered_is_told_so_and_others_are
         shared_daemon.process.send_signal(signal.SIGSTOP)
         try:
             for number in range(1500):
-                hasty.send(b'{"v":1,"id":%d,"op":"config"}' % number)
+                hasty.send(b'{"v":2,"id":%d,"op":"config"}' % number)
             reply = json.loads(hasty.recv())  # while fishd answers nothing
         finally:
             shared_daemon.process.send_signal(signal.SIGCONT)
@@ -333,16 +336,16 @@ def test_a_client_that_asks_again_as_soon_as_it_has_an_answer_is_never_refused(
     shared_daemon: Daemon,
 ) -> None:
     with Fish(shared_daemon.endpoint, timeout=PATIENCE) as fish:
-        missed = fish.status().missed
+        missed = fish.status().missed_slots
         for _ in range(500):
-            assert fish.status().missed == missed
+            assert fish.status().missed_slots == missed
 
 
 def test_a_long_name_of_an_operation_is_refused_before_anybody_looks_for_a_like_one(
     shared_daemon: Daemon,
 ) -> None:
     with shared_daemon.socket() as client:
-        client.send(b'{"v":1,"id":1,"op":"%s"}' % (b"x" * 16_000))
+        client.send(b'{"v":2,"id":1,"op":"%s"}' % (b"x" * 16_000))
         error = json.loads(client.recv())["error"]
     assert error["code"] == "bad-request"
     assert "length <= 64" in error["message"]
@@ -368,15 +371,15 @@ def test_replies_longer_than_the_link_has_room_for_arrive_whole_and_hold_up_no_e
 def test_a_reply_that_nobody_waits_for_any_more_reaches_no_other_client(tmp_path: Path) -> None:
     with running(tmp_path) as daemon, daemon.socket() as before:
         for _ in range(4):
-            before.send(b'{"v":1,"id":"before","op":"policies"}')
+            before.send(b'{"v":2,"id":"before","op":"policies"}')
         killed = both_gateways(daemon)["control"]
         os.kill(killed, signal.SIGKILL)
         wait_until(lambda: gateways(daemon).get("control", killed) != killed)
         with daemon.socket() as after:
             for number in range(50):
-                after.send(b'{"v":1,"id":%d,"op":"status"}' % number)
+                after.send(b'{"v":2,"id":%d,"op":"status"}' % number)
                 assert json.loads(after.recv())["id"] == number
-        assert daemon.status().counters["control_restarts"] == 1
+        assert daemon.status().recovered_errors["control_restarts"] == 1
 
 
 @pytest.mark.realtime
@@ -405,12 +408,12 @@ def test_a_gateway_that_had_too_many_connections_begins_anew_without_a_leak(
 ) -> None:
     pid = daemon.process.pid
     open_files = []
-    missed = daemon.status().missed
+    missed = daemon.status().missed_slots
     for count in (1, 2):
         with attacking("idle-telemetry", daemon):
             wait_until(lambda count=count: restarts(daemon, "telemetry") >= count)
         with Subscriber(daemon.telemetry, b"tick") as subscriber:
-            assert subscriber.message()["missed"] == missed
+            assert subscriber.message()["missed_slots"] == missed
         open_files.append(len(list(Path(f"/proc/{pid}/fd").iterdir())))
     assert open_files[1] <= open_files[0] + 1
 
@@ -426,7 +429,7 @@ def test_a_gateway_that_dies_again_and_again_is_reported_all_the_same(daemon: Da
                 os.kill(pid, signal.SIGKILL)
                 killed.add(pid)
             time.sleep(0.01)
-        wait_until(lambda: daemon.status().counters["telemetry_restarts"] >= len(killed))
+        wait_until(lambda: daemon.status().recovered_errors["telemetry_restarts"] >= len(killed))
         subscriber.until(kind="gateway")
     _, _, errors = daemon.end()
     assert "the gateway of telemetry was started again: its process ended with status -9" in errors

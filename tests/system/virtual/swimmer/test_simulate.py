@@ -53,7 +53,7 @@ def test_the_figures_agree_with_one_another(swum: tuple[dict[str, Any], Path]) -
     assert figures["frequency"] == pytest.approx(2.5)
     assert figures["beats"] == 6
     assert 0.0 < figures["speed"] < 0.2
-    assert 0.0 < figures["speed_error"] < figures["speed"]
+    assert 0.0 < figures["speed_ci95"] < figures["speed"]
     assert 0.1 < figures["tail_width"] < 0.4
     assert 0.0 < figures["froude_efficiency"] < 1.0
     assert 0.0 < figures["water_power"] <= figures["muscle_power"]

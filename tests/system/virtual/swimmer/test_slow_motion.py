@@ -40,10 +40,10 @@ def test_its_status_says_so_and_no_tick_is_late(daemon: Daemon) -> None:
     assert daemon.fishctl("set-controller", "swing").returncode == 0
     wait_until(lambda: daemon.status().seq > 20)
     status = daemon.status()
-    (line,) = status.degraded
+    (line,) = status.limitations
     assert line.startswith("slow motion: a second of the fish takes ")
     assert (status.robot, status.mode, status.controller) == ("swimmer", "running", "swing")
-    assert (status.missed, status.overruns, status.reason) == (0, 0, None)
+    assert (status.missed_slots, status.overruns, status.reason) == (0, 0, None)
     assert status.speed is not None
     assert "mm/s" in daemon.fishctl("status").stdout
     timing = daemon.fishctl("status", "--timing").stdout

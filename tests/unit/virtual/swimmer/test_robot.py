@@ -105,7 +105,7 @@ def test_a_fish_that_is_lost_stays_lost() -> None:
     for _ in range(2):
         with pytest.raises(FishLost, match=r"cannot go on at 0\.100 s"):
             fish.read(1.0)
-    assert fish.degraded() == ("the swimmer cannot go on at 0.100 s: a test; restart fishd",)
+    assert fish.limitations() == ("the swimmer cannot go on at 0.100 s: a test; restart fishd",)
 
 
 def test_the_loop_swims_it_and_latches_a_fault_of_its_own_where_it_is_lost() -> None:
