@@ -29,7 +29,7 @@ def test_both_kinds_of_socket_get_an_answer_with_their_id(daemon: Daemon, kind: 
     with daemon.socket(kind) as socket:
         reply = ask(socket, b'{"v":2,"id":"a1","op":"status","args":{}}')
         failure = ask(socket, b"hello")
-    assert (reply["v"], reply["id"], reply["ok"]) == (1, "a1", True)
+    assert (reply["v"], reply["id"], reply["ok"]) == (2, "a1", True)
     assert reply["result"]["mode"] == "idle"
     assert (failure["id"], failure["error"]["code"]) == (None, "bad-request")
 

@@ -192,7 +192,7 @@ def markdown(results: Results) -> str:
         [
             *_conditions(round_),
             late.contestant,
-            *(f"{value:.0f}" for value in (late.p50, late.p99, late.max)),
+            *(f"{value:.0f}" for value in (late.p50, late.p99, late.worst)),
             f"{late.missed:.3%}",
             "not known" if late.drift is None else f"{late.drift:+.0f}",
         ]

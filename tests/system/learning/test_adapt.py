@@ -58,7 +58,7 @@ def identification() -> Identification:
     ]
     channel = Channel(
         "fx",
-        explained_fraction=0.99,
+        explained=0.99,
         explained_out_of_sample=0.99,
         noise=1e-3,
         drift=0.0,
@@ -106,7 +106,7 @@ USELESS = Model(explained_fraction=0.61, standard_error=None)
 def contender(name: str, thrust: float, error: float, *expected: float) -> Contender:
     return Contender(
         name=name, controller=CONTROLLERS[name], parameters={}, thrust=thrust, thrust_ci95=error,
-        frequency=1.7, seconds=46.0, expected=list(expected),
+        frequency=1.7, seconds=46.0, expected_thrusts=list(expected),
     )  # fmt: skip
 
 
@@ -196,14 +196,14 @@ def test_the_weight_of_a_fit_follows_what_it_explains_out_of_sample(
     vague = dataclasses.replace(fit.channels[0], explained_out_of_sample=explained)
     fit = dataclasses.replace(fit, channels=(fit.channels[0], vague), failed_assumptions=failed)
     model = model_of(fit)
-    assert model.explained == explained
+    assert model.explained_fraction == explained
     assert model.standard_error == (error and pytest.approx(error, rel=1e-3))
 
 
 def fitted(model: Model) -> Fitted:
     return Fitted(
         plant=PlantParameters(), rig=SimulationSettings(), offset=0.0, cloud=(PlantParameters(),),
-        model=model, found={},
+        model=model, identification={},
     )  # fmt: skip
 
 
@@ -282,7 +282,7 @@ class StoringDisplay:
 
 
 def no_policy(*_: Any) -> Trained:
-    return Trained(steps=0, refused="this test trains no policy")
+    return Trained(steps=0, refusal="this test trains no policy")
 
 
 def folder(path: Path) -> AdaptFolder:
@@ -361,7 +361,7 @@ def test_no_policy_is_trained_on_a_fish_that_explains_too_little(tmp_path: Path)
     assert show.lines == ["no policy is trained: the fit explains too little"]
     stored = folder(run.path).state
     assert stored.trained
-    assert stored.trained.refused
+    assert stored.trained.refusal
     assert not (run.path / TRAINING).exists()
 
 

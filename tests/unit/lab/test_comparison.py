@@ -40,7 +40,7 @@ def test_the_runs_of_a_contestant_differ_in_noise_and_give_the_interval_of_their
     assert standing.thrust == pytest.approx(thrusts.mean())
     # Student's t of four degrees of freedom, from a table.
     assert standing.thrust_ci95 == pytest.approx(2.776 * thrusts.std(ddof=1) / 5**0.5, rel=1e-3)
-    assert compare(config, ["swing"], 20.0, 5.0)[0][0].error is None
+    assert compare(config, ["swing"], 20.0, 5.0)[0][0].thrust_ci95 is None
 
 
 def test_it_is_said_that_another_controller_took_over_from_a_policy(tmp_path: Path) -> None:

@@ -71,7 +71,7 @@ def write_with_old_names(path: Path, to: Path) -> Path:
 
 def test_a_recording_with_old_names_is_read_as_one_of_today(tmp_path: Path) -> None:
     ticks = [
-        replace(tick, thrust_ci95=0.001, thrust_factor_ci95=0.002, missed_slots=2)
+        replace(tick, thrust_ci95=0.001, thrust_factor_ci95=0.002, missed_slots=2, frequency=1.7)
         for tick in swum(1.0).recorder.ticks
     ]
     times = Percentiles(1.0, 2.0, 3.0, 4)

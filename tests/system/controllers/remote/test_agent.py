@@ -113,7 +113,7 @@ def test_in_virtual_time_the_successor_of_an_agent_that_died_is_asked_again(tmp_
         with Agent(address, timeout=PATIENCE) as second:
             assert second.observe() == unanswered
             second.act(0.2)
-            assert second.observe().answered == unanswered.seq
+            assert second.observe().answered_seq == unanswered.seq
             second.act(0.3)
             assert second.poll(PATIENCE) is None
     assert [tick.phi_c for tick in ticks] == [0.1, 0.2, 0.3]
