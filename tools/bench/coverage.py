@@ -319,7 +319,7 @@ WAVES: dict[str, Wave] = {
     "policy default-fish": ("ppo", {"policy": "default-fish"}),
 }
 HELD: dict[str, Wave] = {f"{mN} mN": ("thrust", {"target": 1e-3 * mN}) for mN in (5, 10, 15, 20)}
-"""Targets of the controller `thrust`, judged by its quantities `held_thrust` and `held_thrust_ci95`."""
+"""Targets of `thrust`, judged by its quantities `held_thrust` and `held_thrust_ci95`."""
 
 
 class Shown(NamedTuple):
