@@ -507,3 +507,7 @@ class Status(Struct, frozen=True):
         Reason | None,
         note("Reason why the fish rests after a lease that was not renewed; null otherwise."),
     ] = None
+
+    def shows_restart_since(self, earlier: "Status") -> bool:
+        """Return whether this is the status of another fishd than the one of `earlier`."""
+        return self.pid != earlier.pid or self.uptime < earlier.uptime

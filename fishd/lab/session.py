@@ -288,7 +288,7 @@ class LiveSession(Session):
         self.config = fish.config()
         self.fish = fish
         self._messages = fish.ticks_and_events()
-        self._pid = status.pid
+        self._first_status = status
         self._latest = 0
         """Number of the latest received tick."""
         self._lease = fish.lease(experiment, take=take, idle_limit=IDLE_LIMIT)
@@ -359,7 +359,8 @@ class LiveSession(Session):
         if tick.seq <= before:
             raise _restarted()
         # A fishd that restarted soon after its start may have passed that tick number meanwhile.
-        if before and tick.seq > before + 1 and self.fish.status().pid != self._pid:
+        is_gap = before and tick.seq > before + 1
+        if is_gap and self.fish.status().shows_restart_since(self._first_status):
             raise _restarted()
 
 

@@ -10,7 +10,7 @@ import msgspec
 from fishd.config import Config
 from fishd.core.errors import LeaseLost, ParameterError, Refused
 from fishd.core.protocol import State
-from fishd.core.signals import Event, Tick
+from fishd.core.signals import Event, Status, Tick
 from fishd.lab.simulation import KeepingPublisher, VirtualRun
 
 
@@ -20,11 +20,15 @@ class VirtualStatus:
     def __init__(self, run: VirtualRun, pid: int) -> None:
         loop = run.loop
         self.pid, self.robot, self.tick = pid, "simulated", run.config.tick
+        self.uptime = loop.seq * run.config.tick
         self.force_unit = "N"
         self.lease = None
         self.amplitude_limit = run.config.amplitude_limit
         self.mode, self.controller = loop.supervisor.mode.value, loop.active.name
         self.reason, self.fallback = loop.supervisor.reason, loop.active.fallback
+
+    def shows_restart_since(self, earlier: "VirtualStatus") -> bool:
+        return Status.shows_restart_since(cast(Status, self), cast(Status, earlier))
 
 
 class VirtualDaemon:

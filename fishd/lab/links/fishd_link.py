@@ -261,14 +261,9 @@ class FishdLink:
     def _is_ours(self, status: Status) -> bool:
         """Return whether fishd uses, or waits for, this agent."""
         return _waits_for_an_agent(status) and (
-            (self._agent.active and not self._is_another(status))
+            (self._agent.active and not status.shows_restart_since(self._acquired))
             or status.parameters["agent"] == self._agent.address
         )
-
-    def _is_another(self, status: Status) -> bool:
-        """Return whether the status is that of another fishd than the one that was controlled."""
-        acquired = self._acquired
-        return status.pid != acquired.pid or status.uptime < acquired.uptime
 
     def _lost_error(self, status: Status | None = None) -> LinkLost:
         """Return the error of a lost control, with the reason that fishd gives if it gives one."""
@@ -277,7 +272,7 @@ class FishdLink:
             status = status or self._fish.status()
         except NoDaemon as error:
             return LinkLost(str(error))
-        if self._is_another(status):
+        if status.shows_restart_since(self._acquired):
             return LinkLost(
                 f"fishd was restarted: it is process {status.pid} now, and was {self._acquired.pid}"
             )
