@@ -35,17 +35,16 @@ FAULTS = {
         in_a_row=3,
     ),
     "sensor-range": Fault(
-        "the force is not to be believed: a sample at the end of the ADC's range, a channel that "
-        "has not changed for `force_sensor.frozen_after`, or a force beyond "
-        "`force_sensor.force_limit`; until it is a fault, the last force that was believed is used "
-        "again",
+        "the force is not plausible: a sample at the end of the ADC's range, a channel that has "
+        "not changed for `force_sensor.frozen_after`, or a force beyond "
+        "`force_sensor.force_limit`; until it is a fault, the last plausible force is used again",
         "look for a clipped or broken wire of the force sensor, or calibrate it",
         in_a_row=3,
     ),
     "fish-lost": Fault(
         "the computation of a swimmer has diverged, or it has left the part of the tank that is "
         "computed well; or a plant of another package has failed",
-        "change what the message says, and start fishd again: this fish is gone",
+        "change what the message says, and start fishd again",
     ),
     "fy-reversed": Fault(
         "the first push of the tail has shown that F_y is reversed, `estimator.reversed_fy` is "
@@ -67,7 +66,7 @@ FAULTS = {
         in_a_row=3,
     ),
     "chatter": Fault(
-        "`ppo`, or `remote` with a `dwell`, insists on reversing too fast, and `chatter.fallback` "
+        "`ppo`, or `remote` with a `dwell`, keeps reversing too fast, and `chatter.fallback` "
         "is `fault`",
         "set another policy, one that was trained for this fish",
     ),

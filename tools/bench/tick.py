@@ -218,11 +218,11 @@ def markdown(results: Results) -> str:
         "The machine": (" | ", results.machine.items()),
         "Goals": ("goal | idle | met | under load | met", goals(results)),
         f"Lateness over {results.seconds:g} s [µs]": (
-            f"{head} | contestant | p50 | p99 | worst | missed | drift",
+            f"{head} | loop | p50 | p99 | worst | missed | drift",
             late,
         ),
         "Time per phase of a fishd tick, p50 / p99 [µs]": (
-            " | ".join((head, *PHASES, "whole tick", "until sealed")),
+            " | ".join((head, *PHASES, "whole tick", "until written")),
             phases,
         ),
         "What fishd costs": (f"{head} | CPU | RSS [MB] | peak RSS [MB]", costs),

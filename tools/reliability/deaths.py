@@ -78,7 +78,7 @@ def killed_with_pigpiod(pi: VirtualPi, fishd: Fishd) -> None:
 
 # Failures, and their names in the table.
 DEATHS: dict[str, tuple[str, Deed]] = {
-    "SIGTERM": ("asked to stop", signalled(signal.SIGTERM)),
+    "SIGTERM": ("a request to end", signalled(signal.SIGTERM)),
     "SIGINT": ("Ctrl-C", signalled(signal.SIGINT)),
     "SIGKILL": ("kill -9, or out of memory", signalled(signal.SIGKILL)),
     "SIGKILL of both": ("fishd, then pigpiod, which is started again", killed_with_pigpiod),

@@ -377,7 +377,7 @@ def summary(kills: list[Kill], seed: int) -> str:
     stuck = sum(kill.off is None for kill in kills)
     stopped = sum(kill.stopped for kill in kills)
     rows.append(["all", str(len(kills)), str(sum(kill.swimming for kill in kills)), "", str(stuck)])
-    head = "fishd is killed while | kills | with pulses on | off after, at most [ms] | stuck"
+    head = "fishd is killed while | kills | with pulses on | pulses off after, at most [ms] | stuck"
     return f"{table(head, rows)}\n\nSeed {seed}; {stopped} of them by SIGSTOP."
 
 

@@ -264,7 +264,7 @@ def hanging(method: str) -> Callable[[], Outcome]:
             results += ends(method, [way])
         times, statuses = zip(*results, strict=True)
         load = method in ("check", "__init__")
-        does = "goes on ticking" if load else "the countdown ends the pulses; ends when asked to"
+        does = "ticks continue" if load else "the countdown ends the pulses; ends at a signal"
         what = f"`{method}` hangs" + (" while it loads" if load else "")
         ended = sum(took > MAX_END_S for took in times)
         return Outcome(what, does, len(HANGS), ended, max(times), sorted(set(statuses)))
@@ -308,7 +308,7 @@ def unread(number: signal.Signals, terminal: bool) -> Callable[[], Outcome]:
             status = fishd.process.returncode
         os.close(reader)
         os.close(writer)
-        what = f"{number.name}, a {'terminal' if terminal else 'pipe'} that nobody reads"
+        what = f"{number.name}, a {'terminal' if terminal else 'pipe'} without a reader"
         ended = int(took > MAX_END_S or status != 0)
         return Outcome(what, "fades, and loses its last lines", 1, ended, took, [status])
 
@@ -359,7 +359,7 @@ def measure(options: Namespace) -> Report:
         outcomes[name] = KINDS[name]()
         progress(*row(outcomes[name]))
     head = (
-        "what a controller does | what fishd does | cases | ended it | "
+        "what a controller does | what fishd does | cases | ends of fishd | "
         "longest from SIGTERM to the end [s] | exit status"
     )
     rows = map(row, outcomes.values())

@@ -308,8 +308,8 @@ def measure(options: Namespace) -> Report:
         for result in (*results, together)
     ]
     head = (
-        "what is done to the file | files | still exported or drawn | slowest verb [s] | "
-        "memory until then, at most [MB] | wrong answers"
+        "damage to the file | files | still exported or drawn | slowest verb [s] | "
+        "peak memory [MB] | wrong answers"
     )
     broken = any(
         result.mistakes or result.seconds > MAX_SECONDS or result.megabytes > MAX_MEGABYTES

@@ -229,7 +229,7 @@ def test_each_permitted_operator_is_listed() -> None:
 def test_installing_lists_all_files_and_groups_that_come_onto_a_pi() -> None:
     layout = (ROOT / "tools/pi_layout.sh").read_text()
     users = (ROOT / "systemd/sysusers.d/fishd.conf").read_text()
-    table = text_of(ROOT / "docs/how-to/installing.md").split("What it brings:")[1].split("\n\n")[1]
+    table = text_of(ROOT / "docs/how-to/installing.md").split("It installs:")[1].split("\n\n")[1]
     files = re.findall(r"(?m)^\w*CONFIG=(\S+)|^ +\"\S+ (/\S+)\"$", layout)
     wanted = {f"`{name or path}`" for name, path in files}
     assert len(wanted) > 10

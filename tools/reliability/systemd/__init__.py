@@ -136,12 +136,12 @@ def _text(container: Container, rows: list[Row], limits: bool) -> str:
     )
     text = (
         f"systemd {version}, {python}, fishd from `make install-pi` with "
-        "the virtual Pi; times in seconds from what was done to the daemon.\n\n"
-        + table("what | servo neutral | pulses off | ready (again) | outcome", cells)
+        "the virtual Pi; times in seconds from the action.\n\n"
+        + table("action | servo neutral | pulses off | ready (again) | outcome", cells)
     )
     if not limits:
         text += (
-            f"\n\nThis machine forbids systemd to raise limits; {_MAY} stood in for `LimitRTPRIO=` "
-            "and `LimitMEMLOCK=`. All else is the unit as installed."
+            f"\n\nThis machine forbids systemd to raise limits; {_MAY} replaced `LimitRTPRIO=` "
+            "and `LimitMEMLOCK=`. The unit is otherwise as installed."
         )
     return text
