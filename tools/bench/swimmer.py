@@ -196,7 +196,7 @@ def turek_hron(finest: float) -> str:
             progress(*rows[-1])
     heads = (
         "case | source | u_y (mm) | f (Hz) | drag (N/m) | lift (N/m) | "
-        "u_y and f off 2006 by | off newer by"
+        "u_y and f: deviation from 2006 | deviation from newer"
     )
     return table(heads, rows)
 
@@ -258,7 +258,7 @@ def cylinder(finest: float) -> str:
             ]
         )
         progress(*rows[-1])
-    return table("source | Strouhal number | mean drag | outside of the published values by", rows)
+    return table("source | Strouhal number | mean drag | deviation from the published range", rows)
 
 
 def outside(value: float, band: tuple[float, float]) -> float:
