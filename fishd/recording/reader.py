@@ -22,9 +22,8 @@ from fishd.core.signals import Event, Status, Tick
 from fishd.recording.images import IMAGE_TOPIC, FrameHead, RecordedFrame, decode_frame, decode_head
 from fishd.recording.mcap_file import Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
-from fishd.recording.schemas import CHANNELS
 from fishd.recording.summary import Gap, Summary, Tally, from_metadata
-from fishd.recording.writer import CALIBRATIONS_ATTACHMENT, CONFIG_ATTACHMENT, FORMAT
+from fishd.recording.writer import CALIBRATIONS_ATTACHMENT, CHANNELS, CONFIG_ATTACHMENT, FORMAT
 
 if TYPE_CHECKING:
     from pandas import DataFrame

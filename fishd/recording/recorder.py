@@ -16,9 +16,8 @@ from fishd.core.errors import FishError, RecordingError, Refused
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status
 from fishd.recording.images import FrameHead
-from fishd.recording.schemas import CHANNELS
 from fishd.recording.summary import TickHead
-from fishd.recording.writer import RunWriter
+from fishd.recording.writer import CHANNELS, RunWriter
 
 DRAIN_INTERVAL_S = 0.2
 """Interval at which messages are read from their queue, to wake up rarely [s]."""

@@ -17,9 +17,8 @@ from fishd.recording.part_file import (
     rename_to_final,
 )
 from fishd.recording.reader import TOPICS, Run, open_run
-from fishd.recording.schemas import CHANNELS, json_schema, schema_name
 from fishd.recording.summary import to_metadata
-from fishd.recording.writer import CHUNK_BYTES
+from fishd.recording.writer import CHANNELS, CHUNK_BYTES, json_schema, schema_name
 
 RECOVERING_SUFFIX = ".recovering"
 """Suffix of the name of the copy until it is complete."""

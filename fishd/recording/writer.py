@@ -1,6 +1,7 @@
 """Writer of a recording: an MCAP file that Foxglove, Lichtblick and PlotJuggler open.
 
-docs/how-to/recording.md describes its layout.
+docs/how-to/recording.md describes its layout. Viewers need JSON Schemas with a root of type
+object, without `$ref` and `anyOf`, so nested values are plain objects.
 """
 
 import getpass
@@ -17,6 +18,7 @@ from typing import Any, Literal, Self
 import msgspec
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from fishd import __version__
@@ -24,6 +26,7 @@ from fishd.config import Config, to_yaml
 from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
+from fishd.core.schema import fields_of
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.images import (
     IMAGE_SCHEMA,
@@ -33,9 +36,18 @@ from fishd.recording.images import (
     image_json_schema,
 )
 from fishd.recording.part_file import SUFFIX, PartFile
-from fishd.recording.schemas import CHANNELS, json_schema, schema_name
 from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
 
+CHANNELS: dict[str, type[Struct]] = {"tick": Tick, "event": Event, "status": Status}
+"""Recorded topics of telemetry, and the types of their messages."""
+
+_TYPES = {
+    "number": "number",
+    "integer": "integer",
+    "boolean": "boolean",
+    "section": "object",
+    "list": "array",
+}
 CHUNK_BYTES = 32 * 2**10
 """Size at which a chunk is closed, which blocks the writer for 0.5 ms [bytes]."""
 MAX_TIME_S = 1e10
@@ -47,6 +59,24 @@ FORMAT = "2"
 
 Source = Literal["fishd", "simulation"]
 """Origin of the ticks: a running fishd, whatever its robot, or a run in virtual time."""
+
+
+def schema_name(message: type[Struct]) -> str:
+    """Return the name of the schema in the file, such as `fishd.Tick`."""
+    return f"fishd.{message.__name__}"
+
+
+def json_schema(message: type[Struct]) -> bytes:
+    """Return the flat JSON Schema of a message."""
+    properties: dict[str, Any] = {}
+    for field in fields_of(message):
+        description = f"{field.description} [{field.unit}]" if field.unit else field.description
+        properties[field.name] = {
+            "type": _TYPES.get(field.kind, "string"),
+            "description": description,
+        }
+    title = schema_name(message)
+    return msgspec.json.encode({"title": title, "type": "object", "properties": properties})
 
 
 class RunWriter:

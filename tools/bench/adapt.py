@@ -17,8 +17,8 @@ from msgspec.structs import replace
 
 from common.report import JOBS, Options, Report, percent, progress, run_cases, table
 from fishd.config import Start, load
+from fishd.lab.compare.survey import harsh
 from fishd.lab.experiment import Header, open_experiment
-from fishd.lab.other_fish import harsh
 from fishd.lab.session import VirtualSession
 from fishd.learning.adapt.adaptation import Adaptation
 from fishd.learning.adapt.state import AdaptFolder, Contender, Verdict

@@ -17,9 +17,9 @@ import numpy as np
 
 from common.report import Options, Report, table
 from fishd.config import Config, load
+from fishd.lab.compare.survey import harsh
 from fishd.lab.identification import experiment, identify
 from fishd.lab.identification.summary import SCALED
-from fishd.lab.other_fish import harsh
 from fishd.lab.session import VirtualSession
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters

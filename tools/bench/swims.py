@@ -22,8 +22,7 @@ import yaml
 from common.report import DOCS, JOBS, QUICK, Options, Report, percent, run_cases, table
 from common.reversed_force import reversed_robot
 from fishd.config import load
-from fishd.lab.compare.survey import ReversalTimes
-from fishd.lab.other_fish import CHANGES, OtherFish, harsh, harsh_fish, mild
+from fishd.lab.compare.survey import CHANGES, OtherFish, ReversalTimes, harsh, harsh_fish, mild
 from fishd.lab.simulation import VirtualRun, simulate
 
 RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 2, 3)

@@ -69,14 +69,13 @@ def evaluate(
     longest stretch of reversals in consecutive ticks.
     Exit status 1 when a run ends in mode fault.
     """
-    from fishd.lab import other_fish
     from fishd.lab.compare.contestants import parse
-    from fishd.lab.compare.survey import survey
+    from fishd.lab.compare.survey import CHANGES, harsh_fish, survey
 
     parsed = [parse(text) for text in contestants]
-    fish = list(other_fish.CHANGES) if which != "random" else []
+    fish = list(CHANGES) if which != "random" else []
     singles = len(fish)
-    fish += other_fish.harsh_fish() if which != "changes" else ()
+    fish += harsh_fish() if which != "changes" else ()
     configs = [(changed, load(file, (*overrides, *changed.overrides))) for changed in fish]
     with show_progress(len(parsed) * len(fish) * seconds, "s swum") as bar:
         surveys = survey(configs, parsed, seconds, settle, bar.at)

@@ -17,7 +17,7 @@ from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.core.errors import Refused
 from fishd.core.signals import Measurement, Observation, Tick
 from fishd.hardware.base import Robot
-from fishd.lab.other_fish import FIRST_SEED, HARSH_FISH_COUNT, harsh
+from fishd.lab.compare.survey import FIRST_SEED, HARSH_FISH_COUNT, harsh
 
 REST_S = 3.0
 Wrap = Callable[[Robot], Robot]

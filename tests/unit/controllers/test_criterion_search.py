@@ -8,7 +8,7 @@ from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.criterion_search import LADDER, START_INDEX
 from fishd.core.errors import ParameterError
-from fishd.lab.other_fish import harsh
+from fishd.lab.compare.survey import harsh
 from fishd.lab.simulation import simulate
 
 

@@ -8,9 +8,9 @@ from msgspec.structs import replace
 from fishd.config import load
 from fishd.core.calibration import EXACT, ForceCalibration
 from fishd.lab.compare import LiveComparison
+from fishd.lab.compare.survey import harsh
 from fishd.lab.error_budget import budget, format_with_budget, unknown_calibration
 from fishd.lab.measurement import ThrustMeasurement, measure, summarise
-from fishd.lab.other_fish import harsh
 from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import simulate
 

@@ -10,8 +10,7 @@ from rigs.processes import fishctl
 
 from fishd.config import load
 from fishd.lab.compare.contestants import Contestant, parse
-from fishd.lab.compare.survey import survey
-from fishd.lab.other_fish import CHANGES, OtherFish, harsh, harsh_fish, mild
+from fishd.lab.compare.survey import CHANGES, OtherFish, harsh, harsh_fish, mild, survey
 from fishd.lab.simulation import simulate
 
 BRIEF = ("--seconds", "8", "--settle", "3")

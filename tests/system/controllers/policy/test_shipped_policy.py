@@ -7,7 +7,7 @@ from rigs.documents import ROOT
 from fishd.config import load
 from fishd.controllers.policy import library
 from fishd.controllers.policy.file import read
-from fishd.lab.other_fish import mild
+from fishd.lab.compare.survey import mild
 from fishd.lab.simulation import simulate
 from fishd.learning import settings as training
 from fishd.learning.settings import TrainingSettings
