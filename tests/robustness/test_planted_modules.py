@@ -88,9 +88,9 @@ def test_as_a_module_fishd_executes_none_but_those_that_python_loads_first(trap:
 
 
 def test_python_is_started_in_one_way() -> None:
-    """By `safe_path`, or by a library within `SafeChildren`; `__main__` starts itself again.
+    """Allow `safe_path`, a library within `SafeChildren`, and the restart in `__main__`.
 
-    So a training starts its processes as a sweep does.
+    A training thus starts its processes like a sweep.
     """
     for path in (ROOT / "fishd").rglob("*.py"):
         code = path.read_text(encoding="utf-8")

@@ -29,7 +29,7 @@ PHASES = ("statistics", "between ticks")
 
 @pytest.mark.realtime
 def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then() -> None:
-    """One test of all six, who die side by side: judged again, they are measured again."""
+    """Check six deaths in one test: they run in parallel, and a repetition measures all again."""
     deaths = measured("deaths", "--only", *SIGNALS, *PHASES)
     for name, status in SIGNALS.items():
         outcome = deaths[name]
@@ -76,7 +76,7 @@ def test_a_fishd_that_hangs_ends_soon(kind: str, status: int) -> None:
 
 @pytest.mark.realtime
 def test_a_fishd_that_says_what_nobody_reads_ends_soon() -> None:
-    """One test of all three, side by side: they hardly compute."""
+    """Check three kinds in one test: they run in parallel, as they hardly compute."""
     kinds = ("unread-pipe", "unread-terminal", "hangup")
     with ThreadPoolExecutor(len(kinds)) as pool:
         outcomes = list(pool.map(lambda kind: misbehaviour.KINDS[kind](), kinds))

@@ -30,16 +30,16 @@ from fishd.core.signals import Tick
 
 SHIPPED = str(ROOT / "config" / "simulated.yaml")
 
-EXTREMES = {"fx_min", "fx_max", "fy_min", "fy_max"}  # which a simulated fish leaves out
-OF_A_SWIMMER = {"x", "y", "speed", "heading"}
-KNOWN_THRUST = {"thrust_ci95", "thrust_factor", "thrust_factor_ci95"}
-"""Fields from the first rest on."""
-AT_TIMES = KNOWN_THRUST | {"quantities", "leak", "fy_corrected", "suspect"}
-"""Fields that are absent where there is nothing to say."""
+EXTREMES = {"fx_min", "fx_max", "fy_min", "fy_max"}  # absent with a simulated fish
+SWIMMER_FIELDS = {"x", "y", "speed", "heading"}
+THRUST_FIELDS = {"thrust_ci95", "thrust_factor", "thrust_factor_ci95"}
+"""Fields that are present after the first rest."""
+OPTIONAL_FIELDS = THRUST_FIELDS | {"quantities", "leak", "fy_corrected", "suspect"}
+"""Fields that are absent without a value."""
 TICK_FIELDS = {
     name: kind if isinstance(kind, type) else float
     for name, kind in get_type_hints(Tick).items()
-    if name not in EXTREMES | OF_A_SWIMMER | AT_TIMES
+    if name not in EXTREMES | SWIMMER_FIELDS | OPTIONAL_FIELDS
 }
 
 
@@ -49,7 +49,9 @@ def test_a_bare_subscriber_gets_two_frames_and_every_documented_field(daemon: Da
             topic, payload = subscriber.socket.recv_multipart()
             assert topic == b"tick"
             tick = msgspec.json.decode(payload)
-            kinds = {name: type(value) for name, value in tick.items() if name not in AT_TIMES}
+            kinds = {
+                name: type(value) for name, value in tick.items() if name not in OPTIONAL_FIELDS
+            }
             assert kinds == TICK_FIELDS
             assert b"null" not in payload
 

@@ -1,4 +1,4 @@
-"""The real fishctl with the real daemon: every verb, and what it says when something is wrong."""
+"""The real fishctl with the real daemon: every verb, and its error messages."""
 
 import json
 import socket

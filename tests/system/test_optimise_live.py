@@ -1,4 +1,4 @@
-"""`fishctl optimise --on live` on a real fishd: what a signal leaves, and how it goes on."""
+"""`fishctl optimise --on live` on a real fishd: its state after a signal, and how it resumes."""
 
 import signal
 from pathlib import Path

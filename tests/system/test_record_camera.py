@@ -1,4 +1,4 @@
-"""`fishctl record --camera` on a true fishd and a true fishd-camera, also one that dies."""
+"""`fishctl record --camera` on a real fishd and a real fishd-camera, also one that is killed."""
 
 import re
 import signal

@@ -1,4 +1,4 @@
-"""A true fishd and a true agent, in two processes, and what goes wrong between them."""
+"""A real fishd and a real agent, in two processes, and failures of their connection."""
 
 import json
 import subprocess
@@ -40,7 +40,7 @@ with Agent(sys.argv[1]) as agent:
 
 @contextmanager
 def agent_process(address: str) -> Iterator[subprocess.Popen[bytes]]:
-    """An agent that has bound its address."""
+    """Run an agent that has bound its address."""
     process = subprocess.Popen([sys.executable, "-c", AGENT, address], stdout=subprocess.PIPE)
     try:
         assert process.stdout
@@ -178,7 +178,7 @@ def test_a_simulation_waits_for_its_agent(address: str) -> None:
 
 @contextmanager
 def waiting_daemon(folder: Path, address: str) -> Iterator[Daemon]:
-    """A fishd in lockstep that waits for an agent in its first tick."""
+    """Run a fishd in lockstep that waits for an agent in its first tick."""
     settings = ["lockstep=true", "start.controller=remote", f"start.parameters.agent={address}"]
     with running(folder, *sets(*settings)) as daemon:
         yield daemon

@@ -1,4 +1,4 @@
-"""Controllers of other people's packages: slow ones, broken ones, and what they must not spoil."""
+"""Controllers of other packages: slow and broken ones do no harm to fishd."""
 
 import json
 import threading
@@ -90,7 +90,7 @@ CONTROLLERS = {
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of packages, in which one of bad controllers is installed."""
+    """Return a folder of packages in which bad controllers are installed."""
     folder = tmp_path_factory.mktemp("packages") / "site"
     modules = {"manners": MODULE, "quitter": QUITTER, "untyped": UNTYPED}
     install(folder, modules, **CONTROLLERS)
@@ -99,7 +99,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def shared_daemon(site: Path) -> Iterator[Daemon]:
-    """A daemon on a machine with these packages."""
+    """Run a daemon on a machine with these packages."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", str(site))
         with running(site.parent) as daemon:

@@ -1,4 +1,4 @@
-"""The settings of `fishd-camera`: what is wrong is said in one line, with its place."""
+"""Settings of `fishd-camera`: an error is one line that names its place."""
 
 import os
 from pathlib import Path

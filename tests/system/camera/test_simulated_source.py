@@ -1,4 +1,4 @@
-"""A simulated camera above a running fishd: true processes, in real time and in lockstep."""
+"""A simulated camera above a running fishd: real processes, in real time and in lockstep."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -33,7 +33,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
 
 
 def expected(ticks: list[Tick], camera: SimulatedCameraSettings) -> dict[float, np.ndarray]:
-    """Frames as they would be drawn from the true states of successive ticks, by their times."""
+    """Return the frames, by time, of the true states of successive ticks."""
     clean = SimulatedCamera(camera, 84)
     frames = {}
     tails = [Tail(t.time, float(t.alpha), float(t.alpha_rate)) for t in ticks]  # type: ignore[arg-type]

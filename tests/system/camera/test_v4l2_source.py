@@ -1,4 +1,4 @@
-"""A camera of this machine: a true `fishd-camera` and a true linuxpy on an emulated V4L2 device."""
+"""A camera of this machine: a real `fishd-camera` and linuxpy on an emulated V4L2 device."""
 
 import time
 from collections.abc import Iterator

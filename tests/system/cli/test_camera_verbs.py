@@ -1,4 +1,4 @@
-"""`fishctl camera` on a true fishd-camera above a true fishd."""
+"""`fishctl camera` on a real fishd-camera above a real fishd."""
 
 import json
 import os

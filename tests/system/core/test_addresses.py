@@ -99,7 +99,7 @@ def test_a_port_that_a_rival_has_bound_too_and_listens_at_is_waited_for(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     class Second(socket.socket):
-        """The rival, which has bound this port, listens before it does."""
+        """Socket whose rival, bound to the same port, starts to listen first."""
 
         def bind(self, address: tuple[str, int]) -> None:
             super().bind(address)

@@ -1,4 +1,4 @@
-"""The site of `make docs`, built without a warning where neither numba nor torch is installed."""
+"""The site of `make docs`, built without a warning if numba and torch are not installed."""
 
 import subprocess
 import sys

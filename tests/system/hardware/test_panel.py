@@ -1,4 +1,4 @@
-"""The E-stop button and the status light: the true rpi-lgpio on emulated pins."""
+"""The E-stop button and the status light: the real rpi-lgpio on emulated pins."""
 
 import sys
 import threading

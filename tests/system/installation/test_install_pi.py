@@ -32,7 +32,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Pi:
-    """A folder that stands for the disk of a Pi."""
+    """Folder that replaces the disk of a Pi."""
 
     def __init__(self, disk: Path, wheel: Path) -> None:
         self.disk = disk
@@ -75,7 +75,7 @@ class Pi:
 
 @pytest.fixture(scope="session")
 def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Pi:
-    """An installation where the Python of an earlier one is gone."""
+    """Return an installation over an earlier one whose Python no longer exists."""
 
     def make(folder: Path) -> Pi:
         pi = Pi(folder / "disk", wheel)
@@ -344,7 +344,7 @@ def test_it_is_the_interpreter_that_is_asked_for_its_bits(tmp_path: Path) -> Non
 
 
 def test_no_driver_brings_a_gpio_package_along_by_itself(wheel: Path) -> None:
-    """Adafruit-Blinka before 10 asks for RPi.GPIO and lgpio on a Pi, which exclude rpi-lgpio."""
+    """Require Adafruit-Blinka 10: before, it needs RPi.GPIO and lgpio, which exclude rpi-lgpio."""
     with zipfile.ZipFile(wheel) as archive:
         (name,) = (name for name in archive.namelist() if name.endswith("dist-info/METADATA"))
         metadata = archive.read(name).decode()

@@ -1,4 +1,4 @@
-"""A replay is what a subscriber and a client of fishd expect, and cannot be steered."""
+"""A replay, which subscribers and clients read like a fishd, and which refuses commands."""
 
 import re
 import signal

@@ -1,4 +1,4 @@
-"""The page's server: what it gives, to whom, and to how many."""
+"""The page's server: its files and pictures, its clients, and their limits."""
 
 import asyncio
 import socket
@@ -168,7 +168,7 @@ HALF_ASKED = (
 
 @asynccontextmanager
 async def neighbour(server: PageServer) -> AsyncIterator[aiohttp.ClientSession]:
-    """A client with another address."""
+    """Yield a client with another address."""
     connector = aiohttp.TCPConnector(local_addr=("127.0.0.2", 0))
     async with aiohttp.ClientSession(server.url, connector=connector) as session:
         yield session

@@ -1,4 +1,4 @@
-"""The policy that comes with fishd: how it was made, and the fish that it swims."""
+"""The policy that comes with fishd: its training, and its swims."""
 
 import msgspec
 import pytest

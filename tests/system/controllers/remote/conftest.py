@@ -27,7 +27,7 @@ def rig() -> Iterator[Rig]:
 
 @pytest.fixture
 def still() -> Iterator[Rig]:
-    """A loop whose virtual time stands still while an agent thinks."""
+    """Loop whose virtual time stops while an agent computes."""
     rig = Rig("lockstep=true")
     yield rig
     rig.loop.close()

@@ -1,4 +1,4 @@
-"""`Agent`, the agent's side for Python, against the true controller `remote`."""
+"""`Agent`, the Python class of agents, with the real controller `remote`."""
 
 import math
 import os
@@ -27,7 +27,7 @@ def agent(tmp_path: Path) -> Iterator[Agent]:
 
 @contextmanager
 def swimming(rig: Rig, agent: Agent, ticks: int) -> Iterator[list[Tick]]:
-    """`remote` is active for some ticks, in another thread; the list is filled at the end."""
+    """Run `remote` for some ticks in another thread; yield the list that gets them at the end."""
     rig.start("remote", agent=agent.address)
     swum: list[Tick] = []
 

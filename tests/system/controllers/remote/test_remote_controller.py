@@ -1,4 +1,4 @@
-"""The controller `remote` against agents on true sockets: deadlines, numbers, pauses, addresses."""
+"""The controller `remote` with agents on real sockets: deadlines, numbers, pauses, addresses."""
 
 import math
 import time

@@ -1,4 +1,4 @@
-"""Agents that do what they should not: answers that are none, and reversals in every tick."""
+"""Agents that violate the protocol: invalid answers, and reversals in every tick."""
 
 import socket
 from collections.abc import Iterator
@@ -27,7 +27,7 @@ PLAIN = b"\xff" + bytes(8) + b"\x7f\x03\x01PLAIN" + bytes(47)
 
 
 def _ended(connection: socket.socket) -> bool:
-    """Whether fishd has closed its end."""
+    """Return whether fishd has closed the connection."""
     connection.setblocking(False)
     with suppress(BlockingIOError):
         while connection.recv(4096):
@@ -68,7 +68,7 @@ def test_rubbish_is_a_fault_that_says_what_came(
 
 
 class RawAgent:
-    """An agent without ZeroMQ, which sends whatever bytes a test wants."""
+    """Agent without ZeroMQ, which sends any bytes."""
 
     GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01NULL" + bytes(48)
     READY = b"\x04\x29\x05READY\x0bSocket-Type\0\0\0\x06ROUTER\x08Identity\0\0\0\0"

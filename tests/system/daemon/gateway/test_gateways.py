@@ -1,4 +1,4 @@
-"""Gateways of a real fishd, which survives all that happens to them."""
+"""Gateways of a real fishd, which survives their failures."""
 
 import asyncio
 import contextlib
@@ -215,7 +215,7 @@ def test_a_fishd_whose_gateways_hang_ends_in_time(tmp_path: Path) -> None:
 
 
 def test_stopped_gateways_end_with_a_fishd_that_is_killed(tmp_path: Path) -> None:
-    """The next fishd needs their addresses."""
+    """Check that their addresses are free for the next fishd."""
     with running(tmp_path, *SWIMMING) as daemon:
         pids = [fork_server(daemon), *both_gateways(daemon).values()]
         for pid in pids:

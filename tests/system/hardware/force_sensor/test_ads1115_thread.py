@@ -1,4 +1,4 @@
-"""The force sensor in real time: its thread, how it keeps out of the tick's way, how it ends."""
+"""The force sensor in real time: its thread, which delays no tick, and its end."""
 
 import contextlib
 import threading

@@ -42,20 +42,20 @@ def test_the_force_sensor_loses_few_samples_to_the_power_meter() -> None:
 
 
 class Steady(PowerMeterDriver[PowerMeterSettings]):
-    """A meter that is always there."""
+    """Meter that always works and measures a constant power."""
 
     Settings = PowerMeterSettings
     place = "a meter"
 
     def open(self) -> None:
-        """There it is."""
+        """Do nothing."""
 
     def sample(self) -> PowerSample:
-        """The same at any time."""
+        """Return a constant power."""
         return PowerSample(self.clock.monotonic(), 2.5)
 
     def close(self) -> None:
-        """Gone."""
+        """Do nothing."""
 
 
 def test_a_meter_that_hangs_does_not_delay_a_read() -> None:

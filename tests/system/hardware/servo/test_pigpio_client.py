@@ -1,4 +1,4 @@
-"""The client of pigpiod against servers that answer badly, and a client that cannot be prepared."""
+"""The client of pigpiod with servers that answer wrongly, and a client that cannot start."""
 
 import contextlib
 import socket
@@ -18,7 +18,7 @@ from fishd.hardware.servo.pigpio_client import Client, open_client
 
 
 class Server:
-    """A pigpiod that gives one prepared answer and then dies, or goes silent."""
+    """Pigpiod that gives one prepared answer and then ends, or does not answer."""
 
     def __init__(self, answer: bytes, *, dies: bool) -> None:
         self._listener = socket.create_server(("127.0.0.1", 0))

@@ -1,4 +1,4 @@
-"""An answer of pigpiod that comes late: waited for, but never past the countdown."""
+"""Late answers of pigpiod: the servo waits for them, but not longer than the countdown."""
 
 import contextlib
 import time
@@ -14,7 +14,7 @@ from fishd.hardware.servo.calibrated_servo import CalibratedServo
 
 
 def late_tick(bench: Bench, servo: CalibratedServo, angle: float) -> None:
-    """A tick whose answer does not come in time, but before the next tick."""
+    """Run a tick whose answer is late, but arrives before the next tick."""
     bench.faults.inject("pigpiod-frozen")
     try:
         servo.write(angle)
@@ -24,7 +24,7 @@ def late_tick(bench: Bench, servo: CalibratedServo, angle: float) -> None:
 
 
 def thaw(bench: Bench) -> None:
-    """Pigpiod goes on, and has carried out all that it was sent when this returns."""
+    """Let pigpiod continue, and wait until it has executed all commands."""
     bench.faults.clear()
     with bench.client() as client:
         client.get_pigpio_version()
@@ -44,7 +44,7 @@ def test_a_late_answer_now_and_then_does_not_end_the_link(bench: Bench) -> None:
 
 
 def stall(bench: Bench) -> None:
-    """The machine is so busy that the next command takes 0.3 s of real time."""
+    """Let the next command take 0.3 s of real time, as on a busy machine."""
     commands = bench.daemon._commands
     execute = commands.execute
 

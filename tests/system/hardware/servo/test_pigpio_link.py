@@ -16,8 +16,8 @@ from fishd.hardware.servo.pigpio import PigpioSettings
 
 pytestmark = pytest.mark.realtime
 
-BOUND = 0.05
-"""No write may take longer, on a machine that is busy with other things [s]; the limit is 8 ms."""
+MAX_WRITE_S = 0.05
+"""Longest permitted write on a busy machine [s]; fishd's own limit is 8 ms."""
 
 
 class Swimming(Bench):
@@ -66,20 +66,20 @@ def eventually(condition: Callable[[], bool], seconds: float = 10.0) -> None:
 def test_one_thread_and_one_connection_are_all_it_needs(bench: Swimming) -> None:
     kinds = [type(thread).__name__ for thread in threading.enumerate()]
     assert "_callback_thread" not in kinds
-    assert link_threads() == 1
+    assert count_link_threads() == 1
     bench.swimmer.close()
-    assert link_threads() == 0
+    assert count_link_threads() == 0
 
 
-def link_threads() -> int:
-    """Number of the threads that keep a link."""
+def count_link_threads() -> int:
+    """Return the number of threads that keep a link."""
     return [thread.name for thread in threading.enumerate()].count("pigpio-link")
 
 
 @pytest.mark.parametrize(("fault", "forgiven"), [("pigpiod-gone", 0), ("pigpiod-frozen", 2)])
 def test_no_call_is_held_up_and_no_thread_spins(bench: Swimming, fault: str, forgiven: int) -> None:
     bench.swimmer.close()
-    bench.swimmer = bench.servo(replace(bench.settings(), countdown=2.0))  # which forgives longest
+    bench.swimmer = bench.servo(replace(bench.settings(), countdown=2.0))  # the longest tolerance
     bench.write_until_it_works(0.5)
     bench.faults.inject(fault)
     errors, durations = [], []
@@ -93,7 +93,7 @@ def test_no_call_is_held_up_and_no_thread_spins(bench: Swimming, fault: str, for
         with pytest.raises(ServoError):
             bench.swimmer.release()
         durations.append(time.monotonic() - begun)
-    assert max(durations) < BOUND
+    assert max(durations) < MAX_WRITE_S
     assert errors[:forgiven] == [None] * forgiven
     for error in errors[forgiven:]:
         assert error is not None
@@ -108,7 +108,7 @@ def test_no_call_is_held_up_and_no_thread_spins(bench: Swimming, fault: str, for
         bench.swimmer.close()
     bench.swimmer.close()
     assert time.monotonic() - begun < 1.0
-    assert link_threads() == 0
+    assert count_link_threads() == 0
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen", "pigpiod-restart"])

@@ -1,4 +1,4 @@
-"""The emulated pigpiod, driven by the true pigpio client: commands and connections."""
+"""The emulated pigpiod, driven by the real pigpio client: commands and connections."""
 
 import socket
 import struct

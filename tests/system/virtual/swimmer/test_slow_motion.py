@@ -1,4 +1,4 @@
-"""A swimmer in a running fishd: its time is slower than that of people, and nothing is late."""
+"""A swimmer in a running fishd: its time is slower than real time, and no tick is late."""
 
 import signal
 import socket
