@@ -182,7 +182,7 @@ def test_after_a_kill_a_client_knows_at_once_that_nobody_is_there(tmp_path: Path
     with running(tmp_path) as daemon:
         daemon.kill()
         assert (tmp_path / "control").exists()
-        wait_until(lambda: is_deserted(tmp_path / "control"))  # its gateways leave in a moment
+        wait_until(lambda: is_deserted(tmp_path / "control"))  # its gateways end shortly after it
         done = daemon.fishctl("status")
     assert (done.returncode, done.stderr) == (
         1,

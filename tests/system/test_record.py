@@ -117,7 +117,7 @@ def test_a_kill_of_fishd_loses_nothing_and_the_next_one_is_recorded_too(
         with Fish(first.endpoint) as fish:
             ticks = (tick.seq for tick in fish.ticks())
             heard = [seq for _, seq in zip(range(15), ticks, strict=False)]
-        # The next one is heard at a lower number, however busy the machine is.
+        # The next fishd is received at a lower tick number, even on a busy machine.
         wait_until(lambda: first.status().seq > 150)
         first.kill()
     with running(tmp_path, "--set", "start.controller=square"):
@@ -158,7 +158,7 @@ def test_a_disk_that_is_full_ends_the_recording_and_fishd_is_told(
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         events = fish.events()
         limit = f"ulimit -f 16; exec {FISHCTL} --endpoint {daemon.endpoint} record run"
-        # Python would leave compiled modules that are cut off at the limit, too.
+        # Python would also write compiled modules that are cut off at the limit.
         uncompiled = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
         ended = call("bash", "-c", f"{limit} --folder {runs}", env=uncompiled)
         mark = next(event for event in events if event.kind == "mark")

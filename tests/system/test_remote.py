@@ -141,7 +141,7 @@ def test_an_agent_and_telemetry_may_be_reached_over_ipv6(tmp_path: Path) -> None
 
 def test_rubbish_is_a_fault_that_says_what_came(daemon: Daemon, address: str) -> None:
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    socket = context.socket(zmq.DEALER)  # may bind just as well
+    socket = context.socket(zmq.DEALER)  # can bind as well
     socket.bind(address)
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("remote", agent=address)

@@ -58,10 +58,12 @@ def test_the_button_of_the_panel_stops_the_pulses_until_it_is_released_and_the_s
         pi.wait_until_released()
         assert daemon.fishctl("set-controller", "swing").returncode == 1
         daemon.fishctl("clear-fault")
-        while "button is pressed" not in daemon.fishctl("status", "--json").stdout:  # not: was
+        while (
+            "button is pressed" not in daemon.fishctl("status", "--json").stdout
+        ):  # not "was pressed"
             ticks.message()
         pi.control("unpress")
-        for _ in range(100):  # until fishd has seen that, too
+        for _ in range(100):  # until fishd has read the pin
             daemon.fishctl("clear-fault")
             if [ticks.message()["mode"] for _ in range(5)] == ["idle"] * 5:
                 break

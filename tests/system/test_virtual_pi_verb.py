@@ -182,6 +182,6 @@ def test_what_a_stopped_virtual_pi_was_asked_in_vain_is_not_done_later(pi: Pi) -
         asked = pi.fishctl("inject", "nack")
     assert asked.returncode == 1
     assert "does not answer" in asked.stderr
-    pi.control("inject", "clipped")  # and nothing before it is left
+    pi.control("inject", "clipped")  # without the requests before it
     time.sleep(0.2)
     assert faults(pi) == ["clipped"]

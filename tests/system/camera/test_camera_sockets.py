@@ -223,6 +223,6 @@ def test_a_frame_is_young_when_a_learner_has_it(camera: CameraProcess) -> None:
             ages.append(time.monotonic() - frame.available)
             if len(ages) == 600:
                 break
-    # One stop of the machine makes more than a hundredth of all late: the best third is judged.
+    # One stall of the machine delays more than 1 % of all frames, so the best third is judged.
     thirds = [float(np.percentile(ages[begin : begin + 200], 99)) for begin in (0, 200, 400)]
     assert min(thirds) <= 0.010

@@ -60,7 +60,7 @@ def test_from_another_machine_the_offset_is_estimated(
                 received += client.poll_with_headers(PATIENCE)
             offset = client.offset()
     assert 0.0 < offset.uncertainty < 1.0
-    assert abs(offset.seconds) <= offset.uncertainty  # it is one clock in truth
+    assert abs(offset.seconds) <= offset.uncertainty  # in truth both use one clock
     sent, frame = received[-1]
     assert frame.time == pytest.approx(sent.time, abs=offset.uncertainty)
 

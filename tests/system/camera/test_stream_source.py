@@ -40,7 +40,7 @@ def test_a_file_is_played_at_its_own_rate_again_and_again(tmp_path: Path, video:
     levels = [round(float(np.median(frame.pixels[:, 5:35])) / 10) * 10 for frame in frames]
     numbers = [(grey - level(0)) // 10 for grey in levels]
     assert all(after == (before + 1) % 12 for before, after in pairwise(numbers))
-    # After a stop of the machine it catches up: the longest time of 30 frames is judged.
+    # After a stall of the machine, frames catch up, so the longest time of 30 frames is judged.
     longest = max(b.time - a.time for a, b in zip(frames[:-29], frames[29:], strict=True))
     assert longest >= 29 / 50.0 - 0.03
     assert state.limitations == ("times are those of playback: a file has no times of exposure",)

@@ -54,7 +54,7 @@ def test_a_lock_that_its_holder_removed_while_another_opened_it_is_no_lock(
         descriptor = really(name, flags, mode)
         if not removed:
             removed.append(name)
-            lock_path(path).unlink()  # as a holder does that ends now
+            lock_path(path).unlink()  # as a holder does when it ends
         return descriptor
 
     removed: list[Path] = []
@@ -124,7 +124,7 @@ def test_a_pid_that_is_none_is_unknown(
     path = tmp_path / "control"
     monkeypatch.setattr(
         "fishd.core.process.lockfile._KERNEL_LOCKS", tmp_path / "nowhere"
-    )  # the kernel says none
+    )  # the kernel reports none
     with locked(path):
         lock_path(path).write_bytes(text)
         with pytest.raises(LockHeld) as caught, locked(path):

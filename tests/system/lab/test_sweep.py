@@ -63,7 +63,7 @@ def measure(folder: SweepFolder, points: Sequence[Point], session: VirtualSessio
 
 
 def test_a_simulated_fish_is_judged_by_its_true_thrust_whatever_its_sensor_says() -> None:
-    for frequency, millinewtons in ((1.0, 15.234453), (2.0, 23.829169)):  # of tests/reference
+    for frequency, millinewtons in ((1.0, 15.234453), (2.0, 23.829169)):  # from tests/reference
         point = Point("square", {"frequency": frequency})
         result = swim(point, load(None, DRIFTS), Lengths(), DroppingPublisher())
         assert result.thrust == pytest.approx(millinewtons * 1e-3, rel=1e-4)

@@ -72,7 +72,7 @@ def test_neutral_in_between_does_not_hide_a_reversal() -> None:
 def test_a_missed_tick_counts_as_time() -> None:
     limit = DwellLimit(0.2, LIMITS, 0.42)
     assert limit.apply(0.42, 1.0) == 0.42
-    limit.activate(0.42)  # from which on it waits again
+    limit.activate(0.42)  # starts a new wait
     assert limit.apply(-0.42, 0.15) == 0.42
     assert limit.apply(-0.42, 0.05) == -0.42
 

@@ -58,8 +58,8 @@ def test_several_runs_come_in_turn() -> None:
 @pytest.mark.parametrize(
     ("thrusts", "expected"),
     [
-        ([20e-3, 20e-3, 20e-3], 0.3e-3 / math.sqrt(3.0)),  # what each is known to decides
-        ([19e-3, 20e-3, 21e-3], 4.302653 * 1e-3 / math.sqrt(3.0)),  # Student's t of three
+        ([20e-3, 20e-3, 20e-3], 0.3e-3 / math.sqrt(3.0)),  # the error of each swim decides
+        ([19e-3, 20e-3, 21e-3], 4.302653 * 1e-3 / math.sqrt(3.0)),  # Student's t of three swims
         ([19e-3, 21e-3], 12.706205 * 1e-3),
         ([20e-3], 0.3e-3),
     ],

@@ -25,7 +25,7 @@ def test_a_range_has_both_ends_and_decimals_that_are_exact() -> None:
 def test_a_value_is_a_number_where_it_is_one() -> None:
     texts = ["0.6", "1.0", "1E+1", "3", "on", "nan", "inf", "pi/servo", "1e400"]
     assert [*map(parse_value, texts)] == [0.6, 1, 10, 3, "on", "nan", "inf", "pi/servo", "1e400"]
-    assert isinstance(parse_value("3"), int)  # as a seed must be
+    assert isinstance(parse_value("3"), int)  # as needed for a seed
     assert (
         find_axis([Point("swing", {}, {"plant.xi": parse_value(x)}) for x in ("0.9", "1")])
         == "plant.xi"

@@ -49,7 +49,7 @@ def test_a_file_that_a_power_cut_left_is_finished_at_the_next_start(tmp_path: Pa
     writer._give_up()  # as a kill does
     (tmp_path / "blackbox-0.mcap.part").touch()  # nothing was written yet
     copies = [Path(f"{path}.recovering") for path in (writer.path, tmp_path / "blackbox-1.mcap")]
-    for copy in copies:  # a second power cut, while the first one was seen to
+    for copy in copies:  # a second power cut, during the recovery from the first
         copy.write_bytes(writer.part.read_bytes())
     with BlackBox(tmp_path, KEEP, RunWriter).open() as now:
         assert open_run(writer.path).ticks == ticks

@@ -37,7 +37,7 @@ def frames(ticks: list[Tick]) -> list[Frame]:
 
 
 def head(frame: Frame, seq: int, session: str = "one", dropped: int = 0) -> FrameHead:
-    exposure = 0.01 if seq % 2 else None  # which no camera has to know
+    exposure = 0.01 if seq % 2 else None  # optional
     return FrameHead(
         UNIX + frame.time, frame.time, frame.available, seq, session, exposure, dropped
     )

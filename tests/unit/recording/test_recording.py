@@ -43,7 +43,7 @@ def test_a_recording_gives_back_every_bit_of_a_run(tmp_path: Path) -> None:
 
 
 def test_its_thrust_is_the_mean_over_all_its_swimming() -> None:
-    quiet = "simulation.noise=0"  # what noise does to the thrust is in its interval
+    quiet = "simulation.noise=0"  # the interval contains the effect of noise
     fish, tally, impulse = Rig("simulation.offset_x=0.02", quiet), Tally(), 0.0
     fish.run_for(10)
     for controller, parameters in (("swing", {}), ("square", {"frequency": 0.8})):

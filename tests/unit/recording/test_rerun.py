@@ -97,7 +97,7 @@ def test_a_swim_before_the_recording_began_has_an_unknown_past(tmp_path: Path) -
     assert not stretch.from_start
     assert not result.estimates.from_start
     assert stretch.ticks == 299  # without the first, whose time since the previous tick is unknown
-    assert stretch.equal >= 295  # from its first reversal on, swing remembers nothing of before
+    assert stretch.equal >= 295  # after its first reversal, swing does not depend on the past
 
 
 def test_another_fishd_is_judged_with_its_own_configuration(tmp_path: Path) -> None:

@@ -233,7 +233,7 @@ def test_with_a_dwell_its_reversals_wait(still: Rig, agent: ScriptedAgent) -> No
     with agent.answering(lambda seen: flip(agent, seen)):
         angles = [tick.phi_c for tick in still.run(9)]
     assert angles == [0.42] * 3 + [-0.42] * 3 + [0.42] * 3
-    # The agent is shown the angle that was sent.
+    # The agent receives the angle that was sent.
     shown = [seen["instruction_angle"] for seen in agent.seen]
     assert shown == [0.0, *angles[:-1]]
 

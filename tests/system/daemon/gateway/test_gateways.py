@@ -70,7 +70,7 @@ def test_a_gateway_that_dies_is_started_again_and_its_subscribers_go_on(
     assert restarts(shared_daemon, "telemetry") == before + 1
 
 
-@pytest.mark.realtime  # a subscriber has a second to come back
+@pytest.mark.realtime  # a subscriber has a second to connect again
 def test_subscribers_hear_of_a_restart_however_long_the_new_gateway_takes(tmp_path: Path) -> None:
     """The gateway drops waiting messages if no subscriber has connected again."""
     slow = tmp_path / "slow"

@@ -73,13 +73,13 @@ def test_the_thread_stays_quiet_around_the_expected_read() -> None:
                 sensor.read(now)
             except SensorError:
                 continue
-            time.sleep(1.2 * TICK)  # the next read comes late: sampling goes on without it
+            time.sleep(1.2 * TICK)  # the next read is late; sampling continues
             expected = now + TICK
             near = [moment for moment in transfers if -1e-3 < moment - expected < 0.5e-3]
             later = [moment for moment in transfers if moment > expected + 2.4e-3]
             quiet += not near and bool(later)
         sensor.close()
-    assert quiet >= 5  # it would be 0; on a busy machine many a conversion is late
+    assert quiet >= 5  # 0 on an idle machine; on a busy one many conversions are late
 
 
 def test_closing_does_not_wait_for_a_transfer_that_hangs() -> None:

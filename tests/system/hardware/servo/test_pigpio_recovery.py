@@ -21,7 +21,7 @@ def test_pulses_of_a_killed_fishd_go_to_neutral_once_the_next_one_connects(bench
     bench.servo().write(0.5)
     bench.wait(0.05)
     with pytest.raises(ServoError, match="soft limits"):
-        bench.servo().write(9.0)  # no connection for what never reaches the wire
+        bench.servo().write(9.0)  # needs no connection
     successor = bench.servo(calibration=ServoCalibration(trim=10))
     connect(successor)
     bench.wait(0.03)

@@ -50,7 +50,7 @@ def test_chatter_gives_swing_command_in_two_seconds(
     assert changed == 39
     assert {tick.controller for tick in ticks[changed:]} == {"swing"}
     assert {tick.mode for tick in ticks} == {"running"}
-    assert ticks[changed].phi_c == ticks[changed - 1].phi_c  # without a bump
+    assert ticks[changed].phi_c == ticks[changed - 1].phi_c  # the angle does not jump
     (event,) = (event for event in rig.recorder.events if event.kind == "fallback")
     assert (event.level, event.data["controller"], event.data["before"], event.data["code"]) == (
         "warning",
@@ -64,7 +64,7 @@ def test_chatter_gives_swing_command_in_two_seconds(
     assert rig.loop.active.fallback
     assert rig.loop.active.fallback.code == "chatter"
     assert rig.loop.observation
-    assert rig.loop.observation.frequency == pytest.approx(1.7, abs=0.2)  # and it swims
+    assert rig.loop.observation.frequency == pytest.approx(1.7, abs=0.2)  # the fish swims
 
 
 def test_it_is_a_fault_where_that_is_configured(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_a_pickle_is_refused_and_never_unpickled(tmp_path: Path, protocol: int) 
         file.read(path)
     assert not (tmp_path / "trace").exists()
     pickle.loads(path.read_bytes())
-    assert (tmp_path / "trace").exists()  # so it was a trap
+    assert (tmp_path / "trace").exists()  # the file would have run code
 
 
 def test_an_archive_of_torch_or_baselines_is_refused_and_never_unpickled(tmp_path: Path) -> None:
