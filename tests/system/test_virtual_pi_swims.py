@@ -58,9 +58,7 @@ def test_the_button_of_the_panel_stops_the_pulses_until_it_is_released_and_the_s
         pi.wait_until_released()
         assert daemon.fishctl("set-controller", "swing").returncode == 1
         daemon.fishctl("clear-fault")
-        while (
-            "button is pressed" not in daemon.fishctl("status", "--json").stdout
-        ):  # not "was pressed"
+        while "button is pressed" not in daemon.fishctl("status", "--json").stdout:  # not: was
             ticks.message()
         pi.control("unpress")
         for _ in range(100):  # until fishd has read the pin

@@ -108,9 +108,7 @@ def test_each_is_described_with_its_card_or_what_is_wrong_with_it(tmp_path: Path
     assert quick.problem.startswith("it was trained at a tick of 20 ms, this robot's is 50 ms")
     assert torch.card is None
     assert torch.problem.startswith("this is a zip archive as torch writes")
-    assert not any(
-        info.problem for info in library.describe_all()[:2]
-    )  # without the tick of a robot
+    assert not any(info.problem for info in library.describe_all()[:2])  # without a robot
 
 
 def test_a_folder_that_cannot_be_read_hides_no_other(tmp_path: Path) -> None:
