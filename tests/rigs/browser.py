@@ -12,7 +12,7 @@ needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not ins
 
 
 @contextmanager
-def opened(url: str) -> Iterator[tuple[Page, list[str]]]:
+def open_page(url: str) -> Iterator[tuple[Page, list[str]]]:
     """Yield the page, and its problems: errors, and requests that leave this machine."""
     complaints: list[str] = []
     with sync_playwright() as playwright:

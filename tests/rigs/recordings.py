@@ -18,7 +18,7 @@ def swum(seconds: float = 3.0, *overrides: str) -> Rig:
     return rig
 
 
-def recorded(rig: Rig, path: Path, *, flush_every: int = 1000, **about: Any) -> Path:
+def record_run(rig: Rig, path: Path, *, flush_every: int = 1000, **about: Any) -> Path:
     """Return the published messages of the rig, in their order."""
     with RunWriter(path, **about) as writer:
         writer.describe(rig.config)

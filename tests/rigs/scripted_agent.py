@@ -99,24 +99,24 @@ def connect(rig: Rig, agent: ScriptedAgent, **parameters: Any) -> dict[str, Any]
     """Activate `remote`, and return its first observation."""
     before = {message["session"] for message in agent.seen}
     rig.start("remote", agent=agent.address, **parameters)
-    connected(rig)
+    wait_for_connection(rig)
     rig.run()
     while (message := agent.next())["session"] in before:
         pass
     return message
 
 
-def connected(rig: Rig) -> None:
+def wait_for_connection(rig: Rig) -> None:
     """Wait until the next tick can send its observation."""
     wait_until(lambda: remote(rig)._wire.state()[0])
 
 
-def arrived(rig: Rig) -> None:
+def wait_for_message(rig: Rig) -> None:
     """Wait until a message of the agent has arrived for the next tick."""
     wait_until(lambda: remote(rig)._wire.state()[1])
 
 
-def answered(rig: Rig, agent: ScriptedAgent, angle: float, **changes: Any) -> Tick:
+def run_answered_tick(rig: Rig, agent: ScriptedAgent, angle: float, **changes: Any) -> Tick:
     """Run one tick, with its answer before its deadline starts.
 
     changes: changes of the action in the answer
@@ -130,14 +130,14 @@ def answered(rig: Rig, agent: ScriptedAgent, angle: float, **changes: Any) -> Ti
     while agent.next().get("seq") != controller._seq:
         pass
     agent.send(agent.action(angle, **changes))
-    arrived(rig)
+    wait_for_message(rig)
     rig.loop.act(turn)
     return rig.recorder.ticks[-1]
 
 
 def swim(rig: Rig, agent: ScriptedAgent, angle: float = 0.2) -> None:
     """Run one tick with an active action."""
-    assert answered(rig, agent, angle).phi_c == angle
+    assert run_answered_tick(rig, agent, angle).phi_c == angle
 
 
 def reason(rig: Rig) -> str:

@@ -15,7 +15,7 @@ MAX_END_S = 3.0
 """Longest time from a signal to the end of the process, with anything hanging [s]."""
 
 
-def measured(*arguments: str) -> Any:
+def measure(*arguments: str) -> Any:
     """Return the results of the tool that writes docs/reference/reliability.md."""
     done = call(sys.executable, ROOT / "tools" / "reliability", *arguments, "--json", timeout=200)
     assert done.returncode in (0, 1), done.stderr
@@ -30,7 +30,7 @@ PHASES = ("statistics", "between ticks")
 @pytest.mark.realtime
 def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then() -> None:
     """Check six deaths in one test: they run in parallel, and a repetition measures all again."""
-    deaths = measured("deaths", "--only", *SIGNALS, *PHASES)
+    deaths = measure("deaths", "--only", *SIGNALS, *PHASES)
     for name, status in SIGNALS.items():
         outcome = deaths[name]
         assert outcome["status"] == status, name
@@ -46,7 +46,7 @@ def test_the_servo_is_neutral_soon_after_the_end_of_fishd_and_released_then() ->
 @pytest.mark.realtime
 def test_a_fishd_that_is_killed_at_any_moment_leaves_no_pulses() -> None:
     # With this seed, two of the first six are a SIGSTOP.
-    kills = measured(*["kills", "--kills", "30", "--lanes", "6", "--seed", "10", "--limit", "100"])
+    kills = measure(*["kills", "--kills", "30", "--lanes", "6", "--seed", "10", "--limit", "100"])
     assert [kill for kill in kills if kill["off"] is None] == []
     assert len(kills) >= 10
     assert any(kill["swimming"] for kill in kills)

@@ -124,7 +124,7 @@ def test_a_signal_fades_to_neutral_and_exits_with_0(tmp_path: Path, number: int)
     assert "Traceback" not in errors
 
 
-def refused(folder: Path, *settings: str) -> str:
+def read_start_error(folder: Path, *settings: str) -> str:
     """Return the error messages of a fishd that cannot start with these settings."""
     status, out, errors = Daemon(folder, *sets(*settings)).finish()
     assert (status, out) == (1, "")
@@ -145,16 +145,16 @@ def test_a_second_daemon_on_the_same_address_says_so_and_exits(
 ) -> None:
     with running(tmp_path, *sets(f"telemetry.address=ipc://{tmp_path}/telemetry")) as first:
         rival = f"another fishd (pid {first.process.pid}) already serves"
-        assert f"{rival} {first.endpoint}" in refused(tmp_path)
+        assert f"{rival} {first.endpoint}" in read_start_error(tmp_path)
         (tmp_path / "other").mkdir()
         same = f"telemetry.address={first.telemetry}"
-        assert f"{rival} {first.telemetry}" in refused(tmp_path / "other", same)
+        assert f"{rival} {first.telemetry}" in read_start_error(tmp_path / "other", same)
         assert first.fishctl("status").returncode == 0
     assert not (tmp_path / "telemetry").exists()
     assert not (tmp_path / "control").exists()
     tcp = daemon.telemetry
     host, _, port = tcp.rpartition(":")
-    line = refused(tmp_path, f"telemetry.address={tcp}")
+    line = read_start_error(tmp_path, f"telemetry.address={tcp}")
     assert f"telemetry.address: cannot listen on {tcp}: it is in use" in line
     assert line.endswith(f" --set telemetry.address={host}:{int(port) + 1}\n")
 
@@ -166,14 +166,14 @@ def test_a_telemetry_address_of_another_machine_is_one_line_with_what_would_be_r
     assert (
         f"telemetry.address: cannot listen on tcp://{host}:9872: {host} is not an address of this "
         "machine; write tcp://127.0.0.1:9872, or tcp://0.0.0.0:9872 for all\n"
-    ) in refused(tmp_path, f"telemetry.address=tcp://{host}:9872")
+    ) in read_start_error(tmp_path, f"telemetry.address=tcp://{host}:9872")
 
 
 @pytest.mark.parametrize("key", ["control", "telemetry"])
 def test_a_file_that_is_no_socket_is_left_alone(tmp_path: Path, key: str) -> None:
     precious = tmp_path / "precious.txt"
     precious.write_text("data")
-    errors = refused(tmp_path, f"{key}.address=ipc://{precious}")
+    errors = read_start_error(tmp_path, f"{key}.address=ipc://{precious}")
     assert f"{precious} exists and is not a socket" in errors
     assert precious.read_text() == "data"
 

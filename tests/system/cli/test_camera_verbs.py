@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import pytest
 from playwright.sync_api import expect
-from rigs.browser import needs_browser, opened
+from rigs.browser import needs_browser, open_page
 from rigs.camera_process import CameraProcess, running_camera
 from rigs.drawing_interrupted import ENTER_SCREEN, LEAVE_SCREEN, signal_as_drawing_begins
 from rigs.processes import (
@@ -319,7 +319,7 @@ def test_the_page_shows_the_view_live_with_the_axis_in_a_true_browser(swimming: 
         line = process.process.stdout.readline()
         url = re.fullmatch(r"the camera is at (http://127\.0\.0\.1:\d+/); Ctrl-C ends it\n", line)
         assert url
-        with opened(url[1]) as (page, complaints):
+        with open_page(url[1]) as (page, complaints):
             page.wait_for_selector(".pill.streaming", timeout=PATIENCE * 1e3)
             expect(page.locator("#axis")).to_contain_text("px", timeout=PATIENCE * 1e3)
             before = page.inner_text("#seq")

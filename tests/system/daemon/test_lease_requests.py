@@ -28,7 +28,7 @@ class Client:
         lease: str = (await self.ask("take-lease", name=name, host="lab", pid=42, **args)).lease
         return lease
 
-    async def refused(self, op: str, **args: Any) -> Refused:
+    async def expect_refusal(self, op: str, **args: Any) -> Refused:
         with pytest.raises(Refused) as refusal:
             await self.ask(op, **args)
         return refusal.value
@@ -53,7 +53,9 @@ def test_a_lease_lasts_as_configured_or_as_asked_for_within_bounds(tmp_path: Pat
         assert (await client.ask("take-lease", name="a")).seconds == 3.0
         assert (await client.ask("take-lease", name="b", take=True, seconds=9.0)).seconds == 9.0
         for seconds in (0.1, 61.0, "long"):
-            refusal = await client.refused("take-lease", name="c", take=True, seconds=seconds)
+            refusal = await client.expect_refusal(
+                "take-lease", name="c", take=True, seconds=seconds
+            )
             assert refusal.code == "bad-arguments"
 
     run_story(tmp_path, story, "control.lease=3.0")
@@ -72,7 +74,7 @@ def test_a_request_by_hand_takes_the_fish_and_the_answer_says_from_whom(tmp_path
             assert holder.age == pytest.approx(1.0, abs=0.1)
             for change in ("set-controller", "stop", "renew-lease", "end-lease"):
                 arguments = {"name": "swing"} if change == "set-controller" else {}
-                refusal = await client.refused(change, lease=lease, **arguments)
+                refusal = await client.expect_refusal(change, lease=lease, **arguments)
                 assert (refusal.code, "by hand" in str(refusal)) == ("no-lease", True)
             assert (await client.ask("status")).lease is None
         client.rig.run_for(10.0)
@@ -95,14 +97,14 @@ def test_a_second_experiment_is_refused_unless_it_takes_the_fish(tmp_path: Path)
         first = await client.take(seconds=10.0)
         await client.ask("set-controller", name="swing", lease=first)
         client.rig.run_for(1.0)
-        refusal = await client.refused("take-lease", name="optimise")
+        refusal = await client.expect_refusal("take-lease", name="optimise")
         assert refusal.code == "leased"
         assert "measure (pid 42 on lab)" in str(refusal)
         assert client.rig.mode == "running"
         grant = await client.ask("take-lease", name="optimise", take=True)
         assert grant.previous_holder.name == "measure"
         assert client.rig.run_for(1.0)[-1].phi_c == 0.0
-        refusal = await client.refused("set-controller", name="swing", lease=first)
+        refusal = await client.expect_refusal("set-controller", name="swing", lease=first)
         assert "optimise took the fish" in str(refusal)
         await client.ask("set-controller", name="swing", lease=grant.lease)
         assert (await client.ask("status")).lease.name == "optimise"
@@ -134,8 +136,8 @@ def test_a_tare_by_hand_is_refused_in_an_experiment_and_possible_within_it(tmp_p
     async def story(client: Client) -> None:
         client.rig.run_for(1.0)
         lease = await client.take(seconds=10.0)
-        assert (await client.refused("tare", sample=1)).code == "leased"
-        assert (await client.refused("tare", sample=1, lease=lease)).code == "no-samples"
+        assert (await client.expect_refusal("tare", sample=1)).code == "leased"
+        assert (await client.expect_refusal("tare", sample=1, lease=lease)).code == "no-samples"
 
     run_story(tmp_path, story)
 
@@ -143,6 +145,6 @@ def test_a_tare_by_hand_is_refused_in_an_experiment_and_possible_within_it(tmp_p
 def test_nothing_is_leased_while_a_fault_is_latched(tmp_path: Path) -> None:
     async def story(client: Client) -> None:
         client.rig.loop.estop("enough")
-        assert (await client.refused("take-lease", name="measure")).code == "estop"
+        assert (await client.expect_refusal("take-lease", name="measure")).code == "estop"
 
     run_story(tmp_path, story)

@@ -49,7 +49,7 @@ class Client:
         await self.calibrate(calibration, lease=lease)
         return lease
 
-    async def refused(self, op: str, **args: Any) -> str:
+    async def expect_refusal(self, op: str, **args: Any) -> str:
         """Return the code with which a request is refused."""
         with pytest.raises(Refused) as refusal:
             await self.ask(op, **args)
@@ -159,7 +159,7 @@ def test_a_lease_lasts_as_long_as_it_is_renewed_or_changed(rig: LockstepRig) -> 
         await wait_for_lease_check()
         assert not (await client.ask("calibrations")).on_trial
         for op in ("renew-lease", "end-lease"):
-            assert await client.refused(op, lease=lease) == "no-lease"
+            assert await client.expect_refusal(op, lease=lease) == "no-lease"
         with pytest.raises(Refused, match="it was not renewed for 2 s"):
             await client.calibrate(WIDE_LIMITS, lease=lease)
 
@@ -184,9 +184,9 @@ def test_a_lease_that_is_given_back_ends_at_once_and_without_a_warning(rig: Lock
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(1.0)
         await client.ask("end-lease", lease=lease)
-        assert await client.refused("renew-lease", lease=lease) == "no-lease"
+        assert await client.expect_refusal("renew-lease", lease=lease) == "no-lease"
         for name in ("swing", "hold"):  # the tail has to reach neutral first
-            assert await client.refused("set-controller", name=name) == "calibrating"
+            assert await client.expect_refusal("set-controller", name=name) == "calibrating"
         await client.until_over(1.0)
         assert (await client.ask("calibrations")).servo == before
 
@@ -198,7 +198,7 @@ def test_nothing_but_hold_takes_over_while_a_lease_lasts(rig: LockstepRig) -> No
     async def story(client: Client) -> None:
         lease = await client.begin_trial(WIDE_LIMITS)
         for arguments in ({"name": "swing", "lease": lease}, {"name": "swing"}, {"name": "hold"}):
-            assert await client.refused("set-controller", **arguments) == "calibrating"
+            assert await client.expect_refusal("set-controller", **arguments) == "calibrating"
         assert (await client.ask("set-controller", name="hold", lease=lease)).mode == "running"
         await client.ask("end-lease", lease=lease)
         await client.until_over()
@@ -273,13 +273,13 @@ def test_after_an_emergency_stop_a_lease_ends_before_the_tail_is_driven_again(
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)
         rig.run_for(1.0)
         await client.ask("estop")
-        assert await client.refused("end-lease", lease=lease) == "no-lease"
+        assert await client.expect_refusal("end-lease", lease=lease) == "no-lease"
         rig.run_for(0.5)
         await wait_for_lease_check()
         # The previous limits would not permit the angle at which the pulses start again.
         assert (await client.ask("calibrations")).on_trial
         await client.ask("clear-fault")
-        assert await client.refused("set-controller", name="swing") == "calibrating"
+        assert await client.expect_refusal("set-controller", name="swing") == "calibrating"
         await client.until_over()
         assert (await client.ask("calibrations")).servo.highest == 0.2
 

@@ -27,10 +27,10 @@ def apply(section: str, folder: Path) -> None:
         elif kind == "diff":
             old = [line[2:] for line in body.splitlines() if not line.startswith("+")]
             new = [line[2:] for line in body.splitlines() if not line.startswith("-")]
-            path.write_text(replaced(text_of(path), old, new), encoding="utf-8")
+            path.write_text(replace_lines(text_of(path), old, new), encoding="utf-8")
 
 
-def replaced(source: str, old: list[str], new: list[str]) -> str:
+def replace_lines(source: str, old: list[str], new: list[str]) -> str:
     """Replace lines, indented as in the source."""
     match = re.search(rf"^( *){re.escape(old[0].lstrip())}$", source, re.MULTILINE)
     assert match, old[0]

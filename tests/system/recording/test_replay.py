@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zmq
 from rigs.processes import FISHCTL, PATIENCE, Process, Subscriber, fishctl, one_line, wait_until
-from rigs.recordings import recorded, swum
+from rigs.recordings import record_run, swum
 
 from fishd.client import Fish, Refused
 from fishd.core import addresses
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def replay(tmp_path: Path) -> Iterator[Replay]:
-    run = open_run(recorded(swum(), tmp_path / "run", source="simulation"))
+    run = open_run(record_run(swum(), tmp_path / "run", source="simulation"))
     with Replay(run, "tcp://127.0.0.1:0", f"ipc://{tmp_path}/control") as made:
         yield made
 
@@ -50,7 +50,7 @@ def test_a_replay_is_the_recorded_bytes_at_the_recorded_speed(replay: Replay) ->
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_replay_ends_by_a_signal_and_leaves_no_socket(tmp_path: Path, number: int) -> None:
-    run = recorded(swum(), tmp_path / "run", source="simulation")
+    run = record_run(swum(), tmp_path / "run", source="simulation")
     socket = tmp_path / "control"
     words = ("--speed", "0.01", "--address", "tcp://127.0.0.1:0", "--control", f"ipc://{socket}")
     process = Process(FISHCTL, "replay", str(run), *words)
@@ -60,7 +60,7 @@ def test_a_replay_ends_by_a_signal_and_leaves_no_socket(tmp_path: Path, number: 
 
 
 def test_a_client_sees_the_replay_and_cannot_steer_it(tmp_path: Path) -> None:
-    run = recorded(swum(30.0), tmp_path / "run", source="simulation")
+    run = record_run(swum(30.0), tmp_path / "run", source="simulation")
     control, telemetry = f"ipc://{tmp_path}/control", f"ipc://{tmp_path}/telemetry"
     words = ("--speed", "0.5", "--address", telemetry, "--control", control)
     player = Process(FISHCTL, "replay", str(run), *words)
@@ -94,7 +94,7 @@ def test_an_address_in_use_is_said_in_one_line(replay: Replay, tmp_path: Path) -
 
 
 def test_a_replay_leaves_the_telemetry_of_a_fishd_alone(tmp_path: Path) -> None:
-    run = recorded(swum(0.2), tmp_path / "run")
+    run = record_run(swum(0.2), tmp_path / "run")
     address = f"ipc://{tmp_path}/telemetry"
     with (
         addresses.claim_address(address),
@@ -111,7 +111,7 @@ def test_a_replay_leaves_the_telemetry_of_a_fishd_alone(tmp_path: Path) -> None:
 def test_a_replay_names_the_command_that_shows_it_and_not_the_live_fish(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    run = recorded(swum(0.2), tmp_path / "run")
+    run = record_run(swum(0.2), tmp_path / "run")
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     words = ("replay", str(run), "--address", f"ipc://{tmp_path}/telemetry", "--speed", "9")
     assert fishctl(*words).stdout.endswith("watch it with: fishctl watch\n")

@@ -26,7 +26,7 @@ def pictures(**optics: float) -> Pixels:
     return np.stack([frame.pixels for frame in frames])
 
 
-def judged(seen: Pixels, settings: CameraSettings = V4L2, picture: Any = VGA) -> Alignment:
+def judge_pictures(seen: Pixels, settings: CameraSettings = V4L2, picture: Any = VGA) -> Alignment:
     return judge(find_motion(seen), picture, settings)
 
 
@@ -36,7 +36,7 @@ def turned(quarters: int) -> Pixels:
 
 
 def test_a_camera_that_stands_well_is_left_alone() -> None:
-    alignment = judged(pictures())
+    alignment = judge_pictures(pictures())
     assert (alignment.good, alignment.advice, alignment.settings) == (True, (), {})
     assert 20 < alignment.place.left < alignment.place.right < 75
     assert alignment.place.top < 42 < alignment.place.bottom
@@ -44,7 +44,7 @@ def test_a_camera_that_stands_well_is_left_alone() -> None:
 
 @pytest.mark.parametrize(("tilt", "way"), [(0.1, "clockwise"), (-0.05, "counter-clockwise")])
 def test_a_tilted_camera_is_turned_by_its_tilt(tilt: float, way: str) -> None:
-    alignment = judged(pictures(tilt=tilt))
+    alignment = judge_pictures(pictures(tilt=tilt))
     assert not alignment.good
     assert f"turn the camera {way}, as seen from behind it, by " in alignment.advice[0]
     degrees = float(alignment.advice[0].split()[-1].rstrip("°"))
@@ -55,7 +55,7 @@ def test_a_tilted_camera_is_turned_by_its_tilt(tilt: float, way: str) -> None:
 @pytest.mark.parametrize("off", [3.0, -6.0])
 def test_the_crop_is_moved_so_that_the_axis_lies_in_its_middle(off: float, side: float) -> None:
     settings = replace(V4L2, picture=PictureSettings(crop=Square(side=side)))
-    alignment = judged(pictures(off_axis=off), settings)
+    alignment = judge_pictures(pictures(off_axis=off), settings)
     y, new_side = (
         alignment.settings["picture.crop.y"],
         alignment.settings.get("picture.crop.side", side),
@@ -73,14 +73,16 @@ def test_the_crop_is_moved_so_that_the_axis_lies_in_its_middle(off: float, side:
 def test_a_fish_that_lies_otherwise_is_turned_with_its_head_to_the_left(
     quarters: int, rotate: Any
 ) -> None:
-    alignment = judged(turned(quarters), replace(V4L2, picture=PictureSettings(rotate=rotate)))
+    alignment = judge_pictures(
+        turned(quarters), replace(V4L2, picture=PictureSettings(rotate=rotate))
+    )
     assert alignment.settings == {"picture.rotate": (rotate + 360 - 90 * quarters) % 360}
     assert not alignment.good
     assert "head to the left: turn it" in alignment.advice[-1]
 
 
 def test_a_tail_that_leaves_the_picture_is_said_to() -> None:
-    alignment = judged(pictures()[:, 33:51, :56])
+    alignment = judge_pictures(pictures()[:, 33:51, :56])
     assert not alignment.good
     assert alignment.advice[0].startswith(
         "the motion is cut off at the upper edge and the lower edge and the right"
@@ -98,6 +100,6 @@ def test_of_a_simulated_camera_its_own_settings_are_named() -> None:
     settings = CameraSettings(
         simulated=replace(CameraSettings().simulated, off_axis=3.0, tilt=0.05)
     )
-    alignment = judged(pictures(off_axis=3.0, tilt=0.05), settings, (84, 84))
+    alignment = judge_pictures(pictures(off_axis=3.0, tilt=0.05), settings, (84, 84))
     assert alignment.settings["simulated.off_axis"] == pytest.approx(0.0, abs=0.3)
     assert alignment.settings["simulated.tilt"] == pytest.approx(0.0, abs=0.015)

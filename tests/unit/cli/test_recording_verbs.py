@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 from rigs.harness import Rig
 from rigs.processes import fishctl, one_line
-from rigs.recordings import recorded, swum
+from rigs.recordings import record_run, swum
 
 from fishd.recording import RunWriter
 from fishd.recording.images import FrameHead
@@ -45,7 +45,7 @@ def test_times_and_forces_that_cannot_be_are_listed_in_few_digits(tmp_path: Path
 @pytest.fixture(scope="module")
 def damaged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of which one chunk, of ten ticks, cannot be read."""
-    path = recorded(swum(), tmp_path_factory.mktemp("runs") / "run", flush_every=10)
+    path = record_run(swum(), tmp_path_factory.mktemp("runs") / "run", flush_every=10)
     content = bytearray(path.read_bytes())
     content[int(0.4 * len(content))] ^= 0x55
     path.write_bytes(content)
@@ -98,7 +98,7 @@ def test_what_is_recovered_is_said_with_its_frames(tmp_path: Path) -> None:
 def test_where_no_controller_swam_nothing_is_chosen_again(tmp_path: Path) -> None:
     rig = Rig()
     rig.run_for(0.5)
-    path = recorded(rig, tmp_path / "run")
+    path = record_run(rig, tmp_path / "run")
     done = fishctl("rerun", str(path))
     assert done.returncode == 1
     assert done.stderr == f"fishctl: {path}: no controller swam, so none can choose again\n"

@@ -11,7 +11,7 @@ from fishd.camera.drawing import to_colours
 from fishd.cli.camera.terminal import TerminalPicture
 
 
-def drawn(picture: np.ndarray, width: int, height: int, system: str | None) -> list[str]:
+def draw_lines(picture: np.ndarray, width: int, height: int, system: str | None) -> list[str]:
     out = io.StringIO()
     console = Console(
         file=out, width=width, height=height, force_terminal=True,
@@ -31,7 +31,7 @@ def plain(lines: list[str]) -> list[str]:
 def test_a_picture_fits_and_keeps_its_proportions(
     shape: tuple[int, int], width: int, height: int, system: str | None
 ) -> None:
-    lines = plain(drawn(np.full(shape, 100, np.uint8), width, height, system))
+    lines = plain(draw_lines(np.full(shape, 100, np.uint8), width, height, system))
     assert {len(line) for line in lines} == {len(lines[0])}
     columns, rows = len(lines[0]), 2 * len(lines)
     assert columns <= min(width, shape[1])
@@ -42,7 +42,7 @@ def test_a_picture_fits_and_keeps_its_proportions(
 
 def test_each_character_shows_two_pixels_in_their_colours() -> None:
     picture = np.array([[0, 0, 240], [240, 0, 0]], np.uint8)
-    (line,) = drawn(picture, 80, 24, "truecolor")
+    (line,) = draw_lines(picture, 80, 24, "truecolor")
     black, white = "0;0;0", "240;240;240"
     assert line == (
         f"\x1b[38;2;{black};48;2;{white}m▀\x1b[0m"
@@ -53,4 +53,4 @@ def test_each_character_shows_two_pixels_in_their_colours() -> None:
 
 def test_without_colours_shades_of_grey_are_drawn() -> None:
     ramp = np.tile(np.arange(0, 250, 50, dtype=np.uint8), (2, 1))
-    assert drawn(ramp, 80, 24, None) == ["  ░▒▓"]
+    assert draw_lines(ramp, 80, 24, None) == ["  ░▒▓"]

@@ -24,7 +24,7 @@ json_values = st.recursive(
 )
 
 
-def decoded(payload: bytes) -> protocol.Request | Refused:
+def decode_request(payload: bytes) -> protocol.Request | Refused:
     try:
         return protocol.decode_request(payload)
     except Refused as refusal:
@@ -33,14 +33,14 @@ def decoded(payload: bytes) -> protocol.Request | Refused:
 
 @given(st.binary(max_size=200))
 def test_any_bytes_become_a_request_or_a_refusal(payload: bytes) -> None:
-    assert isinstance(decoded(payload), protocol.Request | Refused)
+    assert isinstance(decode_request(payload), protocol.Request | Refused)
     protocol.request_id(payload)
 
 
 @settings(max_examples=40)
 @given(json_values)
 def test_any_json_becomes_a_request_or_a_refusal(value: object) -> None:
-    assert isinstance(decoded(msgspec.json.encode(value)), protocol.Request | Refused)
+    assert isinstance(decode_request(msgspec.json.encode(value)), protocol.Request | Refused)
 
 
 @settings(max_examples=40)

@@ -12,7 +12,7 @@ POLICIES = [f"policy-{number:04d}-swim" for number in range(500)]
 KEYS = keys()
 
 
-def cost(function: Callable[[], object]) -> float:
+def measure_cost(function: Callable[[], object]) -> float:
     """Return the time of a function over that of a sum of 10 000 numbers, about 0.2 ms."""
     return fastest(function) / fastest(lambda: sum(range(10_000)))
 
@@ -33,7 +33,7 @@ def fastest(function: Callable[[], object]) -> float:
     ids=["64 kB", "500 names"],
 )
 def test_a_suggestion_is_quick(word: str, words: list[str], limit: int) -> None:
-    assert cost(lambda: suggest(word, words)) < limit
+    assert measure_cost(lambda: suggest(word, words)) < limit
 
 
 def test_the_nearest_of_many_is_found() -> None:
@@ -57,4 +57,4 @@ def test_a_long_value_is_quoted_briefly_and_quickly(value: object) -> None:
         return str(problem.value)
 
     assert len(refuse()) < 150
-    assert cost(refuse) < 10
+    assert measure_cost(refuse) < 10

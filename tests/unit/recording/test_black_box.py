@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from rigs.recordings import recorded, swum
+from rigs.recordings import record_run, swum
 
 from fishd.recording import RunWriter, open_run
 from fishd.recording.black_box import BlackBox
@@ -27,7 +27,7 @@ def fill(box: BlackBox, folder: Path, files: int) -> None:
 
 
 def test_the_oldest_files_make_room_and_nobody_elses(tmp_path: Path) -> None:
-    mine = recorded(swum(), tmp_path / "mine")
+    mine = record_run(swum(), tmp_path / "mine")
     box = BlackBox(tmp_path, KEEP, RunWriter)
     fill(box, tmp_path, 6)
     oldest = next(path for path in list_recordings(tmp_path) if path != mine).stat().st_mtime_ns

@@ -14,7 +14,7 @@ import pytest
 from msgspec.structs import replace
 from rigs.harness import Rig
 from rigs.kills import ends_before
-from rigs.recordings import recorded, status, swum, write
+from rigs.recordings import record_run, status, swum, write
 
 from fishd.config import Config
 from fishd.core.errors import NoDaemon, RecordingError, Refused
@@ -29,7 +29,7 @@ from fishd.recording.summary import Tally
 
 def test_a_recording_gives_back_every_bit_of_a_run(tmp_path: Path) -> None:
     rig = swum()
-    path = recorded(rig, tmp_path / "run", operator="Ada", subject="fish 3", note="stiff fin")
+    path = record_run(rig, tmp_path / "run", operator="Ada", subject="fish 3", note="stiff fin")
     run = open_run(str(path))
     assert path.name == "run.mcap"
     assert run.ticks == rig.recorder.ticks
@@ -61,7 +61,7 @@ def test_its_thrust_is_the_mean_over_all_its_swimming() -> None:
 
 
 def test_an_older_recording_is_never_overwritten(tmp_path: Path) -> None:
-    path = recorded(swum(), tmp_path / "run.mcap")
+    path = record_run(swum(), tmp_path / "run.mcap")
     before = path.read_bytes()
     with pytest.raises(RecordingError, match="already exists; choose another name"):
         RunWriter(path)
@@ -83,7 +83,7 @@ def test_ticks_that_are_missing_are_counted(tmp_path: Path) -> None:
 
 
 def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> None:
-    whole = recorded(swum(), tmp_path / "whole", flush_every=10)
+    whole = record_run(swum(), tmp_path / "whole", flush_every=10)
     content, ticks = whole.read_bytes(), open_run(whole).ticks
     kept = []
     for share in (0.3, 0.7, 0.999):
@@ -115,7 +115,7 @@ def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("damaged", [False, True], ids=["cut off", "damaged"])
 def test_a_recovery_that_is_killed_is_finished_by_the_next(tmp_path: Path, damaged: bool) -> None:
-    whole = recorded(swum(), tmp_path / "whole", flush_every=10)
+    whole = record_run(swum(), tmp_path / "whole", flush_every=10)
     content = bytearray(whole.read_bytes())
     for call in count():
         folder = tmp_path / f"{call}"
@@ -139,7 +139,7 @@ def test_a_recovery_that_is_killed_is_finished_by_the_next(tmp_path: Path, damag
 
 
 def test_a_recording_killed_while_it_got_its_name_gets_it_from_a_recovery(tmp_path: Path) -> None:
-    whole = recorded(swum(), tmp_path / "run")
+    whole = record_run(swum(), tmp_path / "run")
     content, part = whole.read_bytes(), whole.with_name("run.mcap.part")
     part.hardlink_to(whole)
     assert recover(part).path == whole
@@ -149,7 +149,7 @@ def test_a_recording_killed_while_it_got_its_name_gets_it_from_a_recovery(tmp_pa
     assert not part.exists()
     assert whole.read_bytes() == content
     part.write_bytes(content[: len(content) // 2])
-    whole.write_bytes(recorded(swum(), tmp_path / "other").read_bytes())
+    whole.write_bytes(record_run(swum(), tmp_path / "other").read_bytes())
     with pytest.raises(RecordingError, match=r"run\.mcap already exists; move it away first"):
         recover(part)
 
@@ -157,7 +157,7 @@ def test_a_recording_killed_while_it_got_its_name_gets_it_from_a_recovery(tmp_pa
 @pytest.mark.slow
 def test_a_damaged_byte_costs_its_chunk_at_most_and_is_told(tmp_path: Path) -> None:
     rig = swum()
-    path = recorded(rig, tmp_path / "run", flush_every=10)
+    path = record_run(rig, tmp_path / "run", flush_every=10)
     whole, ticks = path.read_bytes(), rig.recorder.ticks
     worst = 0
     for offset in range(30, len(whole) - 40, 797):
@@ -175,7 +175,7 @@ def test_a_damaged_byte_costs_its_chunk_at_most_and_is_told(tmp_path: Path) -> N
 
 
 def test_what_names_a_recording_and_its_channels_may_be_damaged_too(tmp_path: Path) -> None:
-    path = recorded(swum(), tmp_path / "run", flush_every=10)
+    path = record_run(swum(), tmp_path / "run", flush_every=10)
     whole, ticks = path.read_bytes(), open_run(path).ticks
     first_chunk = whole.index(b"\x04\0\0\0zstd")
     for offset in (whole.index(b"fishd.run") - 4, first_chunk + 60, len(whole) // 2):
@@ -190,7 +190,7 @@ def test_what_names_a_recording_and_its_channels_may_be_damaged_too(tmp_path: Pa
 
 
 def test_what_is_recovered_of_a_damaged_recording_is_whole(tmp_path: Path) -> None:
-    path = recorded(swum(), tmp_path / "run", flush_every=10)
+    path = record_run(swum(), tmp_path / "run", flush_every=10)
     content = bytearray(path.read_bytes())
     content[int(0.4 * len(content))] ^= 0x55
     path.write_bytes(content)
@@ -338,7 +338,7 @@ def test_what_is_no_recording_is_one_line(
 
 
 def test_what_is_no_regular_file_is_no_recording_of_a_folder(tmp_path: Path) -> None:
-    path = recorded(swum(0.2), tmp_path / "run")
+    path = record_run(swum(0.2), tmp_path / "run")
     os.mkfifo(tmp_path / "pipe.mcap")  # opening it would block
     os.mkfifo(tmp_path / "pipe.mcap.part")
     (tmp_path / "folder.mcap").mkdir()
@@ -348,7 +348,7 @@ def test_what_is_no_regular_file_is_no_recording_of_a_folder(tmp_path: Path) -> 
 
 
 def test_a_name_means_a_recording_of_the_folder(tmp_path: Path) -> None:
-    path = recorded(swum(0.2), tmp_path / "morning")
+    path = record_run(swum(0.2), tmp_path / "morning")
     assert (
         find_recording("morning", tmp_path)
         == find_recording(str(path))

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 from rigs.harness import Rig, fragile_rig
-from rigs.recordings import recorded, status
+from rigs.recordings import record_run, status
 
 from common.reversed_force import reversed_robot
 from fishd.controllers import registry
@@ -16,7 +16,7 @@ from fishd.recording import RunWriter, open_run
 
 
 def rerun_of(rig: Rig, path: Path) -> Rerun:
-    return rerun(open_run(recorded(rig, path, source="simulation")))
+    return rerun(open_run(record_run(rig, path, source="simulation")))
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_a_thrust_that_was_held_by_a_measured_factor_is_held_by_it_again(tmp_pat
 def test_the_observer_is_rerun_and_sees_another_fish_where_asked(tmp_path: Path) -> None:
     rig = Rig("estimator.kind=observer", "simulation.noise=0.002").start("swing")
     rig.run_for(10)
-    run = open_run(recorded(rig, tmp_path / "run"))
+    run = open_run(record_run(rig, tmp_path / "run"))
     result = rerun(run)
     assert result.stretches[0].equal == result.estimates.equal == 200
     changed = rerun(run, overrides=["plant.omega0=9"])
@@ -124,7 +124,7 @@ def test_another_fishd_is_judged_with_its_own_configuration(tmp_path: Path) -> N
 def test_another_controller_sees_what_the_recorded_one_saw(tmp_path: Path) -> None:
     rig = Rig().start("square", frequency=1.667)
     rig.run_for(10)
-    run = open_run(recorded(rig, tmp_path / "run"))
+    run = open_run(record_run(rig, tmp_path / "run"))
     (stretch,) = rerun(run, "swing", {"C": 0.6}).stretches
     assert (stretch.recorded, stretch.controller) == ("square", "swing")
     assert 0 < stretch.equal < stretch.ticks
@@ -176,7 +176,7 @@ def test_time_stands_still_for_a_controller_only_where_it_did(
 ) -> None:
     rig = Rig().start("swing")
     rig.run_for(1)
-    path = recorded(rig, tmp_path / "run", source=source)
+    path = record_run(rig, tmp_path / "run", source=source)
     seen = []
 
     def create(name: str, parameters: dict[str, object], limits: Limits) -> object:

@@ -9,7 +9,7 @@ import pyarrow.parquet
 import pytest
 from rigs.harness import Rig
 from rigs.processes import fishctl, one_line
-from rigs.recordings import recorded, swum, write
+from rigs.recordings import record_run, swum, write
 
 from fishd.lab.run_figure import draw_run
 from fishd.lab.run_page import write_page
@@ -19,7 +19,9 @@ from fishd.recording import open_run
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return recorded(swum(), tmp_path_factory.mktemp("runs") / "run", note="<b>stiff</b> & $new_{$")
+    return record_run(
+        swum(), tmp_path_factory.mktemp("runs") / "run", note="<b>stiff</b> & $new_{$"
+    )
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])
@@ -63,7 +65,7 @@ def test_an_interval_is_in_the_legend_where_there_is_one(tmp_path: Path) -> None
     known.run_for(5)
     for rig, expected in ((swum(), False), (known, True)):
         name = f"known-{expected}"
-        drawn = traces(open_run(recorded(rig, tmp_path / name)))
+        drawn = traces(open_run(record_run(rig, tmp_path / name)))
         write_page(drawn, tmp_path / f"{name}.html")
         assert ("95 %" in (tmp_path / f"{name}.html").read_text()) == expected
     draw_run(drawn, tmp_path / "known.svg")
@@ -83,7 +85,7 @@ def test_a_curve_has_breaks_and_events_and_units_are_said(path: Path, tmp_path: 
 def test_a_resting_fish_has_no_phase_portrait_and_dust_is_not_blown_up(tmp_path: Path) -> None:
     rig = Rig("simulation.noise=0")
     rig.run_for(1)
-    drawn = traces(open_run(recorded(rig, tmp_path / "run")))
+    drawn = traces(open_run(record_run(rig, tmp_path / "run")))
     assert drawn.portrait is None
     low, high = limits(MIN_FORCE_SPAN, drawn.fx, drawn.fy)
     assert high - low == pytest.approx(1.0)

@@ -21,14 +21,14 @@ Test = Callable[[PageServer, aiohttp.ClientSession], Coroutine[Any, Any, None]]
 
 
 @asynccontextmanager
-async def served() -> AsyncIterator[tuple[PageServer, aiohttp.ClientSession]]:
+async def run_server() -> AsyncIterator[tuple[PageServer, aiohttp.ClientSession]]:
     async with PageServer("127.0.0.1", 0) as server, aiohttp.ClientSession(server.url) as session:
         yield server, session
 
 
 def run(test: Test) -> None:
     async def run_all() -> None:
-        async with asyncio.timeout(20.0), served() as (server, session):
+        async with asyncio.timeout(20.0), run_server() as (server, session):
             await test(server, session)
 
     asyncio.run(run_all())
@@ -181,10 +181,10 @@ def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone(
                 await session.ws_connect("/live")
                 for _ in range(page_server.MAX_VIEWERS_PER_ADDRESS)
             ]
-            await refused(session)
+            await check_refused(session)
             while len(socks) < page_server.MAX_VIEWERS:
                 socks.append(await second_session.ws_connect("/live"))
-            await refused(second_session)
+            await check_refused(second_session)
             await socks[0].close()
             while True:
                 try:
@@ -201,7 +201,7 @@ def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone(
     run(test)
 
 
-async def refused(session: aiohttp.ClientSession) -> None:
+async def check_refused(session: aiohttp.ClientSession) -> None:
     with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
         await session.ws_connect("/live")
     assert refusal.value.status == 503

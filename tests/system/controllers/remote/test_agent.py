@@ -12,7 +12,7 @@ import pytest
 import zmq
 from rigs.harness import Rig
 from rigs.processes import PATIENCE, wait_until
-from rigs.scripted_agent import connected
+from rigs.scripted_agent import wait_for_connection
 
 from fishd.client import Agent, FishError, NoDaemon
 from fishd.core.errors import ParameterError
@@ -74,7 +74,7 @@ def test_a_pause_gives_the_observation_anew(agent: Agent) -> None:
 def test_the_newest_of_several_observations_counts(agent: Agent) -> None:
     rig = Rig("tick=0.02")
     rig.start("remote", agent=agent.address)
-    connected(rig)
+    wait_for_connection(rig)
     rig.run(20)  # no agent answers
     taken, lost = 0, 0
     while lost < 19:  # `lost` counts observations taken at once; some may still be in transit

@@ -11,13 +11,13 @@ import pytest
 from rigs.harness import LIMITS, Rig
 from rigs.scripted_agent import (
     ScriptedAgent,
-    answered,
-    arrived,
     connect,
-    connected,
     reason,
     remote,
+    run_answered_tick,
     swim,
+    wait_for_connection,
+    wait_for_message,
 )
 
 from fishd.config import load
@@ -79,7 +79,7 @@ def test_one_answer_in_time_forgives_the_silence_before(rig: Rig, agent: Scripte
     swim(rig, agent)
     for _ in range(6):
         assert {tick.phi_c for tick in rig.run(2)} == {0.0}
-        assert answered(rig, agent, 0.2).phi_c == 0.2
+        assert run_answered_tick(rig, agent, 0.2).phi_c == 0.2
     assert rig.mode == "running"
 
 
@@ -97,7 +97,7 @@ def test_a_late_action_is_for_no_other_tick(rig: Rig, agent: ScriptedAgent) -> N
     connect(rig, agent, deadline=0.02)
     for _ in range(10):
         agent.send(agent.action(0.3))  # the tick that asked is over
-        arrived(rig)
+        wait_for_message(rig)
         assert rig.run()[-1].phi_c == 0.0
         agent.drain()
     assert agent.seen[-1]["answered_seq"] == 0
@@ -129,11 +129,11 @@ def test_a_pause_is_neutral_silent_and_ends_when_it_is_told(rig: Rig, agent: Scr
     swim(rig, agent)
     before = agent.seen[-1]
     agent.send(agent.pause(100.0))
-    arrived(rig)
+    wait_for_message(rig)
     assert {tick.phi_c for tick in rig.run(50)} == {0.0}
     assert remote(rig)._seq == before["seq"]
     agent.send(agent.pause(0.0))
-    arrived(rig)
+    wait_for_message(rig)
     rig.run()
     fresh = agent.next()
     assert fresh["seq"] == before["seq"] + 1
@@ -158,7 +158,7 @@ def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> No
     swim(rig, agent)
     rig.retune(deadline=0.001)
     agent.send(agent.pause(1.0))
-    arrived(rig)
+    wait_for_message(rig)
     rig.run(5)
     assert rig.mode == "running"
     rig.run(2)
@@ -239,7 +239,7 @@ def test_before_the_first_action_an_agent_that_was_started_again_is_asked(
     connect(rig, agent)
     agent.close()
     with closing(ScriptedAgent(tmp_path)) as successor:
-        connected(rig)
+        wait_for_connection(rig)
         rig.run()
         assert successor.next()["answered_seq"] == 0
 

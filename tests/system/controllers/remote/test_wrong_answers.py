@@ -11,13 +11,13 @@ from rigs.harness import Rig
 from rigs.processes import PATIENCE, wait_until
 from rigs.scripted_agent import (
     ScriptedAgent,
-    answered,
-    arrived,
     connect,
-    connected,
     reason,
     remote,
+    run_answered_tick,
     swim,
+    wait_for_connection,
+    wait_for_message,
 )
 
 from fishd.core.agent_messages import Pause
@@ -36,7 +36,7 @@ def _ended(connection: socket.socket) -> bool:
     return False
 
 
-def spoiled(**changes: Any) -> dict[str, Any]:
+def make_action(**changes: Any) -> dict[str, Any]:
     return {"kind": "action", "v": 2, "session": "s", "seq": 1, "phi_c": 0.1, **changes}
 
 
@@ -47,10 +47,10 @@ def spoiled(**changes: Any) -> dict[str, Any]:
         (b'{"kind":"action","session":"\xff","seq":1,"phi_c":0.1}', "can't decode byte 0xff"),
         (b'{"a":' + 60_000 * b"[", "maximum recursion depth exceeded"),
         (b'{"kind":"action","v":2,"session":"s","seq":1,"phi_c":NaN}', "JSON is malformed"),
-        (spoiled(phi_c=None), "Expected `float`, got `null` - at `$.phi_c`"),
-        (spoiled(speed=1), "Object contains unknown field `speed`"),
-        (spoiled(kind="dance"), "Invalid value 'dance' - at `$.kind`"),
-        (spoiled(v=3, angle=1), "a message of version 3; this fishd needs version 2"),
+        (make_action(phi_c=None), "Expected `float`, got `null` - at `$.phi_c`"),
+        (make_action(speed=1), "Object contains unknown field `speed`"),
+        (make_action(kind="dance"), "Invalid value 'dance' - at `$.kind`"),
+        (make_action(v=3, angle=1), "a message of version 3; this fishd needs version 2"),
         ({"kind": "pause", "v": 2, "session": "s", "seconds": -1}, "Expected `float` >= 0"),
     ],
 )
@@ -59,7 +59,7 @@ def test_rubbish_is_a_fault_that_says_what_came(
 ) -> None:
     connect(rig, agent)
     agent.send(rubbish)
-    arrived(rig)
+    wait_for_message(rig)
     rig.run()
     assert rig.reason == "remote-error"
     assert f"the agent at {agent.address} sent " in reason(rig)
@@ -113,9 +113,9 @@ def test_frames_without_end_are_a_fault_and_nothing_of_them_is_kept(
     rig.start("remote", agent=raw.address)
     connection = raw.accept()
     connection.sendall(raw.GREETING + raw.READY)
-    connected(rig)
+    wait_for_connection(rig)
     connection.sendall(sent)
-    arrived(rig)
+    wait_for_message(rig)
     assert len(remote(rig)._wire._received) <= 2 * 65536
     rig.run()
     assert rig.reason == "remote-error"
@@ -142,7 +142,7 @@ def test_a_heartbeat_of_the_agent_is_answered(rig: Rig, raw: RawAgent) -> None:
     rig.start("remote", agent=raw.address)
     connection = raw.accept()
     connection.sendall(raw.GREETING + raw.READY)
-    connected(rig)
+    wait_for_connection(rig)
     connection.sendall(b"\x04\x09\x04PING\x00\x10ab")
     received = b""
     while not received.endswith(b"\x04\x07\x04PONGab"):
@@ -154,7 +154,7 @@ def test_heartbeats_of_an_agent_that_never_reads_take_no_memory(rig: Rig, raw: R
     rig.start("remote", agent=raw.address)
     connection = raw.accept()
     connection.sendall(raw.GREETING + raw.READY)
-    connected(rig)
+    wait_for_connection(rig)
     wire, heartbeats = remote(rig)._wire, 1000 * b"\x04\x09\x04PING\x00\x10ab"
     for _ in range(300):  # their answers are more than the kernel keeps
         connection.sendall(heartbeats)
@@ -170,7 +170,7 @@ def test_messages_that_come_byte_by_byte_are_put_together(rig: Rig, raw: RawAgen
     for byte in raw.GREETING + raw.READY + b"\x00" + bytes([len(payload)]) + payload:
         connection.sendall(bytes([byte]))
         remote(rig)._wire.state()
-    arrived(rig)
+    wait_for_message(rig)
     assert remote(rig)._wire.receive() == Pause(session="s", seconds=1.0)
 
 
@@ -187,7 +187,7 @@ def test_what_is_shown_of_a_bad_message_is_where_it_is_bad(
     session = connect(rig, agent)["session"].encode()
     head = b'{"kind":"action","v":2,' + fill * b" " + b'"session":"' + session + b'","seq":12,'
     agent.send(head + b'"phi_c":' + angle + b"}" + fill * b" ")
-    arrived(rig)
+    wait_for_message(rig)
     rig.run()
     assert shown.decode() in reason(rig)
     assert ("…" in reason(rig)) == bool(fill)
@@ -200,7 +200,7 @@ def test_an_action_for_what_was_not_sent_is_a_fault(
 ) -> None:
     assert connect(rig, agent)["seq"] == 1
     agent.send(agent.action(0.1, seq=seq))
-    arrived(rig)
+    wait_for_message(rig)
     assert rig.run()[-1].phi_c == 0.0
     assert rig.reason == "remote-error"
     assert f"an action for observation {seq}, which was never sent; the latest is 1" in reason(rig)
@@ -209,7 +209,7 @@ def test_an_action_for_what_was_not_sent_is_a_fault(
 def test_answers_of_another_session_are_told_from_late_ones(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent)
     swim(rig, agent)
-    assert {answered(rig, agent, 0.3, session="0123").phi_c for _ in range(5)} == {0.0}
+    assert {run_answered_tick(rig, agent, 0.3, session="0123").phi_c for _ in range(5)} == {0.0}
     assert rig.reason == "remote-silent"
     assert "5 ticks in a row (5 were for another session)" in reason(rig)
 
@@ -218,7 +218,7 @@ def test_before_the_first_action_wrong_answers_count_too(rig: Rig, agent: Script
     connect(rig, agent, first_action=2.0)
     for _ in range(9):
         assert rig.mode == "running"
-        answered(rig, agent, 0.3, session="0123")
+        run_answered_tick(rig, agent, 0.3, session="0123")
     assert rig.reason == "remote-silent"
     assert "no action has come in time from the agent at" in reason(rig)
     assert "(9 were for another session)" in reason(rig)

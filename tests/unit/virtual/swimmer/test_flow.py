@@ -64,7 +64,7 @@ def test_a_vortex_ages_at_the_right_rate() -> None:
     assert flow.vorticity().max() / before == pytest.approx((2.5 / 3.75) ** 2, rel=0.02)
 
 
-def lost_way(cells: int) -> float:
+def measure_advection_error(cells: int) -> float:
     """Return the relative error of a vortex after advection by a stream."""
     dt = 0.2 / cells
     flow, right = Flow(box(cells), NU, "slip"), Flow(box(cells), NU, "slip")
@@ -76,7 +76,7 @@ def lost_way(cells: int) -> float:
 
 
 def test_what_a_stream_carries_along_gets_there_with_an_error_of_third_order() -> None:
-    assert lost_way(48) / lost_way(96) > 6.0
+    assert measure_advection_error(48) / measure_advection_error(96) > 6.0
 
 
 def test_a_grid_that_travels_with_the_stream_sees_the_same_water() -> None:

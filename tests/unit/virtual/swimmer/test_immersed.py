@@ -60,7 +60,7 @@ def test_water_and_body_together_keep_their_momentum(excess: float) -> None:
         assert momentum(body) - before == pytest.approx(gained, abs=1e-12)
 
 
-def swung(steps: int) -> float:
+def compute_bend(steps: int) -> float:
     """Return the bend after 0.1 s [rad]."""
     body = swimmer()
     forces = bend(body, 10.0)
@@ -70,8 +70,8 @@ def swung(steps: int) -> float:
 
 
 def test_it_bends_as_far_however_short_the_steps() -> None:
-    assert swung(25) > 0.2
-    assert swung(400) == pytest.approx(swung(50), rel=0.05)
+    assert compute_bend(25) > 0.2
+    assert compute_bend(400) == pytest.approx(compute_bend(50), rel=0.05)
 
 
 @pytest.mark.parametrize("excess", [-200.0, 0.0, 7000.0])
