@@ -37,7 +37,7 @@ class Alignment(NamedTuple):
 
     motion: Motion
     place: Place
-    good: bool
+    is_aligned: bool
     advice: tuple[str, ...]
     """Instructions, one line each; empty where the alignment is good."""
     settings: dict[str, object]
@@ -63,7 +63,7 @@ def judge(motion: Motion, picture: tuple[int, int], settings: CameraSettings) ->
         )
         return Alignment(motion, place, False, tuple(advice), new_settings)
     axis = motion.axis
-    if not motion.sure:
+    if not motion.is_certain:
         advice.append(
             "the axis lies at the edge of the search range, and may be further off or steeper: "
             "turn or move the camera, then align again"
@@ -89,7 +89,7 @@ def judge(motion: Motion, picture: tuple[int, int], settings: CameraSettings) ->
                 value = round(getattr(crop, name), 3)
                 if value != round(getattr(settings.picture.crop, name), 3):
                     new_settings[f"picture.crop.{name}"] = value
-    good = level and centred and motion.sure and not edges
+    good = level and centred and motion.is_certain and not edges
     return Alignment(motion, place, good, tuple(advice), new_settings)
 
 

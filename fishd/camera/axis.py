@@ -68,7 +68,7 @@ class Motion(NamedTuple):
     axis: Axis
     centre: float
     """Column of the centre of the motion [px]."""
-    sure: bool = True
+    is_certain: bool = True
     """False where the axis lies at the edge of the search range, and may lie outside it."""
 
 

@@ -59,7 +59,7 @@ class Latency(NamedTuple):
 
     stamps: float
     """Delay of a frame's time stamp after the middle of its exposure [s]."""
-    error: float
+    ci95: float
     """Half-width of the 95 % confidence interval of `stamps`, from a jackknife [s]."""
     arrival: float
     """Mean time from a frame's time stamp until the frame is available [s]."""
@@ -108,11 +108,11 @@ def find_latency(frames: Sequence[Frame], forces: Sequence[Force]) -> Latency:
         _Fit(angle, times[kept], position[kept]).near(delay, log_rate)[0]
         for kept in _all_but_one_part(len(times))
     ]
-    error = _STUDENT * math.sqrt((JACKKNIFE_PARTS - 1) * float(np.var(left_out)))
+    ci95 = _STUDENT * math.sqrt((JACKKNIFE_PARTS - 1) * float(np.var(left_out)))
     late = [frame.available - frame.time for frame in inside]
     return Latency(
         stamps=delay,
-        error=error,
+        ci95=ci95,
         arrival=float(np.mean(late)),
         latest=float(np.quantile(late, 0.99)),
         agreement=agreement,

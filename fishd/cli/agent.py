@@ -180,8 +180,8 @@ class _Swim:
                     "frequency": observation.frequency,
                     "thrust": observation.thrust,
                     "fullness": fullness,
-                    "unseen": self._blind_ticks,
-                    "lost": self._late_ticks,
+                    "ticks_without_frames": self._blind_ticks,
+                    "late_ticks": self._late_ticks,
                     "ticks": len(self._angles),
                 }
             )

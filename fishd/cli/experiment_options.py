@@ -276,12 +276,14 @@ def restore_arguments(context: click.Context, args: list[str]) -> list[str]:
     folder = next((b for a, b in pairwise(args) if a == "--resume"), None)
     folder = folder or next((a[9:] for a in args if a.startswith("--resume=")), None)
     if folder is not None and (not args or args[0].startswith("-")):
+        from fishd.core.old_names import OLD_OPTIONS
+
         header = _read_header(Path(folder))
         if header.kind != verb_words(context):
             raise click.UsageError(
                 f"--resume {folder}: it is of another verb: fishctl {header.kind} --resume {folder}"
             )
-        args = [*header.command, *args]
+        args = [*(OLD_OPTIONS.get(word, word) for word in header.command), *args]
     context.meta[_COMMAND] = list(_without_run_options(args))
     return args
 

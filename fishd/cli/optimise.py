@@ -47,7 +47,7 @@ def optimise_options(function: Any) -> Any:
         fish_choice,
         folder_options,
         click.option(
-            "--at-least",
+            "--target-thrust",
             type=FiniteRange(min=0.0, min_open=True),
             metavar="MN",
             help="Thrust to reach [mN]: find the parameters that give it at the least power.",
@@ -60,7 +60,7 @@ def optimise_options(function: Any) -> Any:
         ),
         seed_option("the search"),
         click.option(
-            "--until",
+            "--min-gain",
             type=FiniteRange(0.0, 1.0),
             default=0.01,
             show_default=True,
@@ -102,10 +102,10 @@ def _optimise(
     parameters: dict[str, Any],
     over: tuple[str, ...],
     budget: float,
-    until: float,
+    min_gain: float,
     seed: int,
     objective: Literal["thrust", "thrust-per-watt"] | None,
-    at_least: float | None,
+    target_thrust: float | None,
     place: ExperimentFolder,
     fish: ChosenFish,
     picture: Path | None,
@@ -118,9 +118,11 @@ def _optimise(
     drawing.check_installed()
     if picture:
         drawing.check(picture)
-    if objective and at_least:
-        raise click.UsageError("--objective and --at-least exclude each other: give one of them")
-    aim = Aim(objective or "thrust", at_least * 1e-3 if at_least else None)
+    if objective and target_thrust:
+        raise click.UsageError(
+            "--objective and --target-thrust exclude each other: give one of them"
+        )
+    aim = Aim(objective or "thrust", target_thrust * 1e-3 if target_thrust else None)
     with fish.session() as session:
         ranges = [_parse_range(text, name, parameters, session) for text in dict.fromkeys(over)]
         search = aim.make_search(ranges, seed)
@@ -140,7 +142,7 @@ def _optimise(
         with place.open(fish, session.config, settings, session.unit) as experiment:
             fish.announce(as_json)
             return _Optimisation(
-                name, parameters, search, budget, until, aim, session, experiment, fish, as_json
+                name, parameters, search, budget, min_gain, aim, session, experiment, fish, as_json
             ).run(picture)
 
 
@@ -168,7 +170,7 @@ class _Optimisation:
     """Parameters that are not searched."""
     search: "Search | LeastPower"
     budget: float
-    until: float
+    min_gain: float
     aim: "Aim"
     session: "Session"
     experiment: "Experiment"
@@ -216,15 +218,15 @@ class _Optimisation:
         if not self._is_done(proposal):
             echo(
                 f"fishctl: the budget of {self.budget:g} s is used up: another candidate is "
-                f"expected to give {proposal.improvement:.1%} more, --until is {self.until:.1%}. "
-                f"To continue: {self.experiment.resume_command} --budget SECONDS",
+                f"expected to give {proposal.improvement:.1%} more, --min-gain is "
+                f"{self.min_gain:.1%}. To continue: {self.experiment.resume_command} --budget SECONDS",
                 err=True,
             )
             return 1
         return 0
 
     def _is_done(self, proposal: "Proposal") -> bool:
-        return self.search.is_warm and proposal.improvement <= self.until
+        return self.search.is_warm and proposal.improvement <= self.min_gain
 
     def _measure(self, ending: ExperimentEnding) -> float:
         """Measure candidates until the search is done; those in the table are kept.
@@ -363,7 +365,7 @@ class Optimum(Struct, frozen=True):
     """Tank time, rests included [s]."""
     objective: str = "thrust"
     target: float | None = None
-    """Thrust to reach [N]; null without --at-least."""
+    """Thrust to reach [N]; null without --target-thrust."""
     power: float | None = None
     """Electrical power of the servo [W]; null if unknown."""
     power_ci95: float | None = None

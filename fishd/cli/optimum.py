@@ -119,8 +119,8 @@ def _control_rows(control: "OptimalControl") -> list[tuple[str, str]]:
     return [
         ("control", f"{1e3 * control.thrust:.3f} mN at {control.frequency:.3f} Hz"),
         ("", f"{control.ratio:.2%} of the best square wave"),
-        ("", f"|φ_c| = Φ in {control.full:.1%} of the time"),
-        ("", f"on the side of the costate in {control.agreement:.1%} of the time"),
+        ("", f"|φ_c| = Φ in {control.saturated_fraction:.1%} of the time"),
+        ("", f"on the side of the costate in {control.costate_agreement:.1%} of the time"),
     ]
 
 

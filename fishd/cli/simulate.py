@@ -163,10 +163,10 @@ def _power_rows(report: "Report") -> list[tuple[str, str]]:
 
 def _format_takeover(report: "Report", settle: float) -> str:
     """Return until when the requested controller swam, if another one took over."""
-    if report.took_over is None:
+    if report.took_over_at is None:
         return ""
-    note = "whose figures these are" if report.took_over <= settle else "the figures are of both"
-    return f"until {report.took_over:.2f} s, then {report.successor}; {note}"
+    note = "whose figures these are" if report.took_over_at <= settle else "the figures are of both"
+    return f"until {report.took_over_at:.2f} s, then {report.successor}; {note}"
 
 
 def _criterion_rows(report: "Report") -> list[tuple[str, str]]:

@@ -144,7 +144,7 @@ def press(file: Path | None, overrides: tuple[str, ...]) -> None:
 
 @virtual_pi.command()
 @fish_options
-def unpress(file: Path | None, overrides: tuple[str, ...]) -> None:
+def release_button(file: Path | None, overrides: tuple[str, ...]) -> None:
     """Release the E-stop button."""
     _set_button(load(file, overrides), pressed=False)
 

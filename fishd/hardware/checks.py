@@ -19,7 +19,7 @@ class Result(NamedTuple):
 
     level: Level
     message: str
-    mend: str = ""
+    remedy: str = ""
 
 
 class Machine(ABC):
@@ -78,14 +78,14 @@ def ok(message: str) -> Result:
     return Result("ok", message)
 
 
-def warning(message: str, mend: str) -> Result:
+def warning(message: str, remedy: str) -> Result:
     """Return the result of a check of something that works but could be better."""
-    return Result("warning", message, mend)
+    return Result("warning", message, remedy)
 
 
-def fail(message: str, mend: str) -> Result:
+def fail(message: str, remedy: str) -> Result:
     """Return the result of a check that failed: the robot cannot work."""
-    return Result("FAIL", message, mend)
+    return Result("FAIL", message, remedy)
 
 
 def skipped(message: str) -> Result:

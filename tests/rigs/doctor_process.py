@@ -18,7 +18,7 @@ def doctor(
     ended = call(*under, FISHCTL, *verb, env=os.environ | env) if apart else fishctl(*verb)
     assert ended.stderr == ""
     findings = json.loads(ended.stdout)
-    assert all(bool(f["mend"]) == (f["level"] in ("warning", "FAIL")) for f in findings)
+    assert all(bool(f["remedy"]) == (f["level"] in ("warning", "FAIL")) for f in findings)
     assert not any("broke off" in finding["message"] for finding in findings)
     return ended.returncode, {f["check"]: (f["level"], f["message"]) for f in findings}
 

@@ -24,7 +24,7 @@ def examiner(root: Path) -> Examine:
         )
         if result is None:
             return "", "", ""
-        assert bool(result.mend) == (result.level in ("warning", "FAIL"))
+        assert bool(result.remedy) == (result.level in ("warning", "FAIL"))
         return tuple(result)
 
     return make

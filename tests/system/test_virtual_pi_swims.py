@@ -60,7 +60,7 @@ def test_the_button_of_the_panel_stops_the_pulses_until_it_is_released_and_the_s
         daemon.fishctl("clear-fault")
         while "button is pressed" not in daemon.fishctl("status", "--json").stdout:  # not: was
             ticks.message()
-        pi.control("unpress")
+        pi.control("release-button")
         for _ in range(100):  # until fishd has read the pin
             daemon.fishctl("clear-fault")
             if [ticks.message()["mode"] for _ in range(5)] == ["idle"] * 5:

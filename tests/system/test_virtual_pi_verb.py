@@ -95,7 +95,7 @@ def test_the_button_of_the_configuration_is_pressed_and_let_go(pi: Pi) -> None:
     pi.control("press")
     with RemotePi(pi.path) as remote:
         assert remote.state().levels == {17: 1}
-        pi.control("unpress")
+        pi.control("release-button")
         assert remote.state().levels == {17: 0}
     done = fishctl("virtual-pi", "press", "--set", f"virtual_pi.socket={pi.path}")
     assert done.returncode == 1

@@ -63,7 +63,7 @@ class Swum(NamedTuple):
     """Thrust over that of the best square wave; 0 after a fault."""
     best: float
     """Thrust of the best square wave [N]."""
-    shaken: float
+    longest_chatter_s: float
     """Longest series of reversals in consecutive ticks [s]."""
     troubled: bool
     """Whether the run ended in a fault, or another controller took over."""
@@ -90,8 +90,8 @@ def swim(case: tuple[OtherFish, int | None, Way]) -> Swum:
     )
     share = 0.0 if report.reason else report.relative_thrust
     troubled = bool(report.reason or report.fallback)
-    shaken = reversals.longest(1.5 * config.tick)
-    return Swum(share, report.best_square_thrust, shaken, troubled)
+    longest_chatter_s = reversals.longest(1.5 * config.tick)
+    return Swum(share, report.best_square_thrust, longest_chatter_s, troubled)
 
 
 def swing() -> tuple[list[Row], Sequence[Way]]:
@@ -269,8 +269,10 @@ def _measure(
         best = statistics.median(swum.best for swum in own[0])
         lines.append([row.name, f"{1e3 * best:.2f}", *(_cell(row, column) for column in own)])
     columns = [[swum for key, swum in swims if key[3] == way] for way in ways]
-    shaken = [f"{max(swum.shaken for swum in column):.1f}" for column in columns]
-    lines.append(["reversals in consecutive ticks, at most, s", "", *shaken])
+    longest_chatter_s = [
+        f"{max(swum.longest_chatter_s for swum in column):.1f}" for column in columns
+    ]
+    lines.append(["reversals in consecutive ticks, at most, s", "", *longest_chatter_s])
     trouble = [str(sum(swum.troubled for swum in column)) for column in columns]
     lines.append(["runs with a fault or another controller", "", *trouble])
     head = " | ".join(["fish", "best square wave, mN", *(way.name for way in ways)])

@@ -50,8 +50,8 @@ def compute(jobs: int) -> None:
             "best_square_thrust_mN": 1e3 * control.best_square.thrust,
             "best_square_frequency_Hz": control.best_square.frequency,
             "thrust_over_best_square": control.ratio,
-            "share_of_time_at_limit": control.full,
-            "share_of_time_on_side_of_costate": control.agreement,
+            "share_of_time_at_limit": control.saturated_fraction,
+            "share_of_time_on_side_of_costate": control.costate_agreement,
         }
         for (xi, _), control in zip(REFERENCES, controls, strict=True)
     ]

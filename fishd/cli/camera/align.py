@@ -141,7 +141,7 @@ def _print_alignment(alignment: "Alignment", frames: int) -> None:
             ("from", f"{frames} frames"),
         ]
     )
-    if alignment.good:
+    if alignment.is_aligned:
         echo("well aligned")
     for line in alignment.advice:
         echo(line)
@@ -159,8 +159,8 @@ def _to_json(alignment: "Alignment", frames: int) -> dict[str, Any]:
         "tilt": axis.tilt,
         "motion": alignment.place._asdict(),
         "frames": frames,
-        "sure": alignment.motion.sure,
-        "good": alignment.good,
+        "is_certain": alignment.motion.is_certain,
+        "is_aligned": alignment.is_aligned,
         "advice": alignment.advice,
         "settings": alignment.settings,
     }

@@ -88,7 +88,7 @@ def force_windows(ticks: list["Tick"], period: float) -> list["Force"]:
 
 
 def _print_latency(delays: "Latency", clock_error: float, settings: "CameraSettings") -> None:
-    error = f"± {delays.error * 1e3:.1f} ms"
+    error = f"± {delays.ci95 * 1e3:.1f} ms"
     echo_rows(
         [
             ("delay", f"{delays.total * 1e3:.1f} {error}, from exposure until the frame is there"),
@@ -122,7 +122,7 @@ def suggest_stack_delay(delays: "Latency") -> float:
 def suggest_settings(delays: "Latency", settings: "CameraSettings") -> list[str]:
     """Return lines that say which settings to write into which file, in YAML, if any."""
     lines = []
-    if abs(delays.stamps) > max(delays.error, 1e-3):
+    if abs(delays.stamps) > max(delays.ci95, 1e-3):
         if settings.source == "simulated":
             lines.append("the stamps of a simulated camera are exact: this is an error of the fit")
         else:
@@ -146,13 +146,13 @@ def suggest_settings(delays: "Latency", settings: "CameraSettings") -> list[str]
 def _to_json(delays: "Latency", clock_error: float, settings: "CameraSettings") -> dict[str, Any]:
     return {
         "delay": delays.total,
-        "error": delays.error,
+        "ci95": delays.ci95,
         "stamps": delays.stamps,
         "arrival": delays.arrival,
         "latest": delays.latest,
         "agreement": delays.agreement,
         "frames": delays.frames,
-        "clocks": clock_error,
+        "clock_error": clock_error,
         "stack_delay": round(suggest_stack_delay(delays), 3),
         "advice": suggest_settings(delays, settings),
     }

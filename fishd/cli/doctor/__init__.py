@@ -59,8 +59,8 @@ def doctor(
 def _print(name: str, result: Result) -> None:
     level = click.style(f"{result.level:<8}", fg=_COLOURS[result.level])
     click.echo(f"{level} {name:<14} {result.message}")
-    if result.mend:
-        echo(f"{'':<24}{result.mend}")
+    if result.remedy:
+        echo(f"{'':<24}{result.remedy}")
 
 
 def checks(context: Context) -> Iterator[Check]:
@@ -85,8 +85,8 @@ def examine(context: Context) -> Iterator[tuple[str, Result]]:
             with driver_packages():
                 result = check.function(context)
         except MissingPackage as error:
-            mend = INSTALL if "fishd[pi]" in str(error) else f"{sys.executable} -m pip install it"
-            result = fail(str(error), mend)
+            remedy = INSTALL if "fishd[pi]" in str(error) else f"{sys.executable} -m pip install it"
+            result = fail(str(error), remedy)
         except Exception as error:
             message = f"this check broke off: {type(error).__name__}: {error}"
             result = fail(message, "please report this, with the output of 'fishctl doctor --json'")

@@ -151,10 +151,10 @@ def disk(context: Context) -> Result:
     parent = _visible_folder(state_folder(context.config))
     free = shutil.disk_usage(parent).free
     message = f"{free / 1e9:.1f} GB free at {parent}"
-    mend = "remove old recordings and logs (journalctl --vacuum-size=100M)"
+    remedy = "remove old recordings and logs (journalctl --vacuum-size=100M)"
     if free < FULL_DISK_BYTES:
-        return fail(message, mend)
-    return warning(message, mend) if free < LOW_DISK_BYTES else ok(message)
+        return fail(message, remedy)
+    return warning(message, remedy) if free < LOW_DISK_BYTES else ok(message)
 
 
 def calibrations(context: Context) -> Result:
@@ -175,8 +175,8 @@ def calibrations(context: Context) -> Result:
         result = _judge_calibrations(force, newest_servo[0].date if newest_servo else "")
     with suppress(ConfigError):  # the folder of a running fishd may be unreadable
         if ignored := folder.ignored():
-            mend = result.mend or "restore its name, or move it away"
-            return warning("; ".join([result.message, *ignored]), mend)
+            remedy = result.remedy or "restore its name, or move it away"
+            return warning("; ".join([result.message, *ignored]), remedy)
     return result
 
 

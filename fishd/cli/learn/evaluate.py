@@ -65,8 +65,8 @@ def evaluate(
     A contestant is a policy by name or file, or a controller with parameters, as for `fishctl
     compare`. Figures are fractions of the true thrust of the best square wave of the same fish. The
     fish differ from the configured one by the keys that --json shows. "another took over" counts
-    the runs in which a policy was replaced because it kept reversing too fast; "shaken" is the
-    longest stretch of reversals in consecutive ticks.
+    the runs in which a policy was replaced because it kept reversing too fast; "longest
+    chatter" is the longest stretch of reversals in consecutive ticks.
     Exit status 1 when a run ends in mode fault.
     """
     from fishd.lab.compare.contestants import parse
@@ -120,5 +120,5 @@ def _build_table(surveys: "list[ContestantSurvey]", singles: int) -> "Table":
         table.add_row(name, *(figure(surveyed.fish) for surveyed in surveys))
 
     add_figure("another took over", lambda row: f"{sum(run.fallback is not None for run in row)}")
-    add_figure("shaken, at most", lambda row: f"{max(run.shaken for run in row):.1f} s")
+    add_figure("longest chatter", lambda row: f"{max(run.longest_chatter_s for run in row):.1f} s")
     return table

@@ -230,12 +230,12 @@ def _pigpiod(machine: Machine, settings: PigpioSettings) -> Result:
     except ServoError as error:
         is_frozen = "answer" in str(error)
         if virtual:
-            mend = f"{START_VIRTUAL_PI}; its port must be that of servo.port"
+            remedy = f"{START_VIRTUAL_PI}; its port must be that of servo.port"
         elif is_frozen:
-            mend = "sudo systemctl restart pigpiod"
+            remedy = "sudo systemctl restart pigpiod"
         else:
-            mend = _start_pigpiod(machine)
-        return fail(str(error), mend)
+            remedy = _start_pigpiod(machine)
+        return fail(str(error), remedy)
     message = f"version {version} answers in {duration * 1e3:.2f} ms"
     if duration > SLOW_ANSWER_S:
         return warning(f"{message}: too slow for a tick", "find out what else loads this machine")

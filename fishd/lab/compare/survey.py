@@ -122,7 +122,7 @@ class FishResult(Struct, frozen=True, kw_only=True):
     """Mean thrust [N]."""
     frequency: float
     """Frequency of the tail beat [Hz]."""
-    shaken: float
+    longest_chatter_s: float
     """Length of the longest series of reversals in consecutive ticks [s]."""
     fallback: str | None
     """Reason why the fallback took over; None if not. The results include its swimming."""
@@ -209,7 +209,7 @@ def survey(
                     relative_thrust=report.relative_thrust,
                     thrust=report.mean_thrust,
                     frequency=report.frequency,
-                    shaken=reversals.longest(1.5 * config.tick),
+                    longest_chatter_s=reversals.longest(1.5 * config.tick),
                     fallback=report.fallback.message if report.fallback else None,
                     fault=report.reason.message if report.reason else None,
                 )

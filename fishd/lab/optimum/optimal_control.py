@@ -63,9 +63,9 @@ class OptimalControl:
     """Tail beats per second [Hz]; a period may contain several beats."""
     thrust: float
     """Mean F_x over the period, integrated by the simulated fish [N]."""
-    full: float
+    saturated_fraction: float
     """Fraction of the time in which |φ_c| = Φ, to 0.1 %."""
-    agreement: float
+    costate_agreement: float
     """Fraction of the time in which φ_c has the sign of the costate, as Pontryagin requires."""
     best_square: SteadyState
     """Best square wave of the same fish and amplitude."""
@@ -282,8 +282,8 @@ def _simulate_optimum(problem: _Problem, climb: _Climb, best_square: SteadyState
         period=climb.period,
         frequency=0.5 * reversals / climb.period,
         thrust=float(np.mean(force)),
-        full=float(np.mean(np.abs(share) > 1.0 - _FULL_TOLERANCE)),
-        agreement=float(np.mean(side == np.sign(costate))),
+        saturated_fraction=float(np.mean(np.abs(share) > 1.0 - _FULL_TOLERANCE)),
+        costate_agreement=float(np.mean(side == np.sign(costate))),
         best_square=best_square,
     )
 

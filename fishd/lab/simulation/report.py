@@ -61,7 +61,7 @@ class Report(Struct, frozen=True):
     """Name of the controller that took over; None if there was none."""
     quantities: dict[str, float]
     """Quantities of the controller at the end."""
-    took_over: float | None
+    took_over_at: float | None
     """Time when the fallback took over [s]; if before settling, the figures are its own."""
     microseconds_per_tick: float
     """Mean computing time of a tick on this machine, after settling [µs]."""
@@ -136,7 +136,7 @@ def judge(
     ticks, first = count_ticks(seconds, settle, config.tick)
     beats = Beats()
     since = 0.0
-    took_over: float | None = None
+    took_over_at: float | None = None
     with VirtualRun(config, publisher) as virtual:
         on_start(virtual)
         virtual.loop.set_controller(name, controller)
@@ -145,8 +145,8 @@ def judge(
                 since = time.perf_counter()
             angle = virtual.loop.applied
             window = virtual.tick()
-            if virtual.loop.active.fallback and took_over is None:
-                took_over = index * config.tick
+            if virtual.loop.active.fallback and took_over_at is None:
+                took_over_at = index * config.tick
             if index >= first:
                 beats.add(angle, window)
         elapsed = time.perf_counter() - since
@@ -179,7 +179,7 @@ def judge(
         fallback=fallback,
         successor=successor,
         quantities=quantities,
-        took_over=took_over,
+        took_over_at=took_over_at,
         microseconds_per_tick=elapsed / (ticks - first) * 1e6,
         real_time_factor=(ticks - first) * config.tick / elapsed,
     )

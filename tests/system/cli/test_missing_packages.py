@@ -78,7 +78,7 @@ def test_no_check_of_doctor_breaks_off(pi: Bench, env: dict[str, str]) -> None:
     for name in ("adc", "force", "pigpiod"):
         assert findings[name]["level"] == "FAIL"
         assert findings[name]["message"].endswith(" is missing; install fishd[pi]")
-        assert findings[name]["mend"].endswith("-m pip install 'fishd[pi]'")
+        assert findings[name]["remedy"].endswith("-m pip install 'fishd[pi]'")
     assert "ModuleNotFoundError" not in ended.stdout
     assert "broke off" not in ended.stdout
 

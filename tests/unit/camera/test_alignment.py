@@ -37,7 +37,7 @@ def turned(quarters: int) -> Pixels:
 
 def test_a_camera_that_stands_well_is_left_alone() -> None:
     alignment = judge_pictures(pictures())
-    assert (alignment.good, alignment.advice, alignment.settings) == (True, (), {})
+    assert (alignment.is_aligned, alignment.advice, alignment.settings) == (True, (), {})
     assert 20 < alignment.place.left < alignment.place.right < 75
     assert alignment.place.top < 42 < alignment.place.bottom
 
@@ -45,7 +45,7 @@ def test_a_camera_that_stands_well_is_left_alone() -> None:
 @pytest.mark.parametrize(("tilt", "way"), [(0.1, "clockwise"), (-0.05, "counter-clockwise")])
 def test_a_tilted_camera_is_turned_by_its_tilt(tilt: float, way: str) -> None:
     alignment = judge_pictures(pictures(tilt=tilt))
-    assert not alignment.good
+    assert not alignment.is_aligned
     assert f"turn the camera {way}, as seen from behind it, by " in alignment.advice[0]
     degrees = float(alignment.advice[0].split()[-1].rstrip("°"))
     assert degrees == pytest.approx(abs(math.degrees(tilt)), abs=0.6)
@@ -77,13 +77,13 @@ def test_a_fish_that_lies_otherwise_is_turned_with_its_head_to_the_left(
         turned(quarters), replace(V4L2, picture=PictureSettings(rotate=rotate))
     )
     assert alignment.settings == {"picture.rotate": (rotate + 360 - 90 * quarters) % 360}
-    assert not alignment.good
+    assert not alignment.is_aligned
     assert "head to the left: turn it" in alignment.advice[-1]
 
 
 def test_a_tail_that_leaves_the_picture_is_said_to() -> None:
     alignment = judge_pictures(pictures()[:, 33:51, :56])
-    assert not alignment.good
+    assert not alignment.is_aligned
     assert alignment.advice[0].startswith(
         "the motion is cut off at the upper edge and the lower edge and the right"
     )
@@ -91,8 +91,8 @@ def test_a_tail_that_leaves_the_picture_is_said_to() -> None:
 
 def test_an_axis_at_the_edge_of_what_is_looked_at_is_said_to_be_unsure() -> None:
     motion = find_motion(pictures())
-    alignment = judge(motion._replace(sure=False), VGA, V4L2)
-    assert not alignment.good
+    alignment = judge(motion._replace(is_certain=False), VGA, V4L2)
+    assert not alignment.is_aligned
     assert "may be further off or steeper" in alignment.advice[0]
 
 

@@ -38,12 +38,12 @@ def test_the_axis_is_found_within_a_quarter_of_a_pixel(
 def test_a_steep_axis_is_found_too(rig: SimulatedCameraSettings, slope: float) -> None:
     motion = find_motion(swinging(replace(rig, tilt=slope)))
     assert math.tan(motion.axis.tilt) == pytest.approx(slope, abs=0.03)
-    assert motion.sure
+    assert motion.is_certain
 
 
 @pytest.mark.parametrize("off", [-30.0, 30.0])
 def test_an_axis_beyond_what_is_looked_at_is_not_sure(off: float) -> None:
-    assert not find_motion(swinging(replace(DEFAULT, off_axis=off), amplitude=0.1)).sure
+    assert not find_motion(swinging(replace(DEFAULT, off_axis=off), amplitude=0.1)).is_certain
 
 
 def test_a_tail_that_rests_has_no_axis() -> None:

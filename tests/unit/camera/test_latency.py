@@ -41,8 +41,8 @@ def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_ar
     latency = find_latency(stamped_late(film(camera), late), felt(ticks))
     assert latency.stamps == pytest.approx(late, abs=within)
     assert latency.total == pytest.approx(camera.latency, abs=within + 1e-3)
-    assert abs(latency.stamps - late) < 1.5 * latency.error
-    assert latency.error < 3e-3
+    assert abs(latency.stamps - late) < 1.5 * latency.ci95
+    assert latency.ci95 < 3e-3
     assert latency.agreement > 0.95
 
 

@@ -41,8 +41,8 @@ def test_an_amplitude_that_is_not_positive_is_refused() -> None:
 
 def is_bang_bang(control: OptimalControl) -> bool:
     return (
-        control.full >= 0.98
-        and control.agreement >= 0.98
+        control.saturated_fraction >= 0.98
+        and control.costate_agreement >= 0.98
         and control.ratio == pytest.approx(1.0, abs=0.005)
         and control.frequency == pytest.approx(control.best_square.frequency, rel=0.01)
     )

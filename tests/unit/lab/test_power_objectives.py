@@ -114,7 +114,7 @@ def test_optimise_finds_the_frequency_that_gives_most_for_each_watt(tmp_path: Pa
 
 @pytest.mark.slow
 def test_optimise_finds_the_slowest_beat_that_gives_a_thrust(tmp_path: Path) -> None:
-    optimum = _run_optimise(tmp_path, "--at-least", "15")
+    optimum = _run_optimise(tmp_path, "--target-thrust", "15")
     assert (optimum["objective"], optimum["target"]) == ("least-power", 0.015)
     assert optimum["parameters"] == {"frequency": pytest.approx(1.0)}
     assert optimum["true_thrust"] > 0.015
@@ -123,7 +123,7 @@ def test_optimise_finds_the_slowest_beat_that_gives_a_thrust(tmp_path: Path) -> 
 def test_two_aims_are_one_too_many() -> None:
     done = fishctl(
         *("optimise", "square", "--over", "frequency", "--on", "simulation"),
-        *("--objective", "thrust", "--at-least", "15"),
+        *("--objective", "thrust", "--target-thrust", "15"),
     )
     assert "exclude each other: give one of them" in one_line(done)
 

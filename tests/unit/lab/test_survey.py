@@ -33,8 +33,8 @@ def test_it_tells_who_shook_the_servo_and_who_lost_command(tmp_path: Path) -> No
     configs = [(free, load(None, ["chatter.dwell=0"])), (limited, load(None))]
     (flip,) = survey(configs, [policy], 8.0, 3.0)
     shaken, held = flip.fish
-    assert (shaken.shaken, shaken.fallback) == (pytest.approx(8.0, abs=0.2), None)
-    assert held.shaken == 0.0
+    assert (shaken.longest_chatter_s, shaken.fallback) == (pytest.approx(8.0, abs=0.2), None)
+    assert held.longest_chatter_s == 0.0
     assert held.fallback is not None
     assert held.fallback.startswith("ppo gave up")
 
