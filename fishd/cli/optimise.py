@@ -219,7 +219,8 @@ class _Optimisation:
             echo(
                 f"fishctl: the budget of {self.budget:g} s is used up: another candidate is "
                 f"expected to give {proposal.improvement:.1%} more, --min-gain is "
-                f"{self.min_gain:.1%}. To continue: {self.experiment.resume_command} --budget SECONDS",
+                f"{self.min_gain:.1%}. "
+                f"To continue: {self.experiment.resume_command} --budget SECONDS",
                 err=True,
             )
             return 1

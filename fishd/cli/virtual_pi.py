@@ -89,7 +89,7 @@ def run(file: Path | None, overrides: tuple[str, ...]) -> None:
 @for_option("Duration of the fault [s]; by default it lasts until 'clear'.", kind=click.FLOAT)
 @fish_options
 def inject(name: str, seconds: float | None, file: Path | None, overrides: tuple[str, ...]) -> None:
-    """Begin the fault NAME; 'fishctl virtual-pi faults' lists them."""
+    """Begin the fault NAME; 'virtual-pi faults' lists them."""
     with _connect(load(file, overrides)) as pi:
         pi.inject(name, seconds)
 
@@ -118,7 +118,7 @@ def faults(as_json: bool) -> None:
 @fish_options
 @json_option
 def status(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> None:
-    """Show pulses, fish and faults of the virtual Pi that is running."""
+    """Show pulses, fish and faults of the running virtual Pi."""
     with _connect(load(file, overrides)) as pi:
         state = pi.state()
     if as_json:
