@@ -4,7 +4,6 @@ python tools/config_reference.py --write
 python tools/config_reference.py --check     exits with 1 when they are out of date
 """
 
-import argparse
 import inspect
 import sys
 from collections.abc import Iterator
@@ -12,7 +11,7 @@ from collections.abc import Iterator
 import yaml
 from msgspec import Struct
 
-from common.report import DOCS, between, put, table
+from common.report import table, write_reference
 from fishd.camera.settings import CameraSettings
 from fishd.config import Config
 from fishd.config.drivers import CHOICES
@@ -104,24 +103,6 @@ def _to_yaml(value: object) -> str:
     return text.removesuffix("\n").removesuffix("\n...")
 
 
-def main() -> int:
-    """Print, write or check the tables, and return the exit status."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--write", action="store_true", help="put them into docs/")
-    parser.add_argument("--check", action="store_true", help="exit with 1 when out of date there")
-    options = parser.parse_args()
-    stale = 0
-    for document, text in references().items():
-        if options.write:
-            put(DOCS / document, MARKER, text)
-        elif not options.check:
-            print(text)
-        elif between(DOCS / document, MARKER) != text:
-            command = "python tools/config_reference.py --write"
-            print(f"docs/{document} is out of date: run {command}", file=sys.stderr)
-            stale = 1
-    return stale
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    pages = references().items()
+    sys.exit(write_reference("config_reference", [(page, MARKER, text) for page, text in pages]))

@@ -4,14 +4,13 @@
 one is out of date.
 """
 
-import argparse
 import sys
 from collections.abc import Iterator
 
 import msgspec
 from msgspec import NODEFAULT, Struct, inspect
 
-from common.report import DOCS, between, put, table
+from common.report import table, write_reference
 from fishd.camera import messages
 from fishd.control.faults import FAULTS
 from fishd.core import protocol, signals
@@ -156,24 +155,5 @@ def _times(in_a_row: int) -> str:
     return f"{in_a_row} times in a row: " if in_a_row > 1 else ""
 
 
-def main() -> int:
-    """Print, write or check the tables, and return the exit status."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--write", action="store_true", help="put them into docs/")
-    parser.add_argument("--check", action="store_true", help="exit with 1 when one is out of date")
-    options = parser.parse_args()
-    stale = 0
-    for document, name, text in references():
-        if options.write:
-            put(DOCS / document, name, text)
-        elif not options.check:
-            print(f"{document}, {name}:\n\n{text}\n")
-        elif between(DOCS / document, name) != text:
-            command = "python tools/protocol_reference.py --write"
-            print(f"docs/{document}: {name} is out of date: run {command}", file=sys.stderr)
-            stale = 1
-    return stale
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(write_reference("protocol_reference", references()))

@@ -7,7 +7,6 @@ commands; an arrow is a pair of rooms of which the first imports the second, in 
 date.
 """
 
-import argparse
 import ast
 import sys
 import tomllib
@@ -15,10 +14,9 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-from common.report import DOCS, between, put, table
+from common.report import table, write_reference
 
 FISHD = Path(__file__).resolve().parents[1] / "fishd"
-PAGE = DOCS / "explanation" / "rooms.md"
 
 
 def rooms(folder: Path = FISHD) -> dict[str, Path]:
@@ -95,22 +93,5 @@ def summary() -> str:
     return f"{head}\n\n{len(rows)} rooms, {len(pairs)} arrows."
 
 
-def main() -> int:
-    """Print the table, write it into the page, or compare it with the page."""
-    parser = argparse.ArgumentParser(prog="tools/rooms.py", description=__doc__)
-    parser.add_argument("--write", action="store_true", help=f"put it into {PAGE.name}")
-    parser.add_argument("--check", action="store_true", help="exit with 1 where it is out of date")
-    options = parser.parse_args()
-    text = summary()
-    if options.write:
-        put(PAGE, "rooms", text)
-    elif options.check and between(PAGE, "rooms") != text:
-        print(f"{PAGE.name} is out of date: run make docs", file=sys.stderr)
-        return 1
-    elif not options.check:
-        print(text)
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(write_reference("rooms", [("explanation/rooms.md", "rooms", summary())]))

@@ -4,17 +4,15 @@ python tools/verb_reference.py --write
 python tools/verb_reference.py --check     exits with 1 when it is out of date
 """
 
-import argparse
 import sys
 from collections.abc import Iterator
 
 import click
 
-from common.report import DOCS, between, put, table
+from common.report import table, write_reference
 from fishd.cli.main import fishctl
 from fishd.cli.options import ControllerGroup
 
-DOCUMENT, MARKER = DOCS / "reference" / "verbs.md", "options"
 SHARED = (
     *("--on", "--for", "--budget", "--folder", "--resume", "--to", "--plot", "--json", "--seed"),
     *("--config", "--endpoint", "--take"),
@@ -62,24 +60,5 @@ def reference() -> str:
     return table(head, rows)
 
 
-def main() -> int:
-    """Print, write or check the table, and return the exit status."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--write", action="store_true", help="put it into docs/")
-    parser.add_argument("--check", action="store_true", help="exit with 1 when out of date there")
-    chosen = parser.parse_args()
-    text = reference()
-    if chosen.write:
-        put(DOCUMENT, MARKER, text)
-    elif not chosen.check:
-        print(text)
-    elif between(DOCUMENT, MARKER) != text:
-        print(
-            f"{DOCUMENT}: out of date: run python tools/verb_reference.py --write", file=sys.stderr
-        )
-        return 1
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(write_reference("verb_reference", [("reference/verbs.md", "options", reference())]))

@@ -23,6 +23,7 @@ from hatchling.build import build_wheel
 from rigs.documents import ROOT
 
 import rooms as tool
+from common.report import DOCS, between
 from rooms import arrows, imports, layers, purpose, rooms
 
 ROOMS = rooms()
@@ -56,7 +57,7 @@ def test_the_checked_layers_are_the_rooms() -> None:
 
 @pytest.mark.slow
 def test_the_page_lists_every_room_with_its_own_words() -> None:
-    assert tool.between(tool.PAGE, "rooms") == tool.summary()
+    assert between(DOCS / "explanation" / "rooms.md", "rooms") == tool.summary()
 
 
 def test_a_wheel_names_its_licence_and_carries_its_text(

@@ -24,8 +24,6 @@ from fishd.lab.session import VirtualSession
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
-DOCUMENT = "how-to/identification.md"
-
 RIG = SimulationSettings(noise=1e-3, rotation=radians(5), offset_x=0.02, offset_y=0.02, drift=5e-3)
 SPREAD = 0.3
 """Largest relative difference of the other fish from the default one, in each of `VARIED`."""

@@ -32,7 +32,6 @@ from fishd.virtual.swimmer.flow import Flow  # noqa: E402
 from fishd.virtual.swimmer.grid import Array, Grid, edges  # noqa: E402
 from fishd.virtual.swimmer.immersed import Immersed  # noqa: E402
 
-DOCUMENT = "explanation/swimmer.md"
 RHO = 1000.0
 RADIUS, CENTRE, HEIGHT, LENGTH, TIP, THICKNESS = 0.05, 0.2, 0.41, 2.5, 0.6, 0.02
 """Sizes of the benchmark's cylinder, channel and flag [m]."""

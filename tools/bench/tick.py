@@ -7,12 +7,11 @@ With --against, two checkouts of fishd are compared instead, in turns.
 """
 
 import json
-import shutil
 import statistics
 import subprocess
 import time
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -20,15 +19,14 @@ import msgspec
 from msgspec import Struct
 
 from bench.compare import compare
-from bench.contestants import PLAIN_LOOPS, CyclicTest, Lateness, PlainLoop, lateness
+from bench.contestants import Lateness, lateness, start_all
 from common.daemon import Fishd
 from common.machine import load, machine, priorities, scheduling, stress
 from common.processes import BIN
 from common.report import Options, Report, progress, quantile, table
 from fishd.control.statistics import PHASES
-from fishd.core.signals import Percentiles, Tick, Timing
+from fishd.core.signals import Percentiles, Timing
 
-DOCUMENT = "reference/performance.md"
 TICK = 0.05
 """Tick of the robot [s]."""
 FAST = 0.002
@@ -90,23 +88,18 @@ def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Rou
         fishd = stack.enter_context(Fishd(f"tick={tick}", f"realtime.priority={priority}"))
         fishd.next_tick()
         time.sleep(1.0)
-        others: list[PlainLoop | CyclicTest] = [
-            PlainLoop(kind, tick, seconds, priority) for kind in PLAIN_LOOPS
-        ]
-        if shutil.which("cyclictest"):
-            others.append(CyclicTest(tick, seconds, priority))
+        others = start_all(tick, seconds, priority)
         for other in others:
             stack.callback(other.kill)
         fishd.waiting_ticks()
-        offset, began, cpu = _wall_offset(), time.monotonic(), fishd.cpu_seconds()
+        start, cpu = time.monotonic(), fishd.cpu_seconds()
         time.sleep(seconds)
-        cpu = (fishd.cpu_seconds() - cpu) / (time.monotonic() - began)
-        slewed = _wall_offset() - offset
+        cpu = (fishd.cpu_seconds() - cpu) / (time.monotonic() - start)
         ticks = fishd.waiting_ticks()
-        late, busy, offsets = zip(*_tick_times(ticks, tick, slewed), strict=True)
+        busy = [message.busy_time_us for message in ticks]
         missed = ticks[-1].missed_slots - ticks[0].missed_slots
         itself = msgspec.structs.replace(
-            lateness("fishd", tick, late, offsets),
+            lateness("fishd", tick, [message.lateness_us * 1e-6 for message in ticks]),
             missed=missed / (ticks[-1].seq - ticks[0].seq + missed),
         )
         figures = Figures(
@@ -118,26 +111,6 @@ def run_round(stressed: bool, priority: int, tick: float, seconds: float) -> Rou
         )
         everyone = [itself, *(other.result() for other in others)]
         return Round(stressed, priority, tick, everyone, figures)
-
-
-def _wall_offset() -> float:
-    """Return Unix time minus monotonic time [s]; it changes, because NTP adjusts only one."""
-    before, wall, after = min(
-        ((time.monotonic(), time.time(), time.monotonic()) for _ in range(10)),
-        key=lambda clocks: clocks[2] - clocks[0],
-    )
-    return wall - (before + after) / 2
-
-
-def _tick_times(
-    ticks: list[Tick], period: float, slewed: float
-) -> Iterator[tuple[float, float, float]]:
-    """Return lateness [s], time until sealed [µs] and offset from whole periods [s] of ticks."""
-    first = ticks[0]
-    for index, tick in enumerate(ticks):
-        slots = tick.seq - first.seq + tick.missed_slots - first.missed_slots
-        began = tick.t - first.t - tick.busy_time_us * 1e-6 - slewed * index / len(ticks)
-        yield tick.lateness_us * 1e-6, tick.busy_time_us, began - slots * period
 
 
 def measure_latency(stressed: bool, priority: int, runs: int) -> Latency:
@@ -194,7 +167,6 @@ def markdown(results: Results) -> str:
             late.contestant,
             *(f"{value:.0f}" for value in (late.p50, late.p99, late.worst)),
             f"{late.missed:.3%}",
-            "not known" if late.drift is None else f"{late.drift:+.0f}",
         ]
         for round_ in rounds
         for late in round_.lateness
@@ -218,7 +190,7 @@ def markdown(results: Results) -> str:
         "The machine": (" | ", results.machine.items()),
         "Goals": ("goal | idle | met | under load | met", goals(results)),
         f"Lateness over {results.seconds:g} s [µs]": (
-            f"{head} | loop | p50 | p99 | worst | missed | drift",
+            f"{head} | loop | p50 | p99 | worst | missed",
             late,
         ),
         "Time per phase of a fishd tick, p50 / p99 [µs]": (
@@ -257,7 +229,6 @@ def goals(results: Results) -> list[list[str]]:
             judged(f"{late}, {scheduling(p)} scheduling", 2, "{:.2f} ×", _to_cyclictest, priority=p)
             for p in sorted({round_.priority for round_ in results.rounds})
         ),
-        judged("no drift: ≤ 100 µs over a round", 100, us, lambda r: abs(r.lateness[0].drift or 0)),
         judged("busy time p50 ≤ 100 µs", 100, us, lambda r: r.fishd.timing.duration.p50),
         judged("busy time p99 ≤ 250 µs", 250, us, lambda r: r.fishd.timing.duration.p99),
         judged(

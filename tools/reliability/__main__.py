@@ -7,22 +7,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 
 from common.report import run  # noqa: E402
 
+NAMES = ("deaths", "kills", "misbehaviour", "mutations", "odd_conditions", "soak", "systemd")
+
 if __name__ == "__main__":
-    sys.exit(
-        run(
-            "reliability",
-            (
-                "deaths",
-                "kills",
-                "leases",
-                "misbehaviour",
-                "attacks",
-                "gateways",
-                "soak",
-                "systemd",
-                "recording",
-                "odd_conditions",
-                "mutations",
-            ),
-        )
-    )
+    sys.exit(run("reliability", NAMES))

@@ -24,7 +24,6 @@ from common.report import Options, Report, progress, table
 from fishd.client import Fish, NoDaemon
 from fishd.virtual.pi.virtual_pi import VirtualPi
 
-DOCUMENT = "reference/reliability.md"
 GPIO = 18
 NEUTRAL = 1500.0
 WATCHED = 1.8

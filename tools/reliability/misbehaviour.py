@@ -25,7 +25,6 @@ from fishd.client import Fish, NoDaemon, Refused
 from fishd.core.protocol import LOADING_TIMEOUT_S
 from fishd.daemon.background_calls import MAX_CALLS
 
-DOCUMENT = "reference/reliability.md"
 ZOO = DOCS.parent / "tests" / "rigs" / "zoo"
 MAX_END_S = 3.0
 """Longest time from a signal to the end of fishd, with anything hanging [s]."""

@@ -49,7 +49,6 @@ from fishd.core.errors import FishdError
 from fishd.lab.run_traces import traces
 from fishd.recording import open_run
 
-DOCUMENT = "reference/reliability.md"
 MAX_ADDRESSES = 8 * 2**30
 """Limit of allocations, at which a file that claims 8 GB would end in a MemoryError [bytes]."""
 OFTEN = "runs", "export --csv", "rerun", "replay", "recover"

@@ -24,7 +24,6 @@ from common.processes import FISHCTL, FISHD
 from common.report import Options, Report, progress, table
 from fishd.client import Fish, FishError
 
-DOCUMENT = "reference/reliability.md"
 TIMEOUT_S = 90.0
 """Time after which a command counts as hung [s]."""
 START_S = 30.0

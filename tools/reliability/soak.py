@@ -40,7 +40,6 @@ from fishd.virtual.pi.linux_i2c import LinuxI2c
 from reliability.soak_memory import Memory
 from reliability.soak_troubles import Counting, Rest, Saboteur, misuse
 
-DOCUMENT = "reference/reliability.md"
 SIMULATED_TICKS = 1_000_000
 VIRTUAL_PI_TICKS = 20_000
 

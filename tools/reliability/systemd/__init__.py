@@ -17,7 +17,6 @@ from reliability.systemd.container import Container, wait_for
 from reliability.systemd.root import build, check_machine
 from reliability.systemd.trials import CONFIG, TRIALS, Rig, Row
 
-DOCUMENT = "reference/reliability.md"
 HERE = Path(__file__).resolve().parent
 UNIT = "etc/systemd/system/fishd.service"
 SOCKET = "/run/fishd-virtual-pi/socket"
