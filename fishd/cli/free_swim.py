@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from fishd.lab.simulation.free_swim import SwimReport, SwimResult
     from fishd.virtual.swimmer.robot import Swimmer
 
-
 DEFAULT_CHECKPOINT_INTERVAL_S = 5.0
 DEFAULT_SETTLE_S = 8.0
 """Time that a swimmer needs from rest to a steady speed, roughly [s]."""

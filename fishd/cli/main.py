@@ -70,7 +70,6 @@ VERBS = {
     },
 }
 
-
 DAILY_VERBS = (
     *("status", "watch", "set-controller", "stop", "measure"),
     *("compare", "record", "runs", "plot", "simulate"),

@@ -37,7 +37,6 @@ endpoint_option = click.option(
     help="Control socket of the daemon; default: $FISHD_ENDPOINT, else the one on this machine.",
 )
 
-
 _TAKE = "fishd.take"
 
 

@@ -1,6 +1,7 @@
-"""Progress of an experiment: a line for each result, and a bar with the time left.
+"""Displays in the terminal: progress of an experiment, and a full screen.
 
-The bar goes to standard error, so that programs can read the output.
+Progress is a line for each result, and a bar with the time left. The bar goes to standard error, so
+that programs can read the output.
 """
 
 import sys
@@ -10,8 +11,10 @@ from typing import TYPE_CHECKING
 
 from fishd.cli.output import echo
 from fishd.core import text
+from fishd.core.process.interruption import defer_signals
 
 if TYPE_CHECKING:
+    from rich.live import Live
     from rich.progress import Progress, TaskID
 
 
@@ -94,3 +97,17 @@ def show_progress(total: float, unit: str, *, err: bool = False) -> Iterator[Lin
     console = Console(stderr=True)
     with Progress(*columns, console=console, redirect_stdout=False) as progress:
         yield Bar(progress, progress.add_task("", total=total), err)
+
+
+@contextmanager
+def open_full_screen() -> Iterator["Live"]:
+    """Yield a display on the alternate screen; restore the previous screen whatever ends this."""
+    from rich.live import Live
+
+    live = Live(screen=True, auto_refresh=False)
+    try:
+        with defer_signals():  # rich does not undo an interrupted start
+            live.start()
+        yield live
+    finally:
+        live.stop()

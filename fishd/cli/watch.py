@@ -11,9 +11,9 @@ from contextlib import suppress
 
 import click
 
-from fishd.cli.drawing import open_full_screen
 from fishd.cli.options import daemon_options, for_option
 from fishd.cli.output import echo, format_quantities, format_time_of_day, print_json_line
+from fishd.cli.progress import open_full_screen
 from fishd.client import AsyncFish
 from fishd.core import text
 from fishd.core.console import status_line

@@ -20,7 +20,6 @@ ORDINARY_DEVIATIONS = 4.5
 _PASSES = 4
 _HUBER_MEDIANS = 1.5
 
-
 Forces = NDArray[np.float64]
 
 

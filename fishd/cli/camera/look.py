@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 import click
 
 from fishd.cli.camera.options import camera_option, check_png, png_option
-from fishd.cli.drawing import open_full_screen
 from fishd.cli.options import json_option
 from fishd.cli.output import (
     echo,
@@ -24,6 +23,7 @@ from fishd.cli.output import (
     print_json,
     print_json_line,
 )
+from fishd.cli.progress import open_full_screen
 from fishd.core.errors import FishdError, StartupError
 from fishd.core.process.interruption import on_signal
 

@@ -28,7 +28,6 @@ from fishd.recording.recorder import Recorder
 if TYPE_CHECKING:
     from fishd.lab.camera_tap import CameraTap
 
-
 F = TypeVar("F", bound=Callable[..., Any])
 UNIT_BYTES = {"MB": 10**6, "GB": 10**9}
 MIN_BLACK_BOX_BYTES = 10**7

@@ -37,7 +37,6 @@ from fishd.virtual.plant.parameters import PlantParameters
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-
 DEFAULT = (
     *("omega0", "xi", "quadratic_drag", "coupling", "servo_speed", "servo_lag"),
     *("thrust_coefficient", "lateral_inertia_ratio", "lateral_drag"),

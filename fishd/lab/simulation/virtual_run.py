@@ -21,7 +21,6 @@ from fishd.virtual.plant.base import TrueWindow
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-
 MAX_RUN_S = 1e8
 """Upper limit of the length of a run [s]: three years."""
 

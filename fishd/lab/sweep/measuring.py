@@ -31,7 +31,6 @@ from fishd.virtual.swimmer.track import Track
 SLOWEST_BEAT_HZ = 0.4
 """Tail-beat frequency that limits the duration for a controller without a frequency [Hz]."""
 
-
 STOP_FILE = "stop"
 """Name of the file in the folder that ends a sweep in simulation."""
 

@@ -17,7 +17,6 @@ from fishd.virtual.swimmer.settings import SwimmerSettings
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-
 Array = NDArray[np.float64]
 Positions = NDArray[np.floating]
 Quantity = Literal["vorticity", "speed", "pressure"]

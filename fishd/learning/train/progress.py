@@ -7,7 +7,6 @@ from fishd.lab.experiment import Progress
 if TYPE_CHECKING:
     from fishd.learning.env.evaluation import Evaluation
 
-
 NOT_COUNTED = " without evaluations"
 """Note on the tank time of a simulated training, whose evaluations swim a separate fish."""
 
