@@ -177,7 +177,7 @@ def test_every_configuration_that_is_shown_is_good(block: str, tmp_path: Path) -
 
 
 def test_the_table_of_faults_has_each_fault_of_the_virtual_pi_in_its_order() -> None:
-    assert first_cells(ROOT / "docs" / "how-to" / "virtual-pi.md", "Break it") == list(FAULTS)
+    assert first_cells(ROOT / "docs" / "how-to" / "virtual-pi.md", "Inject faults") == list(FAULTS)
 
 
 def test_the_table_of_checks_has_each_check_of_doctor_in_its_order() -> None:
