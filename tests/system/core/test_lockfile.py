@@ -108,7 +108,7 @@ def test_a_lock_of_another_user_counts_where_all_share_or_the_folder_is_his(tmp_
     path = tmp_path / "control"
     lock_path(path).write_text("")
     os.chown(lock_path(path), 60101, 60101)
-    with pytest.raises(NotALock, match="is a file of user 60101, no lock"), locked(path):
+    with pytest.raises(NotALock, match="is a file of user 60101, not a lock file"), locked(path):
         pass
     with locked(path, shared=True):
         assert find_lock_holder(path) == str(os.getpid())

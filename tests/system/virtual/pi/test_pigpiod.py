@@ -60,7 +60,7 @@ def test_what_is_not_emulated_is_refused_and_named_in_the_log(
     assert bench.result("store_script", b"tag 0 inr p0 jmp 0") == pigpio.PI_BAD_SCRIPT_CMD
     command, instruction = caplog.messages
     assert "command NB (19) is not emulated" in command
-    assert "'inr' is none of the instructions that are emulated: tag, " in instruction
+    assert "'inr' is not one of the emulated instructions: tag, " in instruction
 
 
 def test_ending_software_pwm_cuts_the_pulse_under_way(bench: Bench) -> None:
