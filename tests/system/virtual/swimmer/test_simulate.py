@@ -130,7 +130,7 @@ def test_a_checkpoint_of_another_fish_is_refused_with_the_key_that_differs(
 def test_what_is_no_checkpoint_is_said_to_be_none(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "kept").write_bytes(content)
     line = one_line(simulate("swing", "--resume", str(tmp_path / "kept")))
-    assert line == f"fishctl: {tmp_path}/kept: it is no checkpoint of a swimmer\n"
+    assert line == f"fishctl: {tmp_path}/kept: it is not a checkpoint of a swimmer\n"
 
 
 def bad(array: np.ndarray[Any, Any], value: float) -> np.ndarray[Any, Any]:
