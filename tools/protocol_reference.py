@@ -41,6 +41,8 @@ PLACES = {
     "frame": "frame of a camera in a recording",
     "summary": "summary of a recording: `fishctl runs --json`",
     "sweep": "`rows.csv` of `fishctl sweep`",
+    "camera of a training": "section `camera` of the settings of a training",
+    "evaluation": "`evaluations.csv` of a training",
     "optimise": "`rows.csv` of `fishctl optimise`",
 }
 """Places of the names in `OLD_NAMES`."""

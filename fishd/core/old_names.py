@@ -47,6 +47,8 @@ OLD_NAMES: dict[str, dict[str, str]] = {
         "trouble": "failure",
         "settled": "settled_time",
     },
+    "camera of a training": {"eye": "feature_extractor", "babble": "random_excitation"},
+    "evaluation": {"error": "thrust_ci95"},
     "optimise": {
         "error": "thrust_ci95",
         "power_error": "power_ci95",

@@ -25,12 +25,12 @@ from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
 from fishd.learning.env.perception import Perception
-from fishd.learning.eyes import random_angles
+from fishd.learning.extractors import random_angles
 from fishd.learning.picture_networks import PictureExtractor, network_nodes
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.runs import make_card
-from fishd.learning.settings import EvaluationSettings, TrainingSettings
+from fishd.learning.settings import EvaluationSettings, TrainingSettings, from_plain
 
 TOLERANCE = 1e-4
 """Largest difference between the outputs of the file and of the trained policy, as a share of Φ:
@@ -93,7 +93,7 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
             f"{path}: the environment of this model, {type(vec_env).__name__}, is not a SwimEnv "
             "alone, so the inputs of the network are not known"
         )
-    if env.eye:
+    if env.extractor:
         raise PolicyError(
             f"{path}: a model that sees pictures is not exported from Python; train it with "
             "'fishctl learn ppo --see camera'"
@@ -137,13 +137,13 @@ def _make_sight(policy: ActorCriticPolicy, perception: Perception) -> Sight | No
     """Return the graph from frames to the inputs of the first layer; None without frames."""
     from onnx import TensorProto, helper
 
-    eye = perception.eye
-    if eye is None:
+    feature_extractor = perception.extractor
+    if feature_extractor is None:
         return None
     nodes = [helper.make_node("Cast", [FRAMES], ["grey"], to=TensorProto.FLOAT)]
-    more, constants = eye.nodes("grey", "eye")
+    more, constants = feature_extractor.nodes("grey", "eye")
     nodes += more
-    parts, width = ["eye"], eye.outputs
+    parts, width = ["eye"], feature_extractor.outputs
     others = [INPUT] if perception.features else []
     extractor = policy.features_extractor
     mirrored = isinstance(extractor, PictureExtractor) and extractor.mirrored
@@ -185,7 +185,7 @@ def _evaluate(
     plant = adopt({"plant": card.provenance.plant}).plant
     config = replace(config, tick=card.tick, amplitude_limit=card.amplitude, plant=plant)
     decide = DeterministicPolicy(policy, perception, card.amplitude)
-    settings = msgspec.convert(card.provenance.settings, TrainingSettings)
+    settings = from_plain(card.provenance.settings)
     camera = _camera(checkpoint.parent, card)
     return evaluate_in_simulation(config, decide, settings.evaluation, camera)
 
@@ -223,9 +223,9 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
     for index, row in enumerate(rows):
         network.row[:] = row
         seen = row
-        if perception.eye:
+        if perception.extractor:
             network.frames[:] = stacks[index]
-            seen = np.concatenate((perception.eye.see(stacks[index]), row))
+            seen = np.concatenate((perception.extractor.see(stacks[index]), row))
         given.append(seen)
         outputs.append(network.run())
     expected, _ = policy.predict(np.array(given), deterministic=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, MlpExtractor, NatureCNN
 from torch import nn
 
-from fishd.learning.eyes import Nodes
+from fishd.learning.extractors import Nodes
 
 PictureKind = Literal["cnn", "nature"]
 Shape = tuple[int, int, int]

@@ -21,7 +21,7 @@ from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
 from fishd.learning.env.environment import spaces
 from fishd.learning.env.perception import Perception
-from fishd.learning.eyes import Eye
+from fishd.learning.extractors import FeatureExtractor
 from fishd.learning.picture_networks import (
     HALF,
     PairExtractor,
@@ -206,11 +206,13 @@ class Rollout(RolloutBuffer):
         return super()._get_samples(batch_inds[~self.void[batch_inds]], env)
 
 
-def make_learner(settings: TrainingSettings, env: VecEnv, eye: Eye | None = None) -> PPO:
+def make_learner(
+    settings: TrainingSettings, env: VecEnv, extractor: FeatureExtractor | None = None
+) -> PPO:
     """Return a new PPO with an untrained policy; seed torch, numpy and the environment."""
     ppo = settings.ppo
     return PPO(
-        _policy_class(ppo, eye),
+        _policy_class(ppo, extractor),
         env,
         learning_rate=ppo.learning_rate,
         n_steps=ppo.n_steps,
@@ -224,41 +226,43 @@ def make_learner(settings: TrainingSettings, env: VecEnv, eye: Eye | None = None
         max_grad_norm=ppo.max_grad_norm,
         target_kl=ppo.target_kl,
         rollout_buffer_class=Rollout,
-        policy_kwargs=_policy_arguments(ppo, eye),
+        policy_kwargs=_policy_arguments(ppo, extractor),
         seed=settings.seed,
         device="cpu",
     )
 
 
-def make_policy(ppo: PpoSettings, numbers: int, eye: Eye | None = None) -> ActorCriticPolicy:
+def make_policy(
+    ppo: PpoSettings, numbers: int, extractor: FeatureExtractor | None = None
+) -> ActorCriticPolicy:
     """Return the networks alone, as in `make_learner`.
 
-    numbers: number of inputs beside the outputs of the eye
+    numbers: number of inputs beside the outputs of the feature extractor
     """
-    observation, action = spaces(numbers + (eye.outputs if eye else 0))
-    return _policy_class(ppo, eye)(
-        observation, action, lambda _: ppo.learning_rate, **_policy_arguments(ppo, eye)
+    observation, action = spaces(numbers + (extractor.outputs if extractor else 0))
+    return _policy_class(ppo, extractor)(
+        observation, action, lambda _: ppo.learning_rate, **_policy_arguments(ppo, extractor)
     )
 
 
-def _policy_class(ppo: PpoSettings, eye: Eye | None) -> type[ActorCriticPolicy]:
+def _policy_class(ppo: PpoSettings, extractor: FeatureExtractor | None) -> type[ActorCriticPolicy]:
     if not ppo.symmetric:
         return ActorCriticPolicy
-    return SymmetricPicturePolicy if eye and eye.shape else SymmetricPolicy
+    return SymmetricPicturePolicy if extractor and extractor.shape else SymmetricPolicy
 
 
-def _policy_arguments(ppo: PpoSettings, eye: Eye | None) -> dict[str, Any]:
+def _policy_arguments(ppo: PpoSettings, extractor: FeatureExtractor | None) -> dict[str, Any]:
     arguments = {
         "net_arch": {"pi": list(ppo.hidden), "vf": list(ppo.hidden)},
         "activation_fn": _ACTIVATIONS[ppo.activation],
         "log_std_init": ppo.log_std_init,
         "optimizer_class": Adam,
     }
-    if eye and eye.shape:
+    if extractor and extractor.shape:
         arguments["features_extractor_class"] = PictureExtractor
         arguments["features_extractor_kwargs"] = {
-            "shape": eye.shape,
-            "kind": eye.network,
+            "shape": extractor.shape,
+            "kind": extractor.network,
             "mirrored": ppo.symmetric,
         }
     return arguments
@@ -349,7 +353,7 @@ class DeterministicPolicy:
         If frames are needed and missing, hold the last angle for `HOLD_TIME_S`, then return
         neutral.
         """
-        if stack is None and self._perception.eye:
+        if stack is None and self._perception.extractor:
             self._perception.note(observation)
             self._blind += observation.dt
             return self._latest if self._blind <= HOLD_TIME_S else 0.0

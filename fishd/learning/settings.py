@@ -1,7 +1,7 @@
 """The settings of a training, from a YAML file: every hyper-parameter, with bounds and units."""
 
 import os
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta, Struct
@@ -11,11 +11,12 @@ from fishd.controllers.policy.card import COMMAND_FEATURES, MAX_HISTORY_TICKS, F
 from fishd.core import strict_yaml
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import ConfigError
+from fishd.core.old_names import rename_keys
 from fishd.core.schema import Problem, convert, drop_empty_sections, note, unit
 from fishd.virtual.plant.parameters import PlantParameters
 
 MIN_FRAME_SIZES_PX = {"modes": 16, "cnn": 68, "nature": 36}
-"""Smallest size of a frame that all convolutions of the network can process, by eye [px]."""
+"""Smallest frame that all convolutions of the network can process, by feature extractor [px]."""
 Share = Annotated[float, Meta(ge=0, le=9)]
 
 
@@ -89,7 +90,7 @@ class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_on
 class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The conversion of pictures to numbers, where the agent sees pictures."""
 
-    eye: Annotated[
+    feature_extractor: Annotated[
         Literal["modes", "cnn", "nature"],
         note(
             "`modes`: patterns that follow the command; `cnn`: a small network for differences of "
@@ -98,7 +99,7 @@ class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         ),
     ] = "modes"
     stack: StackSettings = StackSettings()
-    babble: Annotated[
+    random_excitation: Annotated[
         int,
         unit(
             "ticks",
@@ -109,9 +110,14 @@ class VisionSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     ] = 256
     align: Annotated[
         bool,
-        note("Whether `modes` and `cnn` detect the axis in the babble; false: the middle row."),
+        note(
+            "Whether `modes` and `cnn` detect the axis in the random excitation; false: the "
+            "middle row."
+        ),
     ] = True
-    modes: Annotated[int, note("Number of patterns of the eye `modes`.", ge=1, le=16)] = 4
+    modes: Annotated[
+        int, note("Number of patterns of the feature extractor `modes`.", ge=1, le=16)
+    ] = 4
     memory: Annotated[
         int, unit("ticks", "Number of commands that `modes` explains a frame by.", ge=2, le=64)
     ] = 8
@@ -311,11 +317,18 @@ def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
         return TrainingSettings()
     data, sources = strict_yaml.read(path, "a training", "steps: 8000")
     try:
-        settings = convert(drop_empty_sections(data, TrainingSettings), TrainingSettings)
+        settings = from_plain(drop_empty_sections(data, TrainingSettings))
         _check(settings)
         return settings
     except Problem as problem:
         raise ConfigError(problem.message_with_place(sources)) from None
+
+
+def from_plain(data: dict[str, Any]) -> TrainingSettings:
+    """Return settings from plain data, also with old names of keys; raises `Problem`."""
+    if isinstance(data.get("camera"), dict):
+        data = {**data, "camera": rename_keys("camera of a training", data["camera"])}
+    return convert(data, TrainingSettings)
 
 
 def check(settings: TrainingSettings) -> None:
@@ -371,25 +384,25 @@ def _check(settings: TrainingSettings) -> None:
             ("environment", "observation"),
             "an empty list is not valid with see: force; the agent would see nothing",
         )
-    eye, size = settings.camera.eye, settings.camera.stack.size
-    if settings.see != "force" and size < MIN_FRAME_SIZES_PX[eye]:
+    extractor, size = settings.camera.feature_extractor, settings.camera.stack.size
+    if settings.see != "force" and size < MIN_FRAME_SIZES_PX[extractor]:
         raise Problem(
             ("camera", "stack", "size"),
-            f"{size} px is not valid with the eye {eye}: {MIN_FRAME_SIZES_PX[eye]} px or more are "
-            "needed",
+            f"{size} px is not valid with the feature extractor {extractor}: "
+            f"{MIN_FRAME_SIZES_PX[extractor]} px or more are needed",
         )
-    babbles = settings.see != "force" and settings.camera.eye != "nature"
-    if babbles and settings.steps <= settings.camera.babble:
+    needs_excitation = settings.see != "force" and settings.camera.feature_extractor != "nature"
+    if needs_excitation and settings.steps <= settings.camera.random_excitation:
         raise Problem(
             ("steps",),
-            f"{settings.steps} is not valid: more than the babble, {settings.camera.babble} steps, "
-            "is needed",
+            f"{settings.steps} is not valid: more than the random excitation, "
+            f"{settings.camera.random_excitation} steps, is needed",
         )
-    if settings.camera.memory >= settings.camera.babble // 4:
+    if settings.camera.memory >= settings.camera.random_excitation // 4:
         raise Problem(
             ("camera", "memory"),
-            f"{settings.camera.memory} ticks is not valid: less than a quarter of babble, "
-            f"{settings.camera.babble} ticks, is needed",
+            f"{settings.camera.memory} ticks is not valid: less than a quarter of "
+            f"random_excitation, {settings.camera.random_excitation} ticks, is needed",
         )
     if evaluation.settle >= evaluation.seconds:
         raise Problem(

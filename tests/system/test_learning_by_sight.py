@@ -20,13 +20,13 @@ if find_spec("torch") is None:
 BRIEF = """
 see: camera
 steps: 320
-camera: {babble: 128}
+camera: {random_excitation: 128}
 ppo: {n_steps: 64}
 evaluation: {every: 0}
 """
 BRIEFEST = """
 see: camera
-camera: {babble: 64}
+camera: {random_excitation: 64}
 ppo: {n_steps: 32, batch_size: 32}
 evaluation: {every: 0}
 """
@@ -106,7 +106,7 @@ def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
     with rig_of(tmp_path) as rig:
         file = tmp_path / "brief.yaml"
         file.write_text(f"{BRIEF}\n", encoding="utf-8")
-        text = BRIEF.replace("babble: 128", "babble: 128, stack: {size: 42}")
+        text = BRIEF.replace("random_excitation: 128", "random_excitation: 128, stack: {size: 42}")
         file.write_text(text, encoding="utf-8")
         done = fishctl(*rig.words)
         assert done.returncode == 1

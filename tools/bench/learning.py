@@ -35,7 +35,7 @@ from fishd.lab.simulation import simulate
 from fishd.learning import settings as training
 from fishd.learning.env.environment import SwimEnv, best_thrust
 from fishd.learning.env.evaluation import Evaluation, judge
-from fishd.learning.eyes import make_eye
+from fishd.learning.extractors import make_extractor
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder.checkpoints import load_policy
 from fishd.learning.run_folder.tables import best_so_far, read_evaluations
@@ -366,14 +366,14 @@ def speed(options: Namespace) -> Report:
 
 def steps_per_second(settings: TrainingSettings, camera: SimulatedCameraSettings) -> float:
     """Return the steps per second with random actions and the configured fish."""
-    config, eye = rig(), make_eye(settings)
+    config, extractor = rig(), make_extractor(settings)
     link = SimulatedLink(config)
-    if eye:
+    if extractor:
         link = SimulatedLink(config, camera=Camera(camera, settings.camera.stack))
-    env = SwimEnv(link, config, settings.seen, eye)
+    env = SwimEnv(link, config, settings.seen, extractor)
     env.reset(seed=0)
-    if eye:
-        env.babble(0, settings.camera.babble)
+    if extractor:
+        env.excite_randomly(0, settings.camera.random_excitation)
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (3000, 1)).astype(np.float32)
     rates = []
     for _ in range(5):

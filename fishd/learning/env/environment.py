@@ -29,7 +29,7 @@ from fishd.core.errors import ConfigError
 from fishd.core.signals import Observation
 from fishd.lab.links.link import Link, LinkLost
 from fishd.learning.env.perception import Perception
-from fishd.learning.eyes import Eye, random_angles
+from fishd.learning.extractors import FeatureExtractor, random_angles
 from fishd.learning.settings import EnvironmentSettings
 from fishd.virtual.plant.optimum import best_square_wave
 
@@ -112,12 +112,16 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     metadata = {"render_modes": []}  # noqa: RUF012 (as Gymnasium defines it)
 
     def __init__(
-        self, link: Link, config: Config, settings: EnvironmentSettings, eye: Eye | None = None
+        self,
+        link: Link,
+        config: Config,
+        settings: EnvironmentSettings,
+        extractor: FeatureExtractor | None = None,
     ) -> None:
         """
         link: link to the fish
         config: configuration that the scales are computed from
-        eye: eye of an agent that sees pictures; to be fitted before the first step
+        extractor: feature extractor of an agent that sees pictures, fitted before the first step
 
         Raises `ConfigError` where the fish has another tick or Φ than `config`, or swims freely.
         """
@@ -127,9 +131,9 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.config = config
         self.features = features(config, settings)
         self.settings = settings
-        self.eye = eye
+        self.extractor = extractor
         window = Window(settings.history, settings.history * config.tick)
-        self.perception = Perception(self.features, eye, window)
+        self.perception = Perception(self.features, extractor, window)
         self.reward_per_newton = settings.reward_scale / thrust_scale(config, settings)
         """Reward per thrust [1/N]."""
         self._price, self._cost = settings.power_price, 0.0  # N/W, N
@@ -233,14 +237,16 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
                 )
             self._cost = self._price * power
         self.perception.note(self.latest)
-        if self.eye and not self._look():
+        if self.extractor and not self._look():
             self.blind += 1
         self.tank_time += self.latest.time - before
         self.lost += lost
         return lost
 
-    def babble(self, seed: int, ticks: int, stop: Callable[[], bool] = lambda: False) -> bool:
-        """Move at random, outside of any episode, and fit the eye to the pictures of that.
+    def excite_randomly(
+        self, seed: int, ticks: int, stop: Callable[[], bool] = lambda: False
+    ) -> bool:
+        """Move at random, outside of any episode, and fit the extractor to the pictures of that.
 
         ticks: length of the motion
         stop: called before each tick; True ends the motion
@@ -248,7 +254,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         Returns False where it was stopped; else the fish is in a pause afterwards. Raises
         `LinkLost`, and `NoMotion` where the tail is not visible.
         """
-        assert self.eye
+        assert self.extractor
         assert self._shown
         frames, angles = [], []
         for angle in random_angles(seed, ticks, self.link.amplitude).tolist():
@@ -256,9 +262,11 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
                 return False
             self.advance(angle)
             frames.append(self._shown[0])
-            angles.append(self.latest.instruction_angle)  # in a lost tick, not that of the babble
+            angles.append(
+                self.latest.instruction_angle
+            )  # in a lost tick, not that of the random excitation
         self.pause()  # the fit takes longer than fishd waits
-        self.eye.fit(np.stack(frames), np.array(angles))
+        self.extractor.fit(np.stack(frames), np.array(angles))
         return True
 
     def pause(self, seconds: float | None = None) -> None:
@@ -303,7 +311,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
 
     def _await_frames(self) -> None:
         """Stay at neutral until the camera shows a whole stack; raises `LinkLost`."""
-        if self.eye is None or self._look():
+        if self.extractor is None or self._look():
             return
         virtual_start, real_start = self.latest.time, time.monotonic()
         while (
@@ -327,7 +335,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
             raise RuntimeError("this environment is closed; make another one")
 
     def _info(self, lost: int) -> dict[str, Any]:
-        blind = int(self.eye is not None and self.stack is None)
+        blind = int(self.extractor is not None and self.stack is None)
         return {
             "thrust": self.latest.fx,
             "lateral_force": self.latest.fy,

@@ -35,7 +35,7 @@ def swim(
     config, overrides: configuration as for fishd, a YAML file and `KEY=VALUE`s; by default the
         default fish
     settings: YAML file of a training, of which `see`, `environment`, `camera` and `randomisation`
-        are used; an eye that must be fitted is fitted to a babble first
+        are used; a feature extractor that must be fitted is fitted to a random excitation first
     camera: YAML file of the simulated camera, for settings with `see: camera` or `both`
 
     Raises `ConfigError`.
@@ -44,18 +44,18 @@ def swim(
     from fishd.lab.links.simulated_link import Camera, SimulatedLink
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.env.fish_variation import episode_fish
-    from fishd.learning.eyes import make_eye
+    from fishd.learning.extractors import make_extractor
 
     fish = load(config, overrides)
     chosen = load_settings(settings)
-    eye = make_eye(chosen)
-    sight = Camera(cameras.load_simulated(camera), chosen.camera.stack) if eye else None
+    extractor = make_extractor(chosen)
+    sight = Camera(cameras.load_simulated(camera), chosen.camera.stack) if extractor else None
     metered = bool(chosen.seen.power_price)
     link = SimulatedLink(fish, episode_fish(chosen.randomisation), sight, metered=metered)
-    env = SwimEnv(link, fish, chosen.seen, eye)
-    if eye and not eye.is_fitted:
+    env = SwimEnv(link, fish, chosen.seen, extractor)
+    if extractor and not extractor.is_fitted:
         env.reset(seed=0)
-        env.babble(chosen.seed, chosen.camera.babble)
+        env.excite_randomly(chosen.seed, chosen.camera.random_excitation)
     return env
 
 
@@ -83,18 +83,18 @@ def swim_on_daemon(
     """
     from fishd.lab.links.fishd_link import FishdLink, config_of
     from fishd.learning.env.environment import SwimEnv
-    from fishd.learning.eyes import make_eye
+    from fishd.learning.extractors import make_extractor
 
     chosen = load_settings(settings)
     fish = load(config, overrides) if config else adopt(config_of(endpoint), overrides)
-    eye = make_eye(chosen)
-    stack = chosen.camera.stack if eye else None
+    extractor = make_extractor(chosen)
+    stack = chosen.camera.stack if extractor else None
     link = FishdLink(endpoint, experiment, take, address=agent, stack=stack, camera=camera)
     try:
-        env = SwimEnv(link, fish, chosen.seen, eye)
-        if eye and not eye.is_fitted:
+        env = SwimEnv(link, fish, chosen.seen, extractor)
+        if extractor and not extractor.is_fitted:
             env.reset()
-            env.babble(chosen.seed, chosen.camera.babble)
+            env.excite_randomly(chosen.seed, chosen.camera.random_excitation)
         return env
     except BaseException:
         link.close()

@@ -22,11 +22,12 @@ from msgspec import Meta, Struct
 from fishd.controllers.policy.card import Card, decode, encode
 from fishd.core import files
 from fishd.core.errors import FishdError, PolicyError
+from fishd.core.old_names import rename_keys
 from fishd.lab.experiment import On
-from fishd.learning import eyes
+from fishd.learning import extractors
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.perception import Perception
-from fishd.learning.eyes import Eye
+from fishd.learning.extractors import FeatureExtractor
 from fishd.learning.settings import TrainingSettings
 
 # Modules that import torch are imported where they are used: most functions need no networks.
@@ -38,8 +39,8 @@ MODEL, CARD, STATE, EYE = "model.zip", "card.json", "state.json", "eye.msgpack"
 
 MAX_MODEL_BYTES = 256 * 2**20
 """Largest size of the file of networks and optimiser [bytes]."""
-MAX_EYE_BYTES = 16 * 2**20
-"""Largest size of the file of an eye's constants [bytes]."""
+MAX_EXTRACTOR_BYTES = 16 * 2**20
+"""Largest size of the file of a feature extractor's constants [bytes]."""
 MAX_TEXT_BYTES = 2**20
 """Largest size of the file of a card, or of a state [bytes]."""
 
@@ -76,7 +77,7 @@ class State(Struct, frozen=True):
 
 
 class Constant(Struct, frozen=True):
-    """A constant of an eye."""
+    """A constant of a feature extractor."""
 
     shape: tuple[Annotated[int, Meta(ge=0)], ...]
     values: bytes
@@ -84,7 +85,12 @@ class Constant(Struct, frozen=True):
 
 
 def save(
-    folder: Path, kind: str, model: "PPO", card: Card, state: State, eye: Eye | None = None
+    folder: Path,
+    kind: str,
+    model: "PPO",
+    card: Card,
+    state: State,
+    extractor: FeatureExtractor | None = None,
 ) -> Path:
     """Write a checkpoint; kind: step or best, of which only the newest is kept."""
     name = f"{kind}-{state.steps:06d}"
@@ -96,8 +102,10 @@ def save(
     files.write_atomically(part / MODEL, archive.getvalue())
     files.write_atomically(part / CARD, msgspec.json.format(encode(card), indent=2) + "\n")
     files.write_atomically(part / STATE, msgspec.json.encode(state))
-    if eye and eye.is_fitted:
-        constants = {name: Constant(a.shape, a.tobytes()) for name, a in eye.constants.items()}
+    if extractor and extractor.is_fitted:
+        constants = {
+            name: Constant(a.shape, a.tobytes()) for name, a in extractor.constants.items()
+        }
         files.write_atomically(part / EYE, msgspec.msgpack.encode(constants))
     files.sync_folder(part)
     if final.exists():  # a run that was stopped before it learned any more
@@ -193,7 +201,11 @@ def read_card(checkpoint: Path) -> Card:
 def read_state(checkpoint: Path) -> State:
     """Read the state of a checkpoint; raises `CheckpointError`."""
     try:
-        return msgspec.json.decode(_read_text(checkpoint / STATE), type=State)
+        state = msgspec.json.decode(_read_text(checkpoint / STATE), type=dict[str, Any])
+        for name in ("latest", "best"):
+            if isinstance(state.get(name), dict):
+                state[name] = rename_keys("evaluation", state[name])
+        return msgspec.convert(state, State)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{checkpoint / STATE}: {_format_error(error)}; {_ADVICE}") from None
 
@@ -219,25 +231,25 @@ def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
 
     card = read_card(checkpoint)
     settings = msgspec.convert(card.provenance.settings, TrainingSettings)
-    eye = eyes.make_eye(settings)
-    if eye:
-        load_eye(eye, checkpoint)
+    extractor = extractors.make_extractor(settings)
+    if extractor:
+        load_extractor(extractor, checkpoint)
     with _open_model(checkpoint / MODEL) as parameters:
-        policy = make_policy(settings.ppo, card.numbers, eye)
+        policy = make_policy(settings.ppo, card.numbers, extractor)
         policy.load_state_dict(parameters["policy"])
     policy.set_training_mode(False)
-    return policy, Perception(card.observation, eye, card.window)
+    return policy, Perception(card.observation, extractor, card.window)
 
 
-def load_eye(eye: Eye, checkpoint: Path) -> None:
-    """Load the constants of a checkpoint into an eye, if any; raises `CheckpointError`."""
+def load_extractor(extractor: FeatureExtractor, checkpoint: Path) -> None:
+    """Load the constants of a checkpoint into an extractor, if any; raises `CheckpointError`."""
     path = checkpoint / EYE
     if not path.exists():
         return
     try:
-        content = files.read(path, MAX_EYE_BYTES, "the constants of an eye")
+        content = files.read(path, MAX_EXTRACTOR_BYTES, "the constants of a feature extractor")
         constants = msgspec.msgpack.decode(content, type=dict[str, Constant])
-        eye.restore(
+        extractor.restore(
             {
                 name: np.frombuffer(constant.values, np.float32).reshape(constant.shape)
                 for name, constant in constants.items()

@@ -180,7 +180,9 @@ class RunRecorder:
             swims=self.winner.swims if self.winner else 0,
         )
         card = self._card(state.steps, self.best if kind == "best" else self.latest)
-        return checkpoints.save(self._job.folder, kind, self._model, card, state, self._env.eye)
+        return checkpoints.save(
+            self._job.folder, kind, self._model, card, state, self._env.extractor
+        )
 
     def _card(self, steps: int = 0, evaluation: Evaluation | None = None) -> Card:
         job, seen = self._job, self._env.features
@@ -207,7 +209,7 @@ class RunRecorder:
             if theirs.get(key) != here:
                 raise CheckpointError(
                     f"{checkpoint}: its {key} is {theirs.get(key)}, that of this training is "
-                    f"{here}; eye and networks must be alike"
+                    f"{here}; feature extractor and networks must be alike"
                 )
         for what in ("observation", "history", "tick", "amplitude"):
             here, there = getattr(own, what), getattr(card, what)
@@ -224,8 +226,8 @@ class RunRecorder:
         return card
 
     def _load_eye(self, checkpoint: Path) -> None:
-        if self._env.eye:
-            checkpoints.load_eye(self._env.eye, checkpoint)
+        if self._env.extractor:
+            checkpoints.load_extractor(self._env.extractor, checkpoint)
 
     def _resume(self) -> None:
         """Continue from the newest checkpoint; raises `ConfigError` and `CheckpointError`."""

@@ -22,7 +22,7 @@ from fishd.core.errors import FishdError
 from fishd.lab.links.fishd_link import FishdLink
 from fishd.lab.links.link import Link, LinkLost
 from fishd.lab.links.simulated_link import SimulatedLink
-from fishd.learning import eyes
+from fishd.learning import extractors
 from fishd.learning.env import evaluation
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
@@ -92,10 +92,10 @@ class Training:
     def __init__(self, job: Job, link: Link, display: Display, stop: Callable[[], bool]) -> None:
         """Create or open the run folder; nothing moves yet. Raises as `train` does."""
         self._job, self._display, self._stop = job, display, stop
-        self._eye = eyes.make_eye(job.settings)
-        self._env = SwimEnv(link, job.config, job.settings.seen, self._eye)
+        self._extractor = extractors.make_extractor(job.settings)
+        self._env = SwimEnv(link, job.config, job.settings.seen, self._extractor)
         self._vec_env = DummyVecEnv([lambda: self._env])
-        self._model = make_learner(job.settings, self._vec_env, self._eye)
+        self._model = make_learner(job.settings, self._vec_env, self._extractor)
         if job.cleans_rewards:
             _enable_cleaning(cast(Rollout, self._model.rollout_buffer), self._env)
         self._rollouts = Rollouts(self._model, self._env, display, stop)
@@ -122,8 +122,8 @@ class Training:
                 ended = self._imitate()
             if ended == "finished":
                 self._reset()
-            if ended == "finished" and self._eye and not self._eye.is_fitted:
-                ended, message = self._babble()
+            if ended == "finished" and self._extractor and not self._extractor.is_fitted:
+                ended, message = self._excite_randomly()
             while recorder.steps < job.settings.steps and ended == "finished" and not message:
                 ended, message = self._update()
         except LinkLost as error:
@@ -148,15 +148,16 @@ class Training:
     def _introduce(self) -> None:
         recorder, job = self._recorder, self._job
         done, rollout = recorder.steps, job.settings.ppo.n_steps
-        if self._eye and not self._eye.is_fitted:
-            done = job.settings.camera.babble
+        if self._extractor and not self._extractor.is_fitted:
+            done = job.settings.camera.random_excitation
         last = job.last_step(done)
         whole = f", in whole rollouts of {rollout}" if last != job.settings.steps else ""
         most = "at most " if job.on == "simulation" and job.settings.evaluation.patience else ""
         text = f"{job.folder}: {most}{last} steps{whole} {_WHERE[job.on]}"
-        if self._eye:
+        if self._extractor:
             also = " and forces" if job.settings.see == "both" else ""
-            text += f", from pictures{also} with the eye {job.settings.camera.eye}"
+            kind = job.settings.camera.feature_extractor
+            text += f", from pictures{also} with the feature extractor {kind}"
         if job.settings.imitation.rounds and not recorder.imitated:
             fish = job.settings.imitation.rounds * job.settings.imitation.fish
             text += f", after an imitation of the best beats of {fish} fish"
@@ -174,15 +175,15 @@ class Training:
             self._model.set_random_seed(int(mixed.generate_state(1)[0]))
         self._rollouts.begin(cast(NDArray[np.float32], self._vec_env.reset())[0])
 
-    def _babble(self) -> tuple[Ended, str]:
-        """Move at random first, to fit the eye to its pictures; these steps count, too."""
-        env, ticks = self._env, self._job.settings.camera.babble
+    def _excite_randomly(self) -> tuple[Ended, str]:
+        """Move at random first, to fit the extractor to its pictures; these steps count, too."""
+        env, ticks = self._env, self._job.settings.camera.random_excitation
 
         def stop() -> bool:
             self._display.step(env.tank_time)
             return self._stop()
 
-        if not env.babble(self._job.settings.seed, ticks, stop):
+        if not env.excite_randomly(self._job.settings.seed, ticks, stop):
             return "interrupted", ""
         self._paused = True
         self._recorder.steps = self._model.num_timesteps = ticks

@@ -1,4 +1,4 @@
-"""The export of policies that see pictures, together with their eyes."""
+"""The export of policies that see pictures, together with their feature extractors."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from msgspec.structs import replace
-from rigs.seeing_policies import babbled
+from rigs.seeing_policies import randomly_excited
 from stable_baselines3 import PPO
 
 from fishd.camera.simulated import DEFAULT
@@ -26,7 +26,7 @@ from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.export import export, export_model
-from fishd.learning.eyes import random_angles
+from fishd.learning.extractors import random_angles
 from fishd.learning.look import look
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.settings import (
@@ -38,10 +38,10 @@ from fishd.learning.settings import (
 from fishd.learning.train.jobs import Outcome
 
 
-def settings_of(eye: str, **values: Any) -> TrainingSettings:
+def settings_of(extractor: str, **values: Any) -> TrainingSettings:
     ppo = PpoSettings(symmetric=values.pop("symmetric", True))
     stack = StackSettings(size=values.pop("size", 84), frames=values.pop("frames", 4))
-    vision = VisionSettings(eye=eye, stack=stack)  # type: ignore[arg-type]
+    vision = VisionSettings(feature_extractor=extractor, stack=stack)  # type: ignore[arg-type]
     return TrainingSettings(camera=vision, ppo=ppo, **({"see": "camera"} | values))
 
 
@@ -58,7 +58,7 @@ CASES = [
 
 
 def network_of(settings: TrainingSettings) -> tuple[Network, Any]:
-    card, policy, perception = babbled(settings)
+    card, policy, perception = randomly_excited(settings)
     sight = exporting._make_sight(policy, perception)
     content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
     exporting._verify(PolicyFile(Path("eye.onnx"), content, card), policy, perception)
@@ -66,7 +66,9 @@ def network_of(settings: TrainingSettings) -> tuple[Network, Any]:
 
 
 @pytest.mark.parametrize(
-    "settings", CASES, ids=lambda case: f"{case.camera.eye}-{case.see}-{case.ppo.symmetric}"
+    "settings",
+    CASES,
+    ids=lambda case: f"{case.camera.feature_extractor}-{case.see}-{case.ppo.symmetric}",
 )
 def test_the_outputs_of_the_file_are_those_of_the_trained_policy(
     settings: TrainingSettings,
@@ -80,7 +82,7 @@ def test_where_frames_are_missing_the_file_swims_as_the_policy_is_evaluated(
     tmp_path: Path,
 ) -> None:
     settings = settings_of("modes", environment=EnvironmentSettings(history=3))
-    card, policy, perception = babbled(settings)
+    card, policy, perception = randomly_excited(settings)
     path, config = tmp_path / "eye.onnx", Config()
     exporting._write(path, card, policy, perception)
     pilot = Pilot(str(path), replace(config.limits, dwell=0.0))
@@ -94,15 +96,17 @@ def test_where_frames_are_missing_the_file_swims_as_the_policy_is_evaluated(
         seen = link.step(angle).observation
 
 
-@pytest.mark.parametrize("eye", ["cnn", "nature"])
-def test_a_mirrored_picture_gets_the_mirrored_action(eye: str) -> None:
-    settings = settings_of(eye)
-    if eye == "cnn":  # without the axis of the fish: the picture is mirrored about the middle row
+@pytest.mark.parametrize("extractor", ["cnn", "nature"])
+def test_a_mirrored_picture_gets_the_mirrored_action(extractor: str) -> None:
+    settings = settings_of(extractor)
+    if (
+        extractor == "cnn"
+    ):  # without the axis of the fish: the picture is mirrored about the middle row
         settings = replace(settings, camera=replace(settings.camera, align=False))
-    card, policy, perception = babbled(settings)
-    if perception.eye and eye == "cnn":  # make its mean picture symmetric
-        mean = perception.eye.constants["mean"]
-        perception.eye.constants["mean"] = 0.5 * (mean + mean[::-1])
+    card, policy, perception = randomly_excited(settings)
+    if perception.extractor and extractor == "cnn":  # make its mean picture symmetric
+        mean = perception.extractor.constants["mean"]
+        perception.extractor.constants["mean"] = 0.5 * (mean + mean[::-1])
     sight = exporting._make_sight(policy, perception)
     content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
     network = Network(PolicyFile(Path("eye.onnx"), content, card))
@@ -123,7 +127,7 @@ def test_a_mirrored_picture_gets_the_mirrored_action(eye: str) -> None:
 def test_a_file_with_another_eye_is_not_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    card, policy, perception = babbled(settings_of("cnn"))
+    card, policy, perception = randomly_excited(settings_of("cnn"))
     make_sight = exporting._make_sight
 
     def without_mean(*arguments: Any) -> Any:
@@ -142,7 +146,7 @@ def test_a_file_with_another_eye_is_not_written(
 def test_a_model_of_the_user_that_sees_pictures_is_refused(tmp_path: Path) -> None:
     settings, config = settings_of("modes"), Config()
     link = SimulatedLink(config, camera=Camera(DEFAULT, settings.camera.stack))
-    env = SwimEnv(link, config, settings.seen, babbled(settings)[2].eye)
+    env = SwimEnv(link, config, settings.seen, randomly_excited(settings)[2].extractor)
     with pytest.raises(PolicyError, match="sees pictures is not exported from Python; train it"):
         export_model(PPO("MlpPolicy", env, device="cpu"), tmp_path / "eye.onnx")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""Eyes that are fitted to a tail with random motion."""
+"""Feature extractors that are fitted to a tail with random motion."""
 
 from collections.abc import Callable
 
@@ -16,7 +16,7 @@ from fishd.core.camera_frames import Stack, StackSettings
 from fishd.lab.links.link import StepResult
 from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.eyes import Eye, make_eye, random_angles
+from fishd.learning.extractors import FeatureExtractor, make_extractor, random_angles
 from fishd.learning.settings import EnvironmentSettings, TrainingSettings, VisionSettings
 
 CONFIG = Config()
@@ -24,11 +24,11 @@ EYES = ["modes", "cnn", "nature"]
 TICKS = 256
 
 
-def eye_of(kind: str, **settings: object) -> Eye:
-    camera = VisionSettings(eye=kind, **settings)
-    eye = make_eye(TrainingSettings(see="camera", camera=camera))
-    assert eye
-    return eye
+def extractor_of(kind: str, **settings: object) -> FeatureExtractor:
+    camera = VisionSettings(feature_extractor=kind, **settings)
+    extractor = make_extractor(TrainingSettings(see="camera", camera=camera))
+    assert extractor
+    return extractor
 
 
 def swim_with(
@@ -37,10 +37,13 @@ def swim_with(
     """Return stacks, fin angles and commands of a fish with random motion."""
     if angles is None:
         angles = random_angles(0, TICKS, CONFIG.amplitude_limit)
-    eye = eye_of("nature")
+    extractor = extractor_of("nature")
     link = SimulatedLink(CONFIG, camera=Camera(rig, StackSettings()))
     env = SwimEnv(
-        link, CONFIG, EnvironmentSettings(observation=("instruction_angle",), longest_start=0), eye
+        link,
+        CONFIG,
+        EnvironmentSettings(observation=("instruction_angle",), longest_start=0),
+        extractor,
     )
     env.reset(seed=0)
     stacks, fins = [], []
@@ -68,22 +71,24 @@ class Waiting(SimulatedLink):
 def test_the_fish_waits_while_its_eye_is_fitted_and_afterwards(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    eye = eye_of("nature")
+    extractor = extractor_of("nature")
     link = Waiting(CONFIG, camera=Camera(DEFAULT, StackSettings()))
-    env = SwimEnv(link, CONFIG, EnvironmentSettings(longest_start=0), eye)
+    env = SwimEnv(link, CONFIG, EnvironmentSettings(longest_start=0), extractor)
     waits: list[bool] = []
-    monkeypatch.setattr(eye, "fit", lambda frames, angles: waits.append(link.waits))
+    monkeypatch.setattr(extractor, "fit", lambda frames, angles: waits.append(link.waits))
     env.reset(seed=0)
-    assert env.babble(0, 4)
+    assert env.excite_randomly(0, 4)
     assert waits == [True]
     assert link.waits
 
 
-def fitted(kind: str, rig: SimulatedCameraSettings = DEFAULT, **settings: object) -> Eye:
+def fitted(
+    kind: str, rig: SimulatedCameraSettings = DEFAULT, **settings: object
+) -> FeatureExtractor:
     stacks, _, angles = swim_with(rig)
-    eye = eye_of(kind, **settings)
-    eye.fit(np.stack([stack[0] for stack in stacks]), angles)
-    return eye
+    extractor = extractor_of(kind, **settings)
+    extractor.fit(np.stack([stack[0] for stack in stacks]), angles)
+    return extractor
 
 
 def mirrored(stack: Stack) -> Stack:
@@ -92,10 +97,10 @@ def mirrored(stack: Stack) -> Stack:
 
 @pytest.mark.parametrize("rig", [DEFAULT, WEB])
 def test_modes_contain_the_fin_angle_whatever_the_light(rig: SimulatedCameraSettings) -> None:
-    eye = fitted("modes", rig)
+    extractor = fitted("modes", rig)
     angles = random_angles(1, 300, CONFIG.amplitude_limit)
     stacks, fins, _ = swim_with(replace(rig, seed=7, light_drift=0.2), angles)
-    seen = np.stack([eye.see(stack) for stack in stacks])[:, :4]
+    seen = np.stack([extractor.see(stack) for stack in stacks])[:, :4]
     fit = np.linalg.lstsq(seen, fins, rcond=None)[0]
     unexplained = (fins - seen @ fit).std() / fins.std()
     assert unexplained < (
@@ -106,12 +111,12 @@ def test_modes_contain_the_fin_angle_whatever_the_light(rig: SimulatedCameraSett
 @pytest.mark.parametrize("kind", ["modes", "cnn"])
 def test_the_output_of_an_eye_for_a_mirrored_picture_is_mirrored(kind: str) -> None:
     rig = replace(DEFAULT, noise=0.0)
-    eye = fitted(kind, rig)
+    extractor = fitted(kind, rig)
     stack = swim_with(rig)[0][-1]
-    output, opposite = eye.see(stack), eye.see(mirrored(stack))
-    if eye.shape:
-        image = opposite.reshape(eye.shape)[:, ::-1]
-        assert np.abs(output.reshape(eye.shape) - image).max() < 0.15 * np.abs(output).max()
+    output, opposite = extractor.see(stack), extractor.see(mirrored(stack))
+    if extractor.shape:
+        image = opposite.reshape(extractor.shape)[:, ::-1]
+        assert np.abs(output.reshape(extractor.shape) - image).max() < 0.15 * np.abs(output).max()
     else:
         assert np.abs(output + opposite).max() < 0.15 * np.abs(output).max()
 
@@ -128,25 +133,25 @@ def test_an_eye_with_align_detects_the_axis_of_a_camera_off_centre() -> None:
 
 @pytest.mark.parametrize("kind", ["modes", "cnn"])
 def test_the_output_of_an_eye_does_not_depend_on_the_brightness(kind: str) -> None:
-    eye = fitted(kind)
+    extractor = fitted(kind)
     stack = swim_with(DEFAULT)[0][-1]
     darker = tuple((0.7 * frame).astype(np.uint8) for frame in stack)
-    assert np.abs(eye.see(stack) - eye.see(darker)).max() < 0.2
+    assert np.abs(extractor.see(stack) - extractor.see(darker)).max() < 0.2
 
 
 @pytest.mark.parametrize("kind", ["modes", "cnn"])
 def test_an_eye_cannot_be_fitted_to_a_fish_that_rests(kind: str) -> None:
     stacks, _, angles = swim_with(DEFAULT, np.zeros(TICKS))
     with pytest.raises(NoMotion, match="let the fish swim"):
-        eye_of(kind).fit(np.stack([stack[0] for stack in stacks]), angles)
+        extractor_of(kind).fit(np.stack([stack[0] for stack in stacks]), angles)
 
 
 @pytest.mark.parametrize("kind", EYES)
 def test_an_eye_with_the_constants_of_another_sees_the_same(kind: str) -> None:
-    eye, other = fitted(kind), eye_of(kind)
-    other.restore(eye.constants)
+    extractor, other = fitted(kind), extractor_of(kind)
+    other.restore(extractor.constants)
     stack = swim_with(DEFAULT)[0][-1]
-    assert np.array_equal(eye.see(stack), other.see(stack))
+    assert np.array_equal(extractor.see(stack), other.see(stack))
 
 
 @pytest.mark.parametrize(
@@ -162,7 +167,7 @@ def test_constants_of_another_kind_of_eye_are_refused(
     constants: dict[str, object] = {"patterns": np.zeros((4, 84 * 84)), "zero": np.zeros(4)}
     change(constants)
     with pytest.raises(ValueError, match="constants of shapes"):
-        eye_of("modes").restore(constants)
+        extractor_of("modes").restore(constants)
 
 
 def test_the_babble_is_the_same_for_the_same_seed_and_within_the_limit() -> None:

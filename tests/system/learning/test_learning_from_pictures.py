@@ -20,7 +20,7 @@ from fishd.core.camera_frames import StackSettings
 from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env import environment
 from fishd.learning.env.environment import SwimEnv
-from fishd.learning.eyes import Eye, make_eye
+from fishd.learning.extractors import FeatureExtractor, make_extractor
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import (
@@ -37,17 +37,20 @@ BRIEF = EvaluationSettings(seconds=6.0, settle=2.0)
 
 
 def job_of(
-    folder: Path, eye: str = "modes", steps: int = 384, rig: SimulatedCameraSettings = DEFAULT
+    folder: Path, extractor: str = "modes", steps: int = 384, rig: SimulatedCameraSettings = DEFAULT
 ) -> Job:
     settings = TrainingSettings(
-        see="camera", steps=steps, camera=VisionSettings(eye=eye), evaluation=BRIEF
+        see="camera",
+        steps=steps,
+        camera=VisionSettings(feature_extractor=extractor),
+        evaluation=BRIEF,
     )
     return replace(brief_job(folder), settings=settings, camera=rig)
 
 
 @pytest.fixture(scope="module")
 def brief(tmp_path_factory: pytest.TempPathFactory) -> tuple[Job, Outcome]:
-    """A training with a babble and two updates; its folder must not be changed."""
+    """A training with a random excitation and two updates; its folder must not be changed."""
     job = job_of(tmp_path_factory.mktemp("pictures") / "first")
     return job, train(job)
 
@@ -65,13 +68,13 @@ def test_a_policy_swims_by_sight_after_a_thousand_steps(
 
 
 @pytest.mark.parametrize(
-    ("eye", "size", "see"),
+    ("extractor", "size", "see"),
     [("cnn", 68, "camera"), ("nature", 36, "camera"), ("modes", 16, "both")],
 )
 def test_with_the_smallest_frames_each_eye_learns_from_whole_rollouts(
-    tmp_path: Path, eye: str, size: int, see: Literal["camera", "both"]
+    tmp_path: Path, extractor: str, size: int, see: Literal["camera", "both"]
 ) -> None:
-    job = job_of(tmp_path / "run", eye)
+    job = job_of(tmp_path / "run", extractor)
     few = replace(job.settings.ppo, n_epochs=2)
     small = replace(job.settings.camera, stack=StackSettings(size=size))
     settings = replace(job.settings, see=see, ppo=few, camera=small)
@@ -102,9 +105,11 @@ def test_a_resumed_run_keeps_its_eye(tmp_path: Path, brief: tuple[Job, Outcome])
     outcome = train(longer)
     assert outcome.steps == 512
     _, after = checkpoints.load_policy(folder / "step-000512")
-    assert before.eye
-    assert after.eye
-    assert np.array_equal(before.eye.constants["patterns"], after.eye.constants["patterns"])
+    assert before.extractor
+    assert after.extractor
+    assert np.array_equal(
+        before.extractor.constants["patterns"], after.extractor.constants["patterns"]
+    )
 
 
 def test_a_run_folder_contains_the_settings_of_its_camera(tmp_path: Path) -> None:
@@ -124,7 +129,8 @@ def fields(rig: SimulatedCameraSettings) -> dict[str, object]:
         (TrainingSettings(), "its see is camera, that of this training is force"),
         (
             TrainingSettings(see="camera", camera=VisionSettings(modes=3)),
-            "its camera.modes is 4, that of this training is 3; eye and networks must be alike",
+            "its camera.modes is 4, that of this training is 3; feature extractor and "
+            "networks must be alike",
         ),
         (
             TrainingSettings(see="both"),
@@ -184,7 +190,10 @@ def test_steps_without_a_frame_are_void() -> None:
     rare = replace(DEFAULT, rate=3.0)
     camera = Camera(rare, StackSettings(frames=1))
     env = SwimEnv(
-        SimulatedLink(Config(), camera=camera), Config(), EnvironmentSettings(), job_eye("nature")
+        SimulatedLink(Config(), camera=camera),
+        Config(),
+        EnvironmentSettings(),
+        job_extractor("nature"),
     )
     env.reset(seed=0)
     action = np.array([0.2], np.float32)
@@ -215,16 +224,19 @@ def test_with_another_camera_the_eye_is_fitted_again_and_the_networks_are_kept(
     assert outcome.best_evaluation.relative_thrust > 0.9
     assert by_sight.best
     assert outcome.best
-    eyes = [
-        checkpoints.load_policy(checkpoint)[1].eye for checkpoint in (by_sight.best, outcome.best)
+    extractors = [
+        checkpoints.load_policy(checkpoint)[1].extractor
+        for checkpoint in (by_sight.best, outcome.best)
     ]
-    first, second = (eye.constants["patterns"] for eye in eyes if eye)
+    first, second = (extractor.constants["patterns"] for extractor in extractors if extractor)
     assert not np.array_equal(first, second)
 
 
-def job_eye(kind: str) -> Eye | None:
+def job_extractor(kind: str) -> FeatureExtractor | None:
     stack = StackSettings(frames=1)
-    return make_eye(TrainingSettings(see="camera", camera=VisionSettings(eye=kind, stack=stack)))
+    return make_extractor(
+        TrainingSettings(see="camera", camera=VisionSettings(feature_extractor=kind, stack=stack))
+    )
 
 
 def test_gymnasium_makes_an_environment_that_sees(tmp_path: Path) -> None:

@@ -78,11 +78,20 @@ def test_written_settings_can_be_read_back(tmp_path: Path) -> None:
             "needed",
         ),
         ("environment: {observation: []}", "the agent would see nothing"),
-        ("see: camera\ncamera: {babble: 64, memory: 16}", "less than a quarter of babble"),
-        ("see: camera\ncamera: {eye: fish}", "camera.eye"),
-        ("see: camera\ncamera: {eye: cnn, stack: {size: 67}}", "68 px or more are needed"),
-        ("see: camera\ncamera: {eye: nature, stack: {size: 35}}", "36 px or more are needed"),
-        ("see: camera\nsteps: 256", "more than the babble, 256 steps, is needed"),
+        (
+            "see: camera\ncamera: {random_excitation: 64, memory: 16}",
+            "less than a quarter of random_excitation",
+        ),
+        ("see: camera\ncamera: {feature_extractor: fish}", "camera.feature_extractor"),
+        (
+            "see: camera\ncamera: {feature_extractor: cnn, stack: {size: 67}}",
+            "68 px or more are needed",
+        ),
+        (
+            "see: camera\ncamera: {feature_extractor: nature, stack: {size: 35}}",
+            "36 px or more are needed",
+        ),
+        ("see: camera\nsteps: 256", "more than the random excitation, 256 steps, is needed"),
         ("steps: 0", "steps: 0 is not valid without imitation.rounds"),
         (
             "see: both\nimitation: {rounds: 2}",
@@ -106,3 +115,10 @@ def test_a_wrong_value_is_one_line_that_names_file_line_key_and_what_is_needed(
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
         load(tmp_path / "none.yaml")
+
+
+def test_settings_with_the_keys_of_an_older_fishd_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "settings.yaml"
+    path.write_text("camera: {eye: cnn, babble: 128}\n")
+    camera = load(path).camera
+    assert (camera.feature_extractor, camera.random_excitation) == ("cnn", 128)

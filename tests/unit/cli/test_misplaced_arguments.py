@@ -9,7 +9,9 @@ from rigs.policy_files import velocity_follower, write
 from rigs.processes import fishctl, one_line
 
 
-@pytest.mark.parametrize("override", ["camera.eye=cnn", "ppo.n_steps=64", "see=camera"])
+@pytest.mark.parametrize(
+    "override", ["camera.feature_extractor=cnn", "ppo.n_steps=64", "see=camera"]
+)
 @pytest.mark.parametrize("verb", [("learn", "ppo"), ("compare", "swing")])
 def test_for_a_setting_of_a_training_the_message_names_its_file(
     verb: tuple[str, ...], override: str

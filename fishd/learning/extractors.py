@@ -1,4 +1,4 @@
-"""The eyes: an eye is fitted to the babble once, then converts stacks of frames to numbers.
+"""The feature extractors: one is fitted once, then converts stacks of frames to numbers.
 
 `modes` works like a lock-in amplifier: each pixel of the part of the picture that changes sign in
 the mirror is regressed on the latest commands, and the strongest patterns of the explained part are
@@ -24,16 +24,16 @@ Array = NDArray[np.float32]
 Nodes = tuple[list[Any], dict[str, NDArray[Any]]]
 """Operators of ONNX in their order of execution, and their constants by name."""
 SHRINK = 4
-"""Side of the squares of pixels that the eye `cnn` averages over [px]."""
+"""Side of the squares of pixels that the feature extractor `cnn` averages over [px]."""
 _MAX_HOLD_TICKS = 6
-"""Largest number of ticks for which an angle of the babble is held."""
+"""Largest number of ticks for which an angle of the random excitation is held."""
 
 
-class Eye(ABC):
+class FeatureExtractor(ABC):
     """A conversion of stacks of frames to numbers, with constants that learning does not change.
 
-    The constants are fitted once, to the babble: frames of a tail that is driven at random. The
-    network of a policy file contains them.
+    The constants are fitted once, to the random excitation: frames of a tail that is driven at
+    random. The network of a policy file contains them.
     """
 
     shape: tuple[int, int, int] | None = None
@@ -49,7 +49,7 @@ class Eye(ABC):
     def __init__(self, stack: StackSettings) -> None:
         self.stack = stack
         self.constants: dict[str, Array] = {}
-        """Constants by name; empty until the eye is fitted."""
+        """Constants by name; empty until the feature extractor is fitted."""
         self._latest: deque[tuple[Pixels, Array]] = deque(maxlen=2 * stack.frames)
         """Latest frames with their codes, a cache, since a frame is in several stacks."""
 
@@ -57,7 +57,7 @@ class Eye(ABC):
     def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
         """Fit the constants.
 
-        frames: newest frame of each tick of the babble, shape (ticks, size, size)
+        frames: newest frame of each tick of the random excitation, shape (ticks, size, size)
         angles: instruction angle applied until each of these ticks, shape (ticks,) [rad]
 
         Raises `fishd.camera.axis.NoMotion` where the tail is not visible.
@@ -93,7 +93,7 @@ class Eye(ABC):
 
     @property
     def is_fitted(self) -> bool:
-        """Whether the eye has all its constants."""
+        """Whether the feature extractor has all its constants."""
         return set(self.constants) == set(self.shapes)
 
     def restore(self, constants: Mapping[str, Array]) -> None:
@@ -130,8 +130,8 @@ def normalise_nodes(pictures: str, out: str, size: int) -> Nodes:
     return nodes, {area: np.array(size * size, np.float32), plane: np.array([2, 3])}
 
 
-class ModesEye(Eye):
-    """An eye that returns the amplitudes of a few patterns in each frame, newest frame first."""
+class ModesExtractor(FeatureExtractor):
+    """Extractor of the amplitudes of a few patterns in each frame, newest frame first."""
 
     def __init__(self, stack: StackSettings, modes: int, memory: int, align: bool) -> None:
         """
@@ -163,7 +163,7 @@ class ModesEye(Eye):
         follow = (odd @ patterns.T).T @ lags.mean(axis=1)  # with the sign of the command,
         patterns *= np.where(follow < 0.0, -1.0, 1.0)[
             :, None
-        ]  # so that another eye has the same signs
+        ]  # so that another feature extractor has the same signs
         patterns /= (odd @ patterns[0]).std()
         self.constants = {
             "patterns": patterns.astype(np.float32),
@@ -210,8 +210,8 @@ def _odd_part(pictures: Array, axis: Axis) -> Array:
     return (0.5 * odd).astype(np.float32)
 
 
-class CnnEye(Eye):
-    """An eye that returns the newest frame and differences of frames, shrunk, about the axis."""
+class CnnExtractor(FeatureExtractor):
+    """Extractor of the newest frame and differences of frames, shrunk, about the axis."""
 
     def __init__(self, stack: StackSettings, align: bool) -> None:
         super().__init__(stack)
@@ -245,7 +245,7 @@ class CnnEye(Eye):
         }
 
     def encode_frame(self, frame: Pixels) -> Array:
-        """Return the difference to the mean picture, over its standard deviation in the babble."""
+        """Return the difference to the mean picture, over the standard deviation."""
         constants = self.constants
         small = constants["rows"] @ normalise(frame) @ constants["columns"]
         return np.asarray((small - constants["mean"]) * constants["scale"], np.float32)
@@ -282,8 +282,8 @@ class CnnEye(Eye):
         return nodes, constants
 
 
-class NatureEye(Eye):
-    """An eye that returns the frames unchanged, scaled to 0 to 1, as in the paper."""
+class NatureExtractor(FeatureExtractor):
+    """A feature extractor that returns the frames unchanged, scaled to 0 to 1, as in the paper."""
 
     network = "nature"
 
@@ -294,7 +294,7 @@ class NatureEye(Eye):
         self.shapes = {}
 
     def fit(self, frames: Pixels, angles: NDArray[np.float64]) -> None:
-        """Do nothing: this eye has no constants."""
+        """Do nothing: this feature extractor has no constants."""
 
     def encode_frame(self, frame: Pixels) -> Array:
         """Return the grey levels divided by 255."""
@@ -328,16 +328,16 @@ def _shrink_matrix(size: int, shift: float) -> Array:
     return weights
 
 
-def make_eye(settings: TrainingSettings) -> Eye | None:
-    """Return the eye of a training, not yet fitted; None where the agent sees only forces."""
+def make_extractor(settings: TrainingSettings) -> FeatureExtractor | None:
+    """Return the extractor of a training, not yet fitted; None for an agent without pictures."""
     camera = settings.camera
     if settings.see == "force":
         return None
-    if camera.eye == "modes":
-        return ModesEye(camera.stack, camera.modes, camera.memory, camera.align)
-    if camera.eye == "cnn":
-        return CnnEye(camera.stack, camera.align)
-    return NatureEye(camera.stack)
+    if camera.feature_extractor == "modes":
+        return ModesExtractor(camera.stack, camera.modes, camera.memory, camera.align)
+    if camera.feature_extractor == "cnn":
+        return CnnExtractor(camera.stack, camera.align)
+    return NatureExtractor(camera.stack)
 
 
 def random_angles(seed: int, ticks: int, amplitude: float) -> NDArray[np.float64]:
