@@ -4,18 +4,16 @@ Each fish swims one experiment of three minutes in virtual time, measured with n
 sensor, offsets and drift. Every fit begins with the default fish.
 """
 
-import os
 import random
 from argparse import Namespace
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from math import radians
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
-from common.report import Options, Report, table
+from common.report import JOBS, Options, Report, run_cases, table
 from fishd.config import Config, load
 from fishd.lab.compare.survey import harsh
 from fishd.lab.identification import experiment, identify
@@ -193,21 +191,20 @@ OPTIONS: Options = {
         "default": 10,
         "help": "experiments of each kind, half as many harsh ones; default 10",
     },
-    "--jobs": {"type": int, "default": os.cpu_count(), "help": "processes"},
+    **JOBS,
 }
 
 
 def measure(options: Namespace) -> Report:
     """Return the tables; each experiment takes some seconds."""
     sections, figures, whole = {}, {}, []
-    with ProcessPoolExecutor(options.jobs) as pool:
-        for kind in KINDS:
-            seeds = options.seeds if kind in EQUALLY_FITTED else (options.seeds + 1) // 2
-            outcomes = list(pool.map(one, [(kind, seed) for seed in range(seeds)]))
-            whole.append(summary(kind, outcomes))
-            figures[kind] = [outcome._asdict() for outcome in outcomes]
-            if kind in EQUALLY_FITTED:
-                lines = rows(outcomes, known=kind == "other")
-                sections[f"bench identification {kind}"] = table(HEAD, lines)
+    for kind in KINDS:
+        seeds = options.seeds if kind in EQUALLY_FITTED else (options.seeds + 1) // 2
+        outcomes = run_cases(one, [(kind, seed) for seed in range(seeds)], options.jobs)
+        whole.append(summary(kind, outcomes))
+        figures[kind] = [outcome._asdict() for outcome in outcomes]
+        if kind in EQUALLY_FITTED:
+            lines = rows(outcomes, known=kind == "other")
+            sections[f"bench identification {kind}"] = table(HEAD, lines)
     sections["bench identification summary"] = table(SUMMARY, whole)
     return Report(sections, figures)

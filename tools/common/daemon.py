@@ -3,7 +3,6 @@
 import contextlib
 import os
 import signal
-import socket
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -39,18 +38,12 @@ class Fishd(Process):
         command: Sequence[str] = START,
         environment: dict[str, str] | None = None,
         output: int | None = None,
-        tcp: bool = False,
     ) -> None:
-        """
-        command: command that starts fishd; output: file for standard output and error instead of a
-        log tcp: telemetry over TCP; another program may take the port before fishd
-        """
+        """command: command that starts fishd; output: file for standard output and error"""
         self._folder = tempfile.TemporaryDirectory(prefix="fishd-")
         self.folder = Path(self._folder.name)
         self.endpoint = f"ipc://{self.folder}/control"
         self.telemetry = f"ipc://{self.folder}/telemetry"
-        if tcp:
-            self.telemetry = f"tcp://127.0.0.1:{_free_port()}"
         self.log = self.folder / "log"
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.SUB)
@@ -123,28 +116,9 @@ class Fishd(Process):
         servers = _children(self.pid)
         return [*servers, *(pid for server in servers for pid in _children(server))]
 
-    def gateway(self, kind: str) -> int:
-        """Return the process of a gateway: `control`, `telemetry` or `gateways` for their parent.
-
-        Waits until there is one.
-        """
-        deadline = time.monotonic() + TIMEOUT_S
-        while time.monotonic() < deadline:
-            for pid in self.gateways():
-                with contextlib.suppress(OSError):
-                    if Path(f"/proc/{pid}/comm").read_text(encoding="ascii") == f"fishd-{kind}\n":
-                        return pid
-            time.sleep(0.001)
-        raise SystemExit(f"fishd has no gateway of {kind}: {self.log.read_text(encoding='utf-8')}")
-
     def cpu_seconds(self) -> float:
         """Return the user and system time of all threads and of the gateways [s]."""
         return sum(_cpu_seconds(Path(f"/proc/{pid}")) for pid in (self.pid, *self.gateways()))
-
-    def thread_seconds(self) -> dict[int, float]:
-        """Return the user and system time of each thread of the main process [s]."""
-        tasks = Path(f"/proc/{self.pid}/task").iterdir()
-        return {int(task.name): _cpu_seconds(task) for task in tasks}
 
     def memory(self, field: str = "VmRSS") -> float:
         """Return a size of the main process in /proc/PID/status [MB]."""
@@ -199,10 +173,3 @@ def _size(file: Path, field: str) -> float:
         return 0.0
     sizes = (int(line.split()[1]) * 1024e-6 for line in lines if line.startswith(f"{field}:"))
     return next(sizes, 0.0)
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-    return port

@@ -29,6 +29,9 @@ TIMEOUT_S = 90.0
 START_S = 30.0
 """Longest time until fishd answers, or is terminated [s]."""
 
+Done = subprocess.CompletedProcess[str] | subprocess.TimeoutExpired
+"""Result of a command: its end, or that it hung."""
+
 OPTIONS: Options = {
     "--only": {"nargs": "+", "metavar": "CONDITION", "help": "of all conditions"},
     "--groups": {"nargs": "+", "metavar": "GROUP", "help": "of all groups of verbs"},
@@ -199,9 +202,7 @@ def try_group(group: str, name: str, fishd: Fishd, place: Place) -> Iterator[Cel
         yield _cell(group, name, verb.words, done, wrong)
 
 
-def _run(
-    verb: Verb, name: str, fishd: Fishd, place: Place
-) -> "subprocess.CompletedProcess[str] | subprocess.TimeoutExpired":
+def _run(verb: Verb, name: str, fishd: Fishd, place: Place) -> Done:
     words = [
         word.replace("FOLDER", str(place.folder))
         .replace("RUNS", str(place.runs))
@@ -214,9 +215,7 @@ def _run(
     return _under(name, [FISHCTL, *words], _environment(fishd), place)
 
 
-def _under(
-    name: str, command: list[str], environment: dict[str, str], place: Place
-) -> "subprocess.CompletedProcess[str] | subprocess.TimeoutExpired":
+def _under(name: str, command: list[str], environment: dict[str, str], place: Place) -> Done:
     condition = CONDITIONS[name]
     shutil.rmtree(place.folder, ignore_errors=True)
     place.folder.mkdir()
@@ -288,9 +287,7 @@ def _try_fishd(name: str, place: Place) -> Cell:
     return _cell("fishd", name, "fishd", done, wrong)
 
 
-def _common_fault(
-    done: "subprocess.CompletedProcess[str] | subprocess.TimeoutExpired",
-) -> str:
+def _common_fault(done: Done) -> str:
     if isinstance(done, subprocess.TimeoutExpired):
         return f"hangs for {TIMEOUT_S:g} s"
     if done.returncode == _NOT_TRIED:
@@ -303,12 +300,7 @@ def _common_fault(
     return ""
 
 
-def _judge(
-    verb: Verb,
-    condition: Condition,
-    name: str,
-    done: "subprocess.CompletedProcess[str] | subprocess.TimeoutExpired",
-) -> str:
+def _judge(verb: Verb, condition: Condition, name: str, done: Done) -> str:
     """Return the mistake in the end of a command; empty without one."""
     fault = _common_fault(done)
     if fault or isinstance(done, subprocess.TimeoutExpired) or done.returncode == _NOT_TRIED:
@@ -331,13 +323,7 @@ def _judge(
     return ""
 
 
-def _cell(
-    group: str,
-    condition: str,
-    words: str,
-    done: "subprocess.CompletedProcess[str] | subprocess.TimeoutExpired",
-    wrong: str,
-) -> Cell:
+def _cell(group: str, condition: str, words: str, done: Done, wrong: str) -> Cell:
     if isinstance(done, subprocess.TimeoutExpired):
         return Cell(group, condition, words, None, "", wrong)
     tried = done.returncode != _NOT_TRIED
