@@ -97,7 +97,7 @@ def compare(
 
     A contestant is the name of a policy (see `fishctl policies`), an .onnx file, or a controller
     with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. The default is the
-    best square wave, swing, and the named policies that are made for this fish.
+    best square wave, swing, and the named policies that are trained for this fish.
 
     In simulation the thrust is the true thrust, and relative thrust is its ratio to that of the
     best square wave. The thrust of a live fish is measured, with rests between swims; Ctrl-C lets

@@ -194,7 +194,7 @@ def _prepare_job(
     # The plant scales the inputs, and that of fishd is most likely right.
     if running_config and (difference := plant_differences(config, plant)):
         echo(
-            "fishctl: careful: scales and relative thrust are made for another plant than "
+            "fishctl: careful: scales and relative thrust are those of another plant than "
             f"that of the fishd that runs: {difference}",
             err=True,
         )
