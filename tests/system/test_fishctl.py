@@ -121,7 +121,7 @@ def test_the_status_says_what_runs_and_how_well(daemon: Daemon) -> None:
     assert "sine frequency=1.5" in text
     assert not {"loop", "duration", "estimate"} & set(rows)
     with_timing = daemon.fishctl("status", "--timing").stdout
-    for word in ("running", "loop ", "lateness ", "busy ", "estimate "):
+    for word in ("running", "loop ", "lateness ", "duration ", "estimate "):
         assert word in with_timing
 
 
