@@ -81,7 +81,7 @@ CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
     ("i2c bus", "FAIL", "does not exist", {}, []),
     ("i2c bus", "ok", "", {"dev/i2c-1": ""}, []),
     ("i2c bus", "FAIL", "there is i2c-1", {"dev/i2c-1": ""}, ["force_sensor.bus=3"]),
-    ("i2c speed", "skipped", "does not tell", {}, []),
+    ("i2c speed", "skipped", "does not state", {}, []),
     ("i2c speed", "ok", "400 kbit/s", {SPEED: FAST}, []),
     ("i2c speed", "warning", "100 kbit/s", {SPEED: SLOW}, []),
     ("i2c speed", "ok", "400 kbit/s", {SPEED_BEFORE: FAST}, []),

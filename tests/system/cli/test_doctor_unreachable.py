@@ -55,7 +55,7 @@ def test_beside_a_fishd_that_may_not_be_asked_no_hardware_is_touched(root: Path)
     for name in HARDWARE:
         level, message, _ = findings[name]
         assert (level, name) == ("skipped", name)
-        assert "may not connect" in message
+        assert "may not ask" in message
         assert AS_FISHD in message
     assert findings["daemon"][0] == "warning"
     assert findings["daemon"][2].startswith(AS_FISHD)

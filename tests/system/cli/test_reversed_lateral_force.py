@@ -52,7 +52,7 @@ def wait_for_ticks(fish: Fish, ticks: int, earlier: Callable[[], bool]) -> None:
 def interchanged(rig: Bench, daemon: Daemon) -> Daemon:
     """The fishd, calibrated with +y and -y interchanged, after a swim."""
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        fish.calibrate_force(ForceCalibration(yy=-1.0, loads_file=5))
+        fish.calibrate_force(ForceCalibration(yy=-1.0, loads=5))
         assert fish.status().fy_reversed is None
         swim_until_judged(fish)
     return daemon
