@@ -46,6 +46,7 @@ _POOR_RESIDUAL = 0.02
 @for_option("Duration of each measurement [s].", default=5.0, kind=FiniteRange(0.1, 60.0))
 @click.option(
     "--load-error",
+    "load_ci95",
     type=FiniteRange(0.0, 0.5),
     default=DEFAULT_LOAD_ERROR,
     show_default=True,
