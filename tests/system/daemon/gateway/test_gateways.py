@@ -30,7 +30,7 @@ from fishd.daemon.gateway.gateways import (
 )
 from fishd.daemon.gateway.limits import _nice_value
 
-ATTACKERS = ROOT / "tools" / "reliability" / "attackers.py"
+ATTACKERS = ROOT / "tests" / "rigs" / "attackers.py"
 
 
 SWIMMING = ("--set", "start.controller=swing")
