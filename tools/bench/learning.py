@@ -408,7 +408,7 @@ PARTS = {
 }
 OPTIONS: Options = {
     "--seeds": {"type": int, "default": 10, "help": "trainings of each row; default: 10"},
-    "--steps": {"type": int, "help": "control steps of each training, instead of those of its row"},
+    "--steps": {"type": int, "help": "control steps of each training, as a trial; 512 or more"},
     "--jobs": {
         "type": int,
         "default": max(1, joblib.cpu_count() - 1),

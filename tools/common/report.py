@@ -50,7 +50,7 @@ def run(package: str, names: Sequence[str]) -> int:
         text = _docstring(f"{package}.{name}")
         command = commands.add_parser(
             name,
-            help=text.partition("\n")[0],
+            help=text.partition("\n")[0].replace("%", "%%"),
             description=text,
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
