@@ -58,5 +58,15 @@ def test_the_committed_tables_are_what_the_code_says(tool: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("words", [["bench"], ["bench", "swimmer"], ["reliability"]])
+def test_the_help_of_a_program_lists_what_it_measures(words: list[str]) -> None:
+    program = [sys.executable, str(ROOT / "tools" / words[0]), *words[1:], "--help"]
+    done = subprocess.run(program, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert {"bench": "coverage", "swimmer": "cylinder", "reliability": "kills"}[words[-1]] in (
+        done.stdout
+    )
+
+
 def test_every_kind_of_event_is_described() -> None:
     assert {kind for kind, *_ in EVENTS} == set(get_args(EventKind))
