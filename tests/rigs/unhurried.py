@@ -11,6 +11,7 @@ import sys
 from msgspec.structs import replace
 
 from fishd.__main__ import fishctl, fishd
+from fishd.client import Fish
 from fishd.control import loop, supervisor
 from fishd.control.faults import FAULTS
 from fishd.hardware.servo import pigpio_link
@@ -24,6 +25,7 @@ def have_patience() -> None:
     pigpio_link.MAX_LATE_ANSWERS = 1_000_000
     FAULTS["controller-slow"] = replace(FAULTS["controller-slow"], in_a_row=1_000_000)
     session.MAX_LOST_FRACTION, session.IDLE_LIMIT = 1.0, 60.0
+    Fish.__init__.__kwdefaults__["timeout"] = 30.0
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ def lockstep(tmp_path: Path) -> Iterator[Rig]:
 def test_it_learns_from_the_frames_of_each_tick_in_lockstep(lockstep: Rig) -> None:
     done = fishctl(*lockstep.words)
     assert done.returncode == 0, done.stderr
-    assert "from pictures with the eye modes" in done.stdout
+    assert "from pictures with the feature extractor modes" in done.stdout
     table = rows(lockstep.folder / "progress.csv")
     assert [row["steps"] for row in table] == ["192", "256", "320"]
     assert {row["lost"] for row in table} == {"0"}

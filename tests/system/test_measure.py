@@ -5,7 +5,16 @@ import signal
 
 import msgspec
 import pytest
-from rigs.processes import EXPERIMENT, PATIENCE, Daemon, Process, Subscriber, running, wait_until
+from rigs.processes import (
+    EXPERIMENT,
+    PATIENCE,
+    Daemon,
+    Process,
+    Subscriber,
+    call,
+    running,
+    wait_until,
+)
 
 from fishd.client import Fish
 from fishd.core.errors import Refused
@@ -30,7 +39,8 @@ def start_measurement(daemon: Daemon) -> Process:
 
 
 def test_it_finds_the_thrust_and_fishd_shows_it_from_then_on(daemon: Daemon) -> None:
-    ended = daemon.fishctl("measure", "swing", "--for", "21", "--json")
+    words = ("--endpoint", daemon.endpoint, "measure", "swing", "--for", "21", "--json")
+    ended = call(*EXPERIMENT, *words)
     assert ended.returncode == 0, ended.stderr
     result = msgspec.json.decode(ended.stdout)
     assert result["thrust"] == pytest.approx(25.74e-3, abs=1.5e-3)

@@ -28,7 +28,7 @@ from fishd.learning import extractors
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.perception import Perception
 from fishd.learning.extractors import FeatureExtractor
-from fishd.learning.settings import TrainingSettings
+from fishd.learning.settings import from_plain
 
 # Modules that import torch are imported where they are used: most functions need no networks.
 if TYPE_CHECKING:
@@ -230,7 +230,7 @@ def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
     from fishd.learning.ppo import make_policy
 
     card = read_card(checkpoint)
-    settings = msgspec.convert(card.provenance.settings, TrainingSettings)
+    settings = from_plain(card.provenance.settings)
     extractor = extractors.make_extractor(settings)
     if extractor:
         load_extractor(extractor, checkpoint)

@@ -5,11 +5,13 @@ import re
 import signal
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
+from functools import partialmethod
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
+from rich.progress import Progress
 from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line
 from rigs.swimming import brief_job, rows, wait_for, while_it_trains
 
@@ -165,6 +167,8 @@ def test_on_a_terminal_a_training_shows_a_bar(
 ) -> None:
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
+    # A training of a moment may end before the next refresh.
+    monkeypatch.setattr(Progress, "update", partialmethod(Progress.update, refresh=True))
     ours, theirs = pty.openpty()
 
     def read_terminal() -> str:

@@ -10,14 +10,13 @@ from fishd.controllers.policy.file import read
 from fishd.lab.compare.survey import mild
 from fishd.lab.simulation import simulate
 from fishd.learning import settings as training
-from fishd.learning.settings import TrainingSettings
 
 SETTINGS = ROOT / "config" / "learning-harsh.yaml"
 
 
 def test_its_card_names_the_settings_of_the_documented_training() -> None:
     provenance = read(library.find("default-fish")).card.provenance
-    settings = msgspec.convert(provenance.settings, TrainingSettings)
+    settings = training.from_plain(provenance.settings)
     assert settings == training.load(SETTINGS)
     assert provenance.seed == settings.seed
     plant = msgspec.to_builtins(load().plant)
