@@ -23,7 +23,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def _awaited(
+def _run_in_thread(
     method: Callable[Concatenate[Fish, P], T],
 ) -> Callable[Concatenate["AsyncFish", P], Coroutine[Any, Any, T]]:
     """Return a method of `AsyncFish` that runs one of `Fish` in a thread."""
@@ -69,23 +69,23 @@ class AsyncFish:
             self._fish.close()
         self._context.destroy(linger=0)
 
-    status = _awaited(Fish.status)
-    controllers = _awaited(Fish.controllers)
-    policies = _awaited(Fish.policies)
-    config = _awaited(Fish.config)
-    set_controller = _awaited(Fish.set_controller)
-    set_parameters = _awaited(Fish.set_parameters)
-    stop = _awaited(Fish.stop)
-    clear_fault = _awaited(Fish.clear_fault)
-    mark = _awaited(Fish.mark)
-    calibrations = _awaited(Fish.calibrations)
-    sample_force = _awaited(Fish.sample_force)
-    tare = _awaited(Fish.tare)
-    calibrate_force = _awaited(Fish.calibrate_force)
-    calibrate_thrust = _awaited(Fish.calibrate_thrust)
-    calibrate_servo = _awaited(Fish.calibrate_servo)
-    _take_lease = _awaited(Fish.take_lease)
-    _end_lease = _awaited(Fish.end_lease)
+    status = _run_in_thread(Fish.status)
+    controllers = _run_in_thread(Fish.controllers)
+    policies = _run_in_thread(Fish.policies)
+    config = _run_in_thread(Fish.config)
+    set_controller = _run_in_thread(Fish.set_controller)
+    set_parameters = _run_in_thread(Fish.set_parameters)
+    stop = _run_in_thread(Fish.stop)
+    clear_fault = _run_in_thread(Fish.clear_fault)
+    mark = _run_in_thread(Fish.mark)
+    calibrations = _run_in_thread(Fish.calibrations)
+    sample_force = _run_in_thread(Fish.sample_force)
+    tare = _run_in_thread(Fish.tare)
+    calibrate_force = _run_in_thread(Fish.calibrate_force)
+    calibrate_thrust = _run_in_thread(Fish.calibrate_thrust)
+    calibrate_servo = _run_in_thread(Fish.calibrate_servo)
+    _take_lease = _run_in_thread(Fish.take_lease)
+    _end_lease = _run_in_thread(Fish.end_lease)
 
     async def estop(self, message: str = "requested by a client") -> State:
         """Stop the servo's pulses at once, like `Fish.estop`, before requests that wait."""

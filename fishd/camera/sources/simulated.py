@@ -70,22 +70,22 @@ class Foresight:
     def __init__(self, swimmer: Swimmer) -> None:
         self._swimmer = swimmer
         self._fish = TetheredFish(swimmer.plant)
-        self._last_seq: TickTruth | None = None
+        self._last_tick: TickTruth | None = None
         self._end = Tail(0.0, 0.0, 0.0)
 
     def follow(self, tick: TickTruth) -> list[tuple[Tail, Tail]]:
         """Return the parts of the motion that follow from a tick, as pairs of begin and end."""
         assert isinstance(tick.alpha, float)
-        period, last_seq = self._swimmer.tick, self._last_seq
+        period, last_tick = self._swimmer.tick, self._last_tick
         command = tick.phi_c if tick.servo_on else None
         now = Tail(tick.time, tick.alpha, tick.alpha_rate)
         parts = []
-        if last_seq is None or tick.seq != last_seq.seq + 1:
+        if last_tick is None or tick.seq != last_tick.seq + 1:
             self._fish = TetheredFish(self._swimmer.plant, PlantState(phi=tick.phi))
             if self._swimmer.plant.servo_delay:  # the commands within the servo's delay are unknown
                 self._swim(command, self._swimmer.plant.servo_delay + period)
         elif tick.time > self._end.time + TIME_TOLERANCE_S:  # after ticks that fishd has skipped
-            self._swim(last_seq.phi_c if last_seq.servo_on else None, tick.time - self._end.time)
+            self._swim(last_tick.phi_c if last_tick.servo_on else None, tick.time - self._end.time)
             parts.append((self._end, now))
         self._fish.state = PlantState(tick.phi, tick.alpha, tick.alpha_rate)
         end = tick.time + period
@@ -93,7 +93,7 @@ class Foresight:
             end = (round(tick.time / period) + 1) * period
         self._swim(command, end - tick.time)
         state = self._fish.state
-        self._last_seq, self._end = tick, Tail(end, state.alpha, state.alpha_rate)
+        self._last_tick, self._end = tick, Tail(end, state.alpha, state.alpha_rate)
         return [*parts, (now, self._end)]
 
     @property

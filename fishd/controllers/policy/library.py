@@ -112,7 +112,7 @@ def unknown_name_message(name: str, known: list[str]) -> str:
     """Return the message about an unknown name."""
     if not known:
         return (
-            f"no policy is named '{name}', and there is no other; put one into {folders()[0]}, or "
+            f"no policy is named '{name}', and none is installed; put one into {folders()[0]}, or "
             f"give the path of a {SUFFIX} file"
         )
     hint = suggest(name, known)

@@ -83,7 +83,7 @@ def test_where_there_are_none_it_says_where_to_put_one(tmp_path: Path) -> None:
     with pytest.raises(PolicyError) as caught:
         library.find("swim")
     assert str(caught.value) == (
-        "no policy is named 'swim', and there is no other; put one into "
+        "no policy is named 'swim', and none is installed; put one into "
         f"{tmp_path}/state/fishd/policies, or give the path of a .onnx file"
     )
 
