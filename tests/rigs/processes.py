@@ -78,11 +78,7 @@ class Daemon(Process):
     """Running fishd with separate addresses."""
 
     def __init__(
-        self,
-        folder: Path,
-        *arguments: str,
-        under: Sequence[str] = (),
-        start: Sequence[str] = START,
+        self, folder: Path, *arguments: str, under: Sequence[str] = (), start: Sequence[str] = START
     ) -> None:
         """
         under: beginning of the command that starts the daemon, for example `setpriv`

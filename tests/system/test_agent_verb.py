@@ -11,16 +11,7 @@ from typing import Any
 import pytest
 from rigs.camera_process import CameraProcess, running_camera
 from rigs.policy_files import FLIP, seeing_card, velocity_follower, write
-from rigs.processes import (
-    FISHCTL,
-    PATIENCE,
-    Daemon,
-    Process,
-    Subscriber,
-    running,
-    sets,
-    wait_until,
-)
+from rigs.processes import FISHCTL, PATIENCE, Daemon, Process, Subscriber, running, sets, wait_until
 
 from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.client import Fish

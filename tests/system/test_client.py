@@ -74,10 +74,7 @@ def test_nobody_at_the_endpoint_is_told_apart_from_a_refusal(tmp_path: Path) -> 
     ):
         fish.status()
     silence = r"no answer within 0\.05 s"
-    with (
-        Fish("tcp://127.0.0.1:9", timeout=0.05) as fish,
-        pytest.raises(NoDaemon, match=silence),
-    ):
+    with Fish("tcp://127.0.0.1:9", timeout=0.05) as fish, pytest.raises(NoDaemon, match=silence):
         fish.status()
     with pytest.raises(NoDaemon, match=silence):
         asyncio.run(call())

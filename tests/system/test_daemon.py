@@ -90,9 +90,7 @@ def test_a_mark_is_a_text_in_utf_8_whatever_the_locale(daemon: Daemon) -> None:
     assert "'fin ?' is not a text in UTF-8" in refused.stderr
 
 
-def test_the_shipped_configuration_rests_swims_and_says_so_every_second(
-    tmp_path: Path,
-) -> None:
+def test_the_shipped_configuration_rests_swims_and_says_so_every_second(tmp_path: Path) -> None:
     with running(tmp_path, "--config", SHIPPED, "--print-status") as daemon:
         with Subscriber(daemon.telemetry, b"tick") as subscriber:
             while subscriber.message()["frequency"] == 0.0:

@@ -89,9 +89,7 @@ def test_a_mark_arrives_as_an_event(daemon: Daemon) -> None:
     assert (event["message"], event["level"]) == ("changed the fin", "info")
 
 
-def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(
-    daemon: Daemon,
-) -> None:
+def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(daemon: Daemon) -> None:
     text = daemon.fishctl("controllers").stdout
     assert "swing  Reverse the tail" in text
     assert "--longest-half-period" in text

@@ -81,10 +81,7 @@ def test_a_camera_that_dies_ends_the_training_with_the_fish_at_rest(
             monkeypatch.setattr(fishd_link, "FRAMES_TIMEOUT_S", 2.0)
 
         done = while_it_trains(
-            lambda: begun.exists() and rows(begun),
-            kill_camera,
-            *rig.words,
-            *("--steps", "100000"),
+            lambda: begun.exists() and rows(begun), kill_camera, *rig.words, *("--steps", "100000")
         )
         assert done.returncode == 1
         assert f"camera at {rig.camera.endpoint}" in done.stderr

@@ -227,9 +227,7 @@ def test_in_lockstep_a_signal_ends_the_wait(tmp_path: Path, address: str) -> Non
     assert "Traceback" not in errors
 
 
-def test_the_example_of_the_documentation_swims_and_leaves_the_fish_at_rest(
-    tmp_path: Path,
-) -> None:
+def test_the_example_of_the_documentation_swims_and_leaves_the_fish_at_rest(tmp_path: Path) -> None:
     document = text_of(ROOT / "docs" / "how-to" / "remote.md")
     example = next(block for kind, block in FENCE.findall(document) if kind == "python")
     assert "400" in example

@@ -49,10 +49,7 @@ def test_from_another_machine_the_offset_is_estimated(
     tmp_path: Path, daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fishd.camera.clock_offset.read_boot_id", lambda: "of another machine")
-    with (
-        running_camera(tmp_path, *settings(daemon)) as camera,
-        Fish(daemon.endpoint) as fish,
-    ):
+    with running_camera(tmp_path, *settings(daemon)) as camera, Fish(daemon.endpoint) as fish:
         camera.is_in("streaming")
         with camera.client(fish=fish) as client:
             received: list[tuple[FrameHeader, Frame]] = []

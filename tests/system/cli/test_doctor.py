@@ -104,10 +104,7 @@ def test_a_fault_of_the_hardware_fails_the_check_that_is_about_it(
 
 @pytest.mark.parametrize(
     ("register", "value", "level", "complaint"),
-    [
-        (1, 0x0483, "warning", "another program uses it"),
-        (3, 0x7FF0, "FAIL", "an ADS1015 answers"),
-    ],
+    [(1, 0x0483, "warning", "another program uses it"), (3, 0x7FF0, "FAIL", "an ADS1015 answers")],
 )
 def test_a_chip_that_is_not_as_fishd_left_it_is_pointed_out(
     pi: Bench, register: int, value: int, level: str, complaint: str

@@ -200,9 +200,7 @@ def test_a_simulated_fish_leaves_the_recipe_of_a_robot_alone_unless_the_file_has
         assert not recipe.exists()
 
 
-def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(
-    killed: Remains,
-) -> None:
+def test_a_pigpiod_that_is_gone_is_the_line_and_the_status_of_fishctl(killed: Remains) -> None:
     pi, file, _ = killed
     pi.pi.inject("pigpiod-gone")
     ended = release("--config", str(file))

@@ -68,11 +68,7 @@ def ends(*hangs: Mapping[str, Any]) -> list[tuple[int, str]]:
 
 
 def start_process(
-    hang: str = "",
-    release: str = "None",
-    number: int = SIGTERM,
-    limits: str = "",
-    last: str = "",
+    hang: str = "", release: str = "None", number: int = SIGTERM, limits: str = "", last: str = ""
 ) -> "subprocess.Popen[str]":
     """Start a process. limits, last: statements before and after the last resort is set up"""
     program = PROGRAM.format(hang=hang, release=release, limits=limits, last=last)

@@ -213,11 +213,7 @@ PCA9685 = ["servo.driver=pca9685", "servo.bus=177", "force_sensor.bus=178"]
     ids=["hx711", "pca9685"],
 )
 def test_a_second_fishd_on_the_same_chip_is_refused(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    settings: list[str],
-    part: int,
-    complaint: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: list[str], part: int, complaint: str
 ) -> None:
     monkeypatch.setattr(ownership, "FOLDER", tmp_path)
     config = load(None, ["robot=pi", *settings, f"state_folder={tmp_path}"])

@@ -66,10 +66,7 @@ def test_a_signal_while_its_processes_are_being_started_is_heard(
         return start(parallel, calls)
 
     monkeypatch.setattr(joblib.Parallel, "__call__", interrupted)
-    with (
-        on_signal(lambda: heard.append(number)),
-        workers(tmp_path / "stop", jobs=2) as crew,
-    ):
+    with on_signal(lambda: heard.append(number)), workers(tmp_path / "stop", jobs=2) as crew:
         assert sorted(crew.run(abs, [-1, -2])) == [(0, 1), (1, 2)]
     assert heard == [number]
 

@@ -57,12 +57,7 @@ def identification() -> Identification:
         Estimate("rotation", 0.1, 0.1, 0.1, fitted=False),
     ]
     channel = Channel(
-        "fx",
-        explained=0.99,
-        explained_out_of_sample=0.99,
-        noise=1e-3,
-        drift=0.0,
-        white=True,
+        "fx", explained=0.99, explained_out_of_sample=0.99, noise=1e-3, drift=0.0, white=True
     )
     errors = np.log([1.02, 1.04]) / 1.96
     empty = np.zeros((2, 0))

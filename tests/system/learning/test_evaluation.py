@@ -15,11 +15,7 @@ from fishd.lab.compare.contestants import best_on_grid
 from fishd.lab.simulation import simulate
 from fishd.learning.env.evaluation import evaluate_in_simulation, judge, worst_on_others
 from fishd.learning.env.fish_variation import draw_edge_fish, draw_fish
-from fishd.learning.settings import (
-    EvaluationSettings,
-    Randomisation,
-    TrainingSettings,
-)
+from fishd.learning.settings import EvaluationSettings, Randomisation, TrainingSettings
 from fishd.learning.train.jobs import Job
 from fishd.learning.train.training import train
 from fishd.virtual.plant.optimum import best_square_wave, square_wave

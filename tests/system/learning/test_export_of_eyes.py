@@ -78,9 +78,7 @@ def test_the_outputs_of_the_file_are_those_of_the_trained_policy(
     assert len(network.row) == len(perception.features)
 
 
-def test_where_frames_are_missing_the_file_swims_as_the_policy_is_evaluated(
-    tmp_path: Path,
-) -> None:
+def test_where_frames_are_missing_the_file_swims_as_the_policy_is_evaluated(tmp_path: Path) -> None:
     settings = settings_of("modes", environment=EnvironmentSettings(history=3))
     card, policy, perception = randomly_excited(settings)
     path, config = tmp_path / "eye.onnx", Config()

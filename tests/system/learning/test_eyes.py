@@ -156,10 +156,7 @@ def test_an_eye_with_the_constants_of_another_sees_the_same(kind: str) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [
-        lambda constants: constants.pop("zero"),
-        lambda constants: constants.update(more=np.zeros(3)),
-    ],
+    [lambda constants: constants.pop("zero"), lambda constants: constants.update(more=np.zeros(3))],
 )
 def test_constants_of_another_kind_of_eye_are_refused(
     change: Callable[[dict[str, object]], None],

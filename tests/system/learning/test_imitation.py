@@ -17,11 +17,7 @@ from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.export import export
 from fishd.learning.imitation import advise_side, half_beat_thrusts, narrow
 from fishd.learning.run_folder import checkpoints
-from fishd.learning.settings import (
-    EnvironmentSettings,
-    ImitationSettings,
-    Randomisation,
-)
+from fishd.learning.settings import EnvironmentSettings, ImitationSettings, Randomisation
 from fishd.learning.train.jobs import Outcome
 from fishd.learning.train.progress import ShownDisplay
 from fishd.learning.train.training import train

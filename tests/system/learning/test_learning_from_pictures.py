@@ -132,10 +132,7 @@ def fields(rig: SimulatedCameraSettings) -> dict[str, object]:
             "its camera.modes is 4, that of this training is 3; feature extractor and "
             "networks must be alike",
         ),
-        (
-            TrainingSettings(see="both"),
-            "its see is camera, that of this training is both",
-        ),
+        (TrainingSettings(see="both"), "its see is camera, that of this training is both"),
     ],
 )
 def test_networks_are_not_given_to_another_eye(

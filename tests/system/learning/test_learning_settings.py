@@ -68,10 +68,7 @@ def test_written_settings_can_be_read_back(tmp_path: Path) -> None:
             "ppo.hidden: 64 is not valid: a list of whole numbers in [1, 1024] is needed: write "
             "[64]",
         ),
-        (
-            "evaluation:\n  others: 3\n",
-            "evaluation.others: 3 is not valid without a randomisation",
-        ),
+        ("evaluation:\n  others: 3\n", "evaluation.others: 3 is not valid without a randomisation"),
         (
             "evaluation:\n  on_robot: 5.0\n",
             "learning.yaml:2: evaluation.on_robot: 5.0 is not valid: a number in [8, 3600] s is "

@@ -12,13 +12,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from fishd.controllers.policy.card import Feature, Layout
 from fishd.learning.env.environment import spaces
 from fishd.learning.env.perception import Perception
-from fishd.learning.ppo import (
-    DeterministicPolicy,
-    Rollout,
-    layers_of,
-    learning_rate,
-    make_policy,
-)
+from fishd.learning.ppo import DeterministicPolicy, Rollout, layers_of, learning_rate, make_policy
 from fishd.learning.settings import PpoSettings
 
 FEATURES = (Feature("fy", 0.4), Feature("instruction_angle", 0.42))

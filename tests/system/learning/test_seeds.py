@@ -133,12 +133,7 @@ def test_a_seed_that_fails_is_reported_and_the_others_continue(tmp_path: Path) -
             (folder / "seed-2").write_text("a file, not a folder")
 
     outcomes = train_seeds(job, 4, jobs=1, ended=block_folder)
-    assert [outcome.ended for outcome in outcomes] == [
-        "finished",
-        "finished",
-        "failed",
-        "finished",
-    ]
+    assert [outcome.ended for outcome in outcomes] == ["finished", "finished", "failed", "finished"]
     assert "seed-2" in outcomes[2].message
     assert len((folder / "seeds.csv").read_text().splitlines()) == 3
 

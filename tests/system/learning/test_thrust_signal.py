@@ -96,9 +96,7 @@ def test_the_limit_of_a_spike_does_not_depend_on_the_scale_of_the_reward(tmp_pat
     assert largest[0] == largest[1] < 0.01
 
 
-def test_the_errors_are_removed_unless_each_episode_has_another_fish(
-    tmp_path: Path,
-) -> None:
+def test_the_errors_are_removed_unless_each_episode_has_another_fish(tmp_path: Path) -> None:
     def signal(name: str, **changes: object) -> ThrustSignal | None:
         job = brief_job(tmp_path / name, **changes)
         training = Training(job, SimulatedLink(job.config), Display(), lambda: False)

@@ -19,11 +19,7 @@ from fishd.learning.env.environment import features, thrust_scale
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
-from fishd.learning.settings import (
-    EnvironmentSettings,
-    EvaluationSettings,
-    PpoSettings,
-)
+from fishd.learning.settings import EnvironmentSettings, EvaluationSettings, PpoSettings
 from fishd.learning.train.jobs import Job, Outcome
 from fishd.learning.train.progress import Display
 from fishd.learning.train.training import Training, train
@@ -244,9 +240,7 @@ def test_a_resume_continues_from_the_newest_complete_checkpoint(copied: Job) -> 
     assert not half.exists()
 
 
-def test_a_run_killed_in_its_first_rollout_resumes_as_if_it_was_not_killed(
-    tmp_path: Path,
-) -> None:
+def test_a_run_killed_in_its_first_rollout_resumes_as_if_it_was_not_killed(tmp_path: Path) -> None:
     job, whole = brief_job(tmp_path / "run"), brief_job(tmp_path / "whole")
 
     def die() -> bool:
@@ -329,9 +323,7 @@ def test_a_pause_is_never_part_of_a_transition(tmp_path: Path) -> None:
     assert paused == pytest.approx([0.0, 3.0, 3.0])
 
 
-def test_a_rollout_equals_one_that_stable_baselines_computes_step_by_step(
-    tmp_path: Path,
-) -> None:
+def test_a_rollout_equals_one_that_stable_baselines_computes_step_by_step(tmp_path: Path) -> None:
     environment = EnvironmentSettings(episode=25)
     job = brief_job(tmp_path / "run", environment=environment)
     training = Training(job, SimulatedLink(job.config), Display(), lambda: False)

@@ -30,9 +30,7 @@ def stamped_late(frames: list[Frame], late: float) -> list[Frame]:
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [-0.01, 0.04])
 @pytest.mark.parametrize(
-    ("camera", "within"),
-    [(DEFAULT, 1.5e-3), (BAD, 3e-3)],
-    ids=["default", "bad"],
+    ("camera", "within"), [(DEFAULT, 1.5e-3), (BAD, 3e-3)], ids=["default", "bad"]
 )
 def test_the_delay_is_found_within_milliseconds_however_wrong_the_time_stamps_are(
     camera: SimulatedCameraSettings, within: float, late: float

@@ -56,8 +56,7 @@ def test_the_axis_can_be_off_and_tilted() -> None:
 
 
 @pytest.mark.parametrize(
-    "change",
-    [{"noise": 6.0}, {"caustics": 12.0}, {"light_drift": 0.3}, {"side_light": 20.0}],
+    "change", [{"noise": 6.0}, {"caustics": 12.0}, {"light_drift": 0.3}, {"side_light": 20.0}]
 )
 def test_each_imperfection_shows(change: dict[str, float]) -> None:
     clear = TailPainter(CLEAR, 84).paint(0.0, 0.0, 5.0).astype(float)

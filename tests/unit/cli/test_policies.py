@@ -32,9 +32,7 @@ def invoke(*arguments: str) -> Result:
     return CliRunner().invoke(fishctl, arguments)
 
 
-def test_without_a_daemon_the_policies_of_this_machine_are_listed(
-    policy_folder: Path,
-) -> None:
+def test_without_a_daemon_the_policies_of_this_machine_are_listed(policy_folder: Path) -> None:
     write(policy_folder, FLIP, "flip")
     write(policy_folder, b"PK", "torch")
     write(policy_folder, to_onnx(linear(1.0), "tanh", card(tick=0.02, amplitude=0.8)), "wide")
@@ -84,9 +82,7 @@ def test_a_file_without_a_policy_is_refused_with_the_reason(policy_folder: Path)
     assert str(done.exception).startswith("no policy is named 'touch'; did you mean 'torch'? Th")
 
 
-def test_control_characters_of_a_file_do_not_reach_the_terminal(
-    policy_folder: Path,
-) -> None:
+def test_control_characters_of_a_file_do_not_reach_the_terminal(policy_folder: Path) -> None:
     provenance = replace(PROVENANCE, on="\x1b[2Jrobot" + "x" * 10_000, note="\x1b]0;title\x07")
     hostile_card = replace(card(), provenance=replace(provenance, steps=10**50))
     write(policy_folder, to_onnx(linear(1.0), "tanh", hostile_card), "evil")

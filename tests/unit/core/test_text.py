@@ -69,11 +69,7 @@ def test_an_exception_is_named_whatever_it_is(error: BaseException, line: str) -
 
 @pytest.mark.parametrize(
     ("ci95", "said"),
-    [
-        (0.12e-3, "25.74 ± 0.12 mN"),
-        (1.7e-18, "25.74 mN (exact)"),
-        (None, "25.74 mN"),
-    ],
+    [(0.12e-3, "25.74 ± 0.12 mN"), (1.7e-18, "25.74 mN (exact)"), (None, "25.74 mN")],
 )
 def test_an_interval_of_zero_is_called_exact_and_not_zero(ci95: float | None, said: str) -> None:
     assert text.format_measured(25.74e-3, ci95, "N") == said

@@ -126,13 +126,7 @@ def test_a_table_of_speeds_is_gone_on_with_and_swing_is_drawn_among_the_waves(
     assert fields["speed"] == pytest.approx(0.07, abs=4e-3)
     assert "thrust" not in fields
     picture = tmp_path / "speed.svg"
-    figure.draw(
-        [picture],
-        curves,
-        {"frequency": "Hz"},
-        error_of="it",
-        quantity=folder.quantity,
-    )
+    figure.draw([picture], curves, {"frequency": "Hz"}, error_of="it", quantity=folder.quantity)
     text = picture.read_text()
     assert all(label in text for label in ("speed (mm/s)", "swing C=0.6", "frequency (Hz)"))
     assert "<!-- C -->" not in text  # swing has no separate panel

@@ -28,8 +28,7 @@ KEYS_AS_DEFAULT = {
 
 
 @pytest.mark.parametrize(
-    ("section", "defaults"),
-    [("plant", PlantParameters()), ("simulation", SimulationSettings())],
+    ("section", "defaults"), [("plant", PlantParameters()), ("simulation", SimulationSettings())]
 )
 def test_it_has_every_imperfection_that_there_is(section: str, defaults: msgspec.Struct) -> None:
     harsh = getattr(load(FILE), section)

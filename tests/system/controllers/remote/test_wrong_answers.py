@@ -175,11 +175,7 @@ def test_messages_that_come_byte_by_byte_are_put_together(rig: Rig, raw: RawAgen
 
 
 @pytest.mark.parametrize(
-    ("angle", "fill", "shown"),
-    [
-        (b"nul", 0, b'"phi_c":nul}'),
-        (b"nul", 900, b'"phi_c":nul}'),
-    ],
+    ("angle", "fill", "shown"), [(b"nul", 0, b'"phi_c":nul}'), (b"nul", 900, b'"phi_c":nul}')]
 )
 def test_what_is_shown_of_a_bad_message_is_where_it_is_bad(
     rig: Rig, agent: ScriptedAgent, angle: bytes, fill: int, shown: bytes

@@ -409,9 +409,7 @@ def test_fishd_waits_for_the_end_of_its_gateways_without_a_real_time_priority(
 
 
 @pytest.mark.realtime
-def test_a_gateway_that_had_too_many_connections_begins_anew_without_a_leak(
-    daemon: Daemon,
-) -> None:
+def test_a_gateway_that_had_too_many_connections_begins_anew_without_a_leak(daemon: Daemon) -> None:
     pid = daemon.process.pid
     open_files = []
     missed = daemon.status().missed_slots

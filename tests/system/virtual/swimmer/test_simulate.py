@@ -195,9 +195,7 @@ def test_a_swim_that_is_not_steady_is_said_to_need_a_longer_settle() -> None:
     assert " %/s: a longer --settle is needed\n" in out
 
 
-def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(
-    tmp_path: Path,
-) -> None:
+def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     keeps = ("--checkpoint", str(kept), "--checkpoint-every", "0.1")
     narrow = sets("swimmer.numerics.fine_width=0.5", "swimmer.steering=0")

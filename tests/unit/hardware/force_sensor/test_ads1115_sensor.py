@@ -20,8 +20,7 @@ def test_forces_are_the_calibrated_voltages(rig: ForceRig) -> None:
 
 
 @pytest.mark.parametrize(
-    ("channel_x", "channel_y"),
-    [("A2-A3", "A0-A1"), ("A0", "A3"), ("A0-A3", "A1-A3")],
+    ("channel_x", "channel_y"), [("A2-A3", "A0-A1"), ("A0", "A3"), ("A0-A3", "A1-A3")]
 )
 def test_each_force_comes_from_its_channel(rig: ForceRig, channel_x: str, channel_y: str) -> None:
     rig.volts = {channel_x: 0.8, channel_y: 0.3}

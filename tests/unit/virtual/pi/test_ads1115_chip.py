@@ -25,10 +25,7 @@ def test_the_driver_reads_every_input(board: Board) -> None:
     assert [AnalogIn(ads, *pins).value for pins in PINS] == [codes(volts) for volts in VOLTS]
 
 
-@pytest.mark.parametrize(
-    ("gain", "full_scale"),
-    [(2 / 3, 6.144), (2, 2.048), (16, 0.256)],
-)
+@pytest.mark.parametrize(("gain", "full_scale"), [(2 / 3, 6.144), (2, 2.048), (16, 0.256)])
 def test_a_code_is_a_share_of_its_range_or_end(
     board: Board, gain: float, full_scale: float
 ) -> None:
