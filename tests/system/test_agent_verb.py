@@ -120,9 +120,7 @@ def test_a_signal_leaves_the_fish_at_neutral(
 
 
 @pytest.mark.realtime
-def test_a_camera_that_dies_ends_it_at_neutral_with_a_clear_line(
-    tmp_path: Path, daemon: Daemon, eye: str
-) -> None:
+def test_a_camera_that_dies_ends_it_at_neutral(tmp_path: Path, daemon: Daemon, eye: str) -> None:
     with running_camera(tmp_path, *CAMERA, f"simulated.fishd={daemon.endpoint}") as camera:
         camera.is_in("streaming")
         with (
@@ -236,9 +234,7 @@ def test_without_a_camera_it_says_how_to_start_one(daemon: Daemon, eye: str) -> 
 
 
 @pytest.mark.realtime
-def test_a_live_comparison_lets_it_swim_through_the_camera(
-    daemon: Daemon, camera: CameraProcess, eye: str
-) -> None:
+def test_a_live_comparison_swims_by_sight(daemon: Daemon, camera: CameraProcess, eye: str) -> None:
     words = ("compare", "--on", "live", "--for", "21", eye, "--camera", camera.endpoint)
     done = daemon.fishctl_apart(*words, timeout=60.0)
     assert (done.returncode, done.stderr) == (0, "")
@@ -262,9 +258,7 @@ def test_a_live_comparison_leaves_out_what_the_camera_does_not_suit(
 
 
 @pytest.mark.realtime
-def test_a_camera_that_dies_ends_a_live_comparison_with_the_fish_at_rest(
-    tmp_path: Path, daemon: Daemon, eye: str
-) -> None:
+def test_a_dead_camera_ends_a_live_comparison(tmp_path: Path, daemon: Daemon, eye: str) -> None:
     with running_camera(tmp_path, *CAMERA, f"simulated.fishd={daemon.endpoint}") as camera:
         camera.is_in("streaming")
         own = ("--endpoint", daemon.endpoint, "compare", "--on", "live", eye)

@@ -138,9 +138,7 @@ def test_a_bad_configuration_exits_with_78_and_one_line(tmp_path: Path) -> None:
     assert errors == f"fishd: {file}:2: plant.omega: unknown key; did you mean 'omega0'?\n"
 
 
-def test_a_second_daemon_on_the_same_address_says_so_and_exits(
-    tmp_path: Path, daemon: Daemon
-) -> None:
+def test_a_second_daemon_on_the_same_address_exits(tmp_path: Path, daemon: Daemon) -> None:
     with running(tmp_path, *sets(f"telemetry.address=ipc://{tmp_path}/telemetry")) as first:
         rival = f"another fishd (pid {first.process.pid}) already serves"
         assert f"{rival} {first.endpoint}" in read_start_error(tmp_path)
@@ -158,9 +156,7 @@ def test_a_second_daemon_on_the_same_address_says_so_and_exits(
 
 
 @pytest.mark.parametrize("host", ["nohost.invalid", "192.0.2.1"])  # reserved for examples
-def test_a_telemetry_address_of_another_machine_is_one_line_with_what_would_be_right(
-    tmp_path: Path, host: str
-) -> None:
+def test_a_telemetry_address_elsewhere_is_one_line_of_advice(tmp_path: Path, host: str) -> None:
     assert (
         f"telemetry.address: cannot listen on tcp://{host}:9872: {host} is not an address of this "
         "machine; write tcp://127.0.0.1:9872, or tcp://0.0.0.0:9872 for all\n"

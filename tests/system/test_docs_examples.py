@@ -21,9 +21,7 @@ def examples() -> Iterator[object]:
 
 
 @pytest.mark.parametrize("block", list(examples()))
-def test_an_example_prints_ticks_and_ends_without_a_traceback(
-    block: str, daemon: Daemon, tmp_path: Path
-) -> None:
+def test_an_example_prints_ticks_and_ends_well(block: str, daemon: Daemon, tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-u", "-c", block],
         env={**os.environ, "FISHD_ENDPOINT": daemon.endpoint},

@@ -169,9 +169,7 @@ def test_a_fish_has_a_name_which_tells_two_daemons_apart(tmp_path: Path) -> None
         (("estop", "line\nline"), "a text of up to 1000 printable characters is needed"),
     ],
 )
-def test_a_mistake_gets_one_line_that_says_what_to_do(
-    daemon: Daemon, arguments: tuple[str, ...], message: str
-) -> None:
+def test_a_mistake_gets_one_line(daemon: Daemon, arguments: tuple[str, ...], message: str) -> None:
     done = daemon.fishctl(*arguments)
     assert done.returncode in (1, 2)
     assert message in one_line(done)

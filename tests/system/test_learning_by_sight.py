@@ -70,9 +70,7 @@ def test_it_learns_from_the_frames_of_each_tick_in_lockstep(lockstep: Rig) -> No
 
 
 @pytest.mark.realtime
-def test_a_camera_that_dies_ends_the_training_with_the_fish_at_rest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_camera_that_dies_ends_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with rig_of(tmp_path, "tick=0.05", "start.controller=hold", brief=BRIEFEST) as rig:
         begun = rig.folder / "progress.csv"
 

@@ -8,9 +8,7 @@ from rigs.processes import EXPERIMENT, Daemon, Process, fishctl, one_line, wait_
 
 
 @pytest.mark.slow
-def test_a_search_that_is_interrupted_rests_the_fish_and_goes_on(
-    daemon: Daemon, tmp_path: Path
-) -> None:
+def test_an_interrupted_search_rests_the_fish_and_goes_on(daemon: Daemon, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     table = folder / "rows.csv"
     words = ["--endpoint", daemon.endpoint, "optimise", "square", "--over", "frequency=1:3"]

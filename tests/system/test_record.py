@@ -151,9 +151,7 @@ def test_a_kill_of_the_recorder_leaves_a_file_to_recover(daemon: Daemon, runs: P
     assert find_recording("latest", runs) == runs / "run.mcap"
 
 
-def test_a_disk_that_is_full_ends_the_recording_and_fishd_is_told(
-    daemon: Daemon, runs: Path
-) -> None:
+def test_a_full_disk_ends_the_recording_and_fishd_is_told(daemon: Daemon, runs: Path) -> None:
     before = daemon.status()
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         events = fish.events()

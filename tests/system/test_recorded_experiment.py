@@ -36,9 +36,7 @@ def count_excitation_ticks(part: Path) -> int:
         return 0
 
 
-def test_an_experiment_that_is_ended_leaves_what_it_swam_and_a_fish_at_rest(
-    daemon: Daemon, tmp_path: Path
-) -> None:
+def test_an_ended_experiment_keeps_its_data_and_rests(daemon: Daemon, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     path = folder / "identify.mcap"
     words = ("identify", "--experiment", "--on", "live", "--for", "40", "--folder", str(folder))

@@ -57,9 +57,7 @@ def address(tmp_path: Path) -> str:
 
 
 @pytest.mark.realtime
-def test_an_agent_that_dies_leaves_a_fault_and_its_successor_swims_on(
-    daemon: Daemon, address: str
-) -> None:
+def test_an_agent_that_dies_leaves_a_fault_to_its_successor(daemon: Daemon, address: str) -> None:
     with Subscriber(daemon.telemetry, b"tick") as ticks:
         with agent_process(address) as process:
             assert daemon.fishctl("set-controller", "remote", "--agent", address).returncode == 0
@@ -184,9 +182,7 @@ def waiting_daemon(folder: Path, address: str) -> Iterator[Daemon]:
         yield daemon
 
 
-def test_in_lockstep_fishd_waits_for_its_agent_and_answers_meanwhile(
-    tmp_path: Path, address: str
-) -> None:
+def test_in_lockstep_fishd_waits_for_its_agent_and_answers(tmp_path: Path, address: str) -> None:
     with (
         waiting_daemon(tmp_path, address) as daemon,
         Fish(daemon.endpoint, timeout=PATIENCE) as fish,

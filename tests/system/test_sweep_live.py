@@ -6,9 +6,7 @@ from pathlib import Path
 from rigs.processes import EXPERIMENT, Daemon, Process, Subscriber, one_line, wait_until
 
 
-def test_a_point_that_this_fish_cannot_swim_is_told_before_anything_moves(
-    daemon: Daemon, tmp_path: Path
-) -> None:
+def test_a_point_that_this_fish_cannot_swim_is_told_first(daemon: Daemon, tmp_path: Path) -> None:
     words = ("sweep", "square", "--on", "live", "--folder", str(tmp_path / "run"))
     with Subscriber(daemon.telemetry, b"event") as events:
         events.connected()

@@ -181,9 +181,7 @@ def test_one_that_loads_slowly_costs_no_tick(daemon: Daemon) -> None:
     assert any(missed() == 0 for _ in range(3))
 
 
-def test_one_that_is_still_loading_is_not_held_up_by_a_request_that_is_refused(
-    daemon: Daemon,
-) -> None:
+def test_one_that_is_still_loading_is_not_held_up_by_a_refused_request(daemon: Daemon) -> None:
     with (
         ThreadPoolExecutor() as threads,
         Fish(daemon.endpoint, timeout=PATIENCE) as first,
@@ -197,9 +195,7 @@ def test_one_that_is_still_loading_is_not_held_up_by_a_request_that_is_refused(
 
 
 @pytest.mark.parametrize("newer", ["stop", "estop"])
-def test_one_that_is_still_loading_does_not_undo_a_newer_request(
-    daemon: Daemon, site: Path, newer: str
-) -> None:
+def test_one_still_loading_undoes_no_newer_request(daemon: Daemon, site: Path, newer: str) -> None:
     go_on = site / "go_on"
     go_on.unlink(missing_ok=True)
     refusals: list[str] = []

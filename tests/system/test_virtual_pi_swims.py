@@ -14,9 +14,7 @@ def swimming(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Pi, Dae
         yield pi, daemon
 
 
-def test_the_shipped_configuration_swims_through_the_whole_hardware_path(
-    swimming: tuple[Pi, Daemon],
-) -> None:
+def test_the_shipped_configuration_swims_on_all_hardware(swimming: tuple[Pi, Daemon]) -> None:
     _, daemon = swimming
     with Subscriber(daemon.telemetry, b"tick") as subscriber:
         while (tick := subscriber.message())["thrust"] < 0.02 or tick["samples"] < 4:
@@ -27,9 +25,7 @@ def test_the_shipped_configuration_swims_through_the_whole_hardware_path(
     assert any("not calibrated" in line for line in status.limitations)
 
 
-def test_a_sensor_that_is_pulled_out_is_a_fault_that_a_clear_ends(
-    swimming: tuple[Pi, Daemon],
-) -> None:
+def test_a_sensor_pulled_out_is_a_fault_that_a_clear_ends(swimming: tuple[Pi, Daemon]) -> None:
     pi, daemon = swimming
     with Subscriber(daemon.telemetry, b"tick") as ticks:
         pi.control("inject", "unplugged")

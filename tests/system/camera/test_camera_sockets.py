@@ -82,9 +82,7 @@ def test_a_request_that_is_none_gets_an_error(
     assert camera.status().state == "streaming"
 
 
-def test_a_flood_of_garbage_is_survived_while_frames_go_on(
-    camera: CameraProcess, make: Make
-) -> None:
+def test_a_flood_of_garbage_is_survived_with_frames(camera: CameraProcess, make: Make) -> None:
     with camera.client() as client:
         for address in (camera.endpoint, camera.frames):
             for kind in (zmq.DEALER, zmq.SUB, zmq.PUSH):
@@ -116,9 +114,7 @@ def wait_for_view(client: CameraClient, after: float) -> None:
     wait_until(has_come)
 
 
-def test_subscriptions_to_unknown_topics_take_no_memory_and_viewers_come_back(
-    camera: CameraProcess, make: Make
-) -> None:
+def test_subscriptions_to_unknown_topics_take_no_memory(camera: CameraProcess, make: Make) -> None:
     with camera.client(views=True) as client:
         wait_for_view(client, 0.0)
         before = resident(camera)
@@ -187,9 +183,7 @@ def test_no_camera_is_said_in_one_line(tmp_path: Path) -> None:
         ("tcp://10.0.0.2:9874", "tcp://fish.local:9875", "tcp://10.0.0.2:9874"),
     ],
 )
-def test_a_camera_that_serves_the_network_is_reached_where_it_answers(
-    frames: str, endpoint: str, seen: str
-) -> None:
+def test_a_camera_on_the_network_is_reached_there(frames: str, endpoint: str, seen: str) -> None:
     assert resolve_frames_address(frames, endpoint) == seen
 
 

@@ -114,9 +114,7 @@ class Lockstep:
 
 
 @pytest.mark.parametrize("rate", ["null", "400"])
-def test_in_lockstep_every_tick_has_its_frames_however_fast_it_is(
-    tmp_path: Path, rate: str
-) -> None:
+def test_in_lockstep_every_tick_has_its_frames_at_any_speed(tmp_path: Path, rate: str) -> None:
     with (
         running(tmp_path, "--set", "lockstep=true") as daemon,
         running_camera(tmp_path, *settings(daemon, f"simulated.rate={rate}")) as camera,

@@ -87,9 +87,7 @@ def test_a_network_camera_that_goes_and_comes_back_is_followed(tmp_path: Path, v
             camera.until(lambda state: state.session != first.session)
 
 
-def test_a_network_camera_that_is_not_there_is_looked_for_and_its_password_kept(
-    tmp_path: Path,
-) -> None:
+def test_an_absent_network_camera_is_looked_for_and_its_password_kept(tmp_path: Path) -> None:
     url = "rtsp://me:secret@127.0.0.1:9/fish"
     with running_camera(tmp_path, "source=stream", f"stream.url={url}") as camera:
         state = camera.is_in("unplugged")

@@ -75,9 +75,7 @@ def test_broken_jpegs_are_counted_and_left_out(good: V4l2Rig, fault: str) -> Non
     good.until(lambda state: state.seq > after.seq + 3)
 
 
-def test_a_camera_that_sends_only_broken_frames_does_not_stream_and_is_opened_anew(
-    good: V4l2Rig,
-) -> None:
+def test_a_camera_that_sends_only_broken_frames_is_opened_again(good: V4l2Rig) -> None:
     good.set(broken=True)
     state = good.is_in("stalled")
     assert "/dev/video7 has sent only broken frames for 2 s (" in state.problem

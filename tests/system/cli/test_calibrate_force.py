@@ -151,9 +151,7 @@ def test_loads_that_make_no_fit_can_be_measured_again_and_none_is_lost(
     assert forces(daemon) == pytest.approx((0.1, -0.1), abs=3e-3)
 
 
-def test_a_load_beyond_the_force_limit_is_refused_where_it_is_typed(
-    talk: Talk, rig: Bench, daemon: Daemon
-) -> None:
+def test_a_load_beyond_the_force_limit_is_refused(talk: Talk, rig: Bench, daemon: Daemon) -> None:
     dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.2")
     measure(dialogue, rig, 0.0, 0.0)
     dialogue.answer("load [N]", "20")
@@ -184,9 +182,7 @@ def test_without_a_yes_nothing_changes(talk: Talk, rig: Bench, daemon: Daemon, h
     assert rig.files("force") == []
 
 
-def test_a_plan_from_a_file_is_measured_load_by_load(
-    talk: Talk, rig: Bench, daemon: Daemon
-) -> None:
+def test_a_plan_from_a_file_is_measured_in_order(talk: Talk, rig: Bench, daemon: Daemon) -> None:
     plan = rig.folder / "plan.csv"
     plan.write_text("fx,fy\n" + "".join(f"{x / GRAM},{y / GRAM}\n" for x, y in PLAN))
     dialogue = talk(
@@ -204,9 +200,7 @@ def test_a_plan_from_a_file_is_measured_load_by_load(
     assert calibration.yy == pytest.approx(1 / SENSITIVITY_Y / determinant, rel=0.02)
 
 
-def test_loads_outlive_a_fishd_that_does_not_answer_or_refuses_what_they_make(
-    talk: Talk, rig: Bench, daemon: Daemon
-) -> None:
+def test_loads_outlive_a_fishd_without_an_answer(talk: Talk, rig: Bench, daemon: Daemon) -> None:
     dialogue = talk(daemon, "calibrate", "force", "--seconds", "0.3", "--yes")
     measure(dialogue, rig, 0.0, 0.0)
     measure(dialogue, rig, 0.2, 0.0, "0.2")
@@ -235,9 +229,7 @@ def test_loads_outlive_a_fishd_that_does_not_answer_or_refuses_what_they_make(
     assert len(rig.files("force")) == 1
 
 
-def test_a_full_disk_costs_no_load_and_is_reported(
-    talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path
-) -> None:
+def test_a_full_disk_costs_no_load(talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path) -> None:
     record = tmp_path / "folder" / "loads.csv"
     record.parent.mkdir()
     dialogue = talk(

@@ -17,9 +17,7 @@ from fishd.core.calibration import ServoCalibration
 from fishd.core.signals import Tick
 
 
-def test_the_servo_is_calibrated_by_small_steps_and_saved_after_a_yes(
-    talk: Talk, rig: Bench, daemon: Daemon
-) -> None:
+def test_the_servo_is_calibrated_by_small_steps(talk: Talk, rig: Bench, daemon: Daemon) -> None:
     dialogue = talk(daemon, "calibrate", "servo")
     dialogue.answer("trim +0 µs> ", "++")
     dialogue.answer("trim +25 µs> ", "+")
@@ -75,9 +73,7 @@ def test_an_interrupted_servo_calibration_leaves_neutral_and_the_previous_calibr
     rig.wait_for_pulse(1499, 1501)
 
 
-def test_a_calibration_whose_fishctl_is_killed_is_taken_back_by_fishd(
-    talk: Talk, rig: Bench, daemon: Daemon
-) -> None:
+def test_a_calibration_ends_with_a_killed_fishctl(talk: Talk, rig: Bench, daemon: Daemon) -> None:
     before = calibrations(daemon)
     with Subscriber(daemon.telemetry, b"event") as events:
         dialogue = talk(daemon, "calibrate", "servo")
@@ -133,18 +129,14 @@ def test_where_pulses_end_before_the_amplitude_the_limit_is_there_and_saved_afte
     assert (calibration.trim, calibration.highest, calibration.lowest) == (10.0, 0.0166, -1.2)
 
 
-def test_a_lease_that_ends_while_fishctl_is_stopped_is_reported_at_the_prompt(
-    talk: Talk, rig: Bench, daemon: Daemon
-) -> None:
+def test_a_lease_that_ends_meanwhile_is_reported(talk: Talk, rig: Bench, daemon: Daemon) -> None:
     dialogue = begin_trim_of_25(talk, rig, daemon)
     dialogue.process.send_signal(signal.SIGSTOP)
     rig.wait_for_pulse(1499, 1501)
     check_end_of_lease(dialogue)
 
 
-def test_a_lease_that_ends_as_fishd_is_restarted_is_reported_at_the_prompt(
-    talk: Talk, pi: Bench
-) -> None:
+def test_a_lease_that_ends_with_its_fishd_is_reported_at_the_prompt(talk: Talk, pi: Bench) -> None:
     with pi.daemon() as first:
         dialogue = begin_trim_of_25(talk, pi, first)
         dialogue.process.send_signal(

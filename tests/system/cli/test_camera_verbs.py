@@ -169,9 +169,7 @@ def test_a_view_that_follows_draws_again_until_it_is_interrupted(swimming: Daemo
     assert drawn.count(ENTER_SCREEN) == drawn.count(LEAVE_SCREEN) == 1  # the screen is restored
 
 
-def test_ctrl_c_at_the_moment_when_a_view_takes_the_screen_gives_it_back(
-    camera: CameraProcess, tmp_path: Path
-) -> None:
+def test_ctrl_c_as_a_view_takes_the_screen_ends_it(camera: CameraProcess, tmp_path: Path) -> None:
     drawn = run_in_terminal(100, "view", "--follow", **signal_as_drawing_begins(tmp_path, "SIGINT"))
     assert drawn.count(ENTER_SCREEN) == drawn.count(LEAVE_SCREEN) == 1
     assert "Traceback" not in drawn
@@ -241,9 +239,7 @@ def test_alignment_finds_the_axis_within_a_pixel(swimming: Daemon, tmp_path: Pat
     assert width_of(tmp_path / "motion.png") == 84 * 7
 
 
-def test_alignment_lets_the_fish_swim_with_swim_and_rest_afterwards(
-    daemon: Daemon, tmp_path: Path
-) -> None:
+def test_alignment_lets_the_fish_swim_with_swim_then_rest(daemon: Daemon, tmp_path: Path) -> None:
     done = fishctl("camera", "align", "--swim", "--for", "5")
     assert done.returncode == 0, done.stderr
     assert done.stderr == "fishctl: it swims for 5 s; Ctrl-C stops it\n"

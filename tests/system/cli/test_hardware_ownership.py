@@ -68,9 +68,7 @@ def pi_settings(folder: Path) -> list[str]:
     return [*PI, "--set", f"state_folder={folder}"]
 
 
-def test_a_second_fishd_on_the_same_bus_is_refused_with_the_pid_of_the_first(
-    folders: tuple[Path, Path],
-) -> None:
+def test_a_second_fishd_on_the_same_bus_is_refused_with_a_pid(folders: tuple[Path, Path]) -> None:
     one, other = folders
     with running(one, *pi_settings(one)) as first:
         message = failed_start(other, *pi_settings(other))
@@ -109,9 +107,7 @@ def locks(tmp_path: Path) -> Iterator[Path]:
     shutil.rmtree(parent)
 
 
-def test_the_fishd_of_another_user_counts_and_what_it_leaves_behind_does_not(
-    folders: tuple[Path, Path], locks: Path
-) -> None:
+def test_fishd_of_another_user_counts_as_owner(folders: tuple[Path, Path], locks: Path) -> None:
     nobody = command_as_nobody()
     start = ("-c", IN_FOLDER.format(folder=str(locks)))
     own_start = (sys.executable, "-P", *start)
@@ -184,9 +180,7 @@ def test_one_virtual_pi_takes_one_fishd_by_any_name_of_its_socket_even_one_that_
         pass
 
 
-def test_doctor_leaves_the_bus_of_a_fishd_at_another_endpoint_alone(
-    pi: Bench, tmp_path: Path
-) -> None:
+def test_doctor_leaves_the_bus_of_another_endpoint_alone(pi: Bench, tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     with running(tmp_path / "elsewhere", *pi.settings) as daemon:
         _, findings = doctor(pi.folder, *pi.settings, *free_telemetry())

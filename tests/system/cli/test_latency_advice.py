@@ -34,9 +34,7 @@ def test_old_frames_need_one_that_can_be_pasted_into_the_file_of_a_training(tmp_
     assert load_training(file).camera.stack.delay == 0.125
 
 
-def test_late_time_stamps_are_set_right_in_the_file_of_the_camera_or_at_its_start(
-    tmp_path: Path,
-) -> None:
+def test_late_time_stamps_are_set_right_in_the_file_or_at_the_start(tmp_path: Path) -> None:
     where, block, command, _ = suggest_settings(latency_of(0.02, 0.04), CAMERA)
     assert where == "write into the file of the camera:"
     file = tmp_path / "camera.yaml"

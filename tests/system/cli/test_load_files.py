@@ -59,9 +59,7 @@ def test_the_file_for_recorded_loads_is_checked_before_the_first_load(
     assert one_line(ended).endswith("none/loads.csv: its folder does not exist; create it\n")
 
 
-def test_a_refusal_for_now_names_the_file_that_still_holds_the_loads(
-    rig: Bench, daemon: Daemon
-) -> None:
+def test_a_refusal_for_now_names_the_file_with_the_loads(rig: Bench, daemon: Daemon) -> None:
     measured = rig.folder / "measured.csv"
     measured.write_text("fx_N,fy_N,vx_V,vy_V\n" + "".join(f"{x},{y},{x},{y}\n" for x, y in PLAN))
     words = ("calibrate", "force", "--yes", "--loads", str(measured))
@@ -77,9 +75,7 @@ def test_a_refusal_for_now_names_the_file_that_still_holds_the_loads(
     assert daemon.fishctl(*words).returncode == 0
 
 
-def test_loads_of_a_file_that_make_no_fit_are_refused_even_with_yes(
-    rig: Bench, daemon: Daemon
-) -> None:
+def test_loads_of_a_file_without_a_fit_are_refused_despite_yes(rig: Bench, daemon: Daemon) -> None:
     noise = [(0.3, 0.1), (-0.2, 0.3), (0.4, -0.2), (0.1, 0.4), (-0.3, -0.3)]
     measured = rig.folder / "noise.csv"
     lines = [f"{x},{y},{vx},{vy}" for (x, y), (vx, vy) in zip(PLAN, noise, strict=True)]

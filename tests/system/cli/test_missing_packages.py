@@ -119,9 +119,7 @@ def test_an_agent_names_the_extra_that_policies_need(tmp_path: Path, module: str
 
 
 @pytest.mark.parametrize(("module", "verb"), [("aiohttp", ("page",)), ("mcap", ("record", "run"))])
-def test_a_verb_about_a_camera_names_the_extra_that_it_needs(
-    tmp_path: Path, module: str, verb: tuple[str, ...]
-) -> None:
+def test_a_camera_verb_names_its_extra(tmp_path: Path, module: str, verb: tuple[str, ...]) -> None:
     done = call(FISHCTL, "camera", *verb, env=environment_without(tmp_path, module))
     extra = "camera" if module == "aiohttp" else "record"
     assert (done.returncode, done.stdout) == (1, "")

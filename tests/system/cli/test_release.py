@@ -54,9 +54,7 @@ def test_without_any_file_it_is_no_success_and_says_how_to_name_one() -> None:
     assert "/etc/fishd/fishd.yaml" in ended.stderr
 
 
-def test_the_file_of_the_service_is_used_where_none_is_named(
-    pi: Bench, other_program: pigpio.pi
-) -> None:
+def test_the_file_of_the_service_is_used_by_default(pi: Bench, other_program: pigpio.pi) -> None:
     file = pi.folder / "service.yaml"
     file.write_text("robot: virtual-pi\n")
     ended = release(*pi.settings[2:], FISHD_CONFIG=str(file))
@@ -65,9 +63,7 @@ def test_the_file_of_the_service_is_used_where_none_is_named(
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
 
 
-def test_an_output_that_takes_nothing_is_no_failure_of_the_release(
-    pi: Bench, other_program: pigpio.pi
-) -> None:
+def test_a_failed_output_is_no_failure_of_a_release(pi: Bench, other_program: pigpio.pi) -> None:
     command = ["sh", "-c", '"$@" >/dev/full', "sh", FISHCTL, "release", *pi.settings]
     ended = call(*command, env=os.environ | {"FISHD_CONFIG": ""})
     message = (
@@ -122,9 +118,7 @@ def test_a_fishd_that_does_not_answer_where_it_should_be_is_named(pi: Bench) -> 
 
 
 @pytest.mark.parametrize("restarted", [False, True])
-def test_pulses_of_the_pwm_peripheral_that_pigpiod_may_not_know_of_end_too(
-    pi: Bench, restarted: bool
-) -> None:
+def test_pulses_of_the_pwm_peripheral_unknown_to_pigpiod_end(pi: Bench, restarted: bool) -> None:
     client = pigpio.pi("127.0.0.1", pi.pi.port(), show_errors=False)
     client.hardware_PWM(18, 50, 1740 * 50)
     dispose(client)

@@ -82,9 +82,7 @@ def test_status_doctor_and_calibrate_force_say_it_and_the_right_calibration_ends
     assert LINE not in interchanged.fishctl("status").stdout
 
 
-def test_a_calibration_that_would_turn_a_right_force_round_is_doubted(
-    rig: Bench, daemon: Daemon
-) -> None:
+def test_a_calibration_that_would_reverse_a_force_is_doubted(rig: Bench, daemon: Daemon) -> None:
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         swim_until_judged(fish)
         assert fish.status().fy_reversed is False

@@ -21,9 +21,7 @@ from fishd.hardware.settings import ServoSettings
     ("highest", "shown"),
     [(1.2, "within ±0.42 rad\n"), (0.3, "within -0.42 to +0.3 rad, less than ±0.42 rad")],
 )
-def test_status_shows_the_range_and_a_soft_limit_is_no_complaint(
-    pi: Bench, highest: float, shown: str
-) -> None:
+def test_status_shows_the_range_without_a_complaint(pi: Bench, highest: float, shown: str) -> None:
     with pi.daemon("--set", f"servo.highest={highest}") as daemon:
         status = json.loads(daemon.fishctl("status", "--json").stdout)
         assert (status["lowest_angle"], status["highest_angle"]) == (-0.42, min(highest, 0.42))
@@ -82,9 +80,7 @@ def test_config_check_reports_a_reduced_range(tmp_path: Path) -> None:
         (["servo.centre=2300", "servo.direction=-1"], "servo.centre: 2300 is not valid: "),
     ],
 )
-def test_pulses_that_end_before_the_amplitude_are_refused(
-    overrides: list[str], message: str
-) -> None:
+def test_pulses_that_end_too_early_are_refused(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError) as refusal:
         load(None, overrides)
     assert message in str(refusal.value)

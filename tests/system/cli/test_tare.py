@@ -12,9 +12,7 @@ from rigs.operator_rig import Bench, fishctl_alone, forces
 from rigs.processes import FISHCTL, Daemon, Process, running
 
 
-def test_a_tare_sets_the_zero_to_the_present_force_and_reports_it(
-    rig: Bench, daemon: Daemon
-) -> None:
+def test_a_tare_sets_the_zero_to_the_present_force_and_says_so(rig: Bench, daemon: Daemon) -> None:
     before = forces(daemon)
     assert math.hypot(*before) > 0.3  # the voltages of the bridge without a load
     ended = daemon.fishctl("tare", "--seconds", "0.6")
@@ -39,9 +37,7 @@ def test_a_tare_that_cannot_be_trusted_is_refused_in_one_line(rig: Bench, daemon
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_tare_that_is_given_up_while_it_measures_changes_nothing(
-    rig: Bench, daemon: Daemon, how: int
-) -> None:
+def test_a_tare_that_is_given_up_changes_nothing(rig: Bench, daemon: Daemon, how: int) -> None:
     seconds = 6.0
     tare = Process(FISHCTL, "--endpoint", daemon.endpoint, "tare", "--seconds", str(seconds))
     time.sleep(1.5)  # it measures

@@ -147,9 +147,7 @@ def test_without_a_terminal_it_prints_a_plain_line_every_second(daemon: Daemon) 
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_it_draws_until_a_signal_and_leaves_the_terminal_as_it_was(
-    daemon: Daemon, number: int
-) -> None:
+def test_it_draws_until_a_signal_and_restores_the_terminal(daemon: Daemon, number: int) -> None:
     terminal = Terminal(daemon)
     terminal.wait_for("RUNNING")
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:

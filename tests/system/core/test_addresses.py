@@ -95,9 +95,7 @@ def test_a_port_that_is_taken_is_named_with_its_key() -> None:
             listen(address, "telemetry.address")
 
 
-def test_a_port_that_a_rival_has_bound_too_and_listens_at_is_waited_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_port_that_a_rival_listens_at_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     class Second(socket.socket):
         """Socket whose rival, bound to the same port, starts to listen first."""
 

@@ -76,9 +76,7 @@ PLANTS: dict[str, Callable[[Path, Path], None]] = {
 
 @pytest.mark.parametrize("what", PLANTS)
 @pytest.mark.parametrize("shared", [False, True])
-def test_what_was_planted_for_a_lock_is_refused_and_left_as_it_is(
-    tmp_path: Path, what: str, shared: bool
-) -> None:
+def test_what_was_planted_for_a_lock_is_refused(tmp_path: Path, what: str, shared: bool) -> None:
     victim = tmp_path / "victim"
     victim.write_text("precious")
     PLANTS[what](lock_path(tmp_path / "control"), victim)

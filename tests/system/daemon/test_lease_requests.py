@@ -118,9 +118,7 @@ def test_a_second_experiment_is_refused_unless_it_takes_the_fish(tmp_path: Path)
     run_story(tmp_path, story)
 
 
-def test_a_controller_that_was_loading_when_its_lease_ended_does_not_take_over(
-    tmp_path: Path,
-) -> None:
+def test_a_controller_still_loading_when_its_lease_ended_does_not_start(tmp_path: Path) -> None:
     async def story(client: Client) -> None:
         lease = await client.take()
         loading = asyncio.create_task(client.ask("set-controller", name="swing", lease=lease))

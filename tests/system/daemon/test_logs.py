@@ -38,9 +38,7 @@ def test_a_text_of_5_mb_is_cut_and_its_traceback_too(formatter: logging.Formatte
 
 
 @pytest.mark.parametrize("formatter", [TextFormatter(False), TextFormatter(True), JsonFormatter()])
-def test_what_is_logged_can_be_encoded_and_says_nothing_to_a_terminal(
-    formatter: logging.Formatter,
-) -> None:
+def test_what_is_logged_is_encoded_and_no_terminal_code(formatter: logging.Formatter) -> None:
     odd = "\x1b[2J\udcff\x9b31m\r\nforged"
     line = formatter.format(record(odd, raised(RuntimeError(odd))))
     line.encode()

@@ -124,9 +124,7 @@ def levels_of_undo_events(rig: LockstepRig) -> list[str]:
     return [event.level for event in rig.recorder.events if "previous calibration" in event.message]
 
 
-def test_a_lease_that_nobody_renews_ends_at_neutral_with_the_calibration_of_before(
-    rig: LockstepRig,
-) -> None:
+def test_a_lease_without_renewal_ends_at_neutral_as_calibrated_before(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         before = (await client.ask("calibrations")).servo
         lease = await client.begin_trial(WIDE_LIMITS)
@@ -207,9 +205,7 @@ def test_nothing_but_hold_takes_over_while_a_lease_lasts(rig: LockstepRig) -> No
     run_story(rig, story)
 
 
-def test_a_controller_that_was_loading_when_a_lease_began_does_not_take_over(
-    rig: LockstepRig,
-) -> None:
+def test_a_controller_still_loading_when_a_lease_began_is_dropped(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         swimming = asyncio.create_task(client.ask("set-controller", name="swing"))
         await asyncio.sleep(0)  # starts loading it in a thread
@@ -265,9 +261,7 @@ def test_only_who_has_the_lease_changes_or_saves_a_servo_calibration(rig: Lockst
     assert levels_of_undo_events(rig) == []
 
 
-def test_after_an_emergency_stop_a_lease_ends_before_the_tail_is_driven_again(
-    rig: LockstepRig,
-) -> None:
+def test_after_an_emergency_stop_a_lease_ends_before_the_tail_moves(rig: LockstepRig) -> None:
     async def story(client: Client) -> None:
         lease = await client.begin_trial(WIDE_LIMITS)
         await client.ask("set-controller", name="hold", parameters={"angle": 0.4}, lease=lease)

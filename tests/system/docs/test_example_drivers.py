@@ -271,9 +271,7 @@ def board(_installed: None) -> Iterator[ServoBoard]:
 
 
 @pytest.mark.parametrize("frequency", [50.0, 100.0, 333.0])
-def test_pca9685_an_angle_is_a_pulse_within_half_a_count(
-    board: ServoBoard, frequency: float
-) -> None:
+def test_pca9685_an_angle_is_a_pulse_to_half_a_count(board: ServoBoard, frequency: float) -> None:
     servo = board.servo(frequency=frequency)
     for angle, pulse in ((0.0, 1500.0), (0.42, 1752.0), (-0.42, 1248.0)):
         servo.write(angle)

@@ -140,9 +140,7 @@ def test_every_file_under_systemd_is_installed(installed: Pi) -> None:
     assert shipped <= {Path(name).name for name in files(installed.disk)}
 
 
-def test_installing_again_without_the_gpio_package_adds_nothing_and_says_what_is_missing(
-    pi: Pi, tmp_path: Path
-) -> None:
+def test_installing_again_adds_nothing_and_says_what_is_missing(pi: Pi, tmp_path: Path) -> None:
     before = files(pi.disk)
     sdist(tmp_path / "sources", "rpi_lgpio", 'raise SystemExit("error: swig failed")')
     options = {"FISHD_GPIO": "rpi-lgpio", "PIP_FIND_LINKS": str(tmp_path / "sources")}
@@ -279,9 +277,7 @@ def build_wheel(folder, settings=None, metadata=None):
             tar.addfile(info, io.BytesIO(text.encode()))
 
 
-def test_a_gpio_package_is_built_as_its_sources_want_and_only_then_the_other_goes(
-    pi: Pi, tmp_path: Path
-) -> None:
+def test_a_gpio_package_is_built_and_only_then_the_other_goes(pi: Pi, tmp_path: Path) -> None:
     sources, install = tmp_path / "sources", ("install_gpio", "rpi-lgpio")
     (site,) = (pi.disk / "opt/fishd/lib").glob("python3*/site-packages")
     with zipfile.ZipFile(wheel_of(tmp_path, "RPi.GPIO")) as archive:
@@ -354,9 +350,7 @@ def test_no_driver_brings_a_gpio_package_along_by_itself(wheel: Path) -> None:
     assert ">=10" in wanted["adafruit-blinka"]
 
 
-def test_an_unknown_gpio_package_is_refused_before_anything_is_done(
-    wheel: Path, tmp_path: Path
-) -> None:
+def test_an_unknown_gpio_package_is_refused_before_anything(wheel: Path, tmp_path: Path) -> None:
     done = Pi(tmp_path, wheel).attempt("install_pi.sh", FISHD_GPIO="gpio")
     assert done.returncode == 1
     assert done.stderr == "install_pi.sh: FISHD_GPIO=gpio: rpi-gpio, rpi-lgpio or none\n"

@@ -18,9 +18,7 @@ def blocked(_: int) -> set[int]:
     return set(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
 
 
-def test_its_processes_leave_ctrl_c_and_hang_up_to_the_one_that_has_begun_them(
-    tmp_path: Path,
-) -> None:
+def test_its_processes_leave_ctrl_c_and_hang_up_to_their_first_process(tmp_path: Path) -> None:
     with workers(tmp_path / "stop", jobs=2) as crew:
         for _, signals in crew.run(blocked, range(3)):
             assert signals == {signal.SIGINT, signal.SIGHUP}

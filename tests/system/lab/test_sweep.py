@@ -111,9 +111,7 @@ def test_a_fish_that_somebody_else_takes_loses_one_point_only(tmp_path: Path) ->
     assert len(open_folder(tmp_path).results) == 2
 
 
-def test_a_point_that_is_refused_or_given_up_is_trouble_and_the_next_is_measured(
-    tmp_path: Path,
-) -> None:
+def test_a_point_that_is_refused_is_trouble_and_the_next_is_measured(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime", reason="the extra 'policy' is not installed")
     points = [
         Point("square", {"frequency": 50.0}),
@@ -237,9 +235,7 @@ def test_a_folder_is_not_gone_on_with_by_another_fish_or_for_another_time(
         open_folder(tmp_path, load(None, settings), seconds)
 
 
-def test_a_curve_tells_the_best_frequency_of_whole_ticks_and_one_that_is_missing(
-    tmp_path: Path,
-) -> None:
+def test_a_curve_tells_the_best_frequency_in_ticks_or_that_it_lacks_one(tmp_path: Path) -> None:
     folder = open_folder(tmp_path)
     thrusts = {1.4: 0.0227, 1.6: 0.0251, 1.8: 0.0252, 2.0: 0.0238, 2.2: 0.0216, 2.5: 0.0176}
     points = [Point("square", {"frequency": value}) for value in thrusts]

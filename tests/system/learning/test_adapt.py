@@ -291,9 +291,7 @@ class Stopped(BaseException):
 
 
 @pytest.mark.slow
-def test_a_resume_does_not_repeat_measurements(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_resume_repeats_no_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adaptation, "train_policy", no_policy)
     monkeypatch.setattr(
         steps, "draw_cloud", partial(draw_cloud, count=2)

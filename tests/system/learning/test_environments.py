@@ -189,9 +189,7 @@ def test_a_step_before_the_first_episode_or_after_the_end_is_an_error() -> None:
     env.close()
 
 
-def test_the_requested_pause_follows_the_longest_previous_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_requested_pause_follows_the_longest_before(monkeypatch: pytest.MonkeyPatch) -> None:
     requested: list[float] = []
     now = 1000.0
 
@@ -211,9 +209,7 @@ def test_the_requested_pause_follows_the_longest_previous_one(
     assert requested[-1] == 300.0
 
 
-def test_the_environment_on_a_running_fishd_passes_both_checkers(
-    daemon: Daemon, tmp_path: Path
-) -> None:
+def test_the_environment_on_a_fishd_passes_both_checkers(daemon: Daemon, tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/agent"
     with Fish(daemon.endpoint) as fish:  # a busy machine may delay the checkers by many ticks
         fish.set_controller("remote", agent=address, misses=100)

@@ -157,9 +157,7 @@ class Pushed(SimulatedLink):
         return step._replace(observation=pushed)
 
 
-def test_a_policy_that_was_pushed_once_does_not_stay_the_best(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_policy_pushed_once_does_not_stay_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
     tank = Tank(monkeypatch, "noise=0.001", kind=Pushed)
     link = tank.env.link
     assert isinstance(link, Pushed)
@@ -175,9 +173,7 @@ def test_a_policy_that_was_pushed_once_does_not_stay_the_best(
     assert tank.best == 0
 
 
-def test_a_policy_that_stalls_costs_little_and_never_swims_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_policy_that_stalls_costs_little_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     tank = Tank(monkeypatch, "noise=0.001")
     before = tank.env.tank_time
     (row,) = tank.evaluate(still)
@@ -283,9 +279,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     assert exported.card.provenance.relative_thrust == best.relative_thrust
 
 
-def test_a_resumed_training_keeps_the_best_policy_and_its_swims(
-    tmp_path: Path, beating: list[Policy]
-) -> None:
+def test_a_resumed_training_keeps_the_best_policy(tmp_path: Path, beating: list[Policy]) -> None:
     beating[:] = [square(6), square(5), square(6), still, square(5)]
     job = on_robot(tmp_path / "run")
     training = storing_training(job, Resting(job))
@@ -302,9 +296,7 @@ def test_a_resumed_training_keeps_the_best_policy_and_its_swims(
     assert rows(job.folder / "evaluations.csv")[-1]["steps"] == "256"
 
 
-def test_a_killed_training_resumes_with_its_best_policy(
-    tmp_path: Path, beating: list[Policy]
-) -> None:
+def test_a_killed_training_resumes_with_its_best(tmp_path: Path, beating: list[Policy]) -> None:
     job = on_robot(tmp_path / "run", steps=128, checkpoint_every=64)
     outcome = Training(job, Resting(job), Display(), lambda: False).run()
     best, step = outcome.best_evaluation, job.folder / "step-000128"
@@ -320,9 +312,7 @@ def test_a_killed_training_resumes_with_its_best_policy(
     assert (recorder.winner.steps, recorder.winner.thrust) == (best.policy, best.thrust)
 
 
-def test_a_training_resumes_without_its_best_policy_if_that_was_moved_away(
-    tmp_path: Path, beating: list[Policy]
-) -> None:
+def test_a_training_resumes_without_a_moved_policy(tmp_path: Path, beating: list[Policy]) -> None:
     job = on_robot(tmp_path / "run", steps=64)
     outcome = Training(job, Resting(job), Display(), lambda: False).run()
     assert outcome.best
@@ -332,9 +322,7 @@ def test_a_training_resumes_without_its_best_policy_if_that_was_moved_away(
     assert again.best == job.folder / "best-000128"
 
 
-def test_a_stop_in_an_evaluation_keeps_earlier_measurements(
-    tmp_path: Path, beating: list[Policy]
-) -> None:
+def test_a_stop_in_an_evaluation_keeps_measurements(tmp_path: Path, beating: list[Policy]) -> None:
     job = on_robot(tmp_path / "run", steps=6400)
     link = Resting(job)
     ended = 64 + 150 + 64 + 120  # in the swim of the second evaluation
@@ -347,9 +335,7 @@ def test_a_stop_in_an_evaluation_keeps_earlier_measurements(
     assert outcome.checkpoint == job.folder / "step-000128"
 
 
-def test_a_fish_that_is_lost_in_an_evaluation_loses_nothing(
-    tmp_path: Path, beating: list[Policy]
-) -> None:
+def test_a_fish_lost_in_an_evaluation_loses_nothing(tmp_path: Path, beating: list[Policy]) -> None:
     job = on_robot(tmp_path / "run")
     lost = storing_training(job, Failing(job, 64 + 150 + 64 + 190))
     outcome = lost.run()
@@ -384,9 +370,7 @@ def test_export_finds_the_best_of_a_tank(tmp_path: Path, beating: list[Policy]) 
     assert checkpoints.find(job.folder) == outcome.best
 
 
-def test_a_fishd_in_lockstep_gives_the_same_evaluations_as_a_fish_in_process(
-    tmp_path: Path,
-) -> None:
+def test_a_fishd_in_lockstep_gives_the_same_evaluations_as_a_simulation(tmp_path: Path) -> None:
     changes = {"steps": 256, "seed": 249, "ppo": PpoSettings()}
     here = on_robot(tmp_path / "here", **changes)
     Training(here, SimulatedLink(here.config), Display(), lambda: False).run()

@@ -34,9 +34,7 @@ def stalled(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     return train(brief_job(tmp_path_factory.mktemp("stalled") / "run", ppo=timid, steps=64))
 
 
-def test_the_outputs_of_the_file_are_those_of_the_trained_policy(
-    tmp_path: Path, by_force: Outcome
-) -> None:
+def test_outputs_of_the_file_are_those_of_the_policy(tmp_path: Path, by_force: Outcome) -> None:
     assert by_force.best
     exported = export(by_force.best, tmp_path / "policy.onnx")
     controller = registry.create(
@@ -51,9 +49,7 @@ def test_the_outputs_of_the_file_are_those_of_the_trained_policy(
         assert controller.update(seen) == pytest.approx(decide(seen), abs=1e-5)
 
 
-def test_an_exported_policy_swims_in_the_loop_of_the_robot(
-    tmp_path: Path, by_force: Outcome
-) -> None:
+def test_an_exported_policy_swims_in_the_robots_loop(tmp_path: Path, by_force: Outcome) -> None:
     assert by_force.best
     exported = export(by_force.best, tmp_path / "policy.onnx")
     rig = Rig(*NOISY)
@@ -73,9 +69,7 @@ def test_the_card_contains_the_evaluation_and_the_note(tmp_path: Path, by_force:
     assert past.frequency == pytest.approx(by_force.best_evaluation.frequency)
 
 
-def test_a_policy_that_stalls_is_refused_and_leaves_no_file(
-    tmp_path: Path, stalled: Outcome
-) -> None:
+def test_a_policy_that_stalls_is_refused_without_a_file(tmp_path: Path, stalled: Outcome) -> None:
     assert stalled.checkpoint
     target = tmp_path / "policy.onnx"
     with pytest.raises(PolicyError, match=r"this policy stalls .* nevertheless with --force"):
@@ -181,9 +175,7 @@ def test_a_model_that_a_policy_file_cannot_represent_is_refused(tmp_path: Path) 
         ("empty", "it contains no checkpoint"),
     ],
 )
-def test_a_path_that_is_not_a_run_is_refused_with_the_reason(
-    tmp_path: Path, name: str, message: str
-) -> None:
+def test_a_path_that_is_not_a_run_is_refused(tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / "model.zip").write_bytes(b"PK")
     (tmp_path / "empty").mkdir()
     for seed in (0, 2, 10):

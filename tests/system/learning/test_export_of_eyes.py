@@ -70,9 +70,7 @@ def network_of(settings: TrainingSettings) -> tuple[Network, Any]:
     CASES,
     ids=lambda case: f"{case.camera.feature_extractor}-{case.see}-{case.ppo.symmetric}",
 )
-def test_the_outputs_of_the_file_are_those_of_the_trained_policy(
-    settings: TrainingSettings,
-) -> None:
+def test_outputs_of_the_file_are_those_of_the_policy(settings: TrainingSettings) -> None:
     network, perception = network_of(settings)  # raises where they differ
     assert network.frames.shape == settings.camera.stack.shape
     assert len(network.row) == len(perception.features)
@@ -163,9 +161,7 @@ def test_an_exported_policy_swims_by_sight(tmp_path: Path, by_sight: Outcome) ->
 
 
 @pytest.mark.slow
-def test_a_policy_by_sight_is_sensitive_where_the_tail_moves(
-    tmp_path: Path, by_sight: Outcome
-) -> None:
+def test_a_policy_by_sight_looks_where_the_tail_moves(tmp_path: Path, by_sight: Outcome) -> None:
     assert by_sight.best
     path = export(by_sight.best, tmp_path / "eye.onnx").path
     sensitivity = look(str(path), Config(), DEFAULT, 10.0)  # with the camera of its training
@@ -173,9 +169,7 @@ def test_a_policy_by_sight_is_sensitive_where_the_tail_moves(
 
 
 @pytest.mark.slow
-def test_the_verb_prints_the_command_that_lets_a_policy_by_sight_swim(
-    tmp_path: Path, by_sight: Outcome
-) -> None:
+def test_the_verb_prints_how_a_policy_by_sight_swims(tmp_path: Path, by_sight: Outcome) -> None:
     path = tmp_path / "eye.onnx"
     words = ["learn", "export", str(by_sight.folder), "--to", str(path)]
     result = CliRunner().invoke(fishctl, words)

@@ -68,9 +68,7 @@ class Waiting(SimulatedLink):
         self.waits = True
 
 
-def test_the_fish_waits_while_its_eye_is_fitted_and_afterwards(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_fish_waits_while_its_eye_is_fitted_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
     extractor = extractor_of("nature")
     link = Waiting(CONFIG, camera=Camera(DEFAULT, StackSettings()))
     env = SwimEnv(link, CONFIG, EnvironmentSettings(longest_start=0), extractor)

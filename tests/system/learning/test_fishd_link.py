@@ -118,9 +118,7 @@ def test_a_fishd_in_lockstep_gives_the_same_results_as_a_fish_in_process(
     assert there == course(SimulatedLink(load(None, FISH)), 300, pause_every, ticks)
 
 
-def test_a_link_swims_a_fishd_in_real_time_and_leaves_it_at_rest(
-    daemon: Daemon, fish: Fish
-) -> None:
+def test_a_link_swims_a_fishd_in_real_time_and_rests_it(daemon: Daemon, fish: Fish) -> None:
     link = FishdLink(daemon.endpoint)
     with Subscriber(daemon.telemetry, b"tick") as telemetry:
         assert (link.tick, link.amplitude) == (0.1, 0.42)
@@ -155,9 +153,7 @@ def test_a_late_action_is_reported_as_lost(link: FishdLink) -> None:
         assert link.step(0.3).lost >= 1
 
 
-def test_a_pause_is_at_neutral_and_the_next_observation_is_fresh(
-    link: FishdLink, fish: Fish
-) -> None:
+def test_a_pause_is_at_neutral_and_followed_by_fresh_data(link: FishdLink, fish: Fish) -> None:
     before = link.step(0.3).observation
     link.pause(30.0)
     fish.set_parameters(misses=DEFAULT_MISSES)
@@ -215,9 +211,7 @@ def test_a_close_that_takes_long_leaves_no_fault(
     assert (final.mode, final.reason) == ("idle", None)
 
 
-def test_another_controller_ends_control_and_a_reset_does_not_replace_it(
-    env: SwimEnv, fish: Fish
-) -> None:
+def test_another_controller_ends_control_and_a_reset_keeps_it(env: SwimEnv, fish: Fish) -> None:
     fish.set_controller("swing")
     with losing("another controller has taken command: swing"):
         swim_on(env)

@@ -69,9 +69,7 @@ def test_the_advice_is_to_stay_until_the_best_half_beat_is_over() -> None:
     assert costs == pytest.approx((0.52, 0.52, 0.12, 0.62, 0.62, 0.62))
 
 
-def test_a_policy_of_imitation_alone_swims_and_its_card_says_so(
-    tmp_path: Path, imitated: tuple[Outcome, str]
-) -> None:
+def test_imitation_alone_swims_and_is_named(tmp_path: Path, imitated: tuple[Outcome, str]) -> None:
     outcome, output = imitated
     assert outcome.ended == "finished"
     assert outcome.steps == 0
@@ -106,9 +104,7 @@ def test_a_training_stopped_during_imitation_repeats_it(tmp_path: Path) -> None:
         train(replace(job, resume=True))
 
 
-def test_a_training_with_a_parent_does_not_imitate_again(
-    tmp_path: Path, imitated: tuple[Outcome, str]
-) -> None:
+def test_a_child_does_not_imitate_again(tmp_path: Path, imitated: tuple[Outcome, str]) -> None:
     parent = imitated[0].best
     evaluations: list[Evaluation] = []
     display = ShownDisplay(Lines(err=False))

@@ -249,9 +249,7 @@ def test_an_estop_ends_a_training_with_the_reason_and_a_checkpoint_and_no_other_
     assert not (tmp_path / "other").exists()
 
 
-def test_a_configuration_that_is_not_that_of_the_fishd_is_explained(
-    tmp_path: Path, daemon: Daemon
-) -> None:
+def test_a_configuration_unlike_that_of_fishd_is_explained(tmp_path: Path, daemon: Daemon) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("amplitude_limit: 0.3\ntick: 0.05\n", encoding="utf-8")
     status, line = complaint(

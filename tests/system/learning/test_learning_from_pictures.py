@@ -84,9 +84,7 @@ def test_with_the_smallest_frames_each_eye_learns_from_whole_rollouts(
     assert outcome.latest_evaluation
 
 
-def test_the_same_seed_gives_the_same_training_by_sight(
-    tmp_path: Path, brief: tuple[Job, Outcome]
-) -> None:
+def test_the_same_seed_gives_the_same_by_sight(tmp_path: Path, brief: tuple[Job, Outcome]) -> None:
     again = train(job_of(tmp_path / "again"))
     for table in ("progress.csv", "evaluations.csv"):
         assert (again.folder / table).read_bytes() == (brief[0].folder / table).read_bytes()
@@ -175,9 +173,7 @@ def test_an_eye_that_cannot_be_read_is_an_error_with_advice(
         checkpoints.load_policy(path.parent)
 
 
-def test_a_training_whose_camera_does_not_show_the_tail_ends_with_an_explanation(
-    tmp_path: Path,
-) -> None:
+def test_a_training_whose_camera_sees_no_tail_ends_with_an_explanation(tmp_path: Path) -> None:
     blind = replace(DEFAULT, contrast=0.1)
     with pytest.raises(NoMotion, match="see that the camera looks at its tail"):
         train(job_of(tmp_path / "run", rig=blind))
@@ -212,9 +208,7 @@ def test_a_training_whose_camera_is_too_late_ends_with_an_explanation(
     assert "give that a larger delay or oldest" in outcome.message
 
 
-def test_with_another_camera_the_eye_is_fitted_again_and_the_networks_are_kept(
-    tmp_path: Path, by_sight: Outcome
-) -> None:
+def test_with_another_camera_only_the_eye_is_fitted(tmp_path: Path, by_sight: Outcome) -> None:
     again = job_of(tmp_path / "again", steps=512, rig=WEB)
     outcome = train(replace(again, parent=by_sight.best))
     assert outcome.best_evaluation

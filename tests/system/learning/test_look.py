@@ -38,9 +38,7 @@ def test_a_sensitive_corner_is_found(tmp_path: Path) -> None:
     assert result.sensitivity[1, 30] > 3.0 * result.sensitivity[1, 1]
 
 
-def test_a_policy_that_sees_no_pictures_or_does_not_swim_or_react_is_refused(
-    tmp_path: Path,
-) -> None:
+def test_a_policy_that_sees_nothing_or_does_not_swim_or_react_is_refused(tmp_path: Path) -> None:
     def refused(content: bytes, error: type[FishdError], seconds: float = 8.0) -> str:
         with pytest.raises(error) as caught:
             look(str(write(tmp_path, content)), Config(), DEFAULT, seconds)

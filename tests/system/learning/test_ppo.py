@@ -103,18 +103,14 @@ def seen() -> NDArray[np.float32]:
     return np.random.default_rng(0).normal(0.0, 1.5, (50, 4)).astype(np.float32)
 
 
-def test_a_mirrored_fish_gets_the_mirrored_action(
-    policy: ActorCriticPolicy, seen: NDArray[np.float32]
-) -> None:
+def test_a_mirrored_fish_is_mirrored(policy: ActorCriticPolicy, seen: NDArray[np.float32]) -> None:
     actions, _ = policy.predict(seen, deterministic=True)
     mirrored, _ = policy.predict(-seen, deterministic=True)
     assert np.ptp(actions) > 0.5
     assert mirrored == pytest.approx(-actions)
 
 
-def test_a_state_and_its_mirror_image_are_worth_the_same(
-    policy: ActorCriticPolicy, seen: NDArray[np.float32]
-) -> None:
+def test_a_mirrored_state_is_as_good(policy: ActorCriticPolicy, seen: NDArray[np.float32]) -> None:
     with torch.no_grad():
         values = policy.predict_values(torch.from_numpy(seen)).numpy()
         mirrored = policy.predict_values(torch.from_numpy(-seen)).numpy()
@@ -122,9 +118,7 @@ def test_a_state_and_its_mirror_image_are_worth_the_same(
     assert mirrored == pytest.approx(values, abs=1e-5)
 
 
-def test_plain_layers_give_the_same_outputs(
-    policy: ActorCriticPolicy, seen: NDArray[np.float32]
-) -> None:
+def test_layers_give_the_same_output(policy: ActorCriticPolicy, seen: NDArray[np.float32]) -> None:
     *hidden, (last, bias) = layers_of(policy)
     values = seen
     for weight, offset in hidden:

@@ -219,9 +219,7 @@ def test_a_run_in_progress_is_not_resumed_by_another(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("until", ["", "plant:", "ppo:"])
-def test_a_file_of_a_run_that_was_cut_off_is_not_completed_by_defaults(
-    run: Path, until: str
-) -> None:
+def test_a_file_of_a_run_that_was_cut_off_has_no_defaults_added(run: Path, until: str) -> None:
     file = run / (runs.CONFIG if until == "plant:" else runs.SETTINGS)
     text = file.read_text(encoding="utf-8")
     file.write_text(text[: text.index(until)], encoding="utf-8")
@@ -246,9 +244,7 @@ def test_a_resume_with_another_fish_or_other_networks_is_refused(run: Path) -> N
 
 
 @pytest.mark.parametrize("content", ["", "a,b\n1,2\n", "steps\nmany\n", "\xff\x00"])
-def test_a_file_that_is_not_a_table_is_one_line_and_can_be_moved_away(
-    run: Path, content: str
-) -> None:
+def test_a_file_that_is_not_a_table_is_one_line_and_may_be_moved(run: Path, content: str) -> None:
     table = run / "progress.csv"
     table.write_bytes(content.encode("latin-1"))
     with pytest.raises(CheckpointError, match="not a table of a training; move it away"):
@@ -312,9 +308,7 @@ def test_a_full_disk_loses_nothing_and_advises_how_to_resume(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("size", ["16k", "28k", "48k"])
-def test_a_disk_that_is_full_before_the_first_checkpoint_advises_to_start_again(
-    tmp_path: Path, size: str
-) -> None:
+def test_a_full_disk_before_a_checkpoint_advises_to_restart(tmp_path: Path, size: str) -> None:
     with small_disk(tmp_path / "disk", size) as enlarge:
         job = brief_job(tmp_path / "disk" / "run", steps=64)
         with pytest.raises(CheckpointError) as caught:

@@ -266,9 +266,7 @@ def test_a_cluster_sends_back_the_same_trainings_as_this_machine(
     assert (here / "seeds.csv").read_text() == (there / "seeds.csv").read_text()
 
 
-def test_a_cluster_that_does_not_answer_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_silent_cluster_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
     monkeypatch.setattr(parallel, "CONNECT_TIMEOUT_S", 0.2)
     done = fishctl(*command(tmp_path, "--seeds", "2", "--cluster", "tcp://127.0.0.1:1"))
@@ -277,9 +275,7 @@ def test_a_cluster_that_does_not_answer_is_one_line(
     assert not (tmp_path / "run").exists()
 
 
-def test_in_a_summary_the_last_figures_of_a_seed_that_ended_early_are_repeated(
-    tmp_path: Path,
-) -> None:
+def test_a_summary_repeats_the_last_figures_of_a_seed_that_ended_early(tmp_path: Path) -> None:
     table = "steps,thrust,relative_thrust,frequency,fullness,stalled,best\n"
     rows = [f"{steps},0.02,0.{steps},1.7,1,0,1\n" for steps in (64, 72, 80)]
     for name, lines in (("short", rows[:1]), ("long", rows)):

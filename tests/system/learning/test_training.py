@@ -51,9 +51,7 @@ def same(left: dict[str, Any], right: dict[str, Any]) -> bool:
 
 
 @pytest.mark.parametrize("dwell", [False, True])
-def test_a_policy_swims_after_a_thousand_steps(
-    tmp_path: Path, by_force: Outcome, dwell: bool
-) -> None:
+def test_a_policy_swims_after_1000_steps(tmp_path: Path, by_force: Outcome, dwell: bool) -> None:
     outcome = by_force
     if not dwell:
         config, settings = runs.read(by_force.folder)
@@ -68,9 +66,7 @@ def test_a_policy_swims_after_a_thousand_steps(
     assert outcome.best_evaluation.thrust > better * float(untrained["thrust"])
 
 
-def test_the_same_seed_gives_the_same_numbers_and_another_does_not(
-    tmp_path: Path, brief: tuple[Job, Outcome]
-) -> None:
+def test_the_same_seed_gives_the_same_numbers(tmp_path: Path, brief: tuple[Job, Outcome]) -> None:
     others = [train(brief_job(tmp_path / str(seed), seed=seed)).folder for seed in (0, 1)]
     runs = [brief[0].folder, *others]
     for table in ("progress.csv", "evaluations.csv"):
@@ -198,9 +194,7 @@ def test_a_policy_that_holds_still_is_marked_and_never_the_best(tmp_path: Path) 
     assert outcome.best is None
 
 
-def test_a_resumed_run_continues_exactly_where_it_ended(
-    copied: Job, brief: tuple[Job, Outcome]
-) -> None:
+def test_a_resumed_run_continues_where_it_ended(copied: Job, brief: tuple[Job, Outcome]) -> None:
     job, first = copied, brief[1]
     assert first.checkpoint
     more = resumed(job, 256)
@@ -256,9 +250,7 @@ def test_a_run_killed_in_its_first_rollout_resumes_as_if_it_was_not_killed(tmp_p
     assert table == (whole.folder / "progress.csv").read_bytes()
 
 
-def test_a_resume_of_a_finished_run_or_without_a_checkpoint_is_refused(
-    copied: Job, tmp_path: Path
-) -> None:
+def test_a_resume_of_a_finished_or_empty_run_is_refused(copied: Job, tmp_path: Path) -> None:
     job = copied
     with pytest.raises(ConfigError, match="is finished, with 128 steps; to train it for longer"):
         train(replace(job, resume=True))

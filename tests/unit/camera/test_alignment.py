@@ -70,9 +70,7 @@ def test_the_crop_is_moved_so_that_the_axis_lies_in_its_middle(off: float, side:
 
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 @pytest.mark.parametrize("rotate", [0, 90])
-def test_a_fish_that_lies_otherwise_is_turned_with_its_head_to_the_left(
-    quarters: int, rotate: Any
-) -> None:
+def test_a_fish_that_lies_otherwise_is_turned_head_left(quarters: int, rotate: Any) -> None:
     alignment = judge_pictures(
         turned(quarters), replace(V4L2, picture=PictureSettings(rotate=rotate))
     )

@@ -36,9 +36,7 @@ def test_the_angle_follows_the_frames(brightness: str) -> None:
     assert pilot.angle(observe(), stack(250)) == pytest.approx(0.42)
 
 
-def test_without_frames_it_holds_its_angle_for_a_while_and_then_goes_to_neutral(
-    brightness: str,
-) -> None:
+def test_without_frames_it_holds_its_angle_and_then_goes_to_neutral(brightness: str) -> None:
     pilot = Pilot(brightness, LIMITS)
     held = pilot.angle(observe(), stack(50))
     blind = [pilot.angle(observe()) for _ in range(8)]

@@ -16,9 +16,7 @@ swum = cache(filmed_swim.swum)  # ticks are immutable
 
 @pytest.mark.parametrize("camera", [DEFAULT, WEB, replace(DEFAULT, off_axis=6.0, tilt=0.1)])
 @pytest.mark.parametrize("light_tail", [False, True])
-def test_its_position_follows_the_fin_angle(
-    camera: SimulatedCameraSettings, light_tail: bool
-) -> None:
+def test_its_position_follows_the_fin(camera: SimulatedCameraSettings, light_tail: bool) -> None:
     ticks = swum(10.0)
     camera = replace(camera, rate=None, latency=0.0, jitter=0.0)
     pictures = np.stack([frame.pixels for frame in filmed(ticks, camera)])

@@ -150,9 +150,7 @@ def test_parameters_stand_behind_a_controller_or_are_options(words: tuple[str, .
     assert json.loads(done.stdout)["parameters"] == {"frequency": 1.7, "amplitude": 0.3}
 
 
-def test_the_fish_is_live_if_a_fishd_runs_and_no_option_describes_another(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_fish_is_live_if_a_fishd_runs_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
     choose = experiment_options.default_on
     monkeypatch.setattr(experiment_options, "is_fishd_running", lambda: True)
     assert choose(None, (), None) == "live"

@@ -64,9 +64,7 @@ def test_a_folder_that_cannot_be_made_is_reported_before_the_fish_swims(
     assert swum == []
 
 
-def test_a_run_is_a_name_in_the_folder_of_recordings_or_the_latest(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_a_name_or_the_latest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "first"
     monkeypatch.setenv("FISHD_RUNS", str(folder))
     known = ("--fit", "omega0", "--set", "simulation.rotation=0.1")
@@ -118,9 +116,7 @@ def test_a_drift_is_reported_in_both_directions() -> None:
         (("--experiment", "--for", "inf"), "inf is not in the range"),
     ],
 )
-def test_a_command_line_that_makes_no_sense_is_refused(
-    words: tuple[str, ...], complaint: str
-) -> None:
+def test_a_command_line_without_sense_is_refused(words: tuple[str, ...], complaint: str) -> None:
     done = invoke(*words)
     assert done.exit_code == 2
     assert complaint in done.stderr

@@ -110,9 +110,7 @@ def test_a_policy_can_be_simulated_by_name_and_by_a_relative_path(
         assert f"ppo policy={shown}" in done.stdout
 
 
-def test_the_option_for_a_policy_explains_itself_and_completes_names_and_files(
-    policy_folder: Path,
-) -> None:
+def test_the_option_for_a_policy_completes_names_and_files(policy_folder: Path) -> None:
     for name in ("flip", "flop", "swim"):
         write(policy_folder, FLIP, name)
     shown = invoke("set-controller", "ppo", "--help").stdout

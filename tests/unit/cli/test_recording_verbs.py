@@ -106,9 +106,7 @@ def test_where_no_controller_swam_nothing_is_chosen_again(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("verb", ["export --csv", "plot", "replay", "rerun", "recover"])
 @pytest.mark.parametrize("run", ["~nobody-here", "~nobody-here/run", "~nobody\0here"])
-def test_a_home_that_nobody_has_is_one_line_of_every_verb(
-    tmp_path: Path, verb: str, run: str
-) -> None:
+def test_a_home_of_nobody_is_one_line_of_every_verb(tmp_path: Path, verb: str, run: str) -> None:
     done = fishctl(*verb.split(), run, "--folder", str(tmp_path))
     assert done.returncode == 1
     assert "fishctl: no recording '~nobody" in one_line(done)

@@ -102,9 +102,7 @@ def test_the_servo_gets_what_the_row_of_a_latched_fault_says(code: str) -> None:
     ("name", "data_rate"),
     [(name, 250 if name in TRANSFER_ERRORS else 860) for name in SENSOR_FAULTS],
 )
-def test_a_bad_force_ends_in_neutral_and_recovers_after_a_clear(
-    rig: LockstepRig, name: str
-) -> None:
+def test_a_bad_force_ends_in_neutral_until_it_is_cleared(rig: LockstepRig, name: str) -> None:
     code, earliest, latest = SENSOR_FAULTS[name]
     broke = rig.now
     rig.pi.faults.inject(name)

@@ -189,9 +189,7 @@ def test_one_suspect_force_in_a_beat_does_not_change_the_thrust(fx: float) -> No
 
 @pytest.mark.parametrize("tick", [43, 57, 59])
 @pytest.mark.parametrize("fx", [0.2, -5.0])
-def test_a_spike_that_is_not_suspect_makes_the_zero_uncertain_not_wrong(
-    fx: float, tick: int
-) -> None:
+def test_a_spike_that_is_not_suspect_widens_the_interval_of_zero(fx: float, tick: int) -> None:
     rig, robot = fragile_rig()
     rig.run(tick)
     robot.fx = fx

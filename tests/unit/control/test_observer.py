@@ -66,9 +66,7 @@ def test_a_strongly_damped_fin_is_observed_as_well() -> None:
 
 @pytest.mark.parametrize(("kind", "least", "most"), [("observer", 0.97, 1.0),
                                                      ("lateral_force", 0.6, 0.9)])  # fmt: skip
-def test_swing_with_the_observer_tolerates_a_slow_servo(
-    kind: str, least: float, most: float
-) -> None:
+def test_swing_with_the_observer_bears_a_slow_servo(kind: str, least: float, most: float) -> None:
     from fishd.config import load
 
     config = load(None, [f"estimator.kind={kind}", "plant.servo_delay=0.1", *REAL])

@@ -84,9 +84,7 @@ def complaint(read: Callable[[Path], object], path: Path) -> str:
 
 @pytest.mark.parametrize("plant", PLANTS, ids=lambda plant: plant.__name__)
 @pytest.mark.parametrize("name", READERS)
-def test_what_is_no_file_is_one_line(
-    tmp_path: Path, name: str, plant: Callable[[Path], None]
-) -> None:
+def test_what_is_no_file_is_told(tmp_path: Path, name: str, plant: Callable[[Path], None]) -> None:
     plant(tmp_path / name)
     assert complaint(READERS[name], tmp_path / name).startswith(
         f"{tmp_path / name}: {PLANTS[plant]}"
@@ -185,9 +183,7 @@ def test_a_name_may_be_as_long_as_the_file_system_permits(tmp_path: Path) -> Non
         ("a\0b", "cannot be written: a name has no zero byte"),
     ],
 )
-def test_a_file_that_cannot_be_written_is_refused(
-    tmp_path: Path, name: str, complaint: str
-) -> None:
+def test_an_unwritable_file_is_refused(tmp_path: Path, name: str, complaint: str) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "link").symlink_to("/dev/null")
     with pytest.raises(files.FileProblem, match=complaint):

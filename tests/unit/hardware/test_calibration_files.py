@@ -153,9 +153,7 @@ def test_a_servo_calibration_has_the_bounds_of_the_same_keys_of_the_configuratio
         assert bounds(ServoCalibration, key) == bounds(ServoSettings, key), key
 
 
-def test_a_file_of_before_uncertainties_were_kept_is_used_and_its_own_is_unknown(
-    tmp_path: Path,
-) -> None:
+def test_a_file_from_before_uncertainties_is_used_and_they_are_unknown(tmp_path: Path) -> None:
     (tmp_path / "force-2026-11-21T120000.000000Z.yaml").write_text(yaml.safe_dump(FORCE))
     newest = CalibrationFolder(tmp_path).newest(ForceCalibration)
     assert newest is not None

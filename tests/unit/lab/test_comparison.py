@@ -112,9 +112,7 @@ def test_what_is_no_controller_is_taken_for_a_policy() -> None:
             parse(text)
 
 
-def test_nobody_swims_before_everybody_is_known_to_be_able_to(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_none_swims_before_all_are_known_to_be_able_to(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(comparison, "judge", lambda *_: pytest.fail("a contestant swam"))
     with pytest.raises(ParameterError, match="frequency"):
         compare_texts("swing", "square:frequency=99")

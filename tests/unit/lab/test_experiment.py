@@ -76,9 +76,7 @@ def test_a_table_with_columns_of_an_older_fishd_is_read_and_renamed(
         ({"kind": "optimise"}, "kind = sweep, now it is optimise"),
     ],
 )
-def test_it_is_resumed_with_the_same_only(
-    tmp_path: Path, changes: dict[str, Any], named: str
-) -> None:
+def test_it_is_resumed_only_as_begun(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
     begin(tmp_path)
     header = {"kind": "sweep", "on": "live", "settings": HEADER.settings, "config": HEADER.config}
     with pytest.raises(ConfigError, match=named):

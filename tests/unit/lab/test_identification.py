@@ -62,9 +62,7 @@ def identification(table: pd.DataFrame) -> Identification:
 
 
 @pytest.mark.slow
-def test_it_finds_the_fish_and_the_rig_from_forces_and_commands_alone(
-    identification: Identification,
-) -> None:
+def test_it_finds_fish_and_rig_from_forces_and_commands(identification: Identification) -> None:
     config = load(None, RIG_OVERRIDES)
     truth = asdict(config.plant) | asdict(config.simulation)
     for name in ("omega0", "xi", "coupling", "servo_speed", "servo_lag", "thrust_coefficient",
@@ -81,9 +79,7 @@ def test_it_finds_the_fish_and_the_rig_from_forces_and_commands_alone(
 
 
 @pytest.mark.slow
-def test_forces_tell_products_and_the_intervals_of_factors_allow_for_any_ratio(
-    identification: Identification,
-) -> None:
+def test_products_are_told_and_factors_have_any_ratio(identification: Identification) -> None:
     truth = asdict(FISH)
     scale = truth["coupling"]
     products = [truth["thrust_coefficient"] * scale, truth["thrust_coefficient"],
@@ -130,9 +126,7 @@ def test_what_the_forces_show_is_fitted_too_unless_that_is_fixed() -> None:
     assert fixed.inflation > 2.0
 
 
-def test_a_fish_of_another_kind_is_not_identified_and_the_first_line_says_so(
-    table: pd.DataFrame,
-) -> None:
+def test_a_fish_of_another_kind_is_not_identified_in_one_line(table: pd.DataFrame) -> None:
     # The forces have components that no fish of the model can have.
     chance = np.random.default_rng(0)
     table = table.iloc[:600]
@@ -168,9 +162,7 @@ def test_delay_and_backlash_are_known_to_10_percent_at_best_where_they_are() -> 
 
 
 @pytest.mark.slow
-def test_offsets_are_those_of_the_sensor_and_the_drift_is_told_apart(
-    identification: Identification,
-) -> None:
+def test_offsets_of_the_sensor_are_told_from_its_drift(identification: Identification) -> None:
     # One period and a half of a drift of 5 mN: its mean is within 2 π of a third.
     assert abs(identification["offset_y"].value - 0.02) < 5e-3 / 2
     assert all(
@@ -198,9 +190,7 @@ def test_what_it_writes_is_a_configuration(identification: Identification, tmp_p
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "seconds"), [(0, 135.0), (1, 180.0)])
-def test_the_interval_of_an_offset_knows_that_the_drift_has_a_mean(
-    seed: int, seconds: float
-) -> None:
+def test_the_interval_of_an_offset_knows_the_mean_drift(seed: int, seconds: float) -> None:
     table = swim_experiment(*RIG_OVERRIDES, f"simulation.seed={seed}", seconds=seconds)
     identification = identify(
         table, start=FISH, rig=load(None, RIG_OVERRIDES).simulation, fit=["coupling"]
@@ -219,9 +209,7 @@ def test_an_experiment_takes_half_a_minute_or_more_and_ends(seconds: float) -> N
 
 
 @pytest.mark.slow
-def test_the_configuration_has_no_digits_that_the_interval_does_not_know(
-    table: pd.DataFrame, tmp_path: Path
-) -> None:
+def test_the_configuration_has_no_false_digits(table: pd.DataFrame, tmp_path: Path) -> None:
     identification = identify(table.iloc[:400], start=FISH, fit=["coupling"])
     others = tuple(
         estimate for estimate in identification.estimates if estimate.name != "servo_delay"

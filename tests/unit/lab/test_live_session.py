@@ -43,9 +43,7 @@ class LostAnswer(VirtualDaemon):
 
 @pytest.mark.parametrize("ended_by", [KeyboardInterrupt, NoDaemon])
 @pytest.mark.parametrize("loads", [False, True])
-def test_a_controller_whose_start_was_not_heard_of_is_stopped(
-    ended_by: type[BaseException], loads: bool
-) -> None:
+def test_a_controller_that_began_unheard_stops(ended_by: type[BaseException], loads: bool) -> None:
     daemon = LostAnswer(ended_by, loads)
     with pytest.raises(ended_by), rig_of(daemon) as rig:
         rig.swim("swing", {}, 1.0)

@@ -78,9 +78,7 @@ def test_a_fish_that_holds_still_has_no_thrust() -> None:
 
 
 @pytest.mark.parametrize(("seconds", "frequency"), [(30.0, 1.7), (60.0, 0.4), (21.0, 3.0)])
-def test_a_plan_takes_its_time_and_begins_and_ends_at_rest(
-    seconds: float, frequency: float
-) -> None:
+def test_a_plan_takes_its_time_from_rest_to_rest(seconds: float, frequency: float) -> None:
     phases = plan(seconds, {"frequency": frequency})
     assert sum(length for _, length in phases) == pytest.approx(seconds)
     assert [swims for swims, _ in phases] == [False, *[True, False] * (len(phases) // 2)]
@@ -194,9 +192,7 @@ def test_nothing_is_named_where_the_zero_holds_still() -> None:
     assert not measure_undisturbed(60.0).remark
 
 
-def test_a_zero_with_more_disturbances_than_are_searched_for_is_a_remark(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_zero_with_too_many_disturbances_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fishd.lab.disturbances.MAX_DISTURBANCES", 1)
     assert (
         "disturbed too often" in measure_disturbed(30.0, lambda time, _: 5e-3 * (time > 8.0)).remark

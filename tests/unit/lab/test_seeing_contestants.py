@@ -54,9 +54,7 @@ def test_one_for_another_robot_is_refused_before_anything_swims(tmp_path: Path) 
     assert "trained at a tick of 20 ms, this robot's is 50 ms" in str(refused)
 
 
-def test_named_policies_that_see_swim_where_none_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_named_policies_swim_by_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path, velocity_follower(), "eye")
     monkeypatch.setenv("FISHD_POLICIES", str(tmp_path))
     assert "eye" in [contestant.label for contestant in default_contestants(Config())]

@@ -57,9 +57,7 @@ def test_a_recording_that_fails_ends_a_swim_and_is_no_fault_of_the_fish() -> Non
             rig.swim("swing", {}, 10.0)
 
 
-def test_what_swam_before_an_interruption_or_a_kill_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_swam_before_a_kill_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "run.mcap"
     monkeypatch.setattr("fishd.lab.session.FLUSH_INTERVAL_S", 0.0)
 

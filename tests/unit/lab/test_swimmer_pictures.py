@@ -59,9 +59,7 @@ def test_the_colours_end_at_a_round_value_of_the_size_that_occurs(fish: Fish) ->
 
 
 @pytest.mark.parametrize("quantity", wake.QUANTITIES)
-def test_a_picture_of_the_wake_is_written(
-    fish: Fish, quantity: wake.Quantity, tmp_path: Path
-) -> None:
+def test_a_picture_of_a_wake_is_made(fish: Fish, quantity: wake.Quantity, tmp_path: Path) -> None:
     shown = wake.take_view(fish, quantity, wake.whole_window(COARSE), 200)
     wake.draw_wake(shown, wake.choose_colour_limit(COARSE, quantity), tmp_path / "wake.png")
     with Image.open(tmp_path / "wake.png") as picture:
@@ -69,9 +67,7 @@ def test_a_picture_of_the_wake_is_written(
 
 
 @pytest.mark.parametrize("kind", [".webp", ".gif"])
-def test_a_film_has_a_frame_every_20_ms_and_shows_that_the_fish_moves(
-    kind: str, tmp_path: Path
-) -> None:
+def test_a_film_has_a_frame_every_20_ms_and_the_fish_moves(kind: str, tmp_path: Path) -> None:
     path = tmp_path / f"wake{kind}"
     swimmer = Fish(COARSE)
     with Film(path, COARSE) as film:
@@ -90,9 +86,7 @@ def pixels(film: Image.Image) -> Iterator[np.ndarray]:
         yield np.asarray(film.convert("RGB"))
 
 
-def test_a_long_film_leaves_frames_out_and_keeps_its_pace(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_film_leaves_frames_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert MAX_FRAMES < 1000
     monkeypatch.setattr("fishd.lab.swimmer.film.MAX_FRAMES", 4)
     path = tmp_path / "wake.webp"

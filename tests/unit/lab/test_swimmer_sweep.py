@@ -106,9 +106,7 @@ def open_folder(path: Path, config: Config) -> SweepFolder:
         return SweepFolder(experiment, ["controller", "parameters.frequency", "parameters.C"])
 
 
-def test_a_table_of_speeds_is_gone_on_with_and_swing_is_drawn_among_the_waves(
-    tmp_path: Path, config: Config
-) -> None:
+def test_a_table_of_speeds_is_resumed_and_swing_is_drawn(tmp_path: Path, config: Config) -> None:
     folder = open_folder(tmp_path, config)
     points = [Point("square", {"frequency": value}) for value in (1.0, 2.0, 3.0, 4.0, 5.0)]
     points += [Point("swing", {"C": value}) for value in (0.0, 0.6)]
@@ -159,9 +157,7 @@ def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(
     assert (folder / row["recording"]).is_file()
 
 
-def test_a_grid_with_a_fish_that_cannot_be_computed_is_refused_before_anything_is_made(
-    tmp_path: Path,
-) -> None:
+def test_a_grid_with_a_fish_that_cannot_be_computed_is_refused_first(tmp_path: Path) -> None:
     words = ("sweep", "square", "--vary", "swimmer.numerics.cell=0.002,0.02")
     line = one_line(fishctl(*words, "--config", str(FILE), "--folder", str(tmp_path / "run")))
     assert "swimmer.numerics.cell" in line

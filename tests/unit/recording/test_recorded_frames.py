@@ -67,9 +67,7 @@ def path(tmp_path: Path, ticks: list[Tick], frames: list[Frame]) -> Path:
     return write(tmp_path / "run.mcap", ticks, frames)
 
 
-def test_pixels_and_times_are_given_back(
-    path: Path, ticks: list[Tick], frames: list[Frame]
-) -> None:
+def test_pixels_and_times_are_returned(path: Path, ticks: list[Tick], frames: list[Frame]) -> None:
     run = open_run(path)
     recorded = list(run.frames())
     assert len(recorded) == len(frames) == len(run.frame_heads)
@@ -116,9 +114,7 @@ def test_an_hour_of_frames_has_the_size_that_the_docs_say(path: Path, tmp_path: 
     assert 4.0e3 < frame_bytes < 6.0e3
 
 
-def test_missing_frames_and_a_new_camera_are_counted_as_gaps(
-    tmp_path: Path, frames: list[Frame]
-) -> None:
+def test_missing_frames_and_a_new_camera_are_gaps(tmp_path: Path, frames: list[Frame]) -> None:
     with RunWriter(tmp_path / "run") as writer:
         writer.describe(Rig().config)
         heads = [

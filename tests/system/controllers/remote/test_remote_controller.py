@@ -25,9 +25,7 @@ from fishd.controllers import registry
 from fishd.core.errors import ConfigError, ParameterError
 
 
-def test_an_action_is_in_force_in_the_tick_that_it_answers(
-    still: Rig, agent: ScriptedAgent
-) -> None:
+def test_an_action_is_applied_in_the_tick_it_answers(still: Rig, agent: ScriptedAgent) -> None:
     angles = {n: 0.4 * math.sin(n) for n in range(1, 51)}
     still.start("remote", agent=agent.address)
     with agent.answering(lambda seen: agent.action(angles[seen["seq"]])):

@@ -125,9 +125,7 @@ def test_frames_without_end_are_a_fault_and_nothing_of_them_is_kept(
 @pytest.mark.parametrize(
     "greeting", [b"HTTP/1.1 200 OK\r\n\r\n", GREETING_OF_2, PLAIN, bytes(64), b""]
 )
-def test_what_does_not_greet_as_zeromq_does_is_no_agent(
-    rig: Rig, raw: RawAgent, greeting: bytes
-) -> None:
+def test_what_speaks_no_zeromq_is_no_agent(rig: Rig, raw: RawAgent, greeting: bytes) -> None:
     rig.start("remote", agent=raw.address, deadline=0.001)
     connection = raw.accept()
     connection.sendall(greeting)
@@ -191,9 +189,7 @@ def test_what_is_shown_of_a_bad_message_is_where_it_is_bad(
 
 
 @pytest.mark.parametrize("seq", [-3, 0, 2, 8, 10**18])
-def test_an_action_for_what_was_not_sent_is_a_fault(
-    rig: Rig, agent: ScriptedAgent, seq: int
-) -> None:
+def test_an_action_for_nothing_sent_is_a_fault(rig: Rig, agent: ScriptedAgent, seq: int) -> None:
     assert connect(rig, agent)["seq"] == 1
     agent.send(agent.action(0.1, seq=seq))
     wait_for_message(rig)
@@ -243,9 +239,7 @@ def test_a_dwell_can_be_changed_in_flight(still: Rig, agent: ScriptedAgent) -> N
     assert angles == [0.42, 0.42, -0.42, -0.42] * 2
 
 
-def test_an_agent_that_insists_is_told_and_swing_takes_over(
-    still: Rig, agent: ScriptedAgent
-) -> None:
+def test_an_agent_that_insists_is_told_and_swing_follows(still: Rig, agent: ScriptedAgent) -> None:
     still.start("remote", agent=agent.address, dwell=0.2)
     with agent.answering(lambda seen: flip(agent, seen)):
         ticks = still.run(60)

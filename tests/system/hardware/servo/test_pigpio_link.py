@@ -112,9 +112,7 @@ def test_no_call_is_held_up_and_no_thread_spins(bench: Swimming, fault: str, for
 
 
 @pytest.mark.parametrize("fault", ["pigpiod-gone", "pigpiod-frozen", "pigpiod-restart"])
-def test_pulses_come_back_only_with_a_write_and_with_a_countdown(
-    bench: Swimming, fault: str
-) -> None:
+def test_pulses_come_back_only_with_a_write_and_countdown(bench: Swimming, fault: str) -> None:
     bench.write_until_it_works(0.5)
     before = bench.swimmer.driver.counters()["servo_reconnects"]
     bench.faults.inject(fault)

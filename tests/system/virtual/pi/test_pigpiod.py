@@ -53,9 +53,7 @@ def test_what_cannot_be_done_is_answered_with_pigpios_error(
     assert bench.result(method, *arguments) == number
 
 
-def test_what_is_not_emulated_is_refused_and_named_in_the_log(
-    bench: Bench, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_is_not_emulated_is_refused(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     assert bench.result("notify_begin", 0, 1) == pigpio.PI_UNKNOWN_COMMAND
     assert bench.result("store_script", b"tag 0 inr p0 jmp 0") == pigpio.PI_BAD_SCRIPT_CMD
     command, instruction = caplog.messages

@@ -218,15 +218,11 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(tmp_
         (("--checkpoint", "kept.npz", "--save", "kept.npz"), "--save need different files"),
     ],
 )
-def test_what_cannot_be_done_is_said_before_it_swims(
-    words: tuple[str, ...], complaint: str
-) -> None:
+def test_what_cannot_be_done_is_said_before_a_swim(words: tuple[str, ...], complaint: str) -> None:
     assert complaint in one_line(simulate("swing", *words))
 
 
-def test_a_checkpoint_of_another_swim_is_not_written_over(
-    swum: tuple[dict[str, Any], Path],
-) -> None:
+def test_a_checkpoint_of_another_swim_is_kept(swum: tuple[dict[str, Any], Path]) -> None:
     kept = swum[1] / "end"
     before = kept.read_bytes()
     line = one_line(simulate("swing", "--checkpoint", kept))

@@ -23,9 +23,7 @@ def daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
         yield daemon
 
 
-def test_its_ticks_are_evenly_spaced_in_its_time_and_slower_in_that_of_people(
-    daemon: Daemon,
-) -> None:
+def test_its_ticks_are_evenly_spaced_in_its_time_and_slow_for_people(daemon: Daemon) -> None:
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         ticks = fish.ticks()
         seen = [next(ticks) for _ in range(40)]

@@ -161,9 +161,7 @@ _OUT = "one float32 output of shape [1, 1] named 'action' is needed"
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_wrong_ends_are_refused_with_what_is_right(
-    change: Change, actual: str, wanted: str
-) -> None:
+def test_wrong_ends_are_refused_with_right_ones(change: Change, actual: str, wanted: str) -> None:
     message = refusal(changed(change))
     assert actual in message
     assert wanted in message

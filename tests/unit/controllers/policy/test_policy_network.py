@@ -17,9 +17,7 @@ FEATURES = (("fy", 0.02), ("fy_rate", 0.3), ("instruction_angle", 0.42), ("fin_v
 
 @pytest.mark.parametrize("activation", ["tanh", "relu"])
 @pytest.mark.parametrize("hidden", [(), (64, 64)])
-def test_onnx_agrees_with_numpy(
-    activation: Literal["tanh", "relu"], hidden: tuple[int, ...]
-) -> None:
+def test_onnx_equals_numpy(activation: Literal["tanh", "relu"], hidden: tuple[int, ...]) -> None:
     layers = random_layers(4, *hidden, 1)
     session = onnxruntime.InferenceSession(to_onnx(layers, activation, card(*FEATURES)))
     for inputs in np.random.default_rng(1).normal(0.0, 1.5, (200, 4)).astype(np.float32):

@@ -59,9 +59,7 @@ def test_a_measurement_is_of_the_window_before_its_tick() -> None:
 @pytest.mark.parametrize(
     "fault", ["nack", "timeout", "arbitration-lost", "unplugged", "stuck-busy"]
 )
-def test_while_the_chip_is_away_reads_raise_and_soon_after_it_is_well(
-    rig: ForceRig, fault: str
-) -> None:
+def test_while_the_chip_is_away_reads_raise_and_then_work_again(rig: ForceRig, fault: str) -> None:
     sensor = rig.sensor()
     ticks = Ticks(sensor)
     measurements(ticks.run(1.0))

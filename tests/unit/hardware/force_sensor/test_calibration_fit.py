@@ -55,9 +55,7 @@ def test_without_noise_the_sensor_is_recovered_to_the_last_digits(
 
 
 @given(crosstalk, crosstalk, st.integers(0, 2**32 - 1))
-def test_with_noise_it_is_recovered_as_well_as_that_permits(
-    cx: float, cy: float, seed: int
-) -> None:
+def test_with_noise_it_is_recovered_as_well_as_can_be(cx: float, cy: float, seed: int) -> None:
     noise = 1e-4
     loads = measured_loads(PLAN * 8, sensor(1.0, 1.0, cx, cy), (0.5, -0.5), noise, seed)
     fitted = fit(loads)

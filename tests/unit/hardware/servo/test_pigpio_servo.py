@@ -84,9 +84,7 @@ def test_a_release_stops_pulses_and_disarms_the_countdown(bench: Bench, while_it
 
 
 @pytest.mark.parametrize("pause", [0.05, 1.0])
-def test_a_write_after_a_release_brings_pulses_and_countdown_back(
-    bench: Bench, pause: float
-) -> None:
+def test_a_write_after_a_release_brings_pulses_back(bench: Bench, pause: float) -> None:
     servo = bench.servo()
     servo.write(0.5)
     servo.release()

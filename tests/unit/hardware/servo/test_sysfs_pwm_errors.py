@@ -34,9 +34,7 @@ def settled_width(bench: Bench) -> float:
     "unwritable",
     [{("duty_cycle", NEUTRAL)}, {("duty_cycle", NEUTRAL), ("duty_cycle", 0)}, {("enable", 0)}],
 )
-def test_the_last_resort_ends_pulses_whatever_fails(
-    bench: Bench, unwritable: set[tuple[str, int]]
-) -> None:
+def test_the_last_resort_ends_all_pulses(bench: Bench, unwritable: set[tuple[str, int]]) -> None:
     bench.kernel.unwritable = unwritable
     with pytest.raises(ServoError, match="Input/output error"):
         bench.last_resort()

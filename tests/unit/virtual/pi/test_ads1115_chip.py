@@ -26,9 +26,7 @@ def test_the_driver_reads_every_input(board: Board) -> None:
 
 
 @pytest.mark.parametrize(("gain", "full_scale"), [(2 / 3, 6.144), (2, 2.048), (16, 0.256)])
-def test_a_code_is_a_share_of_its_range_or_end(
-    board: Board, gain: float, full_scale: float
-) -> None:
+def test_a_code_is_a_share_of_its_range(board: Board, gain: float, full_scale: float) -> None:
     board.volts[:3] = [0.2, 1.001 * full_scale, -1.001 * full_scale]
     ads = board.driver(gain=gain)
     assert ads.read(0) == codes(0.2, full_scale)

@@ -19,9 +19,7 @@ def faults(clock: VirtualClock) -> Faults:
     return Faults(clock)
 
 
-def test_a_fault_lasts_till_it_is_cleared_or_for_its_time(
-    faults: Faults, clock: VirtualClock
-) -> None:
+def test_a_fault_lasts_till_its_end_or_for_its_time(faults: Faults, clock: VirtualClock) -> None:
     assert faults.listing() == {}
     faults.inject("stuck-busy")
     faults.inject("nack", 0.5)
@@ -44,9 +42,7 @@ def test_clearing_all_ends_random_errors_too(faults: Faults) -> None:
 
 
 @pytest.mark.parametrize("call", [Faults.inject, Faults.clear])
-def test_an_unknown_name_gets_the_nearest(
-    faults: Faults, call: Callable[[Faults, str], None]
-) -> None:
+def test_the_nearest_name_is_offered(faults: Faults, call: Callable[[Faults, str], None]) -> None:
     with pytest.raises(ValueError, match="no fault is called 'brownout'; did you mean 'brown-out'"):
         call(faults, "brownout")
 

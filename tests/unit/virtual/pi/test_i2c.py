@@ -81,9 +81,7 @@ def test_a_failed_transfer_may_have_reached_the_chip_all_the_same(board: Board) 
 I2C_TIMEOUT = 0x0702
 
 
-def test_a_hanging_bus_costs_a_second_or_what_is_asked_for(
-    board: Board, pureio: smbus.SMBus
-) -> None:
+def test_a_hanging_bus_costs_a_second_or_the_limit(board: Board, pureio: smbus.SMBus) -> None:
     board.faults.inject("timeout")
 
     def cost() -> float:

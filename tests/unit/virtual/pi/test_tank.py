@@ -124,9 +124,7 @@ def test_sensitivity_crosstalk_and_zero_are_those_of_the_settings() -> None:
         (("A3", "A2"), [0, -1, -1, 1, 0, 0, 2, 1]),
     ],
 )
-def test_each_input_sees_what_its_pins_are_wired_to(
-    channels: tuple[str, str], volts: list[float]
-) -> None:
+def test_each_input_sees_its_wires(channels: tuple[str, str], volts: list[float]) -> None:
     rig = Rig(channel_x=channels[0], channel_y=channels[1], zero_x=1.0, zero_y=2.0)
     assert [rig.tank.volts(mux, mux, mux + 0.01) for mux in range(8)] == volts
 

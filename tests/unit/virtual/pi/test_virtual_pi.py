@@ -57,9 +57,7 @@ def test_faults_reach_both_halves_of_the_pi(pi: VirtualPi, clock: VirtualClock) 
     assert abs(pi.tank.truth().phi) < AMPLITUDE - 0.02
 
 
-def test_the_fish_swims_on_where_nobody_reads_the_sensor(
-    pi: VirtualPi, clock: VirtualClock
-) -> None:
+def test_the_fish_swims_on_with_an_unread_sensor(pi: VirtualPi, clock: VirtualClock) -> None:
     steer(pi)
     assert pi.state().truth.alpha == 0.0
     clock.now += 10.0
