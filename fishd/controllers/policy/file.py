@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from fishd.controllers.policy import checksum, operators, size_check
+from fishd.controllers.policy import checksum, operators
 from fishd.controllers.policy.card import CARD_KEY, Card, decode
-from fishd.controllers.policy.size_check import EXPORT_REMEDY, NOT_ONNX
 from fishd.core import files
 from fishd.core.errors import PolicyError
 from fishd.core.text import describe_error, quoted
@@ -20,6 +19,7 @@ from fishd.core.text import describe_error, quoted
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto, ValueInfoProto
 
+EXPORT_REMEDY = "export it with 'fishctl learn export'"
 INPUT, FRAMES, OUTPUT = "observation", "frames", "action"
 MAX_FILE_BYTES = 16 * 2**20
 """Maximum size of a file; a policy has about ten thousand weights [bytes]."""
@@ -54,7 +54,6 @@ def read(path: Path) -> PolicyFile:
 def parse(content: bytes) -> Card:
     """Check the content of a policy file and return its card; raise `PolicyError`."""
     _refuse_pickles(content)
-    size_check.check(content)
     model = _load_model(content)
     try:
         return _check_model(content, model)
@@ -106,7 +105,7 @@ def _load_model(content: bytes) -> "ModelProto":
         model = None
     # Almost any bytes are a valid protobuf message with unknown fields.
     if model is None or not (model.ir_version and model.opset_import and model.graph.node):
-        raise PolicyError(NOT_ONNX)
+        raise PolicyError(f"this is not an ONNX model; {EXPORT_REMEDY}")
     return model
 
 
@@ -202,15 +201,13 @@ def _check_tensor(tensor: "TensorProto") -> None:
     what = f"weights '{quoted(tensor.name)}'" if tensor.name else "constants"
     if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
         raise PolicyError(f"its {what} are in another file; save the model as a single file")
-    if tensor.data_type == TensorProto.STRING:
-        raise PolicyError(f"its {what} are text; a network computes numbers")
     if tensor.data_type == TensorProto.UNDEFINED:  # an attribute without a tensor
         return
     try:
         array = numpy_helper.to_array(tensor)
+        numbers = array if array.dtype.kind in "biufc" else array.astype(np.float32)
     except Exception as error:  # a tensor may be inconsistent in many ways
         raise PolicyError(f"its {what} cannot be read: {describe_error(error)}") from None
-    numbers = array if array.dtype.kind in "biufc" else array.astype(np.float32)
     if not np.isfinite(numbers).all():
         raise PolicyError(_not_finite(what))
 

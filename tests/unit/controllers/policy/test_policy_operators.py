@@ -1,4 +1,4 @@
-"""A policy does what ends in time: other operators, and networks too large, are refused."""
+"""Refusal of policies with other operators, and of networks that are too slow."""
 
 import re
 import time
@@ -78,11 +78,6 @@ def test_an_operator_that_the_file_defines_itself_is_refused() -> None:
     assert refusal(seal(model)) == "it defines a custom operator, Tanh"
 
 
-def test_a_graph_in_an_attribute_is_refused() -> None:
-    node = make("Tanh", ["observation"], ["action"], inner=body())
-    assert refusal(of_nodes([node])) == "its Tanh contains a graph"
-
-
 @pytest.mark.parametrize("opset", [10, 99])
 def test_a_version_of_the_operators_that_is_not_known_is_refused(opset: int) -> None:
     content = of_nodes([make("Tanh", ["observation"], ["action"])], opset=opset)
@@ -100,61 +95,29 @@ def test_more_operators_than_a_policy_needs_are_refused() -> None:
 @pytest.mark.parametrize(
     ("nodes", "weights", "message"),
     [
-        (  # 40 GB from 800 kB
-            [make("Add", ["a", "b"], ["c"]), make("ReduceMean", ["c"], ["action"])],
-            [floats("a", 100_000, 1), floats("b", 1, 100_000)],
-            r"its network computes 1e\+10 values for one answer; 4.2e\+06 are the most",
-        ),
-        (
-            [make("MatMul", ["a", "b"], ["c"]), make("ReduceMean", ["c"], ["action"])],
-            [floats("a", 1000, 1000), floats("b", 1000, 1000)],
-            r"its network computes 1e\+09 multiplications for one answer; 1e\+08 are the most",
-        ),
-        (
-            [
-                make("ConstantOfShape", ["s"], ["c"]),
-                make("Conv", ["c", "w"], ["d"]),
-                make("ReduceMean", ["d"], ["action"], axes=[2, 3], keepdims=0),
-            ],
-            [integers("s", 1, 1, 2000, 1000), floats("w", 1, 1, 100, 100)],
-            r"its network computes 1.7e\+10 multiplications",
-        ),
-        (
-            [
-                make("Cast", ["observation"], ["n"], to=TensorProto.INT64),
-                make("Expand", ["observation", "n"], ["c"]),
-                make("ReduceMean", ["c"], ["action"]),
-            ],
-            [],
-            "its network contradicts itself|how much its Expand computes cannot be told",
-        ),
         (
             [make("Tanh", ["observation"], ["w"]), make("Tanh", ["w"], ["action"])],
             [floats("w", 1, 1)],
-            "its network contradicts itself",
+            "'w' has been used as output names multiple times",
         ),
         (
-            [make("Conv", ["observation", "w"], ["action"], strides=[0])],
-            [floats("w", 1, 1)],
-            r"its Conv: strides \[0\]: 1 or more is needed",
+            [make("MatMul", ["observation", "w"], ["action"])],
+            [floats("w", 5, 1)],
+            "Incompatible dimensions for matrix multiplication",
+        ),
+        (
+            [make("Tanh", ["observation"], ["action"], inner=body())],
+            [],
+            "Unrecognized attribute: inner for operator Tanh",
         ),
     ],
 )
-def test_a_network_that_would_take_all_memory_or_hours_is_refused_at_once(
+def test_a_network_that_contradicts_itself_is_refused_with_onnx_s_reason(
     nodes: list[Any], weights: list[Any], message: str
 ) -> None:
-    began = time.process_time()
-    assert re.match(message, refusal(of_nodes(nodes, weights)))
-    assert time.process_time() - began < 5.0
-
-
-def test_a_size_that_the_file_only_claims_does_not_count() -> None:
-    """Shapes that a file states for inner values are not trusted."""
-    nodes = [make("Add", ["a", "b"], ["c"]), make("ReduceMean", ["c"], ["action"])]
-    content = of_nodes(nodes, [floats("a", 100_000, 1), floats("b", 1, 100_000)])
-    model = onnx.load_model_from_string(content)
-    model.graph.value_info.append(helper.make_tensor_value_info("c", TensorProto.FLOAT, [1, 1]))
-    assert "its network computes 1e+10 values" in refusal(seal(model))
+    refused = refusal(of_nodes(nodes, weights))
+    assert refused.startswith("its network contradicts itself: ")
+    assert message in refused
 
 
 def test_a_network_that_takes_over_half_a_tick_is_refused_with_its_time(tmp_path: Path) -> None:
@@ -175,6 +138,28 @@ def test_a_network_that_takes_over_half_a_tick_is_refused_with_its_time(tmp_path
         r"2 ms; train a smaller network"
     )
     assert re.fullmatch(re.escape(str(path)) + expected, str(caught.value))
+
+
+class CountingNetwork(Network):
+    runs = 0
+
+    def run(self) -> float:
+        type(self).runs += 1
+        return super().run()
+
+
+def test_a_network_that_takes_seconds_is_refused_after_a_few_runs(tmp_path: Path) -> None:
+    """Each of the 40 products has 10⁹ multiplications: a second for one run, not for eight."""
+    names = ["wide", *(f"v{number}" for number in range(39)), "narrow"]
+    nodes = [
+        make("Expand", ["observation", "s"], ["wide"]),
+        *(make("MatMul", [a, "w"], [b]) for a, b in pairwise(names)),
+        make("ReduceMean", ["narrow"], ["action"]),
+    ]
+    path = write(tmp_path, of_nodes(nodes, [integers("s", 1000, 1000), floats("w", 1000, 1000)]))
+    with pytest.raises(PolicyError, match=r"this machine takes [\d.e+]+ ms to run it once"):
+        CountingNetwork(file.read(path))
+    assert CountingNetwork.runs < 8
 
 
 def test_a_usual_network_is_fast_enough_for_the_shortest_tick(tmp_path: Path) -> None:
