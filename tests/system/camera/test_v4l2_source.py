@@ -81,9 +81,8 @@ def test_a_camera_that_sends_only_broken_frames_is_opened_again(good: V4l2Rig) -
     assert "/dev/video7 has sent only broken frames for 2 s (" in state.problem
     assert "another cable or port" in state.remedy
     assert (state.rate, state.latency) == (0.0, None)
-    good.until(
-        lambda later: later.broken_frames > state.broken_frames + 3
-    )  # the camera is open again
+    # The camera is open again
+    good.until(lambda later: later.broken_frames > state.broken_frames + 3)
     assert good.status().state == "stalled"
     good.set()
     good.is_in("streaming")

@@ -139,9 +139,8 @@ def test_a_lease_that_ends_meanwhile_is_reported(talk: Talk, rig: Bench, daemon:
 def test_a_lease_that_ends_with_its_fishd_is_reported_at_the_prompt(talk: Talk, pi: Bench) -> None:
     with pi.daemon() as first:
         dialogue = begin_trim_of_25(talk, pi, first)
-        dialogue.process.send_signal(
-            signal.SIGSTOP
-        )  # so that its first request goes to the second fishd
+        # So that its first request goes to the second fishd
+        dialogue.process.send_signal(signal.SIGSTOP)
     with pi.daemon():
         check_end_of_lease(dialogue)
 

@@ -82,9 +82,8 @@ def test_what_was_planted_for_a_lock_is_refused(tmp_path: Path, what: str, share
     PLANTS[what](lock_path(tmp_path / "control"), victim)
     with pytest.raises(NotALock, match=what), locked(tmp_path / "control", shared=shared):
         pass
-    assert (
-        find_lock_holder(tmp_path / "control") == ""
-    )  # and without a wait for the pipe's other end
+    # And without a wait for the pipe's other end
+    assert find_lock_holder(tmp_path / "control") == ""
     with pytest.raises(StartupError) as caught, claim_address(f"ipc://{tmp_path}/control"):
         pass
     assert str(caught.value) == (
@@ -120,9 +119,8 @@ def test_a_pid_that_is_none_is_unknown(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: bytes
 ) -> None:
     path = tmp_path / "control"
-    monkeypatch.setattr(
-        "fishd.core.process.lockfile._KERNEL_LOCKS", tmp_path / "nowhere"
-    )  # the kernel reports none
+    # The kernel reports none
+    monkeypatch.setattr("fishd.core.process.lockfile._KERNEL_LOCKS", tmp_path / "nowhere")
     with locked(path):
         lock_path(path).write_bytes(text)
         with pytest.raises(LockHeld) as caught, locked(path):

@@ -185,9 +185,8 @@ def test_the_camera_gives_way_to_fishd_and_reaches_video_devices_only() -> None:
 def test_the_daemon_and_the_unit_agree_on_real_time() -> None:
     priority = int(setting("fishd.service", "LimitRTPRIO")[0])
     assert priority == timing.SERVICE_PRIORITY_LIMIT
-    assert (
-        priority > Config().realtime.priority
-    )  # the watchdog thread, one above, ends a fishd that hangs
+    # The watchdog thread, one above, ends a fishd that hangs
+    assert priority > Config().realtime.priority
     assert int(setting("pigpiod.service.d/fishd.conf", "CPUSchedulingPriority")[0]) > priority
 
 

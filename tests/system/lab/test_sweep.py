@@ -228,9 +228,8 @@ def test_a_folder_is_not_gone_on_with_by_another_fish_or_for_another_time(
     tmp_path: Path, settings: Sequence[str], seconds: float, named: str
 ) -> None:
     open_folder(tmp_path)
-    open_folder(
-        tmp_path, load(None, ["telemetry.address=tcp://127.0.0.1:1"])
-    )  # makes no difference
+    # Makes no difference
+    open_folder(tmp_path, load(None, ["telemetry.address=tcp://127.0.0.1:1"]))
     with pytest.raises(ConfigError, match=named):
         open_folder(tmp_path, load(None, settings), seconds)
 

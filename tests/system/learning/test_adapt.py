@@ -242,9 +242,8 @@ def test_the_fit_decides_on_the_best_square_wave_if_it_explains_well(
     assert is_used == used
     assert frequency == pytest.approx(true)
     fastest = max(search.ranges[0].values)
-    assert (fastest > 4.0) == (
-        model.standard_error is None
-    )  # all frequencies are searched without a fit
+    # All frequencies are searched without a fit
+    assert (fastest > 4.0) == (model.standard_error is None)
 
 
 def test_with_a_good_fit_few_noisy_waves_do_not_move_the_maximum() -> None:
@@ -293,9 +292,8 @@ class Stopped(BaseException):
 @pytest.mark.slow
 def test_a_resume_repeats_no_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adaptation, "train_policy", no_policy)
-    monkeypatch.setattr(
-        steps, "draw_cloud", partial(draw_cloud, count=2)
-    )  # each fish takes long to compute
+    # Each fish takes long to compute
+    monkeypatch.setattr(steps, "draw_cloud", partial(draw_cloud, count=2))
     path, config = tmp_path / "run", load("config/simulated.yaml")
     daemon, show = VirtualDaemon(config), StoringDisplay()
 

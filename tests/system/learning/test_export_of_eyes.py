@@ -95,9 +95,8 @@ def test_where_frames_are_missing_the_file_swims_as_the_policy_is_evaluated(tmp_
 @pytest.mark.parametrize("extractor", ["cnn", "nature"])
 def test_a_mirrored_picture_gets_the_mirrored_action(extractor: str) -> None:
     settings = settings_of(extractor)
-    if (
-        extractor == "cnn"
-    ):  # without the axis of the fish: the picture is mirrored about the middle row
+    # Without the axis of the fish: the picture is mirrored about the middle row
+    if extractor == "cnn":
         settings = replace(settings, camera=replace(settings.camera, align=False))
     card, policy, perception = randomly_excited(settings)
     if perception.extractor and extractor == "cnn":  # make its mean picture symmetric

@@ -101,9 +101,8 @@ def test_modes_contain_the_fin_angle_whatever_the_light(rig: SimulatedCameraSett
     seen = np.stack([extractor.see(stack) for stack in stacks])[:, :4]
     fit = np.linalg.lstsq(seen, fins, rcond=None)[0]
     unexplained = (fins - seen @ fit).std() / fins.std()
-    assert unexplained < (
-        0.35 if rig is DEFAULT else 0.75
-    )  # pictures are 30 ms, or 50 to 90 ms, old
+    # Pictures are 30 ms, or 50 to 90 ms, old
+    assert unexplained < (0.35 if rig is DEFAULT else 0.75)
 
 
 @pytest.mark.parametrize("kind", ["modes", "cnn"])

@@ -209,10 +209,8 @@ def test_a_training_on_a_running_fishd_uses_its_tick_and_leaves_the_fish_at_rest
     )
     assert result.returncode == 0, result.stderr
     config, _ = runs.read(folder)
-    assert (config.tick, config.simulation.noise) == (
-        0.05,
-        0.001,
-    )  # the configuration is that of fishd
+    # The configuration is that of fishd
+    assert (config.tick, config.simulation.noise) == (0.05, 0.001)
     assert result.stderr == ""
     assert [row["steps"] for row in rows(folder / "progress.csv")] == ["16", "32"]
     card = checkpoints.read_card(checkpoints.newest(folder))

@@ -73,9 +73,8 @@ def test_a_run_is_a_name_or_the_latest(tmp_path: Path, monkeypatch: pytest.Monke
     results = [invoke(run, *known) for run in ("identify", "identify.mcap", "latest")]
     assert results[0].stdout.endswith("\nfrom identify.mcap\n")
     assert {result.stdout for result in results} == {results[0].stdout}
-    assert {result.stderr for result in results} == {
-        ""
-    }  # no warning: the model includes the turned sensor
+    # No warning: the model includes the turned sensor
+    assert {result.stderr for result in results} == {""}
     assert "the folder is not empty" in str(invoke(*swim).exception)
 
 

@@ -66,9 +66,8 @@ def test_all_mistakes_of_a_file_are_found_in_the_order_of_its_lines(tmp_path: Pa
     wrong = [mistake.removeprefix(f"{file}:") for mistake in listed if str(file) in mistake]
     keys = {int(line.partition(":")[0]): line.split(": ")[1] for line in reversed(wrong)}
     assert keys == KEYS
-    assert [int(line.partition(":")[0]) for line in wrong] == sorted(
-        [*KEYS, 16]
-    )  # both pins of line 16
+    # Both pins of line 16
+    assert [int(line.partition(":")[0]) for line in wrong] == sorted([*KEYS, 16])
     assert {mistake.partition(": ")[0] for mistake in listed[len(wrong) :]} == {
         "--set plant.B=soft",
         "--set tick",

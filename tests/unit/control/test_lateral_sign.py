@@ -192,9 +192,8 @@ def test_with_refuse_the_first_push_is_a_fault_and_the_next_start_is_refused() -
         with pytest.raises(Refused, match="F_y is reversed") as refused:
             rig.start(controller, **parameters)
         assert refused.value.code == "fy-reversed"
-    assert (
-        detect_reversal(rig, "square", frequency=1.5) is True
-    )  # this controller ignores the force
+    # This controller ignores the force
+    assert detect_reversal(rig, "square", frequency=1.5) is True
     assert rig.mode == "running"
     rig.loop.forget_force(scale=True)
     rig.start("swing")

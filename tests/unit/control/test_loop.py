@@ -310,9 +310,8 @@ class Restless(Wrapped):
         self.reads += 1
         self.clock.now += self.reads * 1e-6
         extremes = Extremes(*self.next_values(4))
-        forces = (
-            1e-3 * force for force in self.next_values(2)
-        )  # a drift, so that the zero is known
+        # A drift, so that the zero is known
+        forces = (1e-3 * force for force in self.next_values(2))
         return Measurement(now - self.reads * 1e-6, *forces, self.reads, "", extremes)
 
 

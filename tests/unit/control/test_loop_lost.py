@@ -16,9 +16,8 @@ from fishd.hardware.base import Robot
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Iterator[LockstepRig]:
-    with lockstep_rig(
-        tmp_path, "force_sensor.data_rate=250"
-    ) as rig:  # the sensor is not tested here
+    # The sensor is not tested here
+    with lockstep_rig(tmp_path, "force_sensor.data_rate=250") as rig:
         rig.start("hold", angle=0.3)
         rig.run_for(1.0)
         assert rig.pulse > NEUTRAL + 100
