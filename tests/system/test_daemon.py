@@ -84,7 +84,8 @@ def test_a_mark_is_a_text_in_utf_8_whatever_the_locale(daemon: Daemon) -> None:
         events.connected()
         done = daemon.fishctl_apart("mark", "--json", "fin é", env=plain)
         assert done.returncode == 0, done.stderr
-        assert events.until(kind="mark")["message"] == "fin é"
+        mark = events.until(kind="mark")
+    assert (mark["message"], mark["level"]) == ("fin é", "info")
     refused = daemon.fishctl_apart("mark", b"fin \xe9")  # type: ignore[arg-type]
     assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
     assert "'fin ?' is not a text in UTF-8" in refused.stderr

@@ -100,7 +100,6 @@ def test_without_a_camera_nothing_begins(tmp_path: Path) -> None:
 def test_a_camera_of_another_size_is_refused(tmp_path: Path) -> None:
     with rig_of(tmp_path) as rig:
         file = tmp_path / "brief.yaml"
-        file.write_text(f"{BRIEF}\n", encoding="utf-8")
         text = BRIEF.replace("random_excitation: 128", "random_excitation: 128, stack: {size: 42}")
         file.write_text(text, encoding="utf-8")
         done = fishctl(*rig.words)

@@ -9,7 +9,7 @@ import pytest
 from rigs.policy_files import FLIP, card, linear, random_layers, write
 from rigs.processes import PATIENCE, Daemon, Subscriber, install, one_line, running, sets
 
-from fishd.client import Fish, Refused
+from fishd.client import Fish
 from fishd.controllers.policy.network import to_onnx
 
 
@@ -110,17 +110,6 @@ def test_a_policy_that_cannot_be_used_is_refused_in_one_line(daemon: Daemon) -> 
         assert done.returncode == 1
         assert message in one_line(done)
         assert daemon.status().mode == "idle"
-
-
-def test_a_policy_does_not_change_in_flight(daemon: Daemon) -> None:
-    daemon.fishctl("set-controller", "ppo", "--policy", "flip")
-    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        with pytest.raises(
-            Refused, match="ppo: policy: it cannot change while ppo is active"
-        ) as caught:
-            fish.set_parameters(policy="flip")
-        assert fish.status().controller == "ppo"
-    assert caught.value.code == "bad-parameter"
 
 
 def test_the_daemon_lists_its_policies_and_why_some_are_not_for_it(daemon: Daemon) -> None:

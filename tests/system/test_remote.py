@@ -8,9 +8,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
-import msgspec
 import pytest
-import zmq
 from rigs.documents import FENCE, ROOT, text_of
 from rigs.processes import (
     FISHD,
@@ -25,7 +23,7 @@ from rigs.processes import (
 )
 from rigs.scripted_agent import ScriptedAgent
 
-from fishd.client import Agent, Fish, Refused
+from fishd.client import Agent, Fish
 
 AGENT = """
 import sys
@@ -135,33 +133,6 @@ def test_an_agent_and_telemetry_may_be_reached_over_ipv6(tmp_path: Path) -> None
         fish.set_controller("remote", agent=agent.address, first_action=PATIENCE)
         assert agent.observe().session
         assert next(fish.ticks()).controller == "remote"
-
-
-def test_rubbish_is_a_fault_that_says_what_came(daemon: Daemon, address: str) -> None:
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    socket = context.socket(zmq.DEALER)  # can bind as well
-    socket.bind(address)
-    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        fish.set_controller("remote", agent=address)
-        assert socket.poll(int(PATIENCE * 1e3))
-        seen = msgspec.json.decode(socket.recv())
-        assert seen["kind"] == "observation"
-        socket.send(b"0.3")
-        wait_until(lambda: fish.status().mode != "running")
-        reason = fish.status().reason
-        assert reason
-        assert reason.code == "remote-error"
-        assert "sent '0.3', which is neither an action nor a pause" in reason.message
-    context.destroy(linger=0)
-
-
-def test_a_deadline_beyond_the_tick_is_refused(daemon: Daemon) -> None:
-    with (
-        Fish(daemon.endpoint, timeout=PATIENCE) as fish,
-        pytest.raises(Refused, match=r"at most 0\.0225 s"),
-    ):
-        fish.set_controller("remote", deadline=0.03)
-    assert daemon.status().mode == "idle"
 
 
 def test_a_simulation_waits_for_its_agent(address: str) -> None:

@@ -53,11 +53,6 @@ class Explosive(Hold):
         raise RuntimeError("no such model")
 
 
-class Drunk(Hold):
-    """Fails while it runs."""
-
-    def update(self, observation):
-        return float("nan")
 '''
 QUITTER = "import sys\nsys.exit(3)\n"
 UNTYPED = '''
@@ -80,7 +75,6 @@ CONTROLLERS = {
     "waiting": "manners:Waiting",
     "shapeless": "manners:Shapeless",
     "explosive": "manners:Explosive",
-    "drunk": "manners:Drunk",
     "absent": "nowhere:Absent",
     "quitter": "quitter:Quitter",
     "untyped": "untyped:Untyped",
@@ -108,7 +102,7 @@ def shared_daemon(site: Path) -> Iterator[Daemon]:
 
 def test_the_good_ones_are_listed_beside_the_built_in_ones(daemon: Daemon) -> None:
     known = [info["name"] for info in json.loads(daemon.fishctl("controllers", "--json").stdout)]
-    assert {"slow", "drunk", "swing"} <= set(known)
+    assert {"slow", "explosive", "swing"} <= set(known)
     assert not {"shapeless", "absent", "function"} & set(known)
     assert "swing" in daemon.fishctl("simulate", "--help").stdout
 
@@ -155,16 +149,6 @@ def test_one_that_was_installed_since_and_cannot_be_imported_needs_a_restart(
         "controller 'hidden' (hidden:Hidden in hidden 1.0) does not load: ModuleNotFoundError: "
         "No module named 'hidden'; it was installed after fishd had started: restart fishd"
     )
-
-
-def test_one_that_fails_in_the_tick_is_a_fault_with_its_reason(daemon: Daemon) -> None:
-    with Subscriber(daemon.telemetry, b"tick") as ticks:
-        daemon.fishctl("set-controller", "drunk")
-        ticks.until(mode="fault", servo_on=False)
-    reason = daemon.status().reason
-    assert reason
-    assert reason.code == "controller-error"
-    assert "the command is nan, not an angle" in reason.message
 
 
 @pytest.mark.realtime

@@ -128,12 +128,6 @@ def test_a_port_that_is_taken_is_one_line(tmp_path: Path) -> None:
     assert err.count("\n") == 1
 
 
-def test_a_wrong_configuration_is_exit_78(tmp_path: Path) -> None:
-    code, _, err = Pi(tmp_path, "virtual_pi.bus_sped=1").finish()
-    assert code == 78
-    assert "did you mean 'bus_speed'?" in err
-
-
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_signal_ends_it_cleanly(own_pi: Pi, number: int) -> None:
     with RemotePi(own_pi.path):

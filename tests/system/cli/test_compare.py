@@ -88,18 +88,10 @@ def test_a_misspelt_path_of_a_policy_is_reported_before_anything_swims() -> None
     assert done.stderr == "fishctl: ppo: policy: ~no-such-user.onnx: no such file\n"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message", "status"),
-    [
-        (["swing:C=2"], "fishctl: swing: C: 2 is not valid: a number in [0, 1]", 1),
-        (["swing", "--seconds", "1"], "fishctl: a run of 1 s is too short", 1),
-        (["swing", "--set", "tick=3"], "fishctl: --set tick=3: tick: 3 is not valid", 78),
-    ],
-)
-def test_a_wrong_command_is_one_line(arguments: list[str], message: str, status: int) -> None:
-    done = run(*arguments)
-    assert message in done.stderr
-    assert (done.stdout, done.returncode, done.stderr.count("\n")) == ("", status, 1)
+def test_a_wrong_contestant_is_one_line() -> None:
+    done = run("swing:C=2")
+    assert "fishctl: swing: C: 2 is not valid: a number in [0, 1]" in done.stderr
+    assert (done.stdout, done.returncode, done.stderr.count("\n")) == ("", 1, 1)
 
 
 @pytest.mark.slow

@@ -199,14 +199,6 @@ def test_a_driver_that_is_too_old_fails_only_where_it_is_needed(tmp_path: Path) 
     assert (status, findings["packages"][0]) == (0, "ok")
 
 
-def test_a_wrong_configuration_is_one_line_and_exit_status_78(tmp_path: Path) -> None:
-    file = tmp_path / "fish.yaml"
-    file.write_text("tik: 0.05\n")
-    ended = fishctl("doctor", "--config", str(file))
-    assert (ended.returncode, ended.stdout) == (78, "")
-    assert ended.stderr == f"fishctl: {file}:1: tik: unknown key; did you mean 'tick'?\n"
-
-
 def test_a_configuration_that_anybody_may_change_is_a_warning(tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("tick: 0.05\n")

@@ -14,7 +14,7 @@ from fishd.core.addresses import (
     parse,
     reachable_address,
 )
-from fishd.core.errors import ConfigError, StartupError
+from fishd.core.errors import ConfigError
 
 
 @pytest.mark.parametrize(
@@ -86,13 +86,6 @@ def test_a_control_socket_is_for_user_and_group_only(tmp_path: Path) -> None:
     path = tmp_path / "control"
     with listen(f"ipc://{path}", "control.address", group=True):
         assert path.stat().st_mode & 0o777 == 0o660
-
-
-def test_a_port_that_is_taken_is_named_with_its_key() -> None:
-    with listen("tcp://127.0.0.1:0", "telemetry.address") as server:
-        address = reachable_address("tcp://127.0.0.1:0", server)
-        with pytest.raises(StartupError, match=f"telemetry.address: cannot listen on {address}"):
-            listen(address, "telemetry.address")
 
 
 def test_a_port_that_a_rival_listens_at_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,31 +1,15 @@
 """The package in docs/example-controller, installed and used as its reader would."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rigs import processes
 from rigs.documents import ROOT
-from rigs.example_packages import fishctl, forget_drivers, install
+from rigs.example_packages import fishctl
 
 pytestmark = pytest.mark.slow  # it starts processes
-
-
-@pytest.fixture(scope="module")
-def laptop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder where the example is installed."""
-    folder = tmp_path_factory.mktemp("site")
-    install(folder, "example-controller")
-    return folder
-
-
-@pytest.fixture
-def _installed(laptop: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.syspath_prepend(str(laptop))
-    forget_drivers()
-    yield
-    forget_drivers()
+EXAMPLES = "example-controller"
 
 
 @pytest.mark.usefixtures("_installed")
@@ -55,9 +39,9 @@ def test_its_options_show_bounds_units_and_defaults(monkeypatch: pytest.MonkeyPa
     assert "--sweep-time NUMBER Time from lowest to highest. A number in [1, 3600] s;" in shown
 
 
-def test_it_is_listed_beside_the_controllers_that_come_with_fishd(laptop: Path) -> None:
+def test_it_is_listed_beside_the_controllers_that_come_with_fishd(site: Path) -> None:
     known = {
-        info["name"]: info for info in json.loads(fishctl(laptop, "controllers", "--json").stdout)
+        info["name"]: info for info in json.loads(fishctl(site, "controllers", "--json").stdout)
     }
     assert {"chirp", "square", "swing"} <= set(known)
     parameters = {field["name"]: field for field in known["chirp"]["parameters"]}
@@ -67,10 +51,10 @@ def test_it_is_listed_beside_the_controllers_that_come_with_fishd(laptop: Path) 
     assert [quantity["name"] for quantity in known["chirp"]["quantities"]] == ["frequency"]
 
 
-def test_it_can_be_named_in_the_configuration(laptop: Path, tmp_path: Path) -> None:
+def test_it_can_be_named_in_the_configuration(site: Path, tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("start:\n  controller: chirp\n  parameters:\n    sweep_time: 120\n")
-    assert fishctl(laptop, "config", "check", str(file)).returncode == 0
+    assert fishctl(site, "config", "check", str(file)).returncode == 0
 
 
 @pytest.mark.usefixtures("_installed")
@@ -91,11 +75,11 @@ def test_a_bad_parameter_is_one_line(option: str, complaint: str) -> None:
     assert not done.stdout
 
 
-def test_the_page_about_it_shows_what_a_run_prints(laptop: Path) -> None:
+def test_the_page_about_it_shows_what_a_run_prints(site: Path) -> None:
     page = (ROOT / "docs" / "how-to" / "writing-a-controller.md").read_text(encoding="utf-8")
     shown = page.partition("$ fishctl simulate chirp --seconds 130\n")[2].partition("timing ")[0]
     assert (
-        shown == fishctl(laptop, "simulate", "chirp", "--seconds", "130").stdout.split("timing ")[0]
+        shown == fishctl(site, "simulate", "chirp", "--seconds", "130").stdout.split("timing ")[0]
     )
 
 

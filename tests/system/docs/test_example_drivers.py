@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rigs.documents import ROOT
 from rigs.example_packages import (
     BUS,
     MILLIVOLTS_PER_NEWTON,
     LoadCellRig,
     ServoBoardRig,
     fishctl,
-    forget_drivers,
-    install,
 )
 from rigs.hx711_chip import GpioStandIn, Hx711Chip
 from rigs.pca9685_chip import AUTO_INCREMENT, LED0, MODE1, PRE_SCALE, RESTART, SLEEP, Pca9685Chip
@@ -35,26 +32,10 @@ from fishd.virtual.pi.linux_i2c import LinuxI2c
 
 pytestmark = pytest.mark.slow
 
-PAGE = ROOT / "docs" / "how-to" / "writing-a-driver.md"
-EXAMPLES = ROOT / "docs" / "example-drivers"
+EXAMPLES = "example-drivers"
 VOLTS = {"x": 1e-3, "y": -2e-3}
 THRUST = 0.026
 """Mean thrust of a square wave of 1.7 Hz on the default fish [N]."""
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("site")
-    install(folder, "example-drivers")
-    return folder
-
-
-@pytest.fixture
-def _installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.syspath_prepend(str(site))
-    forget_drivers()
-    yield
-    forget_drivers()
 
 
 def options(*settings: str) -> list[str]:
@@ -408,12 +389,3 @@ def test_a_driver_whose_package_is_not_installed_is_one_line() -> None:
         "no servo driver is named 'pca9685'; installed: pigpio, rpi-gpio, sysfs-pwm; for another "
         "one, install its package"
     )
-
-
-def test_the_page_about_them_shows_the_code_as_it_is() -> None:
-    shown = [block.partition("\n") for block in PAGE.read_text().split("```")[1::2]]
-    code = [body.strip() for language, _, body in shown if language in ("python", "toml")]
-    files = [path.read_text() for path in EXAMPLES.rglob("*") if path.suffix in (".py", ".toml")]
-    assert len(code) == 6
-    for block in code:
-        assert any(block in file for file in files), block

@@ -1,13 +1,12 @@
 """The package in docs/example-plant, installed and used as its reader would."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from rigs import processes
 from rigs.documents import ROOT
-from rigs.example_packages import fishctl, forget_drivers, install
+from rigs.example_packages import fishctl
 from rigs.processes import running, sets, wait_until
 
 from fishd.client import Fish
@@ -21,27 +20,11 @@ from fishd.virtual.plant.registry import open_plant
 from fishd.virtual.plant.tethered import TetheredFish
 
 pytestmark = pytest.mark.slow  # it starts processes
+EXAMPLES = "example-plant"
 PAGE = ROOT / "docs" / "how-to" / "writing-a-plant.md"
 MODEL = "plant.model=two-segments"
 THRUST = 0.01495
 """Mean thrust of `swing` with C = 0.6 [N]."""
-
-
-@pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder where the example is installed."""
-    folder = tmp_path_factory.mktemp("site")
-    install(folder, "example-plant")
-    return folder
-
-
-@pytest.fixture
-def _installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.syspath_prepend(str(site))
-    monkeypatch.setenv("PYTHONPATH", str(site))
-    forget_drivers()
-    yield
-    forget_drivers()
 
 
 @pytest.mark.usefixtures("_installed")
@@ -119,16 +102,6 @@ def test_what_it_has_no_equation_for_is_refused_by_key() -> None:
         "fishctl: --set plant.backlash=0.1: plant.backlash: 0.1 is not valid: this "
         "plant has none; 0 is needed\n"
     )
-
-
-def test_the_page_about_it_shows_the_code_as_it_is() -> None:
-    shown = [block.partition("\n") for block in PAGE.read_text().split("```")[1::2]]
-    code = [body.strip() for language, _, body in shown if language in ("python", "toml")]
-    folder = ROOT / "docs" / "example-plant"
-    files = [path.read_text() for path in folder.iterdir() if path.suffix in (".py", ".toml")]
-    assert len(code) == 4
-    for block in code:
-        assert any(block in file for file in files), block
 
 
 def test_the_page_about_it_shows_what_a_run_prints(site: Path) -> None:

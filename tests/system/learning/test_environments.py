@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env as check_for_baseline
 import fishd.learning  # noqa: F401 (registers the environments)
 from fishd.client import Fish
 from fishd.config import load
-from fishd.core.errors import ConfigError, NoDaemon
+from fishd.core.errors import ConfigError
 from fishd.lab.links.link import StepResult
 from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
@@ -44,11 +44,6 @@ def test_an_environment_is_made_from_the_files_of_fish_and_training(tmp_path: Pa
     assert swim.link.amplitude == 0.2
     ends = [env.step(np.ones(1, np.float32))[2:4] for _ in range(3)]
     assert ends == [(False, False), (False, False), (False, True)]
-
-
-def test_a_wrong_override_is_one_line() -> None:
-    with pytest.raises(ConfigError, match=r"plant\.omega: unknown key; did you mean 'omega0'"):
-        gymnasium.make("fishd/Swim-v0", overrides=("plant.omega=3",))
 
 
 def test_the_same_seed_swims_the_same_way() -> None:
@@ -231,11 +226,6 @@ def test_the_environment_on_a_running_fishd_listens_at_the_given_address(tmp_pat
                 assert fish.status().parameters["agent"] == address
         finally:
             env.close()
-
-
-def test_without_a_fishd_the_error_names_the_endpoint(tmp_path: Path) -> None:
-    with pytest.raises(NoDaemon, match="control"):
-        gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=f"ipc://{tmp_path}/control")
 
 
 def test_no_policy_learns_from_a_fin_velocity_that_it_would_not_receive() -> None:

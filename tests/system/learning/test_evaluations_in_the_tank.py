@@ -256,7 +256,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     best = outcome.best_evaluation
     assert best
     assert (best.policy, best.stalled, best.swam) == (64, False, 7.0)
-    assert outcome.best == job.folder / "best-000064"
+    assert outcome.best == checkpoints.find(job.folder) == job.folder / "best-000064"
     assert same(outcome.best, training.networks[64])
     past = checkpoints.read_card(outcome.best).provenance
     assert (past.steps, past.relative_thrust, past.on) == (64, best.relative_thrust, "live")
@@ -361,13 +361,6 @@ def test_the_initial_policy_of_a_training_may_stay_the_best(
     assert first.best
     assert outcome.best == child.folder / "best-000000"
     assert same(outcome.best, checkpoints.load_policy(first.best)[0].state_dict())
-
-
-def test_export_finds_the_best_of_a_tank(tmp_path: Path, beating: list[Policy]) -> None:
-    job = on_robot(tmp_path / "run", steps=64)
-    outcome = Training(job, Resting(job), Display(), lambda: False).run()
-    assert outcome.best
-    assert checkpoints.find(job.folder) == outcome.best
 
 
 def test_a_fishd_in_lockstep_gives_the_same_evaluations_as_a_simulation(tmp_path: Path) -> None:

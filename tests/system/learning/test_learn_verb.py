@@ -96,12 +96,6 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     assert "there is only one live fish" in line
 
 
-def test_steps_are_rounded_up_to_whole_rollouts(tmp_path: Path, settings: str) -> None:
-    result = learn("ppo", "--settings", settings, "--folder", str(tmp_path / "a"), "--steps", "65")
-    assert "128 steps, in whole rollouts of 64 in simulation" in result.stdout
-    assert "\n128 steps in " in result.stdout
-
-
 def test_no_export_is_advised_for_a_policy_that_never_swam(tmp_path: Path) -> None:
     idle = tmp_path / "idle.yaml"
     idle.write_text(

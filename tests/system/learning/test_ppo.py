@@ -80,13 +80,6 @@ def test_the_policy_in_numpy_is_that_of_stable_baselines(
     assert len(set(angles)) > 2
 
 
-def test_the_layers_are_those_from_the_inputs_to_the_mean_of_the_action() -> None:
-    layers = layers_of(make_policy(PpoSettings(hidden=(16, 8), symmetric=False), 2))
-    assert [weight.shape for weight, _ in layers] == [(16, 2), (8, 16), (1, 8)]
-    assert [bias.shape for _, bias in layers] == [(16,), (8,), (1,)]
-    assert all(weight.dtype == np.float32 for weight, _ in layers)
-
-
 @pytest.fixture
 def policy() -> ActorCriticPolicy:
     torch.manual_seed(0)

@@ -34,17 +34,6 @@ def test_no_summary_is_cut(path: tuple[str, ...]) -> None:
     assert "..." not in shown.stdout.replace("[ARGS]...", "")
 
 
-def test_verbs_stand_below_headings_of_their_purpose() -> None:
-    lines = CliRunner().invoke(fishctl, ["--help"]).stdout.splitlines()
-    headings = [line for line in lines if line.endswith(":") and not line.startswith(" ")]
-    assert headings == [
-        "Options:", "Watch:", "Swim and stop:", "Experiment:", "Record:", "Camera:",
-        "Calibrate:",
-        "Simulate and learn:", "Check and configure:",
-    ]  # fmt: skip
-    assert "explain" not in "\n".join(lines)
-
-
 @pytest.mark.parametrize(
     ("words", "meant"),
     [

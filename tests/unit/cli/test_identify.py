@@ -30,16 +30,8 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     assert load(fish).plant.omega0 == pytest.approx(11.0, rel=0.01)
     assert picture.read_bytes()[:4] == b"\x89PNG"
 
-    second = invoke(
-        str(record),
-        "--fit",
-        "omega0, xi, coupling",
-        "--fix",
-        "coupling",
-        "--set",
-        "plant.omega0=11",
-        "--json",
-    )
+    words = ("--fit", "omega0, xi, coupling", "--fix", "coupling", "--set", "plant.omega0=11")
+    second = invoke(str(record), *words, "--json")
     assert second.exit_code == 0
     result = json.loads(second.stdout)
     assert result["origin"] == "identify.mcap"
@@ -107,12 +99,10 @@ def test_a_drift_is_reported_in_both_directions() -> None:
     ("words", "complaint"),
     [
         ((), "name recordings to identify, or use --experiment: one of the two"),
-        (("run.mcap", "--experiment"), "one of the two"),
         (("run.mcap", "--for", "60"), "--for goes with --experiment"),
         (("run.mcap", "--folder", "x"), "--folder goes with --experiment"),
         (("--experiment", "--for", "5"), "5.0 is not in the range"),
         (("--experiment", "--for", "nan"), "'nan' is not valid: a finite number is needed"),
-        (("--experiment", "--for", "inf"), "inf is not in the range"),
     ],
 )
 def test_a_command_line_without_sense_is_refused(words: tuple[str, ...], complaint: str) -> None:

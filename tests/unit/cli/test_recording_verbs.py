@@ -110,11 +110,3 @@ def test_a_home_of_nobody_is_one_line_of_every_verb(tmp_path: Path, verb: str, r
     done = fishctl(*verb.split(), run, "--folder", str(tmp_path))
     assert done.returncode == 1
     assert "fishctl: no recording '~nobody" in one_line(done)
-
-
-@pytest.mark.parametrize("verb", ["export --csv", "plot", "replay", "rerun", "recover"])
-def test_a_file_that_is_no_recording_is_one_line_of_every_verb(tmp_path: Path, verb: str) -> None:
-    (tmp_path / "run.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(range(256)) * 9)
-    done = fishctl(*verb.split(), "run", "--folder", str(tmp_path))
-    assert done.returncode == 1
-    assert "run.mcap is an MCAP file, but not a recording of fishd" in one_line(done)

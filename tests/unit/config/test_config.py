@@ -189,10 +189,7 @@ telemetry: {address: localhost}
         (BOMB, "fish.yaml:1: more than 2000 values and keys, each alias counted as all that it"),
         ("a: [" + "x, " * 3000 + "]", "fish.yaml:1: more than 2000 values and keys"),
         ("# " + "x" * 70000, "fish.yaml: is longer than 64 kB, far more than a configuration"),
-        (
-            "a: " + "1" * 200,
-            "fish.yaml:1: a: a number of 200 characters; at most 100 are permitted",
-        ),
+        ("a: " + "1" * 200, "fish.yaml:1: a: a number of 200 characters; at most 100 are"),
     ],
 )
 def test_a_bad_file_gets_a_line_with_a_remedy(text: str, message: str, tmp_path: Path) -> None:
@@ -241,11 +238,7 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
     ("overrides", "key", "words"),
     [
         (["robot=pi", "force_sensor.full_scale=2"], "force_sensor.full_scale", "2.048"),
-        (
-            ["robot=pi", "force_sensor.saturation_low=3.3"],
-            "force_sensor.saturation_low",
-            "less than saturation_high, 3.2 V",
-        ),
+        (["robot=pi", "force_sensor.saturation_low=3.3"], "force_sensor.saturation_low", "3.2 V"),
         (["robot=pi", "force_sensor.channel_y=A0-A1"], "force_sensor.channel_y", "channel_x"),
         (["robot=pi", "force_sensor.data_rate=32"], "force_sensor.data_rate", "78.1 ms"),
         (["robot=pi", "tick=0.002"], "force_sensor.data_rate", "2.9 ms"),
@@ -263,11 +256,7 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         (["panel.estop_gpio=5", "panel.led_gpio=5"], "panel.led_gpio", "panel.estop_gpio"),
         (["robot=virtual-pi", "servo.driver=sysfs-pwm"], "servo.driver", "pigpiod"),
         (["virtual_pi.servo_scale=0"], "virtual_pi.servo_scale", "would not turn"),
-        (
-            ["state_folder=~no-such-user/fish"],
-            "state_folder",
-            "this machine has no user 'no-such-user'",
-        ),
+        (["state_folder=~no-such-user/fish"], "state_folder", "has no user 'no-such-user'"),
         (['state_folder="/var/\\0fish"'], "state_folder", "a path has no zero byte"),
     ],
 )

@@ -58,19 +58,10 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str, s
     ("name", "message"),
     [
         ("keys", r"^no gadget is named 'keys'; did you mean 'key'\?$"),
-        (
-            "text",
-            rf"^gadget 'text' \(string:digits in fishd\) is not a subclass of {__name__}.Gadget$",
-        ),
-        (
-            "shapeless",
-            r"^gadget 'shapeless' \(.*:Shapeless in fishd\) has no Settings, a msgspec.Struct$",
-        ),
+        ("text", r"'text' \(string:digits in fishd\) is not a subclass of .*test_plugins\.Gadget$"),
+        ("shapeless", r"'shapeless' \(.*:Shapeless in fishd\) has no Settings, a msgspec.Struct$"),
         ("unfinished", r"^gadget 'unfinished' \(.*:Unfinished in fishd\) does not define turn$"),
-        (
-            "lost",
-            r"^gadget 'lost' \(nowhere:Lost in fishd\) does not load: ModuleNotFoundError: No mod",
-        ),
+        ("lost", r"'lost' \(nowhere:Lost in fishd\) does not load: ModuleNotFoundError: No mod"),
     ],
 )
 def test_what_cannot_be_had_is_explained(gadgets: Plugins[Gadget], name: str, message: str) -> None:

@@ -9,7 +9,7 @@ from rigs.pictures import letters_of
 from rigs.policy_files import write
 
 from fishd.config import load
-from fishd.core.errors import FishdError, ParameterError, UnknownController
+from fishd.core.errors import ParameterError, UnknownController
 from fishd.lab.compare import comparison
 from fishd.lab.compare.comparison import Standing, Trace, compare, judge_standings
 from fishd.lab.compare.contestants import default_contestants, parse
@@ -175,12 +175,3 @@ def test_the_command_is_not_drawn_beyond_the_time_that_is_shown() -> None:
     (command,) = axis.patches
     assert list(command.get_data().values) == [0.4, 0.4]
     assert list(command.get_data().edges) == [0.0, 0.05, 0.1]
-
-
-def test_a_picture_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib", reason=FIGURES)
-    from fishd.lab.compare.figures import draw
-
-    standings, traces = compare(CONFIG, [parse("hold")], 6.0, 1.0)
-    with pytest.raises(FishdError, match=r"no/such\.png: the figure cannot be written"):
-        draw(tmp_path / "no" / "such.png", standings, traces, 0.42)

@@ -301,16 +301,6 @@ def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
     assert identification.seconds == pytest.approx(TICK * (len(long) - 1))
 
 
-@pytest.mark.slow
-def test_data_that_cannot_tell_say_so() -> None:
-    with VirtualSession(load(None, ["simulation.noise=0.003"])) as rig:
-        ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
-    identification = identify(
-        ticks_to_frame(ticks), fit=("xi", "coupling", "thrust_coefficient", "lateral_drag")
-    )
-    assert any("known to 10 % at best" in remark for remark in identification.remarks)
-
-
 @pytest.mark.parametrize(
     ("spoil", "complaint"),
     [
@@ -327,11 +317,6 @@ def test_a_table_with_nothing_to_fit_is_refused(
 ) -> None:
     with pytest.raises(Unidentifiable, match=complaint):
         identify(spoil(table))  # type: ignore[operator]
-
-
-def test_a_name_that_cannot_be_fitted_is_refused(table: pd.DataFrame) -> None:
-    with pytest.raises(ParameterError, match="'omega' cannot be fitted; did you mean 'omega0'"):
-        identify(table, fit=["omega"])
 
 
 @pytest.mark.parametrize(

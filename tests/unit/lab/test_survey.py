@@ -77,20 +77,3 @@ def test_the_verb_tells_programs_every_fish() -> None:
     assert [row["fish"] for row in hold["fish"][-2:]] == ["harsh 318", "harsh 319"]
     assert "plant.servo_delay=0.02" in hold["fish"][3]["overrides"]
     assert len(hold["fish"]) == len(CHANGES) + 20
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message", "status"),
-    [
-        ((), "Missing argument 'POLICY|CONTROLLER...'", 2),
-        (("swim",), "'swim' is not a controller, named policy or .onnx file; ", 1),
-        (("swing", "--set", "amplitude_limit=x"), "amplitude_limit", 78),
-        (("swing", "--fish", "tame"), "'tame' is not one of 'changes', 'random', 'harsh'", 2),
-    ],
-)
-def test_a_wrong_evaluation_is_said_to_be_one(
-    arguments: tuple[str, ...], message: str, status: int
-) -> None:
-    done = fishctl("learn", "evaluate", *arguments)
-    assert message in done.stderr
-    assert (done.stdout, done.returncode) == ("", status)

@@ -242,11 +242,6 @@ def test_before_the_first_action_an_agent_that_was_started_again_is_asked(
         assert successor.next()["answered_seq"] == 0
 
 
-def test_a_configuration_is_refused_whose_agent_cannot_be_connected_to() -> None:
-    with pytest.raises(ConfigError, match=r"start\.parameters\.agent: .* is not valid: "):
-        load(None, ["start.controller=remote", "start.parameters.agent='tcp://*:1'"])
-
-
 def test_deadlines_change_while_it_swims_the_agent_stays(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent)
     rig.retune(misses=7)
