@@ -33,12 +33,7 @@ def _apply(data: dict[str, Any], override: str) -> tuple[str, ...]:
 
 
 def _value(text: str, dotted: str, override: str) -> Any:
-    """Parse a value as a Python number, such as `1e-3`, else as YAML."""
-    for number in (int, float):
-        try:
-            return number(text)
-        except ValueError:
-            continue
+    """Parse a value as YAML."""
     try:
         return strict_yaml.parse(text, name=dotted).data if text else ""
     except strict_yaml.YamlProblem as problem:

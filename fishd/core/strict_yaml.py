@@ -1,7 +1,7 @@
-"""Reader of YAML that keeps the line of each key and refuses values with surprising meanings.
+"""Reader of YAML that keeps the line of each key, and refuses repeated keys.
 
-PyYAML follows YAML 1.1, in which `on` is true, `1e2` is a text, `1:30` is ninety and the second of
-two equal keys wins. This reader refuses each of these, with the line and the right notation.
+The values are those of YAML 1.2's core schema: PyYAML itself follows YAML 1.1, in which `on` is
+true, `1e2` is a text, `1:30` is ninety, `010` is eight, and the second of two equal keys wins.
 """
 
 import os
@@ -37,15 +37,19 @@ class ValueProblem(YamlProblem):
     """One value is invalid; the rest of the document can be read."""
 
 
-_WORDS = {"on": "true", "yes": "true", "y": "true", "off": "false", "no": "false", "n": "false"}
-_BARE_EXPONENT = re.compile(r"[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+")
-_SEXAGESIMAL = re.compile(r"[-+]?[0-9]+(:[0-5]?[0-9])+(\.[0-9]*)?")
 _MAX_DEPTH = 20
 _MAX_NODES = 2000
 """Maximum number of values and keys in one document; an alias counts as everything it refers to."""
 _MAX_NUMBER_CHARACTERS = 100
-_MAX_PLAIN_INTEGER = 1e12
-_OCTAL = re.compile(r"[-+]?0[0-7_]+")
+_TAG = "tag:yaml.org,2002:"
+_CORE_SCHEMA = {
+    "null": r"~|null|Null|NULL|",
+    "bool": r"true|True|TRUE|false|False|FALSE",
+    "int": r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+",
+    "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+}
+"""Plain scalars that are not texts, by tag; see section 10.3.2 of the specification of YAML 1.2."""
 
 
 def read(
@@ -85,7 +89,8 @@ def parse(
     if len(text) > files.MAX_SETTINGS_BYTES:
         raise YamlProblem(1, f"longer than {files.MAX_SETTINGS_BYTES // 2**10} kB")
     try:
-        root = _Loader(text).get_single_node()
+        loader = _Loader(text)
+        root = loader.get_single_node()
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1
@@ -94,63 +99,57 @@ def parse(
         raise YamlProblem(1, f"not valid YAML: {' '.join(str(error).split())}") from None
     except (ValueError, OverflowError):  # an escape such as "\\U00110000"
         raise YamlProblem(1, "not valid YAML: a character that does not exist") from None
-    builder = _Builder(name, problems)
+    except RecursionError:
+        raise YamlProblem(1, "nested too deeply") from None
+    builder = _Builder(loader, name, problems)
     return Document({} if root is None else builder.build(root, ()), builder.lines)
 
 
+def dump(data: Any) -> str:
+    """Return plain values as YAML that readers of YAML 1.1 and 1.2 understand."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+
+
 class _Loader(yaml.SafeLoader):
-    """Loader that stops as soon as a document has too many values or levels."""
+    """Loader of plain scalars as in the core schema."""
 
-    def __init__(self, text: str) -> None:
-        super().__init__(text)
-        self._count = self._depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """Return the next node, and count it and its level."""
-        self._count += 1
-        self._depth += 1
-        line = int(self.line) + 1
-        if self._depth > _MAX_DEPTH + 1:
-            raise YamlProblem(line, "nested too deeply")
-        _check_count(self._count, line)
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        return node
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        """Return an integer in decimal, octal (`0o17`) or hexadecimal digits (`0xff`)."""
+        digits = str(node.value)
+        return int(digits, 0 if digits.startswith(("0o", "0x")) else 10)
 
 
 class _Dumper(yaml.SafeDumper):
-    """Dumper that quotes the texts that the reader would refuse."""
-
-    def represent_str(self, data: str) -> yaml.ScalarNode:
-        """Return the node of a text."""
-        style = "'" if _explain_surprise(data, _TEXT) else None
-        return self.represent_scalar(_TEXT, data, style=style)
+    """Dumper that quotes a text that would be another value in YAML 1.1 or 1.2."""
 
 
-_TEXT = "tag:yaml.org,2002:str"
-_Dumper.add_representer(str, _Dumper.represent_str)
-
-
-def dump(data: Any) -> str:
-    """Return plain values as YAML that `read` accepts."""
-    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+_Loader.yaml_implicit_resolvers = {}  # instead of those of YAML 1.1
+_Loader.add_constructor(_TAG + "int", _Loader.construct_yaml_int)
+for _tag, _pattern in _CORE_SCHEMA.items():
+    for _class in _Loader, _Dumper:
+        _class.add_implicit_resolver(_TAG + _tag, re.compile(f"(?:{_pattern})\\Z"), None)
 
 
 class _Builder:
     """Converter of the nodes of a document to plain values."""
 
-    def __init__(self, name: str, problems: list[ValueProblem] | None) -> None:
+    def __init__(self, loader: _Loader, name: str, problems: list[ValueProblem] | None) -> None:
         self.lines: dict[Path, int] = {}
+        self._loader = loader
         self._name = name
         self._problems = problems
         self._count = 0
-        self._constructor = yaml.constructor.SafeConstructor()
 
     def build(self, node: yaml.Node, path: Path) -> Any:
         """Return the value of the node at this path of keys."""
         line = node.start_mark.line + 1
         self._count += 1
-        _check_count(self._count, line)
+        if self._count > _MAX_NODES:
+            raise YamlProblem(
+                line,
+                f"more than {_MAX_NODES} values and keys, each alias counted as all that it "
+                "refers to",
+            )
         if len(path) > _MAX_DEPTH:  # an alias that contains itself has no end
             raise YamlProblem(line, f"{'.'.join(path[:3])}...: nested too deeply")
         self.lines.setdefault(path, line)
@@ -194,13 +193,9 @@ class _Builder:
                 f"{name}: a number of {length} characters; at most {_MAX_NUMBER_CHARACTERS} are "
                 "permitted",
             )
-        if length <= _MAX_NUMBER_CHARACTERS and node.style is None:  # plain, not quoted
-            surprise = _explain_surprise(str(node.value), node.tag)
-            if surprise:
-                raise ValueProblem(line, f"{name}: '{node.value}' {surprise}")
         _check_characters(str(node.value), name, line)
         try:
-            return self._constructor.construct_object(node, deep=True)
+            return self._loader.construct_object(node, deep=True)
         except (yaml.YAMLError, ValueError) as error:
             raise ValueProblem(line, f"{name}: {' '.join(str(error).split())}") from None
         except (LookupError, AttributeError):  # PyYAML's errors for an explicit tag
@@ -214,34 +209,3 @@ def _check_characters(text: str, name: str, line: int) -> None:
         text.encode()
     except UnicodeEncodeError:
         raise ValueProblem(line, f"{name}: half of a character (\\ud800…\\udfff)") from None
-
-
-def _check_count(count: int, line: int) -> None:
-    if count > _MAX_NODES:
-        raise YamlProblem(
-            line,
-            f"more than {_MAX_NODES} values and keys, each alias counted as all that it refers to",
-        )
-
-
-def _explain_surprise(text: str, tag: str) -> str | None:
-    """Return the surprising meaning of a plain scalar in YAML 1.1, and what to write instead."""
-    if text.lower() in _WORDS:
-        value = _WORDS[text.lower()]
-        return f"is {value} in YAML; write {value}, or quote it where a text is meant"
-    if tag.endswith(":str") and _BARE_EXPONENT.fullmatch(text):
-        return f"is a text in YAML, not a number; write {_format_number(text)}"
-    if tag.endswith((":int", ":float")) and _SEXAGESIMAL.fullmatch(text):
-        return "counts in sixties in YAML; write a plain number"
-    if tag.endswith(":int") and _OCTAL.fullmatch(text):
-        return "is octal in YAML; leave out the leading zero"
-    return None
-
-
-def _format_number(text: str) -> str:
-    """Return a number for YAML 1.1: an integer in digits, else with a dot and a signed exponent."""
-    if float(text).is_integer() and abs(float(text)) < _MAX_PLAIN_INTEGER:
-        return f"{float(text):.0f}"
-    mantissa, _, exponent = text.lower().partition("e")
-    mantissa = mantissa if "." in mantissa else mantissa + ".0"
-    return f"{mantissa}e{exponent if exponent[0] in '+-' else '+' + exponent}"

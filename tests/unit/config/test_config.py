@@ -11,7 +11,7 @@ from rigs.documents import ROOT
 
 from fishd.config import SERVICE_FILE, Config, load, mistakes, to_yaml
 from fishd.core.errors import ConfigError
-from fishd.core.strict_yaml import YamlProblem, parse
+from fishd.core.strict_yaml import YamlProblem, dump, parse
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 7)
@@ -89,6 +89,23 @@ def test_only_values_that_were_given_are_doubted(caplog: pytest.LogCaptureFixtur
     )
 
 
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("on", "on"), ("no", "no"), ("y", "y"), ("2026-11-26", "2026-11-26"), ("1_000", "1_000"),
+        ("1:30", "1:30"), ("tRUE", "tRUE"), ("<<", "<<"), ("0b11", "0b11"), ("1e", "1e"),
+        ("true", True), ("False", False), ("NULL", None), ("~", None),
+        ("010", 10), ("0o17", 15), ("0xfF", 255), ("+5", 5), ("-0", 0),
+        ("1e2", 100.0), (".5", 0.5), ("1.", 1.0), ("-1E-3", -0.001), ("-.inf", float("-inf")),
+    ],
+)  # fmt: skip
+def test_plain_values_are_those_of_the_core_schema_of_yaml_1_2(text: str, value: object) -> None:
+    data = parse(f"[{text}, '{text}']").data
+    assert data == [value, text]
+    assert type(data[0]) is type(value)
+    assert parse(dump({"key": text})).data == {"key": text}
+
+
 def test_a_section_with_nothing_below_it_takes_its_defaults(tmp_path: Path) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("plant:\n#  xi: 0.7\nstart: {controller: null, parameters: {}}\n")
@@ -132,11 +149,11 @@ tick: 0.1
 
 realtime:
   lock_memory: on
-=> fish.yaml:2: realtime.lock_memory: 'on' is true in YAML; write true, or quote it
+=> fish.yaml:2: realtime.lock_memory: 'on' is not valid: true or false is needed
 
 simulation:
   seed: 1e2
-=> fish.yaml:2: simulation.seed: '1e2' is a text in YAML, not a number; write 100
+=> fish.yaml:2: simulation.seed: 100.0 is not valid: a whole number
 
 plant: 3
 => fish.yaml:1: plant: 3 is not valid: a section (a mapping of keys to values)
@@ -148,7 +165,7 @@ tick: [
 => fish.yaml:2: not valid YAML
 
 tick: 1:30
-=> fish.yaml:1: tick: '1:30' counts in sixties in YAML
+=> fish.yaml:1: tick: '1:30' is not valid: a number in [0.002, 0.2] s is needed
 
 a: &a [*a]
 => nested too deeply

@@ -103,7 +103,6 @@ def test_a_torn_file_is_an_error(tmp_path: Path, length: int) -> None:
     ("text", "words"),
     [
         ("xx: [", ":1: not valid YAML"),
-        ("xx: 1e2\n", "1e2"),
         ("", "the file is empty"),
         ("- 1.0\n", "a mapping of keys to values is needed"),
         ("xx: 1.0\nxy: 0.0\nx0: 0.0\nyx: 0.0\n", "yy, y0, date missing: fishd fills in no default"),
