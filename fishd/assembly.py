@@ -446,6 +446,7 @@ def build_loop(
         estimator=build_estimator(config),
         thrust=LiveThrust(config.estimator.zero_drift),
         guard=guard,
+        settings=config,
         limits=config.limits,
         clock=clock,
         publisher=publisher,

@@ -47,6 +47,7 @@ from fishd.controllers.base import (
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.estimation import EstimatorSettings
+from fishd.core.loop_settings import LoopSettings
 from fishd.core.overrides import apply_overrides
 from fishd.core.protocol import DEFAULT_LEASE_S, MAX_LEASE_S, MIN_LEASE_S
 from fishd.core.robots import RobotKind, find_kind
@@ -175,7 +176,7 @@ class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     lock_memory: Annotated[bool, note("Keep fishd's memory from being paged out.")] = True
 
 
-class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The whole configuration; `Config()` is a simulated fish at rest."""
 
     name: Annotated[
@@ -190,21 +191,6 @@ class Config(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
             "two-dimensional fluid."
         ),
     ] = "simulated"
-    tick: Annotated[float, unit("s", "Period of the loop.", ge=0.002, le=0.2)] = 0.05
-    amplitude_limit: Annotated[
-        float, unit("rad", "Φ: instruction angles stay within ±Φ.", gt=0, le=1.57)
-    ] = 0.42
-    slew_limit: Annotated[
-        Annotated[float, Meta(gt=0, le=10_000)] | None,
-        unit(
-            "rad/s",
-            "Largest rate of change of the instruction angle. null allows one full reversal, 2Φ, "
-            "in each tick, and so does not change a square wave.",
-        ),
-    ] = None
-    fade_time: Annotated[
-        float, unit("s", "Time to fade from Φ to neutral on stop, fault and exit.", gt=0, le=0.5)
-    ] = 0.4
     start: Annotated[Start, note("Controller that is started with fishd.")] = Start()
     chatter: Annotated[ChatterSettings, note("Limits for a policy that reverses too fast.")] = (
         ChatterSettings()

@@ -29,6 +29,7 @@ from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import Clock, Slot
 from fishd.core.errors import ControllerFault, FishLost, Refused, SensorError
 from fishd.core.foreign_code import call_foreign
+from fishd.core.loop_settings import LoopSettings
 from fishd.core.signals import Measurement, Observation, Publisher, Tick
 from fishd.hardware.base import Robot
 
@@ -64,6 +65,7 @@ class ControlLoop:
         estimator: Estimator,
         thrust: LiveThrust,
         guard: Guard,
+        settings: LoopSettings,
         limits: Limits,
         clock: Clock,
         publisher: Publisher | None,
@@ -76,14 +78,15 @@ class ControlLoop:
         """
         self.robot = robot
         self.guard = guard
+        self.settings = settings
         self.limits = limits
         self.supervisor = Supervisor(self._mode_changed)
-        self.statistics = Statistics(limits.tick)
+        self.statistics = Statistics(settings.tick)
         self.reporter = Reporter(clock, publisher)
         self.active = ActiveController(limits, self.reporter)
         self.lease = Lease(clock.monotonic)
         self.servo = ServoOutput(robot, clock.monotonic)
-        self.power = ServoPower(robot, self.reporter, limits.tick)
+        self.power = ServoPower(robot, self.reporter, settings.tick)
         self.seq = 0
         """Sequence number of the latest tick."""
         self.applied = 0.0
@@ -103,7 +106,7 @@ class ControlLoop:
         self._publisher = publisher
         self._mode = self.supervisor.mode.value
         self._notify = notify
-        self._budget = UPDATE_BUDGET * limits.tick
+        self._budget = UPDATE_BUDGET * settings.tick
         self._trusted = Measurement(clock.monotonic(), 0.0, 0.0, 0)
         """Latest measurement that was not suspect."""
         self._index = -1
@@ -136,7 +139,7 @@ class ControlLoop:
         started = self._now()
         self.seq += 1
         self.statistics.missed += slot.missed
-        dt = (slot.index - self._index) * self.limits.tick
+        dt = (slot.index - self._index) * self.settings.tick
         self._index = slot.index
         if self._pending:
             self._start_pending(*self._pending)
@@ -206,7 +209,7 @@ class ControlLoop:
         Any other request cancels that. So does another calibration of the servo, since the operator
         tries it out then, and the tail must not move.
         """
-        rest = math.ceil(seconds / self.limits.tick - 1e-9)
+        rest = math.ceil(seconds / self.settings.tick - 1e-9)
         self._pending = (rest, name, controller, self._servo_calibration)
 
     def forget_force(self, *, scale: bool) -> None:
@@ -321,7 +324,7 @@ class ControlLoop:
         if not measurement.suspect:
             self._trusted = measurement
         age = slot.now - measurement.time
-        if problem is None and age > MAX_SAMPLE_AGE_PERIODS * self.limits.tick:
+        if problem is None and age > MAX_SAMPLE_AGE_PERIODS * self.settings.tick:
             problem = f"the newest force sample is {age * 1e3:.0f} ms old"
         if problem or self.supervisor.failures:
             self.supervisor.check("sensor-stale", problem)
