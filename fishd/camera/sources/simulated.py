@@ -53,7 +53,7 @@ class TickTruth(Struct, frozen=True, gc=False):
     phi: float = 0.0
 
 
-class Swimmer(NamedTuple):
+class FishDescription(NamedTuple):
     """Description by fishd of its simulated fish."""
 
     tick: float
@@ -67,29 +67,31 @@ class Swimmer(NamedTuple):
 class Foresight:
     """Prediction of the tail's motion from each tick to the next."""
 
-    def __init__(self, swimmer: Swimmer) -> None:
-        self._swimmer = swimmer
-        self._fish = TetheredFish(swimmer.plant)
+    def __init__(self, description: FishDescription) -> None:
+        self._description = description
+        self._fish = TetheredFish(description.plant)
         self._last_tick: TickTruth | None = None
         self._end = Tail(0.0, 0.0, 0.0)
 
     def follow(self, tick: TickTruth) -> list[tuple[Tail, Tail]]:
         """Return the parts of the motion that follow from a tick, as pairs of begin and end."""
         assert isinstance(tick.alpha, float)
-        period, last_tick = self._swimmer.tick, self._last_tick
+        period, last_tick = self._description.tick, self._last_tick
         command = tick.phi_c if tick.servo_on else None
         now = Tail(tick.time, tick.alpha, tick.alpha_rate)
         parts = []
         if last_tick is None or tick.seq != last_tick.seq + 1:
-            self._fish = TetheredFish(self._swimmer.plant, PlantState(phi=tick.phi))
-            if self._swimmer.plant.servo_delay:  # the commands within the servo's delay are unknown
-                self._swim(command, self._swimmer.plant.servo_delay + period)
+            self._fish = TetheredFish(self._description.plant, PlantState(phi=tick.phi))
+            if (
+                self._description.plant.servo_delay
+            ):  # the commands within the servo's delay are unknown
+                self._swim(command, self._description.plant.servo_delay + period)
         elif tick.time > self._end.time + TIME_TOLERANCE_S:  # after ticks that fishd has skipped
             self._swim(last_tick.phi_c if last_tick.servo_on else None, tick.time - self._end.time)
             parts.append((self._end, now))
         self._fish.state = PlantState(tick.phi, tick.alpha, tick.alpha_rate)
         end = tick.time + period
-        if self._swimmer.lockstep:  # on the grid of fishd's virtual clock
+        if self._description.lockstep:  # on the grid of fishd's virtual clock
             end = (round(tick.time / period) + 1) * period
         self._swim(command, end - tick.time)
         state = self._fish.state
@@ -103,7 +105,7 @@ class Foresight:
 
     def _swim(self, command: float | None, duration: float) -> None:
         duration = round(duration, 9)
-        samples = max(1, round(self._swimmer.sample_rate * duration))
+        samples = max(1, round(self._description.sample_rate * duration))
         self._fish.advance(command, duration, samples)
 
 
@@ -134,8 +136,8 @@ class SimulatedSource:
     def _follow(self, fish: Fish, sink: Sink, stopping: Callable[[float], bool]) -> None:
         """Draw the fish of one fishd, until that ends or is replaced."""
         status = fish.status()
-        swimmer = _swimmer(fish.config())
-        view = _View(self._settings, self._size, swimmer, sink)
+        description = _read_description(fish.config())
+        view = _View(self._settings, self._size, description, sink)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
             socket = connect_subscriber(context, status.telemetry, b"tick")
@@ -176,12 +178,12 @@ class _View:
     """View of the fish of one fishd, which puts each frame at its time."""
 
     def __init__(
-        self, settings: SimulatedSettings, size: int, swimmer: Swimmer, sink: Sink
+        self, settings: SimulatedSettings, size: int, description: FishDescription, sink: Sink
     ) -> None:
         self._settings = settings
         self._camera = SimulatedCamera(settings, size)
-        self._foresight = Foresight(swimmer)
-        self._swimmer = swimmer
+        self._foresight = Foresight(description)
+        self._description = description
         self._sink = sink
         self._due: deque[Shot] = deque()
         self._last_seq = 0
@@ -210,7 +212,7 @@ class _View:
         for before, after in self._foresight.follow(tick):
             for frame in self._camera.frames(before, after):
                 self._due.append(Shot(*frame, self._settings.exposure))
-        if self._swimmer.lockstep:
+        if self._description.lockstep:
             while self._due:
                 self._sink.put(self._due.popleft())
             self._sink.covered(self._foresight.end)
@@ -233,12 +235,14 @@ class _View:
     def report_idle(self) -> None:
         """Report that fishd answers, but does not tick."""
         reason = (
-            "as in lockstep while it waits for its agent" if self._swimmer.lockstep else "so far"
+            "as in lockstep while it waits for its agent"
+            if self._description.lockstep
+            else "so far"
         )
         self._sink.trouble(Trouble("waiting", f"fishd answers, but does not tick, {reason}"))
 
     def _begin(self, status: Status) -> None:
-        if self._swimmer.lockstep:
+        if self._description.lockstep:
             self._sink.begin(Timeline(True, status.boot_id, None))
         else:
             self._sink.begin(Timeline(False, status.boot_id, self._now))
@@ -248,17 +252,17 @@ class _View:
 
     def _frames_in(self, ticks: int) -> int:
         rate = self._settings.rate
-        return ticks if rate is None else round(ticks * self._swimmer.tick * rate)
+        return ticks if rate is None else round(ticks * self._description.tick * rate)
 
 
-def _swimmer(config: dict[str, Any]) -> Swimmer:
+def _read_description(config: dict[str, Any]) -> FishDescription:
     """Return the fish of a configuration; raises `Trouble` where that is of another version."""
     try:
         plant = dict(config["plant"])
         if plant.get("model", TETHERED) != TETHERED:
             # Another model has other keys. Until the next tick, the tethered fish approximates it.
             plant = {name: plant[name] for name in PlantParameters.__struct_fields__}
-        return Swimmer(
+        return FishDescription(
             tick=float(config["tick"]),
             plant=convert(plant, PlantParameters),
             sample_rate=float(config["simulation"]["sample_rate"]),

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fishd.camera.simulated import Tail
-from fishd.camera.sources.simulated import Foresight, Swimmer, TickTruth
+from fishd.camera.sources.simulated import FishDescription, Foresight, TickTruth
 from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
@@ -43,7 +43,7 @@ class Swim:
 
 
 def foresight(plant: PlantParameters, **options: Any) -> Foresight:
-    return Foresight(Swimmer(TICK, plant, 200.0, options.get("lockstep", True)))
+    return Foresight(FishDescription(TICK, plant, 200.0, options.get("lockstep", True)))
 
 
 @settings(max_examples=20)
