@@ -19,8 +19,7 @@ from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.lease import Lease
 from fishd.control.reporting import Reporter
-from fishd.control.servo_output import ServoOutput
-from fishd.control.servo_power import ServoPower
+from fishd.control.servo import ServoOutput, ServoPower
 from fishd.control.statistics import Statistics
 from fishd.control.supervisor import Mode, Supervisor
 from fishd.controllers.base import Controller, Limits

@@ -30,12 +30,10 @@ from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
 from fishd.core.process.shutdown import Shutdown, exit_now
 from fishd.core.process.systemd_notify import SystemdNotifier
 from fishd.daemon.calibration_requests import CalibrationRequests
-from fishd.daemon.control_server import ControlServer
-from fishd.daemon.estop_socket import EstopSocket
+from fishd.daemon.control_server import ControlServer, EstopSocket
 from fishd.daemon.gateway.gateways import Gateways, Telemetry
-from fishd.daemon.lockstep import Lockstep
 from fishd.daemon.requests import Operations
-from fishd.daemon.slow_motion import SlowMotion
+from fishd.daemon.virtual_pace import Lockstep, SlowMotion
 from fishd.daemon.warm_up import mock_ticks
 from fishd.hardware.base import Robot
 from fishd.hardware.servo.pulses import NEUTRAL_TIME_S

@@ -35,8 +35,8 @@ POWER_METERS: Plugins[PowerMeterDriver[Any]] = Plugins(
     PowerMeterDriver,
     "Settings",
     {
-        "ina219": "fishd.hardware.power_meter.ina219:Ina219",
-        "ina226": "fishd.hardware.power_meter.ina226:Ina226",
+        "ina219": "fishd.hardware.power_meter.ina:Ina219",
+        "ina226": "fishd.hardware.power_meter.ina:Ina226",
     },
     UnknownDriver,
 )

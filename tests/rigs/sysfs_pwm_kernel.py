@@ -1,6 +1,6 @@
 """PWM class of the kernel as files in memory, with the checks and errors of Linux.
 
-It replaces module `os` in `fishd.hardware.servo.pwm_channel`. It is as strict as kernels up to 6.9,
+It replaces module `os` in `fishd.hardware.servo.pwm_pulses`. It is as strict as kernels up to 6.9,
 which refuse everything while the period is 0, and ignore a state that they believe to be set.
 """
 
@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from fishd.core.clock import Clock
-from fishd.hardware.servo.pwm_channel import PwmChannel
+from fishd.hardware.servo.pwm_pulses import PwmChannel
 from fishd.virtual.pi.pulse_train import PulseTrain
 
 

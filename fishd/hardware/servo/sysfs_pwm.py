@@ -14,9 +14,7 @@ from fishd.core.errors import ServoError
 from fishd.core.schema import note, unit
 from fishd.hardware.checks import Check, Machine, Result, fail, ok, warning
 from fishd.hardware.driver import Claim, LastResort, ServoDriver, pin
-from fishd.hardware.servo import pwm_pulses
-from fishd.hardware.servo.pwm_channel import Files, PwmChannel, Wires
-from fishd.hardware.servo.pwm_pulses import UDEV_TIMEOUT_S
+from fishd.hardware.servo.pwm_pulses import UDEV_TIMEOUT_S, Files, PwmChannel, Wires
 from fishd.hardware.settings import Gpio, ServoSettings
 
 
@@ -81,7 +79,7 @@ class SysfsPwm(ServoDriver[SysfsPwmSettings]):
         try:
             if self._driving:
                 self._check_pulses()
-                self._channel.write("duty_cycle", pwm_pulses.nanoseconds(pulse))
+                self._channel.change_pulses(pulse)
             else:
                 self._channel.open(timeout=0.0)
                 self._begin(pulse)
@@ -96,10 +94,10 @@ class SysfsPwm(ServoDriver[SysfsPwmSettings]):
         """
         try:
             self._channel.open(timeout=0.0)
-            if pwm_pulses.has_pulses(self._channel):
+            if self._channel.has_pulses():
                 # Enable 0 would let the level fall in the middle of a pulse, and the servo would
                 # jerk. A new duty cycle takes effect at the end of the present period.
-                self._channel.write("duty_cycle", 0)
+                self._channel.change_pulses(0.0)
         except ServoError:
             self._lose()
             raise
@@ -120,7 +118,7 @@ class SysfsPwm(ServoDriver[SysfsPwmSettings]):
             finally:
                 if self._is_used:
                     self._channel.open(timeout=0.0)  # a failed `off` has closed it
-                    pwm_pulses.switch_off(self._channel, self._period, self.clock.sleep)
+                    self._channel.switch_off(self._period)
         except ServoError:
             if self._is_used:  # otherwise this object never started pulses
                 raise
@@ -154,18 +152,13 @@ class SysfsPwm(ServoDriver[SysfsPwmSettings]):
     @classmethod
     def read_pulses(cls, settings: SysfsPwmSettings) -> bool:
         """Read back from the kernel whether there are pulses."""
-        channel = PwmChannel(settings.wires, SystemClock(), os)
-        try:
-            channel.open(UDEV_TIMEOUT_S)
-            return pwm_pulses.has_pulses(channel)
-        finally:
-            channel.close()
-            if channel.exported:
-                channel.unexport()
+        channel = PwmChannel(settings.wires, SystemClock())
+        with channel.borrow():
+            return channel.has_pulses()
 
     def _begin(self, width: float) -> None:
         self._is_used = True
-        pwm_pulses.start_pulses(self._channel, width, self._period)
+        self._channel.start_pulses(width, self._period)
         self._driving = True
         self._reconnects += self._lost
         self._lost = False
@@ -192,17 +185,13 @@ def _channel(machine: Machine, settings: SysfsPwmSettings) -> Result:
     root = str(machine.path(settings.root))
     channel = PwmChannel(settings.wires._replace(root=root), SystemClock())
     try:
-        channel.open(UDEV_TIMEOUT_S)
-        duty = channel.read("enable") and channel.read("duty_cycle")
+        with channel.borrow():
+            is_on = channel.has_pulses()
     except ServoError as error:
         return fail(
             str(error),
             "follow this line, then restart; 'make install-pi' gives group gpio the chip's files",
         )
-    finally:
-        channel.close()
-        if channel.exported:
-            channel.unexport()
-    if duty:
+    if is_on:
         return warning(f"{channel.path}: pulses are on, but no fishd is running", "fishctl release")
     return ok(f"{channel.path} may be written to")

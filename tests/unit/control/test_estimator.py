@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from rigs.harness import Rig
 
+from fishd.control.estimators.base import TailBeat
 from fishd.control.estimators.lateral_force import LateralForceEstimator
-from fishd.control.estimators.tail_beat import TailBeat
 from fishd.core.estimation import EstimatorSettings
 from fishd.core.signals import Measurement
 

@@ -8,9 +8,7 @@ import pytest
 from rigs.ads1115_board import ABSENT_BUS, Board
 
 from fishd.core.errors import SensorError
-from fishd.hardware.power_meter.ina import Ina
-from fishd.hardware.power_meter.ina219 import Ina219, Ina219Settings
-from fishd.hardware.power_meter.ina226 import Ina226, Ina226Settings
+from fishd.hardware.power_meter.ina import Ina, Ina219, Ina219Settings, Ina226, Ina226Settings
 from fishd.hardware.power_meter.sampled_power import SampledPower, sample_interval
 from fishd.virtual.pi.ina import CHIPS
 
