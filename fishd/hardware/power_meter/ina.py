@@ -191,7 +191,7 @@ class Ina219Settings(InaSettings, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class Ina219(Ina[Ina219Settings]):
-    """An INA219 on the I2C bus, through its Adafruit driver; up to 3.2 A with a shunt of 0.1 Ω."""
+    """An INA219 on the I2C bus; up to 3.2 A with a shunt of 0.1 Ω."""
 
     Settings = Ina219Settings
     packages = ("adafruit-blinka", "adafruit-circuitpython-ina219", "adafruit-extended-bus")
