@@ -13,7 +13,7 @@ from fishd.camera.settings import CameraSettings, hide_secrets, load
 from fishd.camera.sources.base import Source
 from fishd.core import text
 from fishd.core.console import complain, run
-from fishd.core.errors import FishdError, install
+from fishd.core.errors import FishdError, install_command
 from fishd.core.process.interruption import on_signal
 from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
 from fishd.core.process.shutdown import exit_now
@@ -71,7 +71,9 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
 
         source = open_source(settings)
     except ImportError as error:
-        complain(NAME, f"{text.error_message(error)}; {install('camera')}", 1)
+        complain(
+            NAME, f"{text.error_message(error)}; install it with: {install_command('camera')}", 1
+        )
     logs = LogWriter(log_format)
     logging.getLogger("linuxpy").setLevel(logging.WARNING)
     if path is not None:

@@ -17,7 +17,7 @@ from fishd.cli.progress import show_progress
 from fishd.config import Config, check_tethered
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
-from fishd.core.errors import FishdError, ParameterError, install
+from fishd.core.errors import FishdError, ParameterError, install_command
 from fishd.core.process.interruption import raise_on_first_signal
 
 if TYPE_CHECKING:
@@ -241,7 +241,7 @@ def _default_contestants(config: Config) -> "list[Contestant]":
     if named and not (find_spec("onnx") and find_spec("onnxruntime")):
         echo(
             f"fishctl: left out, as the extra 'policy' is missing: {', '.join(named)}; "
-            f"{install('policy')}",
+            f"install it with: {install_command('policy')}",
             err=True,
         )
     return default_contestants(config)

@@ -1,6 +1,8 @@
 """Verbs about the configuration: check a file, show it, print its schema."""
 
+import itertools
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +25,8 @@ from fishd.config import (
 )
 from fishd.core.console import MAX_COMPLAINT_CHARACTERS
 from fishd.core.errors import ConfigError
-from fishd.core.schema import fields_of
+from fishd.core.files import shipped_folder, write_atomically
+from fishd.core.schema import fields_of, suggest
 from fishd.core.text import line
 from fishd.hardware.servo import pulses
 
@@ -135,6 +138,43 @@ def show(
         print_json(settings)
     else:
         echo(to_yaml(settings), nl=False)
+
+
+@config.command()
+@click.argument("name", required=False)
+@click.option("--to", "target", type=click.Path(path_type=Path), help="Write it into this file.")
+def example(name: str | None, target: Path | None) -> None:
+    """Print an example of a configuration file, or list the examples.
+
+    They are for fishd, for fishd-camera (camera…) and for 'fishctl learn ppo --settings'
+    (learning…).
+    """
+    examples = {path.stem: path.read_text() for path in shipped_folder("config").glob("*.yaml")}
+    if name is None:
+        if target is not None:
+            raise click.UsageError("--to needs the NAME of an example")
+        for known in sorted(examples):
+            echo(f"{known:<22}{_first_sentence(examples[known])}")
+        return
+    content = examples.get(name.removesuffix(".yaml"))
+    if content is None:
+        raise ConfigError(f"no example is named '{name}'; {suggest(name, sorted(examples))}")
+    if target is None:
+        echo(content, nl=False)
+        return
+    try:
+        write_atomically(target, content, new=True)
+    except FileExistsError:
+        raise ConfigError(f"{target}: exists already; name another file with --to") from None
+    except OSError as error:
+        raise ConfigError(f"{target}: cannot be written: {error.strerror}") from None
+    echo(f"{target}: written")
+
+
+def _first_sentence(example: str) -> str:
+    """Return the first sentence of the comment at the top of a configuration."""
+    comment = itertools.takewhile(lambda row: row.startswith("#"), example.splitlines())
+    return re.split(r"(?<=\.)\s(?=[A-Z])", " ".join(row.lstrip("# ") for row in comment))[0]
 
 
 @config.command()

@@ -10,7 +10,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from fishd.core.console import complain
-from fishd.core.errors import install
+from fishd.core.errors import install_command
 
 _EXTRAS = {
     "aiohttp": "camera",
@@ -82,7 +82,8 @@ class Verbs(click.Group):
             package = (error.name or "").partition(".")[0]
             if package not in _EXTRAS:
                 raise
-            complain("fishctl", f"{package} is not installed; {install(_EXTRAS[package])}", 1)
+            remedy = install_command(_EXTRAS[package])
+            complain("fishctl", f"{package} is not installed; install it with: {remedy}", 1)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all verbs, in the order of help."""

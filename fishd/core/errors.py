@@ -63,15 +63,33 @@ class MissingPackage(StartupError):
     @classmethod
     def of_extra(cls, purpose: str, package: str, extra: str) -> Self:
         """Return the error for a purpose whose package comes with an extra of fishd."""
-        return cls(f"{purpose} needs the package {package}; {install(extra)}")
+        return cls(
+            f"{purpose} needs the package {package}; install it with: {install_command(extra)}"
+        )
 
 
-def install(extra: str) -> str:
-    """Return where and how an extra of fishd is installed."""
-    return (
-        "where the sources of fishd are: pip install --constraint tools/constraints.txt "
-        f"--editable '.[{extra}]'"
-    )
+def install_command(extra: str = "") -> str:
+    """Return the command that installs fishd with an extra, from where fishd was installed."""
+    import json  # only needed for this message
+    import shlex
+    import sys
+    from importlib.metadata import Distribution, PackageNotFoundError
+    from urllib.parse import unquote, urlsplit
+
+    pip = f"{shlex.quote(sys.executable)} -m pip install"
+    try:
+        origin = json.loads(Distribution.from_name("fishd").read_text("direct_url.json") or "{}")
+    except PackageNotFoundError:  # runs from its sources, without an installation
+        origin = {"url": ".", "dir_info": {"editable": True}}
+    suffix = f"[{extra}]" if extra else ""
+    source = unquote(urlsplit(origin.get("url", "")).path)
+    if not source:
+        return f"{pip} {shlex.quote(f'fishd{suffix}')}"
+    target = shlex.quote(f"{source}{suffix}")
+    if not origin.get("dir_info", {}).get("editable"):
+        return f"{pip} {target}"
+    constraints = shlex.quote(f"{source}/tools/constraints.txt")
+    return f"{pip} --constraint {constraints} --editable {target}"
 
 
 class SensorError(FishdError, OSError):

@@ -79,6 +79,16 @@ def expand_user(path: str | os.PathLike[str]) -> Path:
         return Path(path)
 
 
+def shipped_folder(name: str) -> Path:
+    """Return a folder that is shipped with fishd, `config` or `systemd`.
+
+    It lies in the installed package, or in the checkout.
+    """
+    package = Path(__file__).parents[1]
+    installed = package / "shipped" / name
+    return installed if installed.is_dir() else package.parent / name
+
+
 def write_atomically(path: Path, content: str | bytes, *, new: bool = False) -> None:
     """Write or replace a file; a full disk or a kill leaves the old file, never a part of the new.
 

@@ -19,8 +19,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
-from hatchling.build import build_wheel
-from rigs.documents import ROOT
+from rigs.wheel import build
 
 import rooms as tool
 from common.report import DOCS, between
@@ -60,9 +59,8 @@ def test_the_page_lists_every_room_with_its_own_words() -> None:
     assert between(DOCS / "explanation" / "rooms.md", "rooms") == tool.summary()
 
 
-def test_a_wheel_carries_its_licence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
-    with ZipFile(tmp_path / build_wheel(str(tmp_path))) as wheel:
+def test_a_wheel_carries_its_licence(tmp_path: Path) -> None:
+    with ZipFile(build(tmp_path)) as wheel:
         files = {name.partition(".dist-info/")[2]: name for name in wheel.namelist()}
         metadata = message_from_bytes(wheel.read(files["METADATA"]))
         licence = wheel.read(files["licenses/LICENSE"]).decode()

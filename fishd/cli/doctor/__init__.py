@@ -9,11 +9,11 @@ import click
 
 from fishd.cli.config import load_service, service_option, set_option
 from fishd.cli.doctor import computer, drivers, service, software, timing
-from fishd.cli.doctor.base import INSTALL, Context
+from fishd.cli.doctor.base import Context
 from fishd.cli.options import endpoint_option, json_option
 from fishd.cli.output import echo, format_count, print_json
 from fishd.core import text
-from fishd.core.errors import MissingPackage
+from fishd.core.errors import MissingPackage, install_command
 from fishd.hardware.checks import Check, Result, fail
 from fishd.hardware.registry import driver_packages
 
@@ -85,7 +85,8 @@ def examine(context: Context) -> Iterator[tuple[str, Result]]:
             with driver_packages():
                 result = check.function(context)
         except MissingPackage as error:
-            remedy = INSTALL if "fishd[pi]" in str(error) else f"{sys.executable} -m pip install it"
+            is_ours = "fishd[pi]" in str(error)
+            remedy = install_command("pi") if is_ours else f"{sys.executable} -m pip install it"
             result = fail(str(error), remedy)
         except Exception as error:
             message = f"this check broke off: {type(error).__name__}: {error}"

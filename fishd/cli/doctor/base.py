@@ -3,7 +3,6 @@
 import os
 import shlex
 import socket
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -25,8 +24,6 @@ from fishd.core.signals import Status, Tick
 from fishd.hardware import ownership
 from fishd.hardware.checks import Machine, Result, skipped
 
-INSTALL = f"{sys.executable} -m pip install 'fishd[pi]'"
-"""Command that installs missing drivers."""
 ANSWER_TIMEOUT_S = DEFAULT_TIMEOUT_S
 """Longest wait for an answer of a daemon [s]."""
 

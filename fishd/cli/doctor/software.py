@@ -7,6 +7,7 @@ import sys
 from importlib import metadata
 
 from fishd.cli.doctor.base import Context, sudo_unless
+from fishd.core.errors import install_command
 from fishd.hardware import header
 from fishd.hardware.checks import Check, Result, fail, ok, warning
 from fishd.hardware.registry import PACKAGES
@@ -62,8 +63,7 @@ def packages(context: Context) -> Result:
         problem for name, bounds in requirements if (problem := _find_problem(name, bounds))
     ]
     if problems:
-        package = f"fishd[{kind.extra}]" if kind.extra else "fishd"
-        return fail("; ".join(problems), f"{sys.executable} -m pip install '{package}'")
+        return fail("; ".join(problems), install_command(kind.extra))
     user = f"robot {context.robot}" + (f" with {' and '.join(drivers)}" if drivers else "")
     return ok(f"all {len(requirements)} that {user} needs, under {sys.executable}")
 
@@ -89,12 +89,12 @@ def gpio_package(context: Context) -> Result | None:
         return fail(
             "neither RPi.GPIO nor rpi-lgpio is installed, but the configuration uses GPIO pins",
             "sudo make install-pi, which says what it takes; without the service "
-            f"{pip} install 'fishd[rpi-lgpio]' (Pi 5, Debian 13) or 'fishd[rpi-gpio]'",
+            f"{install_command('rpi-lgpio')} (Pi 5, Debian 13); on others, rpi-gpio instead",
         )
     if "RPi.GPIO" in installed and "Raspberry Pi 5" in context.model:
         return fail(
             "RPi.GPIO does not work on a Pi 5",
-            f"{pip} uninstall RPi.GPIO; {pip} install 'fishd[rpi-lgpio]'",
+            f"{pip} uninstall RPi.GPIO; {install_command('rpi-lgpio')}",
         )
     return ok(installed[0])
 

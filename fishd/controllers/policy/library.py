@@ -128,7 +128,4 @@ def _state_folder() -> Path:
 
 
 def _shipped_folder() -> Path:
-    """Return the folder of fishd's policies: in the installed package, else in the checkout."""
-    package = Path(__file__).parent
-    installed = package / "shipped"
-    return installed if installed.is_dir() else package.parents[2] / "config" / "policies"
+    return files.shipped_folder("config") / "policies"

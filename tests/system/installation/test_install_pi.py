@@ -1,6 +1,5 @@
 """make install-pi and uninstall-pi, into a folder: files they write, keep and remove."""
 
-import contextlib
 import io
 import os
 import re
@@ -13,10 +12,10 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from hatchling.build import build_wheel
 from rigs.documents import ROOT as CHECKOUT
 from rigs.once import once
 from rigs.processes import call
+from rigs.wheel import build
 
 CONFIG = "etc/fishd/fishd.yaml"
 AS_INSTALLED = "opt/fishd/fishd.yaml.installed"
@@ -24,11 +23,7 @@ AS_INSTALLED = "opt/fishd/fishd.yaml.installed"
 
 @pytest.fixture(scope="session")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    def make(folder: Path) -> Path:
-        with contextlib.chdir(CHECKOUT):
-            return folder / build_wheel(str(folder))
-
-    return once(tmp_path_factory, "wheel", make)
+    return once(tmp_path_factory, "wheel", build)
 
 
 class Pi:
