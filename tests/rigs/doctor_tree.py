@@ -19,9 +19,8 @@ def examiner(root: Path) -> Examine:
     def make(name: str, *overrides: str) -> tuple[str, str, str]:
         settings = ["robot=pi", f"state_folder={root}/state", *overrides]
         context = Context(load(None, settings), None, f"ipc://{root}/nobody", root)
-        result = next(
-            (check.function(context) for check in checks(context) if check.name == name), None
-        )
+        found = (check.function(context) for check in checks(context) if check.name == name)
+        result = next(found, None)
         if result is None:
             return "", "", ""
         assert bool(result.remedy) == (result.level in ("warning", "FAIL"))

@@ -89,10 +89,8 @@ class Rig:
         return self
 
     def retune(self, **parameters: Any) -> None:
-        loop = self.loop
-        loop.active.retune(
-            registry.merge_parameters(loop.active.controller, loop.active.name, parameters)
-        )
+        active = self.loop.active
+        active.retune(registry.merge_parameters(active.controller, active.name, parameters))
 
     def run(self, ticks: int = 1, *, missed: int = 0, lateness: float = 0.0) -> list[Tick]:
         """Run the loop; `missed` slots are skipped before the first of these ticks."""

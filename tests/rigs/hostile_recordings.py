@@ -176,9 +176,7 @@ def frame_with_damaged_pixels(good: Good) -> bytes:
 
 @file
 def numbers_that_no_fish_has(good: Good) -> bytes:
-    changes = [
-        {name: 1e308 * sign} for name in ("fx", "phi_c", "sample_age_ms", "t") for sign in (1, -1)
-    ]
+    changes = [{name: 1e308 * s} for name in ("fx", "phi_c", "sample_age_ms", "t") for s in (1, -1)]
     return with_messages(
         good, TICK, [tick_of(good, seq=61 + i, **c) for i, c in enumerate(changes)]
     )

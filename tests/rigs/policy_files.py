@@ -129,10 +129,8 @@ def of_nodes(
     nodes: Sequence[Any], weights: Sequence[Any] = (), about: Card | None = None, opset: int = 17
 ) -> bytes:
     """Return a policy of nodes from `observation` to `action`, both of shape [1, 1]."""
-    ends = [
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1])]
-        for name in (file.INPUT, file.OUTPUT)
-    ]
+    numbers = (TensorProto.FLOAT, [1, 1])
+    ends = [[helper.make_tensor_value_info(name, *numbers)] for name in (file.INPUT, file.OUTPUT)]
     graph = helper.make_graph(list(nodes), "policy", *ends, list(weights))
     model = helper.make_model(graph, ir_version=8, opset_imports=[helper.make_opsetid("", opset)])
     helper.set_model_props(model, {CARD_KEY: encode(about or card())})

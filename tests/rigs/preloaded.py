@@ -49,9 +49,7 @@ def _find_program(command: Sequence[str]) -> tuple[str, bool, list[str]] | None:
 
 
 def _variables() -> dict[str, str]:
-    variables = {
-        name: value for name, value in os.environ.items() if name.startswith(READ_AT_START)
-    }
+    variables = {name: text for name, text in os.environ.items() if name.startswith(READ_AT_START)}
     variables.pop("PYTHONSAFEPATH", None)  # which the commands set in any case
     return variables
 

@@ -53,9 +53,7 @@ class SysfsPwm:
         """Names of files and values whose write fails."""
         self.unreadable: set[str] = set()
         """Names of files whose read fails."""
-        self._chips = {
-            device: [_Channel() for _ in range(channels)] for device, channels in chips.items()
-        }
+        self._chips = {device: [_Channel() for _ in range(n)] for device, n in chips.items()}
         self._numbers = dict(enumerate(chips))
         self._taken: set[tuple[str, int]] = set()
         self._fds: dict[int, tuple[str, int | None, str]] = {}

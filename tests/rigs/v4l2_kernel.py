@@ -237,10 +237,8 @@ class V4l2Camera:
             sequence,
             flags,
         )
-        argument.timestamp.secs, argument.timestamp.usecs = (
-            int(stamp),
-            round(stamp % 1.0 * 1e6) % 10**6,
-        )
+        argument.timestamp.secs = int(stamp)
+        argument.timestamp.usecs = round(stamp % 1.0 * 1e6) % 10**6
 
     def _streamon(self, _: Any) -> None:
         self._streaming, self._sequence = True, -1

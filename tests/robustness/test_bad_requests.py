@@ -110,9 +110,7 @@ def test_a_fishd_that_goes_on_after_a_hang_begins_nothing_of_before(own_daemon: 
         replies = {reply["id"]: reply for reply in (json.loads(socket.recv()) for _ in range(2))}
     assert replies[2]["ok"]
     assert replies[1]["error"]["code"] == "stale"
-    assert replies[1]["error"]["message"].endswith(
-        "as fishd stood still or was flooded; send it again"
-    )
+    assert "fishd stood still or was flooded; send it again" in replies[1]["error"]["message"]
     assert own_daemon.status().mode == "idle"
     assert own_daemon.fishctl("set-controller", "swing").returncode == 0
 

@@ -73,9 +73,8 @@ def test_an_answer_that_nobody_has_read_yet_is_no_silence(tmp_path: Path) -> Non
             server.bind(endpoint)
             poller.register(server, zmq.POLLIN)
             command = [sys.executable, "-c", program, endpoint, str(TIMEOUT)]
-            client = subprocess.Popen(
-                command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-            )
+            pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+            client = subprocess.Popen(command, **pipes, text=True)
             clients[server] = stack.enter_context(client), answer, words
         for _ in clients:  # in the order of their requests
             ((server, _), *_) = poller.poll(PATIENCE * 1e3)

@@ -36,9 +36,7 @@ def _evil(kind: inspect.Type, known: dict[str, Any] | None = None) -> Any:
         case inspect.Metadata():
             return _evil(kind.type)
         case inspect.UnionType():
-            return _evil(
-                next(type_ for type_ in kind.types if not isinstance(type_, inspect.NoneType))
-            )
+            return _evil(next(t for t in kind.types if not isinstance(t, inspect.NoneType)))
         case inspect.ListType() | inspect.VarTupleType():
             return [_evil(kind.item_type)]
         case inspect.TupleType():

@@ -162,11 +162,8 @@ def test_frames_that_have_waited_in_the_driver_are_dropped_and_counted(good: V4l
 
 
 def test_controls_are_set_and_tell_the_exposure(tmp_path: Path) -> None:
-    controls = (
-        "v4l2.controls.auto_exposure=1",
-        "v4l2.controls.exposure_time_absolute=100",
-        "v4l2.controls.gain=3",
-    )
+    exposure = ("v4l2.controls.auto_exposure=1", "v4l2.controls.exposure_time_absolute=100")
+    controls = (*exposure, "v4l2.controls.gain=3")
     with v4l2_rig(tmp_path, *controls, rate=15.0) as rig:
         state = rig.is_in("streaming")
         assert state.exposure == pytest.approx(0.01)

@@ -71,9 +71,8 @@ def test_earlier_runs_of_a_controller_that_gives_up_stand_in_the_table(
     )
     monkeypatch.setattr("fishd.lab.compare.live.measure", tiring)
     done = run("swing", "sine", "--on", "live", "--for", "25", "--runs", "2")
-    assert done.stderr == (
-        "fishctl: swing: left out after 1 of 2 runs, which are in the table: swing gave up\n"
-    )
+    left_out = "left out after 1 of 2 runs, which are in the table: swing gave up"
+    assert done.stderr == f"fishctl: swing: {left_out}\n"
     rows = [line for line in done.stdout.splitlines() if line.startswith("swing")]
     assert (done.returncode, len(rows)) == (1, 1)
     assert "Verdict: swing wins: it thrusts " in done.stdout

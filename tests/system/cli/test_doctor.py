@@ -32,7 +32,7 @@ def test_the_table_has_a_line_for_each_check_and_says_how_to_mend(pi: Bench) -> 
     lines = ended.stdout.splitlines()
     assert (
         "ok       adc            an ADS1115 answers at 0x48 on /dev/i2c-1, as after power-on"
-        in (lines)
+        in lines
     )
     warned = lines.index(next(line for line in lines if line.startswith("warning  calibrations")))
     assert lines[warned + 1].strip() == "fishctl calibrate force"
@@ -191,10 +191,8 @@ def test_a_driver_that_is_too_old_fails_only_where_it_is_needed(tmp_path: Path) 
     env = install(tmp_path, "adafruit-circuitpython-ads1x15", "3.0.4")
     status, findings = doctor(tmp_path, "--set", "robot=pi", *free_telemetry(), **env)
     assert status == 1
-    assert findings["packages"] == (
-        "FAIL",
-        "adafruit-circuitpython-ads1x15 is 3.0.4, >= 3.0.5 is needed",
-    )
+    needed = "adafruit-circuitpython-ads1x15 is 3.0.4, >= 3.0.5 is needed"
+    assert findings["packages"] == ("FAIL", needed)
     status, findings = doctor(tmp_path, *free_telemetry(), **env)
     assert (status, findings["packages"][0]) == (0, "ok")
 

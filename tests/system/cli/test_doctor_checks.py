@@ -40,9 +40,8 @@ MONITOR = {
     "sys/class/hwmon/hwmon1/name": "rpi_volt\n",
 }
 ALARM = "sys/class/hwmon/hwmon1/in0_lcrit_alarm"
-GOVERNORS = {
-    f"sys/devices/system/cpu/cpu{n}/cpufreq/scaling_governor": "performance\n" for n in range(4)
-}
+CPU = "sys/devices/system/cpu/cpu{}/cpufreq/scaling_governor"
+GOVERNORS = {CPU.format(number): "performance\n" for number in range(4)}
 PINS = {
     "sys/kernel/debug/gpio": "gpiochip0: GPIOs 512-565, parent: platform/fe200000.gpio:\n"
     " gpio-529 (GPIO17              )\n"

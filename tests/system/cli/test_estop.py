@@ -75,9 +75,7 @@ def test_a_simulated_fish_that_hangs_has_no_pulses(tmp_path: Path) -> None:
         finally:
             daemon.process.send_signal(signal.SIGCONT)
     assert ended.returncode == 0
-    assert ended.stdout.startswith(
-        "no pulses: the fish is simulated, and its fishd does not answer"
-    )
+    assert ended.stdout.startswith("no pulses: the fish is simulated, and its fishd does not")
 
 
 def test_without_a_fishd_and_without_a_servo_it_reports_that_it_did_nothing(tmp_path: Path) -> None:

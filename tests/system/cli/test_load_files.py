@@ -36,13 +36,10 @@ def test_what_was_measured_earlier_cannot_be_recorded(tmp_path: Path) -> None:
     measured = tmp_path / "measured.csv"
     measured.write_text("fx_N,fy_N,vx_V,vy_V\n" + "".join(f"{x},{y},{x},{y}\n" for x, y in PLAN))
     record = tmp_path / "record.csv"
-    ended = fishctl_alone(
-        tmp_path, "calibrate", "force", "--loads", str(measured), "--record", str(record)
-    )
+    words = ("--loads", str(measured), "--record", str(record))
+    ended = fishctl_alone(tmp_path, "calibrate", "force", *words)
     assert (ended.returncode, ended.stdout) == (2, "")
-    assert re.match(
-        rf"fishctl: --record keeps what [^\n]* {measured} holds [^\n]*\n$", ended.stderr
-    )
+    assert re.match(rf"fishctl: --record keeps what .* {measured} holds .*\n$", ended.stderr)
     assert not record.exists()
 
 
@@ -84,8 +81,7 @@ def test_loads_of_a_file_without_a_fit_are_refused_despite_yes(rig: Bench, daemo
     assert ended.returncode == 1
     assert "errors [mN]" in ended.stdout
     assert re.fullmatch(
-        r"fishctl: the voltages do not follow the loads: [^\n]+ measure load \d again first\n",
-        ended.stderr,
+        r"fishctl: the voltages do not follow .* measure load \d again.*\n", ended.stderr
     )
     assert rig.files("force") == []
 

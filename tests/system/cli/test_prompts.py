@@ -35,9 +35,8 @@ while True:
 
 def test_a_signal_at_any_instant_after_a_prompt_interrupts_it() -> None:
     instants = random.Random(11)
-    process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
+    command = [sys.executable, "-c", PROGRAM]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert process.stdout
     try:
         for _ in range(100):

@@ -42,9 +42,8 @@ def test_a_simulated_fish_that_a_file_names_has_nothing_to_release(tmp_path: Pat
     service = {"SERVICE_RESULT": "success", "FISHD_CONFIG": "/nowhere/fishd.yaml"}
     ended = release("--config", str(file), **service)
     assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout == (
-        f"the service ended with 'success': a simulated fish, by {file}, has nothing to release\n"
-    )
+    ended_well = "the service ended with 'success': a simulated fish"
+    assert ended.stdout == f"{ended_well}, by {file}, has nothing to release\n"
 
 
 def test_without_any_file_it_is_no_success_and_says_how_to_name_one() -> None:
@@ -96,9 +95,8 @@ def test_a_fishd_that_drives_the_servo_is_asked_for_an_emergency_stop(pi: Bench)
         pi.wait_for_pulse(1600, 1700)
         ended = release(*pi.settings, "--set", f"control.address={daemon.endpoint}")
         assert (ended.returncode, ended.stderr) == (0, "")
-        assert ended.stdout == (
-            f"fishd (pid {daemon.process.pid}) was asked: mode estop, there are no pulses\n"
-        )
+        pid = daemon.process.pid
+        assert ended.stdout == f"fishd (pid {pid}) was asked: mode estop, there are no pulses\n"
         pi.wait_for_pulse(0, 0)  # at the end of the pulse that has begun
         assert daemon.status().mode == "estop"
         assert daemon.status().recovered_errors["servo_reconnects"] == 0
@@ -162,10 +160,7 @@ def test_a_state_folder_that_cannot_be_does_not_keep_the_servo_energised(
 ) -> None:
     ended = release(*pi.settings, "--set", f"state_folder={folder}")
     assert (ended.returncode, ended.stdout) == (0, "pulses were on: neutral, then off\n")
-    assert re.fullmatch(
-        r"fishctl: --set state_folder=[^\n]+: state_folder: [^\n]+; going on without it\n",
-        ended.stderr,
-    )
+    assert re.fullmatch(r"fishctl: --set .*: state_folder: .*; going on without it\n", ended.stderr)
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
 
 

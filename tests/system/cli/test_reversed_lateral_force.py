@@ -69,16 +69,10 @@ def test_status_doctor_and_calibrate_force_say_it_and_the_right_calibration_ends
     assert level == "warning"
     assert LINE in message
 
-    still_reversed = interchanged.fishctl(
-        "calibrate", "force", "--loads", loads_file(rig.folder, -1), "--yes"
-    )
-    assert "F_y is reversed, as was seen when the tail last set off, and this calibration" in (
-        still_reversed.stderr
-    )
-    right = interchanged.fishctl(
-        "calibrate", "force", "--loads", loads_file(rig.folder, 1), "--yes"
-    )
-    assert right.stderr == ""
+    calibrate = ("calibrate", "force", "--yes", "--loads")
+    wrong = interchanged.fishctl(*calibrate, loads_file(rig.folder, -1))
+    assert "reversed, as was seen when the tail last set off, and this calibration" in wrong.stderr
+    assert interchanged.fishctl(*calibrate, loads_file(rig.folder, 1)).stderr == ""
     assert LINE not in interchanged.fishctl("status").stdout
 
 

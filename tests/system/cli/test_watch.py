@@ -152,9 +152,7 @@ def test_it_draws_until_a_signal_and_restores_the_terminal(daemon: Daemon, numbe
     terminal.wait_for("RUNNING")
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         # Events have a separate subscription, which may begin after the first tick is drawn.
-        terminal.wait_for(
-            "mark: a weight on the sensor", meanwhile=lambda: fish.mark("a weight on the sensor")
-        )
+        terminal.wait_for("mark: a weight on it", meanwhile=lambda: fish.mark("a weight on it"))
         fish.estop("the net")
     terminal.wait_for("estop: the net")
     terminal.signal(number)
@@ -207,13 +205,8 @@ def tick(seq: int, t: float | None = None, **fields: Any) -> Tick:
     """Return a tick of a loop of 50 ms, with a wave on both forces."""
     numbers = {name: 0.0 for name in Tick.__struct_fields__ if name not in ("alpha", "phi")}
     wave = {"fx": 0.02 + 0.02 * math.sin(0.5 * seq), "fy": 0.2 * math.sin(0.25 * seq)}
-    what = {
-        "seq": seq,
-        "mode": "running",
-        "controller": "swing",
-        "servo_on": True,
-        "missed_slots": 0,
-    }
+    what = {"seq": seq, "mode": "running", "controller": "swing", "servo_on": True}
+    what["missed_slots"] = 0
     return Tick(**numbers | what | wave | {"t": 0.05 * seq if t is None else t} | fields)
 
 

@@ -28,7 +28,6 @@ for number in range(400):
 
 
 def test_threads_that_see_a_type_for_the_first_time_together_crash_nothing() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", MANY_AT_ONCE], capture_output=True, text=True, timeout=120
-    )
+    command = [sys.executable, "-c", MANY_AT_ONCE]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")

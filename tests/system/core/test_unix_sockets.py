@@ -136,16 +136,12 @@ def test_a_stranger_is_told_by_folder_rights_and_by_who_listens(shared: Path) ->
     assert find_problem("his-with-me", OTHER_USER, USER) == f"FOLDER belongs to user {OTHER_USER}"
     assert find_problem("open", USER, USER, 0o777) == "other users may write to FOLDER"
     assert find_problem("group", USER, USER, 0o770) == "other users may write to FOLDER"
-    assert (
-        find_problem("slipped-in", USER, OTHER_USER)
-        == f"a process of user {OTHER_USER} listens there"
-    )
+    problem = find_problem("slipped-in", USER, OTHER_USER)
+    assert problem == f"a process of user {OTHER_USER} listens there"
     (shared / "link").symlink_to(shared / "mine")
     with user(USER):
-        assert (
-            find_trust_problem(shared / "link" / "control")
-            == f"{shared / 'link'} is a symbolic link"
-        )
+        link = shared / "link"
+        assert find_trust_problem(link / "control") == f"{link} is a symbolic link"
         assert find_trust_problem(shared / "nowhere" / "control") == ""
 
 

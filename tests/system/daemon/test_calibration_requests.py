@@ -158,9 +158,8 @@ def test_samples_that_are_under_way_end_as_soon_as_a_controller_starts(rig: Lock
     async def run() -> list[Any]:
         long = SampleForce(seconds=60.0)
         request = handler.handlers["sample-force"]
-        answers = asyncio.gather(
-            *(request(long) for _ in range(MAX_CONCURRENT_SAMPLES)), return_exceptions=True
-        )
+        requests = (request(long) for _ in range(MAX_CONCURRENT_SAMPLES))
+        answers = asyncio.gather(*requests, return_exceptions=True)
         await asyncio.sleep(0.1)
         rig.start("square")
         return await asyncio.wait_for(answers, 30.0)
@@ -175,19 +174,15 @@ def test_a_sample_is_good_for_a_tare_only_while_it_is_fresh(rig: LockstepRig) ->
     (sample,) = perform(rig, handler, ("sample-force", BRIEFLY))
     rig.run_for(MAX_SAMPLE_AGE_S + 1.0)
     for number in (sample.number, sample.number + 1, 0):
-        with pytest.raises(
-            Refused, match=f"sample {number} does not exist or is older than 10 s"
-        ) as refusal:
+        with pytest.raises(Refused, match=f"sample {number} does not exist or is older") as refusal:
             perform(rig, handler, ("tare", Tare(number)))
         assert refusal.value.code == "no-samples"
 
 
 def test_what_was_saved_is_in_force_at_the_next_start(rig: LockstepRig, tmp_path: Path) -> None:
     force, servo = ForceCalibration(xx=2.0), ServoCalibration(trim=30.0)
-    requests = (
-        ("calibrate-force", CalibrateForce(force)),
-        ("calibrate-servo", CalibrateServo(servo, save=True)),
-    )
+    calibrated = CalibrateServo(servo, save=True)
+    requests = (("calibrate-force", CalibrateForce(force)), ("calibrate-servo", calibrated))
     perform(rig, calibration_requests(rig), *requests)
     assert rig.run_for(0.5)[-1].fx == pytest.approx(0.4, abs=5e-3)
     assert rig.pulse == pytest.approx(1530.0)
@@ -333,7 +328,5 @@ def test_a_servo_calibration_is_saved_only_if_the_configuration_would_take_it(
 
 def test_a_date_that_a_file_could_not_hold_is_refused(rig: LockstepRig) -> None:
     request = ("calibrate-force", CalibrateForce(ForceCalibration(tare_date="today")))
-    with pytest.raises(
-        Refused, match="tare_date: 'today' is not a date: one in ISO 8601 is needed"
-    ):
+    with pytest.raises(Refused, match="tare_date: 'today' is not a date: one in ISO 8601"):
         perform(rig, calibration_requests(rig), request)

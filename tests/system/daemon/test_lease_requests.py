@@ -52,10 +52,8 @@ def test_a_lease_lasts_as_configured_or_as_asked_for_within_bounds(tmp_path: Pat
     async def story(client: Client) -> None:
         assert (await client.ask("take-lease", name="a")).seconds == 3.0
         assert (await client.ask("take-lease", name="b", take=True, seconds=9.0)).seconds == 9.0
-        for seconds in (0.1, 61.0, "long"):
-            refusal = await client.expect_refusal(
-                "take-lease", name="c", take=True, seconds=seconds
-            )
+        for s in (0.1, 61.0, "long"):
+            refusal = await client.expect_refusal("take-lease", name="c", take=True, seconds=s)
             assert refusal.code == "bad-arguments"
 
     run_story(tmp_path, story, "control.lease=3.0")

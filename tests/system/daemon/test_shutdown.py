@@ -62,9 +62,8 @@ def ends(*hangs: Mapping[str, Any]) -> list[tuple[int, str]]:
             assert process.stdout.readline() == "up\n"
         time.sleep(0.1)
         pool = stack.enter_context(ThreadPoolExecutor(len(hangs)))
-        return list(
-            pool.map(end_process, processes, [hang.get("number", SIGTERM) for hang in hangs])
-        )
+        numbers = [hang.get("number", SIGTERM) for hang in hangs]
+        return list(pool.map(end_process, processes, numbers))
 
 
 def start_process(
@@ -183,9 +182,8 @@ def test_an_answer_of_pigpiod_that_is_late_just_then_keeps_no_tail_from_neutral(
         def rest(seconds: float) -> None:
             widths.append(bench.width)
 
-        loop: Any = SimpleNamespace(
-            servo=SimpleNamespace(on=True), applied=0.5, robot=SimpleNamespace(servo=Thawing())
-        )
+        servo, robot = SimpleNamespace(on=True), SimpleNamespace(servo=Thawing())
+        loop: Any = SimpleNamespace(servo=servo, applied=0.5, robot=robot)
 
         async def move_to_neutral() -> None:
             daemon = DaemonInProcess(Config(lockstep=True), print_status=False)

@@ -40,9 +40,8 @@ def test_its_options_show_bounds_units_and_defaults(monkeypatch: pytest.MonkeyPa
 
 
 def test_it_is_listed_beside_the_controllers_that_come_with_fishd(site: Path) -> None:
-    known = {
-        info["name"]: info for info in json.loads(fishctl(site, "controllers", "--json").stdout)
-    }
+    listed = json.loads(fishctl(site, "controllers", "--json").stdout)
+    known = {info["name"]: info for info in listed}
     assert {"chirp", "square", "swing"} <= set(known)
     parameters = {field["name"]: field for field in known["chirp"]["parameters"]}
     assert parameters["highest"]["unit"] == "Hz"
@@ -78,9 +77,8 @@ def test_a_bad_parameter_is_one_line(option: str, complaint: str) -> None:
 def test_the_page_about_it_shows_what_a_run_prints(site: Path) -> None:
     page = (ROOT / "docs" / "how-to" / "writing-a-controller.md").read_text(encoding="utf-8")
     shown = page.partition("$ fishctl simulate chirp --seconds 130\n")[2].partition("timing ")[0]
-    assert (
-        shown == fishctl(site, "simulate", "chirp", "--seconds", "130").stdout.split("timing ")[0]
-    )
+    swum = fishctl(site, "simulate", "chirp", "--seconds", "130").stdout
+    assert shown == swum.split("timing ")[0]
 
 
 @pytest.mark.parametrize("name", ["fishd_chirp.py", "pyproject.toml"])

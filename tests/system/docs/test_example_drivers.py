@@ -368,9 +368,8 @@ def test_pca9685_a_fish_swims_on_it_beside_the_force_sensor_on_its_bus(tmp_path:
 def test_doctor_names_both_with_their_checks_and_release_works(site: Path, tmp_path: Path) -> None:
     servo = ["robot=pi", "servo.driver=pca9685", f"servo.bus={BUS}"]
     checks = doctor(site, tmp_path, "force_sensor.driver=hx711", *servo)
-    assert checks["drivers"]["message"] == (
-        "force_sensor hx711 of fishd-hx711 0.1.0, servo pca9685 of fishd-pca9685 0.1.0"
-    )
+    used = "force_sensor hx711 of fishd-hx711 0.1.0, servo pca9685 of fishd-pca9685 0.1.0"
+    assert checks["drivers"]["message"] == used
     assert checks["load cells"]["message"] == "±16.8 mV at a gain of 128, 80 per second"
     assert checks["force"]["level"] == "FAIL"  # this machine has no GPIO pins
     assert "adc" not in checks

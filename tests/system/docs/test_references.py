@@ -52,9 +52,8 @@ def test_the_help_of_a_program_lists_what_it_measures(words: list[str]) -> None:
     program = [sys.executable, str(ROOT / "tools" / words[0]), *words[1:], "--help"]
     done = subprocess.run(program, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert {"bench": "coverage", "swimmer": "cylinder", "reliability": "kills"}[words[-1]] in (
-        done.stdout
-    )
+    example = {"bench": "coverage", "swimmer": "cylinder", "reliability": "kills"}[words[-1]]
+    assert example in done.stdout
 
 
 def test_every_kind_of_event_is_described() -> None:

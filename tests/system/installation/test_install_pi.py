@@ -49,14 +49,8 @@ class Pi:
         if not words[0].endswith(".sh"):  # sourced, the script only defines its functions
             step = f'source {CHECKOUT}/tools/install_pi.sh; workspace=$(mktemp -d); "$@"'
             command = ["bash", "-c", f"{step}; rm -r $workspace", "install_pi.sh", *words]
-        return subprocess.run(
-            command,
-            env=environment | variables,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=300,
-        )
+        options = {"capture_output": True, "text": True, "check": False, "timeout": 300}
+        return subprocess.run(command, env=environment | variables, **options)
 
     def copy(self, folder: Path) -> "Pi":
         shutil.copytree(self.disk, folder, symlinks=True, copy_function=self._copy_or_link)
@@ -173,9 +167,8 @@ def test_a_config_that_nobody_edited_is_renewed(pi: Pi) -> None:
 
 
 def test_a_python_that_is_gone_is_replaced(installed: Pi) -> None:
-    subprocess.run(
-        [installed.disk / "opt/fishd/bin/python3", "-I", "-c", "import fishd"], check=True
-    )
+    python = installed.disk / "opt/fishd/bin/python3"
+    subprocess.run([python, "-I", "-c", "import fishd"], check=True)
     assert not (installed.disk / "opt/fishd/lib/python3.9").exists()
 
 

@@ -19,11 +19,8 @@ WITHOUT = ("test_learning_curves.py", "test_learning_settings.py")
 
 
 def pytest_report_header() -> str | None:
-    return (
-        f"tests/system/learning: most are left out, without {', '.join(MISSING)}"
-        if MISSING
-        else None
-    )
+    missing = ", ".join(MISSING)
+    return f"tests/system/learning: most are left out, without {missing}" if MISSING else None
 
 
 def pytest_ignore_collect(collection_path: Path) -> bool | None:

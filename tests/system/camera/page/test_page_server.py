@@ -177,10 +177,8 @@ async def neighbour(server: PageServer) -> AsyncIterator[aiohttp.ClientSession]:
 def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone() -> None:
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
         async with neighbour(server) as second_session:
-            socks = [
-                await session.ws_connect("/live")
-                for _ in range(page_server.MAX_VIEWERS_PER_ADDRESS)
-            ]
+            most = page_server.MAX_VIEWERS_PER_ADDRESS
+            socks = [await session.ws_connect("/live") for _ in range(most)]
             await check_refused(session)
             while len(socks) < page_server.MAX_VIEWERS:
                 socks.append(await second_session.ws_connect("/live"))
