@@ -182,8 +182,8 @@ def test_an_answer_of_pigpiod_that_is_late_just_then_keeps_no_tail_from_neutral(
         def rest(seconds: float) -> None:
             widths.append(bench.width)
 
-        servo, robot = SimpleNamespace(on=True), SimpleNamespace(servo=Thawing())
-        loop: Any = SimpleNamespace(servo=servo, applied=0.5, robot=robot)
+        shown, robot = SimpleNamespace(on=True), SimpleNamespace(servo=Thawing())
+        loop: Any = SimpleNamespace(servo=shown, applied=0.5, robot=robot)
 
         async def move_to_neutral() -> None:
             daemon = DaemonInProcess(Config(lockstep=True), print_status=False)
