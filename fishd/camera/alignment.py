@@ -98,9 +98,8 @@ def _centred_crop(axis: Axis, size: int, picture: tuple[int, int], crop: Square)
     height, shorter = picture[0], min(picture)
     side = crop.side * shorter
     half = 0.5 * side / height
-    middle = min(
-        max(crop.y, half), 1.0 - half
-    )  # where the square is after it was moved inside the picture
+    # Where the square is after it was moved inside the picture.
+    middle = min(max(crop.y, half), 1.0 - half)
     middle += axis.offset * side / size / height
     room = 2.0 * min(middle, 1.0 - middle) * height
     return Square(x=crop.x, y=middle, side=max(0.05, min(side, room) / shorter))

@@ -186,9 +186,8 @@ class TailPainter:
     def _ripples(self) -> Array:
         """Return a smooth random pattern with a period of `size` pixels in both directions."""
         size = self._size
-        waves = np.fft.fftfreq(
-            size, 1.0 / (size * _RIPPLE_LENGTH)
-        )  # relative to the frequency of a ripple
+        # Relative to the frequency of a ripple.
+        waves = np.fft.fftfreq(size, 1.0 / (size * _RIPPLE_LENGTH))
         square = waves[:, None] ** 2 + waves[None, :] ** 2
         spectrum = np.fft.fft2(self._random.standard_normal((size, size)))
         pattern = np.fft.ifft2(spectrum * square * np.exp(-square)).real

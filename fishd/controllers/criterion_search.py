@@ -225,9 +225,8 @@ class CriterionSearch:
         level = _mean(levels[::2])
         scatter = 1.25 * _mean([abs(value - level) for value in levels])
         level_error = scatter * math.sqrt(1.5 / len(levels))
-        if (
-            len(self._halves) < 2 * TRIAL_BEATS
-        ):  # the gait is not settled, which disturbs a turned sensor
+        # The gait is not settled, which disturbs a turned sensor.
+        if len(self._halves) < 2 * TRIAL_BEATS:
             level_error = self.ripple
         return Judgement(self.ripple, error, half_beat, level, level_error)
 

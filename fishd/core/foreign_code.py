@@ -110,9 +110,8 @@ class Attempt(Generic[T]):
                 raise error
             return self._result[0]
         finally:
-            del (
-                error
-            )  # its traceback refers to this frame: the cycle would keep the function's data alive
+            # Its traceback refers to this frame: the cycle would keep the function's data alive.
+            del error
 
     def give_up(self) -> bool:
         """Give up the call, and end a loop in Python; return False if the call has finished."""

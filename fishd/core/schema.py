@@ -229,9 +229,8 @@ def _find_similar(word: str, words: list[str]) -> list[str]:
     def distance(known: str) -> int:
         return len(letters.symmetric_difference(known)) + abs(len(known) - len(word))
 
-    candidates = heapq.nsmallest(
-        _MAX_CANDIDATES, words, distance
-    )  # difflib alone takes milliseconds
+    # `difflib` alone takes milliseconds.
+    candidates = heapq.nsmallest(_MAX_CANDIDATES, words, distance)
     return difflib.get_close_matches(word, candidates, n=1, cutoff=0.6)
 
 

@@ -118,9 +118,8 @@ class Dealer(ABC, Generic[T]):
             with suppress(OSError):
                 self._socket.send(_frame(0, farewell))
                 self._socket.shutdown(socket.SHUT_WR)
-                while self._socket.recv(
-                    _CHUNK
-                ):  # with unread data, the kernel would discard the message
+                # With unread data, the kernel would discard the message.
+                while self._socket.recv(_CHUNK):
                     pass
         self._drop()
         self._poll.close()

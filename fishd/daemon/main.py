@@ -80,9 +80,8 @@ class Daemon:
             stack.enter_context(addresses.claim_address(address))
             stack.enter_context(addresses.claim_address(config.telemetry.address))
             self._gateways = Gateways(address, config.telemetry.address, stack)
-            stack.callback(
-                realtime.drop_priority
-            )  # before the gateways end, after the servo is released
+            # Before the gateways end, after the servo is released.
+            stack.callback(realtime.drop_priority)
             self._telemetry = Telemetry(self._gateways.telemetry.send)
             self._mock_ticks = None if self._virtual else mock_ticks(config)
             controllers = registry.describe_all()  # imports the controllers of other packages
@@ -222,9 +221,7 @@ class Daemon:
             with suppress(Exception):  # closing the servo comes later, and reports errors
                 servo = self._loop.robot.servo
                 servo.write(0.0)
-                servo.write(
-                    0.0
-                )  # a driver that tolerates a late answer may not have sent the first
+                servo.write(0.0)  # a driver may not have sent the first after a late answer
                 self._clock.sleep(NEUTRAL_TIME_S)
 
     def _release(self) -> None:

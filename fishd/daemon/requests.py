@@ -342,9 +342,8 @@ def _create_newly_installed(name: str, create: Callable[[], Controller[Any]]) ->
     try:
         return create()
     except UnknownController as error:
-        if (
-            name in registry.names()
-        ):  # its package cannot be imported, for example from a new folder
+        # Its package is there but cannot be imported, for example from a new folder.
+        if name in registry.names():
             raise UnknownController(
                 f"{text.error_message(error)}; it was installed after fishd had started: restart "
                 "fishd"

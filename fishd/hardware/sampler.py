@@ -1,6 +1,8 @@
-"""Sampler of a driver, which it opens again after failures."""
+"""Sampler of a driver, which it opens again after failures, and the parts that have one."""
 
 import math
+import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from contextlib import suppress
 from typing import Any, Generic, TypeVar
@@ -8,7 +10,7 @@ from typing import Any, Generic, TypeVar
 from fishd.core import text
 from fishd.core.clock import Clock
 from fishd.core.foreign_code import call_foreign
-from fishd.hardware.driver import Pair, PowerSample, SampledDriver
+from fishd.hardware.driver import Pair, PowerSample, SampledDriver, read_counters
 
 X = TypeVar("X", Pair, PowerSample)
 
@@ -19,6 +21,8 @@ REOPEN_FAILURES = 3
 MAX_PAUSE_S = 0.5
 """Longest time between two attempts [s]."""
 _MIN_PAUSE_S = 1e-3
+CLOSE_TIMEOUT_S = 0.5
+"""Longest wait for the end of a thread that samples [s]."""
 
 
 class Sampler(Generic[X]):
@@ -82,3 +86,58 @@ class Sampler(Generic[X]):
             return call_foreign(self._driver.explain, error)
         except Exception:  # a failure of `explain` must not hide the error itself
             return text.describe_error(error)
+
+
+class SampledPart(ABC, Generic[X]):
+    """Part of the robot whose driver is sampled: in a thread, or in virtual time on request."""
+
+    def __init__(self, driver: SampledDriver[Any], clock: Clock) -> None:
+        """Start nothing yet."""
+        self._clock = clock
+        self._driver = driver
+        self._place = driver.place
+        self._sampler: Sampler[X] = Sampler(driver, clock)
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def counters(self) -> dict[str, int]:
+        """Return the numbers of recovered errors since start."""
+        sampler, transport = self._sampler, self._driver.transport
+        return {
+            f"{transport}_errors": sampler.errors,
+            f"{transport}_reconnects": sampler.reconnects,
+            **read_counters(self._driver),
+        }
+
+    def close(self) -> None:
+        """Stop sampling and release the hardware; may be called twice, and never hangs.
+
+        A thread that hangs in a transfer is left to end by itself.
+        """
+        self._closing.set()
+        if self._thread is None:
+            self._sampler.close()
+        else:
+            self._thread.join(CLOSE_TIMEOUT_S)
+
+    def _start_thread(self, name: str) -> None:
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def _run(self) -> None:
+        """Sample until closed, in the thread."""
+        while not self._closing.is_set():
+            pause = self._pause()
+            if pause > 0.0:
+                self._closing.wait(pause)
+            else:
+                self._step()
+        self._sampler.close()
+
+    @abstractmethod
+    def _pause(self) -> float:
+        """Return how long to wait before looking again whether a sample is due [s]; 0 if it is."""
+
+    @abstractmethod
+    def _step(self) -> None:
+        """Make one attempt to sample."""

@@ -40,9 +40,8 @@ class BlackBox:
         self._make_room(0)
         for path in self._list_own_files():
             if path.name.endswith(PART_SUFFIX) and not is_being_written(path):
-                with suppress(
-                    RecordingError
-                ):  # a file that cannot be recovered is removed as the oldest
+                # A file that cannot be recovered is removed as the oldest.
+                with suppress(RecordingError):
                     recover(path)
         self._opened = time.monotonic()
         return self._open_writer(new_path(self._folder, FILE_PREFIX))

@@ -42,9 +42,8 @@ def recover(path: Path) -> Run:
     final = path.with_name(run.name + ("" if is_part else "-recovered") + SUFFIX)
     try:
         with lock_recording(path):
-            final.with_name(final.name + RECOVERING_SUFFIX).unlink(
-                missing_ok=True
-            )  # left by a kill
+            # Left by a kill.
+            final.with_name(final.name + RECOVERING_SUFFIX).unlink(missing_ok=True)
             if is_part and run.finished and not run.is_damaged and not final.exists():
                 rename_to_final(path, final)  # the recorder was killed just before
             elif not (is_part and _is_copy(final, run)):

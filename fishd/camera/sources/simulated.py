@@ -81,11 +81,10 @@ class Foresight:
         now = Tail(tick.time, tick.alpha, tick.alpha_rate)
         parts = []
         if last_tick is None or tick.seq != last_tick.seq + 1:
-            self._fish = TetheredFish(self._description.plant, PlantState(phi=tick.phi))
-            if (
-                self._description.plant.servo_delay
-            ):  # the commands within the servo's delay are unknown
-                self._swim(command, self._description.plant.servo_delay + period)
+            plant = self._description.plant
+            self._fish = TetheredFish(plant, PlantState(phi=tick.phi))
+            if plant.servo_delay:  # the commands within the servo's delay are unknown
+                self._swim(command, plant.servo_delay + period)
         elif tick.time > self._end.time + TIME_TOLERANCE_S:  # after ticks that fishd has skipped
             self._swim(last_tick.phi_c if last_tick.servo_on else None, tick.time - self._end.time)
             parts.append((self._end, now))
@@ -159,9 +158,8 @@ class SimulatedSource:
                     last_tick_time = time.monotonic()
                     if fish.status().pid != status.pid:
                         return
-                    if not socket.poll(
-                        LATE_ANSWER_WAIT_MS
-                    ):  # otherwise this process was delayed itself
+                    # With a waiting tick, it was this process that was delayed.
+                    if not socket.poll(LATE_ANSWER_WAIT_MS):
                         view.report_idle()
                 view.ahead = offset.update().seconds
         finally:

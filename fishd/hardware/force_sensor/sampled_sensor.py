@@ -4,7 +4,6 @@ In virtual time a read samples instead of a thread, until its clock has reached 
 """
 
 import math
-import threading
 from collections.abc import Callable
 from typing import Any
 
@@ -14,9 +13,9 @@ from fishd.core.calibration import ForceCalibration
 from fishd.core.clock import Clock
 from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
-from fishd.hardware.driver import ForceSensorDriver, Pair, read_counters
+from fishd.hardware.driver import ForceSensorDriver, Pair
 from fishd.hardware.force_sensor.window import VoltageWatch, WindowEvaluation
-from fishd.hardware.sampler import Sampler
+from fishd.hardware.sampler import SampledPart
 
 QUIET_TIME_S = 2.2e-3
 """Time without conversions before and after a read, at most an eighth of a tick [s].
@@ -24,11 +23,9 @@ QUIET_TIME_S = 2.2e-3
 It is the time for which the ticker is awake before a deadline: two threads of one interpreter delay
 each other.
 """
-CLOSE_TIMEOUT_S = 0.5
-"""Longest wait for the thread to end [s]."""
 
 
-class SampledSensor:
+class SampledSensor(SampledPart[Pair]):
     """Force sensor that measures voltages and can be calibrated.
 
     Only the thread that ticks may read, watch and calibrate it.
@@ -52,26 +49,19 @@ class SampledSensor:
         between_samples: function called before each sample in virtual time, for other users of the
             clock
         """
+        super().__init__(driver, clock)
         self.calibration = calibration
         """Calibration that turns voltages into forces."""
-        self._clock = clock
         self._tick = tick
         self._quiet_time = min(QUIET_TIME_S, 0.125 * tick)
         self._step_time = 0.0
         self._between_samples = between_samples
-        self._place = driver.place
-        self._transport = driver.transport
-        self._driver = driver
-        self._sampler: Sampler[Pair] = Sampler(driver, clock)
         self._evaluation = WindowEvaluation(driver.settings, driver.names, driver.raw_unit)
         self._latest: Measurement | None = None
         self._watches: list[VoltageWatch] = []
         self._next_read = math.inf
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
         if threaded:
-            self._thread = threading.Thread(target=self._run, name="force-sampler", daemon=True)
-            self._thread.start()
+            self._start_thread("force-sampler")
 
     def recalibrate(self, calibration: ForceCalibration) -> None:
         """Use another calibration from the next read on."""
@@ -116,26 +106,6 @@ class SampledSensor:
         self._watches.append(watch)
         return watch
 
-    def counters(self) -> dict[str, int]:
-        """Return the numbers of recovered errors since start."""
-        sampler, transport = self._sampler, self._transport
-        return {
-            f"{transport}_errors": sampler.errors,
-            f"{transport}_reconnects": sampler.reconnects,
-            **read_counters(self._driver),
-        }
-
-    def close(self) -> None:
-        """Stop sampling and release the hardware; may be called twice, and never hangs.
-
-        A thread that hangs in a transfer is left to end by itself.
-        """
-        self._closing.set()
-        if self._thread is None:
-            self._sampler.close()
-        else:
-            self._thread.join(CLOSE_TIMEOUT_S)
-
     def _take(self, now: float) -> list[Pair]:
         """Return all new pairs; a deque needs no lock for that, so the tick never waits.
 
@@ -166,23 +136,13 @@ class SampledSensor:
         duration = min(self._clock.monotonic() - started, 0.125 * self._tick)
         self._step_time = max(duration, self._step_time + 0.01 * (duration - self._step_time))
 
-    def _run(self) -> None:
-        """Sample until closed, in the thread."""
-        clock, sampler = self._clock, self._sampler
-        while not self._closing.is_set():
-            pause = max(sampler.ready_at - clock.monotonic(), self._pause())
-            if pause > 0.0:
-                self._closing.wait(pause)
-            else:
-                self._step()
-        sampler.close()
-
     def _pause(self) -> float:
-        """Return how long to pause so that the tick need not wait for the interpreter [s].
+        """Return how long to pause, so that the tick need not wait for the interpreter [s].
 
         The pause is around an expected read: it ends some time after the read.
         """
-        late = self._clock.monotonic() - self._next_read
-        if not -self._quiet_time - self._step_time <= late < self._quiet_time:
-            return 0.0
-        return 0.25 * self._quiet_time - min(late, 0.0)
+        now = self._clock.monotonic()
+        pause, late = self._sampler.ready_at - now, now - self._next_read
+        if -self._quiet_time - self._step_time <= late < self._quiet_time:
+            pause = max(pause, 0.25 * self._quiet_time - min(late, 0.0))
+        return pause

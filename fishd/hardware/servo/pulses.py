@@ -21,9 +21,8 @@ def pulse_width(servo: "ServoSettings", angle: float) -> float:
     Raises `ServoError` for an angle that is not finite or beyond the soft limits, and for a pulse
     that no servo accepts. The guard limits commands before they get here.
     """
-    if (
-        not servo.lowest - ANGLE_TOLERANCE_RAD <= angle <= servo.highest + ANGLE_TOLERANCE_RAD
-    ):  # NaN is refused too
+    # NaN is refused too.
+    if not servo.lowest - ANGLE_TOLERANCE_RAD <= angle <= servo.highest + ANGLE_TOLERANCE_RAD:
         raise ServoError(
             f"the angle {angle:g} rad is not within the servo's soft limits, "
             f"{servo.lowest:g} to {servo.highest:g} rad"

@@ -24,7 +24,7 @@ from fishd.core.clock import VirtualClock
 from fishd.core.errors import ConfigError, ServoError, StartupError
 from fishd.hardware import ownership
 from fishd.hardware.driver import Pair
-from fishd.hardware.force_sensor.sampled_sensor import Sampler
+from fishd.hardware.sampler import Sampler
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.i2c import I2cBus

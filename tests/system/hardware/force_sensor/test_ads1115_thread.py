@@ -13,7 +13,8 @@ from fishd.core.clock import SystemClock
 from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
-from fishd.hardware.force_sensor.sampled_sensor import CLOSE_TIMEOUT_S, SampledSensor
+from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+from fishd.hardware.sampler import CLOSE_TIMEOUT_S
 
 
 def threaded() -> SampledSensor:
