@@ -37,13 +37,7 @@ from fishd.config.drivers import (
     settings_of_drivers,
 )
 from fishd.controllers import registry
-from fishd.controllers.base import (
-    DEFAULT_DWELL_S,
-    MAX_DWELL_S,
-    ChatterSettings,
-    Controller,
-    Limits,
-)
+from fishd.controllers.base import DEFAULT_DWELL_S, MAX_DWELL_S, ChatterSettings, Controller, Limits
 from fishd.core import strict_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.estimation import EstimatorSettings

@@ -75,8 +75,7 @@ FAULTS = {
         "start the agent again, or give it a longer deadline",
     ),
     "remote-error": Fault(
-        "the agent of `remote` sent something that is not an answer",
-        "correct the agent",
+        "the agent of `remote` sent something that is not an answer", "correct the agent"
     ),
     "servo-link": Fault(
         "the servo cannot be driven; fishd keeps trying to reach it, and releases it as soon as "
@@ -84,8 +83,7 @@ FAULTS = {
         "check that pigpiod, or the PWM channel, runs and that nothing else uses it",
     ),
     "estop-button": Fault(
-        "the E-stop button cannot be read",
-        "check that nothing else uses the pin of the button",
+        "the E-stop button cannot be read", "check that nothing else uses the pin of the button"
     ),
     "publish-error": Fault(
         "telemetry cannot be encoded or sent; not because of a slow subscriber",

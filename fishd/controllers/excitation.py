@@ -30,8 +30,7 @@ class ExcitationParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_o
         float, unit("s", "Time of a sweep from lowest to highest and back.", ge=1, le=3600)
     ] = 20.0
     amplitude: Annotated[
-        Amplitude,
-        unit("rad", "The larger instruction angle; null: the robot's amplitude_limit."),
+        Amplitude, unit("rad", "The larger instruction angle; null: the robot's amplitude_limit.")
     ] = None
     smaller: Annotated[
         float, unit("1", "The smaller instruction angle, as a fraction of the larger.", gt=0, le=1)

@@ -37,11 +37,7 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     longest_half_period: Annotated[
         float,
         unit(
-            "s",
-            "Reverse after this time even if the fin does not slow down.",
-            gt=0,
-            le=10,
-            usual=5,
+            "s", "Reverse after this time even if the fin does not slow down.", gt=0, le=10, usual=5
         ),
     ] = 1.0
     lead: Annotated[
@@ -67,8 +63,7 @@ class Swing(Controller[SwingParameters]):
     # A lead changes only the size of the wave; `thrust`, which has none, has the same wave.
     swims_like: ClassVar[Likeness | None] = Likeness("swing", frozenset({"lead"}))
     top_speed: float = quantity(
-        "1",
-        "Top speed of the fin in this half beat, or, until it is reached, in the previous one.",
+        "1", "Top speed of the fin in this half beat, or, until it is reached, in the previous one."
     )
     reversal_speed: float = quantity("1", "C times `top_speed`: the tail reverses at this speed.")
     since_reversal: float = quantity("s", "Time since the last reversal.")

@@ -48,11 +48,7 @@ class ThrustParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     longest_half_period: Annotated[
         float,
         unit(
-            "s",
-            "Reverse after this time even if the fin does not slow down.",
-            gt=0,
-            le=10,
-            usual=5,
+            "s", "Reverse after this time even if the fin does not slow down.", gt=0, le=10, usual=5
         ),
     ] = 1.0
 

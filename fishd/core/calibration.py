@@ -61,10 +61,7 @@ class ForceCalibration(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     def forces(self, vx: float, vy: float) -> tuple[float, float]:
         """Return F_x and F_y [N] for two voltages [V]."""
-        return (
-            self.xx * vx + self.xy * vy + self.x0,
-            self.yx * vx + self.yy * vy + self.y0,
-        )
+        return (self.xx * vx + self.xy * vy + self.x0, self.yx * vx + self.yy * vy + self.y0)
 
     def thrust_ci95(self, fx: float, fy: float = 0.0) -> float | None:
         """Return the half-width of the 95 % confidence interval of a force difference [N].

@@ -248,9 +248,7 @@ OPERATIONS = {
     "policies": Operation(NoArguments, "list of [policies](#policies)", "nothing"),
     "config": Operation(NoArguments, _CONFIG, "nothing"),
     "set-controller": Operation(
-        SetController,
-        _STATE,
-        "activates a new controller; omitted parameters take their defaults",
+        SetController, _STATE, "activates a new controller; omitted parameters take their defaults"
     ),
     "set-parameter": Operation(
         SetParameter, _STATE, "changes these parameters of the active controller, all or none"

@@ -454,8 +454,7 @@ class Status(Struct, frozen=True):
         note("Reason why the active controller replaced the one that was set; else null."),
     ] = None
     sensor_lost: Annotated[
-        bool,
-        note("True while no force can be trusted; `thrust` is then the last known one."),
+        bool, note("True while no force can be trusted; `thrust` is then the last known one.")
     ] = False
     name: Annotated[
         str, note("Name of the fish: `name` in the configuration, else the name of the machine.")
@@ -482,8 +481,7 @@ class Status(Struct, frozen=True):
     clock: Annotated[float, unit("s", "Time of the snapshot, on fishd's monotonic clock.")] = 0.0
     speed: Annotated[float | None, unit("m/s", "As in `tick`; null for a tethered fish.")] = None
     power: Annotated[
-        float | None,
-        unit("W", "Mean of `power` over the last 2 s; null if unknown."),
+        float | None, unit("W", "Mean of `power` over the last 2 s; null if unknown.")
     ] = None
     boot_id: Annotated[
         str,

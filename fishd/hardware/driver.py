@@ -14,12 +14,7 @@ from fishd.core.clock import Clock
 from fishd.core.foreign_code import call_foreign
 from fishd.core.schema import Problem, note, unit
 from fishd.hardware.checks import Check, Machine, Result
-from fishd.hardware.settings import (
-    ForceSensorSettings,
-    Gpio,
-    PowerMeterSettings,
-    ServoSettings,
-)
+from fishd.hardware.settings import ForceSensorSettings, Gpio, PowerMeterSettings, ServoSettings
 
 __all__ = [
     "Check",

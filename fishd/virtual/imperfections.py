@@ -18,8 +18,7 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Settings of the simulated rig's errors and of its servo's motor."""
 
     noise: Annotated[
-        float,
-        unit("N", "RMS noise of each force, averaged over one tick.", ge=0, le=1, usual=0.1),
+        float, unit("N", "RMS noise of each force, averaged over one tick.", ge=0, le=1, usual=0.1)
     ] = 1e-3
     noise_freedom: Annotated[
         Annotated[float, Meta(ge=2.1, le=1000)] | None,
@@ -92,12 +91,7 @@ class SimulationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     ] = 0.0
     rotation: Annotated[
         float,
-        unit(
-            "rad",
-            "Rotation of the sensor's axes relative to the fish.",
-            ge=-math.pi,
-            le=math.pi,
-        ),
+        unit("rad", "Rotation of the sensor's axes relative to the fish.", ge=-math.pi, le=math.pi),
     ] = 0.0
     sample_rate: Annotated[
         float,

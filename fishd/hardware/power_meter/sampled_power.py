@@ -28,12 +28,7 @@ class SampledPower(SampledPart[PowerSample]):
     """Power meter that samples by itself; `read` and `close` are for the thread that ticks."""
 
     def __init__(
-        self,
-        driver: PowerMeterDriver[Any],
-        clock: Clock,
-        *,
-        threaded: bool,
-        tick: float,
+        self, driver: PowerMeterDriver[Any], clock: Clock, *, threaded: bool, tick: float
     ) -> None:
         """Start to sample; a meter that is missing may appear later.
 

@@ -62,12 +62,7 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     ] = 1.0
     quadratic_drag: Annotated[
         float,
-        unit(
-            "1/rad",
-            "Quadratic drag c of the fin: −c |α̇| α̇ is added to α̈.",
-            ge=0.0,
-            le=100.0,
-        ),
+        unit("1/rad", "Quadratic drag c of the fin: −c |α̇| α̇ is added to α̈.", ge=0.0, le=100.0),
     ] = 0.0
     lateral_quadratic_drag: Annotated[
         float,

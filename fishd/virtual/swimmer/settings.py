@@ -122,8 +122,7 @@ class SwimmerSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         ),
     ] = 1.0
     sensor_time: Annotated[
-        float,
-        unit("s", "Time constant of the filters of the fish's sensors.", ge=0.0, le=1.0),
+        float, unit("s", "Time constant of the filters of the fish's sensors.", ge=0.0, le=1.0)
     ] = 0.005
     slow_motion: Annotated[
         float,
