@@ -142,7 +142,6 @@ def _print_state(state: "State") -> None:
         if contender.true_thrust is not None:
             echo(
                 f"{contender.name}: truly {1e3 * contender.true_thrust:.2f} mN, "
-                f"{contender.true_relative_thrust:.1%} of "
-                "the best of all square waves"
+                f"{contender.true_relative_thrust:.1%} of the best of all square waves"
             )
     echo(f"{state.tank_time:.0f} s of tank time")

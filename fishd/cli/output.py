@@ -117,9 +117,8 @@ def warn_of_fin(amplitude: float, where: str = "") -> None:
 
     if amplitude > MAX_FIN_ANGLE_RAD:
         echo(
-            f"fishctl: the fin swings by ±{amplitude:.2f} rad{where}: beyond "
-            f"{MAX_FIN_ANGLE_RAD:g} rad "
-            "the equations of the fish do not hold, nor does this thrust",
+            f"fishctl: the fin swings by ±{amplitude:.2f} rad{where}: beyond {MAX_FIN_ANGLE_RAD:g} "
+            "rad the equations of the fish do not hold, nor does this thrust",
             err=True,
         )
 

@@ -62,9 +62,8 @@ def _compare_with_best(
     return {
         field.name: (
             f"{field.name}: {format_quantity(values[field.name], 'N')} is "
-            f"{values[field.name] / best:.3g} "
-            "times the best thrust known: the best square wave of the configured fish gives "
-            f"{best:.3g} N, {1e3 * best:.3g} mN"
+            f"{values[field.name] / best:.3g} times the best thrust known: the best square wave of "
+            f"the configured fish gives {best:.3g} N, {1e3 * best:.3g} mN"
             + (
                 f" ({ask_for_unit(values[field.name], 'N')})"
                 if values[field.name] > 2 * best

@@ -106,8 +106,7 @@ class Swing(Controller[SwingParameters]):
         if limits.tick > MAX_TICK_S:
             raise ParameterError(
                 f"C: auto needs ticks of {MAX_TICK_S:g} s at most, not {limits.tick:g} s, to "
-                "measure "
-                "the ripple of F_x; a number in [0, 1] is needed"
+                "measure the ripple of F_x; a number in [0, 1] is needed"
             )
 
     def retune(self, parameters: SwingParameters) -> None:

@@ -97,8 +97,7 @@ class Thrust(Controller[ThrustParameters]):
         if limits.tick > MAX_TICK_S:
             raise ParameterError(
                 f"it needs ticks of {MAX_TICK_S:g} s at most, not {limits.tick:g} s, to measure "
-                "the "
-                "ripple of F_x"
+                "the ripple of F_x"
             )
 
     def activate(self, observation: Observation) -> None:

@@ -275,7 +275,6 @@ def _explain_bind_error(address: str, error: Exception, key: str, in_use: str) -
     if unknown and isinstance(where := parse(address), Tcp):
         return (
             f"{where.host} is not an address of this machine; write tcp://127.0.0.1:{where.port}, "
-            "or "
-            f"tcp://0.0.0.0:{where.port} for all"
+            f"or tcp://0.0.0.0:{where.port} for all"
         )
     return f"{error.strerror or error}; choose another address"

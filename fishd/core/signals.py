@@ -217,16 +217,14 @@ class Tick(Struct, frozen=True, gc=False):
         bool | UnsetType,
         note(
             "True if estimator and controller got `fy` and `fy_rate` with the opposite sign; "
-            "absent "
-            "otherwise. See `estimator.reversed_fy`."
+            "absent otherwise. See `estimator.reversed_fy`."
         ),
     ] = UNSET
     suspect: Annotated[
         str | UnsetType,
         note(
             "Reason not to trust `fx` and `fy`; absent if there is none. Estimators and "
-            "controllers "
-            "then get the values of the previous tick."
+            "controllers then get the values of the previous tick."
         ),
     ] = UNSET
 

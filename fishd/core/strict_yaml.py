@@ -174,8 +174,7 @@ class _Builder:
                     raise ValueProblem(
                         line,
                         f"{'.'.join(key_path)}: duplicate key, first given on line "
-                        f"{self.lines[key_path]}; "
-                        "keep one",
+                        f"{self.lines[key_path]}; keep one",
                     )
                 self.lines[key_path] = line
                 mapping[key] = self.build(value_node, key_path)

@@ -137,8 +137,7 @@ class CalibrationRequests:
             raise Refused(
                 "no-samples",
                 f"sample {request.sample} does not exist or is older than {MAX_SAMPLE_AGE_S:g} s; "
-                "take "
-                "another one with sample-force",
+                "take another one with sample-force",
             )
         _, sample = self._samples[request.sample]
         if sample.suspect:

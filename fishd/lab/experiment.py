@@ -269,9 +269,8 @@ def _check_same(path: Path, before: Header, header: Header) -> None:
         known = (key in old and key in new) or not key.startswith("config.")
         if known and old.get(key) != new.get(key):
             raise ConfigError(
-                f"{path / HEADER}: this {before.kind} began with {key.removeprefix('settings.')} "
-                f"= {old.get(key)}, now it is {new.get(key)}; give the same value, or "
-                f"{_OTHER_FOLDER}"
+                f"{path / HEADER}: this {before.kind} began with {key.removeprefix('settings.')} = "
+                f"{old.get(key)}, now it is {new.get(key)}; give the same value, or {_OTHER_FOLDER}"
             )
     if others := [key for key in (*old, *new) if not (key in old and key in new)]:
         has = "has" if others[0] in old else "has no"

@@ -171,9 +171,8 @@ class ImitationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         int,
         note(
             "Number of rounds; 0 for none. In each, the policy swims other fish of the "
-            "randomisation, more of them like the configured one, and learns when the best "
-            "square wave of each would reverse. Only in simulation: that wave of a real fish is "
-            "unknown.",
+            "randomisation, more of them like the configured one, and learns when the best square "
+            "wave of each would reverse. Only in simulation: that wave of a real fish is unknown.",
             ge=0,
             le=100,
         ),

@@ -132,9 +132,8 @@ class Remote(Controller[RemoteParameters]):
         if parameters.deadline is not None and parameters.deadline > longest_deadline:
             raise ParameterError(
                 f"deadline: {parameters.deadline:g} s is not valid: at most {longest_deadline:g} "
-                "s, "
-                f"{MAX_DEADLINE_FRACTION:g} of a tick, as half a tick is all that a controller may "
-                "take",
+                f"s, {MAX_DEADLINE_FRACTION:g} of a tick, as half a tick is all that a controller "
+                "may take",
                 ("deadline",),
             )
 
