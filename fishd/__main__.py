@@ -53,6 +53,14 @@ def fishd_camera() -> None:
     main()
 
 
+def fishd_window() -> None:
+    """Run the `fishd-window` command."""
+    _prepare()
+    with _loading():
+        from fishd.window.main import main
+    main()
+
+
 def _prepare() -> None:
     """Correct unusual conditions in which a command was started."""
     _open_closed_streams()

@@ -15,7 +15,7 @@ class ExcitationParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Parameters of `excitation`."""
 
     lowest: Annotated[
-        float, unit("Hz", "Frequency at which the sweep begins and ends.", gt=0, le=10)
+        float, unit("Hz", "Frequency at which the sweep begins and ends.", gt=0, le=10, step=0.05)
     ] = 0.5
     highest: Annotated[
         float,
@@ -24,10 +24,11 @@ class ExcitationParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_o
             "Highest frequency of the sweep, or that of a beat of two ticks if that is lower.",
             gt=0,
             le=10,
+            step=0.05,
         ),
     ] = 3.0
     sweep_time: Annotated[
-        float, unit("s", "Time of a sweep from lowest to highest and back.", ge=1, le=3600)
+        float, unit("s", "Time of a sweep from lowest to highest and back.", ge=1, le=3600, step=1)
     ] = 20.0
     amplitude: Annotated[
         Amplitude, unit("rad", "The larger instruction angle; null: the robot's amplitude_limit.")

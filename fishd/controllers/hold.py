@@ -15,7 +15,8 @@ class HoldParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     """Parameters of `hold`."""
 
     angle: Annotated[
-        float, unit("rad", "The instruction angle; 0 is neutral.", ge=-math.pi, le=math.pi)
+        float,
+        unit("rad", "The instruction angle; 0 is neutral.", ge=-math.pi, le=math.pi, step=0.01),
     ] = 0.0
 
 

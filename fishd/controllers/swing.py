@@ -28,6 +28,7 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             "1",
             "Reverse when the fin's speed falls to C times its last maximum; auto: begin with 0.6, "
             "and search for the largest thrust.",
+            step=0.05,
         ),
     ] = 0.6
     amplitude: Annotated[
@@ -37,7 +38,12 @@ class SwingParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     longest_half_period: Annotated[
         float,
         unit(
-            "s", "Reverse after this time even if the fin does not slow down.", gt=0, le=10, usual=5
+            "s",
+            "Reverse after this time even if the fin does not slow down.",
+            gt=0,
+            le=10,
+            usual=5,
+            step=0.05,
         ),
     ] = 1.0
     lead: Annotated[

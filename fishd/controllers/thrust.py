@@ -36,14 +36,24 @@ SATURATION_TOLERANCE = 0.005
 class ThrustParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `thrust`."""
 
-    target: Annotated[float, unit("N", "Mean thrust to hold.", gt=0, le=10, usual=1)]
+    target: Annotated[float, unit("N", "Mean thrust to hold.", gt=0, le=10, usual=1, step=0.001)]
     C: Annotated[
         float,
-        unit("1", "Reverse when the fin's speed falls to C times its last maximum.", ge=0, le=1),
+        unit(
+            "1",
+            "Reverse when the fin's speed falls to C times its last maximum.",
+            ge=0,
+            le=1,
+            step=0.05,
+        ),
     ] = 0.6
     amplitude: Annotated[
         Amplitude,
-        unit("rad", "Largest instruction angle on either side; null: the robot's amplitude_limit."),
+        unit(
+            "rad",
+            "Largest instruction angle on either side; null: the robot's amplitude_limit.",
+            step=0.01,
+        ),
     ] = None
     longest_half_period: Annotated[
         float,

@@ -37,9 +37,12 @@ def check_frequency(name: str, frequency: float, tick: float, *, highest: bool =
 class WaveformParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `square`, `sine` and `triangle`."""
 
-    frequency: Annotated[float, unit("Hz", "Frequency of the waveform.", gt=0, le=10)] = 1.8
+    frequency: Annotated[
+        float, unit("Hz", "Frequency of the waveform.", gt=0, le=10, step=0.05)
+    ] = 1.8
     amplitude: Annotated[
-        Amplitude, unit("rad", "Largest instruction angle; null: the robot's amplitude_limit.")
+        Amplitude,
+        unit("rad", "Largest instruction angle; null: the robot's amplitude_limit."),
     ] = None
 
 

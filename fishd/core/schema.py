@@ -30,7 +30,13 @@ Scalar = bool | int | float | str | None
 
 
 def unit(
-    symbol: str, description: str, *, file: str = "", usual: float = 0.0, **constraints: Any
+    symbol: str,
+    description: str,
+    *,
+    file: str = "",
+    usual: float = 0.0,
+    step: float = 0.0,
+    **constraints: Any,
 ) -> Meta:
     """Describe a field: `Annotated[float, unit("Hz", "Frequency of the command.", gt=0, le=10)]`.
 
@@ -38,10 +44,13 @@ def unit(
     file: suffix, such as `.onnx`, of a text that may be the path of a file
     usual: largest magnitude that is reasonable on a real fish, if the bounds are wider; see
     `find_doubts`
+    step: smallest change of a number that makes a difference, for pages and panels; derived from
+    the bounds if absent
     constraints: those of `msgspec.Meta`, such as gt, ge, lt, le, min_length, pattern
     """
     extra: dict[str, Any] = {"unit": symbol}
-    extra |= ({"file": file} if file else {}) | ({"usual": usual} if usual else {})
+    given = {"file": file, "usual": usual, "step": step}
+    extra |= {name: value for name, value in given.items() if value}
     return Meta(description=description, extra_json_schema=extra, **constraints)
 
 
@@ -71,6 +80,8 @@ class Field(Struct, frozen=True, omit_defaults=True):
     """Words that are permitted besides a number, such as `auto`."""
     usual: float = 0.0
     """Largest magnitude that is reasonable on a real fish, if the bounds are wider; else 0."""
+    step: float = 0.0
+    """Step in which a page or a panel changes a number; 0 for none."""
 
 
 class Problem(Exception):
@@ -167,6 +178,34 @@ def _prepare(target: Any) -> None:
     with _preparing:
         msgspec.json.Decoder(target)
         _prepared.add(target)
+
+
+_JSON_TYPES = {
+    "number": "number",
+    "integer": "integer",
+    "boolean": "boolean",
+    "section": "object",
+    "list": "array",
+}
+
+
+def schema_name(message: type[Struct]) -> str:
+    """Return the name of the JSON Schema of a message, such as `fishd.Tick`."""
+    return f"fishd.{message.__name__}"
+
+
+def json_schema(message: type[Struct]) -> bytes:
+    """Return the flat JSON Schema of a message, as Foxglove and its relatives need it.
+
+    They take a root of type object, without `$ref` and `anyOf`: nested values are plain objects.
+    """
+    properties: dict[str, Any] = {}
+    for field in fields_of(message):
+        description = f"{field.description} [{field.unit}]" if field.unit else field.description
+        kind = _JSON_TYPES.get(field.kind, "string")
+        properties[field.name] = {"type": kind, "description": description}
+    title = schema_name(message)
+    return msgspec.json.encode({"title": title, "type": "object", "properties": properties})
 
 
 def describe_permitted(field: Field) -> str:
@@ -277,7 +316,23 @@ def _describe(field: inspect.Field) -> Field:
         file=extra.get("file", ""),
         words=_literal_words(field.type) if isinstance(kind, inspect.FloatType) else (),
         usual=extra.get("usual", 0.0),
+        step=extra.get("step", 0.0) or _derive_step(kind, field.default),
     )
+
+
+def _derive_step(kind: inspect.Type, default: Any) -> float:
+    """Return a power of ten: at least 50 steps from bound to bound, or 10 from 0 to the default."""
+    if isinstance(kind, inspect.IntType):
+        return 1.0
+    if not isinstance(kind, inspect.FloatType):
+        return 0.0
+    low = kind.ge if kind.ge is not None else kind.gt
+    high = kind.le if kind.le is not None else kind.lt
+    if low is not None and high is not None:
+        size = (high - low) / 50.0
+    else:
+        size = abs(default) / 10.0 if _is_number(default) else 0.0
+    return float(10.0 ** math.floor(math.log10(size))) if size > 0.0 else 0.0
 
 
 def _format_interval(kind: inspect.Type) -> str:

@@ -6,6 +6,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from fishd.core.errors import RecordingError
+from fishd.core.schema import json_schema, schema_name
 from fishd.recording.images import IMAGE_SCHEMA, image_json_schema
 from fishd.recording.mcap_file import read_records
 from fishd.recording.part_file import (
@@ -18,7 +19,7 @@ from fishd.recording.part_file import (
 )
 from fishd.recording.reader import TOPICS, Run, open_run
 from fishd.recording.summary import to_metadata
-from fishd.recording.writer import CHANNELS, CHUNK_BYTES, json_schema, schema_name
+from fishd.recording.writer import CHANNELS, CHUNK_BYTES
 
 RECOVERING_SUFFIX = ".recovering"
 """Suffix of the name of the copy until it is complete."""

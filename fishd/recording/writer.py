@@ -1,7 +1,6 @@
 """Writer of a recording: an MCAP file that Foxglove, Lichtblick and PlotJuggler open.
 
-docs/how-to/recording.md describes its layout. Viewers need JSON Schemas with a root of type
-object, without `$ref` and `anyOf`, so nested values are plain objects.
+docs/how-to/recording.md describes its layout.
 """
 
 import getpass
@@ -26,7 +25,7 @@ from fishd.config import Config, to_yaml
 from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
-from fishd.core.schema import fields_of
+from fishd.core.schema import json_schema, schema_name
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.images import (
     IMAGE_SCHEMA,
@@ -41,13 +40,6 @@ from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
 CHANNELS: dict[str, type[Struct]] = {"tick": Tick, "event": Event, "status": Status}
 """Recorded topics of telemetry, and the types of their messages."""
 
-_TYPES = {
-    "number": "number",
-    "integer": "integer",
-    "boolean": "boolean",
-    "section": "object",
-    "list": "array",
-}
 CHUNK_BYTES = 32 * 2**10
 """Size at which a chunk is closed, which blocks the writer for 0.5 ms [bytes]."""
 MAX_TIME_S = 1e10
@@ -59,24 +51,6 @@ FORMAT = "2"
 
 Source = Literal["fishd", "simulation"]
 """Origin of the ticks: a running fishd, whatever its robot, or a run in virtual time."""
-
-
-def schema_name(message: type[Struct]) -> str:
-    """Return the name of the schema in the file, such as `fishd.Tick`."""
-    return f"fishd.{message.__name__}"
-
-
-def json_schema(message: type[Struct]) -> bytes:
-    """Return the flat JSON Schema of a message."""
-    properties: dict[str, Any] = {}
-    for field in fields_of(message):
-        description = f"{field.description} [{field.unit}]" if field.unit else field.description
-        properties[field.name] = {
-            "type": _TYPES.get(field.kind, "string"),
-            "description": description,
-        }
-    title = schema_name(message)
-    return msgspec.json.encode({"title": title, "type": "object", "properties": properties})
 
 
 class RunWriter:

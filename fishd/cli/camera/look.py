@@ -265,8 +265,8 @@ def page(address: str | None, port: int, host: str, as_json: bool) -> None:
 
 
 async def _serve(address: str | None, host: str, port: int, as_json: bool) -> None:
-    from fishd.camera.page.feed import Feed, News
-    from fishd.camera.page.server import PageServer
+    from fishd.window.camera_page.feed import Feed, News
+    from fishd.window.camera_page.server import PageServer
 
     loop, ended = asyncio.get_running_loop(), asyncio.Event()
     failures: list[BaseException] = []

@@ -11,10 +11,10 @@ import aiohttp
 import msgspec
 import pytest
 
-from fishd.camera.page import server as page_server
-from fishd.camera.page.feed import News
-from fishd.camera.page.server import PageServer
 from fishd.core.errors import StartupError
+from fishd.window import web_server
+from fishd.window.camera_page.feed import News
+from fishd.window.camera_page.server import PageServer
 
 FACTS = b'{"state":"streaming"}'
 Test = Callable[[PageServer, aiohttp.ClientSession], Coroutine[Any, Any, None]]
@@ -177,10 +177,10 @@ async def neighbour(server: PageServer) -> AsyncIterator[aiohttp.ClientSession]:
 def test_more_pages_than_are_served_are_refused_and_let_in_once_another_is_gone() -> None:
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
         async with neighbour(server) as second_session:
-            most = page_server.MAX_VIEWERS_PER_ADDRESS
+            most = web_server.MAX_VIEWERS_PER_ADDRESS
             socks = [await session.ws_connect("/live") for _ in range(most)]
             await check_refused(session)
-            while len(socks) < page_server.MAX_VIEWERS:
+            while len(socks) < web_server.MAX_VIEWERS:
                 socks.append(await second_session.ws_connect("/live"))
             await check_refused(second_session)
             await socks[0].close()
@@ -219,13 +219,13 @@ COMPLETE_REQUEST = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: keep-alive
 
 @pytest.mark.parametrize("sent", [HALF_ASKED[0], HALF_ASKED[3], COMPLETE_REQUEST])
 def test_no_client_keeps_the_page_from_others(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_server, "REQUEST_TIMEOUT_S", 120.0)
+    monkeypatch.setattr(web_server, "REQUEST_TIMEOUT_S", 120.0)
 
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
         clients = [await connect(server, sent) for _ in range(100)]
         ends = [asyncio.create_task(reader.read()) for reader, _ in clients]
         try:
-            while sum(end.done() for end in ends) < 100 - page_server.MAX_ASKING_PER_ADDRESS:
+            while sum(end.done() for end in ends) < 100 - web_server.MAX_ASKING_PER_ADDRESS:
                 await asyncio.sleep(0.01)  # until the server has seen them all
             async with neighbour(server) as second_session, asyncio.timeout(60.0):
                 for client in (session, second_session):
@@ -241,7 +241,7 @@ def test_no_client_keeps_the_page_from_others(sent: bytes, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("sent", HALF_ASKED)
 def test_half_a_request_is_ended_soon(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page_server, "REQUEST_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(web_server, "REQUEST_TIMEOUT_S", 0.3)
 
     async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
         reader, writer = await connect(server, sent)

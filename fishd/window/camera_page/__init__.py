@@ -1,0 +1,1 @@
+"""The page of the camera: what it sees, live, with the axis of motion."""

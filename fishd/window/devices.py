@@ -1,0 +1,218 @@
+"""Devices that may use the window from the network: pairing, scopes and revocation.
+
+They are in a file of the state folder, which `fishctl window` changes, too. It holds no secret: of
+tokens, only their SHA-256.
+"""
+
+import fcntl
+import hashlib
+import os
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal, TypeVar
+
+import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
+
+from fishd.core import files, text
+from fishd.core.decoding import decoder
+from fishd.core.errors import FishdError
+
+Scope = Literal["watch", "drive"]
+T = TypeVar("T")
+
+INVITATION_S = 600.0
+"""Time within which a token pairs a device [s]."""
+MAX_INVITATIONS = 20
+MAX_DEVICES = 200
+MAX_NAME_CHARACTERS = 40
+MAX_FILE_BYTES = 2**20
+SEEN_PERIOD_S = 3600.0
+"""Shortest time between two updates of the time at which a device was seen [s]."""
+
+
+class DeviceError(FishdError):
+    """A device cannot be paired or revoked."""
+
+
+class Device(Struct, frozen=True):
+    """A paired device."""
+
+    id: str
+    name: str
+    scope: Scope
+    token: str
+    """SHA-256 of the token in its cookie, in hexadecimal."""
+    paired: float
+    """Time at which it was paired [s, unix]."""
+    seen: float
+    """Time at which it was last seen, to the hour [s, unix]."""
+
+
+class Invitation(Struct, frozen=True):
+    """A token that pairs one device."""
+
+    token: str
+    """SHA-256 of the token, in hexadecimal."""
+    scope: Scope
+    until: float
+    """Time at which it expires [s, unix]."""
+
+
+class _Content(Struct, frozen=True):
+    """Content of the file."""
+
+    devices: tuple[Device, ...] = ()
+    invitations: tuple[Invitation, ...] = ()
+
+
+_decode: Callable[[bytes], _Content] = decoder(_Content)
+
+
+class Devices:
+    """The paired devices in the state folder; it follows changes that other processes make."""
+
+    def __init__(self, folder: Path) -> None:
+        """folder: is created if missing; raises `DeviceError`"""
+        self._folder, self._path = folder, folder / "devices.json"
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as error:
+            raise DeviceError(
+                f"{folder} cannot be created: {error.strerror}; set state in the settings"
+            ) from None
+        self._content, self._version = _Content(), (0, 0, 0)
+        self._read()
+
+    def invite(self, scope: Scope, seconds: float = INVITATION_S) -> str:
+        """Return a new token that pairs one device within this time."""
+        token = secrets.token_urlsafe(16)
+        invitation = Invitation(_hash(token), scope, time.time() + seconds)
+        with self._changing() as content:
+            valid = [entry for entry in content.invitations if entry.until > time.time()]
+            kept = (*valid[1 - MAX_INVITATIONS :], invitation)
+            self._write(replace(content, invitations=kept))
+        return token
+
+    def pair(self, token: str, name: str) -> tuple[Device, str]:
+        """Use up a token; return the new device, and the token for its cookie."""
+        digest, secret = _hash(token), secrets.token_urlsafe(32)
+        with self._changing() as content:
+            match = next((entry for entry in content.invitations if entry.token == digest), None)
+            if match is None or match.until < time.time():
+                raise DeviceError(
+                    "this link was used already, or has expired: run 'fishctl window pair' again"
+                )
+            if len(content.devices) >= MAX_DEVICES:
+                raise DeviceError(
+                    f"{MAX_DEVICES} devices are paired: revoke some with 'fishctl window revoke'"
+                )
+            taken = {device.name for device in content.devices}
+            now = time.time()
+            wanted = text.line(name, MAX_NAME_CHARACTERS) or "device"
+            device = Device(
+                id=secrets.token_hex(4),
+                name=_unused_name(wanted, taken),
+                scope=match.scope,
+                token=_hash(secret),
+                paired=now,
+                seen=now,
+            )
+            others = tuple(entry for entry in content.invitations if entry is not match)
+            self._write(_Content((*content.devices, device), others))
+        return device, secret
+
+    def find(self, secret: str | None) -> Device | None:
+        """Return the device with this token in its cookie."""
+        if not secret or len(secret) > 200:
+            return None
+        digest = _hash(secret)
+        device = next((entry for entry in self.list() if entry.token == digest), None)
+        if device and time.time() - device.seen > SEEN_PERIOD_S:
+            self._replace(device, replace(device, seen=time.time()))
+        return device
+
+    def list(self) -> tuple[Device, ...]:
+        """Return all devices."""
+        if self._version_now() != self._version:
+            self._read()
+        return self._content.devices
+
+    def revoke(self, name: str) -> Device:
+        """Remove the device with this name or id; raise `DeviceError` if there is none."""
+        match = next((entry for entry in self.list() if name in (entry.name, entry.id)), None)
+        if match is None:
+            known = ", ".join(entry.name for entry in self.list()) or "there is none"
+            raise DeviceError(f"no device is named '{text.quoted(name)}'; paired: {known}")
+        self._replace(match, None)
+        return match
+
+    def _replace(self, device: Device, successor: Device | None) -> None:
+        with self._changing() as content:
+            devices = (successor if entry.id == device.id else entry for entry in content.devices)
+            self._write(replace(content, devices=tuple(entry for entry in devices if entry)))
+
+    @contextmanager
+    def _changing(self) -> Iterator[_Content]:
+        """Yield the newest content, while no other process changes it."""
+        descriptor = os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            _give_to_owner(self._folder, descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            self._read()
+            yield self._content
+        finally:
+            os.close(descriptor)
+
+    def _write(self, content: _Content) -> None:
+        new = self._path.with_suffix(".new")
+        new.unlink(missing_ok=True)
+        descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(msgspec.json.format(msgspec.json.encode(content)))
+            file.flush()
+            os.fsync(descriptor)
+            _give_to_owner(self._folder, descriptor)
+        new.replace(self._path)
+        self._content, self._version = content, self._version_now()
+
+    def _read(self) -> None:
+        self._version = self._version_now()
+        try:
+            self._content = _decode(files.read(self._path, MAX_FILE_BYTES, "the paired devices"))
+        except files.NoFile:
+            self._content = _Content()
+        except (files.FileProblem, msgspec.DecodeError) as error:
+            raise DeviceError(
+                f"{self._path}: {text.error_message(error)}; remove it, and pair the devices again"
+            ) from None
+
+    def _version_now(self) -> tuple[int, int, int]:
+        """Return values that differ for another content of the file."""
+        try:
+            status = self._path.stat()
+        except FileNotFoundError:
+            return 0, 0, 0
+        return status.st_ino, status.st_mtime_ns, status.st_size
+
+
+def _give_to_owner(folder: Path, descriptor: int) -> None:
+    """Let a file that root creates belong to the owner of the folder, such as the service."""
+    if os.geteuid() == 0:
+        owner = folder.stat()
+        os.fchown(descriptor, owner.st_uid, owner.st_gid)
+
+
+def _unused_name(name: str, taken: set[str]) -> str:
+    number, wanted = 2, name
+    while name in taken:
+        name, number = f"{wanted} {number}", number + 1
+    return name
+
+
+def _hash(token: str) -> str:
+    return hashlib.sha256(token.encode("utf-8", "replace")).hexdigest()

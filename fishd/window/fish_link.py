@@ -1,0 +1,358 @@
+"""Link to one fish: its telemetry, the state of the connection, and requests.
+
+An emergency stop has its own threads and connections, so that it waits for nothing else.
+"""
+
+import asyncio
+import logging
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AsyncExitStack, closing, suppress
+from typing import Any
+
+import msgspec
+import zmq.asyncio
+from msgspec import UNSET, Struct
+
+from fishd.client import AsyncFish, Fish
+from fishd.client.zmq_sockets import connect_subscriber
+from fishd.core import text
+from fishd.core.addresses import find_control_address
+from fishd.core.decoding import decoder
+from fishd.core.errors import FishError, LeaseLost, NoDaemon
+from fishd.core.protocol import State
+from fishd.core.signals import ControllerInfo, Event, Status, Tick
+
+log = logging.getLogger(__name__)
+
+HISTORY_S = 120.0
+"""Length of the history for a page that opens [s]."""
+MAX_EVENTS = 100
+STALE_AFTER_S = 0.7
+"""Time without a tick after which the fish counts as stale [s]."""
+PROBE_PERIOD_S = 1.0
+"""Time between two requests for the status of a fish that sends no ticks [s]."""
+PROBE_TIMEOUT_S = 1.0
+"""Longest wait for that status [s]."""
+BATCH_PERIOD_S = 0.05
+"""Shortest time between two messages with ticks [s]."""
+MAX_WAITING_REQUESTS = 8
+"""Number of requests above which a further one is refused."""
+ESTOP_THREADS = 4
+ESTOP_TIMEOUT_S = 0.5
+"""Time to wait for the answer to an emergency stop, before the last resort [s]."""
+LAST_RESORT_TIMEOUT_S = 10.0
+"""Time to wait for the end of the last resort [s]."""
+
+_decode_tick: Callable[[bytes], Tick] = decoder(Tick)
+_decode_event: Callable[[bytes], Event] = decoder(Event)
+_decode_status: Callable[[bytes], Status] = decoder(Status)
+_RAW = msgspec.json.Encoder().encode
+
+
+class Connection(Struct, frozen=True):
+    """State of the connection to a fish."""
+
+    state: str
+    """`live`, `stale`, `lost` or `restarted`."""
+    age: float
+    """Time since the last tick [s]."""
+    message: str
+
+
+class Busy(FishError):
+    """Too many requests wait."""
+
+
+class FishLink:
+    """Link to one fish; `run` follows it until it is cancelled."""
+
+    def __init__(self, name: str, endpoint: str | None, tell: Callable[[str, bytes], None]) -> None:
+        """
+        name: name of the fish in the page
+        endpoint: its control socket; None for the fishd of this machine
+        tell: receives each message for the pages: its type, and its payload as JSON
+        """
+        self.name, self.endpoint = name, endpoint
+        self.status: Status | None = None
+        self.controllers: list[ControllerInfo] = []
+        self.events: deque[bytes] = deque(maxlen=MAX_EVENTS)
+        self.ticks: deque[bytes] = deque()
+        """Ticks of the last `HISTORY_S`, as they came."""
+        self._tell = tell
+        self._fish = AsyncFish(endpoint)
+        self._stopper = AsyncFish(endpoint)
+        self._monitor = AsyncFish(endpoint, timeout=PROBE_TIMEOUT_S)
+        self._estops = ThreadPoolExecutor(ESTOP_THREADS, thread_name_prefix=f"estop {name}")
+        self._context = zmq.asyncio.Context()
+        self._batch: list[bytes] = []
+        self._flush: asyncio.TimerHandle | None = None
+        self._next_flush = self._last_tick = self._next_probe = 0.0
+        self._started = time.monotonic()
+        self._seq = 0
+        self._state, self._message = "lost", "connecting"
+        self._waiting = 0
+        self._taking = asyncio.Lock()
+        self._lease: AsyncExitStack | None = None
+
+    async def close(self) -> None:
+        """Return the fish, and disconnect."""
+        await self.give_back()
+        for fish in (self._fish, self._stopper, self._monitor):
+            fish.close()
+        self._context.destroy(linger=0)
+        self._estops.shutdown(wait=False, cancel_futures=True)
+
+    @property
+    def connection(self) -> Connection:
+        """State of the connection."""
+        age = time.monotonic() - (self._last_tick or self._started)
+        return Connection(self._state, round(age, 2), self._message)
+
+    @property
+    def endpoint_options(self) -> list[str]:
+        """Options of fishctl for this fish."""
+        return [] if self.endpoint is None else ["--endpoint", self.endpoint]
+
+    @property
+    def address(self) -> str:
+        """Control socket of the fish."""
+        return self.endpoint or find_control_address()
+
+    # Telemetry
+
+    async def run(self) -> None:
+        """Follow the fish, also after it restarts, until this task is cancelled."""
+        while True:
+            try:
+                await self._follow()
+            except FishError as error:
+                self._set_connection("lost", str(error))
+            await asyncio.sleep(PROBE_PERIOD_S)
+
+    async def _follow(self) -> None:
+        """Read telemetry until its address changes; raise `FishError`."""
+        status = await self._take_status(await self._monitor.status())
+        if self._state != "restarted":
+            self._set_connection("stale", "no tick has come yet")
+        address = status.telemetry
+        socket = connect_subscriber(self._context, address, b"tick", b"event", b"status")
+        with closing(socket):
+            while self.status and self.status.telemetry == address:
+                if await socket.poll(int(STALE_AFTER_S * 1e3)):
+                    await self._receive(await socket.recv_multipart())
+                if time.monotonic() - self._last_tick > STALE_AFTER_S:
+                    await self._probe()
+
+    async def _receive(self, frames: list[bytes]) -> None:
+        try:
+            if frames[0] == b"tick":
+                self._receive_tick(_decode_tick(frames[-1]), frames[-1])
+            elif frames[0] == b"event":
+                _decode_event(frames[-1])
+                self.events.append(frames[-1])
+                self._tell("event", frames[-1])
+            elif frames[0] == b"status":
+                await self._take_status(_decode_status(frames[-1]))
+        except msgspec.DecodeError as error:
+            raise FishError(
+                f"the program at {self.address} is not a fishd of this version: "
+                f"{text.error_message(error)}"
+            ) from None
+
+    def _receive_tick(self, tick: Tick, payload: bytes) -> None:
+        now = self._last_tick = time.monotonic()
+        if tick.seq <= self._seq:
+            self._forget()
+        self._seq = tick.seq
+        self.ticks.append(payload)
+        while len(self.ticks) > HISTORY_S / (self.status.tick if self.status else 0.05):
+            self.ticks.popleft()
+        if self._state in ("stale", "lost"):
+            self._set_connection("live", "")
+        self._batch.append(payload)
+        if now >= self._next_flush:
+            self._flush_batch()
+        elif not self._flush:
+            delay = self._next_flush - now
+            self._flush = asyncio.get_running_loop().call_later(delay, self._flush_batch)
+
+    def _flush_batch(self) -> None:
+        self._next_flush = time.monotonic() + 0.9 * BATCH_PERIOD_S
+        if self._flush:
+            self._flush.cancel()
+            self._flush = None
+        batch, self._batch = self._batch, []
+        if batch:
+            self._tell("ticks", b"[" + b",".join(batch) + b"]")
+
+    async def _take_status(self, status: Status) -> Status:
+        """Store a status; after a restart of fishd, begin again."""
+        before, self.status = self.status, status
+        restarted = before is not None and status.shows_restart_since(before)
+        if before is None or restarted:
+            self.controllers = await self._monitor.controllers()
+        if restarted:
+            self._forget()
+            self._set_connection("restarted", f"fishd has restarted: it is process {status.pid}")
+            self._tell("hello", b"")
+        elif self._state == "restarted":
+            self._set_connection("live", "")
+        elif before is None:
+            self._tell("hello", b"")
+        self._tell("status", _RAW(status))
+        return status
+
+    def _forget(self) -> None:
+        """Forget the ticks of an earlier fishd."""
+        self.ticks.clear()
+        self._batch.clear()
+        self._seq = 0
+
+    async def _probe(self) -> None:
+        """Find out why no ticks come; raise `NoDaemon` if fishd does not answer."""
+        age = time.monotonic() - (self._last_tick or self._started)
+        self._set_connection("stale", f"no tick for {age:.1f} s")
+        if time.monotonic() >= self._next_probe:
+            self._next_probe = time.monotonic() + PROBE_PERIOD_S
+            await self._take_status(await self._monitor.status())
+
+    def _set_connection(self, state: str, message: str) -> None:
+        self._state, self._message = state, text.line(message)
+        self._tell("connection", _RAW(self.connection))
+
+    def columns(self, since: int = 0) -> dict[str, Any]:
+        """Return the history as columns by field; those of the quantities are in a mapping.
+
+        since: number of the last tick that is not returned
+        """
+        ticks = [tick for tick in map(_decode_tick, self.ticks) if tick.seq > since]
+        columns: dict[str, Any] = {}
+        for name in Tick.__struct_fields__:
+            column = [getattr(tick, name) for tick in ticks]
+            if name == "quantities":
+                columns[name] = _transpose([{} if row is UNSET else row for row in column])
+            elif any(value is not UNSET for value in column) or name in ("seq", "t"):
+                columns[name] = [None if value is UNSET else value for value in column]
+        return columns
+
+    # Requests
+
+    async def estop(self, message: str) -> dict[str, Any]:
+        """Stop the pulses; raise `FishError` if neither fishd nor the last resort does so."""
+
+        def stop() -> tuple[State, str]:
+            with Fish(self.endpoint, timeout=ESTOP_TIMEOUT_S) as fish:
+                return fish.estop(message), fish.estop_taken_by
+
+        start = time.monotonic()
+        loop = asyncio.get_running_loop()
+        try:
+            state, way = await loop.run_in_executor(self._estops, stop)
+        except NoDaemon as error:
+            way, outcome = "last resort", await self._stop_without_daemon(error)
+        else:
+            outcome = f"mode {state.mode}"
+        milliseconds = round((time.monotonic() - start) * 1e3, 1)
+        return {"server_ms": milliseconds, "way": way, "outcome": outcome}
+
+    async def _stop_without_daemon(self, why: NoDaemon) -> str:
+        """Run `fishctl estop`, which can end the pulses without fishd; return what it did."""
+        command = fishctl_command(*self.endpoint_options, "estop", "--json")
+        process = await asyncio.create_subprocess_exec(
+            *command, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+        )
+        try:
+            async with asyncio.timeout(LAST_RESORT_TIMEOUT_S):
+                output, errors = await process.communicate()
+        except TimeoutError:
+            process.kill()
+            raise why from None
+        if process.returncode:
+            raise FishError(text.line(errors.decode("utf-8", "replace"))) from why
+        answer = msgspec.json.decode(output)
+        return str(answer.get("pulses", answer.get("mode", "")))
+
+    async def request(
+        self, op: str, arguments: dict[str, Any], holder: str, take: bool
+    ) -> dict[str, Any]:
+        """Carry out a request, and return its result; raise `FishdError`.
+
+        holder: name of the lease under which the fish swims
+        take: whether to take the fish from an experiment
+        """
+        if op == "stop":  # must not wait for a controller that loads
+            return _builtins(await self._stopper.stop())
+        if self._waiting >= MAX_WAITING_REQUESTS:
+            raise Busy(f"{self._waiting} requests wait for this fish already; try again later")
+        self._waiting += 1
+        try:
+            async with self._taking:
+                return await self._perform(op, arguments, holder, take)
+        finally:
+            self._waiting -= 1
+
+    async def _perform(
+        self, op: str, arguments: dict[str, Any], holder: str, take: bool
+    ) -> dict[str, Any]:
+        fish = self._fish
+        if op == "clear-fault":
+            return _builtins(await fish.clear_fault())
+        if op == "mark":
+            return _builtins(await fish.mark(arguments["text"]))
+        for is_last in (False, True):
+            await self._hold(holder, take)
+            try:
+                if op == "set-controller":
+                    name, parameters = arguments["name"], arguments["parameters"]
+                    return _builtins(await fish.set_controller(name, **parameters))
+                if op == "set-parameters":
+                    return _builtins(await fish.set_parameters(**arguments["parameters"]))
+                return _builtins(await fish.tare(arguments["seconds"]))
+            except LeaseLost:  # another client has stopped the fish since
+                await self._drop_lease()
+                if is_last:
+                    raise
+        raise AssertionError
+
+    async def _hold(self, holder: str, take: bool) -> None:
+        """Hold the lease of the fish: where this process ends, the fish comes to rest."""
+        if self._lease:
+            return
+        stack = AsyncExitStack()
+        await stack.enter_async_context(
+            self._fish.lease(text.line(holder, 60), take, idle_limit=None)
+        )
+        self._lease = stack
+
+    async def give_back(self) -> None:
+        """End the lease: the fish comes to rest, if it swims under it."""
+        async with self._taking:
+            await self._drop_lease()
+
+    async def _drop_lease(self) -> None:
+        stack, self._lease = self._lease, None
+        if stack:
+            with suppress(FishError):
+                await stack.aclose()
+
+
+def fishctl_command(*arguments: str) -> list[str]:
+    """Return the command that runs fishctl with the Python of this process."""
+    code = "from fishd.__main__ import fishctl; fishctl()"
+    return [sys.executable, "-P", "-c", code, *arguments]
+
+
+def _builtins(result: Struct) -> dict[str, Any]:
+    builtins: dict[str, Any] = msgspec.to_builtins(result)
+    return builtins
+
+
+def _transpose(rows: Iterable[dict[str, float]]) -> dict[str, list[float | None]]:
+    """Return the values of each name, None in the rows without it."""
+    rows = list(rows)
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: [row.get(name) for row in rows] for name in names}
