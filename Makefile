@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 AHEAD := $(shell [ "$$(nice -n -20 nice 2>/dev/null)" = -20 ] && echo nice -n -20)
 
-.PHONY: help run test test-realtime test-fast lint docs figures bench clean
+.PHONY: help run test test-realtime test-fast lint docs figures vendor bench clean
 
 help:  ## List what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 15
@@ -51,6 +51,9 @@ docs: $(VENV)/installed-docs  ## Write the generated parts of docs/, and build b
 
 figures: $(VENV)/installed-dev  ## Compute the paper's figures and numbers again, into docs/
 	$(BIN)/python tools/paper
+
+vendor: $(VENV)/bin/python  ## Fetch the libraries of the window's page again, with npm, and verify them
+	$(BIN)/python tools/vendor.py
 
 bench: $(VENV)/installed-dev  ## Measure lateness, load and start-up on this machine
 	$(BIN)/python tools/bench tick
