@@ -23,6 +23,7 @@ from fishd.core.errors import FishdError, NoDaemon, ParameterError, Refused
 from fishd.window import web_server
 from fishd.window.devices import Device, DeviceError, Devices, Scope
 from fishd.window.fish_link import Busy, FishLink
+from fishd.window.jobs import DRIVING_KINDS, KINDS, Job, JobError, Jobs
 from fishd.window.live import Driver, LivePage, encode, encode_message
 from fishd.window.settings import WindowSettings
 from fishd.window.web_server import WebServer, file_routes, host_name, parse_ip
@@ -94,6 +95,14 @@ class FishRequest(Struct, forbid_unknown_fields=True):
     take: bool = False
 
 
+class JobRequest(Struct, forbid_unknown_fields=True):
+    """Body of a job."""
+
+    fish: str
+    kind: str
+    options: dict[str, Any] = {}
+
+
 class _NoArguments(Struct, forbid_unknown_fields=True):
     pass
 
@@ -136,6 +145,7 @@ class Window(WebServer):
             name: FishLink(name, endpoint, self._teller(name))
             for name, endpoint in settings.endpoints.items()
         }
+        self._jobs = Jobs(settings.runs_folder, self._tell_job)
         self._pages: set[LivePage] = set()
         self._drivers: dict[str, Driver] = {}
         self._tasks: list[asyncio.Task[None]] = []
@@ -152,6 +162,11 @@ class Window(WebServer):
             web.post("/api/fish/{fish}/release", self._release),
             web.post("/api/fish/{fish}/request", self._request),
             web.get("/api/fish/{fish}/history", self._get_history),
+            web.get("/api/jobs", self._list_jobs),
+            web.post("/api/jobs", self._start_job),
+            web.post("/api/jobs/{job}/stop", self._stop_job),
+            web.get("/api/runs", self._list_runs),
+            web.get("/api/runs/{run}/plot.png", self._plot_run),
         ]
         super().__init__(
             host,
@@ -175,6 +190,7 @@ class Window(WebServer):
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self._jobs.close()
         for link in self._links.values():
             await link.close()
         await super().__aexit__(*details)
@@ -228,7 +244,7 @@ class Window(WebServer):
             "status": link.status,
             "controllers": link.controllers,
             "events": [msgspec.Raw(event) for event in link.events],
-            "jobs": [],
+            "jobs": self._jobs.all(),
             "connection": link.connection,
             "driver": driver and driver.describe_to(page),
             "you_drive": bool(driver and driver.page is page),
@@ -237,7 +253,7 @@ class Window(WebServer):
     def _access_of(self, page: LivePage) -> Access:
         if not page.device_id:
             return Access("drive", None, True)
-        device = next(d for d in self.devices.list() if d.id == page.device_id)
+        device = next(d for d in self.devices.all() if d.id == page.device_id)
         return Access(device.scope, device, False)
 
     async def _watch(self) -> None:
@@ -260,7 +276,7 @@ class Window(WebServer):
                         self._teller(name)("connection", encode(link.connection))
 
     def _close_revoked(self) -> None:
-        paired = {device.id for device in self.devices.list()} | {""}
+        paired = {device.id for device in self.devices.all()} | {""}
         for page in self._pages:
             if page.device_id not in paired:
                 page.end()
@@ -278,6 +294,8 @@ class Window(WebServer):
         return Access(scope, None if loopback else device, loopback)
 
     def _require(self, request: web.Request, scope: Scope) -> Access:
+        if request.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+            raise ApiError(403, "other-origin", "this request is from a page of another site")
         access = self._access(request)
         if access.scope is None:
             raise ApiError(
@@ -435,6 +453,46 @@ class Window(WebServer):
             raise ApiError(400, "bad-request", "since: the number of a tick is needed")
         return _success(self._link(request.match_info["fish"]).columns(int(since)))
 
+    # Jobs and runs
+
+    def _tell_job(self, job: Job) -> None:
+        message = encode_message("job", encode(job))
+        for page in self._pages:
+            page.push("job", message)
+
+    async def _list_jobs(self, request: web.Request) -> web.Response:
+        self._require(request, "watch")
+        return _success(self._jobs.all())
+
+    async def _start_job(self, request: web.Request) -> web.Response:
+        access = self._require(request, "drive")
+        body = await _read_body(request, JobRequest)
+        link, page = self._link(body.fish), self._page(request, access)
+        if body.kind not in KINDS:
+            message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(KINDS)}"
+            raise ApiError(400, "unknown-kind", message)
+        options = _convert(body.options, KINDS[body.kind], f"{body.kind}: ")
+        if body.kind in DRIVING_KINDS:
+            self._require_driver(link, page)
+            await link.give_back()  # the experiment takes the fish itself
+        job = self._jobs.start(body.kind, link.name, link.endpoint_options, options)
+        self._tell_job(job)
+        return _success(job)
+
+    async def _stop_job(self, request: web.Request) -> web.Response:
+        self._require(request, "drive")
+        await _read_body(request, _NoArguments)
+        return _success(self._jobs.stop(request.match_info["job"]))
+
+    async def _list_runs(self, request: web.Request) -> web.Response:
+        self._require(request, "watch")
+        return _success(await self._jobs.list_runs())
+
+    async def _plot_run(self, request: web.Request) -> web.Response:
+        self._require(request, "watch")
+        picture = await self._jobs.plot(request.match_info["run"])
+        return web.Response(body=picture, content_type="image/png")
+
 
 def is_loopback(request: web.Request) -> bool:
     """Return whether a request is from a browser of this machine, and not through a proxy."""
@@ -518,6 +576,8 @@ def _refusal(error: FishdError) -> ApiError:
         return ApiError(503, "no-daemon", message)
     if isinstance(error, Busy):
         return ApiError(503, "busy", message)
+    if isinstance(error, JobError):
+        return ApiError(409, "job", message)
     if isinstance(error, DeviceError):
         return ApiError(403, "device", message)
     if isinstance(error, ParameterError):

@@ -131,12 +131,12 @@ class Devices:
         if not secret or len(secret) > 200:
             return None
         digest = _hash(secret)
-        device = next((entry for entry in self.list() if entry.token == digest), None)
+        device = next((entry for entry in self.all() if entry.token == digest), None)
         if device and time.time() - device.seen > SEEN_PERIOD_S:
             self._replace(device, replace(device, seen=time.time()))
         return device
 
-    def list(self) -> tuple[Device, ...]:
+    def all(self) -> tuple[Device, ...]:
         """Return all devices."""
         if self._version_now() != self._version:
             self._read()
@@ -144,9 +144,9 @@ class Devices:
 
     def revoke(self, name: str) -> Device:
         """Remove the device with this name or id; raise `DeviceError` if there is none."""
-        match = next((entry for entry in self.list() if name in (entry.name, entry.id)), None)
+        match = next((entry for entry in self.all() if name in (entry.name, entry.id)), None)
         if match is None:
-            known = ", ".join(entry.name for entry in self.list()) or "there is none"
+            known = ", ".join(entry.name for entry in self.all()) or "there is none"
             raise DeviceError(f"no device is named '{text.quoted(name)}'; paired: {known}")
         self._replace(match, None)
         return match

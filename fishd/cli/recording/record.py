@@ -273,7 +273,7 @@ def _end_line() -> None:
 def _print_summary(writer: RunWriter, as_json: bool) -> None:
     """Print the contents of a recording that has ended."""
     if as_json:
-        print_json({"path": writer.path, "bytes": writer.size, **asdict(writer.summary)})
+        print_json({"path": str(writer.path), "bytes": writer.size, **asdict(writer.summary)})
     else:
         echo(f"{writer.path.name}: {_format_amount(writer)}")
 
