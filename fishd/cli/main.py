@@ -15,6 +15,7 @@ VERBS = {
     "Watch": {
         "status": Verb("status", "status", "Show what the fish and its daemon are doing."),
         "watch": Verb("watch", "watch", "Watch force, command and timing live."),
+        "window": Verb("window", "window", "Show and control the fish on a web page."),
         "mark": Verb("control", "mark", "Put a mark in the event stream."),
     },
     "Swim and stop": {

@@ -29,6 +29,7 @@ _EXTRAS = {
     "plotly": "lab",
     "pyarrow": "lab",
     "scipy": "lab",
+    "segno": "window",
     "simplejpeg": "camera",
     "sklearn": "lab",
     "stable_baselines3": "learn",

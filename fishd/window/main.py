@@ -91,8 +91,15 @@ def window(
     return serve(load(path, listen=listen, fish=fish, state=state), log_format)
 
 
-def serve(settings: WindowSettings, log_format: str = "text") -> int:
-    """Serve the page until a signal; return the exit status."""
+def serve(
+    settings: WindowSettings,
+    log_format: str = "text",
+    when_up: Callable[[str], None] = lambda url: None,
+) -> int:
+    """Serve the page until a signal; return the exit status.
+
+    when_up: is called with the address of the page
+    """
     try:
         from fishd.window.api import Window
     except ImportError as error:
@@ -105,6 +112,7 @@ def serve(settings: WindowSettings, log_format: str = "text") -> int:
         with on_signal(lambda: loop.call_soon_threadsafe(ended.set)):
             async with Window(settings) as server:
                 log.info("the fish is at %s", server.url)
+                when_up(server.url)
                 while not ended.is_set():
                     notifier.ticked(loop.time())
                     try:

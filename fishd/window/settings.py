@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple
 from msgspec import Struct
 
 from fishd.core import strict_yaml
-from fishd.core.addresses import find_connect_problem
+from fishd.core.addresses import find_connect_problem, is_local
 from fishd.core.errors import ConfigError
 from fishd.core.files import expand_user
 from fishd.core.schema import Problem, convert, note
@@ -54,6 +54,12 @@ class WindowSettings(Struct, frozen=True, forbid_unknown_fields=True):
         match = _LISTEN.fullmatch(self.listen)
         assert match
         return Address(match["host"].strip("[]"), int(match["port"]))
+
+    @property
+    def is_local(self) -> bool:
+        """Whether only this machine reaches the page."""
+        host = self.address.host
+        return is_local(f"tcp://{f'[{host}]' if ':' in host else host}:1") or host == "::1"
 
     @property
     def endpoints(self) -> dict[str, str | None]:

@@ -1,0 +1,184 @@
+"""The verbs of the page for people at the tank: open it, and pair and revoke devices."""
+
+import http.client
+import os
+import socket
+import sys
+import webbrowser
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+import click
+
+from fishd.cli.options import json_option
+from fishd.cli.output import echo, print_json
+from fishd.core import text
+from fishd.core.errors import StartupError
+from fishd.window.main import serve, window_options
+from fishd.window.settings import WindowSettings, load
+
+if TYPE_CHECKING:
+    from fishd.window.devices import Devices
+
+ANSWER_TIMEOUT_S = 2.0
+"""Longest wait for the answer of a page that runs already [s]."""
+
+
+@click.group(invoke_without_command=True)
+@click.pass_context
+def window(ctx: click.Context) -> None:
+    """Show the fish on a web page for people at the tank, and control it there.
+
+    Without a further word, opens the page, and first starts it unless it runs. On this machine the
+    page is free; other devices need to be paired.
+    """
+    if ctx.invoked_subcommand is None:
+        ctx.exit(ctx.invoke(open_page))
+
+
+def _load(values: dict[str, Any]) -> WindowSettings:
+    """Return the settings that the options of a verb name."""
+    fish, endpoint = values["fish"], click.get_current_context().find_root().obj
+    if endpoint and not fish:
+        fish = {"fish": endpoint}
+    return load(values["path"], listen=values["listen"], fish=fish, state=values["state"])
+
+
+@window.command("open")
+@window_options
+def open_page(**values: Any) -> int:
+    """Open the page in a browser of this machine; start it unless it runs, until Ctrl-C."""
+    settings = _load(values)
+    url = _local_url(settings)
+    if _answers(url):
+        _show(url)
+        return 0
+    return serve(settings, when_up=_show)
+
+
+@window.command()
+@window_options
+def start(**values: Any) -> int:
+    """Serve the page until Ctrl-C, as the command fishd-window does."""
+    return serve(_load(values))
+
+
+@window.command()
+@window_options
+@click.option(
+    "--scope",
+    type=click.Choice(["watch", "drive"]),
+    default="drive",
+    show_default=True,
+    help="What the device may do. Either may stop the fish in an emergency.",
+)
+@click.option(
+    "--url",
+    metavar="URL",
+    help="Address by which the device reaches the page, such as that of a reverse proxy. [default: "
+    "from the settings]",
+)
+@json_option
+def pair(scope: str, url: str | None, as_json: bool, **values: Any) -> None:
+    """Print a link, and a QR code in a terminal, that pairs one device within ten minutes."""
+    from fishd.window.devices import INVITATION_S
+
+    settings = _load(values)
+    base = url or _network_url(settings)
+    if urlsplit(base).scheme not in ("http", "https"):
+        raise click.BadParameter("http://HOST:PORT/ or https://HOST/ is needed", param_hint="--url")
+    token = _open_devices(settings).invite(scope)  # type: ignore[arg-type]
+    link = f"{base.rstrip('/')}/#pair={token}"
+    if as_json:
+        print_json({"url": link, "scope": scope, "seconds": INVITATION_S})
+        return
+    if sys.stdout.isatty():
+        import segno
+
+        segno.make(link, micro=False).terminal(compact=True)
+    echo(f"open this on one device within {INVITATION_S / 60:.0f} minutes, to {scope}: {link}")
+
+
+@window.command()
+@window_options
+@json_option
+def devices(as_json: bool, **values: Any) -> None:
+    """List the paired devices."""
+    paired = _open_devices(_load(values)).all()
+    if as_json:
+        keys = ("id", "name", "scope", "paired", "seen")
+        print_json([{key: getattr(device, key) for key in keys} for device in paired])
+    elif not paired:
+        echo("no device is paired; pair one with 'fishctl window pair'")
+    for device in () if as_json else paired:
+        seen = datetime.fromtimestamp(device.seen)
+        echo(f"{device.id}  {device.scope:<5}  seen {seen:%Y-%m-%d %H h}  {text.line(device.name)}")
+
+
+@window.command()
+@window_options
+@click.argument("device")
+def revoke(device: str, **values: Any) -> None:
+    """Remove DEVICE, a name or an id: its open pages close at once."""
+    removed = _open_devices(_load(values)).revoke(device)
+    echo(f"{text.line(removed.name)} is no longer paired")
+
+
+def _open_devices(settings: WindowSettings) -> "Devices":
+    from fishd.window.devices import Devices
+
+    return Devices(settings.state_folder)
+
+
+def _local_url(settings: WindowSettings) -> str:
+    """Return the address of the page for a browser of this machine."""
+    host, port = settings.address
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+
+
+def _network_url(settings: WindowSettings) -> str:
+    """Return the address of the page for another device; raise `StartupError`."""
+    host, port = settings.address
+    if settings.is_local:
+        if settings.names:
+            return f"https://{settings.names[0]}/"
+        raise StartupError(
+            f"the page listens at {settings.listen}, which no other device reaches: start it with "
+            "--listen 0.0.0.0:8880, or name the address of a reverse proxy with --url"
+        )
+    if host in ("0.0.0.0", "::"):
+        host = _own_address(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
+
+
+def _own_address(family: int) -> str:
+    """Return the address of this machine in its network; its name if it has no network."""
+    target = "2001:db8::1" if family == socket.AF_INET6 else "192.0.2.1"
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((target, 9))  # sends nothing, but chooses the address
+        except OSError:
+            return socket.gethostname()
+        return str(probe.getsockname()[0])
+
+
+def _answers(url: str) -> bool:
+    """Return whether a window answers there."""
+    place = urlsplit(url)
+    connection = http.client.HTTPConnection(place.netloc, timeout=ANSWER_TIMEOUT_S)
+    try:
+        connection.request("GET", "/api/session")
+        return b'"loopback"' in connection.getresponse().read(10_000)
+    except (OSError, http.client.HTTPException):
+        return False
+    finally:
+        connection.close()
+
+
+def _show(url: str) -> None:
+    """Print the address, and open a browser on a desktop."""
+    echo(f"the fish is at {url}")
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin":
+        webbrowser.open(url)
