@@ -226,6 +226,7 @@ class Window(WebServer):
             == (resumed.client, resumed.device_id)
         ):
             page.client, driver.page = resumed.client, page
+        link.flush()
         page.push("hello", encode_message("hello", encode(self._hello(page))))
         self._pages.add(page)
         try:

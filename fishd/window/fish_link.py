@@ -175,12 +175,13 @@ class FishLink:
             self._set_connection("live", "")
         self._batch.append(payload)
         if now >= self._next_flush:
-            self._flush_batch()
+            self.flush()
         elif not self._flush:
             delay = self._next_flush - now
-            self._flush = asyncio.get_running_loop().call_later(delay, self._flush_batch)
+            self._flush = asyncio.get_running_loop().call_later(delay, self.flush)
 
-    def _flush_batch(self) -> None:
+    def flush(self) -> None:
+        """Send the ticks that wait; first do so where a page gets the history, which has them."""
         self._next_flush = time.monotonic() + 0.9 * BATCH_PERIOD_S
         if self._flush:
             self._flush.cancel()

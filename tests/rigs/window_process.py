@@ -1,0 +1,175 @@
+"""Running `fishd-window`, and pages that are open in it: real HTTP and WebSocket clients."""
+
+import asyncio
+import contextlib
+import re
+import sys
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any, Self
+from urllib.parse import urlsplit
+
+import aiohttp
+import msgspec
+
+from rigs.processes import PATIENCE, Process
+
+START = "from fishd.__main__ import fishd_window; fishd_window()"
+
+
+class WindowProcess(Process):
+    """Running `fishd-window`."""
+
+    def __init__(self, folder: Path, *arguments: str, changes: str = "", **fish: str) -> None:
+        """
+        folder: for paired devices and runs
+        changes: Python code that runs first, such as a shorter timeout
+        fish: control sockets by the name of the fish
+        """
+        self.state = folder / "window"
+        config = folder / "window.yaml"
+        config.write_text(f"runs: {folder}/runs\nnames: [fish.example]\n")
+        options = ("--config", str(config), "--state", str(self.state), "--listen", "127.0.0.1:0")
+        pairs = [word for name, where in fish.items() for word in ("--fish", f"{name}={where}")]
+        code = f"{changes}\n{START}"
+        super().__init__(sys.executable, "-P", "-c", code, *options, *pairs, *arguments)
+
+    def wait_until_up(self) -> Self:
+        assert self.process.stderr
+        self.log = self.process.stderr.readline()
+        match = re.search(r"the fish is at (http://\S+)/", self.log)
+        assert match, self.log + self.process.stderr.read()
+        self.url = match[1]
+        return self
+
+    @property
+    def port(self) -> int:
+        """Port of the page."""
+        return urlsplit(self.url).port or 0
+
+
+@contextlib.contextmanager
+def running_window(folder: Path, *arguments: str, **options: str) -> Iterator[WindowProcess]:
+    """Run a `fishd-window` that always ends with the context."""
+    with WindowProcess(folder, *arguments, **options) as process:
+        try:
+            yield process.wait_until_up()
+        finally:
+            print(f"fishd-window said:\n{process.log}{process.end()[2]}")
+
+
+class Browser:
+    """Client that sends what a browser sends: host, origin, cookies."""
+
+    def __init__(self, url: str, host: str | None = None) -> None:
+        """host: name by which it reaches the window; by default its address"""
+        place = urlsplit(url)
+        authority = f"{host}:{place.port}" if host else place.netloc
+        headers = {"Host": authority, "Origin": f"http://{authority}"}
+        self.session = aiohttp.ClientSession(
+            url, headers=headers, cookie_jar=aiohttp.CookieJar(unsafe=True)
+        )
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.session.close()
+
+    async def get(self, path: str, **options: Any) -> Any:
+        """Return the result of a request."""
+        async with self.session.get(path, **options) as response:
+            return _result(await response.read())
+
+    async def post(self, path: str, body: Any = None, **options: Any) -> Any:
+        """Return the result of a request."""
+        async with self.session.post(path, json=body or {}, **options) as response:
+            return _result(await response.read())
+
+    async def refusal(self, path: str, body: Any = None, **options: Any) -> tuple[int, str]:
+        """Return status and code of a request that is refused."""
+        method = "GET" if body is None else "POST"
+        async with self.session.request(method, path, json=body, **options) as response:
+            answer = msgspec.json.decode(await response.read())
+            assert not answer["ok"]
+            assert answer["error"]["message"]
+            return response.status, answer["error"]["code"]
+
+
+def _result(payload: bytes) -> Any:
+    answer = msgspec.json.decode(payload)
+    assert answer["ok"], answer
+    return answer["result"]
+
+
+class Page:
+    """A page that is open in a browser."""
+
+    def __init__(self, browser: Browser, fish: str, sock: aiohttp.ClientWebSocketResponse) -> None:
+        self.browser, self.fish, self.sock = browser, fish, sock
+        self.hello: dict[str, Any] = {}
+
+    async def message(self) -> tuple[str, Any]:
+        """Return the next message."""
+        kind, payload = msgspec.json.decode(await self.sock.receive_str())
+        return kind, payload
+
+    async def until(self, kind: str, true: Callable[[Any], bool] = lambda _: True) -> Any:
+        """Return the first message of a kind for which a condition holds."""
+        while True:
+            other, payload = await self.message()
+            if other == kind and true(payload):
+                return payload
+
+    async def post(self, what: str, body: Any = None) -> Any:
+        """Return the result of a request about the fish of this page."""
+        path = what if what.startswith("/") else f"/api/fish/{self.fish}/{what}"
+        return await self.browser.post(path, body, headers=self._headers)
+
+    async def refusal(self, what: str, body: Any = None) -> tuple[int, str]:
+        """Return status and code of a request that is refused."""
+        path = what if what.startswith("/") else f"/api/fish/{self.fish}/{what}"
+        return await self.browser.refusal(path, body or {}, headers=self._headers)
+
+    async def request(self, op: str, **arguments: Any) -> Any:
+        """Return the result of a request to the fish."""
+        return await self.post("request", {"op": op, "args": arguments})
+
+    async def drive(self) -> None:
+        """Take the role of the driver, from the page of an earlier test, too."""
+        await self.post("drive", {"take": True})
+
+    async def swim(self, controller: str = "square") -> None:
+        """Drive, start a controller, and wait until it swims."""
+        await self.drive()
+        await self.request("set-controller", name=controller)
+        await self.until("ticks", lambda ticks: ticks[-1]["mode"] == "running")
+
+    async def until_at_rest(self) -> None:
+        """Wait until the fish rests."""
+        await self.until("ticks", lambda ticks: ticks[-1]["mode"] == "idle")
+
+    @property
+    def _headers(self) -> dict[str, str]:
+        return {"X-Client": self.hello["client"]}
+
+
+@contextlib.asynccontextmanager
+async def open_page(browser: Browser, fish: str = "fish", client: str = "") -> AsyncIterator[Page]:
+    """Open a page, and read its first message."""
+    path = f"/live?fish={fish}&client={client}"
+    async with browser.session.ws_connect(path, max_msg_size=0) as sock:
+        page = Page(browser, fish, sock)
+        kind, page.hello = await page.message()
+        assert kind == "hello"
+        yield page
+
+
+def run(test: Coroutine[Any, Any, None]) -> None:
+    """Run a test within a generous time."""
+
+    async def run_in_time() -> None:
+        async with asyncio.timeout(PATIENCE):
+            await test
+
+    asyncio.run(run_in_time())
