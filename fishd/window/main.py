@@ -11,7 +11,7 @@ import click
 from fishd import __version__
 from fishd.core import text
 from fishd.core.console import complain, run
-from fishd.core.errors import FishdError, install
+from fishd.core.errors import FishdError, install_command
 from fishd.core.process.interruption import on_signal
 from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
 from fishd.core.process.shutdown import exit_now
@@ -103,7 +103,9 @@ def serve(
     try:
         from fishd.window.api import Window
     except ImportError as error:
-        complain(NAME, f"{text.error_message(error)}; {install('window')}", 1)
+        complain(
+            NAME, f"{text.error_message(error)}; install it with: {install_command('window')}", 1
+        )
     logs = LogWriter(log_format)
 
     async def run_window() -> None:

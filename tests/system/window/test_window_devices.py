@@ -1,0 +1,185 @@
+"""Devices of the network: pairing, scopes, and revocation that closes their pages."""
+
+import json
+import re
+import stat
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+from rigs.processes import fishctl, one_line
+from rigs.window_process import Browser, WindowProcess, open_page, run
+
+from fishd.window import devices
+from fishd.window.devices import DeviceError, Devices
+
+HOST = "fish.example"
+
+
+def ask(window: WindowProcess, verb: str, *words: str) -> str:
+    """Return what a verb of `fishctl window` prints."""
+    done = fishctl("window", verb, "--state", str(window.state), *words)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def invite(window: WindowProcess, scope: str) -> str:
+    """Return a new token."""
+    url = f"{window.url.replace('127.0.0.1', HOST)}/"
+    answer = json.loads(ask(window, "pair", "--scope", scope, "--url", url, "--json"))
+    match = re.fullmatch(rf"http://{HOST}:\d+/#pair=([\w-]{{22}})", answer["url"])
+    assert match
+    return match[1]
+
+
+@asynccontextmanager
+async def paired(window: WindowProcess, scope: str, name: str) -> AsyncIterator[Browser]:
+    """Yield the browser of a paired device in the network."""
+    async with Browser(window.url, HOST) as browser:
+        body = {"token": invite(window, scope), "name": name}
+        session = await browser.post("/api/pair", body)
+        assert (session["device"], session["scope"], session["loopback"]) == (name, scope, False)
+        yield browser
+
+
+async def refuse_page(browser: Browser) -> int:
+    """Return the status with which a page is refused."""
+    with pytest.raises(aiohttp.WSServerHandshakeError) as refusal:
+        async with browser.session.ws_connect("/live"):
+            pass
+    return refusal.value.status
+
+
+def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with Browser(window.url, HOST) as browser:
+            session = await browser.get("/api/session")
+            assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
+            for path in ("/api/fish", "/api/jobs", "/api/runs", "/api/fish/fish/history"):
+                assert await browser.refusal(path) == (401, "not-paired")
+            for path in ("estop", "drive", "release", "request"):
+                assert await browser.refusal(f"/api/fish/fish/{path}", {}) == (401, "not-paired")
+            assert await browser.refusal("/api/jobs", {}) == (401, "not-paired")
+            assert await refuse_page(browser) == 401
+
+    run(test())
+
+
+def test_a_token_pairs_one_device_and_no_second_one(window: WindowProcess) -> None:
+    async def test() -> None:
+        token = invite(window, "watch")
+        async with Browser(window.url, HOST) as first, Browser(window.url, HOST) as second:
+            async with first.session.post(
+                "/api/pair", json={"token": token, "name": "A"}
+            ) as answer:
+                cookie = answer.headers["Set-Cookie"]
+                assert answer.status == 200
+            for part in ("HttpOnly", "SameSite=Strict", "Max-Age=31536000", "Path=/"):
+                assert part in cookie
+            assert (await first.get("/api/session"))["scope"] == "watch"
+            assert await second.refusal("/api/pair", {"token": token}) == (403, "device")
+            assert await second.refusal("/api/pair", {"token": "x" * 22}) == (403, "device")
+            await first.post("/api/unpair")
+            assert not (await first.get("/api/session"))["paired"]
+
+    run(test())
+
+
+def test_a_device_that_may_watch_sees_the_fish_stops_it_and_nothing_more(
+    window: WindowProcess,
+) -> None:
+    async def test() -> None:
+        async with paired(window, "watch", "wall") as browser, open_page(browser) as page:
+            assert page.hello["session"]["scope"] == "watch"
+            await page.until("ticks")
+            for what in ("drive", "release", "request"):
+                assert await page.refusal(what) == (403, "only-watch")
+            assert await page.refusal("/api/jobs") == (403, "only-watch")
+            assert (await page.post("estop"))["way"] == "control"
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            await page.drive()
+            await page.request("clear-fault")
+
+    run(test())
+
+
+def test_a_paired_device_drives(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with paired(window, "drive", "tablet") as browser, open_page(browser) as page:
+            await page.swim()
+            status = await page.until("status", lambda status: status["lease"])
+            assert status["lease"]["name"] == "window: tablet"
+            await page.request("stop")
+
+    run(test())
+
+
+def test_a_revoked_device_loses_its_page_and_the_fish_stops(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with Browser(window.url) as here, open_page(here) as watcher:
+            async with paired(window, "drive", "stolen") as browser, open_page(browser) as page:
+                await page.swim()
+                removed = ask(window, "revoke", "stolen")
+                assert removed == "stolen is no longer paired\n"
+                while (await page.sock.receive()).type is aiohttp.WSMsgType.TEXT:
+                    pass
+                assert page.sock.closed
+                assert await refuse_page(browser) == 401
+                assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
+            await watcher.until_at_rest()
+
+    run(test())
+
+
+def test_the_devices_are_listed_without_any_secret(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with paired(window, "watch", "listed"):
+            text = ask(window, "devices")
+            assert re.search(r"(?m)^\w{8}  watch  seen \d{4}-\d\d-\d\d \d\d h  listed$", text)
+            listed: list[dict[str, Any]] = json.loads(ask(window, "devices", "--json"))
+            assert listed[-1].keys() == {"id", "name", "scope", "paired", "seen"}
+
+    run(test())
+    file = window.state / "devices.json"
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
+    assert stat.S_IMODE(window.state.stat().st_mode) == 0o700
+
+
+def test_a_page_for_this_machine_only_has_no_link_for_other_devices(tmp_path: Path) -> None:
+    done = fishctl("window", "pair", "--state", str(tmp_path))
+    assert "which no other device reaches: start it with --listen 0.0.0.0:8880" in one_line(done)
+    done = fishctl("window", "pair", "--state", str(tmp_path), "--listen", "192.0.2.9:8880")
+    assert re.search(r"to drive: http://192\.0\.2\.9:8880/#pair=[\w-]{22}\n", done.stdout)
+    done = fishctl("window", "revoke", "--state", str(tmp_path), "tablet")
+    assert "no device is named 'tablet'; paired: there is none" in one_line(done)
+
+
+def test_a_token_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paired = Devices(tmp_path)
+    token = paired.invite("watch", seconds=-1.0)
+    with pytest.raises(DeviceError, match="was used already, or has expired"):
+        paired.pair(token, "late")
+    monkeypatch.setattr(devices, "MAX_DEVICES", 1)
+    paired.pair(paired.invite("watch"), "first")
+    with pytest.raises(DeviceError, match="1 devices are paired"):
+        paired.pair(paired.invite("watch"), "second")
+
+
+def test_devices_of_one_name_are_told_apart_and_names_are_printable(tmp_path: Path) -> None:
+    paired = Devices(tmp_path)
+    names = [
+        paired.pair(paired.invite("watch"), name)[0].name for name in ("a", "a", "\x1b[2J", "")
+    ]
+    assert names == ["a", "a 2", "?[2J", "device"]
+
+
+def test_a_damaged_file_pairs_nothing_and_says_so(tmp_path: Path) -> None:
+    paired = Devices(tmp_path)
+    _, secret = paired.pair(paired.invite("drive"), "tablet")
+    assert paired.find(secret)
+    (tmp_path / "devices.json").write_text("{")
+    with pytest.raises(DeviceError, match=r"devices\.json: .*; remove it, and pair"):
+        paired.find(secret)

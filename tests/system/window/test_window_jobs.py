@@ -1,0 +1,134 @@
+"""Experiments of the page: true verbs of fishctl, their progress, and their ends."""
+
+from typing import Any
+
+import pytest
+from rigs.processes import Daemon
+from rigs.window_process import Browser, Page, WindowProcess, open_page, run
+
+
+async def start(page: Page, kind: str, **options: Any) -> Any:
+    """Start a job, and return it."""
+    return await page.post("/api/jobs", {"fish": "fish", "kind": kind, "options": options})
+
+
+async def end_of(page: Page, job: Any) -> Any:
+    """Return a job that has ended."""
+    return await page.until("job", lambda j: j["id"] == job["id"] and j["state"] != "running")
+
+
+def test_a_recording_is_made_listed_and_drawn(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            job = await start(page, "record", name="first", seconds=0.5, note="a; $(b) 'c'")
+            assert job["command"][:3] == ["fishctl", "record", "first"]
+            ended = await end_of(page, job)
+            assert (ended["state"], ended["exit"]) == ("done", 0)
+            assert ended["result"]["ticks"] > 0
+            run_ = next(
+                entry for entry in await browser.get("/api/runs") if entry["name"] == "first"
+            )
+            assert run_["about"]["note"] == "a; $(b) 'c'"
+            async with browser.session.get("/api/runs/first/plot.png") as response:
+                assert (response.status, response.content_type) == (200, "image/png")
+                assert (await response.read()).startswith(b"\x89PNG")
+            assert await browser.refusal("/api/runs/none/plot.png") == (409, "job")
+
+    run(test())
+
+
+def test_a_recording_is_stopped_and_kept(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            job = await start(page, "record", name="endless")
+            await page.until("job", lambda j: "recording to" in "".join(j["lines"]))
+            await page.post(f"/api/jobs/{job['id']}/stop")
+            ended = await end_of(page, job)
+            assert (ended["state"], ended["exit"]) == ("stopped", 0)
+            runs = [entry["name"] for entry in await browser.get("/api/runs")]
+            assert "endless" in runs
+            assert ended["id"] in [entry["id"] for entry in await browser.get("/api/jobs")]
+
+    run(test())
+
+
+def test_an_experiment_takes_the_fish_from_the_page_and_lets_it_rest_when_stopped(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    async def test() -> None:
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            options = {"controller": "square", "parameters": {"frequency": 2}}
+            refused = {"fish": "fish", "kind": "measure", "options": options}
+            await page.swim("sine")
+            await page.post("release")
+            assert await page.refusal("/api/jobs", refused) == (409, "not-driver")
+            await page.swim("sine")
+            job = await start(page, "measure", **options, seconds=60)
+            status = await page.until(
+                "status", lambda s: s["lease"] and s["lease"]["name"] == "measure square"
+            )
+            assert status["lease"]["name"] == "measure square"
+            await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
+            await page.post(f"/api/jobs/{job['id']}/stop")
+            assert (await end_of(page, job))["state"] == "stopped"
+
+    run(test())
+    assert daemon.status().lease is None
+
+
+def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            job = await start(
+                page, "simulate", controller="swing", parameters={"C": 0.5}, seconds=12
+            )
+            result = (await end_of(page, job))["result"]
+            assert result["parameters"]["C"] == 0.5
+            curve = result["curve"]
+            assert len(curve["time"]) == len(curve["fx"]) == len(curve["alpha"]) == result["ticks"]
+
+    run(test())
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "code"),
+    [
+        ("fly", {}, "unknown-kind"),
+        ("measure", {"controller": "--help"}, "bad-arguments"),
+        ("measure", {"controller": "square", "parameters": {"--config": 1}}, "bad-arguments"),
+        (
+            "measure",
+            {"controller": "ppo", "parameters": {"policy": "/etc/passwd"}},
+            "bad-arguments",
+        ),
+        ("record", {"name": "../above"}, "bad-arguments"),
+        ("record", {"name": "-x"}, "bad-arguments"),
+        ("record", {"name": "line\n"}, "bad-arguments"),
+        ("record", {"note": "bell\x07"}, "bad-arguments"),
+        ("compare", {"contestants": ["--folder=/"]}, "bad-arguments"),
+        ("rerun", {"run": "/etc/passwd"}, "bad-arguments"),
+        ("simulate", {"controller": "square", "seconds": 1e9}, "bad-arguments"),
+        ("simulate", {"controller": "square", "jobs": 9}, "bad-arguments"),
+    ],
+)
+def test_no_words_of_a_command_line_come_from_a_page(
+    window: WindowProcess, kind: str, options: Any, code: str
+) -> None:
+    async def test() -> None:
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            await page.drive()
+            body = {"fish": "fish", "kind": kind, "options": options}
+            assert await page.refusal("/api/jobs", body) == (400, code)
+
+    run(test())
+
+
+def test_a_job_that_fails_says_why(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            ended = await end_of(page, await start(page, "rerun", run="none"))
+            assert (ended["state"], ended["exit"]) == ("failed", 1)
+            assert "none" in ended["lines"][-1]
+            assert await page.refusal("/api/jobs/99/stop") == (409, "job")
+
+    run(test())
