@@ -6,6 +6,7 @@
 # FISHD_GPIO   rpi-gpio or rpi-lgpio, if not what suits this Pi; or none, for a robot without E-stop
 #              button and status light. Where it cannot be had, all else is installed, and it says so
 # FISHD_CAMERA yes: install what fishd-camera needs, too; once it is there, it is renewed
+# FISHD_WINDOW yes: install what the page fishd-window needs, too; once it is there, it is renewed
 # DESTDIR      a folder to install into, without touching the running system
 # pip's own variables work too: PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER installs without a network.
 set -euo pipefail
@@ -122,6 +123,7 @@ install_package() {
   # shellcheck disable=SC2046
   extras=$(core_extras $(about_python "$PYTHON"))
   if [[ ${FISHD_CAMERA:-} == yes ]] || has linuxpy; then extras+=,camera; fi
+  if [[ ${FISHD_WINDOW:-} == yes ]] || has segno; then extras+=,window; fi
   if [[ -z $wheel ]]; then
     try_pip wheel --no-deps --wheel-dir "$workspace" "$checkout" || give_up "building fishd failed"
     wheel=$(echo "$workspace"/fishd-*.whl)
@@ -189,6 +191,7 @@ put() { install -D -m 0644 "$1" "$DESTDIR$2"; }
 install_config() {
   install_one_config "$checkout/config/pi.yaml" "$CONFIG"
   install_one_config "$checkout/config/camera.yaml" "$CAMERA_CONFIG"
+  install_one_config "$checkout/config/window.yaml" "$WINDOW_CONFIG"
   # Its group is set by systemd-tmpfiles, once there is one.
   chmod 0640 "$DESTDIR$CAMERA_CONFIG"
   step "$CAMERA_CONFIG: for root and group fishd only, as it may hold a camera's password"
@@ -216,7 +219,7 @@ install_one_config() {
 install_files() {
   local entry source target
   mkdir -p "$DESTDIR$COMMANDS"
-  for source in fishd fishctl fishd-camera; do
+  for source in fishd fishctl fishd-camera fishd-window; do
     ln -sfn "$HOME_FOLDER/bin/$source" "$DESTDIR$COMMANDS/$source"
     step "$COMMANDS/$source: installed"
   done
@@ -246,12 +249,21 @@ take_effect() {
   if ! systemctl --quiet is-enabled fishd-camera.service 2>/dev/null; then
     step "to serve a camera: $(camera_next)"
   fi
+  if ! systemctl --quiet is-enabled fishd-window.service 2>/dev/null; then
+    step "to serve a page of the fish: $(window_next)"
+  fi
 }
 
 # What a camera still takes.
 camera_next() {
   has linuxpy || echo -n "sudo make install-pi FISHD_CAMERA=yes; "
   echo "look over $CAMERA_CONFIG; sudo systemctl enable --now fishd-camera"
+}
+
+# What the page still takes.
+window_next() {
+  has segno || echo -n "sudo make install-pi FISHD_WINDOW=yes; "
+  echo "sudo systemctl enable --now fishd-window"
 }
 
 say_what_next() {

@@ -6,8 +6,10 @@ DESTDIR=${DESTDIR:-}
 HOME_FOLDER=/opt/fishd
 CONFIG=/etc/fishd/fishd.yaml
 CAMERA_CONFIG=/etc/fishd/camera.yaml
+WINDOW_CONFIG=/etc/fishd/window.yaml
 STATE_FOLDER=/var/lib/fishd
 RECORDINGS=/var/lib/fishd-recorder
+WINDOW_STATE=/var/lib/fishd-window
 COMMANDS=/usr/local/bin
 
 # Files of systemd/, and where they go. Under /etc, so that they do not collide with packages.
@@ -15,6 +17,7 @@ SYSTEM_FILES=(
   "fishd.service /etc/systemd/system/fishd.service"
   "fishd-failure.service /etc/systemd/system/fishd-failure.service"
   "fishd-camera.service /etc/systemd/system/fishd-camera.service"
+  "fishd-window.service /etc/systemd/system/fishd-window.service"
   "fishd-recorder.service /etc/systemd/system/fishd-recorder.service"
   "pigpiod.service.d/fishd.conf /etc/systemd/system/pigpiod.service.d/fishd.conf"
   "sysusers.d/fishd.conf /etc/sysusers.d/fishd.conf"

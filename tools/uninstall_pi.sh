@@ -21,7 +21,7 @@ remove_if_empty() { rmdir "$DESTDIR$1" 2>/dev/null || true; }
 stop_service() {
   local status=0
   local other
-  for other in fishd-recorder fishd-camera; do
+  for other in fishd-recorder fishd-camera fishd-window; do
     systemctl stop "$other.service" 2>/dev/null || true
     systemctl --quiet disable "$other.service" 2>/dev/null || true
   done
@@ -37,7 +37,7 @@ stop_service() {
 
 remove_config() {
   local config
-  for config in "$CONFIG" "$CAMERA_CONFIG"; do
+  for config in "$CONFIG" "$CAMERA_CONFIG" "$WINDOW_CONFIG"; do
     if [[ $PURGE == 1 ]] || cmp -s "$DESTDIR$config" "$DESTDIR$(as_installed "$config")"; then
       remove "$config"
     elif [[ -e $DESTDIR$config ]]; then
@@ -58,6 +58,7 @@ remove_files() {
   remove "$COMMANDS/fishd"
   remove "$COMMANDS/fishctl"
   remove "$COMMANDS/fishd-camera"
+  remove "$COMMANDS/fishd-window"
   remove "$HOME_FOLDER"
 }
 
@@ -69,11 +70,16 @@ remove_state() {
     remove /etc/systemd/system/fishd.service.d
     remove /etc/systemd/system/fishd-recorder.service.d
     remove /etc/systemd/system/fishd-camera.service.d
+    remove /etc/systemd/system/fishd-window.service.d
+    remove "$WINDOW_STATE"
   elif [[ -e $DESTDIR$STATE_FOLDER ]]; then
     step "$STATE_FOLDER: calibrations, kept; PURGE=1 removes them"
   fi
   if [[ -e $DESTDIR$RECORDINGS ]]; then
     step "$RECORDINGS: recordings, kept; PURGE=1 removes them"
+  fi
+  if [[ -e $DESTDIR$WINDOW_STATE ]]; then
+    step "$WINDOW_STATE: paired devices and recordings, kept; PURGE=1 removes them"
   fi
 }
 

@@ -32,6 +32,7 @@ man_pages = [
     for name, about in {
         "fishd": "run a robotic fish",
         "fishctl": "talk to fishd, the daemon that runs a robotic fish",
+        "fishd-window": "serve a page of the fish for people at the tank",
         "fishd-camera": "publish the frames of the camera above the tail",
     }.items()
 ]

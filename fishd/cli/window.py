@@ -48,7 +48,7 @@ def _load(values: dict[str, Any]) -> WindowSettings:
 @window.command("open")
 @window_options
 def open_page(**values: Any) -> int:
-    """Open the page in a browser of this machine; start it unless it runs, until Ctrl-C."""
+    """Open the page in a browser; start it unless it runs."""
     settings = _load(values)
     url = _local_url(settings)
     if _answers(url):
@@ -60,7 +60,7 @@ def open_page(**values: Any) -> int:
 @window.command()
 @window_options
 def start(**values: Any) -> int:
-    """Serve the page until Ctrl-C, as the command fishd-window does."""
+    """Serve the page until Ctrl-C, as fishd-window does."""
     return serve(_load(values))
 
 
@@ -81,7 +81,10 @@ def start(**values: Any) -> int:
 )
 @json_option
 def pair(scope: str, url: str | None, as_json: bool, **values: Any) -> None:
-    """Print a link, and a QR code in a terminal, that pairs one device within ten minutes."""
+    """Print a link and a QR code that pair a device.
+
+    It pairs one device, within ten minutes. The code is for a terminal.
+    """
     from fishd.window.devices import INVITATION_S
 
     settings = _load(values)
@@ -119,10 +122,17 @@ def devices(as_json: bool, **values: Any) -> None:
 @window.command()
 @window_options
 @click.argument("device")
-def revoke(device: str, **values: Any) -> None:
-    """Remove DEVICE, a name or an id: its open pages close at once."""
+@json_option
+def revoke(device: str, as_json: bool, **values: Any) -> None:
+    """Remove a device, and close its pages.
+
+    DEVICE is its name or id, as `fishctl window devices` shows it.
+    """
     removed = _open_devices(_load(values)).revoke(device)
-    echo(f"{text.line(removed.name)} is no longer paired")
+    if as_json:
+        print_json({"id": removed.id, "name": removed.name})
+    else:
+        echo(f"{text.line(removed.name)} is no longer paired")
 
 
 def _open_devices(settings: WindowSettings) -> "Devices":

@@ -16,7 +16,7 @@ from fishd.config import Config, load
 
 SYSTEMD = ROOT / "systemd"
 ON_THE_ROBOT = ("fishd.service", "fishd-failure.service")
-UNITS = (*ON_THE_ROBOT, "fishd-recorder.service", "fishd-camera.service")
+UNITS = (*ON_THE_ROBOT, "fishd-recorder.service", "fishd-camera.service", "fishd-window.service")
 MAX_EXPOSURE = 2.0
 """Largest exposure level of `systemd-analyze security`: 0 is closed, 10 is open."""
 SHIPPED_UNITS = Path("/usr/lib/systemd/system")
@@ -53,6 +53,7 @@ def root(tmp_path: Path) -> Path:
         f"{fishd}-release",
         fishctl,
         f"{fishd}-camera",
+        f"{fishd}-window",
         "usr/bin/pigpiod",
         "bin/sh",
         "bin/systemctl",

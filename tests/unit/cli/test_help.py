@@ -83,7 +83,7 @@ def test_a_time_that_is_no_number_is_a_wrong_use(verb: str) -> None:
 WITHOUT_JSON = {
     *("calibrate force", "calibrate servo", "camera view", "completion", "config example"),
     *("virtual-pi clear", "virtual-pi inject", "virtual-pi press", "virtual-pi run"),
-    *("config schema", "virtual-pi release-button"),
+    *("config schema", "virtual-pi release-button", "window", "window open", "window start"),
 }
 """Verbs that print no result: dialogues, pictures in the terminal, scripts, or nothing."""
 EXPERIMENTS = ("measure", "compare", "sweep", "optimise", "identify", "adapt", "learn ppo")

@@ -21,6 +21,7 @@ from fishd.core.errors import UnknownController
 from fishd.core.schema import fields_of
 from fishd.daemon.main import fishd
 from fishd.virtual.pi.faults import FAULTS
+from fishd.window.main import window
 
 OPERATORS = [path for path in DOCS if path.stem in (
     "calibration", "configuration", "getting-started", "installing", "protocol", "troubleshooting",
@@ -105,7 +106,9 @@ def command_lines(document: Path, program: str) -> Iterator[list[str]]:
 
 
 @each_document
-@pytest.mark.parametrize("program", [fishctl, fishd, camera], ids=lambda command: command.name)
+@pytest.mark.parametrize(
+    "program", [fishctl, fishd, camera, window], ids=lambda command: command.name
+)
 def test_each_verb_and_option_of_a_command_exists(document: Path, program: click.Command) -> None:
     lines = command_lines(document, program.name or "")
     problems = [
@@ -232,6 +235,8 @@ def test_installing_lists_all_files_and_groups_that_come_onto_a_pi() -> None:
     files = re.findall(r"(?m)^\w*CONFIG=(\S+)|^ +\"\S+ (/\S+)\"$", layout)
     wanted = {f"`{name or path}`" for name, path in files}
     assert len(wanted) > 10
-    wanted |= {f"`/usr/local/bin/{name}`" for name in ("fishd", "fishctl", "fishd-camera")}
+    wanted |= {
+        f"`/usr/local/bin/{name}`" for name in ("fishd", "fishctl", "fishd-camera", "fishd-window")
+    }
     wanted |= set(re.findall(r"(?m)^m fishd (\w+)$", users))
     assert {name for name in wanted if name not in table} == set()
