@@ -40,9 +40,8 @@ def test_events_arrive_as_they_happen(daemon: Daemon) -> None:
         Fish(daemon.endpoint, timeout=PATIENCE) as sender,
     ):
         events = listener.events()
-        reader = threading.Thread(
-            target=lambda: seen.append(next(e.message for e in events if e.kind == "mark"))
-        )
+        marks = (event.message for event in events if event.kind == "mark")
+        reader = threading.Thread(target=lambda: seen.append(next(marks)))
         reader.start()
         for _ in range(1000):  # until the subscription is through
             sender.mark("a wave in the tank")

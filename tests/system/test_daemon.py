@@ -49,9 +49,7 @@ def test_a_bare_subscriber_gets_two_frames_and_every_documented_field(daemon: Da
             topic, payload = subscriber.socket.recv_multipart()
             assert topic == b"tick"
             tick = msgspec.json.decode(payload)
-            kinds = {
-                name: type(value) for name, value in tick.items() if name not in OPTIONAL_FIELDS
-            }
+            kinds = {name: type(x) for name, x in tick.items() if name not in OPTIONAL_FIELDS}
             assert kinds == TICK_FIELDS
             assert b"null" not in payload
 

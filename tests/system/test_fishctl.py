@@ -82,9 +82,8 @@ def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(daemon
     assert "swing  Reverse the tail" in text
     assert "--longest-half-period" in text
     assert "A number in (0, 10] s; default 1.0." in text
-    known = {
-        info["name"]: info for info in json.loads(daemon.fishctl("controllers", "--json").stdout)
-    }
+    listed = json.loads(daemon.fishctl("controllers", "--json").stdout)
+    known = {info["name"]: info for info in listed}
     assert {"hold", "square", "sine", "triangle", "swing"} <= set(known)
     assert known["swing"]["parameters"][0] == {
         "name": "C",

@@ -113,9 +113,8 @@ def test_a_policy_that_cannot_be_used_is_refused_in_one_line(daemon: Daemon) -> 
 
 
 def test_the_daemon_lists_its_policies_and_why_some_are_not_for_it(daemon: Daemon) -> None:
-    listed = {
-        info["name"]: info for info in json.loads(daemon.fishctl("policies", "--json").stdout)
-    }
+    found = json.loads(daemon.fishctl("policies", "--json").stdout)
+    listed = {info["name"]: info for info in found}
     assert listed["flip"]["problem"] == ""
     assert listed["flip"]["card"]["amplitude"] == 0.42
     assert listed["torch"]["card"] is None

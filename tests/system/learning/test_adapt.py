@@ -56,9 +56,8 @@ def identification() -> Identification:
         ),
         Estimate("rotation", 0.1, 0.1, 0.1, fitted=False),
     ]
-    channel = Channel(
-        "fx", explained=0.99, explained_out_of_sample=0.99, noise=1e-3, drift=0.0, white=True
-    )
+    explained = {"explained": 0.99, "explained_out_of_sample": 0.99}
+    channel = Channel("fx", **explained, noise=1e-3, drift=0.0, white=True)
     errors = np.log([1.02, 1.04]) / 1.96
     empty = np.zeros((2, 0))
     return Identification(
@@ -110,9 +109,8 @@ def test_the_largest_thrust_wins_where_the_measurement_is_decisive() -> None:
     assert (won.chosen_gait, won.is_decided, won.undecided_gaits) == ("swing", True, ["swing"])
     assert won.relative_thrust == pytest.approx(1.05)
     # √2 · 1 % of relative error, for a single comparison
-    assert (won.relative_thrust_ci95_low, won.relative_thrust_ci95_high) == pytest.approx(
-        (1.0354, 1.0648), abs=5e-4
-    )
+    low, high = won.relative_thrust_ci95_low, won.relative_thrust_ci95_high
+    assert (low, high) == pytest.approx((1.0354, 1.0648), abs=5e-4)
     assert "swing as --C auto has found it wins: it thrusts 105.0 %" in won.claim
 
 
@@ -126,9 +124,7 @@ def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins(
         "undecided between the best square wave found, swing as --C auto has found it and the "
         "policy; the best square wave found chosen because it is the simplest; thrust relative "
     )
-    assert three.claim.endswith(
-        "the identified fish explains 61% of its forces only, so it is not used"
-    )
+    assert "the identified fish explains 61% of its forces only, so it is not used" in three.claim
     assert not any("wins" in verdict.claim for verdict in (two, three))
 
 
@@ -252,10 +248,8 @@ def test_with_a_good_fit_few_noisy_waves_do_not_move_the_maximum() -> None:
     for frequency, luck in ((10 / 8, 1.04), (10 / 6, 0.96), (2.0, 1.0)):
         thrust = luck * square_wave(PlantParameters(), PHI, frequency).thrust
         search.observe({"frequency": frequency}, thrust, 2e-3)
-    tried = [
-        Tried(*measurement, 0, 0.0)
-        for measurement in zip(*search.read_measurements("frequency"), strict=True)
-    ]
+    forces = search.read_measurements("frequency")
+    tried = [Tried(*measurement, 0, 0.0) for measurement in zip(*forces, strict=True)]
     assert steps.best_of(search, tried, fitted(GOOD), PHI) == (pytest.approx(10 / 6), True)
 
 
@@ -334,10 +328,8 @@ def test_a_resume_repeats_no_measurement(tmp_path: Path, monkeypatch: pytest.Mon
     text = page.read_text(encoding="utf-8")
     assert "fishctl set-controller &lt;swing&gt;" in text
     assert "the best square wave found, chosen" in text
-    assert (
-        format_ratio(state.verdict.relative_thrusts["swing"])
-        in text.partition("<h2>In the tank</h2>")[2]
-    )
+    in_the_tank = text.partition("<h2>In the tank</h2>")[2]
+    assert format_ratio(state.verdict.relative_thrusts["swing"]) in in_the_tank
     assert "<td>rad/s</td>" in text
     assert "<td>–</td>" in text
     assert "e-" not in text.partition("<h2>The fish</h2>")[2]

@@ -31,12 +31,9 @@ def test_the_environment_in_process_passes_both_checkers() -> None:
 
 def test_an_environment_is_made_from_the_files_of_fish_and_training(tmp_path: Path) -> None:
     (tmp_path / "fish.yaml").write_text("amplitude_limit: 0.2\n", encoding="utf-8")
-    (tmp_path / "training.yaml").write_text(
-        "environment:\n  observation: [fy]\n  episode: 3\n", encoding="utf-8"
-    )
-    env = gymnasium.make(
-        "fishd/Swim-v0", config=tmp_path / "fish.yaml", settings=str(tmp_path / "training.yaml")
-    )
+    settings = tmp_path / "training.yaml"
+    settings.write_text("environment:\n  observation: [fy]\n  episode: 3\n", encoding="utf-8")
+    env = gymnasium.make("fishd/Swim-v0", config=tmp_path / "fish.yaml", settings=str(settings))
     observation, _ = env.reset(seed=1)
     assert observation.shape == (1,)
     swim = env.unwrapped
@@ -123,18 +120,10 @@ def test_where_no_time_has_passed_a_pause_ends_no_dwell() -> None:
 def test_an_action_that_is_not_one_number_is_refused_and_one_beyond_its_space_clipped() -> None:
     env = gymnasium.make("fishd/Swim-v0").unwrapped
     env.reset(seed=1)
-    invalid: list[Any] = [
-        [np.nan],
-        np.array([-np.inf], np.float32),
-        0.5,
-        np.zeros((1, 1)),
-        [],
-        None,
-    ]
+    invalid: list[Any] = [[np.nan], np.array([-np.inf], np.float32), 0.5, [], None]
+    invalid.append(np.zeros((1, 1)))
     for action in invalid:
-        with pytest.raises(
-            ValueError, match=r"^an action of .* is not valid: (a number in|\(1,\) is) "
-        ):
+        with pytest.raises(ValueError, match=r"^an action of .* is not valid: (a number|\(1,\)) i"):
             env.step(action)
     env.step([7])
     assert env.latest.instruction_angle == 0.42  # type: ignore[attr-defined]

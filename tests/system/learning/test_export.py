@@ -37,9 +37,8 @@ def stalled(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
 def test_outputs_of_the_file_are_those_of_the_policy(tmp_path: Path, by_force: Outcome) -> None:
     assert by_force.best
     exported = export(by_force.best, tmp_path / "policy.onnx")
-    controller = registry.create(
-        "ppo", {"policy": str(exported.path)}, Limits(0.42, 0.05, dwell=0.0)
-    )
+    chosen = {"policy": str(exported.path)}
+    controller = registry.create("ppo", chosen, Limits(0.42, 0.05, dwell=0.0))
     policy, perception = checkpoints.load_policy(by_force.best)
     decide = DeterministicPolicy(policy, perception, 0.42)
     draw = np.random.default_rng(1)
@@ -198,9 +197,8 @@ def test_the_command_overwrites_a_file_only_with_force(tmp_path: Path, by_force:
     words = ["learn", "export", str(by_force.best), "--to", str(target)]
     refused = CliRunner().invoke(fishctl, words)
     assert isinstance(refused.exception, PolicyError)
-    assert str(refused.exception) == (
-        f"{target}: exists already; --force overwrites it, --to names another"
-    )
+    refusal = "exists already; --force overwrites it, --to names another"
+    assert str(refused.exception) == f"{target}: {refusal}"
     assert target.read_text() == "precious"
     assert CliRunner().invoke(fishctl, [*words, "--force"]).exit_code == 0
     assert read(target).card.amplitude == 0.42

@@ -39,12 +39,8 @@ def swim_with(
         angles = random_angles(0, TICKS, CONFIG.amplitude_limit)
     extractor = extractor_of("nature")
     link = SimulatedLink(CONFIG, camera=Camera(rig, StackSettings()))
-    env = SwimEnv(
-        link,
-        CONFIG,
-        EnvironmentSettings(observation=("instruction_angle",), longest_start=0),
-        extractor,
-    )
+    settings = EnvironmentSettings(observation=("instruction_angle",), longest_start=0)
+    env = SwimEnv(link, CONFIG, settings, extractor)
     env.reset(seed=0)
     stacks, fins = [], []
     for angle in angles:

@@ -23,9 +23,8 @@ from fishd.learning.train.progress import ShownDisplay
 from fishd.learning.train.training import train
 from fishd.virtual.plant.optimum import best_square_wave
 
-ENVIRONMENT = EnvironmentSettings(
-    observation=("fy", "instruction_angle", "fin_velocity", "side_time"), history=4
-)
+SEEN = ("fy", "instruction_angle", "fin_velocity", "side_time")
+ENVIRONMENT = EnvironmentSettings(observation=SEEN, history=4)
 SHORT_IMITATION = ImitationSettings(rounds=2, fish=10, ticks=60, batch_size=128)
 CHANGES = {
     "steps": 0,
@@ -62,9 +61,7 @@ def test_a_clean_rig_keeps_the_fish_and_has_less_delay_and_play() -> None:
 
 def test_the_advice_is_to_stay_until_the_best_half_beat_is_over() -> None:
     relative_thrust = np.array([0.0, 0.5, 1.0, 0.9, 0.3])
-    sides, costs = zip(
-        *(advise_side(relative_thrust, elapsed) for elapsed in range(6)), strict=True
-    )
+    sides, costs = zip(*(advise_side(relative_thrust, t) for t in range(6)), strict=True)
     assert sides == (1.0, 1.0, -1.0, -1.0, -1.0, -1.0)
     assert costs == pytest.approx((0.52, 0.52, 0.12, 0.62, 0.62, 0.62))
 
@@ -87,9 +84,8 @@ def test_ppo_continues_with_the_imitated_policy(tmp_path: Path) -> None:
     train(job)
     first, *_ = rows(tmp_path / "run" / "evaluations.csv")
     assert (first["steps"], first["stalled"]) == ("0", "0")
-    assert checkpoints.read_card(tmp_path / "run" / "step-000064").provenance.algorithm == (
-        "imitation and PPO"
-    )
+    card = checkpoints.read_card(tmp_path / "run" / "step-000064")
+    assert card.provenance.algorithm == "imitation and PPO"
 
 
 def test_a_training_stopped_during_imitation_repeats_it(tmp_path: Path) -> None:
@@ -109,9 +105,8 @@ def test_a_child_does_not_imitate_again(tmp_path: Path, imitated: tuple[Outcome,
     evaluations: list[Evaluation] = []
     display = ShownDisplay(Lines(err=False))
     display.evaluated = evaluations.append  # type: ignore[method-assign]
-    outcome = train(
-        brief_job(tmp_path / "second", **{**CHANGES, "steps": 64}, parent=parent), display
-    )
+    more = {**CHANGES, "steps": 64}
+    outcome = train(brief_job(tmp_path / "second", **more, parent=parent), display)
     assert [evaluation.steps for evaluation in evaluations] == [64]
     assert outcome.checkpoint
     assert checkpoints.read_state(outcome.checkpoint).imitated
@@ -120,9 +115,8 @@ def test_a_child_does_not_imitate_again(tmp_path: Path, imitated: tuple[Outcome,
 def test_the_best_beat_of_a_robot_is_not_known(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"imitation\.rounds: the best beat of a robot's fish"):
         train(brief_job(tmp_path / "run", **CHANGES, on="live"))
-    nothing = brief_job(
-        tmp_path / "run", **{**CHANGES, "steps": 0}, on="live", parent=tmp_path / "step-64"
-    )
+    no_step = {**CHANGES, "steps": 0}
+    nothing = brief_job(tmp_path / "run", **no_step, on="live", parent=tmp_path / "step-64")
     with pytest.raises(ConfigError, match="steps: 0 is not valid on a robot"):
         train(nothing)
     assert not (tmp_path / "run").exists()

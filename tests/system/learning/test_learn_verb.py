@@ -98,12 +98,10 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
 
 def test_no_export_is_advised_for_a_policy_that_never_swam(tmp_path: Path) -> None:
     idle = tmp_path / "idle.yaml"
-    idle.write_text(
-        SETTINGS.replace("n_epochs: 4", "n_epochs: 1, learning_rate: 1.0e-9"), encoding="utf-8"
-    )
-    result = learn(
-        "ppo", "--settings", str(idle), "--folder", str(tmp_path / "run"), "--steps", "64"
-    )
+    slow = SETTINGS.replace("n_epochs: 4", "n_epochs: 1, learning_rate: 1.0e-9")
+    idle.write_text(slow, encoding="utf-8")
+    folder = str(tmp_path / "run")
+    result = learn("ppo", "--settings", str(idle), "--folder", folder, "--steps", "64")
     assert result.returncode == 0, result.stderr
     assert "it stalled in every evaluation; train it for longer" in result.stdout
     assert "learn export" not in result.stdout
@@ -139,9 +137,8 @@ def test_after_a_kill_all_checkpoints_are_complete(tmp_path: Path, settings: str
     text = SETTINGS.replace("steps: 128", "steps: 128\ncheckpoint_every: 64")
     Path(settings).write_text(text, encoding="utf-8")
     folder = tmp_path / "run"
-    training = Process(
-        *(FISHCTL, "learn", "ppo", "--folder", str(folder), *ENDLESS, "--settings", settings)
-    )
+    words = ("--folder", str(folder), *ENDLESS, "--settings", settings)
+    training = Process(FISHCTL, "learn", "ppo", *words)
     try:
         wait_for(lambda: updates(folder) >= 3)
     finally:
@@ -197,10 +194,8 @@ def test_a_training_on_a_running_fishd_uses_its_tick_and_leaves_the_fish_at_rest
     tmp_path: Path, hasty: str, daemon: Daemon
 ) -> None:
     folder = tmp_path / "run"
-    result = learn(
-        *("ppo", "--on", "live", "--endpoint", daemon.endpoint),
-        *("--settings", hasty, "--folder", str(folder)),
-    )
+    live = ("ppo", "--on", "live", "--endpoint", daemon.endpoint)
+    result = learn(*live, "--settings", hasty, "--folder", str(folder))
     assert result.returncode == 0, result.stderr
     config, _ = runs.read(folder)
     # The configuration is that of fishd
@@ -244,9 +239,8 @@ def test_an_estop_ends_a_training_with_the_reason_and_a_checkpoint_and_no_other_
 def test_a_configuration_unlike_that_of_fishd_is_explained(tmp_path: Path, daemon: Daemon) -> None:
     file = tmp_path / "fish.yaml"
     file.write_text("amplitude_limit: 0.3\ntick: 0.05\n", encoding="utf-8")
-    status, line = complaint(
-        "ppo", "--on", "live", "--endpoint", daemon.endpoint, "--config", str(file)
-    )
+    live = ("ppo", "--on", "live", "--endpoint", daemon.endpoint)
+    status, line = complaint(*live, "--config", str(file))
     assert status == 78
     assert "amplitude_limit: 0.3 rad in this configuration, 0.42 rad in the fishd" in line
 

@@ -105,9 +105,8 @@ def test_a_resumed_run_keeps_its_eye(tmp_path: Path, brief: tuple[Job, Outcome])
     _, after = checkpoints.load_policy(folder / "step-000512")
     assert before.extractor
     assert after.extractor
-    assert np.array_equal(
-        before.extractor.constants["patterns"], after.extractor.constants["patterns"]
-    )
+    patterns = [model.extractor.constants["patterns"] for model in (before, after)]
+    assert np.array_equal(*patterns)
 
 
 def test_a_run_folder_contains_the_settings_of_its_camera(tmp_path: Path) -> None:
@@ -182,12 +181,8 @@ def test_a_training_whose_camera_sees_no_tail_ends_with_an_explanation(tmp_path:
 def test_steps_without_a_frame_are_void() -> None:
     rare = replace(DEFAULT, rate=3.0)
     camera = Camera(rare, StackSettings(frames=1))
-    env = SwimEnv(
-        SimulatedLink(Config(), camera=camera),
-        Config(),
-        EnvironmentSettings(),
-        job_extractor("nature"),
-    )
+    link = SimulatedLink(Config(), camera=camera)
+    env = SwimEnv(link, Config(), EnvironmentSettings(), job_extractor("nature"))
     env.reset(seed=0)
     action = np.array([0.2], np.float32)
     steps = [env.step(action) for _ in range(100)]
@@ -215,19 +210,16 @@ def test_with_another_camera_only_the_eye_is_fitted(tmp_path: Path, by_sight: Ou
     assert outcome.best_evaluation.relative_thrust > 0.9
     assert by_sight.best
     assert outcome.best
-    extractors = [
-        checkpoints.load_policy(checkpoint)[1].extractor
-        for checkpoint in (by_sight.best, outcome.best)
-    ]
+    saved = (by_sight.best, outcome.best)
+    extractors = [checkpoints.load_policy(step)[1].extractor for step in saved]
     first, second = (extractor.constants["patterns"] for extractor in extractors if extractor)
     assert not np.array_equal(first, second)
 
 
 def job_extractor(kind: str) -> FeatureExtractor | None:
     stack = StackSettings(frames=1)
-    return make_extractor(
-        TrainingSettings(see="camera", camera=VisionSettings(feature_extractor=kind, stack=stack))
-    )
+    camera = VisionSettings(feature_extractor=kind, stack=stack)
+    return make_extractor(TrainingSettings(see="camera", camera=camera))
 
 
 def test_gymnasium_makes_an_environment_that_sees(tmp_path: Path) -> None:

@@ -36,9 +36,8 @@ HARSH = Randomisation(
     servo_reaction=3e-3,
     rotation=0.17,
 )
-REMEMBERING = EnvironmentSettings(
-    observation=("fy", "instruction_angle"), history=4, longest_start=0
-)
+SEEN = ("fy", "instruction_angle")
+REMEMBERING = EnvironmentSettings(observation=SEEN, history=4, longest_start=0)
 
 
 def act(env: SwimEnv, share: float) -> np.ndarray:
@@ -137,9 +136,8 @@ def test_a_policy_that_violates_the_shortest_dwell_has_no_worst_thrust_in_the_ra
 def test_a_training_on_harsh_fish_records_its_worst(tmp_path: Path) -> None:
     chosen = replace(BRIEF.evaluation, others=2, others_from="range")
     environment = replace(REMEMBERING, own_fish=True, episode=32)
-    job = brief_job(
-        tmp_path / "run", environment=environment, randomisation=HARSH, evaluation=chosen
-    )
+    varied = {"randomisation": HARSH, "evaluation": chosen}
+    job = brief_job(tmp_path / "run", environment=environment, **varied)
     latest = train(job).latest_evaluation
     assert latest
     assert latest.worst is not None

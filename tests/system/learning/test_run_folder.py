@@ -121,9 +121,8 @@ def test_an_archive_that_would_fill_the_memory_is_refused(run: Path) -> None:
     with ZipFile(run / STEP / "model.zip", "w", ZIP_DEFLATED, compresslevel=1) as archive:
         for number in range(5):
             archive.writestr(f"{number}.pth", bytes(64 * 2**20))
-    assert "it unpacks to far more than a checkpoint needs" in complaint(
-        READERS[f"{STEP}/model.zip"], run
-    )
+    read_model = READERS[f"{STEP}/model.zip"]
+    assert "it unpacks to far more than a checkpoint needs" in complaint(read_model, run)
 
 
 def test_a_checkpoint_with_a_strange_number_is_not_the_newest(run: Path) -> None:
@@ -162,9 +161,8 @@ def test_after_a_kill_at_any_call_of_a_save_the_best_is_the_new_or_the_old_one(
 
 def test_a_table_of_another_kind_is_one_line(run: Path) -> None:
     (run / "evaluations.csv").write_text("a,b\n1,2\n", encoding="utf-8")
-    assert (
-        complaint(read_evaluations, run) == f"{run / 'evaluations.csv'}: not a table of evaluations"
-    )
+    file = run / "evaluations.csv"
+    assert complaint(read_evaluations, run) == f"{file}: not a table of evaluations"
 
 
 def test_a_resume_with_a_pipe_for_a_state_advises_what_to_do(run: Path) -> None:

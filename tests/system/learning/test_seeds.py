@@ -198,9 +198,8 @@ def test_the_seed_of_a_killed_process_is_resumed(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "latest policies of 2 seeds" in done.stdout
-    assert [evaluation.steps for evaluation in read_evaluations(run / "seed-0")] == list(
-        range(64, 257, 64)
-    )
+    evaluations = read_evaluations(run / "seed-0")
+    assert [evaluation.steps for evaluation in evaluations] == list(range(64, 257, 64))
 
 
 def test_a_finished_seed_whose_outcome_was_lost_is_finished(tmp_path: Path) -> None:

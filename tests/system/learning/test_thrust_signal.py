@@ -114,11 +114,8 @@ def test_a_policy_learns_to_swim_a_rig_whose_sensor_is_turned_and_drifts(tmp_pat
     rig = ("simulation.noise=0.002", TURNED, "simulation.offset_x=0.02", "simulation.drift=0.01")
     job = brief_job(tmp_path / "run", steps=1152)
     settings = replace(job.settings, ppo=type(BRIEF.ppo)())
-    job = replace(
-        job,
-        config=load(None, rig),
-        settings=replace(settings, evaluation=replace(settings.evaluation, every=6)),
-    )
+    often = replace(settings.evaluation, every=6)
+    job = replace(job, config=load(None, rig), settings=replace(settings, evaluation=often))
     best = train(job).best_evaluation
     assert best
     assert best.relative_thrust > 0.95

@@ -139,9 +139,8 @@ def test_the_best_policy_is_stored_beside_the_newest(tmp_path: Path) -> None:
     swimming = [e for e in witness.evaluations if not e.stalled]
     assert outcome.best_evaluation == max(swimming, key=lambda e: (e.relative_thrust, e.steps))
     assert outcome.best == job.folder / f"best-{outcome.best_evaluation.steps:06d}"
-    assert checkpoints.read_card(outcome.best).provenance.relative_thrust == (
-        outcome.best_evaluation.relative_thrust
-    )
+    card = checkpoints.read_card(outcome.best)
+    assert card.provenance.relative_thrust == outcome.best_evaluation.relative_thrust
     assert len(list(job.folder.glob("best-*"))) == 1
 
 
@@ -300,9 +299,8 @@ def test_a_pause_is_never_part_of_a_transition(tmp_path: Path) -> None:
     training = Training(job, link, Display(), lambda: False)
     training.run()
     layout = Layout(features(job.config, job.settings.environment))
-    per_newton = job.settings.environment.reward_scale / thrust_scale(
-        job.config, job.settings.environment
-    )
+    environment = job.settings.environment
+    per_newton = environment.reward_scale / thrust_scale(job.config, environment)
     buffer = training._model.rollout_buffer
     before, after = link.shown[-65:-1], link.shown[-64:]
     assert before[0].instruction_angle == 0.0
@@ -338,9 +336,8 @@ def test_a_rollout_equals_one_that_stable_baselines_computes_step_by_step(tmp_pa
     training._env.step = watched_step  # type: ignore[method-assign]
     training._rollouts.begin(reset(seed=1)[0])
     assert training._rollouts.collect()
-    seen, actions = (
-        torch.from_numpy(array[:, 0]) for array in (buffer.observations, buffer.actions)
-    )
+    arrays = (buffer.observations, buffer.actions)
+    seen, actions = (torch.from_numpy(array[:, 0]) for array in arrays)
     with torch.no_grad():
         values, log_probabilities, _ = model.policy.evaluate_actions(seen, actions)
         of_ends = model.policy.predict_values(torch.from_numpy(np.array(ends)))[:, 0].numpy()

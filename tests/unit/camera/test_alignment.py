@@ -56,10 +56,8 @@ def test_a_tilted_camera_is_turned_by_its_tilt(tilt: float, way: str) -> None:
 def test_the_crop_is_moved_so_that_the_axis_lies_in_its_middle(off: float, side: float) -> None:
     settings = replace(V4L2, picture=PictureSettings(crop=Square(side=side)))
     alignment = judge_pictures(pictures(off_axis=off), settings)
-    y, new_side = (
-        alignment.settings["picture.crop.y"],
-        alignment.settings.get("picture.crop.side", side),
-    )
+    y = alignment.settings["picture.crop.y"]
+    new_side = alignment.settings.get("picture.crop.side", side)
     assert isinstance(y, float)
     assert isinstance(new_side, float)
     assert y == pytest.approx(0.5 + off / 84 * side, abs=0.01)
@@ -71,9 +69,8 @@ def test_the_crop_is_moved_so_that_the_axis_lies_in_its_middle(off: float, side:
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 @pytest.mark.parametrize("rotate", [0, 90])
 def test_a_fish_that_lies_otherwise_is_turned_head_left(quarters: int, rotate: Any) -> None:
-    alignment = judge_pictures(
-        turned(quarters), replace(V4L2, picture=PictureSettings(rotate=rotate))
-    )
+    settings = replace(V4L2, picture=PictureSettings(rotate=rotate))
+    alignment = judge_pictures(turned(quarters), settings)
     assert alignment.settings == {"picture.rotate": (rotate + 360 - 90 * quarters) % 360}
     assert not alignment.is_aligned
     assert "head to the left: turn it" in alignment.advice[-1]
@@ -82,9 +79,8 @@ def test_a_fish_that_lies_otherwise_is_turned_head_left(quarters: int, rotate: A
 def test_a_tail_that_leaves_the_picture_is_said_to() -> None:
     alignment = judge_pictures(pictures()[:, 33:51, :56])
     assert not alignment.is_aligned
-    assert alignment.advice[0].startswith(
-        "the motion is cut off at the upper edge and the lower edge and the right"
-    )
+    cut_off = "the motion is cut off at the upper edge and the lower edge and the right"
+    assert alignment.advice[0].startswith(cut_off)
 
 
 def test_an_axis_at_the_edge_of_what_is_looked_at_is_said_to_be_unsure() -> None:
@@ -95,9 +91,8 @@ def test_an_axis_at_the_edge_of_what_is_looked_at_is_said_to_be_unsure() -> None
 
 
 def test_of_a_simulated_camera_its_own_settings_are_named() -> None:
-    settings = CameraSettings(
-        simulated=replace(CameraSettings().simulated, off_axis=3.0, tilt=0.05)
-    )
+    simulated = replace(CameraSettings().simulated, off_axis=3.0, tilt=0.05)
+    settings = CameraSettings(simulated=simulated)
     alignment = judge_pictures(pictures(off_axis=3.0, tilt=0.05), settings, (84, 84))
     assert alignment.settings["simulated.off_axis"] == pytest.approx(0.0, abs=0.3)
     assert alignment.settings["simulated.tilt"] == pytest.approx(0.0, abs=0.015)

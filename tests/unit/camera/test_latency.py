@@ -56,10 +56,8 @@ def test_no_parameter_of_the_fish_is_needed(setting: str) -> None:
 
 def test_the_window_of_a_force_does_not_reach_back_over_ticks_that_were_skipped() -> None:
     ticks = swum(5.0)
-    lengths = {
-        round(force.end - force.begin, 3)
-        for force in felt([tick for tick in ticks if tick.seq % 10 > 3])
-    }
+    forces = felt([tick for tick in ticks if tick.seq % 10 > 3])
+    lengths = {round(force.end - force.begin, 3) for force in forces}
     assert lengths == {0.05}
 
 

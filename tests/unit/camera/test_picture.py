@@ -37,11 +37,8 @@ def test_a_frame_is_the_mean_over_areas() -> None:
 
 
 def test_a_small_picture_has_larger_pixels_for_people() -> None:
-    _, width, height = picture.encode_jpeg(
-        np.zeros((84, 84), np.uint8), PublishSettings(view_width=480)
-    )
+    small, large = np.zeros((84, 84), np.uint8), np.zeros((480, 640), np.uint8)
+    _, width, height = picture.encode_jpeg(small, PublishSettings(view_width=480))
     assert (width, height) == (420, 420)
-    _, width, height = picture.encode_jpeg(
-        np.zeros((480, 640), np.uint8), PublishSettings(view_width=320)
-    )
+    _, width, height = picture.encode_jpeg(large, PublishSettings(view_width=320))
     assert (width, height) == (320, 240)

@@ -91,9 +91,8 @@ EXPERIMENTS = ("measure", "compare", "sweep", "optimise", "identify", "adapt", "
 
 def test_all_verbs_have_one_vocabulary() -> None:
     known = dict(commands(fishctl))
-    assert {verb for verb, command in known.items() if "--json" not in options(command)} == (
-        WITHOUT_JSON
-    )
+    without = {verb for verb, command in known.items() if "--json" not in options(command)}
+    assert without == WITHOUT_JSON
     for verb, command in known.items():
         own_options = options(command)
         assert ("--for" in own_options) == ("--seconds" in own_options), verb

@@ -106,9 +106,8 @@ def test_hundreds_of_switches_stay_within_amplitude_and_slew(slew_limit: float |
         if generator.random() < 0.1:
             rig.loop.stop()
         else:
-            rig.start(
-                name, **{key: generator.uniform(*bounds) for key, bounds in CHOICES[name].items()}
-            )
+            chosen = {key: generator.uniform(*bounds) for key, bounds in CHOICES[name].items()}
+            rig.start(name, **chosen)
         for tick in rig.run(generator.choice((1, 1, 2, 3, 7))):
             assert abs(tick.phi_c) <= 0.42
             assert abs(tick.phi_c - angle) <= step * (1 + 1e-8)

@@ -104,9 +104,8 @@ def test_a_wave_for_which_the_factor_is_another_is_known_soon(leak: float) -> No
         for frequency, truth in ((1.0, 15.23e-3), (2.0, 23.83e-3), (0.5, 7.26e-3)):
             fish.rest(3.0)
             for seconds in (5.0, 15.0):
-                thrust, error = thrust_and_ci95(
-                    fish.swim("square", {"frequency": frequency}, seconds)
-                )
+                ticks = fish.swim("square", {"frequency": frequency}, seconds)
+                thrust, error = thrust_and_ci95(ticks)
                 assert abs(thrust - truth) < error < 4e-3
         for frequency, truth in ((1.0, 15.23e-3), (2.0, 23.83e-3)):  # without a rest between
             thrust, error = thrust_and_ci95(fish.swim("square", {"frequency": frequency}, 8.0))

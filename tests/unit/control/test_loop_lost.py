@@ -67,10 +67,8 @@ def test_a_hang_while_fading_in_fault_ends_in_a_release(rig: LockstepRig) -> Non
     stand_still(rig, 0.5)
     rig.run_for(0.5)
     assert rig.reason == "controller-error"
-    assert [width for _, width in rig.pulses_since(since)][-2:] == [
-        pytest.approx(NEUTRAL, abs=5),
-        0.0,
-    ]
+    widths = [width for _, width in rig.pulses_since(since)]
+    assert widths[-2:] == [pytest.approx(NEUTRAL, abs=5), 0.0]
     assert not rig.loop.servo.on
 
 

@@ -44,9 +44,8 @@ class Rig:
         self.time += TICK
         self.zero += self.random.gauss(0.0, self.walk * math.sqrt(TICK))
         fx = self.zero + thrust + self.random.gauss(0.0, self.force_noise)
-        seen = Observation(
-            self.time, TICK, fx, 0.0, 0.0, velocity, angle, angle, fx, 1.0 / (2 * TICK)
-        )
+        rate = 1.0 / (2 * TICK)
+        seen = Observation(self.time, TICK, fx, 0.0, 0.0, velocity, angle, angle, fx, rate)
         self.live.update(seen, angle != 0.0, self.wave)
 
     def rest(self, seconds: float = 3.0) -> None:

@@ -76,9 +76,8 @@ def test_spikes_do_not_mislead_it(seed: int) -> None:
 
 
 def test_on_the_model_the_search_costs_a_few_percent_at_most() -> None:
-    assert relative_thrust("auto", seconds=60, settle=0) > 0.95 * relative_thrust(
-        0.6, seconds=60, settle=0
-    )
+    brief = {"seconds": 60, "settle": 0}
+    assert relative_thrust("auto", **brief) > 0.95 * relative_thrust(0.6, **brief)
 
 
 def test_neither_drift_nor_a_turned_sensor_misleads_it() -> None:

@@ -96,9 +96,8 @@ def test_less_than_the_smallest_amplitude_gives_is_held_there_and_told() -> None
     rig.start("thrust", target=1e-6)
     ticks = rig.run_for(15)
     assert last_quantities(ticks)["saturated"] == -1.0
-    assert abs(ticks[-1].phi_c) == pytest.approx(
-        MIN_AMPLITUDE_FRACTION * rig.config.amplitude_limit
-    )
+    least = MIN_AMPLITUDE_FRACTION * rig.config.amplitude_limit
+    assert abs(ticks[-1].phi_c) == pytest.approx(least)
     assert ticks[-1].frequency > 0.5
 
 
@@ -144,9 +143,8 @@ def test_the_mean_is_told_from_the_ripple_alone() -> None:
 def test_a_target_that_is_no_thrust_is_refused_in_a_line(target: float) -> None:
     with pytest.raises(ParameterError) as refused:
         registry.create("thrust", {"target": target}, LIMITS)
-    assert re.fullmatch(
-        r"thrust: target: \S+ is not valid: a number in \(0, 10\] N is needed", str(refused.value)
-    )
+    problem = r"thrust: target: \S+ is not valid: a number in \(0, 10\] N is needed"
+    assert re.fullmatch(problem, str(refused.value))
 
 
 def test_it_is_refused_where_the_force_does_not_tell_the_thrust() -> None:

@@ -86,9 +86,8 @@ def complaint(read: Callable[[Path], object], path: Path) -> str:
 @pytest.mark.parametrize("name", READERS)
 def test_what_is_no_file_is_told(tmp_path: Path, name: str, plant: Callable[[Path], None]) -> None:
     plant(tmp_path / name)
-    assert complaint(READERS[name], tmp_path / name).startswith(
-        f"{tmp_path / name}: {PLANTS[plant]}"
-    )
+    told = f"{tmp_path / name}: {PLANTS[plant]}"
+    assert complaint(READERS[name], tmp_path / name).startswith(told)
 
 
 def test_a_file_that_the_kernel_makes_up_is_read_no_further_than_is_permitted() -> None:

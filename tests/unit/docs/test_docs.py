@@ -148,11 +148,8 @@ def test_every_configuration_key_that_is_named_exists(document: Path) -> None:
     key = re.compile(rf"(?<![\w./-])(?:{sections})(?:\.[a-z_0-9]+)+(?![\w/(])")
     named = {key_path for code in code_of(document) for key_path in key.findall(code)}
     modules = {f"{field.name}.py" for field in fields_of(Config)}
-    wrong = {
-        name
-        for name in named - known - modules - ADDED_BY_EXAMPLES
-        if not name.startswith("start.parameters.")
-    }
+    unknown = named - known - modules - ADDED_BY_EXAMPLES
+    wrong = {name for name in unknown if not name.startswith("start.parameters.")}
     if document.name == "configuration.md":
         wrong -= {"plant.omega"}  # an example of a mistake
     if document.name == "troubleshooting.md":
@@ -207,14 +204,8 @@ def test_each_key_of_the_card_is_described() -> None:
 
 def test_names_of_files_ends_and_folders_are_right() -> None:
     text = text_of(DOCUMENT)
-    for word in (
-        CARD_KEY,
-        checksum.CHECKSUM_KEY,
-        file.INPUT,
-        file.OUTPUT,
-        library.SUFFIX,
-        f"${library.FOLDERS_VARIABLE}",
-    ):
+    words = (CARD_KEY, checksum.CHECKSUM_KEY, file.INPUT, file.OUTPUT, library.SUFFIX)
+    for word in (*words, f"${library.FOLDERS_VARIABLE}"):
         assert f"`{word}`" in text or f"`{word} " in text or f"metadata `{word}`" in text
     assert f"more than {file.MAX_FILE_BYTES // 2**20} MB" in text
     assert "/etc/fishd/policies" in text

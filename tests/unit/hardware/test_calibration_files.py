@@ -47,9 +47,8 @@ def test_a_time_zone_does_not_decide_which_is_newer(tmp_path: Path) -> None:
     summer = datetime.timezone(2 * HOUR)
     winter = datetime.timezone(1 * HOUR)
     folder.save(ForceCalibration(xx=1.0), datetime.datetime(2026, 10, 25, 2, 50, tzinfo=summer))
-    _, later = folder.save(
-        ForceCalibration(xx=2.0), datetime.datetime(2026, 10, 25, 2, 10, tzinfo=winter)
-    )
+    after = datetime.datetime(2026, 10, 25, 2, 10, tzinfo=winter)
+    _, later = folder.save(ForceCalibration(xx=2.0), after)
     assert "2026-10-25T011000" in later.name
     newest = folder.newest(ForceCalibration)
     assert newest is not None

@@ -26,9 +26,8 @@ def test_square_beats_sine_beats_triangle_and_each_is_as_square_as_it_is() -> No
     standings = compare_texts(*(f"{name}:frequency=1.7" for name in ("square", "sine", "triangle")))
     relative_thrusts = [standing.relative_thrust for standing in standings]
     assert relative_thrusts == sorted(relative_thrusts, reverse=True)
-    assert [standing.form_factor for standing in standings] == pytest.approx(
-        [1.0, 0.900, 0.866], abs=0.003
-    )
+    factors = [standing.form_factor for standing in standings]
+    assert factors == pytest.approx([1.0, 0.900, 0.866], abs=0.003)
     assert standings[0].frequency == pytest.approx(1.7, abs=0.02)
 
 
@@ -65,9 +64,8 @@ def test_a_verdict_names_a_winner_where_the_runs_tell_and_else_chooses_the_simpl
     undecided = judge_standings([swing, slow, square])
     assert undecided
     assert undecided.best == ("a wave", "swing")
-    assert undecided.sentence == (
-        "undecided between a wave and swing; a wave chosen because it is the simplest"
-    )
+    sentence = "undecided between a wave and swing; a wave chosen because it is the simplest"
+    assert undecided.sentence == sentence
     decided = judge_standings([slow, swing])
     assert decided
     assert decided.sentence.startswith("swing wins: it thrusts 133.")
@@ -79,10 +77,8 @@ def test_a_verdict_names_a_winner_where_the_runs_tell_and_else_chooses_the_simpl
 
 def test_a_single_run_is_exact_without_noise_and_has_no_verdict_with_it() -> None:
     swing, square = standing("swing", "swing", [21e-3]), standing("square", "square", [20e-3])
-    exact, noisy = (
-        judge_standings([swing, square], is_random=False),
-        judge_standings([swing, square]),
-    )
+    exact = judge_standings([swing, square], is_random=False)
+    noisy = judge_standings([swing, square])
     assert exact
     assert noisy
     assert "swing wins: it thrusts exactly 105.0 % of square" in exact.sentence

@@ -33,18 +33,15 @@ def measure_swing(
 
 def test_a_gain_error_is_within_the_total_interval_and_its_part_is_named() -> None:
     measurement, truth = measure_swing(calibration=KNOWN), simulate(load(), "swing", {}).mean_thrust
-    assert measurement.calibration_ci95 == pytest.approx(
-        0.03 * measurement.thrust / (1.0 + GAIN_ERROR)
-    )
-    assert measurement.total_ci95 == pytest.approx(
-        math.hypot(measurement.thrust_ci95, measurement.calibration_ci95)
-    )
+    relative = 0.03 / (1.0 + GAIN_ERROR)
+    assert measurement.calibration_ci95 == pytest.approx(relative * measurement.thrust)
+    both = math.hypot(measurement.thrust_ci95, measurement.calibration_ci95)
+    assert measurement.total_ci95 == pytest.approx(both)
     assert measurement.thrust_ci95 < abs(measurement.thrust - truth) < measurement.total_ci95
     report = summarise(measurement, 0.05)
     assert report.power is not None
-    assert report.thrust_per_watt_total_ci95 == pytest.approx(
-        measurement.total_ci95 / report.power, rel=1e-3
-    )
+    expected = measurement.total_ci95 / report.power
+    assert report.thrust_per_watt_total_ci95 == pytest.approx(expected, rel=1e-3)
 
 
 def test_the_sensor_of_a_simulated_fish_is_exact() -> None:
@@ -63,9 +60,8 @@ def test_a_rotation_that_no_load_has_shown_is_seen_in_the_swim_and_covered(angle
     assert measurement.rotation == pytest.approx(angle, abs=0.003)
     assert measurement.total_ci95
     assert truth - measurement.thrust == pytest.approx((1.0 - math.cos(angle)) * truth, rel=0.1)
-    assert (
-        measurement.thrust_ci95 < truth - measurement.thrust < measurement.total_ci95 < 0.02 * truth
-    )
+    error = truth - measurement.thrust
+    assert measurement.thrust_ci95 < error < measurement.total_ci95 < 0.02 * truth
 
 
 @pytest.mark.slow
@@ -85,12 +81,10 @@ def test_a_hum_and_a_fin_at_rest_turn_no_sensor() -> None:
 def test_without_a_known_calibration_no_total_is_claimed() -> None:
     old = replace(KNOWN, covariance_x=None)
     assert budget(old, 0.025, 1e-4) == (None, None)
-    assert format_with_budget(0.025, 1e-4, None, None, "N").endswith(
-        "± 0.10 mN (statistical ± 0.10, calibration unknown)"
-    )
-    assert format_with_budget(0.025, 1e-4, None, None, "V").endswith(
-        "mV (statistical ± 0.10, calibration none)"
-    )
+    shown = format_with_budget(0.025, 1e-4, None, None, "N")
+    assert shown.endswith("± 0.10 mN (statistical ± 0.10, calibration unknown)")
+    shown = format_with_budget(0.025, 1e-4, None, None, "V")
+    assert shown.endswith("mV (statistical ± 0.10, calibration none)")
     assert "the uncertainty of the gains" in unknown_calibration(None, "N")
     assert "not calibrated: forces are in V" in unknown_calibration(None, "V")
     assert not unknown_calibration(0.0, "N")
@@ -103,9 +97,8 @@ def test_more_runs_do_not_make_the_part_of_the_calibration_smaller() -> None:
     (standing,) = live.standings()
     assert standing.calibration_ci95 == pytest.approx(0.03 / 1.02 * standing.thrust, rel=1e-3)
     assert standing.thrust_ci95 is not None
-    assert standing.total_ci95 == pytest.approx(
-        math.hypot(standing.thrust_ci95, standing.calibration_ci95)
-    )
+    both = math.hypot(standing.thrust_ci95, standing.calibration_ci95)
+    assert standing.total_ci95 == pytest.approx(both)
 
 
 def test_a_tail_beat_to_one_side_counts_with_the_cross_term() -> None:

@@ -51,9 +51,8 @@ def swim_experiment(*overrides: str, seconds: float = 90.0) -> pd.DataFrame:
 @pytest.fixture(scope="module")
 def table() -> pd.DataFrame:
     """Ticks of an experiment, without the columns that a real robot does not have."""
-    return swim_experiment(*RIG_OVERRIDES).drop(
-        columns=["alpha", "alpha_rate", "phi", "fin_velocity"]
-    )
+    hidden = ["alpha", "alpha_rate", "phi", "fin_velocity"]
+    return swim_experiment(*RIG_OVERRIDES).drop(columns=hidden)
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +88,8 @@ def test_products_are_told_and_factors_have_any_ratio(identification: Identifica
         assert product.high < 1.02 * product.low
     for name, factor in (("coupling", 2.0), ("thrust_coefficient", 4.0), ("lateral_drag", 2.0)):
         low, high = identification[name].narrowest_interval
-        assert (identification[name].low, identification[name].high) == pytest.approx(
-            (low / factor, high * factor)
-        )
+        interval = identification[name].low, identification[name].high
+        assert interval == pytest.approx((low / factor, high * factor))
         assert high < 1.03 * low
 
 
@@ -105,9 +103,8 @@ def test_quadratic_drag_and_another_lateral_inertia_are_found() -> None:
     for estimate in identification.estimates:
         if estimate.fitted and estimate.name in truth:
             width = 0.5 * (estimate.high - estimate.low)
-            assert estimate.low - width <= truth[estimate.name] <= estimate.high + width, (
-                estimate.name
-            )
+            low, high = estimate.low - width, estimate.high + width
+            assert low <= truth[estimate.name] <= high, estimate.name
     assert identification.failed_assumptions == ()
     assert identification["quadratic_drag"].value > 0.4
     assert identification["lateral_inertia_ratio"].value == pytest.approx(0.7, rel=0.02)
@@ -137,9 +134,8 @@ def test_a_fish_of_another_kind_is_not_identified_in_one_line(table: pd.DataFram
     identification = identify(strange, start=FISH, fit=NEARLY_KNOWN)
     assert not identification.identified
     assert identification.headline.startswith("not identified: the model explains ")
-    assert {"white residual of fx", "white residual of fy"} <= set(
-        identification.failed_assumptions
-    )
+    white = {"white residual of fx", "white residual of fy"}
+    assert white <= set(identification.failed_assumptions)
     assert min(channel.explained_out_of_sample for channel in identification.channels) < 0.9
     assert (identification["omega0"].low, identification["omega0"].high) == (0.0, math.inf)
     assert identification.to_builtins()["estimates"]["omega0"]["high"] is None
@@ -151,12 +147,9 @@ def test_a_fish_of_another_kind_is_not_identified_in_one_line(table: pd.DataFram
 def test_delay_and_backlash_are_known_to_10_percent_at_best_where_they_are() -> None:
     with VirtualSession(load(None, [*RIG_OVERRIDES, "simulation.noise=0.01"])) as rig:
         ticks = rig.swim("sine", {"frequency": 1.0, "amplitude": 0.1}, 15.0)
-    identification = identify(
-        ticks_to_frame(ticks), start=FISH, fit=("servo_delay", "backlash", "rotation")
-    )
-    remark = next(
-        text for text in identification.remarks if text.startswith("known to 10 % at best")
-    )
+    chosen = ("servo_delay", "backlash", "rotation")
+    identification = identify(ticks_to_frame(ticks), start=FISH, fit=chosen)
+    remark = next(text for text in identification.remarks if text.startswith("known to 10 %"))
     assert "servo_delay" in remark
     assert "backlash" in remark
 
@@ -165,12 +158,10 @@ def test_delay_and_backlash_are_known_to_10_percent_at_best_where_they_are() -> 
 def test_offsets_of_the_sensor_are_told_from_its_drift(identification: Identification) -> None:
     # One period and a half of a drift of 5 mN: its mean is within 2 π of a third.
     assert abs(identification["offset_y"].value - 0.02) < 5e-3 / 2
-    assert all(
-        channel.drift == pytest.approx(0.010, rel=0.1) for channel in identification.channels
-    )
-    assert all(
-        channel.noise == pytest.approx(1e-3, rel=0.05) for channel in identification.channels
-    )
+    drifts = [channel.drift for channel in identification.channels]
+    assert drifts == pytest.approx([0.010, 0.010], rel=0.1)
+    noises = [channel.noise for channel in identification.channels]
+    assert noises == pytest.approx([1e-3, 1e-3], rel=0.05)
 
 
 @pytest.mark.slow
@@ -183,18 +174,16 @@ def test_what_it_writes_is_a_configuration(identification: Identification, tmp_p
     ratio = identification["thrust_coefficient"].value / identification["lateral_drag"].value
     assert config.estimator.leak == pytest.approx(ratio, rel=1e-3)
     for estimate in identification.estimates:
-        assert abs(written[estimate.name] - estimate.value) <= 0.01 * (
-            estimate.high - estimate.low
-        ), estimate.name
+        error = abs(written[estimate.name] - estimate.value)
+        assert error <= 0.01 * (estimate.high - estimate.low), estimate.name
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "seconds"), [(0, 135.0), (1, 180.0)])
 def test_the_interval_of_an_offset_knows_the_mean_drift(seed: int, seconds: float) -> None:
     table = swim_experiment(*RIG_OVERRIDES, f"simulation.seed={seed}", seconds=seconds)
-    identification = identify(
-        table, start=FISH, rig=load(None, RIG_OVERRIDES).simulation, fit=["coupling"]
-    )
+    rig = load(None, RIG_OVERRIDES).simulation
+    identification = identify(table, start=FISH, rig=rig, fit=["coupling"])
     for name in ("offset_x", "offset_y"):
         assert identification[name].low < 0.02 < identification[name].high, name
 
@@ -211,12 +200,9 @@ def test_an_experiment_takes_half_a_minute_or_more_and_ends(seconds: float) -> N
 @pytest.mark.slow
 def test_the_configuration_has_no_false_digits(table: pd.DataFrame, tmp_path: Path) -> None:
     identification = identify(table.iloc[:400], start=FISH, fit=["coupling"])
-    others = tuple(
-        estimate for estimate in identification.estimates if estimate.name != "servo_delay"
-    )
-    identification = replace(
-        identification, estimates=(Estimate("servo_delay", 3.9e-14, 0.0, 4e-5), *others)
-    )
+    others = tuple(one for one in identification.estimates if one.name != "servo_delay")
+    delay = Estimate("servo_delay", 3.9e-14, 0.0, 4e-5)
+    identification = replace(identification, estimates=(delay, *others))
     file = tmp_path / "fish.yaml"
     file.write_text(identification.to_yaml(), encoding="utf-8")
     assert "servo_delay: 0  # 0 to 4e-05 s" in file.read_text(encoding="utf-8")
@@ -257,9 +243,8 @@ def test_slots_that_were_skipped_are_part_of_a_longer_window() -> None:
 
 def test_what_is_not_fitted_is_as_the_configuration_says(table: pd.DataFrame) -> None:
     config = load(None, (*RIG_OVERRIDES, "plant.servo_reaction=1e-7", "plant.quadratic_drag=1e-3"))
-    identification = identify(
-        table.iloc[:900], start=config.plant, rig=config.simulation, fit=["omega0", "xi"]
-    )
+    fish = {"start": config.plant, "rig": config.simulation}
+    identification = identify(table.iloc[:900], **fish, fit=["omega0", "xi"])
     assert identification["rotation"].value == config.simulation.rotation
     assert not identification["rotation"].fitted
     assert identification["omega0"].low < 11.0 < identification["omega0"].high
@@ -285,9 +270,8 @@ def interval_width(identification: Identification) -> float:
 
 def test_several_runs_are_one_fish(table: pd.DataFrame) -> None:
     halves = [table.iloc[:900], table.iloc[900:]]
-    both, second_half = (
-        identify(runs, start=FISH, fit=NEARLY_KNOWN) for runs in (halves, halves[1])
-    )
+    fits = (identify(runs, start=FISH, fit=NEARLY_KNOWN) for runs in (halves, halves[1]))
+    both, second_half = fits
     assert both.passages == 2
     assert interval_width(both) < 0.8 * interval_width(second_half)
 

@@ -161,6 +161,5 @@ def test_a_thrust_on_a_robot_has_the_uncertainty_of_its_calibration() -> None:
     with rig_of(Calibrated()) as rig:
         measurement = measure(rig, "swing", {}, 21.0)
     assert measurement.calibration_ci95 == pytest.approx(0.02 * measurement.thrust)
-    assert measurement.total_ci95 == pytest.approx(
-        math.hypot(measurement.thrust_ci95, 0.02 * measurement.thrust)
-    )
+    both = math.hypot(measurement.thrust_ci95, 0.02 * measurement.thrust)
+    assert measurement.total_ci95 == pytest.approx(both)

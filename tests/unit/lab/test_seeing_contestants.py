@@ -31,9 +31,8 @@ def test_a_policy_that_sees_is_a_contestant_like_any_other(eye: str) -> None:
 
 
 def test_each_run_is_seen_in_other_light_and_the_same_runs_again_are_the_same(eye: str) -> None:
-    first, again = (
-        compare(Config(), [eye], seconds=10.0, settle=5.0, runs=2)[0][0].thrusts for _ in range(2)
-    )
+    brief = {"seconds": 10.0, "settle": 5.0, "runs": 2}
+    first, again = (compare(Config(), [eye], **brief)[0][0].thrusts for _ in range(2))
     assert first == again
     assert first[0] != first[1]
 

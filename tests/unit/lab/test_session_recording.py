@@ -29,9 +29,8 @@ def test_every_swim_of_a_rig_is_rerun_to_the_last_bit(tmp_path: Path) -> None:
     result = rerun(run)
     assert [stretch.recorded for stretch in result.stretches] == ["swing", "square"]
     assert [stretch.parameters.get("C") for stretch in result.stretches] == [0.4, None]
-    assert all(
-        stretch.from_start and stretch.equal == stretch.ticks for stretch in result.stretches
-    )
+    stretches = result.stretches
+    assert all(s.from_start and s.equal == s.ticks for s in stretches)
     assert result.estimates.equal == result.estimates.ticks == len(run.ticks) == 360
 
 

@@ -59,9 +59,8 @@ def test_mild_fish_are_as_random_as_harsh_ones_and_their_rigs_are_clean() -> Non
 
 
 def test_the_verb_has_a_column_for_each_contestant() -> None:
-    done = fishctl(
-        "learn", "evaluate", "swing", "square:frequency=1.7", "--fish", "changes", *BRIEF
-    )
+    entries = ("swing", "square:frequency=1.7")
+    done = fishctl("learn", "evaluate", *entries, "--fish", "changes", *BRIEF)
     assert (done.returncode, done.stderr) == (0, "")
     head, *rows = done.stdout.splitlines()
     assert head.split() == ["fish", "swing", "square:frequency=1.7"]

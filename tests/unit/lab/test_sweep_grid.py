@@ -13,23 +13,16 @@ from fishd.lab.sweep.grid import Point, expand_values, find_axis, make_points, p
 
 def test_a_range_has_both_ends_and_decimals_that_are_exact() -> None:
     assert list(map(float, expand_values("0.4:1.2:0.2"))) == [0.4, 0.6, 0.8, 1.0, 1.2]
-    assert list(map(float, expand_values("100:300:100,0.05, 1e-3"))) == [
-        100.0,
-        200.0,
-        300.0,
-        0.05,
-        0.001,
-    ]
+    values = expand_values("100:300:100,0.05, 1e-3")
+    assert list(map(float, values)) == [100.0, 200.0, 300.0, 0.05, 0.001]
 
 
 def test_a_value_is_a_number_where_it_is_one() -> None:
     texts = ["0.6", "1.0", "1E+1", "3", "on", "nan", "inf", "pi/servo", "1e400"]
     assert [*map(parse_value, texts)] == [0.6, 1, 10, 3, "on", "nan", "inf", "pi/servo", "1e400"]
     assert isinstance(parse_value("3"), int)  # as needed for a seed
-    assert (
-        find_axis([Point("swing", {}, {"plant.xi": parse_value(x)}) for x in ("0.9", "1")])
-        == "plant.xi"
-    )
+    points = [Point("swing", {}, {"plant.xi": parse_value(x)}) for x in ("0.9", "1")]
+    assert find_axis(points) == "plant.xi"
 
 
 @pytest.mark.parametrize(

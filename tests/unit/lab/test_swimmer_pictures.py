@@ -149,8 +149,7 @@ def test_a_tail_that_does_not_beat_has_no_midlines_of_a_beat() -> None:
 
 
 def test_a_picture_of_midlines_is_written(tmp_path: Path) -> None:
-    midlines.draw_midlines(
-        compute_envelope(*make_midlines(3.5)), "a sine of 2 Hz", tmp_path / "midlines.png"
-    )
+    envelope = compute_envelope(*make_midlines(3.5))
+    midlines.draw_midlines(envelope, "a sine of 2 Hz", tmp_path / "midlines.png")
     with Image.open(tmp_path / "midlines.png") as picture:
         assert picture.width == 1440

@@ -37,10 +37,8 @@ def config() -> Config:
 
 def beats(speeds: np.ndarray, period: float = 0.5) -> tuple[np.ndarray, np.ndarray]:
     """Return the begin times of beats of these speeds, and the positions of the fish then."""
-    return (
-        period * np.arange(len(speeds) + 1),
-        -np.concatenate([[0.0], np.cumsum(period * speeds)]),
-    )
+    way = np.concatenate([[0.0], np.cumsum(period * speeds)])
+    return period * np.arange(len(speeds) + 1), -way
 
 
 def test_the_start_is_dropped_until_the_mean_is_known_best() -> None:
@@ -112,9 +110,7 @@ def test_a_table_of_speeds_is_resumed_and_swing_is_drawn(tmp_path: Path, config:
     points += [Point("swing", {"C": value}) for value in (0.0, 0.6)]
     speeds = (0.02, 0.05, 0.07, 0.06, 0.03, 0.06, 0.07)
     for point, speed in zip(points, speeds, strict=True):
-        result = SpeedResult(
-            speed=speed, speed_ci95=1e-3, beat_frequency=2.9, settled_time=4.0, beats=10
-        )
+        result = SpeedResult(speed, speed_ci95=1e-3, beat_frequency=2.9, settled_time=4.0, beats=10)
         folder.add_result(point, result, b"a recording")
     assert open_folder(tmp_path, config).results == folder.results
     curves = make_curves(folder, points)

@@ -106,9 +106,8 @@ def test_whatever_is_left_of_a_file_is_read_and_recovered(tmp_path: Path) -> Non
 def test_what_is_recorded_now_is_not_recovered(tmp_path: Path) -> None:
     with RunWriter(tmp_path / "run") as writer:
         assert read_overview(writer.part).writing
-        with pytest.raises(
-            RecordingError, match="is being recorded or recovered; end that process first"
-        ):
+        busy = "is being recorded or recovered; end that process first"
+        with pytest.raises(RecordingError, match=busy):
             recover(writer.part)
 
 
@@ -243,10 +242,8 @@ def test_messages_from_no_time_are_left_out_and_counted(tmp_path: Path) -> None:
     for tick in (ticks[0], *wrong, ticks[1]):
         recorder._take("tick", msgspec.json.encode(tick))
     recorder.__exit__(None, None, None)
-    assert lines == [
-        "a message of topic tick is not fishd's: ignored",
-        "messages that are not fishd's, ignored: 3",
-    ]
+    ignored = "a message of topic tick is not fishd's: ignored"
+    assert lines == [ignored, "messages that are not fishd's, ignored: 3"]
     run = open_run(tmp_path / "run.mcap")
     assert run.ticks == ticks[:2]
     assert run.summary == read_overview(run.path).summary
@@ -349,12 +346,8 @@ def test_what_is_no_regular_file_is_no_recording_of_a_folder(tmp_path: Path) -> 
 
 def test_a_name_means_a_recording_of_the_folder(tmp_path: Path) -> None:
     path = record_run(swum(0.2), tmp_path / "morning")
-    assert (
-        find_recording("morning", tmp_path)
-        == find_recording(str(path))
-        == find_recording("latest", tmp_path)
-        == path
-    )
+    for name in ("morning", str(path), "latest"):
+        assert find_recording(name, tmp_path) == path
     with pytest.raises(RecordingError, match="did you mean 'morning'"):
         find_recording("mornin", tmp_path)
     with pytest.raises(RecordingError, match="contains no recording"):

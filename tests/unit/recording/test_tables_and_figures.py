@@ -19,9 +19,8 @@ from fishd.recording import open_run
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record_run(
-        swum(), tmp_path_factory.mktemp("runs") / "run", note="<b>stiff</b> & $new_{$"
-    )
+    folder = tmp_path_factory.mktemp("runs")
+    return record_run(swum(), folder / "run", note="<b>stiff</b> & $new_{$")
 
 
 @pytest.mark.parametrize("form", ["csv", "parquet"])

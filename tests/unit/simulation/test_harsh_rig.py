@@ -26,9 +26,8 @@ KEYS_AS_DEFAULT = {
 )
 def test_it_has_every_imperfection_that_there_is(section: str, defaults: msgspec.Struct) -> None:
     harsh = getattr(load(FILE), section)
-    same = {
-        name for name in harsh.__struct_fields__ if getattr(harsh, name) == getattr(defaults, name)
-    }
+    names = harsh.__struct_fields__
+    same = {name for name in names if getattr(harsh, name) == getattr(defaults, name)}
     assert same == KEYS_AS_DEFAULT[section]
 
 

@@ -78,9 +78,8 @@ def test_slack_that_swallows_the_whole_amplitude_leaves_nothing_to_compare_with(
 @pytest.mark.parametrize("tick", [0.002, 0.2])
 def test_the_loop_runs_at_any_tick(tick: float) -> None:
     report = simulate(load(None, [f"tick={tick}"]), "square", {"frequency": 1.25}, 12, settle=5)
-    assert report.mean_thrust == pytest.approx(
-        square_wave(load().plant, 0.42, 1.25).thrust, rel=1e-3
-    )
+    expected = square_wave(load().plant, 0.42, 1.25).thrust
+    assert report.mean_thrust == pytest.approx(expected, rel=1e-3)
 
 
 def test_only_whole_beats_are_counted() -> None:
@@ -107,9 +106,8 @@ def test_fullness_and_form_factor_of_waveforms(
     waveform: str, fullness: float, form_factor: float
 ) -> None:
     amplitude = 0.3
-    report = simulate(
-        load(None, ["tick=0.005"]), waveform, {"frequency": 1.0, "amplitude": amplitude}, 14
-    )
+    wave = {"frequency": 1.0, "amplitude": amplitude}
+    report = simulate(load(None, ["tick=0.005"]), waveform, wave, 14)
     assert report.fullness == pytest.approx(fullness, abs=1e-3)
     assert report.form_factor == pytest.approx(form_factor, abs=1e-3)
 
@@ -174,9 +172,8 @@ def test_the_heading_says_that_another_controller_swam(tmp_path: Path) -> None:
         "whose figures these are",
         heading,
     )
-    assert (
-        run(*policy, "--settle", "0").stdout.splitlines()[0].endswith("; the figures are of both")
-    )
+    first = run(*policy, "--settle", "0").stdout.splitlines()[0]
+    assert first.endswith("; the figures are of both")
 
 
 def test_a_run_is_a_table_with_a_row_a_tick_and_the_same_numbers_as_a_report() -> None:
@@ -191,9 +188,8 @@ def test_a_run_is_a_table_with_a_row_a_tick_and_the_same_numbers_as_a_report() -
 def test_a_run_takes_a_path_or_a_configuration_and_keys_that_override_either() -> None:
     path = str(ROOT / "config" / "simulated.yaml")
     changes = {"tick": 0.02, "simulation.noise": np.float64(0.0)}
-    of_file, of_config = (
-        simulation.run(config, "swing", {}, 1.0, overrides=changes) for config in (path, load(path))
-    )
+    fish = (path, load(path))
+    of_file, of_config = (simulation.run(x, "swing", {}, 1.0, overrides=changes) for x in fish)
     assert of_file.equals(of_config)
     assert len(of_file) == 50
     assert not of_file.equals(simulation.run(path, "swing", {}, 1.0, overrides={"tick": 0.02}))

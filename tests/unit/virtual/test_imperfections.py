@@ -38,9 +38,8 @@ def test_a_window_has_the_mean_of_its_samples_of_the_hum(frequency: float) -> No
     apart = TICK / SAMPLES
     for k in range(5):
         end = (k + 1) * TICK
-        samples = [
-            single.apply(0.0, 0.0, end - TICK + (i + 1) * apart, apart, 1) for i in range(SAMPLES)
-        ]
+        ends = [end - TICK + (i + 1) * apart for i in range(SAMPLES)]
+        samples = [single.apply(0.0, 0.0, time, apart, 1) for time in ends]
         shown = rig.apply(0.0, 0.0, end, TICK, SAMPLES)
         assert shown == pytest.approx(np.mean(samples, axis=0), abs=1e-12)
 
@@ -85,14 +84,8 @@ def test_heavy_tails_leave_the_rms_and_make_outliers() -> None:
 
 
 def test_the_same_seed_gives_the_same_forces_to_the_last_bit_and_another_one_others() -> None:
-    harsh = {
-        "noise": 0.001,
-        "noise_freedom": 4.0,
-        "hum": 0.003,
-        "spike_rate": 1.0,
-        "quantum": 1e-5,
-        "drift_walk": 1e-4,
-    }
+    noise = {"noise": 0.001, "noise_freedom": 4.0, "hum": 0.003, "spike_rate": 1.0}
+    harsh = noise | {"quantum": 1e-5, "drift_walk": 1e-4}
     first, again = (at_rest(300, seed=7, **harsh) for _ in range(2))
     assert first == again
     assert at_rest(300, seed=8, **harsh) != first

@@ -31,13 +31,8 @@ CONFIG = [Write(b"\x01"), Read(2)]
 
 def virtual_pi() -> VirtualPi:
     """Return a virtual Pi on a virtual clock, so that the bus takes no time."""
-    return VirtualPi(
-        VirtualPiSettings(pigpio_port=0),
-        PlantParameters(),
-        SimulationSettings(),
-        0.05,
-        VirtualClock(),
-    )
+    settings = VirtualPiSettings(pigpio_port=0)
+    return VirtualPi(settings, PlantParameters(), SimulationSettings(), 0.05, VirtualClock())
 
 
 @pytest.fixture
@@ -63,10 +58,8 @@ def test_a_transfer_over_the_link_is_one_on_the_bus(pi: VirtualPi, path: Path) -
     with RemotePi(path) as remote:
         assert path.stat().st_mode & 0o077 == 0, "for this user alone"
         assert remote.transfer(ADDRESS, [Write(b"\x02\x12\x34")]) == []
-        assert remote.transfer(ADDRESS, [Write(b"\x02"), Read(2), Read(1)]) == [
-            b"\x12\x34",
-            b"\x12",
-        ]
+        deeds = [Write(b"\x02"), Read(2), Read(1)]
+        assert remote.transfer(ADDRESS, deeds) == [b"\x12\x34", b"\x12"]
         assert pi.bus.transfer(ADDRESS, [Write(b"\x02"), Read(2)]) == [b"\x12\x34"]
 
 

@@ -13,9 +13,7 @@ from rigs.pigpiod_client import GPIO, PATIENCE, Bench, eventually, pigpiod_bench
 from fishd.core.clock import SystemClock
 
 PIGS = shutil.which("pigs")
-pytestmark = pytest.mark.skipif(
-    PIGS is None, reason="`pigs` is not installed: it is in Debian's package pigpio-tools"
-)
+pytestmark = pytest.mark.skipif(PIGS is None, reason="needs `pigs` of Debian's pigpio-tools")
 
 
 @pytest.fixture
@@ -26,9 +24,8 @@ def bench() -> Iterator[Bench]:
 
 def pigs(bench: Bench, *arguments: str) -> subprocess.CompletedProcess[str]:
     assert PIGS is not None
-    return subprocess.run(
-        [PIGS, *arguments], env=environment(bench), capture_output=True, text=True, timeout=PATIENCE
-    )
+    options = {"capture_output": True, "text": True, "timeout": PATIENCE}
+    return subprocess.run([PIGS, *arguments], env=environment(bench), **options)
 
 
 def environment(bench: Bench) -> dict[str, str]:

@@ -141,9 +141,7 @@ def test_the_shipped_policy_does_not_shake_the_servo_of_a_harsh_fish(fish: tuple
 
 def test_the_shipped_policy_loses_nothing_on_its_own_fish() -> None:
     policy = {"policy": "default-fish"}
-    reports = [
-        simulate(load(None, [*NOISY, f"chatter.dwell={dwell}"]), "ppo", policy)
-        for dwell in (0.0, 0.2)
-    ]
+    fish = [load(None, [*NOISY, f"chatter.dwell={dwell}"]) for dwell in (0.0, 0.2)]
+    reports = [simulate(config, "ppo", policy) for config in fish]
     assert reports[0].mean_thrust == reports[1].mean_thrust
     assert reports[1].fallback is None

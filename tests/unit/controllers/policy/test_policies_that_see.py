@@ -55,10 +55,8 @@ def test_a_card_says_in_a_word_what_is_seen() -> None:
 
 
 def test_a_file_of_which_frames_are_missing_or_others_is_refused() -> None:
-    wanted = (
-        "one uint8 input of shape [1, 2, 32, 32] named 'frames' is needed; export it with 'fishctl "
-        "learn export'"
-    )
+    frames = "one uint8 input of shape [1, 2, 32, 32] named 'frames' is needed"
+    wanted = f"{frames}; export it with 'fishctl learn export'"
 
     def refused(change: Any) -> str:
         model = onnx.load_model_from_string(FOLLOWER)
@@ -72,12 +70,10 @@ def test_a_file_of_which_frames_are_missing_or_others_is_refused() -> None:
         about = encode(seeing_card(("fy", 0.1)))
         helper.set_model_props(model, {CARD_KEY: about})
 
-    assert refused(smaller) == (
-        f"its inputs: uint8 of shape [1, 2, 32, 31] named 'frames'; {wanted}"
-    )
-    assert "named 'frames' and one float32 input of shape [1, 1] named 'observation' are" in (
-        refused(also_numbers)
-    )
+    shape = "uint8 of shape [1, 2, 32, 31] named 'frames'"
+    assert refused(smaller) == f"its inputs: {shape}; {wanted}"
+    also = "and one float32 input of shape [1, 1] named 'observation' are"
+    assert f"named 'frames' {also}" in refused(also_numbers)
 
 
 def test_a_card_with_impossible_frames_is_refused_with_the_key_to_blame() -> None:

@@ -60,9 +60,7 @@ def test_a_sealed_file_of_an_older_fishd_still_tells_its_relative_thrust() -> No
 @pytest.mark.parametrize("protocol", [0, 2, pickle.HIGHEST_PROTOCOL])
 def test_a_pickle_is_refused_and_never_unpickled(tmp_path: Path, protocol: int) -> None:
     path = write(tmp_path, pickle.dumps(Trap(tmp_path / "trace"), protocol))
-    expected = (
-        "this is a pickle, which could run any code" if protocol >= 2 else "not an ONNX model"
-    )
+    expected = "is a pickle, which could run any code" if protocol >= 2 else "not an ONNX model"
     with pytest.raises(PolicyError, match=expected):
         file.read(path)
     assert not (tmp_path / "trace").exists()
@@ -84,9 +82,8 @@ def test_an_archive_of_torch_or_baselines_is_refused_and_never_unpickled(tmp_pat
 
 @pytest.mark.parametrize("content", [b"", b"\x00", b"hello fish", b"\x08\x07" * 9, os.urandom(999)])
 def test_what_is_no_onnx_is_refused(content: bytes) -> None:
-    assert refusal(b"\x01" + content) == (
-        "this is not an ONNX model; export it with 'fishctl learn export'"
-    )
+    refused = "this is not an ONNX model; export it with 'fishctl learn export'"
+    assert refusal(b"\x01" + content) == refused
 
 
 @pytest.mark.parametrize(

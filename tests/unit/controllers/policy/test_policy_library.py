@@ -71,9 +71,8 @@ def test_an_unknown_name_gets_the_nearest_and_the_list(tmp_path: Path) -> None:
         write(tmp_path / "shipped", name=name)
     with pytest.raises(PolicyError) as caught:
         library.find("swim4")
-    assert str(caught.value) == (
-        "no policy is named 'swim4'; did you mean 'swim42'? There are: calm, swim42"
-    )
+    refused = "no policy is named 'swim4'; did you mean 'swim42'? There are: calm, swim42"
+    assert str(caught.value) == refused
     with pytest.raises(PolicyError) as caught:
         library.find("zebra")
     assert str(caught.value) == "no policy is named 'zebra'; valid: calm, swim42"

@@ -71,9 +71,8 @@ def test_other_operators_are_refused_by_name(node: Any, named: str) -> None:
 
 def test_an_operator_that_the_file_defines_itself_is_refused() -> None:
     model = onnx.load_model_from_string(of_nodes([make("Tanh", ["observation"], ["action"])]))
-    own = helper.make_function(
-        "", "Tanh", ["x"], ["y"], [make("Sin", ["x"], ["y"])], [helper.make_opsetid("", 17)]
-    )
+    sine = make("Sin", ["x"], ["y"])
+    own = helper.make_function("", "Tanh", ["x"], ["y"], [sine], [helper.make_opsetid("", 17)])
     model.functions.append(own)
     assert refusal(seal(model)) == "it defines a custom operator, Tanh"
 
@@ -81,9 +80,8 @@ def test_an_operator_that_the_file_defines_itself_is_refused() -> None:
 @pytest.mark.parametrize("opset", [10, 99])
 def test_a_version_of_the_operators_that_is_not_known_is_refused(opset: int) -> None:
     content = of_nodes([make("Tanh", ["observation"], ["action"])], opset=opset)
-    assert refusal(content) == (
-        f"its version of ONNX's operators: {opset}; one from 11 to 26 is needed"
-    )
+    refused = f"its version of ONNX's operators: {opset}; one from 11 to 26 is needed"
+    assert refusal(content) == refused
 
 
 def test_more_operators_than_a_policy_needs_are_refused() -> None:
@@ -124,11 +122,8 @@ def test_a_network_that_takes_over_half_a_tick_is_refused_with_its_time(tmp_path
     """80 products with the same weights: some 8 ms on a fast machine, for a tick of 2 ms."""
     names = ["wide", *(f"v{number}" for number in range(79)), "narrow"]
     chain = [make("MatMul", [a, "w"], [b]) for a, b in pairwise(names)]
-    nodes = [
-        make("Expand", ["observation", "s"], ["wide"]),
-        *chain,
-        make("ReduceMean", ["narrow"], ["action"]),
-    ]
+    wide, mean = ("Expand", ["observation", "s"], ["wide"]), ("ReduceMean", ["narrow"], ["action"])
+    nodes = [make(*wide), *chain, make(*mean)]
     weights = [integers("s", 1, 1100), floats("w", 1100, 1100)]
     path = write(tmp_path, of_nodes(nodes, weights, card(tick=0.002)))
     with pytest.raises(PolicyError) as caught:
@@ -187,10 +182,8 @@ def test_what_other_exporters_write_is_permitted(tmp_path: Path, opset: int) -> 
     ]
     weights = [floats("w0", 1, 8), floats("b0", 8), floats("w1", 1, 8), floats("b1", 1)]
     weights.append(integers("s", 1, 1))
-    weights += [
-        numpy_helper.from_array(np.array(value, np.float32), name)
-        for name, value in (("low", -1.0), ("high", 1.0))
-    ]
+    values = {"low": -1.0, "high": 1.0}
+    weights += [numpy_helper.from_array(np.array(values[n], np.float32), n) for n in values]
     network = Network(file.read(write(tmp_path, of_nodes(nodes, weights, opset=opset))))
     assert network.run() == 0.0
 

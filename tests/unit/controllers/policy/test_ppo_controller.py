@@ -177,6 +177,5 @@ def test_what_runs_the_network_leaves_nothing_in_the_users_folder(tmp_path: Path
 
 def test_a_policy_that_never_saw_a_velocity_in_rad_per_second_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, to_onnx(linear(1.0), "tanh", card(("fin_velocity", 0.002))))
-    assert "trained with the fin_velocity of estimator.kind: lateral_force" in refusal(
-        path, replace(LIMITS, scaled=True)
-    )
+    refused = refusal(path, replace(LIMITS, scaled=True))
+    assert "trained with the fin_velocity of estimator.kind: lateral_force" in refused

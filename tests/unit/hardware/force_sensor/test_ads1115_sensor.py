@@ -89,11 +89,8 @@ def test_no_measurement_is_newer_than_its_tick_if_a_conversion_outlasts_it(data_
     with ForceRig(noise=0.0) as rig:
         rig.volts["A0-A1"] = lambda t: 0.1 * t
         results = Ticks(rig.sensor(data_rate=data_rate)).run(5.0)
-    ages = [
-        index * TICK - item.time
-        for index, item in enumerate(results, 1)
-        if not isinstance(item, str)
-    ]
+    numbered = enumerate(results, 1)
+    ages = [number * TICK - f.time for number, f in numbered if not isinstance(f, str)]
     assert min(ages) >= 0.0
     assert len(ages) > 90
     assert sum(item.samples for item in results if not isinstance(item, str)) >= 2 * data_rate

@@ -59,12 +59,8 @@ def test_with_noise_it_is_recovered_as_well_as_can_be(cx: float, cy: float, seed
     noise = 1e-4
     loads = measured_loads(PLAN * 8, sensor(1.0, 1.0, cx, cy), (0.5, -0.5), noise, seed)
     fitted = fit(loads)
-    matrix = np.array(
-        [
-            [fitted.calibration.xx, fitted.calibration.xy],
-            [fitted.calibration.yx, fitted.calibration.yy],
-        ]
-    )
+    found = fitted.calibration
+    matrix = np.array([[found.xx, found.xy], [found.yx, found.yy]])
     # Six standard errors: 16 loads of 0.2 N and more along each axis, and a matrix of norm < 2.
     tolerance = 6 * 2 * 2 * noise / (0.2 * math.sqrt(16))
     assert np.abs(matrix - np.linalg.inv(sensor(1.0, 1.0, cx, cy))).max() < tolerance
@@ -90,9 +86,8 @@ def test_the_covariance_holds_the_true_gains_whatever_is_wrong_with_the_loads(
         scale, turn = random.standard_normal((2, len(plan), 1)) * [[[weight]], [[thread]]]
         hung = planned * (1.0 + scale) + turn * planned[:, ::-1] * [-1.0, 1.0]
         volts = (hung + noise * random.standard_normal(hung.shape)) @ true.T + [0.3, -0.2]
-        calibration = fit(
-            [Load(*f, *v) for f, v in zip(plan, volts.tolist(), strict=True)]
-        ).calibration
+        loads = [Load(*f, *v) for f, v in zip(plan, volts.tolist(), strict=True)]
+        calibration = fit(loads).calibration
         for index, (fx, fy) in enumerate(((1.0, 0.0), (0.0, 1.0), (1.0, 0.3))):
             vx, vy = true @ (fx, fy)
             ci95 = calibration.thrust_ci95(fx, fy)
@@ -102,9 +97,8 @@ def test_the_covariance_holds_the_true_gains_whatever_is_wrong_with_the_loads(
 
 
 def test_an_error_that_all_loads_share_is_in_the_covariance_as_it_is_told() -> None:
-    loads = [
-        Load(1.02 * f.fx, 1.02 * f.fy, f.vx, f.vy) for f in measured_loads(PLAN, sensor(2, 1, 0.1))
-    ]
+    forces = measured_loads(PLAN, sensor(2, 1, 0.1))
+    loads = [Load(1.02 * f.fx, 1.02 * f.fy, f.vx, f.vy) for f in forces]
     calibration = fit(loads, 0.03).calibration
     assert calibration.thrust_ci95(1.0) == pytest.approx(0.03)
     assert calibration.thrust_ci95(0.5, 0.2) == pytest.approx(0.015)  # a factor for both axes
@@ -112,9 +106,8 @@ def test_an_error_that_all_loads_share_is_in_the_covariance_as_it_is_told() -> N
 
 
 def test_the_error_of_each_load_points_at_the_one_that_was_entered_wrongly() -> None:
-    loads = measured_loads(
-        [*PLAN, (0.1, 0.1), (-0.1, 0.1), (0.1, -0.1), (-0.1, -0.1)], sensor(1, 1)
-    )
+    diagonal = [(0.1, 0.1), (-0.1, 0.1), (0.1, -0.1), (-0.1, -0.1)]
+    loads = measured_loads([*PLAN, *diagonal], sensor(1, 1))
     loads[3] = loads[3]._replace(fy=0.35)
     errors = [math.hypot(*error) for error in fit(loads).errors]
     assert errors.index(max(errors)) == 3

@@ -103,9 +103,8 @@ FAULTS = ("nack", "timeout", "clock-stretch", "bus-owned", "arbitration-lost", "
 
 codes = st.integers(-32767, 32766)
 numbers = st.floats(-100, 100)
-calibrations = st.builds(
-    ForceCalibration, xx=numbers, xy=numbers, x0=numbers, yx=numbers, yy=numbers, y0=numbers
-)
+NAMES = ("xx", "xy", "x0", "yx", "yy", "y0")
+calibrations = st.builds(ForceCalibration, **dict.fromkeys(NAMES, numbers))
 windows = st.lists(st.tuples(codes, codes), min_size=1, max_size=30)
 
 

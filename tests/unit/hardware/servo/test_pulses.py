@@ -149,9 +149,8 @@ def test_every_angle_within_reach_is_a_pulse_and_none_beyond(servo: ServoSetting
             pulse_width(servo, 0.0)
         return
     for share in (0.001, 0.5, 0.999):
-        assert (
-            MIN_PULSE_US <= pulse_width(servo, lowest + share * (highest - lowest)) <= MAX_PULSE_US
-        )
+        angle = lowest + share * (highest - lowest)
+        assert MIN_PULSE_US <= pulse_width(servo, angle) <= MAX_PULSE_US
     for beyond in (lowest - 1e-3, highest + 1e-3):
         with pytest.raises(ServoError):
             pulse_width(servo, beyond)

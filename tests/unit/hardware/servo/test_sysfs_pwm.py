@@ -130,9 +130,8 @@ def tree(tmp_path: Path) -> Path:
 
 
 def on_true_files(settings: SysfsPwmSettings) -> CalibratedServo:
-    return CalibratedServo(
-        SysfsPwm, settings, ServoCalibration(), VirtualClock(), threaded=False, tick=0.05
-    )
+    rest = (ServoCalibration(), VirtualClock())
+    return CalibratedServo(SysfsPwm, settings, *rest, threaded=False, tick=0.05)
 
 
 def open_files(tree: Path) -> int:
@@ -155,11 +154,8 @@ def test_on_true_files_a_channel_is_driven_released_and_unexported(tree: Path) -
     assert (channel / "enable").read_text() == "0\n"
     servo.write(1.0)
     assert open_files(tree) > 0
-    assert [number(channel / n) for n in ("period", "duty_cycle", "enable")] == [
-        20_000_000,
-        2_100_000,
-        1,
-    ]
+    written = [number(channel / name) for name in ("period", "duty_cycle", "enable")]
+    assert written == [20_000_000, 2_100_000, 1]
     servo.write(-1.0)
     assert number(channel / "duty_cycle") == 900_000
     servo.release()

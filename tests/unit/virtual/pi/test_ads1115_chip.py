@@ -64,11 +64,8 @@ def test_a_conversion_lasts_a_period_of_a_rate_that_is_off_by_a_tenth(bits: int,
 
 def test_registers_are_read_and_written_by_their_pointer(board: Board) -> None:
     board.bus.transfer(0x48, [Write(b"\x02\x12\x34")])
-    assert [board.bus.transfer(0x48, [Read(n)]) for n in (1, 2, 3)] == [
-        [b"\x12"],
-        [b"\x12\x34"],
-        [b"\x12\x34\xff"],
-    ]
+    answers = [board.bus.transfer(0x48, [Read(n)]) for n in (1, 2, 3)]
+    assert answers == [[b"\x12"], [b"\x12\x34"], [b"\x12\x34\xff"]]
     board.bus.transfer(0x48, [Write(b"\x03\x12")])  # half a word
     assert board.register(3) == 0x7FFF
 

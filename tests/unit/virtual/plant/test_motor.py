@@ -86,9 +86,8 @@ def test_a_beat_costs_what_the_equations_say_integrated_on_their_own() -> None:
 @pytest.mark.parametrize("fault", [{"backlash": 0.05}, {"cable_slack": 0.05}])
 def test_a_wheel_in_its_play_does_not_pay_for_the_tail(fault: dict[str, float]) -> None:
     plant = replace(PLANT, **fault)
-    heavy, none = (
-        TetheredFish(plant, motor=replace(MOTOR, tail_inertia=inertia)) for inertia in (0.01, 0.0)
-    )
+    motors = (replace(MOTOR, tail_inertia=inertia) for inertia in (0.01, 0.0))
+    heavy, none = (TetheredFish(plant, motor=motor) for motor in motors)
     small = [0.02, -0.02] * 5
     assert mean_power(heavy, small) == pytest.approx(mean_power(none, small), rel=1e-9)
 

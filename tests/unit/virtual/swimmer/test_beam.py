@@ -49,9 +49,8 @@ def test_slices_move_as_their_places_change() -> None:
     random = np.random.default_rng(2)
     body.q[:] = 0.3 * random.normal(size=body.size)
     rate, little = random.normal(size=body.size), 1e-6
-    (ahead, turned), (behind, turned_back) = (
-        body.shape(body.q + sign * little * rate) for sign in (1.0, -1.0)
-    )
+    ends = (body.shape(body.q + sign * little * rate) for sign in (1.0, -1.0))
+    (ahead, turned), (behind, turned_back) = ends
     velocity = body.motion(body.shape(body.q)[1]) @ rate
     assert velocity[:, :2] == pytest.approx((ahead - behind) / (2.0 * little), abs=1e-6)
     assert velocity[:, 2] == pytest.approx((turned - turned_back) / (2.0 * little), abs=1e-6)

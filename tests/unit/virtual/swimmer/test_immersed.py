@@ -43,9 +43,8 @@ def bend(body: Immersed, curvature: float) -> Array:
 
 def momentum(body: Immersed) -> float:
     """Return the momentum along x of the water and of the body's excess mass [kg m/s per metre]."""
-    return body.density * body.flow.momentum() + float(
-        beam_of(body).excess[:, 0] @ body.velocity[:, 0]
-    )
+    excess = float(beam_of(body).excess[:, 0] @ body.velocity[:, 0])
+    return body.density * body.flow.momentum() + excess
 
 
 @pytest.mark.parametrize("excess", [0.0, 3000.0])

@@ -55,9 +55,7 @@ def test_the_profile_that_a_complaint_gives_as_an_example_is_accepted() -> None:
 @pytest.mark.parametrize("profile", ["[[0, 0.3], [1, 0.02]]", "[[0, 0.02], [1, 0.3]]"])
 def test_small_cells_that_end_before_the_fish_does_are_refused(profile: str) -> None:
     body = [f"swimmer.body.profile={profile}"]
-    with pytest.raises(
-        ConfigError, match=r"swimmer\.numerics\.fine_length: 1\.4 is too"
-    ) as refusal:
+    with pytest.raises(ConfigError, match=r"swimmer\.numerics\.fine_length: 1\.4") as refusal:
         load(FILE, [*body, "swimmer.numerics.fine_length=1.4"])
     least = str(refusal.value).rpartition("at least ")[2]
     assert 1.5 < float(least) < 1.7
