@@ -65,7 +65,7 @@ from fishd.hardware.settings import (
 )
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.settings import VirtualPiSettings
-from fishd.virtual.plant.dwell import shortest_dwell
+from fishd.virtual.plant.drive_train import shortest_dwell
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.swimmer.settings import SwimmerSettings
 

@@ -6,7 +6,7 @@ import pytest
 from msgspec.structs import replace
 
 from fishd.config import load
-from fishd.virtual.plant.dwell import shortest_dwell
+from fishd.virtual.plant.drive_train import shortest_dwell
 from fishd.virtual.plant.parameters import PlantParameters
 from fishd.virtual.plant.tethered import PlantState, TetheredFish
 
