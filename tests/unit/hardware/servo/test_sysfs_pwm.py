@@ -111,6 +111,22 @@ def test_a_living_fishd_notices_the_last_resort(bench: Bench) -> None:
         servo.write(0.5)
 
 
+def test_the_last_resort_reports_pulses_that_another_program_starts_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench.write(bench.servo(), 0.5)
+    sleep = bench.clock.sleep
+
+    def sleep_while_another_program_writes(seconds: float) -> None:
+        sleep(seconds)
+        bench.shell("pwmchip1/pwm2/duty_cycle", 1_600_000)
+        bench.shell("pwmchip1/pwm2/enable", 1)
+
+    monkeypatch.setattr(bench.clock, "sleep", sleep_while_another_program_writes)
+    with pytest.raises(ServoError, match="has pulses again: another program drives it"):
+        bench.last_resort()
+
+
 @pytest.fixture
 def tree(tmp_path: Path) -> Path:
     """Return a folder of plain files with an exported channel."""
