@@ -64,7 +64,8 @@ class AsyncFish:
         self.close()
 
     def close(self) -> None:
-        """Disconnect; may be called twice."""
+        """Disconnect, without waiting for the answers of requests; may be called twice."""
+        self._fish.interrupt()
         with self._lock:
             self._fish.close()
         self._context.destroy(linger=0)

@@ -1,6 +1,8 @@
 """Socket of the requests of `Fish`; it works without zmq, so that most commands start faster."""
 
+import socket
 import time
+from contextlib import suppress
 
 from fishd.core.errors import FishError, NoDaemon
 from fishd.core.zmtp import Dealer
@@ -18,6 +20,7 @@ class RequestSocket(Dealer[bytes | FishError]):
     def __init__(self, endpoint: str) -> None:
         """Raises `NoDaemon` if the endpoint is not an address."""
         self._endpoint = endpoint
+        self._interrupted = False
         try:
             super().__init__(endpoint, MAX_REPLY_BYTES)
         except ValueError as error:
@@ -27,27 +30,42 @@ class RequestSocket(Dealer[bytes | FishError]):
 
     def send_by(self, deadline: float, request: bytes) -> bool:
         """Send a request once the daemon accepts it; return False after the deadline [s]."""
-        while (
-            not (is_ready := self.state()[0]) and (remaining := deadline - time.monotonic()) > 0.0
-        ):
-            self.wait(remaining)
+        while not (is_ready := self.state()[0]) and self._wait_until(deadline):
+            pass
         if is_ready:
             self.send(request)
         return is_ready
 
-    def receive_by(self, deadline: float) -> bytes:
+    def receive_by(self, deadline: float, connection: int | None = None) -> bytes:
         """Return a reply; empty if none has come by `deadline` [s, monotonic].
 
+        connection: number of the connection of the request; return empty on the next one
         Raise `FishError` for an invalid message.
         """
         while not self.state()[1]:
-            if (remaining := deadline - time.monotonic()) <= 0.0:
+            is_new = connection is not None and connection != self.connections
+            if is_new or not self._wait_until(deadline):
                 return b""
-            self.wait(remaining)
         reply = self._inbox.popleft()
         if isinstance(reply, FishError):
             raise reply
         return reply
+
+    def interrupt(self) -> None:
+        """End the wait of another thread, whose request then raises `FishError`."""
+        self._interrupted = True
+        if connected := self._socket:
+            with suppress(OSError):
+                connected.shutdown(socket.SHUT_RDWR)
+
+    def _wait_until(self, deadline: float) -> bool:
+        """Wait until `state` may have changed; return False after the deadline [s]."""
+        if self._interrupted:
+            raise FishError("the client was closed during a request")
+        remaining = deadline - time.monotonic()
+        if remaining > 0.0:
+            self.wait(remaining)
+        return remaining > 0.0
 
     def _decode(self, payload: bytes) -> bytes:
         return payload

@@ -18,7 +18,14 @@ from fishd.client.request_socket import RequestSocket
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted
-from fishd.core.protocol import LOADING_TIMEOUT_S, Calibrations, Grant, PolicyInfo, State
+from fishd.core.protocol import (
+    LOADING_TIMEOUT_S,
+    READ_OPERATIONS,
+    Calibrations,
+    Grant,
+    PolicyInfo,
+    State,
+)
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
 if TYPE_CHECKING:
@@ -58,6 +65,11 @@ class Fish(Connection):
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def interrupt(self) -> None:
+        """End the request of another thread, which then raises `FishError`."""
+        if self._socket:
+            self._socket.interrupt()
 
     def close(self) -> None:
         """Disconnect; may be called twice."""
@@ -252,7 +264,7 @@ class Fish(Connection):
         return self._subscribe(kinds)
 
     def _call(self, kind: type[T], op: str, *, patience: float = 0.0, **args: Any) -> T:
-        """Send a request and return its result.
+        """Send a request and return its result; send a read again on a new connection.
 
         patience: time that the answer may take in addition to the timeout; negative to wait for no
             late answer [s]
@@ -260,14 +272,22 @@ class Fish(Connection):
         if self._socket is None:
             self.check_endpoint()
             self._socket = RequestSocket(self.endpoint)
+        connection = self._socket
         identity, request = self.request(op, args)
+        sent_on = None
         for deadline in answer_deadlines(self.timeout + patience, again=patience >= 0.0):
-            if request and self._socket.send_by(deadline, request):
-                request = b""
-            while not request and (reply := self._socket.receive_by(deadline)):
-                result = self.result((reply,), identity, kind)
-                if result is not None:
-                    return result
+            while sent_on is not None or connection.send_by(deadline, request):
+                sent_on = sent_on or connection.connections
+                is_read = op in READ_OPERATIONS
+                reply = connection.receive_by(deadline, sent_on if is_read else None)
+                if reply:
+                    result = self.result((reply,), identity, kind)
+                    if result is not None:
+                        return result
+                elif is_read and sent_on != connection.connections:
+                    sent_on = None
+                else:
+                    break
         raise self.no_answer_error(patience)
 
     def _subscribe(self, kinds: dict[bytes, type[T]], *, forever: bool = False) -> Iterator[T]:

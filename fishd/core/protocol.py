@@ -31,6 +31,8 @@ MAX_SAMPLE_AGE_S = 10.0
 LOADING_TIMEOUT_S = 10.0
 """Maximum time to load a controller, and to read or write files [s]."""
 
+READ_OPERATIONS = {"status", "controllers", "policies", "config", "calibrations"}
+"""Operations without an effect, which a client sends again after its connection was lost."""
 MOVING_OPERATIONS = {"set-controller", "clear-fault", "calibrate-servo"}
 """Operations that may move a fish at rest, or start the pulses of its servo."""
 MAX_WAIT_S = 5.0

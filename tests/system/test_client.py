@@ -1,15 +1,17 @@
 """The Python client, synchronous and asyncio, against the real daemon."""
 
 import asyncio
+import json
 import math
 import threading
 from itertools import dropwhile, islice
 from pathlib import Path
 
 import pytest
-from rigs.processes import PATIENCE, Daemon
+import zmq
+from rigs.processes import PATIENCE, Daemon, wait_until
 
-from fishd.client import AsyncFish, Fish, NoDaemon, Refused
+from fishd.client import AsyncFish, Fish, FishError, NoDaemon, Refused
 from fishd.core.calibration import ServoCalibration
 from fishd.core.errors import ParameterError
 
@@ -117,3 +119,45 @@ def test_text_that_is_not_utf8_is_refused_but_never_stops_an_emergency_stop() ->
         with pytest.raises(ParameterError, match=r"calibrate-servo: '\?' is not a text in UTF-8"):
             connection.request("calibrate-servo", {"calibration": calibration})
     assert b"stop ?" in connection.request("estop", {"message": "stop \udcff"})[1]
+
+
+def test_a_command_is_never_sent_again_on_a_new_connection(tmp_path: Path) -> None:
+    """The first gateway takes the command and is gone; the next one gets only what follows."""
+    endpoint = f"ipc://{tmp_path}/control"
+    operations = []
+
+    def serve_two_gateways() -> None:
+        for _ in range(2):
+            with zmq.Context() as context, context.socket(zmq.ROUTER) as gateway:
+                gateway.linger = 0
+                gateway.bind(endpoint)
+                assert gateway.poll(PATIENCE * 1e3)
+                operations.append(json.loads(gateway.recv_multipart()[-1])["op"])
+
+    server = threading.Thread(target=serve_two_gateways)
+    server.start()
+    wait_until(lambda: (tmp_path / "control").exists())
+    with Fish(endpoint, timeout=1.0) as fish:
+        for request in (lambda: fish.mark("once"), fish.status):
+            with pytest.raises(NoDaemon):
+                request()
+    server.join()
+    assert operations == ["mark", "status"]
+
+
+def test_an_asyncio_client_closes_while_a_request_has_no_answer(tmp_path: Path) -> None:
+    """The request ends with an error, not after its timeout."""
+    endpoint = f"ipc://{tmp_path}/control"
+
+    async def close_early() -> None:
+        fish = AsyncFish(endpoint, timeout=1e6)
+        request = asyncio.create_task(fish.status())
+        assert await asyncio.to_thread(silent.poll, PATIENCE * 1e3)
+        fish.close()
+        with pytest.raises(FishError, match="the client was closed during a request"):
+            await request
+
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as silent:
+        silent.linger = 0
+        silent.bind(endpoint)
+        asyncio.run(close_early())

@@ -17,7 +17,7 @@ from rigs.documents import ROOT
 from rigs.gateway_processes import both_gateways, children, fork_server, gateways, gone
 from rigs.processes import PATIENCE, Daemon, Process, Subscriber, call, running, wait_until
 
-from fishd.client import AsyncFish, Fish, NoDaemon
+from fishd.client import AsyncFish, Fish
 from fishd.daemon.gateway import link
 from fishd.daemon.gateway.gateways import (
     END_TIMEOUT_S,
@@ -146,13 +146,14 @@ def test_an_estop_is_answered_while_every_gateway_is_stopped(daemon: Daemon) -> 
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         assert fish.estop("from a test").mode == "estop"
         assert fish.estop_taken_by in ("estop", "control")
+    assert daemon.status().reason.message == "from a test"  # type: ignore[union-attr]
 
-    def stays_stopped() -> bool:  # a gateway that has just started may be replaced, too
-        with contextlib.suppress(NoDaemon):
-            return daemon.status(timeout=1.0).reason.message == "from a test"  # type: ignore[union-attr]
-        return False
 
-    wait_until(stays_stopped)
+def test_a_read_that_a_hanging_gateway_took_is_answered_by_the_next_one(daemon: Daemon) -> None:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+        fish.status()
+        os.kill(both_gateways(daemon)["control"], signal.SIGSTOP)
+        assert fish.status().recovered_errors["control_restarts"] == 1
 
 
 @pytest.mark.realtime
