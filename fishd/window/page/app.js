@@ -1,0 +1,525 @@
+// The page: its state, what the stream says about it, the header with the E-stop, and the values.
+import {
+  call, duration, forceUnit, html, interval, number, parametersText, recall, remember, render, sentence, setClient,
+  timeOfDay, useState,
+} from "./common.js";
+import { Charts } from "./charts.js";
+import { defaultOf, Drive, request, selectionOf } from "./controls.js";
+import { Experiments, Runs } from "./experiments.js";
+import { TopView } from "./fish.js";
+import { Ring, Stream, ticksOf } from "./stream.js";
+
+const byId = (id) => document.getElementById(id);
+const STALE_S = 0.8;
+const STALE_TICKS = 5;
+const CHECK_MS = 200;
+const VALUES_MS = 250;
+const ESTOP_TIMEOUT_MS = 1500;
+const ESTOP_RETRY_MS = 250;
+const NOTICE_MS = { info: 6_000, warning: 20_000, error: 20_000 };
+const MAX_EVENTS = 100;
+const WINDOWS = [15, 30, 60, 120];
+
+const state = {
+  name: "", fish: [], session: null, status: null, controllers: [], events: [], jobs: new Map(),
+  connection: null, driver: null, linked: false, helloed: false, lastTick: null, tick: null, interval: 0.05,
+  changedSeq: 0, own: new Set(), selected: null, edited: null, keep: recall("keep", false), estop: null,
+  notices: [], reference: null, seconds: recall("seconds", 15),
+};
+let ring = new Ring(0.05), charts, view, stream, drawing = false, valuesAt = 0;
+
+// ---- what the server says ----
+
+const receive = {
+  hello(payload) {
+    setClient(payload.client);
+    stream.client = payload.client;
+    sessionStorage.setItem("fishd.client", payload.client);
+    Object.assign(state, {
+      name: payload.name, fish: payload.fish, session: payload.session, controllers: payload.controllers ?? [],
+      events: payload.events ?? [], connection: payload.connection, driver: payload.driver, linked: true, helloed: true,
+      jobs: new Map((payload.jobs ?? []).map((job) => [job.id, job])),
+      reference: recall(`reference.${payload.name}`, null), changedSeq: 0,
+    });
+    ring = new Ring(payload.status?.tick ?? 0.05);
+    for (const tick of ticksOf(payload.history)) ring.push(tick);
+    state.tick = ring.latest;
+    const age = payload.connection?.age;
+    state.lastTick = ring.latest && Number.isFinite(age) ? performance.now() - 1000 * age : null;
+    charts.setRing(ring);
+    charts.marks.length = 0;
+    for (const event of state.events) markEvent(event);
+    setStatus(payload.status);
+    document.title = `${state.name} · fishd`;
+    document.body.classList.remove("waiting");
+    changed();
+  },
+  ticks(ticks) {
+    const now = performance.now();
+    if (state.lastTick !== null) {
+      const each = (now - state.lastTick) / 1000 / ticks.length;
+      if (each < 2) state.interval += 0.05 * (each - state.interval);
+    }
+    for (const tick of ticks) ring.push(tick);
+    const before = state.tick;
+    state.tick = ticks.at(-1);
+    state.lastTick = now;
+    charts.dirty = true;
+    if (before?.mode !== state.tick.mode && state.status) state.status = { ...state.status, mode: state.tick.mode };
+    schedule();
+    checkConnection();
+  },
+  event(event) {
+    state.events = [...state.events.slice(1 - MAX_EVENTS), event];
+    markEvent(event);
+    if (event.kind === "controller" || event.kind === "parameters" || event.kind === "fallback") {
+      const { controller, parameters } = event.data;
+      setStatus({ ...state.status, controller, parameters });
+      // The answer to a request of this page may come after its event.
+      setTimeout(() => noticeOther(event), 1000);
+    }
+    if (event.kind === "mode") noticeOther(event);
+    changed();
+  },
+  status(status) {
+    const kept = state.status && status.seq < state.changedSeq
+      ? { controller: state.status.controller, parameters: state.status.parameters, mode: state.status.mode, reason: state.status.reason }
+      : {};
+    setStatus({ ...status, ...kept });
+  },
+  job(job) {
+    const before = state.jobs.get(job.id);
+    state.jobs.set(job.id, job);
+    if (before?.state === "running" && job.state !== "running") {
+      notice(job.state === "failed" ? "error" : "info", `${job.kind}: ${job.state}`, job.state === "failed" ? (job.lines?.at(-1) ?? "") : "");
+    }
+    showVirtual(job);
+    changed();
+  },
+  driver(driver) {
+    if (state.driver?.you_drive && driver && !driver.you_drive) notice("warning", `${driver.device || "Another page"} drives now.`);
+    state.driver = driver;
+    changed();
+  },
+  connection(connection) {
+    if (connection.state === "restarted") {
+      notice("warning", connection.message || "fishd was restarted.", "Its controller and parameters are those of a start.");
+      state.changedSeq = 0;
+    }
+    state.connection = connection;
+    checkConnection();
+    changed();
+  },
+};
+
+function setStatus(status) {
+  if (!status) return;
+  state.status = status;
+  charts.setStatus(status, state.controllers.find(({ name }) => name === status.controller));
+  changed();
+}
+
+/** Return the parameters that are not the defaults. */
+function ownText(name, parameters) {
+  const fields = state.controllers.find((controller) => controller.name === name)?.parameters ?? [];
+  const standard = Object.fromEntries(fields.map((field) => [field.name, defaultOf(field)]));
+  return parametersText(Object.fromEntries(Object.entries(parameters ?? {}).filter(([key, value]) => value !== standard[key])));
+}
+
+let markedParameters = {};
+/** Return the parameters that changed since the event before, also back to a default. */
+function changeText(parameters) {
+  const before = markedParameters;
+  markedParameters = parameters;
+  return Object.entries(parameters).filter(([key, value]) => value !== before[key])
+    .map(([key, value]) => parametersText({ [key]: value }) || `${key}=default`).join(" ") || "parameters";
+}
+
+function markEvent(event) {
+  const { controller, parameters } = event.data ?? {};
+  if (event.kind === "controller" || event.kind === "fallback") markedParameters = parameters;
+  const text = {
+    controller: () => controller, fallback: () => `${controller} took over`, parameters: () => changeText(parameters),
+    mark: () => event.message, fault: () => "fault",
+    mode: () => (event.data.mode === "estop" ? "E-stop" : event.data.mode === "idle" ? "idle" : null),
+  }[event.kind]?.();
+  if (text) charts.mark(event.t, text);
+}
+
+function noticeOther(event) {
+  const { controller, parameters, mode } = event.data;
+  if (event.kind === "mode") {
+    if (mode === "estop" && !state.estop) notice("error", "Another client used the E-stop.");
+    return;
+  }
+  if (state.own.has(JSON.stringify([controller, parameters]))) return;
+  if (event.kind === "fallback") notice("warning", event.message);
+  else notice("warning", `Another client set ${controller} ${ownText(controller, parameters)}`.trim() + ".");
+}
+
+function showVirtual(job) {
+  if (job.kind !== "simulate" || job.state !== "done" || !Number.isFinite(job.result?.mean_thrust)) return;
+  if (forceUnit(state.status)[1] !== "mN") return;
+  charts.showVirtual(`${job.result.controller} ${ownText(job.result.controller, job.result.parameters)}`.trim(), job.result);
+}
+
+// ---- how fresh it is: by this page's own clock, whatever the server says ----
+
+function freshness() {
+  const age = state.lastTick === null ? NaN : (performance.now() - state.lastTick) / 1000;
+  if (!state.helloed) return { kind: "connecting", age };
+  if (!state.linked) return { kind: "lost", age, message: "fishd-window does not answer; the page tries again each second." };
+  const said = state.connection?.state;
+  if (said === "lost") return { kind: "lost", age, message: state.connection.message || "fishd does not answer." };
+  if (!(age <= Math.max(STALE_S, STALE_TICKS * state.interval)) || said === "stale") {
+    return { kind: "stale", age, message: state.connection?.message || "No ticks arrive from fishd." };
+  }
+  return { kind: "live", age };
+}
+
+let shownKind = "";
+function checkConnection() {
+  const { kind, message } = freshness();
+  document.body.classList.toggle("stale", kind !== "live");
+  if (kind !== shownKind) {
+    shownKind = kind;
+    say(kind === "live" ? "Connection live." : (message ?? "Connecting."));
+    changed();
+  } else if (kind !== "live") {
+    renderHead();
+    renderValues();
+  }
+}
+
+function say(text) {
+  byId("said").textContent = text;
+}
+
+// ---- requests ----
+
+let notices = 0;
+/** action: what can be done about it: text of a button, and function */
+function notice(level, message, remedy = "", action = null) {
+  const one = { id: ++notices, level, message: sentence(message), remedy: sentence(remedy), action };
+  state.notices = [...state.notices.slice(-3), one];
+  setTimeout(() => dismiss(one.id), NOTICE_MS[level]);
+  changed();
+}
+
+function dismiss(id) {
+  state.notices = state.notices.filter((one) => one.id !== id);
+  changed();
+}
+
+/** Send a request of the driver; take the role first if no page has it. Show why it was refused; return whether it was carried out. */
+async function act(op, args, take = false) {
+  try {
+    if (!state.driver?.you_drive && op !== "stop") await becomeDriver(take);
+    const result = await request(state.name, "request", { op, args, take });
+    if (result && "controller" in result) {
+      const { seq, mode, reason, controller, parameters } = result;
+      state.own.add(JSON.stringify([controller, parameters]));
+      if (state.own.size > 50) state.own.delete(state.own.values().next().value);
+      state.changedSeq = Math.max(state.changedSeq, seq);
+      setStatus({ ...state.status, mode, reason, controller, parameters });
+      if (result.previous_holder) notice("warning", `The experiment ${result.previous_holder.name} has lost the fish to this request.`);
+    }
+    if (op === "tare") notice("info", "The present force is zero now.");
+    if (op === "clear-fault") state.estop = null;
+    changed();
+    return true;
+  } catch (error) {
+    const remedies = { driven: "Take over", "not-driver": "Take over", leased: "Take the fish" };
+    notice("error", error.message, error.remedy, remedies[error.code] && [remedies[error.code], () => act(op, args, true)]);
+    return false;
+  }
+}
+
+/** Take the driver's role, or change whether the fish swims on without this page. */
+async function becomeDriver(take = false) {
+  state.driver = (await request(state.name, "drive", { take, keep: state.keep })).driver;
+}
+
+async function changeRole(drives, take) {
+  try {
+    if (drives) await becomeDriver(take);
+    else state.driver = (await request(state.name, "release", {})).driver;
+  } catch (error) {
+    notice("error", error.message, error.remedy);
+  }
+  changed();
+}
+
+/** Return the experiment that drives; a page of this window holds a lease, too, which is not one. */
+const experimentOf = (status) => (status?.lease && !status.lease.name.startsWith("window: ") ? status.lease : null);
+
+// ---- emergency stop ----
+
+const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+
+/** Send the emergency stop until it is confirmed or refused; measure from the press to the answer. */
+async function pressEstop() {
+  const press = (state.estop = { phase: "sending", begin: performance.now(), attempts: 0 });
+  say("Emergency stop sent.");
+  changed();
+  while (state.estop === press) {
+    press.attempts++;
+    try {
+      const { server_ms: serverMs, outcome } = await call("POST", `/api/fish/${encodeURIComponent(state.name || nameInAddress())}/estop`, {}, ESTOP_TIMEOUT_MS);
+      Object.assign(press, { phase: "done", ms: performance.now() - press.begin, serverMs, outcome });
+      say(`Emergency stop confirmed after ${number(press.ms, 0)} milliseconds.`);
+      break;
+    } catch (error) {
+      Object.assign(press, { phase: "failed", message: error.message, remedy: error.remedy });
+      changed();
+      if (error.status === 401 || error.status === 403 || error.status === 404) break;
+      await wait(ESTOP_RETRY_MS);
+    }
+  }
+  changed();
+}
+
+let pressedAt = -Infinity;
+for (const kind of ["pointerdown", "click"]) {
+  byId("estop").addEventListener(kind, (event) => {
+    if (event.button > 0 || (kind === "click" && performance.now() - pressedAt < 1000 && event.detail > 0)) return;
+    pressedAt = performance.now();
+    pressEstop();
+  });
+}
+
+// ---- what is on the screen ----
+
+const nameInAddress = () => new URLSearchParams(location.search).get("fish") ?? "";
+
+function Head() {
+  const { kind, age, message } = freshness();
+  const mode = state.status?.mode ?? "unknown";
+  const lease = experimentOf(state.status);
+  const driver = lease ? `${lease.name} drives` : state.driver ? (state.driver.you_drive ? "you drive" : `${state.driver.device || "another page"} drives`) : "no driver";
+  return html`
+    ${state.fish.length > 1
+      ? html`<nav class="tabs" aria-label="Fish"><h1 class="unseen">${state.name}</h1>${state.fish.map((name) => html`<a href=${`?fish=${encodeURIComponent(name)}`}
+          aria-current=${name === state.name ? "page" : undefined}>${name}</a>`)}</nav>`
+      : html`<h1>${state.name || "fishd"}</h1>`}
+    <span class=${`pill mode ${mode}`} id="mode">${mode === "estop" ? "E-stop" : mode}</span>
+    <span class=${`pill connection ${kind}`} id="connection" title=${message ?? ""}>
+      <span class="dot"></span>${kind === "live" ? "live" : kind} <span class="age">${kind === "connecting" ? "" : Number.isFinite(age) ? duration(age) : "no tick yet"}</span></span>
+    <span class="driver" id="driver">${driver}</span>`;
+}
+
+function Banner() {
+  const { estop, status, session } = state;
+  const mode = status?.mode;
+  const { kind, message } = freshness();
+  const reason = status?.reason;
+  const latched = mode === "estop" || mode === "fault";
+  return html`
+    ${session && session.paired === false && html`<${Pairing} />`}
+    ${(kind === "lost" || kind === "stale") && html`<div class="banner warn"><b>${kind === "lost" ? "Connection lost." : "Stale."}</b>
+      <span>${sentence(message)} What is greyed is old.</span></div>`}
+    ${estop?.phase === "sending" && html`<div class="banner bad"><b>Emergency stop sent …</b></div>`}
+    ${estop?.phase === "failed" && html`<div class="banner bad" role="alert"><b>Emergency stop NOT confirmed.</b>
+      <span>${sentence(estop.message)} Sent ${estop.attempts} times. Use the button of the panel, or: fishctl estop. ${sentence(estop.remedy)}</span></div>`}
+    ${(latched || estop?.phase === "done") && html`<div class="banner bad" id="latched">
+      <div>${mode === "fault" ? html`<b>Fault.</b>` : html`<b>Emergency stop.</b>`}
+        ${estop?.phase === "done" && html` <span>Confirmed <b id="estop-ms">${number(estop.ms, 0)} ms</b> after the press${
+          Number.isFinite(estop.serverMs) && html` (${number(estop.serverMs, 1)} ms of it in fishd-window and fishd)`}.
+          ${!latched && " The stream has not shown it yet."}</span>`}
+        ${reason && html`<p>${sentence(reason.message)}${reason.remedy && html` <span class="remedy">Before you clear it: ${reason.remedy}.</span>`}</p>`}</div>
+      ${latched && html`<button type="button" id="clear-fault" disabled=${session?.scope !== "drive"} onClick=${() => act("clear-fault", {})}>Clear fault</button>`}
+    </div>`}
+    ${mode === "running" && status.fallback && html`<div class="banner warn"><b>Fallback.</b> <span>${sentence(status.fallback.message)}</span></div>`}
+    ${status?.sensor_lost && html`<div class="banner warn"><b>No force can be trusted.</b> <span>The thrust is the last known one.</span></div>`}
+    ${status?.servo_lost && html`<div class="banner bad"><b>The servo cannot be reached.</b> <span>${status.servo_on && "It may still get pulses."}</span></div>`}`;
+}
+
+function Pairing() {
+  const [token, setToken] = useState(""), [name, setName] = useState("");
+  const send = async (event) => {
+    event.preventDefault();
+    await pair(token.trim(), name.trim());
+  };
+  return html`<form class="banner pairing" onSubmit=${send}>
+    <b>This device is not paired.</b><span>On the machine of fishd-window, fishctl window prints a code for it.</span>
+    <label>Code <input value=${token} required autocomplete="one-time-code" onInput=${(event) => setToken(event.target.value)} /></label>
+    <label>Name of this device <input value=${name} placeholder="tablet" maxlength="40" onInput=${(event) => setName(event.target.value)} /></label>
+    <button class="primary">Pair</button></form>`;
+}
+
+async function pair(token, name) {
+  try {
+    await call("POST", "/api/pair", { token, name: name || "browser" });
+    location.reload();
+  } catch (error) {
+    notice("error", error.message, error.remedy);
+  }
+}
+
+function Card({ title, value, extra = "", unit = "", note = "", level = "", children }) {
+  return html`<div class=${`card ${level}`}><h3>${title}</h3>
+    <p class="big"><span>${value}</span> <small>${extra} ${unit}</small></p><p class="sub">${note && html`<span>${note}</span>`}${children}</p></div>`;
+}
+
+/** Return the largest value of a column in the last second. */
+function largest(name) {
+  const recent = new Array(Math.max(1, Math.ceil(1 / ring.period))).fill(null);
+  ring.copy(name, recent);
+  return recent.reduce((most, value) => (value !== null && !(value <= most) ? value : most), NaN);
+}
+
+function setReference() {
+  const { thrust, thrust_ci95: half = null, controller } = state.tick;
+  if (!(thrust > 0)) return notice("warning", "only a thrust above zero can be 100 %");
+  state.reference = { thrust, half, text: `${controller} ${timeOfDay(state.tick.t)}` };
+  remember(`reference.${state.name}`, state.reference);
+  return changed();
+}
+
+function Values() {
+  const { tick, status, reference } = state;
+  const [factor, unit] = forceUnit(status);
+  const half = tick?.thrust_ci95;
+  const [thrust, error] = interval(tick?.thrust * factor, half == null ? NaN : half * factor);
+  const ratio = reference ? tick?.thrust / reference.thrust : NaN;
+  const ratioHalf = Math.abs(ratio) * Math.hypot((half ?? NaN) / tick?.thrust, (reference?.half ?? NaN) / reference?.thrust);
+  const [relative, relativeError] = interval(100 * ratio, 100 * ratioHalf);
+  const age = largest("sample_age_ms"), late = largest("lateness_us") / 1000, period = ring.period * 1000;
+  return html`
+    <${Card} title="Thrust" value=${thrust} extra=${error} unit=${unit}
+      note=${!tick ? "" : half == null ? "mean F_x: the zero is unknown" : "mean over whole beats, 95 %"} />
+    <${Card} title="Tail beat" value=${tick?.frequency ? number(tick.frequency, 2) : "–"} unit="Hz" note=${tick?.frequency ? `${number(60 * tick.frequency, 0)} a minute` : "no beats"} />
+    <${Card} title="Relative thrust" value=${relative} extra=${relativeError} unit=${reference ? "%" : ""} note=${reference?.text ?? ""}>
+      <button type="button" class="link" disabled=${!tick} onClick=${setReference}>${reference ? "again" : "take this as 100 %"}</button><//>
+    <${Card} title="Servo power" value=${number(status?.power ?? NaN, 2)} unit="W" note=${status?.power == null ? "no power meter" : "mean of 2 s"} />
+    <${Card} title="Controller" value=${status ? (status.mode === "running" ? status.controller : "none") : "–"}
+      note=${status ? (status.mode === "running" ? ownText(status.controller, status.parameters) || "default parameters" : status.servo_on ? "servo at neutral" : "servo without pulses") : ""} />
+    <${Card} title="Sensor age" value=${number(age, 1)} unit="ms" level=${age > 2 * period ? "warn" : ""}
+      note=${tick?.suspect ? `suspect: ${tick.suspect}` : "largest of 1 s"} />
+    <${Card} title="Tick lateness" value=${number(late, 2)} unit="ms" level=${late > 0.5 * period ? "warn" : ""}
+      note=${`${status?.overruns ?? 0} overruns, ${status?.missed_slots ?? 0} missed`} />
+    <${Card} title="Tick" value=${tick ? `#${tick.seq}` : "–"} level=${ring.lost ? "warn" : ""}
+      note=${ring.lost ? `${ring.lost} lost on the way here` : "none lost on the way"} />`;
+}
+
+function Events() {
+  const events = state.events.slice().reverse();
+  return html`<h2 id="events-title">Events</h2>
+    ${events.length === 0 ? html`<p class="muted">None yet.</p>` : html`<ol class="events" tabindex="0" aria-label="Latest events first">
+      ${events.map((event) => html`<li key=${`${event.t}${event.kind}`} class=${event.level}><time>${timeOfDay(event.t)}</time>
+        <span class="kind">${event.kind}</span><span>${event.message}</span></li>`)}</ol>`}
+    ${state.session && !state.session.loopback && state.session.paired && html`<p class="foot">Paired as ${state.session.device || "this device"}.
+      <button type="button" class="link" onClick=${() => call("POST", "/api/unpair", {}).then(() => location.reload())}>Forget this device</button></p>`}`;
+}
+
+const Notices = () => state.notices.map((one) => html`<div key=${one.id} class=${`notice ${one.level}`}>
+  <span>${one.message} ${one.remedy && html`<span class="remedy">${one.remedy}</span>`}</span>
+  ${one.action && html`<button type="button" onClick=${() => {
+    dismiss(one.id);
+    one.action[1]();
+  }}>${one.action[0]}</button>`}
+  <button type="button" aria-label="Dismiss" onClick=${() => dismiss(one.id)}>×</button></div>`);
+
+const renderHead = () => render(html`<${Head} />`, byId("head"));
+const renderValues = () => render(html`<${Values} />`, byId("cards"));
+
+function renderAll() {
+  const shared = { state, act, notice, changed, changeRole, becomeDriver, experiment: experimentOf(state.status) };
+  renderHead();
+  renderValues();
+  render(html`<${Banner} />`, byId("banner"));
+  render(html`<${Drive} ...${shared} />`, byId("drive"));
+  render(html`<${Experiments} ...${shared} />`, byId("experiments"));
+  render(html`<${Runs} ...${shared} />`, byId("runs"));
+  render(html`<${Events} />`, byId("events"));
+  render(html`<${Notices} />`, byId("notices"));
+}
+
+let renderNeeded = false, saidMode = "";
+function changed() {
+  renderNeeded = true;
+  schedule();
+}
+
+function schedule() {
+  if (drawing) return;
+  drawing = true;
+  requestAnimationFrame(drawFrame);
+}
+
+function drawFrame(now) {
+  drawing = false;
+  if (renderNeeded) {
+    renderNeeded = false;
+    renderAll();
+    valuesAt = now;
+  } else if (now - valuesAt > VALUES_MS) {
+    valuesAt = now;
+    renderHead();
+    renderValues();
+  }
+  const mode = state.status?.mode;
+  if (mode && mode !== saidMode) {
+    saidMode = mode;
+    say(`Mode ${mode}.`);
+  }
+  charts.draw(now);
+  view.draw(state.tick);
+  if (charts.dirty) schedule();
+}
+
+function buildStaticParts() {
+  render(html`<h2 id="view-title" class="unseen">From above</h2><canvas id="fish" role="img"
+      aria-label="The fish from above; its tail shows the command, and the true fin if it is simulated"></canvas>
+    <p class="keys"><span class="key-phi">command φ<sub>c</sub></span><span class="key-body">tail</span></p>`, byId("view"));
+  view = new TopView(byId("fish"));
+  const section = byId("charts");
+  render(html`<div class="head-row"><h2 id="charts-title">Live</h2>
+    <span class="keys"><span class="key-suspect">suspect sample</span><span class="key-gap">no ticks</span><span class="key-mark">change</span></span>
+    <label class="row">Show the last <select id="seconds" value=${state.seconds} onChange=${(event) => {
+      state.seconds = Number(event.target.value);
+      remember("seconds", state.seconds);
+      charts.setSeconds(state.seconds);
+      schedule();
+    }}>${WINDOWS.map((seconds) => html`<option value=${seconds}>${seconds} s</option>`)}</select></label></div>
+    <div id="plots"></div>`, section);
+  charts = new Charts(byId("plots"), state.seconds);
+  charts.setRing(ring);
+}
+
+/** Pair with the token in the address, and remove it from there; return whether there is one. */
+function pairByAddress() {
+  const token = new URLSearchParams(location.hash.slice(1)).get("pair");
+  if (!token) return false;
+  history.replaceState(null, "", location.pathname + location.search);
+  pair(token, "");
+  return true;
+}
+
+async function start() {
+  buildStaticParts();
+  renderAll();
+  setInterval(checkConnection, CHECK_MS);
+  addEventListener("hashchange", pairByAddress);
+  if (pairByAddress()) return;
+  for (;;) {
+    try {
+      state.session = await call("GET", "/api/session");
+      break;
+    } catch (error) {
+      say(error.message);
+      await wait(1000);
+    }
+  }
+  changed();
+  if (state.session.paired === false) return;
+  const before = sessionStorage.getItem("fishd.client") ?? ""; // a page that is loaded again goes on driving
+  stream = new Stream(nameInAddress(), before, (type, payload) => receive[type]?.(payload), (linked) => {
+    state.linked = linked;
+    checkConnection();
+    changed();
+  });
+}
+
+export { charts, receive, state, stream };
+start();

@@ -1,0 +1,119 @@
+// What all modules share: the template function, numbers as text, and requests to the server.
+export { html, render, useEffect, useLayoutEffect, useMemo, useRef, useState } from "./vendor/htm-preact-standalone-3.1.1.js";
+
+const NBSP = "\u00a0";
+const REQUEST_TIMEOUT_MS = 20_000;
+
+/** Return a number with a fixed number of decimals and a true minus sign; a dash if there is none. */
+export function number(value, decimals) {
+  if (!Number.isFinite(value)) return "–";
+  const text = value.toFixed(decimals);
+  return /[1-9]/.test(text) ? text.replace("-", "−") : text.replace("-", "");
+}
+
+/** Return a number with about this many significant digits. */
+export function significant(value, digits = 3) {
+  if (!Number.isFinite(value)) return "–";
+  if (value === 0) return "0";
+  const decimals = Math.min(8, Math.max(0, digits - 1 - Math.floor(Math.log10(Math.abs(value)))));
+  return number(value, decimals);
+}
+
+/** Return value and half-width of its interval, rounded to two digits of the half-width. */
+export function interval(value, halfWidth) {
+  if (!Number.isFinite(value)) return ["–", ""];
+  if (!Number.isFinite(halfWidth) || halfWidth <= 0) return [significant(value), `±${NBSP}?`];
+  const decimals = Math.min(8, Math.max(0, 1 - Math.floor(Math.log10(halfWidth))));
+  return [number(value, decimals), `±${NBSP}${number(halfWidth, decimals)}`];
+}
+
+/** Return factor and name of the unit in which forces are shown: mN for newtons. */
+export function forceUnit(status) {
+  const unit = status?.force_unit ?? "N";
+  return unit === "N" ? [1000, "mN"] : [1, unit];
+}
+
+/** Return the text of a unit; a pure number has none. */
+export const unitText = (unit) => (unit && unit !== "1" ? unit : "");
+
+/** Return a duration such as "0.8 s", "12 s", "3 min". */
+export function duration(seconds) {
+  if (!Number.isFinite(seconds)) return "–";
+  if (seconds < 9.95) return `${seconds.toFixed(1)}${NBSP}s`;
+  if (seconds < 120) return `${seconds.toFixed(0)}${NBSP}s`;
+  if (seconds < 7200) return `${(seconds / 60).toFixed(0)}${NBSP}min`;
+  return `${(seconds / 3600).toFixed(1)}${NBSP}h`;
+}
+
+/** Return a message as a sentence: with a capital letter and a full stop. */
+export const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
+
+/** Return the local time of day of a unix time. */
+export const timeOfDay = (t) => new Date(t * 1000).toLocaleTimeString([], { hour12: false });
+
+/** Return parameters as fishctl takes them: C=0.6 amplitude=0.4. */
+export function parametersText(parameters) {
+  return Object.entries(parameters ?? {})
+    .filter(([, value]) => value !== null)
+    .map(([name, value]) => `${name}=${typeof value === "number" ? +value.toPrecision(6) : value}`)
+    .join(" ");
+}
+
+/** An answer of the server that is not the result. */
+export class Refusal extends Error {
+  constructor({ code, message, remedy }, status) {
+    super(message);
+    Object.assign(this, { code, remedy: remedy ?? "", status });
+  }
+}
+
+let clientId = "";
+/** Set the identifier by which the server knows this page. */
+export function setClient(id) {
+  clientId = id;
+}
+
+/** Return the result of a request, or raise `Refusal`. */
+export async function call(method, path, body, timeout = REQUEST_TIMEOUT_MS) {
+  const options = { method, signal: AbortSignal.timeout(timeout), cache: "no-store" };
+  if (method === "POST") {
+    options.headers = { "Content-Type": "application/json", "X-Client": clientId };
+    options.body = JSON.stringify(body ?? {});
+  }
+  let reply, status;
+  try {
+    const response = await fetch(path, options);
+    status = response.status;
+    reply = await response.json();
+  } catch (error) {
+    const message = status
+      ? `fishd-window answered with status ${status} and no reason`
+      : error.name === "TimeoutError"
+        ? `fishd-window has not answered for ${duration(timeout / 1000)}`
+        : "fishd-window does not answer";
+    throw new Refusal({ code: "no-answer", message, remedy: "See whether fishd-window runs." }, status ?? 0);
+  }
+  if (!reply.ok) throw new Refusal(reply.error, status);
+  return reply.result;
+}
+
+/** Return a picture, or raise an error with the server's reason. */
+export async function fetchPicture(path) {
+  const response = await fetch(path);
+  if (response.ok) return response.blob();
+  throw new Error((await response.json()).error.message);
+}
+
+/** Read a value that this browser keeps, or return the default. */
+export function recall(key, standard) {
+  try {
+    return JSON.parse(localStorage.getItem(`fishd.${key}`)) ?? standard;
+  } catch {
+    return standard;
+  }
+}
+
+/** Keep a value in this browser. */
+export function remember(key, value) {
+  localStorage.setItem(`fishd.${key}`, JSON.stringify(value));
+}

@@ -1,0 +1,231 @@
+// Experiments as child processes of the server, with the command line that each ran, and kept runs.
+import { call, duration, fetchPicture, forceUnit, html, interval, number, parametersText, recall, remember, sentence, useEffect, useState } from "./common.js";
+import { contestant, defaultOf, selectionOf, shownParameters } from "./controls.js";
+
+const KINDS = {
+  measure: { title: "Measure", text: "Swims and rests in turn; thrust with its 95 % interval." },
+  sweep: { title: "Sweep", text: "Measures over values of one parameter." },
+  compare: { title: "Compare", text: "Measures several controllers on this fish." },
+  record: { title: "Record", text: "Writes every tick, event and status to a file." },
+  simulate: { title: "Try first", text: "Swims a simulated fish in virtual time; the real one rests." },
+};
+
+/** Return an input with its label; `set` gets its text. */
+const input = (label, value, set, more = {}) => html`<label class="row"><span>${label}</span>
+  <input value=${value} autocomplete="off" onInput=${(event) => set(event.target.value)} ...${more} /></label>`;
+
+/** Kinds that swim the fish, and so need the driver's role. */
+const DRIVING = ["measure", "sweep", "compare"];
+
+/** Leave out what is not given: the server has its own defaults. */
+const given = (options) => Object.fromEntries(Object.entries(options).filter(([, value]) => value !== null));
+
+export function Experiments({ state, notice, changed, becomeDriver }) {
+  const [form, setForm] = useState(() => recall("experiment", {
+    kind: "measure", seconds: "", values: "", parameter: "", contestants: "square swing", runs: "", subject: "", note: "",
+  }));
+  const { controller, edited } = selectionOf(state);
+  const set = (key) => (value) => {
+    const next = { ...form, [key]: value };
+    remember("experiment", next);
+    setForm(next);
+  };
+  const mayDrive = state.session?.scope === "drive";
+  const parameters = controller ? shownParameters(controller, state.status, edited) : {};
+  const own = Object.fromEntries(Object.entries(parameters).filter(([name, value]) => {
+    const field = controller.parameters.find((candidate) => candidate.name === name);
+    return value !== null && value !== defaultOf(field);
+  }));
+  const names = (controller?.parameters ?? []).filter(({ kind }) => kind === "number" || kind === "integer").map(({ name }) => name);
+  const varied = names.includes(form.parameter) ? form.parameter : names[0];
+  const seconds = form.seconds.trim() === "" ? null : Number(form.seconds);
+
+  const options = () => {
+    switch (form.kind) {
+      case "record": return { seconds, subject: form.subject || null, note: form.note || null };
+      case "compare": return { contestants: form.contestants.split(/\s+/).filter(Boolean), seconds, runs: form.runs ? Number(form.runs) : null };
+      case "sweep": return { controller: controller.name, parameters: { ...own, [varied]: form.values }, seconds };
+      default: return { controller: controller.name, parameters: own, seconds };
+    }
+  };
+  const start = async (event) => {
+    event.preventDefault();
+    await send(false);
+  };
+  const send = async (take) => {
+    const { kind } = form;
+    const drives = DRIVING.includes(kind);
+    try {
+      if (drives && (take || !state.driver?.you_drive)) await becomeDriver(take);
+      const more = drives && take ? { take } : {};
+      const job = await call("POST", "/api/jobs", { fish: state.name, kind, options: { ...given(options()), ...more } });
+      state.jobs.set(job.id, job);
+      changed();
+    } catch (error) {
+      const remedies = { driven: "Take over", "not-driver": "Take over", leased: "Take the fish" };
+      notice("error", error.message, error.remedy, remedies[error.code] && [remedies[error.code], () => send(true)]);
+    }
+  };
+  const jobs = [...state.jobs.values()].filter(({ fish }) => !fish || fish === state.name).sort((a, b) => b.started - a.started).slice(0, 8);
+  const uses = ["measure", "sweep", "simulate"].includes(form.kind);
+
+  return html`
+    <h2 id="experiments-title">Experiments</h2>
+    <div class="tabs" role="tablist" aria-label="Kind of experiment">
+      ${Object.entries(KINDS).map(([kind, { title }]) => html`<button type="button" role="tab" id=${`tab-${kind}`}
+        aria-selected=${form.kind === kind} aria-controls="experiment" onClick=${() => set("kind")(kind)}>${title}</button>`)}
+    </div>
+    <form id="experiment" role="tabpanel" aria-labelledby=${`tab-${form.kind}`} onSubmit=${start}>
+      <p class="summary">${KINDS[form.kind].text}</p>
+      ${uses && controller && html`<p class="with">With <b>${[controller.name, parametersText(own)].join(" ").trim()}</b><span class="muted">, as in the panel Controller</span></p>`}
+      <div class="form">
+        ${form.kind === "sweep" && html`<label class="row"><span>Parameter</span>
+          <select value=${varied} onChange=${(event) => set("parameter")(event.target.value)}>
+            ${names.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>
+          ${input("Values", form.values, set("values"), { required: true, placeholder: "1:2:0.2 or 1,1.5,2" })}`}
+        ${form.kind === "compare" && html`
+          ${input("Contestants", form.contestants, set("contestants"), { required: true, placeholder: "square swing:C=0.6" })}
+          ${input("Runs of each", form.runs, set("runs"), { inputmode: "numeric", placeholder: "1", class: "number" })}`}
+        ${form.kind === "record" && html`
+          ${input("Fish", form.subject, set("subject"), { placeholder: "name or number" })}
+          ${input("Note", form.note, set("note"), { placeholder: "purpose" })}`}
+        ${input("Seconds", form.seconds, set("seconds"), {
+          inputmode: "decimal", class: "number", placeholder: { record: "until stopped", sweep: "30 each" }[form.kind] ?? "60",
+        })}
+      </div>
+      <div class="buttons">
+        <button class="primary" disabled=${!mayDrive || !controller}>${form.kind === "simulate" ? "Try on a simulated fish" : KINDS[form.kind].title}</button>
+        ${form.kind === "compare" && controller && html`<button type="button"
+          onClick=${() => set("contestants")(`${form.contestants.trim()} ${contestant(controller, own)}`.trim())}>Add ${controller.name}</button>`}
+      </div>
+    </form>
+    <ul class="jobs" aria-label="Started experiments">
+      ${jobs.map((job) => html`<${Job} key=${job.id} job=${job} state=${state} notice=${notice} mayDrive=${mayDrive} />`)}
+    </ul>`;
+}
+
+/** Return the expected duration of a job from its command line; null if it has none. */
+function expected(command) {
+  const option = command.find((word) => word.startsWith("--for="));
+  return ["measure", "record"].includes(command[1]) && option ? Number(option.slice(6)) : null;
+}
+
+/** Quote a word as a shell needs it. */
+const quote = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
+
+function Job({ job, state, notice, mayDrive }) {
+  const [, tick] = useState(0);
+  const runs = job.state === "running";
+  useEffect(() => {
+    if (!runs) return undefined;
+    const timer = setInterval(() => tick((n) => n + 1), 500);
+    return () => clearInterval(timer);
+  }, [runs]);
+  const elapsed = (job.ended ?? Date.now() / 1000) - job.started;
+  const total = expected(job.command);
+  const stop = () => call("POST", `/api/jobs/${job.id}/stop`).catch((error) => notice("error", error.message, error.remedy));
+  return html`<li class=${`job ${job.state}`}>
+    <div class="job-head"><b>${KINDS[job.kind]?.title ?? job.kind}</b><span class="pill small">${job.state}</span>
+      <span class="muted">${duration(elapsed)}${runs && total ? ` of about ${duration(total)}` : ""}</span>
+      ${runs && html`<button type="button" disabled=${!mayDrive} onClick=${stop}>Stop</button>`}</div>
+    ${runs && html`<progress max=${total ?? undefined} value=${total ? Math.min(elapsed, total) : undefined}
+      aria-label=${`Progress of ${job.kind}`}></progress>`}
+    <code tabindex="0" aria-label="Command line">${job.command.map(quote).join(" ")}</code>
+    <${Result} job=${job} status=${state.status} />
+    ${job.state !== "done" && job.lines?.length > 0 && html`<p class="last">${job.lines.at(-1)}</p>`}
+  </li>`;
+}
+
+function Result({ job, status }) {
+  const result = job.result;
+  if (!result || typeof result !== "object") return null;
+  const [factor, unit] = forceUnit(status);
+  const thrust = (value, half) => {
+    const [middle, error] = interval(value * factor, half == null ? NaN : half * factor);
+    return `${middle} ${error} ${unit}`;
+  };
+  if (job.kind === "simulate") {
+    return html`<p class="result">True thrust <b>${number(result.mean_thrust * 1000, 2)} mN</b> at
+      ${" "}<b>${number(result.frequency, 2)} Hz</b>${Number.isFinite(result.relative_thrust)
+        && html`, <b>${number(100 * result.relative_thrust, 1)} %</b> of the best square wave`}.
+      Drawn beside F<sub>x</sub>, and dashed in the thrust chart.</p>`;
+  }
+  if (Number.isFinite(result.thrust)) {
+    return html`<p class="result">Thrust <b>${thrust(result.thrust, result.thrust_ci95)}</b>${Number.isFinite(result.frequency)
+      && html` at <b>${number(result.frequency, 2)} Hz</b>`}</p>`;
+  }
+  if (Array.isArray(result.stretches)) {
+    return html`<p class="result">${result.stretches.map((stretch) => html`<b>${stretch.controller}</b>: ${stretch.equal} of
+      ${" "}${stretch.ticks} commands are the same${stretch.equal < stretch.ticks && html`, the largest difference is
+      ${" "}${number(stretch.largest, 4)} rad`}. `)}</p>`;
+  }
+  if (!Array.isArray(result) || !result.length) return null;
+  return html`<table class="result"><thead><tr><th>${job.kind === "sweep" ? "best point" : "controller"}</th>
+    <th class="right">thrust</th></tr></thead><tbody>
+    ${result.map((row) => html`<tr><td>${row.contestant ?? row.controller} ${row.contestant ? "" : parametersText(row.parameters)}</td>
+      <td class="right">${thrust(row.thrust, row.thrust_ci95)}</td></tr>`)}
+  </tbody></table>`;
+}
+
+export function Runs({ state, notice, changed }) {
+  const [runs, setRuns] = useState(null);
+  const [failure, setFailure] = useState(null);
+  const [open, setOpen] = useState(null);
+  const finished = [...state.jobs.values()].filter(({ state: at }) => at !== "running").length;
+  const load = () => call("GET", "/api/runs").then((found) => {
+    setRuns(found);
+    setFailure(null);
+  }).catch(setFailure);
+  useEffect(() => {
+    if (state.session?.paired) load();
+  }, [finished, state.session?.paired]);
+  const rerun = async (run) => {
+    try {
+      const job = await call("POST", "/api/jobs", { fish: state.name, kind: "rerun", options: { run: run.name } });
+      state.jobs.set(job.id, job);
+      changed();
+    } catch (error) {
+      notice("error", error.message, error.remedy);
+    }
+  };
+  const list = (runs ?? []).slice().reverse().slice(0, 40);
+  return html`
+    <div class="head-row"><h2 id="runs-title">Runs</h2><button type="button" onClick=${load}>Refresh</button></div>
+    ${failure && html`<p class="note">The runs cannot be listed. ${sentence(failure.message)} ${sentence(failure.remedy)}</p>`}
+    ${runs === null ? !failure && html`<p class="muted">Loading …</p>` : list.length === 0
+      ? html`<p class="muted">None yet. Record, measure or sweep, and it is listed here.</p>`
+      : html`<div class="scroll" tabindex="0" role="region" aria-label="Table of runs"><table>
+        <thead><tr><th>name</th><th>kind</th><th class="right">length</th><th class="right">thrust</th><th>controllers</th>
+          <th class="right">lost</th><th><span class="unseen">what to do</span></th></tr></thead>
+        <tbody>${list.map((run) => {
+          const [factor, unit] = forceUnit(run);
+          const [middle, error] = run.thrust == null ? ["–", ""] : interval(run.thrust * factor, run.thrust_ci95 == null ? NaN : run.thrust_ci95 * factor);
+          return html`<tr key=${run.name} class=${run.damaged ? "damaged" : ""}>
+            <td>${run.name}${run.damaged && html` <span class="pill small">damaged</span>`}</td><td>${run.kind}</td>
+            <td class="right">${duration(run.duration)}</td>
+            <td class="right">${middle} ${error} ${run.thrust == null ? "" : unit}</td>
+            <td>${Object.keys(run.swim_ticks ?? {}).join(", ")}</td><td class="right">${run.lost_ticks ?? ""}</td>
+            <td class="actions">
+              <button type="button" aria-expanded=${open === run.name} aria-label=${`Plot of ${run.name}`}
+                onClick=${() => setOpen(open === run.name ? null : run.name)}>${open === run.name ? "Close" : "Plot"}</button>
+              ${run.kind === "recording" && html`<button type="button" aria-label=${`Rerun ${run.name}`}
+                title="Runs the controller again on each recorded tick and compares its commands" onClick=${() => rerun(run)}>Rerun</button>`}
+            </td></tr>
+            ${open === run.name && html`<tr class="plot-row"><td colspan="7"><${Plot} key=${run.name} name=${run.name} /></td></tr>`}`;
+        })}</tbody></table></div>`}`;
+}
+
+function Plot({ name }) {
+  const [picture, setPicture] = useState(null);
+  const [failure, setFailure] = useState("");
+  useEffect(() => {
+    let address = null;
+    fetchPicture(`/api/runs/${encodeURIComponent(name)}/plot.png`).then((blob) => {
+      address = URL.createObjectURL(blob);
+      setPicture(address);
+    }, (error) => setFailure(error.message));
+    return () => address && URL.revokeObjectURL(address);
+  }, []);
+  if (failure) return html`<p class="note">${sentence(failure)}</p>`;
+  return picture ? html`<img alt=${`Plot of ${name}`} src=${picture} />` : html`<p class="muted">It is being drawn …</p>`;
+}

@@ -1,0 +1,158 @@
+// The live stream: a WebSocket that is opened again when it is lost, and the ring that keeps its ticks.
+const RETRY_MS = 1000;
+const HEARTBEAT_MS = 2000;
+const KEPT_S = 120;
+const MAX_ROWS = 24_000;
+const MAX_COLUMNS = 64;
+const CLOCK_JUMP_S = 1;
+/** Prefix of the column of a controller's quantity. */
+export const QUANTITY = "quantity:";
+
+/** Columns of fixed length with the latest ticks; a row of NaN where ticks were lost. */
+export class Ring {
+  constructor(period) {
+    this.period = period;
+    this.capacity = Math.min(MAX_ROWS, Math.max(2400, Math.ceil(KEPT_S / period))) + 256;
+    this.columns = new Map();
+    this.clear();
+    for (const name of ["t", "seq"]) this.#add(name);
+  }
+
+  clear() {
+    this.rows = 0;
+    this.next = 0;
+    this.lost = 0;
+    this.latest = null;
+    for (const column of this.columns.values()) column.fill(NaN);
+  }
+
+  /** Add a tick; a gap before it becomes a row without values. */
+  push(tick) {
+    const before = this.latest;
+    if (before) {
+      if (tick.t < before.t - CLOCK_JUMP_S) this.clear();
+      else if (tick.t <= before.t) return;
+      else if (tick.seq !== before.seq + 1 || tick.t - before.t > Math.max(1, 4 * this.period)) {
+        if (tick.seq > before.seq) this.lost += tick.seq - before.seq - 1;
+        this.#row();
+        this.#write("t", 0.5 * (tick.t + before.t));
+      }
+    }
+    this.#row();
+    for (const name in tick) {
+      if (typeof tick[name] === "number") this.#write(name, tick[name]);
+    }
+    for (const name in tick.quantities) this.#write(QUANTITY + name, tick.quantities[name]);
+    if (tick.suspect) {
+      this.#write("suspect_fx", tick.fx);
+      this.#write("suspect_fy", tick.fy);
+    }
+    if (tick.thrust_ci95 != null) {
+      this.#write("thrust_low", tick.thrust - tick.thrust_ci95);
+      this.#write("thrust_high", tick.thrust + tick.thrust_ci95);
+    }
+    this.latest = tick;
+  }
+
+  /** Return the number of the first tick at or after a time; null if it is not in the ring. */
+  seqAt(t) {
+    const times = this.columns.get("t"), numbers = this.columns.get("seq");
+    for (let age = this.rows; age >= 1; age--) {
+      const row = (this.next - age + this.capacity) % this.capacity;
+      if (times[row] >= t - 0.5 * this.period && !Number.isNaN(numbers[row])) return numbers[row];
+    }
+    return null;
+  }
+
+  /** Return whether a column has a value anywhere. */
+  has(name) {
+    return this.columns.get(name)?.some((value) => !Number.isNaN(value)) ?? false;
+  }
+
+  /** Copy the latest values of a column into an array of fixed length; null where there is none. */
+  copy(name, target, factor = 1) {
+    const column = this.columns.get(name), length = target.length;
+    const filled = column ? Math.min(this.rows, length) : 0;
+    target.fill(null, 0, length - filled);
+    for (let i = length - filled, row = (this.next - filled + this.capacity) % this.capacity; i < length; i++) {
+      const value = column[row];
+      target[i] = Number.isNaN(value) ? null : value * factor;
+      if (++row === this.capacity) row = 0;
+    }
+  }
+
+  /** Copy the latest times; rows that are not filled yet continue the time backwards. */
+  copyTimes(target) {
+    this.copy("t", target);
+    const first = target.length - Math.min(this.rows, target.length);
+    for (let i = first - 1; i >= 0; i--) target[i] = (target[i + 1] ?? 0) - this.period;
+  }
+
+  #row() {
+    this.at = this.next;
+    for (const column of this.columns.values()) column[this.at] = NaN;
+    this.next = (this.next + 1) % this.capacity;
+    this.rows = Math.min(this.rows + 1, this.capacity);
+  }
+
+  #write(name, value) {
+    const column = this.columns.get(name) ?? this.#add(name);
+    if (column && value !== null) column[this.at] = value;
+  }
+
+  #add(name) {
+    if (this.columns.size >= MAX_COLUMNS) return null;
+    const column = new Float64Array(this.capacity).fill(NaN);
+    this.columns.set(name, column);
+    return column;
+  }
+}
+
+/** Yield the ticks that columns hold. */
+export function* ticksOf(history) {
+  const { quantities = {}, ...columns } = history ?? {};
+  for (let row = 0; row < (columns.seq?.length ?? 0); row++) {
+    const tick = {};
+    for (const name in columns) if (columns[name][row] != null) tick[name] = columns[name][row];
+    const own = Object.entries(quantities).filter(([, column]) => column[row] != null);
+    if (own.length) tick.quantities = Object.fromEntries(own.map(([name, column]) => [name, column[row]]));
+    yield tick;
+  }
+}
+
+/** The connection to the server for one fish. */
+export class Stream {
+  /**
+   * client: identifier that the server gave to this page before, or empty
+   * take: called with type and payload of each message; changed: with whether the server is there
+   */
+  constructor(fish, client, take, changed) {
+    Object.assign(this, { fish, client, take, changed });
+    this.beaten = 0;
+    this.#connect();
+  }
+
+  #connect() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const query = new URLSearchParams();
+    if (this.fish) query.set("fish", this.fish);
+    if (this.client) query.set("client", this.client); // goes on driving
+    this.socket = new WebSocket(`${scheme}://${location.host}/live?${query}`);
+    this.socket.onmessage = (event) => {
+      this.#beat();
+      this.take(...JSON.parse(event.data));
+    };
+    this.socket.onclose = () => {
+      this.changed(false);
+      setTimeout(() => this.#connect(), RETRY_MS);
+    };
+  }
+
+  /** Give a sign of life; not from a timer, as browsers slow the timers of hidden tabs. */
+  #beat() {
+    const now = performance.now();
+    if (now - this.beaten < HEARTBEAT_MS) return;
+    this.beaten = now;
+    this.socket.send(JSON.stringify(["seen", Date.now() / 1000]));
+  }
+}

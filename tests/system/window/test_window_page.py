@@ -1,0 +1,405 @@
+"""The window's page in a true browser: a true fishd-window, and a true fishd."""
+
+import gzip
+import json
+import signal
+import tarfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, expect
+from rigs.browser import needs_browser, open_page
+from rigs.processes import PATIENCE, Daemon, running, wait_until
+from rigs.virtual_pi_process import virtual_pi
+from rigs.window_process import WindowProcess, running_window
+
+pytestmark = needs_browser
+
+AXE = Path(__file__).parents[3] / "build" / "axe-core-4.10.3.tgz"
+"""The program that looks for barriers; `npm pack` fetches it."""
+MAX_ASSETS_BYTES = 120_000
+expect.set_options(timeout=PATIENCE * 1e3)
+
+# Runs in the page: `app` is its own module, with the state that it shows.
+APP = "const app = await import('/app.js');"
+FEED = """
+const day = 24 * 3600 * 20;
+let seq = app.state.tick.seq, t = app.state.tick.t;
+globalThis.feed = (count, drawn) => {
+  for (let i = 0; i < count; i++) {
+    const phase = i / 12;
+    app.receive.ticks([{
+      t: t += 0.05, seq: ++seq, mode: "running", controller: "swing", servo_on: true, samples: 2,
+      fx: Math.sin(phase), fy: Math.cos(phase), fy_rate: 0, fin_velocity: phase % 1, phi_c: 0.4,
+      thrust: 0.02, thrust_ci95: 0.001, frequency: 1.7, sample_age_ms: 2, lateness_us: 50,
+      busy_time_us: 90, missed_slots: 0, alpha: 0.1, phi: 0.3, power: 0.6,
+      quantities: { top_speed: phase % 2 },
+    }]);
+    if (i % drawn === 0) app.charts.draw(performance.now() + 1e7 + i * 100);
+  }
+};
+"""
+# Returns whether a column of pixels in the first chart shows the colour of its line.
+LINE_AT = """([second]) => {
+  const plot = charts.charts[0].plot, { left, top, height } = plot.bbox;
+  const x = Math.round(plot.valToPos(second, "x", true));
+  if (x < left) throw new Error("outside");
+  const pixels = plot.ctx.getImageData(x, top, 1, height).data;
+  for (let i = 0; i < pixels.length; i += 4) {
+    const [red, green, blue] = pixels.slice(i, i + 3);
+    if (blue - red > 40) return true;
+  }
+  return false;
+}"""
+
+
+@pytest.fixture
+def window(daemon: Daemon, tmp_path: Path) -> Iterator[WindowProcess]:
+    """Yield a window that no page drives yet."""
+    with running_window(tmp_path, fish=daemon.endpoint) as process:
+        yield process
+
+
+@contextmanager
+def live_page(url: str, **settings: Any) -> Iterator[tuple[Page, list[str]]]:
+    """Open the page, and wait until it shows ticks."""
+    with open_page(f"{url}/", **settings) as (page, complaints):
+        expect(page.locator("#connection")).to_contain_text("live")
+        yield page, complaints
+
+
+def swim(page: Page, controller: str = "swing") -> None:
+    page.select_option("#controller", controller)
+    page.click("#start")
+    expect(page.locator("#mode")).to_have_text("running")
+
+
+def test_a_chart_moves_and_nothing_leaves_this_machine(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, complaints):
+        swim(page)
+        latest = page.locator(".chart output").first
+        for _ in range(3):
+            expect(latest).not_to_have_text(latest.inner_text())
+        pixels = "document.querySelector('.chart canvas').toDataURL()"
+        before = page.evaluate(pixels)
+        wait_until(lambda: page.evaluate(pixels) != before)
+        expect(page.locator("#cards")).to_contain_text("swing")
+        assert complaints == []
+
+
+def test_a_slider_changes_the_parameter_of_the_fish(window: WindowProcess, daemon: Daemon) -> None:
+    with live_page(window.url) as (page, complaints):
+        swim(page)
+        page.get_by_label("C, slider").fill("0.45")
+        wait_until(lambda: daemon.status().parameters["C"] == 0.45)
+        expect(page.locator("#parameter-C")).to_have_value("0.45")
+        page.locator("#parameter-C").fill("0.55")
+        page.locator("#parameter-C").press("Enter")
+        wait_until(lambda: daemon.status().parameters["C"] == 0.55)
+        assert complaints == []
+
+
+def test_a_value_that_fishd_refuses_is_explained_and_not_shown_as_set(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    with live_page(window.url) as (page, _):
+        swim(page)
+        page.locator("#parameter-C").fill("7")
+        page.locator("#parameter-C").press("Enter")
+        expect(page.locator(".notice.error")).to_contain_text("C")
+        expect(page.locator("#parameter-C")).to_have_value("0.6")
+        assert daemon.status().parameters["C"] == 0.6
+
+
+def test_stop_lets_the_fish_rest(window: WindowProcess, daemon: Daemon) -> None:
+    with live_page(window.url) as (page, complaints):
+        swim(page, "square")
+        page.click("#stop")
+        expect(page.locator("#mode")).to_have_text("idle")
+        assert daemon.status().mode == "idle"
+        assert complaints == []
+
+
+def test_an_emergency_stop_ends_the_pulses_and_shows_its_time_and_the_way_out(
+    tmp_path: Path,
+) -> None:
+    with (
+        virtual_pi(tmp_path) as pi,
+        running(tmp_path, *pi.settings) as daemon,
+        running_window(tmp_path, fish=daemon.endpoint) as window,
+        live_page(window.url) as (page, complaints),
+    ):
+        swim(page)
+        wait_until(lambda: pi.pulse() > 0.0)
+        page.click("#estop")
+        pi.wait_until_released()
+        expect(page.locator("#mode")).to_have_text("E-stop")
+        expect(page.locator("#estop-ms")).to_contain_text("ms")
+        expect(page.locator("#latched")).to_contain_text("Before you clear it")
+        assert page.locator("#start").is_disabled()
+        page.click("#clear-fault")
+        expect(page.locator("#mode")).to_have_text("idle")
+        expect(page.locator("#latched")).to_have_count(0)
+        wait_until(lambda: pi.pulse() > 0.0)
+        assert complaints == []
+
+
+def test_an_emergency_stop_works_when_the_stream_is_stale(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    with live_page(window.url) as (page, _):
+        swim(page)
+        box = page.locator("#estop").bounding_box()
+        page.evaluate(f"(async () => {{ {APP} app.stream.socket.onmessage = null }})()")
+        expect(page.locator("body.stale")).to_have_count(1)
+        page.focus("#estop")
+        page.keyboard.press("Enter")
+        wait_until(lambda: daemon.status().mode == "estop")
+        expect(page.locator("#estop-ms")).to_contain_text("ms")
+        assert page.locator("#estop").bounding_box() == box
+
+
+def test_a_killed_fishd_shows_at_once_and_a_new_one_is_said(
+    own_daemon: Daemon, tmp_path: Path
+) -> None:
+    with (
+        running_window(tmp_path, fish=own_daemon.endpoint) as window,
+        live_page(window.url) as (page, _),
+    ):
+        own_daemon.end(signal.SIGKILL)
+        expect(page.locator("body.stale")).to_have_count(1)
+        expect(page.locator("#connection")).to_contain_text("lost")
+        age = page.locator("#connection .age")
+        expect(age).not_to_have_text(age.inner_text())
+        expect(page.locator("#banner")).to_contain_text("What is greyed is old")
+        with running(tmp_path):
+            expect(page.locator("#connection")).to_contain_text("live")
+            expect(page.locator("#notices")).to_contain_text("restarted")
+            expect(page.locator("body.stale")).to_have_count(0)
+
+
+def test_a_page_whose_server_hangs_says_so_by_its_own_clock(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    with live_page(window.url) as (page, _):
+        window.process.send_signal(signal.SIGSTOP)
+        try:
+            expect(page.locator("#connection")).to_contain_text("stale")
+        finally:
+            window.process.send_signal(signal.SIGCONT)
+        expect(page.locator("#connection")).to_contain_text("live")
+
+
+@pytest.mark.realtime
+def test_old_values_are_grey_within_a_second_and_the_page_is_painted_within_half(
+    own_daemon: Daemon, tmp_path: Path
+) -> None:
+    with (
+        running_window(tmp_path, fish=own_daemon.endpoint) as window,
+        live_page(window.url) as (page, _),
+    ):
+        paint = page.evaluate("performance.getEntriesByType('paint')[0].startTime")
+        page.evaluate(f"""(async () => {{ {APP}
+            new MutationObserver(() => {{
+                if (document.body.classList.contains("stale"))
+                    globalThis.staleAfter ??= performance.now() - app.state.lastTick;
+            }}).observe(document.body, {{ attributes: true }});
+        }})()""")
+        own_daemon.end(signal.SIGKILL)
+        wait_until(lambda: page.evaluate("globalThis.staleAfter ?? 0"))
+        assert page.evaluate("staleAfter") <= 1000
+        assert paint <= 500
+
+
+def test_a_reload_restores_what_the_fish_does_and_its_last_minutes(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    with live_page(window.url) as (page, complaints):
+        swim(page)
+        page.get_by_label("C, slider").fill("0.5")
+        wait_until(lambda: daemon.status().parameters["C"] == 0.5)
+        page.select_option("#seconds", "60")
+        seq = page.evaluate(f"(async () => {{ {APP} return app.state.tick.seq }})()")
+        page.reload()
+        expect(page.locator("#mode")).to_have_text("running")
+        expect(page.locator("#parameter-C")).to_have_value("0.5")
+        expect(page.locator("#driver")).to_have_text("you drive")
+        expect(page.locator("#seconds")).to_have_value("60")
+        expect(page.locator("#events")).to_contain_text("swing takes over")
+        columns = f"(async () => {{ {APP} return [...app.charts.ring.columns.get('seq')] }})()"
+        assert seq in page.evaluate(columns)
+        assert complaints == []
+
+
+def test_a_change_by_another_client_is_said_and_shown(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    with live_page(window.url) as (page, complaints):
+        swim(page)
+        assert daemon.fishctl("set-parameter", "C=0.4").returncode == 0
+        expect(page.locator("#notices")).to_contain_text("Another client set swing C=0.4")
+        expect(page.locator("#parameter-C")).to_have_value("0.4")
+        assert complaints == []
+
+
+def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    url = f"http://fish.example:{window.port}/"
+    done = daemon.fishctl(
+        "window", "pair", "--scope=watch", "--url", url, "--state", str(window.state), "--json"
+    )
+    link = json.loads(done.stdout)["url"]
+    with open_page(url, "--host-resolver-rules=MAP fish.example 127.0.0.1") as (page, complaints):
+        expect(page.locator(".pairing")).to_contain_text("not paired")
+        page.goto(link)
+        expect(page.locator("#connection")).to_contain_text("live")
+        assert page.url == url
+        assert page.locator("#start").is_disabled()
+        page.click("#estop")
+        wait_until(lambda: daemon.status().mode == "estop")
+        expect(page.locator("#estop-ms")).to_contain_text("ms")
+        assert page.locator("#clear-fault").is_disabled()
+        assert complaints == []
+
+
+def test_a_run_in_simulation_is_drawn_beside_the_live_force(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, complaints):
+        page.click("#tab-simulate")
+        page.click("#experiment .primary")
+        expect(page.locator(".job.done")).to_contain_text("True thrust")
+        expect(page.locator(".job code")).to_contain_text("fishctl simulate swing")
+        expect(page.locator("figure", has_text="virtual F")).to_be_visible()
+        assert complaints == []
+
+
+def test_lost_ticks_are_drawn_as_a_gap_and_suspect_samples_are_marked(
+    window: WindowProcess,
+) -> None:
+    with live_page(window.url) as (page, _):
+        lost, row, suspects = page.evaluate("""async () => {
+            const { Ring } = await import("/stream.js");
+            const ring = new Ring(0.05);
+            const { charts } = await import("/app.js");
+            globalThis.charts = charts;
+            (await import("/app.js")).stream.socket.onmessage = null;
+            for (let seq = 1; seq <= 300; seq++) {
+                if (seq > 100 && seq <= 200) continue;
+                const tick = { t: 1000 + seq * 0.05, seq, fx: 0.01, fy: 0, thrust: 0.01, phi_c: 0 };
+                if (seq === 250) tick.suspect = "clipped";
+                ring.push(tick);
+            }
+            charts.setRing(ring);
+            charts.draw(performance.now() + 1e7);
+            const { data } = charts.charts[0], isLost = (value) => value === null;
+            const suspects = data[5].filter((value) => !isLost(value));
+            return [ring.lost, data[1].slice(-201).map(isLost), suspects];
+        }""")
+        assert lost == 100
+        assert row == [False] * 100 + [True] + [False] * 100
+        assert suspects == [10.0]
+        assert page.evaluate(LINE_AT, [1003.0])
+        assert not page.evaluate(LINE_AT, [1007.5])
+        assert page.evaluate(LINE_AT, [1014.0])
+
+
+def test_the_memory_of_the_page_is_the_same_after_a_day_of_ticks(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, _):
+        page.evaluate(f"(async () => {{ {APP} app.stream.socket.onmessage = null; {FEED} }})()")
+        session = page.context.new_cdp_session(page)
+        session.send("Performance.enable")
+
+        def heap() -> float:
+            for _ in range(3):
+                session.send("HeapProfiler.collectGarbage")
+            metrics = session.send("Performance.getMetrics")["metrics"]
+            return next(m["value"] for m in metrics if m["name"] == "JSHeapUsedSize") / 1e6
+
+        page.evaluate("feed(72000, 1000)")
+        before = heap()
+        for _ in range(24):
+            page.evaluate("feed(72000, 1000)")
+        after = heap()
+        print(f"JS heap before {before:.1f} MB, after a day {after:.1f} MB")
+        assert abs(after - before) <= 5.0
+
+
+def test_the_keyboard_reaches_everything_and_the_focus_is_visible(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, _):
+        swim(page)
+        expect(page.locator("#runs")).to_contain_text("None yet")
+        reachable = page.evaluate("""() => {
+            const kinds = "button, input, select, a[href], [tabindex='0']";
+            const isReachable = (node) => !node.disabled && node.checkVisibility();
+            globalThis.wanted = [...document.querySelectorAll(kinds)].filter(isReachable);
+            return wanted.length;
+        }""")
+        page.keyboard.press("Tab")
+        while page.evaluate("document.activeElement.id") != "estop":
+            page.keyboard.press("Tab")  # begins where the mouse was last
+        focused = []
+        for _ in range(reachable):
+            focused.append(
+                page.evaluate("""() => {
+                    const { outlineStyle, outlineWidth } = getComputedStyle(document.activeElement);
+                    if (outlineStyle === "none" || parseFloat(outlineWidth) < 2)
+                        throw new Error(`no focus is seen: ${document.activeElement.id}`);
+                    return wanted.indexOf(document.activeElement);
+                }""")
+            )
+            page.keyboard.press("Tab")
+        assert focused == list(range(reachable))  # in reading order, and the E-stop first
+
+
+@pytest.mark.parametrize("width", [1360, 800, 390])
+def test_nothing_is_wider_than_the_screen_and_the_emergency_stop_keeps_its_place(
+    window: WindowProcess, width: int
+) -> None:
+    with live_page(window.url, viewport={"width": width, "height": 844}) as (page, _):
+        box = page.locator("#estop").bounding_box()
+        assert box
+        assert box["x"] + box["width"] > width - 20
+        swim(page)
+        page.evaluate("scrollTo(0, 600)")
+        assert page.locator("#estop").bounding_box() == box
+        assert page.evaluate("document.documentElement.scrollWidth") == width
+
+
+@pytest.mark.skipif(
+    not AXE.exists(), reason=f"needs: npm pack axe-core@4.10.3 --pack-destination {AXE.parent.name}"
+)
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_barrier_is_serious(window: WindowProcess, scheme: str) -> None:
+    with tarfile.open(AXE) as archive:
+        program = archive.extractfile("package/axe.min.js")
+        assert program
+        source = program.read().decode()
+    with live_page(window.url, color_scheme=scheme, bypass_csp=True) as (page, _):
+        swim(page)
+        for state in ("live", "estop"):
+            if state == "estop":
+                page.click("#estop")
+                expect(page.locator("#latched")).to_be_visible()
+            page.evaluate(source)
+            violations = page.evaluate("axe.run().then(({ violations }) => violations)")
+            serious = [
+                (violation["id"], [node["html"] for node in violation["nodes"]])
+                for violation in violations
+                if violation["impact"] in ("serious", "critical")
+            ]
+            assert serious == []
+
+
+def test_the_files_of_the_page_are_small(window: WindowProcess) -> None:
+    folder = resources.files("fishd.window").joinpath("page")
+    files = [*folder.iterdir(), *folder.joinpath("vendor").iterdir()]
+    sizes = [
+        len(gzip.compress(file.read_bytes()))
+        for file in files
+        if file.name.endswith((".html", ".js", ".css"))
+    ]
+    assert sum(sizes) <= MAX_ASSETS_BYTES
