@@ -53,7 +53,7 @@ def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) 
         if as_json:
             print_json({"way": way, **answer})
         else:
-            echo(f"{summary}\nway: {way}")
+            echo(f"{summary}\nstopped through: {way}")
     return 0
 
 

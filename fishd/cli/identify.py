@@ -16,7 +16,7 @@ from fishd.cli.experiment_options import (
 )
 from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
-from fishd.cli.progress import show_progress
+from fishd.cli.progress import show_progress, show_waiting
 from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.console import INTERRUPTED
@@ -115,9 +115,10 @@ def identify(
         config, tables = load(fish.file, fish.overrides), [find_recording(run) for run in runs]
         check_tethered(config.robot, "identify")
         origin = ", ".join(path.name for path in tables)
-    identification = lab.identify(
-        tables, start=config.plant, rig=config.simulation, fit=names, fix=fixed
-    )
+    with show_waiting("fitting the model to the forces"):
+        identification = lab.identify(
+            tables, start=config.plant, rig=config.simulation, fit=names, fix=fixed
+        )
     if as_json:
         print_json(identification.to_builtins() | {"origin": origin})
     else:

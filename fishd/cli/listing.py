@@ -61,10 +61,13 @@ def controllers(name: str | None, endpoint: str | None, as_json: bool) -> None:
     )
     if name is not None:
         names = [info.name for info in infos]
-        if name not in names:
+        infos = [info for info in infos if info.name == name]
+        if not infos and name in registry.names():
+            echo(f"fishctl: {name} was installed after fishd had started", err=True)
+            infos = [registry.describe(name)]
+        if not infos:
             hint = suggest(name, names)
             raise UnknownController(f"no controller is named '{name}'; {hint}")
-        infos = [info for info in infos if info.name == name]
     if as_json:
         print_json(infos)
         return

@@ -66,6 +66,18 @@ class Bar(Lines):
 
 
 @contextmanager
+def show_waiting(work: str) -> Iterator[None]:
+    """Show that work of unknown length goes on, if standard error is a terminal."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(work):
+        yield
+
+
+@contextmanager
 def show_progress(total: float, unit: str, *, err: bool = False) -> Iterator[Lines]:
     """Yield a printer of lines, with a bar if standard error is a terminal.
 

@@ -314,4 +314,4 @@ def _format_whole_ticks(whole_ticks: "WholeTicks", force_unit: str) -> str:
     best = f"best measured at {whole_ticks.frequency:.4g} Hz: {thrust}"
     if whole_ticks.nearest_frequency is None:
         return best
-    return f"{best}; {whole_ticks.nearest_frequency:.6g} Hz is nearer the best, and not in the grid"
+    return f"{best}; {whole_ticks.nearest_frequency:.6g} Hz is nearer the best: add it to the grid"

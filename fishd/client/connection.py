@@ -86,8 +86,8 @@ class Connection:
 
     def _no_daemon(self, why: str) -> NoDaemon:
         return NoDaemon(
-            f"no fishd at {self.endpoint}: {why}; start one with 'fishd', or name another with "
-            "--endpoint or $FISHD_ENDPOINT"
+            f"no fishd at {self.endpoint}: {why}; start one with 'fishd', or a simulated fish "
+            "that swims with 'make run'; or name another with --endpoint or $FISHD_ENDPOINT"
         )
 
     def no_answer_error(self, patience: float = 0.0) -> NoDaemon:

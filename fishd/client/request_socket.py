@@ -24,9 +24,7 @@ class RequestSocket(Dealer[bytes | FishError]):
         try:
             super().__init__(endpoint, MAX_REPLY_BYTES)
         except ValueError as error:
-            raise NoDaemon(
-                f"'{endpoint}' is not an address: {error}; write ipc://PATH or tcp://HOST:PORT"
-            ) from None
+            raise NoDaemon(f"'{endpoint}' is not an address: {error}") from None
 
     def send_by(self, deadline: float, request: bytes) -> bool:
         """Send a request once the daemon accepts it; return False after the deadline [s]."""

@@ -106,7 +106,7 @@ class Truth(Struct, frozen=True, gc=False):
 class Tick(Struct, frozen=True, gc=False):
     """Telemetry of one tick; published on topic `tick`.
 
-    `Reporter.tick` fills each field.
+    `ControlLoop._record` fills each field.
     """
 
     t: Annotated[float, unit("s", "Time of the tick, unix.")]

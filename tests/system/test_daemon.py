@@ -180,8 +180,8 @@ def test_after_a_kill_a_client_knows_at_once_that_nobody_is_there(tmp_path: Path
     assert (done.returncode, done.stderr) == (
         1,
         f"fishctl: no fishd at {daemon.endpoint}: no process listens there; start one with "
-        "'fishd', "
-        "or name another with --endpoint or $FISHD_ENDPOINT\n",
+        "'fishd', or a simulated fish that swims with 'make run'; or name another with "
+        "--endpoint or $FISHD_ENDPOINT\n",
     )
 
 

@@ -1,6 +1,7 @@
 """Controllers of other packages: slow and broken ones do no harm to fishd."""
 
 import json
+import os
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -95,7 +96,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def shared_daemon(site: Path) -> Iterator[Daemon]:
     """Run a daemon on a machine with these packages."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(site))
+        patch.setenv("PYTHONPATH", str(site), prepend=os.pathsep)
         with running(site.parent) as daemon:
             yield daemon
 
@@ -133,6 +134,9 @@ def test_one_that_is_installed_while_fishd_runs_is_found(daemon: Daemon, site: P
     assert daemon.fishctl_apart("set-controller", "still").returncode == 1
     late = "from fishd.controllers.hold import Hold\nclass Late(Hold):\n    'Comes late.'\n"
     install(site, {"late": late}, late="late:Late")
+    described = daemon.fishctl_apart("controllers", "late")
+    assert described.stdout.startswith("late  Comes late.")
+    assert described.stderr == "fishctl: late was installed after fishd had started\n"
     assert daemon.fishctl_apart("set-controller", "late").stdout.startswith("running: late")
     known = [info["name"] for info in json.loads(daemon.fishctl("controllers", "--json").stdout)]
     assert "late" in known

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fishd.config import adopt, load
+from fishd.core.errors import ConfigError
 from fishd.learning.settings import load as load_settings
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ def swim(
     settings: str | Path | None = None,
     overrides: Iterable[str] = (),
     camera: str | Path | None = None,
+    render_mode: str | None = None,
 ) -> "SwimEnv":
     """Return the environment of a simulated fish in this process, on the virtual clock.
 
@@ -37,9 +39,11 @@ def swim(
     settings: YAML file of a training, of which `see`, `environment`, `camera` and `randomisation`
         are used; a feature extractor that must be fitted is fitted to a random excitation first
     camera: YAML file of the simulated camera, for settings with `see: camera` or `both`
+    render_mode: None, as the environment draws no pictures
 
     Raises `ConfigError`.
     """
+    _refuse_rendering(render_mode)
     from fishd.camera import settings as cameras
     from fishd.lab.links.simulated_link import Camera, SimulatedLink
     from fishd.learning.env.environment import SwimEnv
@@ -68,6 +72,7 @@ def swim_on_daemon(
     camera: str | None = None,
     experiment: str = "environment",
     take: bool = False,
+    render_mode: str | None = None,
 ) -> "SwimEnv":
     """Return the environment of the fish of a running fishd; it holds the lease until it is closed.
 
@@ -78,9 +83,11 @@ def swim_on_daemon(
     camera: request address of the camera, for settings with `see: camera` or `both`
     experiment: name of the lease, as `fishctl status` shows it
     take: whether to take the fish from an experiment that holds it
+    render_mode: None, as the environment draws no pictures
 
     Raises `ConfigError`, also where tick or Φ differ from those of fishd, and `FishError`.
     """
+    _refuse_rendering(render_mode)
     from fishd.lab.links.fishd_link import FishdLink, config_of
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.extractors import make_extractor
@@ -99,3 +106,11 @@ def swim_on_daemon(
     except BaseException:
         link.close()
         raise
+
+
+def _refuse_rendering(mode: str | None) -> None:
+    if mode is not None:
+        raise ConfigError(
+            f"render_mode={mode!r} is not valid: the environment draws no pictures; leave it out, "
+            "and see the fish with 'fishctl watch', or with 'fishctl plot' after a recording"
+        )

@@ -22,7 +22,7 @@ def test_the_control_socket_is_asked_first(pi: Bench) -> None:
         ended = daemon.fishctl("estop", "from a test")
         assert (ended.returncode, ended.stderr) == (0, "")
         assert ended.stdout.startswith("estop (from a test): hold")
-        assert ended.stdout.endswith("\nway: control socket\n")
+        assert ended.stdout.endswith("\nstopped through: control socket\n")
         pi.wait_for_pulse(0, 0)
         state = json.loads(daemon.fishctl("estop", "--json").stdout)
     assert (state["way"], state["mode"]) == ("control socket", "estop")
@@ -35,7 +35,10 @@ def test_gateways_that_are_stopped_do_not_keep_the_pulses_on(pi: Bench) -> None:
             os.kill(pid, signal.SIGSTOP)
         ended = daemon.fishctl("estop")
         assert (ended.returncode, ended.stderr) == (0, "")
-        assert f"\nway: fishd's own socket, {pi.folder}/control.estop, as the" in ended.stdout
+        assert (
+            f"\nstopped through: fishd's own socket, {pi.folder}/control.estop, as the"
+            in ended.stdout
+        )
         pi.wait_for_pulse(0, 0)
 
 
@@ -53,8 +56,8 @@ def test_a_fishd_that_hangs_or_is_dead_does_not_keep_the_pulses_on(
             daemon.process.send_signal(signal.SIGCONT)
     assert (ended.returncode, ended.stderr) == (0, "")
     assert ended.stdout in (
-        "pulses were on: neutral, then off\nway: last resort\n",
-        "there were no pulses\nway: last resort\n",  # their countdown was faster
+        "pulses were on: neutral, then off\nstopped through: last resort\n",
+        "there were no pulses\nstopped through: last resort\n",  # their countdown was faster
     )
 
 
@@ -92,4 +95,4 @@ def test_a_configuration_names_the_servo_of_a_fishd_without_a_recipe(pi: Bench) 
     )
     ended = fishctl("--endpoint", f"ipc://{pi.folder}/nowhere", "estop", "--config", str(file))
     assert (ended.returncode, ended.stderr) == (0, "")
-    assert ended.stdout == "there were no pulses\nway: last resort\n"
+    assert ended.stdout == "there were no pulses\nstopped through: last resort\n"

@@ -17,10 +17,18 @@ print_json([1])
 """
 
 
-def run_on_terminal(err: bool) -> tuple[str, str]:
+WAITING = """
+from fishd.cli.progress import show_waiting
+with show_waiting("fitting"):
+    pass
+print("fitted")
+"""
+
+
+def run_on_terminal(program: str) -> tuple[str, str]:
     """Return the output in a pipe, and the standard error on a terminal."""
     reading_end, terminal = pty.openpty()
-    command = [sys.executable, "-c", PROGRAM.format(err=err)]
+    command = [sys.executable, "-c", program]
     done = subprocess.run(command, stdout=subprocess.PIPE, stderr=terminal, text=True, check=True)
     os.close(terminal)
     shown = b""
@@ -35,7 +43,17 @@ def run_on_terminal(err: bool) -> tuple[str, str]:
 
 @pytest.mark.parametrize("err", [True, False])
 def test_the_bar_is_on_standard_error_and_the_lines_on_either_stream(err: bool) -> None:
-    out, shown = run_on_terminal(err)
+    out, shown = run_on_terminal(PROGRAM.format(err=err))
     assert "2 of 2 s" in shown
     assert ("one is done" in shown) == err
     assert out == ("" if err else "one is done\n") + "[\n  1\n]\n"
+
+
+def test_work_of_unknown_length_is_named_on_a_terminal_only() -> None:
+    out, shown = run_on_terminal(WAITING)
+    assert out == "fitted\n"
+    assert "fitting" in shown
+    done = subprocess.run(
+        [sys.executable, "-c", WAITING], capture_output=True, text=True, check=True
+    )
+    assert (done.stdout, done.stderr) == ("fitted\n", "")

@@ -367,7 +367,7 @@ def test_what_cannot_be_drawn_here_is_told_before_anything_swims(
 ) -> None:
     monkeypatch.setattr("fishd.lab.drawing.find_spec", lambda _: None)
     folder = tmp_path / "run"
-    assert "--editable '.[lab]'" in one_line(fishctl(*verb, "--folder", str(folder)))
+    assert "[lab]" in one_line(fishctl(*verb, "--folder", str(folder)))
     assert not folder.exists()
 
 

@@ -29,6 +29,13 @@ def test_the_environment_in_process_passes_both_checkers() -> None:
     check_for_baselines(env.unwrapped, warn=True)
 
 
+def test_an_environment_refuses_to_be_rendered_in_one_sentence() -> None:
+    with pytest.raises(
+        ConfigError, match="render_mode='human' is not valid: the environment draws"
+    ):
+        gymnasium.make("fishd/Swim-v0", render_mode="human")
+
+
 def test_an_environment_is_made_from_the_files_of_fish_and_training(tmp_path: Path) -> None:
     (tmp_path / "fish.yaml").write_text("amplitude_limit: 0.2\n", encoding="utf-8")
     settings = tmp_path / "training.yaml"

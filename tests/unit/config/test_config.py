@@ -12,7 +12,11 @@ from rigs.documents import ROOT
 from fishd.config import SERVICE_FILE, Config, load, mistakes, to_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.strict_yaml import YamlProblem, dump, parse
+from fishd.hardware.registry import SERVOS
 
+WITH_FREQUENCY = [
+    name for name in SERVOS.names() if "frequency" in SERVOS.find(name).Settings.__struct_fields__
+]
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 7)
 )
@@ -262,9 +266,9 @@ def test_any_text_gives_values_or_one_line_with_its_line_number(text: str) -> No
         ([f"virtual_pi.socket=/tmp/{'x' * 103}"], "virtual_pi.socket", "this one has 108"),
         ([f"control.address=ipc:///tmp/{'x' * 103}"], "control.address", "at most 107 bytes"),
         ([f"telemetry.address=ipc:///tmp/{'é' * 60}"], "telemetry.address", "this one has 125"),
-        (["servo.frequency=100"], "servo.frequency", "drivers that have it: rpi-gpio, sysfs-pwm"),
-        (["servo.driver=steam"], "servo.driver", "installed: pigpio, rpi-gpio, sysfs-pwm"),
-        (["servo.driver=3"], "servo.driver", "one of pigpio, rpi-gpio, sysfs-pwm"),
+        (["servo.frequency=100"], "servo.frequency", f"that have it: {', '.join(WITH_FREQUENCY)}"),
+        (["servo.driver=steam"], "servo.driver", f"installed: {', '.join(SERVOS.names())}"),
+        (["servo.driver=3"], "servo.driver", f"one of {', '.join(SERVOS.names())}"),
         (["gpio=3"], "gpio", "did you mean 'servo.gpio'?"),
         (["panel.led_gpio=18"], "panel.led_gpio", "servo.gpio"),
         (["panel.estop_gpio=3"], "panel.estop_gpio", "force_sensor.bus"),

@@ -85,7 +85,7 @@ def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, progr
     done = call(program, *simulates, *OPTIONS, *own, env={"PYTHONPATH": str(tmp_path)})
     assert done.returncode == 1
     assert "numba" in done.stderr
-    assert done.stderr.endswith("--editable '.[swimmer]'\n")
+    assert done.stderr.endswith("[swimmer]'\n")
     assert done.stderr.count("\n") == 1
 
 
