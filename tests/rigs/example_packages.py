@@ -46,9 +46,8 @@ def fishctl(site: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     """Run fishctl with the installed packages of a folder, without a daemon."""
     mine = {"PYTHONPATH": str(site), "XDG_RUNTIME_DIR": str(site), "COLUMNS": "100"}
     command = [FISHCTL, *arguments]
-    return subprocess.run(
-        command, env=os.environ | mine, capture_output=True, text=True, check=False
-    )
+    options = {"capture_output": True, "text": True, "check": False}
+    return subprocess.run(command, env=os.environ | mine, **options)
 
 
 def forget_drivers() -> None:

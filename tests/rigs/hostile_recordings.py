@@ -177,9 +177,8 @@ def frame_with_damaged_pixels(good: Good) -> bytes:
 @file
 def numbers_that_no_fish_has(good: Good) -> bytes:
     changes = [{name: 1e308 * s} for name in ("fx", "phi_c", "sample_age_ms", "t") for s in (1, -1)]
-    return with_messages(
-        good, TICK, [tick_of(good, seq=61 + i, **c) for i, c in enumerate(changes)]
-    )
+    ticks = [tick_of(good, seq=61 + i, **c) for i, c in enumerate(changes)]
+    return with_messages(good, TICK, ticks)
 
 
 @file

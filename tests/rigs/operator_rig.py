@@ -45,9 +45,8 @@ class LoadedPi:
         # Replace its chip by the one with the loads.
         settings = VirtualPiSettings(socket=socket, pigpio_port=0, address=0x49)
         clock = SystemClock()
-        self._pi = VirtualPi(
-            settings, PlantParameters(), SimulationSettings(noise=2e-4), 0.05, clock
-        )
+        simulation = SimulationSettings(noise=2e-4)
+        self._pi = VirtualPi(settings, PlantParameters(), simulation, 0.05, clock)
         self._pi.bus.attach(0x48, Ads1115Chip(clock, self._volts, self._pi.faults))
         self._server = LinkServer(self._pi, Path(socket))
         self._server.start()

@@ -33,9 +33,8 @@ BRIEF = TrainingSettings(
 def brief_job(folder: Path, **changes: Any) -> Job:
     """Return a training of a second; changes: of its settings, or of fields of the job."""
     fields = {name: changes.pop(name) for name in ("on", "resume", "parent") if name in changes}
-    return Job(
-        config=load(None, NOISY), settings=replace(BRIEF, **changes), folder=folder, **fields
-    )
+    settings = replace(BRIEF, **changes)
+    return Job(config=load(None, NOISY), settings=settings, folder=folder, **fields)
 
 
 def rows(path: Path) -> list[dict[str, str]]:

@@ -42,9 +42,8 @@ class Bench:
     ) -> bool:
         """Run the last resort, as another process does when fishd is dead."""
         resort = SysfsPwm.last_resort(settings or SysfsPwmSettings())
-        return pwm_pulses.neutralise(
-            neutral, files=self.kernel, clock=self.clock, **resort.arguments
-        )
+        means = {"files": self.kernel, "clock": self.clock}
+        return pwm_pulses.neutralise(neutral, **means, **resort.arguments)
 
     def write(self, servo: CalibratedServo, angle: float) -> float:
         """Write, wait for the next frame, and return its pulse [µs]."""

@@ -187,11 +187,8 @@ class V4l2Camera:
         if not later:
             raise OSError(errno.EINVAL, "Invalid argument")
         control = self._controls[later[0]]
-        argument.id, argument.type, argument.name = (
-            later[0],
-            int(control.kind),
-            control.name.encode(),
-        )
+        argument.id, argument.type = later[0], int(control.kind)
+        argument.name = control.name.encode()
         argument.minimum, argument.maximum, argument.step = control.low, control.high, 1
         argument.elems, argument.elem_size, argument.flags = 1, 4, 0
 
@@ -231,12 +228,8 @@ class V4l2Camera:
         assert self._ours is not None
         os.eventfd_read(self._ours)
         index, size, sequence, stamp, flags = self._done.popleft()
-        argument.index, argument.bytesused, argument.sequence, argument.flags = (
-            index,
-            size,
-            sequence,
-            flags,
-        )
+        argument.index, argument.bytesused = index, size
+        argument.sequence, argument.flags = sequence, flags
         argument.timestamp.secs = int(stamp)
         argument.timestamp.usecs = round(stamp % 1.0 * 1e6) % 10**6
 

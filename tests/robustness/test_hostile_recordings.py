@@ -96,9 +96,7 @@ def test_a_bad_file_hides_no_other(folder: Path, results: dict[tuple[str, str], 
         assert outcome.out.replace("\n", "").isprintable()
 
 
-def test_no_text_of_a_file_is_a_command(
-    folder: Path, results: dict[tuple[str, str], Outcome]
-) -> None:
+def test_no_text_in_a_file_is_run(folder: Path, results: dict[tuple[str, str], Outcome]) -> None:
     name = "texts-that-are-commands"
     html = (folder / "plot--html" / name / f"{name}.html").read_text()
     assert "<script>alert" not in html

@@ -69,10 +69,8 @@ def test_nobody_at_the_endpoint_is_told_apart_from_a_refusal(tmp_path: Path) -> 
         async with AsyncFish("tcp://127.0.0.1:9", timeout=0.05) as fish:
             await fish.status()
 
-    with (
-        Fish(f"ipc://{tmp_path}/nobody") as fish,
-        pytest.raises(NoDaemon, match="no process listens"),
-    ):
+    nobody = Fish(f"ipc://{tmp_path}/nobody")
+    with nobody as fish, pytest.raises(NoDaemon, match="no process listens"):
         fish.status()
     silence = r"no answer within 0\.05 s"
     with Fish("tcp://127.0.0.1:9", timeout=0.05) as fish, pytest.raises(NoDaemon, match=silence):

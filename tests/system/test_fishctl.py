@@ -122,10 +122,8 @@ def test_a_fault_is_shown_with_what_to_do_about_it(daemon: Daemon) -> None:
 
 def test_a_fish_has_a_name_which_tells_two_daemons_apart(tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
-    with (
-        running(tmp_path, "--set", "name=left tank") as left,
-        running(tmp_path / "other") as unnamed,
-    ):
+    named = ("--set", "name=left tank")
+    with running(tmp_path, *named) as left, running(tmp_path / "other") as unnamed:
         assert left.fishctl("status").stdout.startswith("fish        left tank, simulated\n")
         assert "  left tank  idle" in left.fishctl("watch", "--seconds", "5").stdout
         with Subscriber(left.telemetry, b"status") as subscriber:

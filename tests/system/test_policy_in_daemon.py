@@ -157,9 +157,8 @@ def test_fishd_starts_with_a_policy_of_its_configuration(folder: Path, tmp_path:
     (folder / "first.onnx").unlink()
     status, _, errors = Daemon(tmp_path, "--config", str(file)).finish()
     assert status == 78
-    assert f"fishd: {file}:4: start.parameters.policy: ppo: policy: no policy is named 'first'" in (
-        errors
-    )
+    refused = f"{file}:4: start.parameters.policy: ppo: policy: no policy is named 'first'"
+    assert f"fishd: {refused}" in errors
 
 
 WARMING = """

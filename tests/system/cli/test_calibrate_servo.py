@@ -189,14 +189,11 @@ def test_the_death_of_the_daemon_ends_it_in_one_line(talk: Talk, pi: Bench) -> N
         daemon.kill()
     dialogue.answer("", "+")
     assert dialogue.finish() == 1
-    assert re.search(
-        r"position of the servo is unknown: .+\nfishctl: no fishd at .+\n$", dialogue.text
-    )
+    unknown = r"the position of the servo is unknown: .+\nfishctl: no fishd at .+\n$"
+    assert re.search(unknown, dialogue.text)
 
 
-def test_the_servo_is_not_calibrated_while_the_fish_swims_or_after_a_fault(
-    rig: Bench, daemon: Daemon
-) -> None:
+def test_no_servo_is_calibrated_while_it_swims_or_after_a_fault(rig: Bench, daemon: Daemon) -> None:
     daemon.fishctl("set-controller", "swing")
     swimming = daemon.fishctl("calibrate", "servo")
     daemon.fishctl("estop", "a test")

@@ -125,9 +125,8 @@ def run_in_terminal(
 
 def test_status_says_how_the_camera_is(camera: CameraProcess, daemon: Daemon) -> None:
     shown = output_of("status")
-    assert re.search(
-        rf"^camera +a simulated camera above the fish at {daemon.endpoint}$", shown, re.M
-    )
+    described = f"a simulated camera above the fish at {daemon.endpoint}"
+    assert re.search(rf"^camera +{described}$", shown, re.M)
     assert re.search(r"^state +streaming for 0:\d\d:\d\d$", shown, re.M)
     assert re.search(r"^rate +(29|30|31)\.\d frames a second$", shown, re.M)
     assert re.search(r"^age +\d+\.\d ms when available, exposed for 10\.0 ms$", shown, re.M)
@@ -175,9 +174,7 @@ def test_ctrl_c_as_a_view_takes_the_screen_ends_it(camera: CameraProcess, tmp_pa
     assert "Traceback" not in drawn
 
 
-def test_a_view_is_written_with_the_axis_once_it_was_searched(
-    swimming: Daemon, tmp_path: Path
-) -> None:
+def test_a_view_is_written_with_the_axis_once_searched(swimming: Daemon, tmp_path: Path) -> None:
     line = output_of("view", "--axis", "--plot", tmp_path / "a.png")
     offset = re.search(r"axis ([+-][\d.]+) px", line)
     assert offset

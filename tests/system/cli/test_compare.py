@@ -94,9 +94,7 @@ def test_a_wrong_contestant_is_one_line() -> None:
 
 
 @pytest.mark.slow
-def test_policies_without_their_packages_are_reported_as_left_out(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_policies_without_their_packages_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     done = run("--seconds", "15", "--settle", "5")
     assert (done.returncode, done.stderr.count("\n")) == (0, 1)

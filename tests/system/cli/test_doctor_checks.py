@@ -35,10 +35,8 @@ OWN_KERNEL = (
 FAST, SLOW = (speed.to_bytes(4, "big") for speed in (400_000, 100_000))
 SPEED, SPEED_BEFORE = f"sys/bus/i2c/devices/i2c-1/{BUS}", f"sys/class/i2c-adapter/i2c-1/{BUS}"
 FLAGS = "sys/devices/platform/soc/soc:firmware/get_throttled"
-MONITOR = {
-    "sys/class/hwmon/hwmon0/name": "cpu_thermal\n",
-    "sys/class/hwmon/hwmon1/name": "rpi_volt\n",
-}
+HWMON = "sys/class/hwmon/hwmon"
+MONITOR = {f"{HWMON}0/name": "cpu_thermal\n", f"{HWMON}1/name": "rpi_volt\n"}
 ALARM = "sys/class/hwmon/hwmon1/in0_lcrit_alarm"
 CPU = "sys/devices/system/cpu/cpu{}/cpufreq/scaling_governor"
 GOVERNORS = {CPU.format(number): "performance\n" for number in range(4)}
@@ -242,9 +240,7 @@ def test_the_pwm_channel_must_be_there_and_silent(root: Path, examine: Examine) 
     assert duty.read_text() == "1500000\n"
 
 
-def test_a_button_that_nothing_can_read_is_reported(
-    examine: Examine, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_button_none_can_read_is_told(examine: Examine, monkeypatch: pytest.MonkeyPatch) -> None:
     """An installation without the package works, but doctor must report it."""
     monkeypatch.setattr("fishd.hardware.header._PROVIDERS", ())
     assert examine("gpio package") == ("", "", "")

@@ -43,9 +43,7 @@ def test_gateways_that_are_stopped_do_not_keep_the_pulses_on(pi: Bench) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
-def test_a_fishd_that_hangs_or_is_dead_does_not_keep_the_pulses_on(
-    pi: Bench, number: signal.Signals
-) -> None:
+def test_a_fishd_that_hangs_or_is_dead_keeps_no_pulses(pi: Bench, number: signal.Signals) -> None:
     with pi.daemon() as daemon:
         swim(pi, daemon)
         daemon.process.send_signal(number)

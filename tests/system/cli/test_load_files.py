@@ -80,9 +80,8 @@ def test_loads_of_a_file_without_a_fit_are_refused_despite_yes(rig: Bench, daemo
     ended = daemon.fishctl("calibrate", "force", "--loads", str(measured), "--yes")
     assert ended.returncode == 1
     assert "errors [mN]" in ended.stdout
-    assert re.fullmatch(
-        r"fishctl: the voltages do not follow .* measure load \d again.*\n", ended.stderr
-    )
+    doubt = r"fishctl: the voltages do not follow the loads: .* measure load \d again.*\n"
+    assert re.fullmatch(doubt, ended.stderr)
     assert rig.files("force") == []
 
 

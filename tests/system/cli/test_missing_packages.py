@@ -93,9 +93,7 @@ def test_a_package_that_is_there_but_broken_is_not_called_missing() -> None:
 
 
 @pytest.mark.parametrize("missing", [["torch"], ["torch", "gymnasium", "stable_baselines3"]])
-def test_training_without_the_extra_names_it_in_one_line(
-    tmp_path: Path, missing: list[str]
-) -> None:
+def test_training_without_the_extra_names_it_in_a_line(tmp_path: Path, missing: list[str]) -> None:
     env = environment_without(tmp_path, *missing)
     done = call(FISHCTL, "learn", "ppo", "--folder", tmp_path / "run", env=env)
     assert done.returncode == 1

@@ -65,9 +65,8 @@ def test_the_file_of_the_service_is_used_by_default(pi: Bench, other_program: pi
 def test_a_failed_output_is_no_failure_of_a_release(pi: Bench, other_program: pigpio.pi) -> None:
     command = ["sh", "-c", '"$@" >/dev/full', "sh", FISHCTL, "release", *pi.settings]
     ended = call(*command, env=os.environ | {"FISHD_CONFIG": ""})
-    message = (
-        "pulses were on: neutral, then off; the output cannot be written: No space left on device"
-    )
+    problem = "the output cannot be written: No space left on device"
+    message = f"pulses were on: neutral, then off; {problem}"
     assert (ended.returncode, ended.stderr) == (0, f"fishctl: {message}\n")
     assert pi.pi.widths()[-3:] == [1750, 1500, 0]
 

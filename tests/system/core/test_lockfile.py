@@ -115,9 +115,7 @@ def test_a_lock_of_another_user_counts_where_all_share_or_the_folder_is_his(tmp_
 
 
 @pytest.mark.parametrize("text", [b"\x1b[31m1", b"1 2", b"9" * 10_000, b""])
-def test_a_pid_that_is_none_is_unknown(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: bytes
-) -> None:
+def test_bad_pid_is_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: bytes) -> None:
     path = tmp_path / "control"
     # The kernel reports none
     monkeypatch.setattr("fishd.core.process.lockfile._KERNEL_LOCKS", tmp_path / "nowhere")

@@ -108,10 +108,8 @@ def test_a_planted_folder_hides_no_service(shared: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(session))
     with user(OTHER_USER):
         session.mkdir()
-    with (
-        Listener(run / "fishd" / "control", USER),
-        Listener(session / "fishd" / "control", OTHER_USER),
-    ):
+    sockets = [folder / "fishd" / "control" for folder in (run, session)]
+    with Listener(sockets[0], USER), Listener(sockets[1], OTHER_USER):
         assert addresses.find_control_address() == f"ipc://{run}/fishd/control"
         with Fish(timeout=0.2) as fish, pytest.raises(NoDaemon, match="no answer within"):
             fish.status()  # the service was asked

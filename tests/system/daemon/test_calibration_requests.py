@@ -81,9 +81,7 @@ def test_a_tare_takes_the_present_force_away_and_keeps_the_rest(rig: LockstepRig
 
 
 @pytest.mark.parametrize("kind", ["lateral_force", "observer"])
-def test_after_a_tare_swing_beats_as_if_the_zero_had_always_been_there(
-    tmp_path: Path, kind: str
-) -> None:
+def test_after_a_tare_swing_beats_as_if_it_was_always_zero(tmp_path: Path, kind: str) -> None:
     beats = []
     for zero in (0.0, 0.9):
         overrides = (f"virtual_pi.zero_y={zero}", f"estimator.kind={kind}")
@@ -244,9 +242,7 @@ def test_nothing_is_measured_or_calibrated_while_the_fish_swims(rig: LockstepRig
         assert refusal.value.code == "running"
 
 
-def test_a_calibration_that_cannot_be_written_is_not_in_force(
-    rig: LockstepRig, tmp_path: Path
-) -> None:
+def test_a_calibration_that_is_unwritten_is_not_in_force(rig: LockstepRig, tmp_path: Path) -> None:
     folder = state_folder(rig.config)
     folder.parent.mkdir(parents=True, exist_ok=True)
     handler = calibration_requests(rig)

@@ -108,9 +108,8 @@ def test_a_second_experiment_is_refused_unless_it_takes_the_fish(tmp_path: Path)
         assert (await client.ask("status")).lease.name == "optimise"
         state = await client.ask("end-lease", lease=grant.lease)
         assert (state.mode, state.previous_holder) == ("idle", None)
-        kinds = [
-            event.data["lease"] for event in client.rig.recorder.events if "lease" in event.data
-        ]
+        events = client.rig.recorder.events
+        kinds = [event.data["lease"] for event in events if "lease" in event.data]
         assert kinds == ["taken", "lost", "taken", "returned"]
 
     run_story(tmp_path, story)

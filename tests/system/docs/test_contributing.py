@@ -35,9 +35,8 @@ def replace_lines(source: str, old: list[str], new: list[str]) -> str:
     match = re.search(rf"^( *){re.escape(old[0].lstrip())}$", source, re.MULTILINE)
     assert match, old[0]
     indent = " " * (len(match[1]) - len(old[0]) + len(old[0].lstrip()))
-    before, after = (
-        "\n".join(f"{indent}{line}".rstrip() for line in lines) for lines in (old, new)
-    )
+    indented = ([f"{indent}{line}".rstrip() for line in lines] for lines in (old, new))
+    before, after = ("\n".join(lines) for lines in indented)
     assert source.count(before) == 1
     return source.replace(before, after)
 

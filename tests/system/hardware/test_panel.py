@@ -141,9 +141,7 @@ def count_flashes(levels: list[int]) -> int:
 
 
 @pytest.mark.parametrize("tick", [0.01, 0.2])
-def test_the_light_flashes_each_second_in_idle(
-    pins: Pins, panel: RpiGpioPanel, tick: float
-) -> None:
+def test_the_light_flashes_each_second_idle(pins: Pins, panel: RpiGpioPanel, tick: float) -> None:
     levels = record_light(pins, panel, "idle", tick, 10.0)
     assert count_flashes(levels) == 10
     assert sum(levels) == pytest.approx(0.2 * len(levels), abs=0.05 * len(levels))

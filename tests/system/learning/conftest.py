@@ -69,6 +69,5 @@ def by_sight(tmp_path_factory: pytest.TempPathFactory) -> "Outcome":
     from fishd.learning.settings import EvaluationSettings
 
     evaluation = EvaluationSettings(seconds=6.0, settle=2.0)
-    return trained_once(
-        tmp_path_factory, "by-sight", see="camera", steps=1024, evaluation=evaluation
-    )
+    brief = {"steps": 1024, "evaluation": evaluation}
+    return trained_once(tmp_path_factory, "by-sight", see="camera", **brief)

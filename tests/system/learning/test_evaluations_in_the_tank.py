@@ -350,9 +350,7 @@ def test_a_fish_lost_in_an_evaluation_loses_nothing(tmp_path: Path, beating: lis
     assert (again.ended, again.steps) == ("finished", 192)
 
 
-def test_the_initial_policy_of_a_training_may_stay_the_best(
-    tmp_path: Path, beating: list[Policy]
-) -> None:
+def test_the_initial_policy_may_stay_the_best(tmp_path: Path, beating: list[Policy]) -> None:
     job = on_robot(tmp_path / "parent", steps=64)
     first = Training(job, Resting(job), Display(), lambda: False).run()
     beating[:] = [square(5), square(6)]
@@ -368,9 +366,8 @@ def test_a_fishd_in_lockstep_gives_the_same_evaluations_as_a_simulation(tmp_path
     here = on_robot(tmp_path / "here", **changes)
     Training(here, SimulatedLink(here.config), Display(), lambda: False).run()
     agent = f"start.parameters.agent=ipc://{tmp_path}/agent"
-    with running(
-        tmp_path, *sets("lockstep=true", "start.controller=remote", agent, *NOISY)
-    ) as daemon:
+    started = sets("lockstep=true", "start.controller=remote", agent, *NOISY)
+    with running(tmp_path, *started) as daemon:
         there = on_robot(tmp_path / "there", **changes)
         train(replace(there, endpoint=daemon.endpoint))
         with Fish(daemon.endpoint) as fish:

@@ -119,9 +119,7 @@ def test_a_mirrored_picture_gets_the_mirrored_action(extractor: str) -> None:
     assert all(abs(action - following) > 1e-4 for action, following in pairwise(actions))
 
 
-def test_a_file_with_another_eye_is_not_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_eye_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     card, policy, perception = randomly_excited(settings_of("cnn"))
     make_sight = exporting._make_sight
 

@@ -151,9 +151,7 @@ def test_an_eye_with_the_constants_of_another_sees_the_same(kind: str) -> None:
     "change",
     [lambda constants: constants.pop("zero"), lambda constants: constants.update(more=np.zeros(3))],
 )
-def test_constants_of_another_kind_of_eye_are_refused(
-    change: Callable[[dict[str, object]], None],
-) -> None:
+def test_constants_of_another_eye_are_refused(change: Callable[[dict[str, object]], None]) -> None:
     constants: dict[str, object] = {"patterns": np.zeros((4, 84 * 84)), "zero": np.zeros(4)}
     change(constants)
     with pytest.raises(ValueError, match="constants of shapes"):

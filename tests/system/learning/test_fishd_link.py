@@ -234,9 +234,7 @@ def test_another_active_agent_is_named(env: SwimEnv, fish: Fish, tmp_path: Path)
 
 
 @pytest.mark.realtime
-def test_a_fault_ends_control_with_the_reason_of_fishd_until_it_is_cleared(
-    env: SwimEnv, fish: Fish
-) -> None:
+def test_a_fault_ends_control_with_its_reason_until_it_is_cleared(env: SwimEnv, fish: Fish) -> None:
     fish.set_parameters(misses=DEFAULT_MISSES)
     while fish.status().mode != "fault":
         time.sleep(0.02)  # the agent does not answer

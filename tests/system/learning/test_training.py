@@ -384,9 +384,7 @@ def test_a_run_that_diverges_stores_no_broken_policy(tmp_path: Path) -> None:
     assert all(bool(v.isfinite().all()) for v in parameters(outcome.checkpoint).values())
 
 
-def test_another_run_can_begin_with_its_networks(
-    tmp_path: Path, brief: tuple[Job, Outcome]
-) -> None:
+def test_another_run_may_begin_with_its_nets(tmp_path: Path, brief: tuple[Job, Outcome]) -> None:
     parent = brief[1].checkpoint
     assert parent
     job = brief_job(tmp_path / "second", parent=parent, seed=5)

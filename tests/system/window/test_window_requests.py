@@ -136,9 +136,7 @@ def test_a_wrong_request_is_answered_with_its_mistake(
         ("/api/runs/..%2f..%2fetc/plot.png", 409, "job"),
     ],
 )
-def test_a_wrong_path_is_answered_in_json(
-    window: WindowProcess, path: str, status: int, code: str
-) -> None:
+def test_wrong_paths_get_json(window: WindowProcess, path: str, status: int, code: str) -> None:
     async def test() -> None:
         async with Browser(window.url) as browser:
             assert await browser.refusal(path) == (status, code)

@@ -39,17 +39,11 @@ def test_no_topic_begins_like_another() -> None:
         ([b"frame", b"{}"], "a message of topic frame has 3 parts, not 2"),
         ([b"until", b"nonsense"], "a message of topic until that cannot be read"),
         ([b"until", b'{"v":3}'], "in version 3; version 2 is needed"),
-        (
-            [*messages.encode_frame(HEADER, PIXELS)[:2], b"short"],
-            "a frame of 4 x 3 px has 12 bytes, not 5",
-        ),
+        ([*messages.encode_frame(HEADER, PIXELS)[:2], b"short"], "4 x 3 px has 12 bytes, not 5"),
         ([b"frame", b'{"v":2,"width":100000}', b""], "cannot be read"),
         (messages.encode_frame(replace(HEADER, time=1e300, available=1e300), PIXELS), "`$.time`"),
         (messages.encode_frame(replace(HEADER, available=-1e300), PIXELS), "`$.available`"),
-        (
-            messages.encode_frame(replace(HEADER, time=1e6), PIXELS),
-            "a frame was available 999998 s before its exposure",
-        ),
+        (messages.encode_frame(replace(HEADER, time=1e6), PIXELS), "999998 s before its exposure"),
         (messages.encode_until(Until(session="s", until=1e300)), "`$.until`"),
     ],
 )

@@ -105,9 +105,8 @@ def test_all_verbs_have_one_vocabulary() -> None:
                 assert isinstance(parameter.type, click.Choice)
                 assert list(parameter.type.choices) == ["live", "simulation"]
     for verb in EXPERIMENTS:
-        assert {"--on", "--config", "--endpoint", "--take", "--folder"} <= options(known[verb]), (
-            verb
-        )
+        shared = {"--on", "--config", "--endpoint", "--take", "--folder"}
+        assert shared <= options(known[verb]), verb
 
 
 @pytest.mark.parametrize("word", ["help", "list", "start", "run", "swim"])

@@ -13,9 +13,7 @@ from rigs.processes import fishctl, one_line
     "override", ["camera.feature_extractor=cnn", "ppo.n_steps=64", "see=camera"]
 )
 @pytest.mark.parametrize("verb", [("learn", "ppo"), ("compare", "swing")])
-def test_for_a_setting_of_a_training_the_message_names_its_file(
-    verb: tuple[str, ...], override: str
-) -> None:
+def test_a_message_on_a_training_names_its_file(verb: tuple[str, ...], override: str) -> None:
     done = fishctl(*verb, "--set", override)
     name = override.partition("=")[0].partition(".")[0]
     assert done.returncode == 78

@@ -86,11 +86,8 @@ def test_control_characters_of_a_file_do_not_reach_the_terminal(policy_folder: P
     provenance = replace(PROVENANCE, on="\x1b[2Jrobot" + "x" * 10_000, note="\x1b]0;title\x07")
     hostile_card = replace(card(), provenance=replace(provenance, steps=10**50))
     write(policy_folder, to_onnx(linear(1.0), "tanh", hostile_card), "evil")
-    for done in (
-        invoke("policies"),
-        invoke("policies", "show", "evil"),
-        invoke("policies", "--json"),
-    ):
+    commands = (("policies",), ("policies", "show", "evil"), ("policies", "--json"))
+    for done in (invoke(*words) for words in commands):
         assert done.exit_code == 0
         assert "robot" in done.stdout
         assert "\x1b" not in done.stdout
@@ -102,10 +99,8 @@ def test_a_policy_can_be_simulated_by_name_and_by_a_relative_path(
 ) -> None:
     path = write(policy_folder, FLIP, "flip")
     monkeypatch.chdir(policy_folder)
-    for given, shown in (
-        ("flip", "flip until 1.95 s, then swing;"),
-        ("flip.onnx", f"{path} until"),
-    ):
+    named = f"{path} until"
+    for given, shown in (("flip", "flip until 1.95 s, then swing;"), ("flip.onnx", named)):
         done = invoke("simulate", "ppo", "--policy", given, "--seconds", "2", "--settle", "1")
         assert f"ppo policy={shown}" in done.stdout
 

@@ -59,9 +59,7 @@ def test_midlines_are_drawn_from_a_saved_swim(swum: Path, tmp_path: Path) -> Non
         (["midlines", "wake.webp"], "not an NPZ file"),
     ],
 )
-def test_what_cannot_be_drawn_is_one_line(
-    swum: Path, tmp_path: Path, words: list[str], named: str
-) -> None:
+def test_nothing_to_draw_is_told(swum: Path, tmp_path: Path, words: list[str], named: str) -> None:
     verb, file, *rest = words
     line = one_line(fishctl("swimmer", verb, str(swum / file), *rest, "--to", str(tmp_path)))
     assert named in line

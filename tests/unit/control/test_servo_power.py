@@ -50,9 +50,7 @@ def test_without_a_power_meter_there_is_no_power_and_no_trouble() -> None:
 
 
 @pytest.mark.parametrize("failing", [broken, lambda now: float("nan"), lambda now: 1 / 0])
-def test_a_power_meter_that_fails_is_one_event_and_no_fault(
-    failing: Callable[[float], float],
-) -> None:
+def test_a_power_meter_that_fails_is_an_event_only(failing: Callable[[float], float]) -> None:
     rig, robot = fragile_rig(kind=Metered)
     rig.start("square", frequency=2)
     rig.run(5)

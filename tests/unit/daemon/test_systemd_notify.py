@@ -50,9 +50,7 @@ def test_without_ticks_the_watchdog_gets_nothing(systemd: socket.socket) -> None
     notifier.close()
 
 
-def test_a_watchdog_of_others_is_not_fed(
-    systemd: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_others_watchdog_is_unfed(systemd: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WATCHDOG_PID", "1")
     notifier = SystemdNotifier()
     for index in range(1, 100):

@@ -226,8 +226,7 @@ def test_installing_lists_all_files_and_groups_that_come_onto_a_pi() -> None:
     files = re.findall(r"(?m)^\w*CONFIG=(\S+)|^ +\"\S+ (/\S+)\"$", layout)
     wanted = {f"`{name or path}`" for name, path in files}
     assert len(wanted) > 10
-    wanted |= {
-        f"`/usr/local/bin/{name}`" for name in ("fishd", "fishctl", "fishd-camera", "fishd-window")
-    }
+    programs = ("fishd", "fishctl", "fishd-camera", "fishd-window")
+    wanted |= {f"`/usr/local/bin/{name}`" for name in programs}
     wanted |= set(re.findall(r"(?m)^m fishd (\w+)$", users))
     assert {name for name in wanted if name not in table} == set()

@@ -30,9 +30,7 @@ def test_the_last_one_that_was_saved_is_in_force_with_its_date(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("step_back", [0 * HOUR, 1 * HOUR, 24 * 365 * HOUR])
-def test_a_clock_gone_back_puts_no_older_one_in_force(
-    tmp_path: Path, step_back: datetime.timedelta
-) -> None:
+def test_a_clock_gone_back_brings_no_older(tmp_path: Path, step_back: datetime.timedelta) -> None:
     folder = CalibrationFolder(tmp_path)
     for number in range(1, 5):
         folder.save(ForceCalibration(xx=float(number)), NOON - (number > 1) * step_back)

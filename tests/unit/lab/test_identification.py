@@ -190,10 +190,8 @@ def test_the_interval_of_an_offset_knows_the_mean_drift(seed: int, seconds: floa
 
 @pytest.mark.parametrize("seconds", [5.0, math.nan, math.inf])
 def test_an_experiment_takes_half_a_minute_or_more_and_ends(seconds: float) -> None:
-    with (
-        VirtualSession(load()) as rig,
-        pytest.raises(ParameterError, match="30 s or more are needed"),
-    ):
+    short = pytest.raises(ParameterError, match="30 s or more are needed")
+    with VirtualSession(load()) as rig, short:
         experiment(rig, seconds)
 
 
@@ -296,9 +294,7 @@ def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
         (lambda t: t.assign(servo_on=False), "there is no passage of 5 s without a gap"),
     ],
 )
-def test_a_table_with_nothing_to_fit_is_refused(
-    table: pd.DataFrame, spoil: object, complaint: str
-) -> None:
+def test_nothing_to_fit_is_refused(table: pd.DataFrame, spoil: object, complaint: str) -> None:
     with pytest.raises(Unidentifiable, match=complaint):
         identify(spoil(table))  # type: ignore[operator]
 

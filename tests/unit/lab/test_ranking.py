@@ -55,9 +55,8 @@ def test_the_best_gait_is_left_out_in_no_more_than_five_percent_of_cases(freedom
         else:
             runs = generator.normal(true, sigma, (3, 4))
             means, ci95 = runs.mean(axis=0), 4.303 * runs.std(axis=0, ddof=1) / math.sqrt(3.0)
-        candidates = [
-            Candidate(str(k), float(means[k]), float(ci95[k]), 0, freedom) for k in range(4)
-        ]
+        numbers = enumerate(zip(means, ci95, strict=True))
+        candidates = [Candidate(str(k), *map(float, both), 0, freedom) for k, both in numbers]
         lost += "0" not in {candidate.name for candidate in rank(candidates).undecided}
     assert lost <= 50
 

@@ -38,9 +38,8 @@ def frames(ticks: list[Tick]) -> list[Frame]:
 
 def head(frame: Frame, seq: int, session: str = "one", dropped: int = 0) -> FrameHead:
     exposure = 0.01 if seq % 2 else None  # optional
-    return FrameHead(
-        UNIX + frame.time, frame.time, frame.available, seq, session, exposure, dropped
-    )
+    times = (UNIX + frame.time, frame.time, frame.available)
+    return FrameHead(*times, seq, session, exposure, dropped)
 
 
 def write(path: Path, ticks: list[Tick], frames: list[Frame], *, close: bool = True) -> Path:

@@ -65,10 +65,8 @@ def test_an_older_recording_is_never_overwritten(tmp_path: Path) -> None:
     before = path.read_bytes()
     with pytest.raises(RecordingError, match="already exists; choose another name"):
         RunWriter(path)
-    with (
-        RunWriter(tmp_path / "other"),
-        pytest.raises(RecordingError, match="in progress or not finished"),
-    ):
+    unfinished = pytest.raises(RecordingError, match="in progress or not finished")
+    with RunWriter(tmp_path / "other"), unfinished:
         RunWriter(tmp_path / "other")
     assert path.read_bytes() == before
 

@@ -102,9 +102,7 @@ def test_only_whole_beats_are_counted() -> None:
     ("waveform", "fullness", "form_factor"),
     [("square", 1.0, 1.0), ("sine", 2.0 / math.pi, 0.9003), ("triangle", 0.5, 0.8660)],
 )
-def test_fullness_and_form_factor_of_waveforms(
-    waveform: str, fullness: float, form_factor: float
-) -> None:
+def test_fullness_and_form_of_waves(waveform: str, fullness: float, form_factor: float) -> None:
     amplitude = 0.3
     wave = {"frequency": 1.0, "amplitude": amplitude}
     report = simulate(load(None, ["tick=0.005"]), waveform, wave, 14)

@@ -186,10 +186,7 @@ def test_a_second_agent_at_an_ipc_address_is_refused_and_the_first_goes_on(agent
     ("address", "complaint"),
     [
         ("tcp://127.0.0.1:99999", "99999 is not a port, 65535 is the highest"),
-        (
-            "ipc:///nowhere/agent",
-            "choose an address in a folder that exists and that you may write to",
-        ),
+        ("ipc:///nowhere/agent", "choose an address in a folder that exists and that you may"),
         ("tcp://nowhere.invalid:*", "No such device"),
     ],
 )

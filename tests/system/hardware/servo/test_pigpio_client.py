@@ -66,10 +66,8 @@ def test_an_answer_that_breaks_off_is_an_error(answer: bytes, dies: bool, messag
 
 
 def test_a_host_that_is_none_is_one_line_too() -> None:
-    with (
-        pytest.raises(ServoError, match=r"^pigpiod at a..b:8888: [^\n]+$"),
-        open_client("a..b", 8888),
-    ):
+    problem = r"^pigpiod at a..b:8888: [^\n]+$"
+    with pytest.raises(ServoError, match=problem), open_client("a..b", 8888):
         pass
 
 

@@ -73,9 +73,7 @@ def test_ending_software_pwm_cuts_the_pulse_under_way(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("off", [("hardware_PWM", GPIO, 0, 0), ("set_servo_pulsewidth", GPIO, 0)])
-def test_hardware_pwm_sends_duty_times_period_till_its_end(
-    bench: Bench, off: tuple[str, int]
-) -> None:
+def test_hardware_pwm_sends_duty_times_period_to_end(bench: Bench, off: tuple[str, int]) -> None:
     for width in (1500, 1600):
         bench.pi.hardware_PWM(GPIO, 333, 333 * width)
         assert bench.pi.get_PWM_dutycycle(GPIO) == 333 * width

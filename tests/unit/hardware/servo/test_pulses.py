@@ -127,9 +127,7 @@ def test_an_angle_is_a_permitted_pulse_or_refused(servo: ServoSettings, angle: f
 
 
 @given(servos, st.floats(0, 1), st.floats(0, 1))
-def test_a_larger_angle_turns_further_that_way(
-    servo: ServoSettings, share_1: float, share_2: float
-) -> None:
+def test_a_larger_angle_turns_further(servo: ServoSettings, share_1: float, share_2: float) -> None:
     lowest, highest = reach(servo)
     if lowest > highest:  # centre and trim permit no pulse
         return

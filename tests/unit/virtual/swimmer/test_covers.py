@@ -18,9 +18,8 @@ def bar(
     direction = np.array([np.cos(angle), np.sin(angle)])
     places: Array = along[:, None] * direction + np.array([0.0, y])
     thick = np.full(len(along), half)
-    return paint(
-        places, np.full(len(along), angle), thick, 0.0 * thick, 0.5 * H, H, PX, PY, clamped
-    )
+    angles = np.full(len(along), angle)
+    return paint(places, angles, thick, 0.0 * thick, 0.5 * H, H, PX, PY, clamped)
 
 
 @pytest.mark.parametrize("half", [2e-4, 4e-3])

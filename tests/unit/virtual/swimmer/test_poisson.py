@@ -19,9 +19,7 @@ def laplacian(grid: Grid, phi: Array) -> Array:
 
 @pytest.mark.parametrize("middle", [0.5, 0.4])
 @pytest.mark.parametrize("cell", [0.02, 0.021])
-def test_what_it_solves_is_solved_to_rounding_on_a_stretched_grid(
-    middle: float, cell: float
-) -> None:
+def test_it_solves_to_rounding_on_a_stretched_grid(middle: float, cell: float) -> None:
     fine = middle - 0.1, middle + 0.1
     grid = Grid(edges(0.0, 2.0, (0.8, 1.2), 0.02, 1.1), edges(0.0, 1.0, fine, cell, 1.1))
     phi = np.random.default_rng(1).normal(size=(grid.nx, grid.ny))
