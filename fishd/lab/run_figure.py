@@ -1,4 +1,4 @@
-"""Figure of a recording: forces, command, thrust, controller quantities, phase portrait."""
+"""Figure of a recording: forces, command, thrust, controller quantities, and its last beats."""
 
 import os
 from typing import TYPE_CHECKING
@@ -13,6 +13,8 @@ from fishd.lab.run_traces import (
     PORTRAIT_S,
     Traces,
     limits,
+    mean_beat,
+    spectrum,
 )
 
 if TYPE_CHECKING:
@@ -48,9 +50,10 @@ def draw_run(traces: Traces, path: str | os.PathLike[str]) -> None:
         for axis in axes:
             _events(axis, traces, named=axis is axes[0])
         if traces.portrait:
-            right = figure.add_subfigure(grid[1])
-            portrait_axis = right.add_subplot(right.add_gridspec(panels, 1)[:2])
-            _portrait(portrait_axis, traces, traces.portrait)
+            portrait, spectral, beat = figure.add_subfigure(grid[1]).subplots(3, 1)
+            _portrait(portrait, traces, traces.portrait)
+            _spectrum(spectral, traces, traces.portrait)
+            _mean_beat(beat, traces, traces.portrait)
 
 
 def _forces(axis: "Axes", traces: Traces) -> None:
@@ -144,6 +147,28 @@ def _portrait(axis: "Axes", traces: Traces, samples: slice) -> None:
     axis.axvline(0.0, color="0.85", linewidth=0.6)
     axis.plot(x[samples], y[samples], color=GREEN, linewidth=0.7, marker=".")
     axis.set_title(f"phase portrait, last {PORTRAIT_S:g} s")
+
+
+def _spectrum(axis: "Axes", traces: Traces, samples: slice) -> None:
+    if spectral := spectrum(traces, samples):
+        axis.plot(spectral.frequency, spectral.fy, color=ORANGE, linewidth=0.9, label="$F_y$")
+        axis.plot(spectral.frequency, spectral.fx, color=BLUE, linewidth=0.9, label="$F_x$")
+        _legend(axis)
+    axis.set_xlabel("frequency (Hz)")
+    axis.set_ylabel(f"amplitude ({traces.unit})")
+    axis.set_title("spectrum of the forces")
+
+
+def _mean_beat(axis: "Axes", traces: Traces, samples: slice) -> None:
+    axis.axhline(0.0, color="0.85", linewidth=0.6)
+    if beat := mean_beat(traces, samples):
+        axis.plot(beat.phase, beat.fy, color=ORANGE, linewidth=0.9, marker=".", label="$F_y$")
+        axis.plot(beat.phase, beat.fx, color=BLUE, linewidth=0.9, marker=".", label="$F_x$")
+        _legend(axis)
+    axis.set_xlim(0.0, 1.0)
+    axis.set_xlabel("phase of the beat")
+    axis.set_ylabel(f"force ({traces.unit})")
+    axis.set_title("mean beat")
 
 
 def _escape_texts(traces: Traces) -> Traces:

@@ -19,6 +19,8 @@ from fishd.recording import Run
 
 PORTRAIT_S = 20.0
 """Length of the phase portrait, at the end of the latest swim [s]."""
+MIN_SPECTRUM_S, MIN_SPECTRUM_TICKS = 2.0, 16
+"""Shortest part of a swim that has a spectrum [s, ticks]."""
 MIN_FORCE_SPAN, MIN_ANGLE_SPAN, MIN_QUANTITY_SPAN = 1.0, 0.1, 1e-3
 """Shortest spans of axes, so that rounding errors do not look like signals [mN or mV, rad, any]."""
 SHOWN_EVENTS = ("mark", "controller", "parameters", "fallback", "fault", "calibration")
@@ -74,7 +76,7 @@ class Traces(NamedTuple):
     alpha_rate: Array | None
     """True fin angle and its rate [rad, rad/s]; None for a real fish."""
     quantities: dict[str, Array]
-    """Quantities of the controller by name and unit, as in `since_reversal (s)`."""
+    """Quantities of the controller by name and unit, as in `since_reversal (s)` or `phase`."""
     portrait: slice | None
     """Samples of the phase portrait; None where no controller swam."""
     events: list[EventLabel]
@@ -127,12 +129,76 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         alpha=column("alpha") if simulated else None,
         alpha_rate=column("alpha_rate") if simulated else None,
         quantities={
-            f"{text.line(name, MAX_NAME_CHARS)} ({units.get(name, '1')})": quantity(name)
+            _label_quantity(name, units.get(name, "1")): quantity(name)
             for name in list(names)[:MAX_QUANTITIES]
         },
         portrait=_portrait(time, swims),
         events=events[:MAX_EVENTS],
     )
+
+
+class Spectrum(NamedTuple):
+    """Amplitudes of the forces over frequency."""
+
+    frequency: Array
+    """Frequency, without zero [Hz]."""
+    fx: Array
+    """Amplitude of F_x [unit of the forces]."""
+    fy: Array
+    """Amplitude of F_y [unit of the forces]."""
+
+
+def spectrum(traces: Traces, samples: slice) -> Spectrum | None:
+    """Return the spectrum of the forces after the last gap; None where fewer than 2 s are left."""
+    time, _, fx, fy = _after_last_gap(traces, samples)
+    if len(time) < MIN_SPECTRUM_TICKS or time[-1] - time[0] < MIN_SPECTRUM_S:
+        return None
+    window = np.hanning(len(time))
+
+    def amplitudes(force: Array) -> Array:
+        folded: Array = np.abs(np.fft.rfft(window * (force - force.mean())))
+        return folded[1:] * (2.0 / float(window.sum()))
+
+    step = (time[-1] - time[0]) / (len(time) - 1)
+    return Spectrum(np.fft.rfftfreq(len(time), step)[1:], amplitudes(fx), amplitudes(fy))
+
+
+class MeanBeat(NamedTuple):
+    """Means of the forces over the beats of the tail."""
+
+    phase: Array
+    """Phase of the beat, from 0, where φ_c becomes positive, to 1."""
+    fx: Array
+    """F_x [unit of the forces]."""
+    fy: Array
+    """F_y [unit of the forces]."""
+
+
+def mean_beat(traces: Traces, samples: slice) -> MeanBeat | None:
+    """Return the mean beat after the last gap; None where there are fewer than two beats."""
+    time, phi_c, *forces = _after_last_gap(traces, samples)
+    starts = time[1:][(phi_c[:-1] <= 0.0) & (phi_c[1:] > 0.0)]
+    if len(starts) < 3:
+        return None
+    counted = (time >= starts[0]) & (time < starts[-1])
+    beat = np.searchsorted(starts, time[counted], side="right") - 1
+    phase = (time[counted] - starts[beat]) / np.diff(starts)[beat]
+    bins = round(counted.sum() / (len(starts) - 1))
+    place = np.round(phase * bins).astype(int) % bins
+    ticks = np.bincount(place, minlength=bins)
+    filled = ticks > 0
+    fx, fy = (np.bincount(place, force[counted], bins)[filled] / ticks[filled] for force in forces)
+    return MeanBeat(np.flatnonzero(filled) / bins, fx, fy)
+
+
+def _after_last_gap(traces: Traces, samples: slice) -> tuple[Array, Array, Array, Array]:
+    """Return time, φ_c, F_x and F_y of the samples after their last gap."""
+    gaps = np.flatnonzero(np.isnan(traces.fx[samples]))
+    first = int(gaps[-1]) + 1 if len(gaps) else 0
+    time, phi_c, fx, fy = (
+        column[samples][first:] for column in (traces.time, traces.phi_c, traces.fx, traces.fy)
+    )
+    return time, phi_c, fx, fy
 
 
 def limits(least: float, *curves: Array) -> tuple[float, float]:
@@ -159,6 +225,11 @@ def _portrait(time: Array, swims: list[int]) -> slice | None:
         return None
     last = swims[-1]
     return slice(int(np.searchsorted(time, time[last] - PORTRAIT_S)), last + 1)
+
+
+def _label_quantity(name: str, unit: str) -> str:
+    label = text.line(name, MAX_NAME_CHARS)
+    return label if unit == "1" else f"{label} ({unit})"
 
 
 def _units(controllers: Iterable[str]) -> dict[str, str]:

@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pandas
 import pyarrow.parquet
 import pytest
@@ -13,7 +14,7 @@ from rigs.recordings import record_run, swum, write
 
 from fishd.lab.run_figure import draw_run
 from fishd.lab.run_page import write_page
-from fishd.lab.run_traces import MIN_FORCE_SPAN, limits, traces
+from fishd.lab.run_traces import MIN_FORCE_SPAN, limits, mean_beat, spectrum, traces
 from fishd.recording import open_run
 
 
@@ -78,7 +79,25 @@ def test_a_curve_has_breaks_and_events_and_units_are_said(path: Path, tmp_path: 
     assert [index for index, value in enumerate(drawn.fx) if value != value] == [20]
     expected = ["swing C=0.6 longest_half_period=1 s lead=0 s", "C=0.3"]
     assert [event.text for event in traces(open_run(path)).events] == expected
-    assert list(drawn.quantities) == ["top_speed (1)", "reversal_speed (1)", "since_reversal (s)"]
+    assert list(drawn.quantities) == ["top_speed", "reversal_speed", "since_reversal (s)"]
+
+
+def test_spectrum_and_mean_beat_of_a_swim_show_its_frequency_and_no_gap(tmp_path: Path) -> None:
+    rig = Rig("simulation.noise=0").start("square", frequency=1.25, amplitude=0.4)
+    rig.run_for(12)
+    ticks = rig.recorder.ticks
+    drawn = traces(open_run(write(tmp_path / "run", ticks[:60] + ticks[80:])))
+    assert drawn.portrait
+    spectral, beat = spectrum(drawn, drawn.portrait), mean_beat(drawn, drawn.portrait)
+    assert spectral
+    assert beat
+    assert spectral.frequency[spectral.fy.argmax()] == pytest.approx(1.25, abs=0.06)
+    assert spectral.fy.max() == pytest.approx(np.abs(np.fft.rfft(beat.fy)[1]) / 8, rel=0.02)
+    assert list(beat.phase * 16) == list(range(16))
+    half = np.roll(beat.fy, 8)
+    assert np.abs(beat.fy + half).max() < 0.02 * np.ptp(beat.fy)  # both strokes are alike
+    assert spectrum(drawn, slice(0, 20)) is None
+    assert mean_beat(drawn, slice(0, 20)) is None
 
 
 def test_a_resting_fish_has_no_phase_portrait_and_dust_is_not_blown_up(tmp_path: Path) -> None:
