@@ -23,6 +23,7 @@ from fishd.core.errors import FishdError, NoDaemon, ParameterError, Refused
 from fishd.window import web_server
 from fishd.window.devices import Device, DeviceError, Devices, Scope
 from fishd.window.fish_link import Busy, FishLink
+from fishd.window.foxglove import PROTOCOL, FoxglovePage
 from fishd.window.jobs import DRIVING_KINDS, KINDS, Job, JobError, Jobs
 from fishd.window.live import Driver, LivePage, encode, encode_message
 from fishd.window.settings import WindowSettings
@@ -147,12 +148,14 @@ class Window(WebServer):
         }
         self._jobs = Jobs(settings.runs_folder, self._tell_job)
         self._pages: set[LivePage] = set()
+        self._session = secrets.token_hex(4)
         self._drivers: dict[str, Driver] = {}
         self._tasks: list[asyncio.Task[None]] = []
         host, port = settings.address
         routes = [
             *file_routes(resources.files(__package__).joinpath("page"), "index.html"),
             web.get("/live", self._live),
+            web.get("/foxglove", self._serve_foxglove),
             web.get("/api/session", self._get_session),
             web.post("/api/pair", self._pair),
             web.post("/api/unpair", self._unpair),
@@ -174,6 +177,7 @@ class Window(WebServer):
             routes,
             names=settings.names,
             middlewares=[_answer_in_json],
+            readers={"/foxglove": frozenset(settings.origins)},
             max_body_bytes=MAX_BODY_BYTES,
             advice="name another one with --listen",
         )
@@ -233,6 +237,17 @@ class Window(WebServer):
             return await self.serve_viewer(request, page)
         finally:
             self._pages.discard(page)
+
+    async def _serve_foxglove(self, request: web.Request) -> web.StreamResponse:
+        if self._access(request).scope is None:
+            raise web.HTTPUnauthorized(text="this device is not paired\n")
+        link = self._link(request.query.get("fish", next(iter(self._links))))
+        page = FoxglovePage(link.name, self._session)
+        link.listeners.add(page.add)
+        try:
+            return await self.serve_viewer(request, page, [PROTOCOL])
+        finally:
+            link.listeners.discard(page.add)
 
     def _hello(self, page: LivePage) -> dict[str, Any]:
         link, driver = self._links[page.fish], self._drivers.get(page.fish)

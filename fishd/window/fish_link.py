@@ -82,6 +82,8 @@ class FishLink:
         self.events: deque[bytes] = deque(maxlen=MAX_EVENTS)
         self.ticks: deque[bytes] = deque()
         """Ticks of the last `HISTORY_S`, as they came."""
+        self.listeners: set[Callable[[str, float, bytes], None]] = set()
+        """Functions that receive topic, time [s, unix] and payload of each message."""
         self._tell = tell
         self._fish = AsyncFish(endpoint)
         self._stopper = AsyncFish(endpoint)
@@ -150,18 +152,26 @@ class FishLink:
     async def _receive(self, frames: list[bytes]) -> None:
         try:
             if frames[0] == b"tick":
-                self._receive_tick(_decode_tick(frames[-1]), frames[-1])
+                tick = _decode_tick(frames[-1])
+                self._receive_tick(tick, frames[-1])
+                self._pass_on("tick", tick.t, frames[-1])
             elif frames[0] == b"event":
-                _decode_event(frames[-1])
+                event = _decode_event(frames[-1])
                 self.events.append(frames[-1])
                 self._tell("event", frames[-1])
+                self._pass_on("event", event.t, frames[-1])
             elif frames[0] == b"status":
-                await self._take_status(_decode_status(frames[-1]))
+                status = await self._take_status(_decode_status(frames[-1]))
+                self._pass_on("status", status.t, frames[-1])
         except msgspec.DecodeError as error:
             raise FishError(
                 f"the program at {self.address} is not a fishd of this version: "
                 f"{text.error_message(error)}"
             ) from None
+
+    def _pass_on(self, topic: str, t: float, payload: bytes) -> None:
+        for listener in self.listeners:
+            listener(topic, t, payload)
 
     def _receive_tick(self, tick: Tick, payload: bytes) -> None:
         now = self._last_tick = time.monotonic()

@@ -13,8 +13,9 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Awaitable, Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Set
 from importlib.resources.abc import Traversable
+from itertools import islice
 from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlsplit
@@ -75,6 +76,7 @@ class WebServer:
         *,
         names: Iterable[str] = (),
         middlewares: Iterable[Any] = (),
+        readers: Mapping[str, Set[str]] | None = None,
         max_body_bytes: int = 1024,
         advice: str = "name another port with --port",
     ) -> None:
@@ -82,12 +84,14 @@ class WebServer:
         host: address to listen at; port: 0 for any free port
         names: further host names by which this machine is reached
         middlewares: those of aiohttp that get what the guards refuse, too
+        readers: origins of other pages that may open a WebSocket, by its path
         advice: remedy where the port cannot be taken
         """
         self._host, self._port, self._advice = host, port, advice
+        self._readers = readers or {}
         self._viewers: set[Viewer] = set()
-        self._asking: dict[web.RequestHandler, str] = {}
-        """Connections that have not sent a request, oldest first, and their addresses."""
+        self._asking: dict[web.RequestHandler, tuple[str, asyncio.TimerHandle]] = {}
+        """Address and timeout of each connection that has not sent a request, oldest first."""
         self._names = {socket.gethostname().lower(), "localhost"}
         self._names |= {f"{name}.local" for name in self._names}
         self._names |= {name.lower() for name in names}
@@ -173,10 +177,9 @@ class WebServer:
         server = self._runner.server
         assert server
         address = str((transport.get_extra_info("peername") or ("",))[0])
-        asking = self._asking = {
-            handler: owner for handler, owner in self._asking.items() if handler.transport
-        }
-        owners = list(asking.values())
+        for handler in [handler for handler in self._asking if not handler.transport]:
+            self._forget(handler)
+        owners = [owner for owner, _ in self._asking.values()]
         crowded = ""
         if owners.count(address) >= MAX_ASKING_PER_ADDRESS:
             crowded = address
@@ -186,26 +189,34 @@ class WebServer:
                 transport.abort()
                 return
         if crowded:
-            self._end(next(handler for handler, owner in asking.items() if owner == crowded))
+            place = owners.index(crowded)
+            self._end(next(islice(self._asking, place, None)))
         handler = server()
-        asking[handler] = address
+        timeout = asyncio.get_running_loop().call_later(REQUEST_TIMEOUT_S, self._end, handler)
+        self._asking[handler] = address, timeout
         transport.set_protocol(handler)
         handler.connection_made(transport)
-        asyncio.get_running_loop().call_later(REQUEST_TIMEOUT_S, self._end, handler)
 
     def _end(self, handler: web.RequestHandler) -> None:
-        """End a connection unless it has sent a request."""
-        if self._asking.pop(handler, None) and isinstance(handler.transport, asyncio.Transport):
+        """End a connection that has not sent a request."""
+        self._forget(handler)
+        if isinstance(handler.transport, asyncio.Transport):
             handler.transport.abort()
+
+    def _forget(self, handler: web.RequestHandler) -> None:
+        """Count a connection no longer among those that have not sent a request."""
+        _, timeout = self._asking.pop(handler, ("", None))
+        if timeout:
+            timeout.cancel()  # it would keep the connection in memory
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        self._asking.pop(request.protocol, None)
+        self._forget(request.protocol)
         try:
             if not self._is_ours(request.host):
                 raise web.HTTPForbidden(text="this is not a name of this machine\n")
             if request.match_info.http_exception is None:
-                check_origin(request)
+                check_origin(request, self._readers.get(request.path, frozenset()))
             response = await handler(request)
         except web.HTTPException as error:
             finish(error)
@@ -327,10 +338,12 @@ def finish(response: web.StreamResponse) -> None:
     response.force_close()  # an idle connection would take the place of others
 
 
-def check_origin(request: web.Request) -> None:
+def check_origin(request: web.Request, readers: Set[str] = frozenset()) -> None:
     """Raise `HTTPForbidden` for a WebSocket or a change that a page of another origin asks for.
 
     Browsers name the origin of both. A change without an origin is refused, too.
+
+    readers: other origins that may open a WebSocket
     """
     origin = request.headers.get("Origin")
     changes = request.method not in ("GET", "HEAD")
@@ -338,6 +351,8 @@ def check_origin(request: web.Request) -> None:
         return
     if not changes and request.headers.get("Upgrade", "").lower() != "websocket":
         return  # browsers keep the answer from the other page
+    if not changes and origin in readers:
+        return
     if origin is None or _origin_host(origin) != request.host.lower():
         raise web.HTTPForbidden(text="this page has another origin\n")
 

@@ -20,15 +20,18 @@ START = "from fishd.__main__ import fishd_window; fishd_window()"
 class WindowProcess(Process):
     """Running `fishd-window`."""
 
-    def __init__(self, folder: Path, *arguments: str, changes: str = "", **fish: str) -> None:
+    def __init__(
+        self, folder: Path, *arguments: str, changes: str = "", settings: str = "", **fish: str
+    ) -> None:
         """
         folder: for paired devices and runs
         changes: Python code that runs first, such as a shorter timeout
+        settings: further lines of its settings
         fish: control sockets by the name of the fish
         """
         self.state = folder / "window"
         config = folder / "window.yaml"
-        config.write_text(f"runs: {folder}/runs\nnames: [fish.example]\n")
+        config.write_text(f"runs: {folder}/runs\nnames: [fish.example]\n{settings}\n")
         options = ("--config", str(config), "--state", str(self.state), "--listen", "127.0.0.1:0")
         pairs = [word for name, where in fish.items() for word in ("--fish", f"{name}={where}")]
         code = f"{changes}\n{START}"

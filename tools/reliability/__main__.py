@@ -7,7 +7,16 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 
 from common.report import run  # noqa: E402
 
-NAMES = ("deaths", "kills", "misbehaviour", "mutations", "odd_conditions", "soak", "systemd")
+NAMES = (
+    "deaths",
+    "kills",
+    "misbehaviour",
+    "mutations",
+    "odd_conditions",
+    "soak",
+    "systemd",
+    "window",
+)
 
 if __name__ == "__main__":
     sys.exit(run("reliability", NAMES))

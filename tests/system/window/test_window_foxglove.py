@@ -1,0 +1,133 @@
+"""Foxglove and Lichtblick read the fish, through the same guards as the page."""
+
+import json
+import struct
+from collections.abc import Iterator
+from typing import Any
+from xml.etree import ElementTree
+
+import aiohttp
+import pytest
+from rigs.documents import ROOT
+from rigs.processes import Daemon
+from rigs.window_process import Browser, WindowProcess, run, running_window
+
+from fishd.core.schema import fields_of
+from fishd.window.foxglove import CHANNELS, PROTOCOL
+
+LAYOUTS = ROOT / "config" / "layouts"
+LICHTBLICK = "http://lichtblick.example:8080"
+
+
+async def read_text(sock: aiohttp.ClientWebSocketResponse) -> dict[str, Any]:
+    message: dict[str, Any] = json.loads(await sock.receive_str())
+    return message
+
+
+def test_a_viewer_gets_the_ticks_to_which_it_subscribes(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with (
+            Browser(window.url) as browser,
+            browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock,
+        ):
+            assert sock.protocol == PROTOCOL
+            info = await read_text(sock)
+            assert (info["op"], info["capabilities"]) == ("serverInfo", [])
+            channels = {c["topic"]: c for c in (await read_text(sock))["channels"]}
+            assert set(channels) == set(CHANNELS)
+            tick = channels["tick"]
+            assert json.loads(tick["schema"])["properties"]["fx"]["type"] == "number"
+            request = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": tick["id"]}]}
+            await sock.send_str(json.dumps(request))
+            seqs = []
+            for _ in range(3):
+                data = await sock.receive_bytes()
+                opcode, number, nanoseconds = struct.unpack("<BIQ", data[:13])
+                message = json.loads(data[13:])
+                assert (opcode, number) == (1, 7)
+                assert abs(nanoseconds * 1e-9 - message["t"]) < 1e-3
+                seqs.append(message["seq"])
+            assert seqs == [seqs[0], seqs[0] + 1, seqs[0] + 2]
+
+    run(test())
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        '{"op": "setParameters", "parameters": [{"name": "x", "value": 1}]}',
+        '{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 99}]}',
+        '{"op": "subscribe", "subscriptions": 3}',
+        "[" * 500,
+    ],
+)
+def test_a_viewer_can_only_read(window: WindowProcess, message: str) -> None:
+    async def test() -> None:
+        async with (
+            Browser(window.url) as browser,
+            browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock,
+        ):
+            await read_text(sock), await read_text(sock)
+            await sock.send_str(message)
+            assert (await read_text(sock))["level"] == 1
+
+    run(test())
+
+
+def test_only_origins_of_the_settings_and_paired_devices_read(
+    daemon: Daemon, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("origins")
+    with running_window(
+        folder, settings=f"origins: [{LICHTBLICK}]", fish=daemon.endpoint
+    ) as window:
+
+        async def connect(path: str, host: str | None = None, **headers: str) -> int:
+            async with Browser(window.url, host) as browser:
+                try:
+                    async with browser.session.ws_connect(path, headers=headers):
+                        return 101
+                except aiohttp.WSServerHandshakeError as refusal:
+                    return refusal.status
+
+        async def test() -> None:
+            assert await connect("/foxglove", Origin=LICHTBLICK) == 101
+            assert await connect("/live", Origin=LICHTBLICK) == 403
+            assert await connect("/foxglove", Origin="http://evil.example") == 403
+            assert await connect("/foxglove", "fish.example") == 401
+
+        run(test())
+
+
+def leaves(layout: Any) -> Iterator[str]:
+    """Yield the panels of a layout."""
+    if isinstance(layout, str):
+        yield layout
+    else:
+        yield from leaves(layout["first"])
+        yield from leaves(layout["second"])
+
+
+def check_path(path: str, separator: str) -> None:
+    """Check that telemetry has this field."""
+    topic, _, field = path.partition(separator)
+    assert not field or field in {entry.name for entry in fields_of(CHANNELS[topic])}, path
+
+
+def test_each_panel_of_the_layout_is_set_up_and_each_of_its_paths_exists() -> None:
+    layout = json.loads((LAYOUTS / "foxglove.json").read_text(encoding="utf-8"))
+    panels = layout["configById"]
+    assert sorted(leaves(layout["layout"])) == sorted(panels)
+    for panel in panels.values():
+        for path in panel.get("paths", []):
+            check_path(path["value"], ".")
+        if "topicPath" in panel:
+            check_path(panel["topicPath"], ".")
+
+
+def test_each_curve_of_the_layout_of_plotjuggler_exists() -> None:
+    layout = ElementTree.parse(LAYOUTS / "plotjuggler.xml").getroot()
+    curves = layout.findall("tabbed_widget/Tab/Container/DockSplitter/DockArea/plot/curve")
+    assert len(curves) == len(list(layout.iter("curve"))) > 5
+    for curve in curves:
+        check_path(curve.attrib["name"], "/")
