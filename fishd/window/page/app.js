@@ -14,10 +14,13 @@ const STALE_S = 0.8;
 const STALE_TICKS = 5;
 const CHECK_MS = 200;
 const VALUES_MS = 250;
-const ESTOP_TIMEOUT_MS = 1500;
-const ESTOP_RETRY_MS = 250;
+/** Longest wait for the answer to an emergency stop, and pause until it is sent again: at first, and at most. */
+const ESTOP_TIMEOUT_MS = [2000, 12_000];
+const ESTOP_RETRY_MS = [250, 2000];
 const NOTICE_MS = { info: 6_000, warning: 20_000, error: 20_000 };
 const MAX_EVENTS = 100;
+/** Beginning of the name of the lease under which a page drives. */
+const OWN_LEASE = "window: ";
 const WINDOWS = [15, 30, 60, 120];
 
 const state = {
@@ -41,6 +44,7 @@ const receive = {
       jobs: new Map((payload.jobs ?? []).map((job) => [job.id, job])),
       reference: recall(`reference.${payload.name}`, null), changedSeq: 0,
     });
+    if (state.estop?.phase === "done" && payload.status?.mode !== "estop") state.estop = null;
     ring = new Ring(payload.status?.tick ?? 0.05);
     for (const tick of ticksOf(payload.history)) ring.push(tick);
     state.tick = ring.latest;
@@ -78,7 +82,13 @@ const receive = {
       // The answer to a request of this page may come after its event.
       setTimeout(() => noticeOther(event), 1000);
     }
-    if (event.kind === "mode") noticeOther(event);
+    if (event.kind === "mode") {
+      if (event.data.mode !== "estop" && state.estop?.phase === "done") state.estop = null; // another client cleared it
+      noticeOther(event);
+    }
+    if (event.kind === "lease" && event.data.lease === "taken" && !event.data.name.startsWith(OWN_LEASE)) {
+      notice("info", `the experiment ${event.data.name} holds the fish`);
+    }
     changed();
   },
   status(status) {
@@ -152,7 +162,7 @@ function noticeOther(event) {
     if (mode === "estop" && !state.estop) notice("error", "Another client used the E-stop.");
     return;
   }
-  if (state.own.has(JSON.stringify([controller, parameters]))) return;
+  if (state.own.has(JSON.stringify([controller, parameters])) || experimentOf(state.status)) return;
   if (event.kind === "fallback") notice("warning", event.message);
   else notice("warning", `Another client set ${controller} ${ownText(controller, parameters)}`.trim() + ".");
 }
@@ -251,11 +261,13 @@ async function changeRole(drives, take) {
 }
 
 /** Return the experiment that drives; a page of this window holds a lease, too, which is not one. */
-const experimentOf = (status) => (status?.lease && !status.lease.name.startsWith("window: ") ? status.lease : null);
+const experimentOf = (status) => (status?.lease && !status.lease.name.startsWith(OWN_LEASE) ? status.lease : null);
 
 // ---- emergency stop ----
 
 const wait = (ms) => new Promise((done) => setTimeout(done, ms));
+
+const doubled = ([first, most], times) => Math.min(most, first * 2 ** times);
 
 /** Send the emergency stop until it is confirmed or refused; measure from the press to the answer. */
 async function pressEstop() {
@@ -265,7 +277,7 @@ async function pressEstop() {
   while (state.estop === press) {
     press.attempts++;
     try {
-      const { server_ms: serverMs, outcome } = await call("POST", `/api/fish/${encodeURIComponent(state.name || nameInAddress())}/estop`, {}, ESTOP_TIMEOUT_MS);
+      const { server_ms: serverMs, outcome } = await call("POST", `/api/fish/${encodeURIComponent(state.name || nameInAddress())}/estop`, {}, doubled(ESTOP_TIMEOUT_MS, press.attempts - 1));
       Object.assign(press, { phase: "done", ms: performance.now() - press.begin, serverMs, outcome });
       say(`Emergency stop confirmed after ${number(press.ms, 0)} milliseconds.`);
       break;
@@ -273,9 +285,14 @@ async function pressEstop() {
       Object.assign(press, { phase: "failed", message: error.message, remedy: error.remedy });
       changed();
       if (error.status === 401 || error.status === 403 || error.status === 404) break;
-      await wait(ESTOP_RETRY_MS);
+      await wait(doubled(ESTOP_RETRY_MS, press.attempts - 1));
     }
   }
+  changed();
+}
+
+function forgetEstop() {
+  state.estop = null;
   changed();
 }
 
@@ -320,7 +337,8 @@ function Banner() {
       <span>${sentence(message)} What is greyed is old.</span></div>`}
     ${estop?.phase === "sending" && html`<div class="banner bad"><b>Emergency stop sent …</b></div>`}
     ${estop?.phase === "failed" && html`<div class="banner bad" role="alert"><b>Emergency stop NOT confirmed.</b>
-      <span>${sentence(estop.message)} Sent ${estop.attempts} times. Use the button of the panel, or: fishctl estop. ${sentence(estop.remedy)}</span></div>`}
+      <span>${sentence(estop.message)} Sent ${estop.attempts} times. Use the button of the panel, or: fishctl estop. ${sentence(estop.remedy)}</span>
+      <button type="button" onClick=${forgetEstop}>Do not send it again</button></div>`}
     ${(latched || estop?.phase === "done") && html`<div class="banner bad" id="latched">
       <div>${mode === "fault" ? html`<b>Fault.</b>` : html`<b>Emergency stop.</b>`}
         ${estop?.phase === "done" && html` <span>Confirmed <b id="estop-ms">${number(estop.ms, 0)} ms</b> after the press${
@@ -389,6 +407,7 @@ function Values() {
     <${Card} title="Thrust" value=${thrust} extra=${error} unit=${unit}
       note=${!tick ? "" : half == null ? "mean F_x: the zero is unknown" : "mean over whole beats, 95 %"} />
     <${Card} title="Tail beat" value=${tick?.frequency ? number(tick.frequency, 2) : "–"} unit="Hz" note=${tick?.frequency ? `${number(60 * tick.frequency, 0)} a minute` : "no beats"} />
+    ${tick?.speed !== undefined && html`<${Card} title="Speed" value=${number(1000 * tick.speed, 1)} unit="mm/s" note="true speed of the simulated fish" />`}
     <${Card} title="Relative thrust" value=${relative} extra=${relativeError} unit=${reference ? "%" : ""} note=${reference?.text ?? ""}>
       <button type="button" class="link" disabled=${!tick} onClick=${setReference}>${reference ? "again" : "take this as 100 %"}</button><//>
     <${Card} title="Servo power" value=${number(status?.power ?? NaN, 2)} unit="W" note=${status?.power == null ? "no power meter" : "mean of 2 s"} />

@@ -45,6 +45,7 @@ const CHARTS = [
   },
   { key: "fin_velocity", title: ["Fin velocity, estimated"], unit: "", series: [line("fin_velocity", "fin")] },
   { key: "alpha", title: ["Fin angle α, true"], unit: "rad", smallest: 0.1, truth: true, series: [line("alpha", "alpha")] },
+  { key: "speed", title: ["Speed, true"], unit: "m/s", truth: true, series: [line("speed", "fin")] },
 ];
 
 /** Return a range around the values that does not follow each of their movements; smallest: its least width. */
@@ -270,7 +271,6 @@ export class Charts {
     this.gaps = [];
     this.limits = null;
     this.virtual = null;
-    this.truth = false;
     this.quantityNames = "";
     this.charts = CHARTS.map((definition, index) => new Chart(parent, { ...definition, labelled: index === 0 }, this));
     this.quantityCharts = Array.from({ length: QUANTITY_CHARTS }, () => new Chart(parent, {
@@ -358,8 +358,9 @@ export class Charts {
     for (const mark of this.marks) if (mark.seq === null && mark.t >= low) mark.seq = ring.seqAt(mark.t);
     for (const chart of this.charts) {
       if (!chart.definition.truth) continue;
-      if (!this.truth) this.truth = ring.has(chart.definition.series[0].column);
-      chart.show(this.truth);
+      chart.known ||= ring.has(chart.definition.series[0].column);
+      chart.show(chart.known);
+      chart.size();
     }
     for (const chart of this.quantityCharts) {
       if (chart.known && chart.root.hidden && ring.has(chart.definition.series[0].column)) {

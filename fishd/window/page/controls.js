@@ -129,15 +129,16 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
     changed();
     const field = controller.parameters.find((candidate) => candidate.name === name);
     if (!running || field.file) return;
-    clearTimeout(timer.current);
-    timer.current = setTimeout(async () => {
-      const sent = { ...state.edited };
-      await act("set-parameters", { parameters: sent });
-      // A refused value goes, too: what is shown then is what the fish does.
-      for (const key in sent) if (state.edited[key] === sent[key]) delete state.edited[key];
-      keep();
-      changed();
-    }, SEND_MS);
+    timer.current ||= setTimeout(sendEdited, SEND_MS);
+  };
+  const sendEdited = async () => {
+    const sent = { ...state.edited };
+    await act("set-parameters", { parameters: sent });
+    // A refused value goes, too: what is shown then is what the fish does.
+    for (const key in sent) if (state.edited[key] === sent[key]) delete state.edited[key];
+    timer.current = Object.keys(state.edited).length ? setTimeout(sendEdited, SEND_MS) : 0;
+    keep();
+    changed();
   };
   const start = async () => {
     if (await act("set-controller", { name: controller.name, parameters })) {

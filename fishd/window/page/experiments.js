@@ -125,7 +125,7 @@ function Job({ job, state, notice, mayDrive }) {
   const total = expected(job.command);
   const stop = () => call("POST", `/api/jobs/${job.id}/stop`).catch((error) => notice("error", error.message, error.remedy));
   return html`<li class=${`job ${job.state}`}>
-    <div class="job-head"><b>${KINDS[job.kind]?.title ?? job.kind}</b><span class="pill small">${job.state}</span>
+    <div class="job-head"><b>${KINDS[job.kind]?.title ?? "Rerun"}</b><span class="pill small">${job.state}</span>
       <span class="muted">${duration(elapsed)}${runs && total ? ` of about ${duration(total)}` : ""}</span>
       ${runs && html`<button type="button" disabled=${!mayDrive} onClick=${stop}>Stop</button>`}</div>
     ${runs && html`<progress max=${total ?? undefined} value=${total ? Math.min(elapsed, total) : undefined}
@@ -167,6 +167,9 @@ function Result({ job, status }) {
   </tbody></table>`;
 }
 
+const MAX_RUNS = 40;
+const shortDate = new Intl.DateTimeFormat([], { month: "short", day: "numeric", hour: "2-digit", minute: "2-digit", hour12: false });
+
 export function Runs({ state, notice, changed }) {
   const [runs, setRuns] = useState(null);
   const [failure, setFailure] = useState(null);
@@ -188,23 +191,25 @@ export function Runs({ state, notice, changed }) {
       notice("error", error.message, error.remedy);
     }
   };
-  const list = (runs ?? []).slice().reverse().slice(0, 40);
+  const begin = (run) => run.began ?? run.about?.started ?? "";
+  const list = (runs ?? []).slice().sort((a, b) => begin(b).localeCompare(begin(a))).slice(0, MAX_RUNS);
   return html`
     <div class="head-row"><h2 id="runs-title">Runs</h2><button type="button" onClick=${load}>Refresh</button></div>
     ${failure && html`<p class="note">The runs cannot be listed. ${sentence(failure.message)} ${sentence(failure.remedy)}</p>`}
     ${runs === null ? !failure && html`<p class="muted">Loading …</p>` : list.length === 0
       ? html`<p class="muted">None yet. Record, measure or sweep, and it is listed here.</p>`
       : html`<div class="scroll" tabindex="0" role="region" aria-label="Table of runs"><table>
-        <thead><tr><th>name</th><th>kind</th><th class="right">length</th><th class="right">thrust</th><th>controllers</th>
+        <thead><tr><th>name</th><th>what</th><th>began</th><th class="right">length</th><th class="right">thrust</th>
           <th class="right">lost</th><th><span class="unseen">what to do</span></th></tr></thead>
         <tbody>${list.map((run) => {
           const [factor, unit] = forceUnit(run);
-          const [middle, error] = run.thrust == null ? ["–", ""] : interval(run.thrust * factor, run.thrust_ci95 == null ? NaN : run.thrust_ci95 * factor);
+          const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, run.thrust_ci95 == null ? NaN : run.thrust_ci95 * factor);
           return html`<tr key=${run.name} class=${run.damaged ? "damaged" : ""}>
-            <td>${run.name}${run.damaged && html` <span class="pill small">damaged</span>`}</td><td>${run.kind}</td>
-            <td class="right">${duration(run.duration)}</td>
+            <td>${run.name}${run.damaged && html` <span class="pill small" title=${run.damaged}>damaged</span>`}
+              ${run.problem && html`<br /><small>${run.problem}</small>`}</td><td>${run.kind === "recording" ? Object.keys(run.swim_ticks ?? {}).join(", ") || "at rest" : run.kind}</td><td>${begin(run) && shortDate.format(new Date(begin(run)))}</td>
+            <td class="right">${run.duration === undefined ? (run.rows ? `${run.rows} rows` : "") : duration(run.duration)}</td>
             <td class="right">${middle} ${error} ${run.thrust == null ? "" : unit}</td>
-            <td>${Object.keys(run.swim_ticks ?? {}).join(", ")}</td><td class="right">${run.lost_ticks ?? ""}</td>
+            <td class="right">${run.lost_ticks ?? ""}</td>
             <td class="actions">
               <button type="button" aria-expanded=${open === run.name} aria-label=${`Plot of ${run.name}`}
                 onClick=${() => setOpen(open === run.name ? null : run.name)}>${open === run.name ? "Close" : "Plot"}</button>
