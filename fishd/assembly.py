@@ -184,10 +184,9 @@ def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
 
     Raises `StartupError` if none is running, or a package is missing.
     """
-    from fishd.virtual.pi.lgpio import EmulatedLgpio
+    from fishd.virtual.pi.lgpio import EmulatedLgpio, Pins
     from fishd.virtual.pi.link import RemotePi
     from fishd.virtual.pi.linux_i2c import LinuxI2c
-    from fishd.virtual.pi.pins import Pins
     from fishd.virtual.pi.wires import Wires
 
     path = virtual_pi_socket(config.virtual_pi.socket)

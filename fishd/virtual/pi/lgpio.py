@@ -1,27 +1,16 @@
-"""Replacement of the C module lgpio with emulated pins; rpi-lgpio's RPi.GPIO runs on it unchanged.
+"""Emulated pins of the header, and a replacement of the C module lgpio that drives them.
 
-Its error numbers, modes and checks are those of lgpio 0.2.2; a line that another process holds is
-busy.
+rpi-lgpio's RPi.GPIO runs on it unchanged. Its error numbers, modes and checks are those of lgpio
+0.2.2; a line that another process holds is busy.
 """
 
 import os
 import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Self
-
-from fishd.virtual.pi.pins import (
-    ALERT,
-    INPUT,
-    LINES,
-    OUTPUT,
-    PULL_DOWN,
-    PULL_NONE,
-    PULL_UP,
-    Callback,
-    EdgeFunction,
-    Line,
-    Pins,
-)
 
 REVISION = "c03114"
 """Revision that rpi-lgpio reads: a Pi 4 B."""
@@ -39,6 +28,87 @@ _ERRORS = {
     -102: "bad PWM frequency",
     -103: "bad PWM dutycycle",
 }
+LINES = 54
+"""Number of GPIOs of the emulated chip."""
+
+INPUT, OUTPUT, ALERT = 0x100, 0x200, 0x400
+"""Modes of a claimed pin; ALERT is an input that reports its edges."""
+PULL_UP, PULL_DOWN, PULL_NONE = 32, 64, 128
+
+EdgeFunction = Callable[[int, int, int, int], None]
+"""Function called with chip, GPIO, level and time."""
+
+
+@dataclass
+class Line:
+    """One pin: its mode, and the levels that drive it."""
+
+    mode: int = 0
+    pull: int = PULL_NONE
+    edges: int = 0
+    driven: int = 0
+    outside: int | None = None
+    pwm: tuple[float, float] | None = None
+    """Frequency [Hz] and duty cycle [%]."""
+    busy: bool = False
+    """Whether another process holds the pin."""
+
+    @property
+    def is_output(self) -> bool:
+        """Whether the Pi drives the pin."""
+        return bool(self.mode & OUTPUT)
+
+    def level(self) -> int:
+        """Return the level, from the side that drives the pin."""
+        if self.is_output:
+            return self.driven
+        if self.outside is not None:
+            return self.outside
+        return int(self.pull == PULL_UP)
+
+
+class Pins:
+    """Pins of the header."""
+
+    def __init__(self) -> None:
+        self.lines = [Line() for _ in range(LINES)]
+        self.callbacks: list[Callback] = []
+        self.present = True
+        """Whether the GPIO chip exists."""
+        self.reports_edges = True
+        """Whether edges can be reported; false as with old libraries on kernels from 6.6 on."""
+
+    def set_level(self, gpio: int, level: int | None) -> None:
+        """Drive a pin from outside, as a button does; None stops driving it.
+
+        Returns after the callbacks of its edges, which run in a separate thread.
+        """
+        line = self.lines[gpio]
+        before = line.level()
+        line.outside = level
+        after = line.level()
+        edge = 1 if after > before else 2 if after < before else 0
+        if not (line.mode & ALERT and line.edges & edge):
+            return
+        for callback in [item for item in self.callbacks if item.gpio == gpio]:
+            thread = threading.Thread(target=callback.function, args=(0, gpio, after, 0))
+            thread.start()
+            thread.join()
+
+
+class Callback:
+    """Registered callback, like the object that lgpio.callback returns."""
+
+    def __init__(self, pins: Pins, gpio: int, function: EdgeFunction) -> None:
+        self.gpio = gpio
+        self.function = function
+        self._pins = pins
+        pins.callbacks.append(self)
+
+    def cancel(self) -> None:
+        """Stop the reports of the pin's edges."""
+        if self in self._pins.callbacks:
+            self._pins.callbacks.remove(self)
 
 
 class Error(Exception):
@@ -105,7 +175,7 @@ class _Lgpio(ModuleType):
 
     def gpio_get_mode(self, handle: int, gpio: int) -> int:
         line = self._line(handle, gpio)
-        kernel_flag = _KERNEL_OUTPUT if line.mode & OUTPUT else 0
+        kernel_flag = _KERNEL_OUTPUT if line.is_output else 0
         return line.mode | kernel_flag | line.pull | line.edges << _EDGE_SHIFT
 
     def gpio_claim_input(self, handle: int, gpio: int, flags: int = 0) -> int:
@@ -114,9 +184,9 @@ class _Lgpio(ModuleType):
 
     def gpio_claim_output(self, handle: int, gpio: int, level: int = 0, flags: int = 0) -> int:
         line = self._line(handle, gpio)
-        if not line.mode & OUTPUT:  # an existing output keeps its level
+        if not line.is_output:  # an existing output keeps its level
             self._claim(line, OUTPUT).pull = flags
-            self._drive(line, level)
+            line.driven = int(bool(level))
         return 0
 
     def gpio_claim_alert(self, handle: int, gpio: int, edges: int, flags: int = 0) -> int:
@@ -141,9 +211,9 @@ class _Lgpio(ModuleType):
 
     def gpio_write(self, handle: int, gpio: int, level: int) -> int:
         line = self._line(handle, gpio)
-        if not line.mode & OUTPUT:
+        if not line.is_output:
             self._claim(line, OUTPUT)
-        self._drive(line, level)
+        line.driven = int(bool(level))
         return 0
 
     def gpio_set_debounce_micros(self, handle: int, gpio: int, micros: int) -> int:
@@ -161,7 +231,7 @@ class _Lgpio(ModuleType):
             raise Error(-102)
         if not 0.0 <= duty_cycle <= 100.0:
             raise Error(-103)
-        if not line.mode & OUTPUT:
+        if not line.is_output:
             self._claim(line, OUTPUT)
         line.pwm = (frequency, duty_cycle)
         return 9  # free entries in its queue
@@ -182,11 +252,6 @@ class _Lgpio(ModuleType):
         self._free(line)
         line.mode = mode
         return line
-
-    @staticmethod
-    def _drive(line: Line, level: int) -> None:
-        line.driven = int(bool(level))
-        line.writes.append(line.driven)
 
     @staticmethod
     def _free(line: Line) -> None:

@@ -15,8 +15,8 @@ from fishd.virtual.pi.ads1115 import Ads1115Chip
 from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.i2c import I2cBus
 from fishd.virtual.pi.ina import CHIPS
+from fishd.virtual.pi.lgpio import Pins
 from fishd.virtual.pi.pigpiod.daemon import Pigpiod
-from fishd.virtual.pi.pins import Pins
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.tank import Tank
 from fishd.virtual.plant.parameters import PlantParameters

@@ -9,8 +9,7 @@ import pytest
 from fishd.core.clock import VirtualClock
 from fishd.hardware.panel import RpiGpioPanel
 from fishd.hardware.settings import PanelSettings
-from fishd.virtual.pi.lgpio import EmulatedLgpio
-from fishd.virtual.pi.pins import Pins
+from fishd.virtual.pi.lgpio import PULL_NONE, PULL_UP, EmulatedLgpio, Pins
 
 BUTTON, LIGHT = 17, 27
 OPENS = PanelSettings(estop_gpio=BUTTON, estop_pressed="high", led_gpio=LIGHT)
@@ -99,13 +98,13 @@ def test_a_spike_that_is_gone_when_looked_at_is_no_press(pins: Pins, panel: RpiG
 def test_a_broken_wire_is_a_press_where_the_button_opens_a_contact(pins: Pins, make: Make) -> None:
     pins.set_level(BUTTON, OPEN)
     panel = make(OPENS)
-    assert pins.pull(BUTTON) == "up"
+    assert pins.lines[BUTTON].pull == PULL_UP
     assert panel.update("idle", 0.0) is True
 
 
 def test_a_button_that_closes_a_contact_is_pressed_when_low(pins: Pins, make: Make) -> None:
     panel = make(CLOSES)
-    assert pins.pull(BUTTON) == "up"
+    assert pins.lines[BUTTON].pull == PULL_UP
     assert panel.update("running", 0.0) is False
     pins.set_level(BUTTON, GROUND)
     assert panel.update("running", 0.05) is True
@@ -131,7 +130,7 @@ def record_light(
     levels = []
     for index in range(round(seconds / tick)):
         panel.update(mode, 100.0 + index * tick)
-        levels.append(pins.level(LIGHT))
+        levels.append(pins.lines[LIGHT].level())
     return levels
 
 
@@ -165,9 +164,9 @@ def test_close_ends_the_light_and_gives_back_only_its_pins(pins: Pins, panel: Rp
     panel.update("running", 0.0)
     panel.close()
     panel.close()
-    assert pins.writes(LIGHT)[-1] == 0
-    assert not pins.is_output(LIGHT)
-    assert pins.level(22) == 1
+    assert pins.lines[LIGHT].driven == 0
+    assert not pins.lines[LIGHT].is_output
+    assert pins.lines[22].level() == 1
     pins.set_level(BUTTON, OPEN)
     assert presses == []
 
@@ -180,7 +179,7 @@ def test_close_goes_on_when_a_step_fails(
     GPIO.cleanup(LIGHT)  # by another part of the program
     panel.close()
     assert caplog.messages[0].startswith("cannot switch off GPIO 27: ")
-    assert pins.pull(BUTTON) == "none"
+    assert pins.lines[BUTTON].pull == PULL_NONE
 
 
 def test_without_pins_no_library_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:

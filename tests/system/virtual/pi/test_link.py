@@ -17,9 +17,9 @@ from fishd.core.errors import StartupError
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.i2c import Read, Write, kernel_error
+from fishd.virtual.pi.lgpio import Pins
 from fishd.virtual.pi.link import RemotePi
 from fishd.virtual.pi.link_server import LinkServer
-from fishd.virtual.pi.pins import Pins
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.virtual_pi import VirtualPi
 from fishd.virtual.pi.wires import Wires
@@ -98,10 +98,10 @@ def test_a_button_reaches_the_pins_of_another_process(pi: VirtualPi, path: Path)
         assert seen == [(4, 1)]
         pi.set_level(17, 1)
         wait_until_equal(seen, (17, 1))
-        assert pins.level(17) == 1
+        assert pins.lines[17].level() == 1
         pi.set_level(17, None)
         wait_until_equal(seen, (17, None))
-        assert pins.level(17) == 0
+        assert pins.lines[17].level() == 0
     wires.close()
 
 

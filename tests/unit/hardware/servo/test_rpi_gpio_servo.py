@@ -13,8 +13,7 @@ from fishd.core.clock import VirtualClock
 from fishd.core.errors import ServoError, StartupError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.rpi_gpio import RpiGpio, RpiGpioSettings, pull_low
-from fishd.virtual.pi.lgpio import EmulatedLgpio
-from fishd.virtual.pi.pins import Pins
+from fishd.virtual.pi.lgpio import EmulatedLgpio, Pins
 
 SETTINGS = RpiGpioSettings(gpio=18)
 
@@ -41,7 +40,7 @@ def open_servo(settings: RpiGpioSettings = SETTINGS, clock: Any = None) -> Calib
 
 def width(pins: Pins, gpio: int = 18) -> float:
     """Return the pulse that a pin sends [µs]."""
-    pwm = pins.pwm(gpio)
+    pwm = pins.lines[gpio].pwm
     return 0.0 if pwm is None else 1e4 * pwm[1] / pwm[0]
 
 
@@ -49,7 +48,7 @@ def test_an_angle_becomes_a_pulse(pins: Pins, servo: CalibratedServo) -> None:
     for angle, expected in ((0.5, 1800.0), (-0.5, 1200.0), (0.0, 1500.0)):
         servo.write(angle)
         assert width(pins) == pytest.approx(expected, abs=0.01)
-        frequency, _ = pins.pwm(18) or (0.0, 0.0)
+        frequency, _ = pins.lines[18].pwm or (0.0, 0.0)
         assert frequency == 50.0
 
 
@@ -57,14 +56,14 @@ def test_at_a_higher_frequency_pulses_are_as_long(pins: Pins) -> None:
     fast = open_servo(RpiGpioSettings(gpio=4, frequency=200.0))
     fast.write(0.5)
     assert width(pins, 4) == pytest.approx(1800.0)
-    assert pins.pwm(4) == (200.0, pytest.approx(36.0))
+    assert pins.lines[4].pwm == (200.0, pytest.approx(36.0))
     fast.close()
 
 
 def test_opening_claims_the_pin_low_without_pulses(pins: Pins, servo: CalibratedServo) -> None:
-    assert pins.is_output(18)
-    assert pins.writes(18) == [0]
-    assert pins.pwm(18) is None
+    assert pins.lines[18].is_output
+    assert pins.lines[18].driven == 0
+    assert pins.lines[18].pwm is None
 
 
 def test_a_release_ends_pulses_and_a_write_begins_again(pins: Pins, servo: CalibratedServo) -> None:
@@ -72,7 +71,7 @@ def test_a_release_ends_pulses_and_a_write_begins_again(pins: Pins, servo: Calib
     servo.release()
     servo.release()
     # Not stopped: RPi.GPIO would start again at 1 kHz.
-    assert pins.pwm(18) == (50.0, 0.0)
+    assert pins.lines[18].pwm == (50.0, 0.0)
     servo.write(0.5)
     assert width(pins) == pytest.approx(1800.0)
 
@@ -88,14 +87,14 @@ def test_close_lets_the_last_pulse_end_and_gives_back_only_its_own_pin(pins: Pin
     servo.close()
     servo.close()
     assert clock.now - before >= 0.02
-    assert pins.pwm(18) is None
-    assert not pins.is_output(18)
-    assert pins.is_output(23)
-    assert pins.level(23) == 1
+    assert pins.lines[18].pwm is None
+    assert not pins.lines[18].is_output
+    assert pins.lines[23].is_output
+    assert pins.lines[23].level() == 1
 
 
 def test_a_pin_that_another_process_holds_is_an_error_until_it_is_free(pins: Pins) -> None:
-    pins.occupy(18)
+    pins.lines[18].busy = True
     servo = open_servo()
     for _ in range(2):
         with pytest.raises(ServoError, match=r"^servo on GPIO 18: GPIO busy$"):
@@ -103,7 +102,7 @@ def test_a_pin_that_another_process_holds_is_an_error_until_it_is_free(pins: Pin
     with pytest.raises(ServoError, match="GPIO busy"):
         pull_low(1500.0, gpio=18)
     servo.release()
-    pins.occupy(18, False)
+    pins.lines[18].busy = False
     servo.write(0.0)
     assert width(pins) == pytest.approx(1500.0)
     servo.close()
@@ -123,8 +122,8 @@ def test_a_cleanup_of_all_pins_by_others_is_survived(pins: Pins, servo: Calibrat
 
 def test_the_last_resort_leaves_the_pin_low(pins: Pins, servo: CalibratedServo) -> None:
     assert pull_low(1500.0, gpio=18) is False
-    assert pins.is_output(18)
-    assert pins.level(18) == 0
+    assert pins.lines[18].is_output
+    assert pins.lines[18].level() == 0
 
 
 def test_the_librarys_warnings_are_logged(pins: Pins, caplog: pytest.LogCaptureFixture) -> None:
