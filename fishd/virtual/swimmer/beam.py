@@ -114,7 +114,3 @@ class Beam:
             moves[:, row, 2:] = np.cumsum(steps, axis=0) - 0.5 * steps
         moves[:, 2, 2:] = self._weights
         return moves
-
-    def bending_energy(self, q: Array) -> float:
-        """Return the elastic energy of a shape with relaxed muscles [J]."""
-        return float(0.5 * q @ self.K @ q)
