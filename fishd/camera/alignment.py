@@ -109,9 +109,8 @@ def _needed_turn(motion: Motion) -> int:
     """Return the clockwise turn of the picture that puts the head at the left [degrees]."""
     energy = motion.energy
     upright = find_axis(np.ascontiguousarray(energy.T))
-    if compute_likeness(energy.T, upright) > _UPRIGHT_LIKENESS_RATIO * compute_likeness(
-        energy, motion.axis
-    ):
+    likeness = compute_likeness(energy, motion.axis)
+    if compute_likeness(energy.T, upright) > _UPRIGHT_LIKENESS_RATIO * likeness:
         return 270 if _tail_is_right(energy.T) else 90
     return 0 if _tail_is_right(energy) else 180
 

@@ -155,10 +155,8 @@ def _sum_convolutions(convolutions: Floats, rows: Floats, offsets: Floats) -> Fl
 
 def _is_inside(axis: Axis, height: int) -> bool:
     """Return whether an axis lies inside the search range, away from its edges."""
-    offset, tilt = (
-        _MAX_OFFSET_FRACTION * height - _FIRST_STEPS[0],
-        _MAX_TILT_RAD - 0.5 * _FIRST_STEPS[1],
-    )
+    offset = _MAX_OFFSET_FRACTION * height - _FIRST_STEPS[0]
+    tilt = _MAX_TILT_RAD - 0.5 * _FIRST_STEPS[1]
     return abs(axis.offset) < offset and abs(axis.tilt) < tilt
 
 

@@ -472,12 +472,7 @@ class ControlLoop:
 
         now: time after the servo was driven [s, monotonic]
         """
-        slot, measurement, observation, power = (
-            turn.slot,
-            turn.measurement,
-            turn.observation,
-            turn.power,
-        )
+        slot, measurement, observation = turn.slot, turn.measurement, turn.observation
         thrust, thrust_ci95 = self.known_thrust
         extremes = measurement.extremes
         swims = self.supervisor.mode is Mode.RUNNING
@@ -520,7 +515,7 @@ class ControlLoop:
             heading=course.heading if course else UNSET,
             thrust_factor=UNSET if factor is None else factor,
             thrust_factor_ci95=UNSET if factor_ci95 is None else factor_ci95,
-            power=UNSET if power is None else power,
+            power=UNSET if turn.power is None else turn.power,
             leak=UNSET if self.found_leak is None else self.found_leak,
             fy_corrected=True if corrected else UNSET,
             suspect=text.line(measurement.suspect) if measurement.suspect else UNSET,

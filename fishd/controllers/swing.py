@@ -146,11 +146,9 @@ class Swing(Controller[SwingParameters]):
         """Return C and the lead [s] of this tick: the parameters, or those of the search."""
         parameters, search = self.parameters, self._search
         if parameters.C != "auto":
-            return (
-                (parameters.C, parameters.lead)
-                if self._reversals >= PREDICTION_DELAY_HALF_BEATS
-                else LADDER[START_INDEX]
-            )
+            if self._reversals < PREDICTION_DELAY_HALF_BEATS:
+                return LADDER[START_INDEX]
+            return parameters.C, parameters.lead
         assert search
         search.update(observation.fx, observation.fy, observation.dt, self._reversal.direction)
         self.criterion, self.lead = rung = search.rung

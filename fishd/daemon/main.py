@@ -59,11 +59,9 @@ class Daemon:
         self._config = config
         self._file = file
         self._print_status = print_status
-        self._slow = (
-            None
-            if config.kind.is_real_time
-            else SlowMotion(config.tick, config.swimmer.slow_motion)
-        )
+        self._slow: SlowMotion | None = None
+        if not config.kind.is_real_time:
+            self._slow = SlowMotion(config.tick, config.swimmer.slow_motion)
         self._clock = SlowClock() if self._slow else _clock(config)
         self._virtual = isinstance(self._clock, VirtualClock)
         self._events = asyncio.get_running_loop()
@@ -154,12 +152,9 @@ class Daemon:
         if self._slow:
             self._slow.stopping = stopping
             self._slow.while_waiting = self._between_ticks
-        clock = self._clock
-        lockstep = (
-            Lockstep(self._loop, clock, self._config.tick, self._slow)
-            if isinstance(clock, VirtualClock)
-            else None
-        )
+        clock, lockstep = self._clock, None
+        if isinstance(clock, VirtualClock):
+            lockstep = Lockstep(self._loop, clock, self._config.tick, self._slow)
         ticker = lockstep or Ticker(self._config.tick, self._mock_ticks and self._warm_up)
 
         def poll() -> None:

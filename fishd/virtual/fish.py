@@ -50,13 +50,8 @@ class SimulatedFish:
         samples = self._samples
         self.window = window = self.fish.advance(self._angle, duration, samples)
         self._power = None
-        fx, fy = self._imperfections.apply(
-            window.sampled_thrust,
-            window.sampled_lateral_force,
-            now - self._start,
-            duration,
-            samples,
-        )
+        fx, fy = window.sampled_thrust, window.sampled_lateral_force
+        fx, fy = self._imperfections.apply(fx, fy, now - self._start, duration, samples)
         if self._watches:
             self._watches = [watch for watch in self._watches if not watch.closed]
             for watch in self._watches:

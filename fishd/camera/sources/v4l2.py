@@ -126,17 +126,11 @@ class _Stream:
         if self._is_late(frame, arrived):
             sink.lost(dropped=1)
             return None
-        camera_format = self._format
+        size = self._format.width, self._format.height, self._format.bytes_per_line
         try:
             if frame.buff.flags & _ERROR:
                 raise Broken("the driver reports an error")
-            picture = decode_grey(
-                frame.data,
-                self._settings.format,
-                camera_format.width,
-                camera_format.height,
-                camera_format.bytes_per_line,
-            )
+            picture = decode_grey(frame.data, self._settings.format, *size)
         except Broken as broken:
             sink.lost(broken=1)
             return broken

@@ -158,9 +158,8 @@ class LeakSearch:
         fit, logs = self.fit, np.log(self.leaks)
         best = int(fit.argmax())
         present = float(np.interp(math.log(self.leak), logs, fit))
-        if fit[best] < MIN_CORRELATION or 1.0 - present**2 < MIN_IMPROVEMENT * (
-            1.0 - fit[best] ** 2
-        ):
+        unexplained = 1.0 - fit[best] ** 2
+        if fit[best] < MIN_CORRELATION or 1.0 - present**2 < MIN_IMPROVEMENT * unexplained:
             return 0.0
         middle = min(max(best, 1), BANK_SIZE - 2)
         left, top, right = fit[middle - 1 : middle + 2].tolist()

@@ -151,9 +151,8 @@ class LiveThrust:
                     self._block.close(seen.time - seen.dt, swims)
                     self._recording = False
                     self._close(self._block)
-            if not self._recording and self._phase > (
-                SWIM_SETTLE_TIME_S if swims else REST_SETTLE_TIME_S
-            ):
+            settle_time = SWIM_SETTLE_TIME_S if swims else REST_SETTLE_TIME_S
+            if not self._recording and self._phase > settle_time:
                 self._block, self._recording = _Block(), True
         if self._recording:
             self._block.add(seen)

@@ -86,11 +86,8 @@ class Observer(Estimator):
         rotation = settings.sensor_rotation
         force = math.cos(rotation) * measurement.fy - math.sin(rotation) * measurement.fx
         if dt > SETTLE_TIME_S:  # fishd was suspended, and the motion of fin and water has decayed
-            dt, self._offset, self._covariance = (
-                SETTLE_TIME_S,
-                None,
-                np.diag(np.square(_INITIAL_SDS)),
-            )
+            dt, self._offset = SETTLE_TIME_S, None
+            self._covariance = np.diag(np.square(_INITIAL_SDS))
         window = fish.advance(instruction_angle, dt, 1)
         undelayed.advance(instruction_angle, dt, 1)
         step = self._step(round(dt, 9))
@@ -131,13 +128,8 @@ class Observer(Estimator):
         sensitivity = np.append(ends @ (motion - np.eye(2)), 1.0)
         cross_covariance = np.append(spread @ ends, 0.5 * wander)
         white = settings.force_noise**2 * self._tick / dt
-        return Step(
-            transition,
-            noise,
-            sensitivity,
-            cross_covariance,
-            float(ends @ spread @ ends) + wander / 3.0 + white,
-        )
+        variance = float(ends @ spread @ ends) + wander / 3.0 + white
+        return Step(transition, noise, sensitivity, cross_covariance, variance)
 
 
 def _motion(plant: PlantParameters, time: float) -> tuple[Array, Array]:

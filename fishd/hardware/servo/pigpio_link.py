@@ -18,6 +18,9 @@ from fishd.hardware.servo.pigpio_client import (
 START_TIMEOUT_S = 2.0
 """Longest time that a new link waits for its first connection [s]."""
 
+PREPARATION_TIMEOUT_S = 2.0
+"""Longest time for the preparation of a new connection [s]."""
+
 PAUSE_RANGE_S = 0.2, 1.0
 """Shortest and longest pause between two attempts to connect [s]."""
 
@@ -158,7 +161,7 @@ class PigpioLink:
         now = self._clock.monotonic()
         if not self._client and not self._thread and now >= self._next_attempt:
             self._next_attempt = now + VIRTUAL_PAUSE_S
-            self._connect(ANSWER_TIMEOUT_S, 2.0 * ANSWER_TIMEOUT_S)
+            self._connect()
         if not self._client:
             raise ServoError(f"{self._where}: not connected: {self._reason}{suffix}")
         return self._client
@@ -169,21 +172,19 @@ class PigpioLink:
         client.close()
         self._needed.set()
 
-    def _connect(self, limit: float, preparation: float) -> bool:
-        client = None
-        time_limit = limit
+    def _connect(self) -> bool:
+        client, limit = None, ANSWER_TIMEOUT_S
+        real_limit = self._real_limit(limit)
         try:
-            client = self._opening = Client(
-                *self._address, self._real_limit(limit), self._standstill
-            )
+            client = self._opening = Client(*self._address, real_limit, self._standstill)
             if self._closed.is_set():  # `close` may have run before `_opening` was set
                 raise ConnectionError("closed")
             client.get_pigpio_version()
-            time_limit = preparation
-            client.within(self._real_limit(preparation))
+            limit = PREPARATION_TIMEOUT_S
+            client.within(self._real_limit(limit))
             self._prepare(client)
         except BaseException as error:
-            self._reason = describe_error(error, time_limit)
+            self._reason = describe_error(error, limit)
             if client:
                 client.close()
             if isinstance(error, Exception):  # the next attempt may succeed
@@ -207,9 +208,7 @@ class PigpioLink:
         while self._needed.wait() and not self._closed.is_set():
             self._needed.clear()
             pause = shortest
-            while not self._connect(
-                ANSWER_TIMEOUT_S, 2.0 * ANSWER_TIMEOUT_S
-            ) and not self._closed.wait(pause):
+            while not self._connect() and not self._closed.wait(pause):
                 pause = min(2.0 * pause, longest)
             # Without this pause, fishd would connect in every tick to a pigpiod that refuses all.
             self._closed.wait(shortest)

@@ -82,14 +82,8 @@ class VirtualPi:
         self.faults = Faults(clock, seed + 1)
         self.bus = I2cBus(clock, settings.bus_speed, self.faults)
         self.pigpiod = Pigpiod(clock, self.faults, settings.pigpio_port)
-        self.tank = Tank(
-            settings,
-            plant,
-            imperfections,
-            tick,
-            partial(self.pigpiod.width, settings.servo_gpio),
-            clock.monotonic(),
-        )
+        pulse = partial(self.pigpiod.width, settings.servo_gpio)
+        self.tank = Tank(settings, plant, imperfections, tick, pulse, clock.monotonic())
         self.chip = Ads1115Chip(
             clock, self.tank.volts, self.faults, settings.adc_noise, seed=seed + 2
         )

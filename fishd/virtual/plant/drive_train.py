@@ -145,7 +145,5 @@ def shortest_dwell(parameters: PlantParameters, amplitude: float) -> float:
     lag = 2.0 * amplitude / p.servo_lag
     turn = p.servo_lag / p.servo_speed * time_between(lag, (1.0 - REVERSAL_FRACTION) * lag)
     half_beat = max(math.pi / p.omega0, 2.0 * amplitude / p.servo_speed)
-    return min(
-        max(p.servo_delay + turn, MIN_HALF_BEAT_FRACTION * half_beat),
-        MAX_HALF_BEAT_FRACTION * half_beat,
-    )
+    dwell = max(p.servo_delay + turn, MIN_HALF_BEAT_FRACTION * half_beat)
+    return min(dwell, MAX_HALF_BEAT_FRACTION * half_beat)

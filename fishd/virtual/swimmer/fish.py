@@ -97,21 +97,13 @@ class Fish:
         self.beam = build_beam(settings)
         self.beam.q[0] = -0.5 * body.length
         length, width = numerics.fine_length * body.length, numerics.fine_width * body.length
+
+        def centred_edges(size: float, fine: float, ratio: float) -> Array:
+            return edges(-0.5 * size, 0.5 * size, (-0.5 * fine, 0.5 * fine), numerics.cell, ratio)
+
         grid = Grid(
-            edges(
-                -0.5 * water.length,
-                0.5 * water.length,
-                (-0.5 * length, 0.5 * length),
-                numerics.cell,
-                numerics.stretch_along,
-            ),
-            edges(
-                -0.5 * water.width,
-                0.5 * water.width,
-                (-0.5 * width, 0.5 * width),
-                numerics.cell,
-                numerics.stretch_across,
-            ),
+            centred_edges(water.length, length, numerics.stretch_along),
+            centred_edges(water.width, width, numerics.stretch_across),
         )
         self.flow = Flow(grid, water.viscosity, "slip")
         self.body = Immersed(self.flow, water.density, self.beam)

@@ -69,31 +69,11 @@ class Flow:
         self.u[0] = self.inlet
         _fill_ghosts(self._u, self._v, 1.0 if self._slip else -1.0)
         new = 1.5 if self._started else 1.0
-        geometry = (grid.dx, grid.dy, self._between_x, self._between_y)
-        crossed = _advance_u(
-            self._u,
-            self._v,
-            self.p,
-            self._rate_u,
-            self.ahead_u,
-            *geometry,
-            self.grid_velocity,
-            self.viscosity,
-            dt,
-            new,
-        )
-        _advance_v(
-            self._u,
-            self._v,
-            self.p,
-            self._rate_v,
-            self.ahead_v,
-            *geometry,
-            self.grid_velocity,
-            self.viscosity,
-            dt,
-            new,
-        )
+        present = self._u, self._v, self.p
+        sizes = grid.dx, grid.dy, self._between_x, self._between_y
+        numbers = self.grid_velocity, self.viscosity, dt, new
+        crossed = _advance_u(*present, self._rate_u, self.ahead_u, *sizes, *numbers)
+        _advance_v(*present, self._rate_v, self.ahead_v, *sizes, *numbers)
         self._started = True
         self.boundary_impulse = dt * crossed
         self.ahead_u[0] = self.inlet
@@ -122,17 +102,8 @@ class Flow:
         _divergence(self.ahead_u, self.ahead_v, grid.dx, grid.dy, 1.0 / dt, weight, source)
         change = self._poisson.solve(source)
         before = grid.dy @ (self.p[-1] - self.p[0])
-        _correct(
-            self.ahead_u,
-            self.ahead_v,
-            change,
-            self.p,
-            self._between_x,
-            self._between_y,
-            dt,
-            self.u,
-            self.v,
-        )
+        sizes = self._between_x, self._between_y
+        _correct(self.ahead_u, self.ahead_v, change, self.p, *sizes, dt, self.u, self.v)
         self.boundary_impulse -= dt * (before + float(grid.dy @ (change[-1] - change[0])))
 
     def momentum(self) -> float:

@@ -92,10 +92,8 @@ class Immersed:
         if self._fixed:
             _exclude_fixed(on_u, self._fixed[0], faces_u)
             _exclude_fixed(on_v, self._fixed[1], faces_v)
-        around_u, around_v = (
-            _copy_with_margin(flow.ahead_u, faces_u),
-            _copy_with_margin(flow.ahead_v, faces_v),
-        )
+        around_u = _copy_with_margin(flow.ahead_u, faces_u)
+        around_v = _copy_with_margin(flow.ahead_v, faces_v)
         self.mass, momentum = gather(
             places,
             (on_u, around_u, grid.x[faces_u[0]], grid.yc[j]),

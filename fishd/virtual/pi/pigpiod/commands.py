@@ -170,11 +170,8 @@ class Pins:
         pin.start_use(time, Use.PWM, duty)
         pin.mode, pin.written = OUTPUT, 0
         if duty:
-            pin.train.set(
-                time,
-                duty * PWM_STEPS // PWM_RANGE * PULSE_STEP_US,
-                PWM_STEPS * PULSE_STEP_US * 1e-6,
-            )
+            width = duty * PWM_STEPS // PWM_RANGE * PULSE_STEP_US
+            pin.train.set(time, width, PWM_STEPS * PULSE_STEP_US * 1e-6)
         else:
             pin.train.cut(time)
         return 0
