@@ -80,11 +80,23 @@ def controllers(name: str | None, endpoint: str | None, as_json: bool) -> None:
             echo(f"    shows {quantity.name:<18} {quantity.description.rstrip('.')}{unit}")
 
 
-@click.group(invoke_without_command=True)
+class _PolicyGroup(click.Group):
+    """Group in which the name of a policy means `show`, as in `fishctl controllers NAME`."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the verb, `show` if the first argument is not a verb, with its arguments."""
+        if args and args[0] not in self.commands:
+            args = ["show", *args]
+        return super().resolve_command(ctx, args)
+
+
+@click.group(cls=_PolicyGroup, invoke_without_command=True, subcommand_metavar="[NAME|FILE]")
 @daemon_options
 @click.pass_context
 def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
-    """List the policies that have a name.
+    """List the policies that have a name, or show one.
 
     A policy that sees forces swims with 'fishctl set-controller ppo --policy NAME', one that
     sees pictures with 'fishctl agent NAME'.

@@ -1,5 +1,6 @@
 """`fishctl policies` and `--policy` where no fishd runs."""
 
+import json
 import sys
 from pathlib import Path
 
@@ -50,6 +51,15 @@ def test_without_a_daemon_the_policies_of_this_machine_are_listed(policy_folder:
     assert rows[2].startswith("    not here: this is a zip archive as torch writes")
     assert rows[3].startswith("wide   forces  0.8")
     assert len(rows) == 4
+
+
+def test_a_name_without_a_verb_shows_that_policy(policy_folder: Path) -> None:
+    write(policy_folder, FLIP, "flip")
+    assert invoke("policies", "flip").stdout == invoke("policies", "show", "flip").stdout != ""
+    assert json.loads(invoke("policies", "--json", "flip").stdout)["name"] == "flip"
+    done = invoke("policies", "flop")
+    assert (done.exit_code, type(done.exception)) == (1, PolicyError)
+    assert "no policy is named 'flop'; did you mean 'flip'?" in str(done.exception)
 
 
 def test_without_policies_it_names_their_folder(policy_folder: Path) -> None:

@@ -58,7 +58,7 @@ def test_every_relative_link_leads_somewhere(document: Path) -> None:
 
 
 def find_mistake(command: click.Command, words: list[str]) -> str | None:
-    """Return the first mistake of a command line; None if all its verbs and options exist."""
+    """Return the first mistake of a command line; None if all its verbs and options are right."""
     path = command.name or ""
     context = click.Context(command)
     flags = {"--help": True, "--version": True} | flags_of(command)
@@ -80,7 +80,14 @@ def find_mistake(command: click.Command, words: list[str]) -> str | None:
             command, path = subcommand, f"{path} {word}"
             context = click.Context(command, parent=context)
             flags |= flags_of(command)
+    needed = [param.opts[0] for param in command.params if is_needed(param)]
+    if needed and not {*needed, "--resume", "--help"} & {word.partition("=")[0] for word in words}:
+        return f"{path} needs {needed[0]}"
     return None
+
+
+def is_needed(param: click.Parameter) -> bool:
+    return isinstance(param, click.Option) and param.required
 
 
 def flags_of(command: click.Command) -> dict[str, bool]:
@@ -109,7 +116,9 @@ def command_lines(document: Path, program: str) -> Iterator[list[str]]:
 @pytest.mark.parametrize(
     "program", [fishctl, fishd, camera, window], ids=lambda command: command.name
 )
-def test_each_verb_and_option_of_a_command_exists(document: Path, program: click.Command) -> None:
+def test_each_verb_and_option_of_a_command_exists_and_none_is_missing(
+    document: Path, program: click.Command
+) -> None:
     lines = command_lines(document, program.name or "")
     problems = [
         mistake
