@@ -39,7 +39,7 @@ def write_page(traces: Traces, path: str | os.PathLike[str]) -> None:
         rows=rows,
         cols=1,
         row_heights=heights,
-        vertical_spacing=0.3 / rows,
+        vertical_spacing=0.4 / rows,
         subplot_titles=titles,
     )
     _add_lines(figure, traces)

@@ -108,7 +108,8 @@ def _expand_range(piece: str) -> list[str]:
         count = int((high - low) / step + Decimal("1e-9")) + 1
     except (ValueError, InvalidOperation, OverflowError):
         raise ParameterError(
-            f"'{piece}' is not valid: LOW:HIGH:STEP is needed, such as 0.4:4:0.2"
+            f"'{piece}' is not valid: LOW:HIGH:STEP is needed, with LOW up to HIGH and a positive "
+            "STEP, such as 0.4:4:0.2"
         ) from None
     if count > MAX_POINTS:
         raise ParameterError(f"'{piece}' has more than {MAX_POINTS} values")
