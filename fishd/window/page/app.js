@@ -484,13 +484,15 @@ function drawFrame(now) {
   }
   charts.draw(now);
   view.draw(state.tick);
+  const tail = !state.tick ? "tail" : state.tick.alpha === undefined ? "tail, as commanded" : "tail, true";
+  if (byId("tail-key").textContent !== tail) byId("tail-key").textContent = tail;
   if (charts.dirty) schedule();
 }
 
 function buildStaticParts() {
   render(html`<h2 id="view-title" class="unseen">From above</h2><canvas id="fish" role="img"
       aria-label="The fish from above; its tail shows the command, and the true fin if it is simulated"></canvas>
-    <p class="keys"><span class="key-phi">command φ<sub>c</sub></span><span class="key-body">tail</span></p>`, byId("view"));
+    <p class="keys"><span class="key-phi">command φ<sub>c</sub></span><span class="key-body" id="tail-key">tail</span></p>`, byId("view"));
   view = new TopView(byId("fish"));
   const section = byId("charts");
   render(html`<div class="head-row"><h2 id="charts-title">Live</h2>

@@ -28,7 +28,7 @@ const invisible = (column) => ({ column, width: 0, points: { show: false }, asid
 /** Charts: key, title, unit, series; `force` scales to the fish's unit, `truth` is of a simulated fish only. */
 const CHARTS = [
   {
-    key: "fx", title: ["Force F", "x"], force: true, smallest: 1,
+    key: "fx", title: ["Force F", "x"], force: true,
     series: [line("fx", "fx", { width: 1 }), line("thrust", "thrust", { width: 2, name: "mean" }),
       invisible("thrust_high"), invisible("thrust_low"), points("suspect_fx")],
     bands: [{ series: [3, 4], fill: colour("band") }],
@@ -48,15 +48,15 @@ const CHARTS = [
   { key: "speed", title: ["Speed, true"], unit: "m/s", truth: true, series: [line("speed", "fin")] },
 ];
 
-/** Return a range around the values that does not follow each of their movements; smallest: its least width. */
-function steadyRange(smallest, limitsOf) {
+/** Return a range around the values that does not follow each of their movements; smallestOf: returns its least width. */
+function steadyRange(smallestOf, limitsOf) {
   let low = NaN, high = NaN;
   return (chart, least, most) => {
     const limits = limitsOf();
     if (limits) return [limits[0] * 1.15, limits[1] * 1.15];
     if (!Number.isFinite(least)) return Number.isFinite(low) ? [low, high] : [-1, 1];
     const middle = 0.5 * (least + most);
-    const span = Math.max(most - least, smallest, 1e-3 * Math.abs(most));
+    const span = Math.max(most - least, smallestOf(), 1e-3 * Math.abs(most));
     [least, most] = [middle - 0.5 * span, middle + 0.5 * span];
     if (!(least >= low && most <= high && span > SHRINK * (high - low))) {
       const step = 10 ** Math.floor(Math.log10(span)) / 2;
@@ -90,7 +90,7 @@ class Chart {
     this.factor = 1;
     this.unit = definition.unit ?? "";
     this.setTitle(definition.title);
-    for (const { name, stroke } of definition.series) if (name) this.#key(name, stroke);
+    for (const { name, stroke, column } of definition.series) if (name) this.#key(name, stroke, column);
     if (definition.close) this.#closeButton();
     this.data = [owner.times, ...definition.series.map(() => owner.newColumn())];
     this.plot = new globalThis.uPlot(this.#options(), this.data, this.plotNode);
@@ -126,6 +126,11 @@ class Chart {
     this.definition.series.forEach(({ column }, index) => ring.copy(column, this.data[index + 1], this.factor));
   }
 
+  /** Show the keys of the lines that have values. */
+  showKeys(ring) {
+    for (const key of this.keys.children) key.hidden = !ring.has(key.dataset.column);
+  }
+
   draw(low, high) {
     this.plot.batch(() => {
       this.plot.setData(this.data, false);
@@ -151,8 +156,9 @@ class Chart {
     button.addEventListener("click", this.definition.close);
   }
 
-  #key(name, stroke) {
+  #key(name, stroke, column) {
     const key = this.keys.appendChild(document.createElement("span"));
+    key.dataset.column = column;
     key.textContent = name;
     key.style.setProperty("--key", stroke());
   }
@@ -169,7 +175,7 @@ class Chart {
       pxAlign: 1,
       legend: { show: false },
       cursor: { ...(definition.close ? {} : { sync: { key: "fish", setSeries: false } }), drag: { x: false, y: false }, points: { size: 6 } },
-      scales: { x: { time: false, auto: false }, y: { range: definition.range ?? steadyRange(definition.smallest ?? 1e-3, () => definition.limits && owner.limits) } },
+      scales: { x: { time: false, auto: false }, y: { range: definition.range ?? steadyRange(() => this.factor * (definition.smallest ?? 1e-3), () => definition.limits && owner.limits) } },
       axes: [
         {
           ...axis, size: 22, gap: 2,
@@ -357,6 +363,7 @@ export class Charts {
     const high = this.times[this.length - 1], low = high - this.seconds;
     for (const mark of this.marks) if (mark.seq === null && mark.t >= low) mark.seq = ring.seqAt(mark.t);
     for (const chart of this.charts) {
+      chart.showKeys(ring);
       if (!chart.definition.truth) continue;
       chart.known ||= ring.has(chart.definition.series[0].column);
       chart.show(chart.known);

@@ -148,6 +148,26 @@ def test_an_emergency_stop_ends_the_pulses_and_shows_its_time_and_the_way_out(
         assert complaints == []
 
 
+def test_a_fault_of_a_true_sensor_marks_its_samples_and_shows_reason_and_remedy(
+    tmp_path: Path,
+) -> None:
+    with (
+        virtual_pi(tmp_path) as pi,
+        running(tmp_path, *pi.settings) as daemon,
+        running_window(tmp_path, fish=daemon.endpoint) as window,
+        live_page(window.url) as (page, complaints),
+    ):
+        swim(page)
+        expect(page.locator("#view")).to_contain_text("tail, as commanded")
+        pi.control("inject", "clipped")
+        expect(page.locator("#mode")).to_have_text("fault")
+        expect(page.locator("#latched")).to_contain_text("clipped")
+        expect(page.locator("#latched")).to_contain_text("wire of the force sensor")
+        marked = "app.charts.charts[0].data[5].filter((value) => value !== null).length"
+        wait_until(lambda: page.evaluate(f"(async () => {{ {APP} return {marked} }})()") >= 3)
+        assert complaints == []
+
+
 def test_an_emergency_stop_works_when_the_stream_is_stale(
     window: WindowProcess, daemon: Daemon
 ) -> None:
