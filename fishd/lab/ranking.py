@@ -126,8 +126,8 @@ def ratio(
 
 
 def format_choice(names: Sequence[str], chosen: str, reason: str) -> str:
-    """Return "undecided between A, B and C; A chosen because …"."""
-    return f"undecided between {join(names)}; {chosen} chosen because {reason}"
+    """Return "undecided between A, B and C; A is chosen because …"."""
+    return f"undecided between {join(names)}; {chosen} is chosen because {reason}"
 
 
 def join(names: Sequence[str]) -> str:

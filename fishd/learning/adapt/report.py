@@ -70,7 +70,7 @@ def _draw_fit(axis: Any, fitted: Fitted) -> None:
     axis.barh(places, [width for _, width in shown], color=BLUE, height=0.6)
     axis.set_yticks(places, [name for name, _ in shown])
     axis.set_xscale("log")
-    axis.set_xlabel("half of the 95 % interval, % of the value")
+    axis.set_xlabel("half-width of the 95 % interval, % of the value")
     axis.set_title("the fish, as fitted")
 
 
@@ -94,7 +94,7 @@ def _draw_search(axis: Any, state: State, amplitude: float) -> None:
     axis.set_xlabel("frequency (Hz)")
     axis.set_ylabel("thrust (mN)")
     axis.set_title("square waves")
-    axis.legend(loc="lower right")
+    axis.legend(loc="upper right")
 
 
 def _draw_training(axis: Any, folder: Path) -> None:

@@ -24,7 +24,7 @@ from fishd.learning.adapt.state import Contender, Model, Verdict
 SQUARE = "square"
 NAMES = {
     "policy": "the policy",
-    "swing": "swing as --C auto has found it",
+    "swing": "swing with the C of --C auto",
     SQUARE: "the best square wave found",
 }
 

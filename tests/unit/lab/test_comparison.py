@@ -64,7 +64,7 @@ def test_a_verdict_names_a_winner_where_the_runs_tell_and_else_chooses_the_simpl
     undecided = judge_standings([swing, slow, square])
     assert undecided
     assert undecided.best == ("a wave", "swing")
-    sentence = "undecided between a wave and swing; a wave chosen because it is the simplest"
+    sentence = "undecided between a wave and swing; a wave is chosen because it is the simplest"
     assert undecided.sentence == sentence
     decided = judge_standings([slow, swing])
     assert decided
