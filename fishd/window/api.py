@@ -208,7 +208,7 @@ class Window(WebServer):
                 return
             if kind == "hello":
                 for page in pages:
-                    page.push("hello", encode_message("hello", encode(self._hello(page))))
+                    self._greet(page)
                 return
             message = encode_message(kind, payload)
             for page in pages:
@@ -231,7 +231,7 @@ class Window(WebServer):
         ):
             page.client, driver.page = resumed.client, page
         link.flush()
-        page.push("hello", encode_message("hello", encode(self._hello(page))))
+        self._greet(page)
         self._pages.add(page)
         try:
             return await self.serve_viewer(request, page)
@@ -249,14 +249,21 @@ class Window(WebServer):
         finally:
             link.listeners.discard(page.add)
 
-    def _hello(self, page: LivePage) -> dict[str, Any]:
+    def _greet(self, page: LivePage) -> None:
+        """Send the first message to a page, and the ticks that are not in its history."""
+        history, later = self._links[page.fish].history()
+        page.push("hello", encode_message("hello", encode(self._hello(page, history))))
+        if later != b"[]":
+            page.push("ticks", encode_message("ticks", later))
+
+    def _hello(self, page: LivePage, history: bytes) -> dict[str, Any]:
         link, driver = self._links[page.fish], self._drivers.get(page.fish)
         return {
             "client": page.client,
             "fish": list(self._links),
             "name": link.name,
             "session": self._describe_session(self._access_of(page)),
-            "history": link.columns(),
+            "history": msgspec.Raw(history),
             "status": link.status,
             "controllers": link.controllers,
             "events": [msgspec.Raw(event) for event in link.events],
@@ -566,6 +573,8 @@ async def _answer_in_json(request: web.Request, handler: Handler) -> web.StreamR
         headers = error.headers
     except FishdError as error:
         refusal = _refusal(error)
+    except ConnectionError:  # the page has gone
+        raise
     except Exception as error:
         log.error("%s failed: %s", request.path, text.describe_error(error), exc_info=True)
         refusal = ApiError(500, "internal", f"a mistake in fishd: {text.describe_error(error)}")

@@ -28,8 +28,10 @@ from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
 log = logging.getLogger(__name__)
 
-HISTORY_S = 120.0
-"""Length of the history for a page that opens [s]."""
+MAX_TICKS = 2400
+"""Number of ticks in the history for a page that opens: two minutes of 20 Hz."""
+HISTORY_AGE_S = 1.0
+"""Longest age of the encoded history that is sent again [s]."""
 MAX_EVENTS = 100
 STALE_AFTER_S = 0.7
 """Time without a tick after which the fish counts as stale [s]."""
@@ -80,8 +82,10 @@ class FishLink:
         self.status: Status | None = None
         self.controllers: list[ControllerInfo] = []
         self.events: deque[bytes] = deque(maxlen=MAX_EVENTS)
-        self.ticks: deque[bytes] = deque()
-        """Ticks of the last `HISTORY_S`, as they came."""
+        self._ticks: deque[tuple[int, bytes]] = deque(maxlen=MAX_TICKS)
+        """Number and payload of each tick of the history."""
+        self._history = (-HISTORY_AGE_S, 0, b"{}")
+        """When the history was encoded [s, monotonic], its last tick, and its payload."""
         self.listeners: set[Callable[[str, float, bytes], None]] = set()
         """Functions that receive topic, time [s, unix] and payload of each message."""
         self._tell = tell
@@ -178,9 +182,7 @@ class FishLink:
         if tick.seq <= self._seq:
             self._forget()
         self._seq = tick.seq
-        self.ticks.append(payload)
-        while len(self.ticks) > HISTORY_S / (self.status.tick if self.status else 0.05):
-            self.ticks.popleft()
+        self._ticks.append((tick.seq, payload))
         if self._state in ("stale", "lost"):
             self._set_connection("live", "")
         self._batch.append(payload)
@@ -219,7 +221,8 @@ class FishLink:
 
     def _forget(self) -> None:
         """Forget the ticks of an earlier fishd."""
-        self.ticks.clear()
+        self._ticks.clear()
+        self._history = (-HISTORY_AGE_S, 0, b"{}")
         self._batch.clear()
         self._seq = 0
 
@@ -240,7 +243,7 @@ class FishLink:
 
         since: number of the last tick that is not returned
         """
-        ticks = [tick for tick in map(_decode_tick, self.ticks) if tick.seq > since]
+        ticks = [_decode_tick(payload) for seq, payload in self._ticks if seq > since]
         columns: dict[str, Any] = {}
         for name in Tick.__struct_fields__:
             column = [getattr(tick, name) for tick in ticks]
@@ -249,6 +252,18 @@ class FishLink:
             elif any(value is not UNSET for value in column) or name in ("seq", "t"):
                 columns[name] = [None if value is UNSET else value for value in column]
         return columns
+
+    def history(self) -> tuple[bytes, bytes]:
+        """Return the columns as JSON, shared by pages that open within a second, and later ticks.
+
+        A page that opens again and again must not take the processor from an emergency stop.
+        """
+        encoded, last, payload = self._history
+        if time.monotonic() - encoded > HISTORY_AGE_S:
+            payload, last = _RAW(self.columns()), self._seq
+            self._history = time.monotonic(), last, payload
+        later = b",".join(payload for seq, payload in self._ticks if seq > last)
+        return payload, b"[%s]" % later
 
     # Requests
 

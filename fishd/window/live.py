@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Iterable
 
 import msgspec
+from aiohttp import WSMsgType
 
 from fishd.window.web_server import Viewer
 
@@ -19,6 +20,8 @@ DRIVER_TIMEOUT_S = 10.0
 class LivePage(Viewer):
     """One open page."""
 
+    OPCODE = WSMsgType.TEXT
+
     def __init__(self, client: str, fish: str, device: str, device_id: str) -> None:
         """
         client: identifier of this page
@@ -29,9 +32,9 @@ class LivePage(Viewer):
         self.client, self.fish, self.device, self.device_id = client, fish, device, device_id
         self.seen = time.monotonic()
         """Time of the last sign of life [s, monotonic]."""
-        self._messages: deque[tuple[str, str]] = deque()
+        self._messages: deque[tuple[str, bytes]] = deque()
 
-    def push(self, kind: str, message: str) -> None:
+    def push(self, kind: str, message: bytes) -> None:
         """Send a message; a slow page misses ticks, and gets only the newest status."""
         waiting = [place for place, (other, _) in enumerate(self._messages) if other == kind]
         if waiting and (
@@ -43,7 +46,7 @@ class LivePage(Viewer):
             self.end()
         self.wake()
 
-    def take(self) -> Iterable[str]:
+    def take(self) -> Iterable[bytes]:
         """Yield the messages that wait, and remove each."""
         while self._messages:
             yield self._messages.popleft()[1]
@@ -72,9 +75,9 @@ class Driver:
         return {"client": self.page.client, "device": self.page.device, "you_drive": mine}
 
 
-def encode_message(kind: str, payload: bytes) -> str:
+def encode_message(kind: str, payload: bytes) -> bytes:
     """Return a message for a page: a JSON array of its type and its payload."""
-    return f'["{kind}",{payload.decode()}]'
+    return b'["%s",%s]' % (kind.encode(), payload)
 
 
 def encode(value: object) -> bytes:

@@ -234,6 +234,8 @@ class WebServer:
 class Viewer:
     """One open WebSocket; `take` returns the messages that are sent next."""
 
+    OPCODE = WSMsgType.BINARY
+    """Kind of the messages that are bytes."""
     address = ""
     """Address of the page."""
 
@@ -271,7 +273,7 @@ class Viewer:
                     if isinstance(message, str):
                         await sock.send_str(message)
                     else:
-                        await sock.send_bytes(message)
+                        await sock.send_frame(message, self.OPCODE)
         except ConnectionError:
             pass
         finally:
@@ -307,8 +309,11 @@ class _RequestLog(logging.LoggerAdapter[logging.Logger]):
     _left_out = 0
 
     def exception(self, msg: object, *args: Any, exc_info: Any = True, **options: Any) -> None:
-        """Log an error of the server with its traceback, a malformed request in one line."""
-        if isinstance(exc_info, http_exceptions.HttpProcessingError):
+        """Log an error of the server with its traceback, a malformed request in one line.
+
+        A page that is gone before it has its answer is no error of the server.
+        """
+        if isinstance(exc_info, http_exceptions.HttpProcessingError | ConnectionError):
             self._log_malformed(args[0] if args else "", exc_info)
         else:
             super().exception(msg, *args, exc_info=exc_info, **options)

@@ -7,8 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rigs.processes import Daemon, wait_until
+from rigs.processes import FISHCTL, Daemon, wait_until
 from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
+
+from bench.window import MAX_STOP_S, measure_stops
 
 SOON = "from fishd.window import live; live.DRIVER_TIMEOUT_S = 1.0"
 SINE = {"op": "set-controller", "args": {"name": "sine"}}
@@ -150,6 +152,9 @@ def test_a_fish_that_an_experiment_holds_is_taken_only_on_request(
 
 def daemon_measure(daemon: Daemon) -> list[str]:
     """Return the command of a measurement."""
-    from rigs.processes import FISHCTL
-
     return [FISHCTL, "measure", "square", "--endpoint", daemon.endpoint, "--on", "live"]
+
+
+@pytest.mark.realtime
+def test_an_emergency_stop_ends_the_pulses_within_a_fifth_of_a_second(tmp_path: Path) -> None:
+    assert max(measure_stops(3, tmp_path)) <= MAX_STOP_S

@@ -1,0 +1,80 @@
+"""`fishctl window` and `fishd-window`: they open a page that runs, start one, and end in order."""
+
+import re
+import signal
+from pathlib import Path
+
+import pytest
+from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, wait_until
+from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
+
+
+def test_a_page_that_runs_is_opened_and_not_started_again(window: WindowProcess) -> None:
+    done = fishctl("window", "open", "--listen", f"127.0.0.1:{window.port}")
+    assert (done.returncode, done.stdout) == (0, f"the fish is at {window.url}/\n")
+
+
+def test_a_page_that_does_not_run_is_started_until_ctrl_c(daemon: Daemon, tmp_path: Path) -> None:
+    options = ["--listen", "127.0.0.1:0", "--state", str(tmp_path)]
+    with Process(FISHCTL, "--endpoint", daemon.endpoint, "window", "open", *options) as process:
+        assert process.process.stdout
+        line = process.process.stdout.readline()
+        match = re.fullmatch(r"the fish is at (http://127\.0\.0\.1:\d+)/\n", line)
+        assert match
+
+        async def test() -> None:
+            async with Browser(match[1]) as browser, open_page(browser) as page:
+                await page.until("ticks")
+
+        run(test())
+        assert process.end(signal.SIGINT)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--listen", "8880"], "--listen: listen: '8880' is not valid: HOST:PORT is needed"),
+        (["--listen", "127.0.0.1:99999"], "HOST:PORT is needed, such as 127.0.0.1:8880"),
+        (["--fish", "tuna"], "'tuna' is not valid: NAME=ENDPOINT is needed"),
+        (["--fish", "a/b=ipc:///x"], "up to 40 letters, digits, dots and dashes are needed"),
+        (["--fish", "tuna=here"], "'here' is not valid: tcp://HOST:PORT or ipc://PATH is needed"),
+        (["--state", "/proc/none"], "/proc/none cannot be created"),
+        (["--listen", "192.0.2.1:8880"], "cannot serve a page at 192.0.2.1:8880"),
+    ],
+)
+def test_a_wrong_option_is_one_line(tmp_path: Path, words: list[str], complaint: str) -> None:
+    with WindowProcess(tmp_path, *words) as process:
+        status, _, errors = process.finish()
+    assert status != 0
+    assert complaint in errors
+    assert errors.count("\n") == 1
+
+
+def test_a_wrong_key_is_named_with_its_line(tmp_path: Path) -> None:
+    file = tmp_path / "window.yaml"
+    file.write_text("listen: 127.0.0.1:8880\nfishes: {}\n")
+    line = one_line(fishctl("window", "devices", "--config", str(file)))
+    assert re.search(r"window\.yaml:2: fishes: unknown key; did you mean 'fish'\?", line)
+
+
+def test_the_end_of_the_window_stops_its_fish_and_its_experiments(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    with running_window(tmp_path, fish=daemon.endpoint) as process:
+
+        async def test() -> None:
+            async with Browser(process.url) as browser, open_page(browser) as page:
+                job = {"fish": "fish", "kind": "record", "options": {"name": "endless"}}
+                await page.post("/api/jobs", job)
+                await page.until("job", lambda j: "recording to" in "".join(j["lines"]))
+                await page.swim()
+                process.process.send_signal(signal.SIGTERM)
+                while not page.sock.closed:
+                    await page.sock.receive()
+
+        run(test())
+        process.process.wait()
+        assert process.process.returncode == 0
+        wait_until(lambda: daemon.status().mode == "idle")
+        assert daemon.status().lease is None
+        assert (tmp_path / "runs" / "endless.mcap").exists()
