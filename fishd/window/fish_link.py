@@ -52,6 +52,8 @@ LAST_RESORT_TIMEOUT_S = 10.0
 _decode_tick: Callable[[bytes], Tick] = decoder(Tick)
 _decode_event: Callable[[bytes], Event] = decoder(Event)
 _decode_status: Callable[[bytes], Status] = decoder(Status)
+_OPTIONAL = {field.name for field in msgspec.structs.fields(Tick) if field.default is UNSET}
+"""Fields that a tick may lack."""
 _RAW = msgspec.json.Encoder().encode
 
 
@@ -249,7 +251,7 @@ class FishLink:
             column = [getattr(tick, name) for tick in ticks]
             if name == "quantities":
                 columns[name] = _transpose([{} if row is UNSET else row for row in column])
-            elif any(value is not UNSET for value in column) or name in ("seq", "t"):
+            elif name not in _OPTIONAL or any(value is not UNSET for value in column):
                 columns[name] = [None if value is UNSET else value for value in column]
         return columns
 
