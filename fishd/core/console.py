@@ -74,7 +74,10 @@ def run(command: click.Command, name: str) -> int:
         sys.exit(2)
     except click.UsageError as error:
         path = error.ctx.command_path if error.ctx else name
-        complain(name, f"{error.format_message().rstrip('.')}; see '{path} --help'", 2)
+        message = error.format_message().rstrip(".")
+        if isinstance(error, click.MissingParameter) and isinstance(error.param, click.Option):
+            message = f"{message} {error.param.metavar or ''}".rstrip()  # what it takes
+        complain(name, f"{message}; see '{path} --help'", 2)
     except click.ClickException as error:
         complain(name, error.format_message(), 1)
     except ConfigError as error:
