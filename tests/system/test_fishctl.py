@@ -93,6 +93,7 @@ def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(daemon
         "begin with 0.6, and search for the largest thrust.",
         "default": 0.6,
         "interval": "[0, 1]",
+        "step": 0.05,
         "optional": False,
         "words": ["auto"],
     }
