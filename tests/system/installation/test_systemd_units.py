@@ -48,16 +48,8 @@ def root(tmp_path: Path) -> Path:
     (tmp_path / "usr/lib/systemd/system/pigpiod.service").write_text(PIGPIOD)
     fishd = "opt/fishd/bin/fishd"
     fishctl = "opt/fishd/bin/fishctl"
-    for program in (
-        fishd,
-        f"{fishd}-release",
-        fishctl,
-        f"{fishd}-camera",
-        f"{fishd}-window",
-        "usr/bin/pigpiod",
-        "bin/sh",
-        "bin/systemctl",
-    ):
+    own_programs = (fishd, f"{fishd}-release", fishctl, f"{fishd}-camera", f"{fishd}-window")
+    for program in (*own_programs, "usr/bin/pigpiod", "bin/sh", "bin/systemctl"):
         (tmp_path / program).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / program).touch(0o755)
     return tmp_path

@@ -362,10 +362,7 @@ def test_a_fish_that_is_only_noise_is_refused_in_one_line(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("error", "code", "status"),
-    [
-        (Refused("leased", "a lease is held"), " [leased]", 1),
-        (ConfigError("run: of another"), "", 78),
-    ],
+    [(Refused("leased", "a lease is held"), " [leased]", 1), (ConfigError("run: another"), "", 78)],
 )
 def test_an_error_ends_an_adaptation_in_one_line_with_the_command_to_resume(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: FishdError, code: str, status: int

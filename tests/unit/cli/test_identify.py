@@ -113,10 +113,7 @@ def test_a_command_line_without_sense_is_refused(words: tuple[str, ...], complai
 
 @pytest.mark.parametrize(
     ("words", "complaint"),
-    [
-        (("nowhere.mcap",), "nowhere.mcap"),
-        (("--experiment", "--fit", "omega"), "did you mean 'omega0'?"),
-    ],
+    [(("no.mcap",), "no.mcap"), (("--experiment", "--fit", "omega"), "did you mean 'omega0'?")],
 )
 def test_what_cannot_be_fitted_is_one_line(words: tuple[str, ...], complaint: str) -> None:
     done = invoke(*words)

@@ -41,7 +41,7 @@ def test_optimal_control_is_printed_and_drawn(tmp_path: Path) -> None:
     ("file", "complaint"),
     [
         ("missing/best.png", "does not exist"),
-        ("best.xyz", "a figure has no format .xyz: .pdf, .png or .svg is needed"),
+        ("best.xyz", "a figure has no format .xyz: .pdf, .png"),
     ],
 )
 def test_a_figure_that_cannot_be_written_is_refused_before_anything_is_computed(

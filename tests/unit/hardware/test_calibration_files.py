@@ -174,22 +174,18 @@ def test_a_folder_that_cannot_be_read_is_an_error_and_not_no_calibration(tmp_pat
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "force-backup.yaml",
-        "force-2027-01-01T000000.000000Z (copy).yaml",
-        "force-2027-02-30T000000.000000Z.yaml",
-    ],
+    ["force-backup", "force-2027-01-01T000000.000000Z (copy)", "force-2027-02-30T000000.000000Z"],
 )
 def test_a_file_without_a_date_in_its_name_is_ignored_and_told(tmp_path: Path, name: str) -> None:
     folder = CalibrationFolder(tmp_path)
     force, _ = folder.save(ForceCalibration(xx=2.0), NOON)
     servo, _ = folder.save(ServoCalibration(trim=3.0), NOON)
     assert folder.ignored() == []
-    (tmp_path / name).write_text("xx: 7.0\n")
+    file = tmp_path / f"{name}.yaml"
+    file.write_text("xx: 7.0\n")
     newest = folder.newest(ForceCalibration), folder.newest(ServoCalibration)
     assert [pair and pair[0] for pair in newest] == [force, servo]
-    line = f"{tmp_path / name} is not a dated calibration file and is ignored"
-    assert folder.ignored() == [line]
+    assert folder.ignored() == [f"{file} is not a dated calibration file and is ignored"]
     _, path = folder.save(ForceCalibration(xx=3.0), NOON + HOUR)
     assert path.name == "force-2026-11-21T130000.000000Z.yaml"
 

@@ -100,12 +100,9 @@ def test_what_is_no_onnx_is_refused(content: bytes) -> None:
         ({"observation": []}, "its card names neither an observation nor pictures"),
         (
             {"observation": [{"name": "fz", "scale": 1.0}]},
-            "its card: observation.name: 'fz' is not valid: one of fin_velocity | fx | fy",
+            "its card: observation.name: 'fz' is not",
         ),
-        (
-            {"observation": [{"name": "fy", "scale": 1e-320}]},
-            "its card: observation.scale: 1e-320 is not valid: ",
-        ),
+        ({"observation": [{"name": "fy", "scale": 1e-320}]}, "its card: observation.scale: 1e-320"),
         ({"provenance": None}, "its card: provenance: is missing"),
     ],
 )

@@ -89,20 +89,12 @@ def test_a_reloaded_driver_is_found_under_its_new_number(bench: Bench) -> None:
         ({FAN: 4}, SysfsPwmSettings(), r"add dtoverlay=pwm-2chan to /boot/firmware/config.txt"),
         ({}, SysfsPwmSettings(gpio=12), r"has none: add dtoverlay=pwm-2chan,pin=12,func=4,pin2=13"),
         ({PI5: 4}, SysfsPwmSettings(gpio=17), r"^servo.gpio: GPIO 17 .*; 12, 13, 18, 19 have$"),
-        (
-            {FAN: 4},
-            SysfsPwmSettings(chip=FAN),
-            r"^servo.channel is missing: for chip 1f0009c000.pwm",
-        ),
+        ({FAN: 4}, SysfsPwmSettings(chip=FAN), r"^servo.channel is missing: for chip 1f0009c000"),
+        ({PI5: 4}, SysfsPwmSettings(channel=4), r"^servo.channel: .*/pwmchip0 has no channel 4$"),
         (
             {PI5: 4},
-            SysfsPwmSettings(channel=4),
-            r"^servo.channel: /sys/class/pwm/pwmchip0 has no channel 4$",
-        ),
-        (
-            {PI5: 4},
-            SysfsPwmSettings(root="/sys/nowhere"),
-            r"^no PWM chips can be found in /sys/nowhere: No such file",
+            SysfsPwmSettings(root="/nowhere"),
+            r"^no PWM chips can be found in /nowhere: No",
         ),
     ],
 )

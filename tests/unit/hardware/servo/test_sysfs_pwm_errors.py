@@ -55,18 +55,14 @@ def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Be
 
 
 @pytest.mark.parametrize(
-    "broken",
-    [
-        {"unreadable": {"duty_cycle"}},
-        {"unreadable": {"enable"}},
-        {"unwritable": {("duty_cycle", 0)}},
-    ],
+    ("what", "broken"),
+    [("unreadable", "duty_cycle"), ("unreadable", "enable"), ("unwritable", ("duty_cycle", 0))],
     ids=str,
 )
 def test_close_ends_a_channel_that_cannot_be_released(
-    bench: Bench, servo: CalibratedServo, broken: dict[str, Any]
+    bench: Bench, servo: CalibratedServo, what: str, broken: Any
 ) -> None:
-    vars(bench.kernel).update(broken)
+    getattr(bench.kernel, what).add(broken)
     with pytest.raises(ServoError, match="Input/output error"):
         servo.close()
     channel = bench.kernel._chips[PI5][2]
