@@ -22,8 +22,8 @@ import yaml
 from common.report import DOCS, JOBS, QUICK, Options, Report, percent, run_cases, table
 from common.reversed_force import reversed_robot
 from fishd.config import load
-from fishd.lab.compare.survey import CHANGES, OtherFish, ReversalTimes, harsh, harsh_fish, mild
-from fishd.lab.simulation import VirtualRun, simulate
+from fishd.lab.compare.survey import CHANGES, OtherFish, harsh, harsh_fish, longest_chatter, mild
+from fishd.lab.simulation import KeepingPublisher, VirtualRun, simulate
 
 RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 2, 3)
 """Values of ω₀Φ/Ω."""
@@ -75,7 +75,7 @@ def swim(case: tuple[OtherFish, int | None, Way]) -> Swum:
     logging.getLogger("fishd").setLevel(logging.ERROR)  # each reversed F_y causes a warning
     seeds = () if seed is None else (f"simulation.seed={seed}",)
     config = load(None, (*fish.overrides, *seeds, *way.overrides))
-    reversals = ReversalTimes()
+    publisher = KeepingPublisher()
 
     def rest(run: VirtualRun) -> None:
         if way.reversed_fy is None:
@@ -86,11 +86,11 @@ def swim(case: tuple[OtherFish, int | None, Way]) -> Swum:
             run.tick()
 
     report = simulate(
-        config, way.controller, way.parameters, way.seconds, way.settle, reversals, rest
+        config, way.controller, way.parameters, way.seconds, way.settle, publisher, rest
     )
     share = 0.0 if report.reason else report.relative_thrust
     troubled = bool(report.reason or report.fallback)
-    longest_chatter_s = reversals.longest(1.5 * config.tick)
+    longest_chatter_s = longest_chatter(publisher.ticks, 1.5 * config.tick)
     return Swum(share, report.best_square_thrust, longest_chatter_s, troubled)
 
 

@@ -13,7 +13,6 @@ from common.report import progress
 from fishd.config import Config, load
 from fishd.lab import drawing
 from fishd.lab.drawing import BLACK, BLUE, GREEN, ORANGE, PURPLE
-from fishd.lab.simulation import EncodingPublisher
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Lengths, swim_freely
 from fishd.lab.sweep.results import SpeedResult
@@ -66,7 +65,7 @@ def swim(case: Case, lengths: Lengths | None = None) -> SpeedResult:
     fish = config(case.cell)
     point = Point(case.controller, {name: case.setting})
     lengths = lengths or Lengths.of(fish, None, None)
-    result = swim_freely(point, fish, lengths, EncodingPublisher())
+    result = swim_freely(point, fish, lengths, None)
     assert result
     if result.failure:
         raise SystemExit(f"{point.label()} at {case.cell:g} mm: {result.failure}")

@@ -122,7 +122,7 @@ def compare(
             noise = replace(config.simulation, seed=config.simulation.seed + run)
             fish = replace(config, simulation=noise)
             camera_of_run = replace(camera_settings, seed=camera_settings.seed + run)
-            latest_ticks = _LatestTicks(config.tick)
+            latest_ticks = KeepingPublisher(max(2, round((TRACE_S + _MARGIN_S) / config.tick) + 1))
             report = swim(fish, contestant, seconds, settle, latest_ticks, camera_of_run)
             check_whole_beat(report, seconds, settle)
             reports.append(report)
@@ -247,17 +247,3 @@ def _candidate(standing: Standing) -> Candidate:
         complexity(standing.controller),
         len(standing.thrusts) - 1 if by_runs is not None and error <= by_runs else math.inf,
     )
-
-
-class _LatestTicks(KeepingPublisher):
-    """A publisher that stores the latest ticks."""
-
-    def __init__(self, tick: float) -> None:
-        super().__init__()
-        self._max_ticks = max(2, round((TRACE_S + _MARGIN_S) / tick) + 1)
-
-    def tick(self, tick: Tick) -> None:
-        """Store a tick, and drop the oldest from time to time."""
-        super().tick(tick)
-        if len(self.ticks) > 2 * self._max_ticks:
-            del self.ticks[: -self._max_ticks]

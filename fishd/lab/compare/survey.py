@@ -16,9 +16,10 @@ from msgspec import Struct
 from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.beats import Reversals
-from fishd.core.signals import Event, Tick
+from fishd.core.signals import Tick
 from fishd.lab.compare.comparison import swim
 from fishd.lab.compare.contestants import Contestant, refusal
+from fishd.lab.simulation import KeepingPublisher
 from fishd.virtual.plant.parameters import PlantParameters
 
 FIRST_SEED = 300
@@ -149,31 +150,18 @@ class ContestantSurvey(Struct, frozen=True, kw_only=True):
         return min(self.fish, key=lambda result: result.relative_thrust)
 
 
-class ReversalTimes:
-    """A publisher that stores the times of reversals of the instruction angle."""
-
-    def __init__(self) -> None:
-        self.times: list[float] = []
-        self._reversals = Reversals()
-
-    def tick(self, tick: Tick) -> None:
-        """Store the time of a reversal."""
-        if self._reversals.add(tick.phi_c):
-            self.times.append(tick.t)
-
-    def event(self, event: Event) -> None:
-        """Drop an event."""
-
-    def longest(self, apart: float) -> float:
-        """Return the length of the longest series of reversals less than `apart` apart [s]."""
-        longest = start = 0.0
-        for previous, current in pairwise(self.times):
-            start = start or previous
-            if current - previous < apart:
-                longest = max(longest, current - start)
-            else:
-                start = 0.0
-        return longest
+def longest_chatter(ticks: Iterable[Tick], apart: float) -> float:
+    """Return the length of the longest series of reversals less than `apart` apart [s]."""
+    reversals = Reversals()
+    times = [tick.t for tick in ticks if reversals.add(tick.phi_c)]
+    longest = start = 0.0
+    for previous, current in pairwise(times):
+        start = start or previous
+        if current - previous < apart:
+            longest = max(longest, current - start)
+        else:
+            start = 0.0
+    return longest
 
 
 def survey(
@@ -200,8 +188,8 @@ def survey(
             raise error
         rows = []
         for fish, config in configs:
-            reversals = ReversalTimes()
-            report = swim(config, contestant, seconds, settle, reversals, camera_settings)
+            publisher = KeepingPublisher()
+            report = swim(config, contestant, seconds, settle, publisher, camera_settings)
             rows.append(
                 FishResult(
                     fish=fish.name,
@@ -209,7 +197,7 @@ def survey(
                     relative_thrust=report.relative_thrust,
                     thrust=report.mean_thrust,
                     frequency=report.frequency,
-                    longest_chatter_s=reversals.longest(1.5 * config.tick),
+                    longest_chatter_s=longest_chatter(publisher.ticks, 1.5 * config.tick),
                     fallback=report.fallback.message if report.fallback else None,
                     fault=report.reason.message if report.reason else None,
                 )

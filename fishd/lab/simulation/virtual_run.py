@@ -41,14 +41,18 @@ class EncodingPublisher:
 
 
 class KeepingPublisher:
-    """A publisher that stores every tick and drops events."""
+    """A publisher that stores the ticks and drops events."""
 
-    def __init__(self) -> None:
+    def __init__(self, min_ticks: int | None = None) -> None:
+        """min_ticks: number of latest ticks to keep at least; None for all ticks"""
         self.ticks: list[Tick] = []
+        self._min_ticks = min_ticks
 
     def tick(self, tick: Tick) -> None:
-        """Store a tick."""
+        """Store a tick, and drop the oldest from time to time."""
         self.ticks.append(tick)
+        if self._min_ticks and len(self.ticks) > 2 * self._min_ticks:
+            del self.ticks[: -self._min_ticks]
 
     def event(self, event: Event) -> None:
         """Drop an event."""

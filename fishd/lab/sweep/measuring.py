@@ -86,7 +86,7 @@ def swim(
     point: Point,
     config: Config,
     lengths: Lengths,
-    publisher: Publisher,
+    publisher: Publisher | None,
     on_start: Callable[[VirtualRun], None] = lambda run: None,
 ) -> Result:
     """Return the true thrust of a simulated fish at a point.
@@ -94,7 +94,7 @@ def swim(
     The error is that of the mean over the beats. Beats differ because the controller reacts to
     noise, and because half beats are not always whole ticks.
 
-    publisher: receives every tick and every event
+    publisher: receives every tick and every event; None to create no messages
     on_start: called before the first tick
     Raises `ParameterError` and `UnknownController`.
     """
@@ -228,7 +228,7 @@ def swim_freely(
     point: Point,
     config: Config,
     lengths: Lengths,
-    publisher: Publisher,
+    publisher: Publisher | None,
     on_start: Callable[[VirtualRun], None] = lambda run: None,
     stop: Callable[[], bool] = lambda: False,
 ) -> SpeedResult | None:
@@ -238,7 +238,7 @@ def swim_freely(
     show no trend. After `MAX_SWIM_S` seconds the later half is measured, or `lengths.periods` beats
     if the half has fewer, and `settled_time` is None.
 
-    publisher: receives every tick and every event
+    publisher: receives every tick and every event; None to create no messages
     on_start: called before the first tick
     stop: called regularly; if it returns True, the swim ends and None is returned
     Raises `ParameterError` and `UnknownController`.

@@ -14,7 +14,7 @@ from rigs.processes import fishctl, one_line
 
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError
-from fishd.core.signals import Event, Tick
+from fishd.core.signals import Tick
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.rerun import rerun
 from fishd.lab.session import Disturbed, VirtualSession
@@ -27,16 +27,6 @@ from fishd.recording import open_run
 DRIFTS = ("simulation.noise=0.001", "simulation.drift=0.005", "simulation.offset_y=0.01")
 MEASURED = select_quantity("live", {}, "N").measured
 SQUARES = [Point("square", {"frequency": value}) for value in (1.25, 5.0 / 3.0, 2.0)]
-
-
-class DroppingPublisher:
-    """Publisher that drops ticks and events."""
-
-    def tick(self, tick: Tick) -> None:
-        pass
-
-    def event(self, event: Event) -> None:
-        pass
 
 
 def do_nothing(*_: object) -> None:
@@ -65,13 +55,13 @@ def measure(folder: SweepFolder, points: Sequence[Point], session: VirtualSessio
 def test_a_simulated_fish_is_judged_by_its_true_thrust_whatever_its_sensor_says() -> None:
     for frequency, millinewtons in ((1.0, 15.234453), (2.0, 23.829169)):  # from tests/reference
         point = Point("square", {"frequency": frequency})
-        result = swim(point, load(None, DRIFTS), Lengths(), DroppingPublisher())
+        result = swim(point, load(None, DRIFTS), Lengths(), None)
         assert result.thrust == pytest.approx(millinewtons * 1e-3, rel=1e-4)
         assert result.thrust_ci95 == pytest.approx(0.0, abs=1e-9)
 
 
 def test_half_beats_that_are_no_whole_ticks_show_in_the_error() -> None:
-    result = swim(Point("square", {"frequency": 1.709}), Config(), Lengths(), DroppingPublisher())
+    result = swim(Point("square", {"frequency": 1.709}), Config(), Lengths(), None)
     assert result.thrust is not None
     assert result.thrust_ci95 is not None
     assert 1e-6 < result.thrust_ci95 < 1e-3

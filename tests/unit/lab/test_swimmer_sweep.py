@@ -11,7 +11,6 @@ from rigs.coarse_swimmer import FILE, OPTIONS, coarse
 from rigs.processes import fishctl, one_line
 
 from fishd.config import Config
-from fishd.core.signals import Event, Tick
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.sweep import figure, measuring
 from fishd.lab.sweep.curves import best_to_builtins, find_best, make_curves
@@ -20,14 +19,6 @@ from fishd.lab.sweep.measuring import find_first_measured, is_steady, swim_freel
 from fishd.lab.sweep.results import SpeedResult, SweepFolder
 
 WAVE = Point("square", {"frequency": 3.0})
-
-
-class NullPublisher:
-    def tick(self, tick: Tick) -> None:
-        pass
-
-    def event(self, event: Event) -> None:
-        pass
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +52,7 @@ def test_a_fish_whose_speed_still_changes_is_judged_by_the_later_half_and_that_i
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(measuring, "MAX_SWIM_S", 2.0)
-    result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
+    result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), None)
     assert result
     assert (result.failure, result.settled_time, result.seconds) == ("", None, 2.0)
     assert result.beats == 2
@@ -75,7 +66,7 @@ def test_a_fish_is_judged_as_soon_as_its_speed_is_steady(
 ) -> None:
     monkeypatch.setattr("fishd.lab.sweep.measuring.MIN_MEASURED_S", 0.5)
     monkeypatch.setattr("fishd.lab.sweep.measuring.STEADY_FRACTION", 0.5)
-    result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
+    result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), None)
     assert result
     assert result.settled_time is not None
     assert 0.3 < result.settled_time < 1.0
@@ -87,7 +78,7 @@ def test_a_fish_that_is_lost_is_a_point_without_a_speed(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fishd.virtual.swimmer.fish.MAX_COURANT_NUMBER", 1e-6)
-    result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), NullPublisher())
+    result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), None)
     assert result
     assert result.speed is None
     assert "the swimmer cannot go on at 0.04" in result.failure
@@ -95,7 +86,7 @@ def test_a_fish_that_is_lost_is_a_point_without_a_speed(
 
 def test_a_swim_is_stopped_before_its_end(config: Config) -> None:
     lengths = Lengths(settle=0.1, periods=2)
-    assert swim_freely(WAVE, config, lengths, NullPublisher(), stop=lambda: True) is None
+    assert swim_freely(WAVE, config, lengths, None, stop=lambda: True) is None
 
 
 def open_folder(path: Path, config: Config) -> SweepFolder:
