@@ -146,10 +146,13 @@ class Window(WebServer):
             name: FishLink(name, endpoint, self._teller(name))
             for name, endpoint in settings.endpoints.items()
         }
+        self._pair_all = settings.pair_all
         self._jobs = Jobs(settings.runs_folder, self._tell_job)
         self._pages: set[LivePage] = set()
         self._session = secrets.token_hex(4)
         self._drivers: dict[str, Driver] = {}
+        self._endings: set[asyncio.Task[None]] = set()
+        """Ends of the role of drivers that are gone; fishd may be slow to answer."""
         self._tasks: list[asyncio.Task[None]] = []
         host, port = settings.address
         routes = [
@@ -208,7 +211,10 @@ class Window(WebServer):
                 return
             if kind == "hello":
                 for page in pages:
-                    self._greet(page)
+                    try:
+                        self._greet(page)
+                    except DeviceError:  # it was revoked, or the file is damaged
+                        page.end()
                 return
             message = encode_message(kind, payload)
             for page in pages:
@@ -239,10 +245,12 @@ class Window(WebServer):
             self._pages.discard(page)
 
     async def _serve_foxglove(self, request: web.Request) -> web.StreamResponse:
-        if self._access(request).scope is None:
+        access = self._access(request)
+        if access.scope is None:
             raise web.HTTPUnauthorized(text="this device is not paired\n")
         link = self._link(request.query.get("fish", next(iter(self._links))))
         page = FoxglovePage(link.name, self._session)
+        page.device_id = access.device_id
         link.listeners.add(page.add)
         try:
             return await self.serve_viewer(request, page, [PROTOCOL])
@@ -276,7 +284,7 @@ class Window(WebServer):
     def _access_of(self, page: LivePage) -> Access:
         if not page.device_id:
             return Access("drive", None, True)
-        device = next(d for d in self.devices.all() if d.id == page.device_id)
+        device = self.devices.get(page.device_id)
         return Access(device.scope, device, False)
 
     async def _watch(self) -> None:
@@ -284,6 +292,7 @@ class Window(WebServer):
         next_connection = 0.0
         while True:
             await asyncio.sleep(WATCH_PERIOD_S)
+            self._endings = {ending for ending in self._endings if not ending.done()}
             try:
                 self._close_revoked()
             except FishdError as error:
@@ -291,7 +300,7 @@ class Window(WebServer):
             for name, driver in list(self._drivers.items()):
                 if driver.is_gone:
                     log.warning("%s has left while it drove %s", driver.page.device, name)
-                    await self._end_driving(name)
+                    self._endings.add(asyncio.create_task(self._end_driving(name)))
             if time.monotonic() >= next_connection:
                 next_connection = time.monotonic() + CONNECTION_PERIOD_S
                 for name, link in self._links.items():
@@ -300,9 +309,9 @@ class Window(WebServer):
 
     def _close_revoked(self) -> None:
         paired = {device.id for device in self.devices.all()} | {""}
-        for page in self._pages:
-            if page.device_id not in paired:
-                page.end()
+        for viewer in self.viewers:
+            if viewer.device_id not in paired:
+                viewer.end()
         for name, driver in list(self._drivers.items()):
             if driver.page.device_id not in paired:
                 driver.page.seen = -1e9
@@ -312,7 +321,7 @@ class Window(WebServer):
 
     def _access(self, request: web.Request) -> Access:
         device = self.devices.find(request.cookies.get(COOKIE))
-        loopback = is_loopback(request)
+        loopback = not self._pair_all and is_loopback(request)
         scope: Scope | None = "drive" if loopback else device.scope if device else None
         return Access(scope, None if loopback else device, loopback)
 
@@ -352,7 +361,7 @@ class Window(WebServer):
         pairing = await _read_body(request, Pairing)
         device, secret = self.devices.pair(pairing.token, pairing.name)
         log.info("%s is paired, to %s", device.name, device.scope)
-        access = Access(device.scope, device, is_loopback(request))
+        access = Access(device.scope, device, False)
         response = _success(self._describe_session(access))
         response.set_cookie(
             COOKIE,

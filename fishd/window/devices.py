@@ -142,6 +142,13 @@ class Devices:
             self._read()
         return self._content.devices
 
+    def get(self, identity: str) -> Device:
+        """Return the device with this id; raise `DeviceError` if there is none."""
+        for device in self.all():
+            if device.id == identity:
+                return device
+        raise DeviceError("this device is no longer paired")
+
     def revoke(self, name: str) -> Device:
         """Remove the device with this name or id; raise `DeviceError` if there is none."""
         match = next((entry for entry in self.all() if name in (entry.name, entry.id)), None)

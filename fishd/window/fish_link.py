@@ -139,6 +139,10 @@ class FishLink:
                 await self._follow()
             except FishError as error:
                 self._set_connection("lost", str(error))
+            except Exception as error:
+                message = f"a mistake in fishd-window: {text.describe_error(error)}"
+                log.error("%s", message, exc_info=True)
+                self._set_connection("lost", message)
             await asyncio.sleep(PROBE_PERIOD_S)
 
     async def _follow(self) -> None:

@@ -43,6 +43,9 @@ class WindowSettings(Struct, frozen=True, forbid_unknown_fields=True):
     origins: Annotated[
         tuple[str, ...], note("Origins whose Foxglove or Lichtblick may read the fish.")
     ] = ()
+    pair_all: Annotated[
+        bool, note("Whether browsers on this machine need pairing, too, as behind a reverse proxy.")
+    ] = False
     runs: Annotated[str | None, note("Folder of recordings; null: $FISHD_RUNS, else runs.")] = None
     state: Annotated[str | None, note("Folder of the paired devices; null: one of this user.")] = (
         None

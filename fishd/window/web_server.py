@@ -89,7 +89,8 @@ class WebServer:
         """
         self._host, self._port, self._advice = host, port, advice
         self._readers = readers or {}
-        self._viewers: set[Viewer] = set()
+        self.viewers: set[Viewer] = set()
+        """Open WebSockets."""
         self._asking: dict[web.RequestHandler, tuple[str, asyncio.TimerHandle]] = {}
         """Address and timeout of each connection that has not sent a request, oldest first."""
         self._names = {socket.gethostname().lower(), "localhost"}
@@ -127,7 +128,7 @@ class WebServer:
     async def __aexit__(self, *_: object) -> None:
         """Close all pages, and abort connections that do not close."""
         self._server.close()
-        for viewer in tuple(self._viewers):
+        for viewer in tuple(self.viewers):
             viewer.end()
         server = self._runner.server
         transports = [connection.transport for connection in server.connections] if server else []
@@ -147,10 +148,10 @@ class WebServer:
     ) -> web.StreamResponse:
         """Serve a WebSocket until the page or the server closes it."""
         viewer.address = request.remote or ""
-        own = sum(other.address == viewer.address for other in self._viewers)
-        if len(self._viewers) >= MAX_VIEWERS or own >= MAX_VIEWERS_PER_ADDRESS:
+        own = sum(other.address == viewer.address for other in self.viewers)
+        if len(self.viewers) >= MAX_VIEWERS or own >= MAX_VIEWERS_PER_ADDRESS:
             raise web.HTTPServiceUnavailable(
-                text=f"{len(self._viewers)} pages are open already, {own} of them from "
+                text=f"{len(self.viewers)} pages are open already, {own} of them from "
                 f"{viewer.address}; close one of them\n"
             )
         sock = web.WebSocketResponse(
@@ -160,12 +161,12 @@ class WebServer:
             max_msg_size=MAX_MESSAGE_BYTES,
             compress=False,
         )
-        self._viewers.add(viewer)
+        self.viewers.add(viewer)
         try:
             await sock.prepare(request)
             await viewer.serve(sock)
         finally:
-            self._viewers.discard(viewer)
+            self.viewers.discard(viewer)
         return sock
 
     def _connected(self) -> asyncio.Protocol:
@@ -238,6 +239,8 @@ class Viewer:
     """Kind of the messages that are bytes."""
     address = ""
     """Address of the page."""
+    device_id = ""
+    """Identifier of the paired device; empty for a browser on this machine."""
 
     def __init__(self) -> None:
         self._waiting = asyncio.Event()

@@ -10,8 +10,8 @@ from typing import Any
 
 import aiohttp
 import pytest
-from rigs.processes import fishctl, one_line
-from rigs.window_process import Browser, WindowProcess, open_page, run
+from rigs.processes import Daemon, fishctl, one_line
+from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
 
 from fishd.window import devices
 from fishd.window.devices import DeviceError, Devices
@@ -183,3 +183,32 @@ def test_a_damaged_file_pairs_nothing_and_says_so(tmp_path: Path) -> None:
     (tmp_path / "devices.json").write_text("{")
     with pytest.raises(DeviceError, match=r"devices\.json: .*; remove it, and pair"):
         paired.find(secret)
+
+
+def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:
+    async def test() -> None:
+        async with paired(window, "watch", "viewer") as browser:
+            options = {"protocols": ["foxglove.sdk.v1"]}
+            async with browser.session.ws_connect("/foxglove", **options) as sock:
+                await sock.receive_str()
+                ask(window, "revoke", "viewer")
+                while not sock.closed:
+                    await sock.receive()
+
+    run(test())
+
+
+def test_with_pair_all_a_browser_on_this_machine_needs_pairing(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    with running_window(tmp_path, settings="pair_all: true", fish=daemon.endpoint) as window:
+
+        async def test() -> None:
+            async with Browser(window.url) as browser:
+                assert await browser.refusal("/api/fish") == (401, "not-paired")
+                assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
+                session = await browser.post("/api/pair", {"token": invite(window, "drive")})
+                assert (session["scope"], session["loopback"]) == ("drive", False)
+                assert await browser.get("/api/fish")
+
+        run(test())
