@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 from rigs.processes import Daemon
-from rigs.window_process import WindowProcess, running_window
+from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
 
 
 @pytest.fixture(scope="module")
@@ -13,6 +13,12 @@ def shared_window(
 ) -> Iterator[WindowProcess]:
     folder = tmp_path_factory.mktemp("window")
     with running_window(folder, fish=shared_daemon.endpoint) as window:
+
+        async def wait_until_live() -> None:
+            async with Browser(window.url) as browser, open_page(browser) as page:
+                await page.until("ticks")
+
+        run(wait_until_live())
         yield window
 
 
