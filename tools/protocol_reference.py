@@ -42,7 +42,8 @@ PLACES = {
     "summary": "summary of a recording: `fishctl runs --json`",
     "sweep": "`rows.csv` of `fishctl sweep`",
     "camera of a training": "section `camera` of the settings of a training",
-    "evaluation": "`evaluations.csv` of a training",
+    "training": "`evaluations.csv` and `progress.csv` of a training",
+    "controller excitation": "parameters of `excitation` in a recording",
     "optimise": "`rows.csv` of `fishctl optimise`",
 }
 """Places of the names in `OLD_NAMES`."""

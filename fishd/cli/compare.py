@@ -1,16 +1,26 @@
 """The verb `fishctl compare`, which compares policies and controllers on the same fish."""
 
 import sys
+from contextlib import AbstractContextManager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import click
 import msgspec
 from msgspec import to_builtins
 
 from fishd.cli.completion import complete_contestant
-from fishd.cli.experiment_options import ChosenFish, fish_choice, keep_option, keep_session
+from fishd.cli.experiment_options import (
+    ChosenFish,
+    ExperimentEnding,
+    ExperimentFolder,
+    Resumable,
+    fish_choice,
+    keep_experiment,
+    live_folder_options,
+    record_session,
+)
 from fishd.cli.options import for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress
@@ -18,7 +28,6 @@ from fishd.config import Config, check_tethered
 from fishd.core import text
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError, install_command
-from fishd.core.process.interruption import raise_on_first_signal
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -26,6 +35,7 @@ if TYPE_CHECKING:
     from fishd.lab.compare.comparison import Standing, Trace
     from fishd.lab.compare.contestants import Contestant
     from fishd.lab.experiment import Experiment
+    from fishd.lab.session import Session
 
 PIPE_TABLE_COLUMNS = 1000
 """Width of a table in a file or a pipe, where lines are not wrapped [columns]."""
@@ -43,7 +53,7 @@ class _Outcome(NamedTuple):
     status: int = 0
 
 
-@click.command()
+@click.command(cls=Resumable)
 @click.argument(
     "contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...", shell_complete=complete_contestant
 )
@@ -64,6 +74,7 @@ class _Outcome(NamedTuple):
     type=float,
     help=f"In simulation: time before the measurement [s]. [default: {DEFAULT_SETTLE_S}]",
 )
+@live_folder_options
 @fish_choice
 @click.option(
     "--camera",
@@ -78,7 +89,6 @@ class _Outcome(NamedTuple):
     help="For policies that see pictures, on a remote robot: address at which its fishd reaches "
     "this program. [default: any free port of this machine]",
 )
-@keep_option
 @json_option
 @plot_option("command, fin, force and result of each")
 def compare(
@@ -89,7 +99,7 @@ def compare(
     fish: ChosenFish,
     camera: str | None,
     agent: str | None,
-    folder: Path | None,
+    place: ExperimentFolder,
     as_json: bool,
     picture: Path | None,
 ) -> int:
@@ -117,12 +127,8 @@ def compare(
         from fishd.lab import drawing
 
         drawing.check(picture)
-    settings = {"contestants": list(contestants), "runs": runs, "for": seconds, "settle": settle}
-    task = _Task(contestants, fish, seconds, runs, camera, folder, settings, as_json)
-    if fish.on == "live":
-        outcome = _measure(task, agent)
-    else:
-        outcome = _swim(task, DEFAULT_SETTLE_S if settle is None else settle)
+    task = _Task(contestants, fish, seconds, settle, runs, camera, place, as_json)
+    outcome = _measure(task, agent) if fish.on == "live" else _swim(task)
     status = _report(outcome, runs, as_json)
     if picture and outcome.standings:
         from fishd.lab.compare.figures import draw
@@ -135,19 +141,25 @@ class _Task(NamedTuple):
     texts: tuple[str, ...]
     fish: ChosenFish
     seconds: float
+    settle: float | None
     runs: int
     camera: str | None
-    folder: Path | None
-    settings: dict[str, Any]
+    place: ExperimentFolder
     as_json: bool
 
-    def write_result(self, experiment: "Experiment | None", standings: "list[Standing]") -> None:
-        """Write the result into the folder of the experiment, if there is one."""
-        if experiment:
-            experiment.write("result.json", msgspec.json.encode(standings))
+    def keep(
+        self, session: "Session | None", chosen: "list[Contestant]"
+    ) -> AbstractContextManager["Experiment | None"]:
+        """Open the folder of the comparison; more runs may be added to it."""
+        settings = {
+            "contestants": list(map(list, chosen)),
+            "for": self.seconds,
+            "settle": self.settle,
+        }
+        return keep_experiment(self.place, self.fish, session, settings)
 
 
-def _swim(task: _Task, settle: float) -> _Outcome:
+def _swim(task: _Task) -> _Outcome:
     from fishd.camera import settings as cameras
     from fishd.lab.compare import comparison
     from fishd.lab.compare.contestants import is_missing, parse, refusal
@@ -162,20 +174,18 @@ def _swim(task: _Task, settle: float) -> _Outcome:
     for contestant, reason in left_out:
         if is_missing(contestant):  # a misspelt path, not a policy for another fish
             raise reason
-    accepted = [
-        contestant
-        for contestant in chosen
-        if contestant not in (refused for refused, _ in left_out)
-    ] or chosen
-    with (
-        keep_session(task.folder, task.fish, None, task.settings) as experiment,
-        show_progress(len(accepted) * task.runs * task.seconds, "s swum") as bar,
-    ):
-        result = comparison.compare(
-            config, accepted, task.seconds, settle, task.runs, bar.at, camera
-        )
-        task.write_result(experiment, result[0])
-    task.fish.announce(task.as_json)
+    refused = [contestant for contestant, _ in left_out]
+    accepted = [contestant for contestant in chosen if contestant not in refused] or chosen
+    settle = DEFAULT_SETTLE_S if task.settle is None else task.settle
+    with task.keep(None, chosen) as experiment:
+        task.fish.announce(task.as_json)
+        with show_progress(
+            len(accepted) * task.runs * task.seconds, "s swum", err=task.as_json
+        ) as bar:
+            result = comparison.compare(
+                config, accepted, task.seconds, settle, task.runs, bar.at, camera
+            )
+        _write_result(experiment, result[0])
     return _Outcome(
         *result,
         [(*omitted, 0) for omitted in left_out],
@@ -190,33 +200,39 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
 
     ended, status = "", 0
     chosen = [absolute(parse(text)) for text in task.texts]
-    with (  # the fish is at rest after any kind of end
-        raise_on_first_signal(),
-        task.fish.session(camera=task.camera, agent=agent) as session,
-    ):
+    with task.fish.session(camera=task.camera, agent=agent) as session:
         chosen = chosen or _default_contestants(session.read_config())
         _check_camera(task.camera, chosen)
         live = LiveComparison(session, chosen)
-        with (
-            session,
-            keep_session(task.folder, task.fish, session, task.settings) as experiment,
-            show_progress(len(chosen) * task.runs * task.seconds, "s") as bar,
-        ):
+        with task.keep(session, chosen) as experiment:
             task.fish.announce(task.as_json)
-            session.progress = bar.at
-            try:
-                live.swim(task.seconds, task.runs)
-            except KeyboardInterrupt:
-                ended, status = "interrupted; the fish rests", INTERRUPTED
-            except ParameterError:
-                raise
-            except FishdError as error:
-                ended, status = str(error), 1
-            task.write_result(experiment, live.standings())
+            ending = ExperimentEnding(experiment)
+            with (  # the fish is at rest after any kind of end
+                ending.measuring(),
+                session,
+                record_session(experiment, session),
+                show_progress(len(chosen) * task.runs * task.seconds, "s", err=task.as_json) as bar,
+            ):
+                session.progress = bar.at
+                try:
+                    live.swim(task.seconds, task.runs)
+                except ParameterError:
+                    raise
+                except FishdError as error:
+                    ended, status = f"{error}; {ending.hint}", 1
+            if ending.is_interrupted:
+                ended, status = f"interrupted; the fish rests; {ending.hint}", INTERRUPTED
+            _write_result(experiment, live.standings())
     return _Outcome(
         live.standings(), live.traces(), live.left_out, session.amplitude, session.unit, True,
         ended, status,
     )  # fmt: skip
+
+
+def _write_result(experiment: "Experiment | None", standings: "list[Standing]") -> None:
+    """Write the result into the folder of the experiment, if there is one."""
+    if experiment:
+        experiment.write("result.json", msgspec.json.encode(standings))
 
 
 def _check_camera(camera: str | None, chosen: "list[Contestant]") -> None:

@@ -97,6 +97,8 @@ class ExperimentFolder(NamedTuple):
     resume: bool
     command: tuple[str, ...]
     """Arguments of the verb that a resumed experiment takes over."""
+    is_named: bool
+    """Whether the folder is on the command line."""
 
     @contextmanager
     def open(
@@ -188,7 +190,15 @@ def is_fishd_running() -> bool:
 
 def folder_options(function: F) -> F:
     """Add `--folder` and `--resume`, passed as `place`."""
+    return _folder_options(function, "")
 
+
+def live_folder_options(function: F) -> F:
+    """Add the same options to a verb that uses `keep_experiment`."""
+    return _folder_options(function, "; in simulation, none, and nothing is kept")
+
+
+def _folder_options(function: F, otherwise: str) -> F:
     @wraps(function)
     def wrapper(*args: Any, folder: Path | None, resume: Path | None, **values: Any) -> Any:
         if folder and resume:
@@ -201,6 +211,7 @@ def folder_options(function: F) -> F:
             path=resume or folder or default_folder(verb_words(context)),
             resume=resume is not None,
             command=tuple(context.meta.get(_COMMAND, ())),
+            is_named=bool(resume or folder),
         )
         return function(*args, place=place, **values)
 
@@ -216,44 +227,54 @@ def folder_options(function: F) -> F:
             "--folder",
             type=click.Path(path_type=Path),
             help="New folder of the experiment. [default: VERB-DATE-TIME in $FISHD_RUNS, else "
-            "runs]",
+            f"runs{otherwise}]",
         ),
     ):
         wrapper = option(wrapper)
     return wrapper  # type: ignore[return-value]
 
 
-keep_option = click.option(
-    "--folder",
-    type=click.Path(path_type=Path),
-    help="Keep recording and result in this new folder of an experiment.",
-)
+@contextmanager
+def keep_experiment(
+    place: ExperimentFolder,
+    fish: ChosenFish,
+    session: "Session | None",
+    settings: dict[str, Any],
+) -> "Iterator[Experiment | None]":
+    """Open the folder of an experiment; yield None in simulation without `--folder`.
+
+    A resumed simulation begins again: virtual time costs nothing, and the result is that of one
+    that was not interrupted.
+
+    session: None for fish that swim without one
+    settings: what the result depends on, besides the fish
+    """
+    if fish.on == "simulation" and not place.is_named:
+        yield None
+        return
+    config = session.config if session else to_builtins(fish.load())
+    with place.open(fish, config, settings, session.unit if session else "N") as experiment:
+        yield experiment
 
 
 @contextmanager
-def keep_session(
-    folder: Path | None, fish: ChosenFish, session: "Session | None", settings: dict[str, Any]
-) -> "Iterator[Experiment | None]":
-    """Record a session into a new folder, and yield its experiment; without a folder, yield None.
+def record_session(
+    experiment: "Experiment | None", session: "Session", *, logged: bool = True
+) -> Iterator[None]:
+    """Record a session into the folder of its experiment, if there is one.
 
-    session: an entered session; None for fish that swim without one
-    settings: what the result depends on, besides the fish
+    logged: whether a live session logs its swims and rests, so that a resumed one repeats none
     """
-    if folder is None:
-        yield None
+    if experiment is None:
+        yield
         return
-    context = click.get_current_context()
-    place = ExperimentFolder(
-        verb_words(context), folder, False, tuple(context.meta.get(_COMMAND, ()))
-    )
-    config = session.config if session else to_builtins(fish.load())
-    unit = session.unit if session else "N"
-    with place.open(fish, config, settings, unit) as experiment:
-        if session is None:
-            yield experiment
-            return
-        with session.recorded(experiment.recording(place.kind), " ".join(("fishctl", place.kind))):
-            yield experiment
+    kind = experiment.header.kind
+    with session.recorded(experiment.recording(kind), f"fishctl {kind}") as writer:
+        if logged and experiment.header.on == "live":
+            from fishd.lab.swim_log import SwimLog
+
+            session.log = SwimLog(experiment, writer, session.tick)
+        yield
 
 
 def verb_words(context: click.Context) -> str:
@@ -314,8 +335,10 @@ class ResumableGroup(Resumable, ControllerGroup):
 class ExperimentEnding:
     """State of the end of an experiment: whether it was interrupted, and how to resume it."""
 
-    def __init__(self, experiment: "Experiment") -> None:
-        self._command = experiment.resume_command
+    def __init__(self, experiment: "Experiment | None") -> None:
+        """experiment: None where nothing is kept"""
+        self.hint = f"resume with: {experiment.resume_command}" if experiment else "nothing is kept"
+        """How the experiment is resumed, for a message."""
         self.is_interrupted = False
 
     @contextmanager
@@ -335,7 +358,7 @@ class ExperimentEnding:
         except FishdError as error:
             if not isinstance(error, errors or (Disturbed, NoDaemon)):
                 raise
-            error.args = (f"{error}; resume with: {self._command}",)
+            error.args = (f"{error}; {self.hint}",)
             raise
 
     def interrupted(self, done: str) -> int:
@@ -343,5 +366,5 @@ class ExperimentEnding:
 
         done: what was finished, in words
         """
-        echo(f"fishctl: interrupted, {done}; resume with: {self._command}", err=True)
+        echo(f"fishctl: interrupted, {done}; {self.hint}", err=True)
         return INTERRUPTED

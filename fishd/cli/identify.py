@@ -10,19 +10,22 @@ import click
 
 from fishd.cli.experiment_options import (
     ChosenFish,
+    ExperimentEnding,
+    ExperimentFolder,
+    Resumable,
     fish_choice_and_config,
-    keep_option,
-    keep_session,
+    keep_experiment,
+    live_folder_options,
+    record_session,
 )
 from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress, show_waiting
 from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import files
-from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError
-from fishd.core.process.interruption import raise_on_first_signal
 from fishd.recording.folder import find_recording
+from fishd.recording.reader import open_run
 
 if TYPE_CHECKING:
     from fishd.lab.identification import Identification
@@ -30,14 +33,14 @@ if TYPE_CHECKING:
 DEFAULT_EXPERIMENT_S = 180.0
 
 
-@click.command()
+@click.command(cls=Resumable)
 @click.argument("runs", nargs=-1, metavar="[RUN]...")
 @click.option("--experiment", is_flag=True, help="First swim an experiment for the identification.")
 @for_option(
     f"With --experiment: its duration [s]. [default: {DEFAULT_EXPERIMENT_S:g}]",
     kind=FiniteRange(min=30.0, max=3600.0),
 )
-@keep_option
+@live_folder_options
 @fish_choice_and_config
 @click.option(
     "--fit",
@@ -67,7 +70,7 @@ def identify(
     runs: tuple[str, ...],
     experiment: bool,
     seconds: float | None,
-    folder: Path | None,
+    place: ExperimentFolder,
     fish: ChosenFish,
     fit: str | None,
     fix: str | None,
@@ -86,8 +89,8 @@ def identify(
     """
     if experiment == bool(runs):
         raise click.UsageError("name recordings to identify, or use --experiment: one of the two")
-    for option, value in (("--for", seconds), ("--folder", folder)):
-        if value is not None and not experiment:
+    for option, is_given in (("--for", seconds is not None), ("--folder", place.is_named)):
+        if is_given and not experiment:
             raise click.UsageError(f"{option} goes with --experiment")
     if target and target.exists() and not force:
         raise FishdError(f"{target}: exists already; --force overwrites it, --to names another")
@@ -102,14 +105,10 @@ def identify(
     fixed = _parse_names(fix or "")
     lab.check(lab.DEFAULT if names is None else names, fixed)  # before minutes of swimming
     if experiment:
-        try:
-            config, tables = _swim_experiment(
-                fish, seconds or DEFAULT_EXPERIMENT_S, folder, as_json
-            )
-        except KeyboardInterrupt:
-            where = f"; the recording is in {folder}" if folder else ""
-            echo(f"fishctl: interrupted before the fit{where}", err=True)
-            return INTERRUPTED
+        swum = _swim_experiment(fish, seconds or DEFAULT_EXPERIMENT_S, place, as_json)
+        if isinstance(swum, int):
+            return swum
+        config, tables = swum
         origin = f"an experiment with {fish}"
     else:
         config, tables = load(fish.file, fish.overrides), [find_recording(run) for run in runs]
@@ -140,12 +139,20 @@ def _parse_names(listed: str) -> tuple[str, ...]:
 
 
 def _swim_experiment(
-    fish: ChosenFish, seconds: float, folder: Path | None, as_json: bool
-) -> tuple[Config, list[Any]]:
-    """Swim an experiment; return the start configuration of the fit, and the ticks."""
-    from fishd.lab.identification import experiment
+    fish: ChosenFish, seconds: float, place: ExperimentFolder, as_json: bool
+) -> tuple[Config, list[Any]] | int:
+    """Swim an experiment, or the rest of one that is resumed.
 
-    with raise_on_first_signal(), fish.session() as session:
+    Return the start configuration of the fit and the tables of ticks; the exit status if it was
+    interrupted.
+    """
+    from fishd.lab.identification import continue_experiment
+    from fishd.recording.folder import list_recordings
+
+    with (
+        fish.session() as session,
+        keep_experiment(place, fish, session, {"for": seconds}) as experiment,
+    ):
         if fish.on == "simulation":
             config = fish.load()
         elif fish.file:
@@ -153,14 +160,20 @@ def _swim_experiment(
         else:
             config = adopt(deepcopy(session.config), fish.overrides)
         session.check_calibrated()
+        fish.announce(as_json)
+        before = []
+        if place.resume and fish.on == "live":
+            before = [open_run(path).frame() for path in list_recordings(place.path)]
+        ending = ExperimentEnding(experiment)
         with (
+            ending.measuring(),
             session,
-            keep_session(folder, fish, session, {"for": seconds}),
+            record_session(experiment, session, logged=False),
             show_progress(seconds, "s", err=as_json) as bar,
         ):
-            fish.announce(as_json)
             session.progress = bar.at
-            return config, [experiment(session, seconds)]
+            return config, continue_experiment(session, before, seconds)
+    return ending.interrupted("before the fit")
 
 
 def _write_config(target: Path, text: str) -> None:

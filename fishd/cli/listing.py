@@ -19,7 +19,7 @@ from fishd.core.schema import names_file, suggest
 T = TypeVar("T")
 
 HEADER = (
-    *("name", "sees", "Φ [rad]", "tick", "trained in", "steps", "relative thrust", "created"),
+    *("name", "observes", "Φ [rad]", "tick", "trained in", "steps", "relative thrust", "created"),
     "folder",
 )
 MAX_CELL_CHARACTERS = 40

@@ -6,12 +6,20 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fishd.cli.experiment_options import ChosenFish, fish_choice, keep_option, keep_session
-from fishd.cli.options import ControllerGroup, FiniteRange, for_option, json_option, plot_option
+from fishd.cli.experiment_options import (
+    ChosenFish,
+    ExperimentEnding,
+    ExperimentFolder,
+    ResumableGroup,
+    fish_choice,
+    keep_experiment,
+    live_folder_options,
+    record_session,
+)
+from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, format_controller, print_json
 from fishd.cli.progress import show_progress
-from fishd.core.console import INTERRUPTED, format_power
-from fishd.core.process.interruption import raise_on_first_signal
+from fishd.core.console import format_power
 
 if TYPE_CHECKING:
     from fishd.lab.measurement import ThrustMeasurement
@@ -22,8 +30,8 @@ def measure_options(function: Any) -> Any:
     for option in (
         json_option,
         plot_option("raw force, fitted drift and corrected thrust"),
-        keep_option,
         fish_choice,
+        live_folder_options,
         click.option(
             "--settle",
             type=FiniteRange(0.0, 600.0),
@@ -37,7 +45,7 @@ def measure_options(function: Any) -> Any:
     return function
 
 
-@click.group(cls=ControllerGroup, options=measure_options, remote=True)
+@click.group(cls=ResumableGroup, options=measure_options, remote=True)
 def measure() -> None:
     """Measure a controller's thrust, with its 95 % interval.
 
@@ -54,7 +62,7 @@ def _measure(
     seconds: float,
     settle: float,
     fish: ChosenFish,
-    folder: Path | None,
+    place: ExperimentFolder,
     picture: Path | None,
     as_json: bool,
 ) -> int:
@@ -66,35 +74,39 @@ def _measure(
     if picture:
         drawing.check(picture)
     settings = {"controller": name, "parameters": parameters, "for": seconds, "settle": settle}
-    try:
+    with (
+        fish.session() as session,
+        keep_experiment(place, fish, session, settings) as experiment,
+    ):
+        fish.announce(as_json)
+        ending = ExperimentEnding(experiment)
         with (
-            raise_on_first_signal(),
-            fish.session() as session,
+            ending.measuring(),
             session,
-            keep_session(folder, fish, session, settings) as experiment,
-            show_progress(seconds, "s") as bar,
+            record_session(experiment, session),
+            show_progress(seconds, "s", err=as_json) as bar,
         ):
-            fish.announce(as_json)
             session.progress = bar.at
             measured = run_measurement(session, name, parameters, seconds, settle)
-            result = summarise(measured, session.tick)
-            if experiment:
-                experiment.write_struct("result.json", result)
-            if (
-                isinstance(session, LiveSession)
-                and measured.thrust > measured.thrust_ci95
-                and not measured.remark
-            ):
-                session.fish.calibrate_thrust(
-                    measured.thrust / measured.power, measured.thrust_ci95 / measured.power
-                )
-    except KeyboardInterrupt:
-        echo("fishctl: interrupted: the fish rests, nothing is measured", err=True)
-        return INTERRUPTED
+        if ending.is_interrupted:
+            return ending.interrupted("the fish rests")
+        result = summarise(measured, session.tick)
+        if experiment:
+            experiment.write_struct("result.json", result)
+        if (
+            isinstance(session, LiveSession)
+            and measured.thrust > measured.thrust_ci95
+            and not measured.remark
+        ):
+            session.fish.calibrate_thrust(
+                measured.thrust / measured.power, measured.thrust_ci95 / measured.power
+            )
     if as_json:
         print_json(result)
     else:
         echo(_format_result(measured))
+        if experiment:
+            echo(f"folder: {experiment.path}")
     for line in _find_warnings(measured):
         echo(f"fishctl: {line}", err=True)
     if picture:

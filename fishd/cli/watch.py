@@ -28,9 +28,10 @@ REDRAW_INTERVAL_S = 0.1
 def watch(endpoint: str | None, as_json: bool, seconds: float | None) -> None:
     """Watch force, command and timing live, until Ctrl-C.
 
-    'late' and 'busy' are the worst of the last 5 s, 'missed' counts slots that the daemon skipped,
-    'lost' counts ticks that did not arrive here. If standard output is not a terminal, a line is
-    printed every second instead; with --json, every tick as one line.
+    'late' is the largest delay of a tick in the last 5 s, 'compute' the longest computing time.
+    'skipped' counts the ticks that the daemon left out, 'lost' those that did not arrive here. If
+    standard output is not a terminal, a line is printed every second instead; with --json, every
+    tick as one line.
     """
     can_draw = sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
     show = _print_ticks if as_json else _draw if can_draw else _print_lines

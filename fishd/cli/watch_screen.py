@@ -143,11 +143,11 @@ class View:
         return table
 
     def _timing_figures(self) -> dict[str, str]:
-        """Return lateness, busy time and missed slots; not shown in slow motion."""
+        """Return lateness, computing time and skipped ticks; not shown in slow motion."""
         return {
             "late": f"{max(tick.lateness_us for tick in self._ticks):.0f} µs",
-            "busy": f"{max(tick.busy_time_us for tick in self._ticks):.0f} µs",
-            "missed": f"{self._ticks[-1].missed_slots}",
+            "compute": f"{max(tick.busy_time_us for tick in self._ticks):.0f} µs",
+            "skipped": f"{self._ticks[-1].missed_slots}",
         }
 
     def _quantity_lines(self) -> list[Text]:

@@ -14,10 +14,10 @@ from fishd.core.signals import Observation
 class ExcitationParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Parameters of `excitation`."""
 
-    lowest: Annotated[
+    lowest_frequency: Annotated[
         float, unit("Hz", "Frequency at which the sweep begins and ends.", gt=0, le=10, step=0.05)
     ] = 0.5
-    highest: Annotated[
+    highest_frequency: Annotated[
         float,
         unit(
             "Hz",
@@ -28,7 +28,7 @@ class ExcitationParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_o
         ),
     ] = 3.0
     sweep_time: Annotated[
-        float, unit("s", "Time of a sweep from lowest to highest and back.", ge=1, le=3600, step=1)
+        float, unit("s", "Time of a sweep up and back down.", ge=1, le=3600, step=1)
     ] = 20.0
     amplitude: Annotated[
         Amplitude, unit("rad", "The larger instruction angle; null: the robot's amplitude_limit.")
@@ -54,7 +54,7 @@ class Excitation(Controller[ExcitationParameters]):
     def __init__(self, parameters: ExcitationParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
         self._progress = 0.0
-        """Progress of the sweep, 0 to 1 from lowest to highest and back."""
+        """Progress of the sweep, 0 to 1 up and down again."""
         self._phase = 0.0
         """Phase since the start [beats]."""
 
@@ -62,11 +62,12 @@ class Excitation(Controller[ExcitationParameters]):
     def check(cls, parameters: Any, limits: Limits) -> None:
         """Refuse bounds in the wrong order or too high, and an amplitude beyond Φ."""
         super().check(parameters, limits)
-        check_frequency("lowest", parameters.lowest, limits.tick)
-        if parameters.highest < parameters.lowest:
+        check_frequency("lowest_frequency", parameters.lowest_frequency, limits.tick)
+        low, high = parameters.lowest_frequency, parameters.highest_frequency
+        if high < low:
             raise ParameterError(
-                f"highest: {parameters.highest:g} Hz is below lowest, {parameters.lowest:g} Hz",
-                ("highest",),
+                f"highest_frequency: {high:g} Hz is below lowest_frequency, {low:g} Hz",
+                ("highest_frequency",),
             )
 
     def activate(self, observation: Observation) -> None:
@@ -79,7 +80,7 @@ class Excitation(Controller[ExcitationParameters]):
         group, phase = int(self._phase // p.beats), self._phase % 1.0
         self._progress = (self._progress + observation.dt / p.sweep_time) % 1.0
         height = 1.0 - abs(1.0 - 2.0 * self._progress)
-        highest = min(p.highest, 0.5 / self.limits.tick)
-        self._phase += (p.lowest + (highest - p.lowest) * height) * observation.dt
+        low, high = p.lowest_frequency, min(p.highest_frequency, 0.5 / self.limits.tick)
+        self._phase += (low + (high - low) * height) * observation.dt
         side = 1.0 if phase < 0.5 else -1.0
         return side * amplitude_of(p, self.limits) * (p.smaller if group % 2 else 1.0)

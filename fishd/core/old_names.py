@@ -48,7 +48,15 @@ OLD_NAMES: dict[str, dict[str, str]] = {
         "settled": "settled_time",
     },
     "camera of a training": {"eye": "feature_extractor", "babble": "random_excitation"},
-    "evaluation": {"error": "thrust_ci95"},
+    "training": {
+        "error": "thrust_ci95",
+        "swam": "swim_time",
+        "stalled": "is_stalled",
+        "worst": "lowest_relative_thrust",
+        "lost": "lost_ticks",
+        "blind": "blind_ticks",
+    },
+    "controller excitation": {"lowest": "lowest_frequency", "highest": "highest_frequency"},
     "optimise": {
         "error": "thrust_ci95",
         "power_error": "power_ci95",
@@ -66,6 +74,12 @@ def rename_keys(kind: str, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields with their present names."""
     names = OLD_NAMES[kind]
     return {names.get(name, name): value for name, value in fields.items()}
+
+
+def rename_parameters(controller: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the recorded parameters of a controller with their present names."""
+    names = OLD_NAMES.get(f"controller {controller}", {})
+    return {names.get(name, name): value for name, value in parameters.items()}
 
 
 def rename_message(kind: str, payload: bytes) -> bytes:

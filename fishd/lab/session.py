@@ -28,6 +28,7 @@ from fishd.core.signals import Event, Publisher, Reason, Tick
 from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:
+    from fishd.lab.swim_log import SwimLog
     from fishd.recording.writer import RunWriter, Source
 
 IDLE_LIMIT = 5.0
@@ -99,6 +100,8 @@ class Session(ABC):
         """Function that is called with the tank time, tick by tick [s]."""
         self.listener: Publisher | None = None
         """Receiver of each tick and event, in order; an exception of it ends a swim or a rest."""
+        self.log: SwimLog | None = None
+        """Log of finished swims and rests, which are not repeated in a resumed experiment."""
         self._elapsed = self._planned = 0.0
 
     def __enter__(self) -> Self:
@@ -138,16 +141,29 @@ class Session(ABC):
 
         Raises `Refused` for a controller that fishd rejects, `Disturbed`, and `NoDaemon`.
         """
-        with self._timed(seconds):
-            return self._swim(controller, parameters, seconds)
+        return self._logged(
+            controller, parameters, seconds, lambda: self._swim(controller, parameters, seconds)
+        )
 
     def rest(self, seconds: float) -> list[Tick]:
         """Fade to neutral and stay there for `seconds`; return the ticks of that time, in order.
 
         Raises `Disturbed` and `NoDaemon`.
         """
+        return self._logged("", {}, seconds, lambda: self._rest(seconds))
+
+    def _logged(
+        self,
+        controller: str,
+        parameters: Mapping[str, Any],
+        seconds: float,
+        swim: Callable[[], list[Tick]],
+    ) -> list[Tick]:
+        """Swim or rest, unless the log of a resumed experiment has these ticks."""
         with self._timed(seconds):
-            return self._rest(seconds)
+            if self.log is None:
+                return swim()
+            return self.log.swim(controller, parameters, seconds, swim)
 
     @contextmanager
     def recorded(

@@ -64,7 +64,7 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
     card = checkpoints.read_card(checkpoint)
     policy, perception = checkpoints.load_policy(checkpoint)
     evaluation = _evaluate(checkpoint, card, policy, perception)
-    if evaluation.stalled and not force:
+    if evaluation.is_stalled and not force:
         raise PolicyError(
             f"{checkpoint}: this policy stalls when it swims without exploration: "
             f"{evaluation.frequency:.2f} Hz, |φ_c| {evaluation.fullness:.0%} of Φ; train longer, "

@@ -2,6 +2,7 @@
 
 import math
 import signal
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -24,6 +25,13 @@ from fishd.core.errors import Refused
 def drifting(tmp_path_factory: pytest.TempPathFactory):  # type: ignore[no-untyped-def]
     with running(tmp_path_factory.mktemp("daemon"), "--set", "simulation.drift=0.005") as daemon:
         yield daemon
+
+
+@pytest.fixture(autouse=True)
+def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Set the folder of all experiments."""
+    monkeypatch.setenv("FISHD_RUNS", str(tmp_path))
+    return tmp_path
 
 
 @pytest.fixture
@@ -61,9 +69,9 @@ def test_another_controller_in_the_middle_ends_it_and_swims_on(daemon: Daemon) -
     assert daemon.fishctl("set-controller", "square").returncode == 0
     status, out, err = measuring.finish()
     assert (status, out.count("\n")) == (1, 1)
-    assert err == (
+    assert err.startswith(
         "fishctl: this program no longer holds the fish: square was set by hand: this measurement "
-        "is lost\n"
+        "is lost; resume with: fishctl measure --resume "
     )
     assert daemon.status().controller == "square"
 
@@ -79,10 +87,14 @@ def test_another_parameter_in_the_middle_ends_it_too(daemon: Daemon) -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_whoever_ends_it_leaves_the_fish_at_rest(daemon: Daemon, how: signal.Signals) -> None:
+def test_whoever_ends_it_leaves_the_fish_at_rest(
+    daemon: Daemon, how: signal.Signals, runs: Path
+) -> None:
     status, out, err = start_measurement(daemon).end(how)
     assert (status, out.count("\n")) == (130, 1)
-    assert err == "fishctl: interrupted: the fish rests, nothing is measured\n"
+    (folder,) = runs.iterdir()
+    resume = f"fishctl measure --resume {folder}"
+    assert err == f"fishctl: interrupted, the fish rests; resume with: {resume}\n"
     assert daemon.status().mode == "idle"
 
 

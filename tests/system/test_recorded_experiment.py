@@ -46,7 +46,8 @@ def test_an_ended_experiment_keeps_its_data_and_rests(daemon: Daemon, tmp_path: 
     status, out, err = swims.end(signal.SIGTERM)
     assert status == 130
     assert out == f"fish: the fish of fishd at {daemon.endpoint}\n"
-    assert err.endswith(f"fishctl: interrupted before the fit; the recording is in {folder}\n")
+    resume = f"fishctl identify --resume {folder}"
+    assert err.endswith(f"fishctl: interrupted, before the fit; resume with: {resume}\n")
     assert daemon.status().mode == "idle"
     run = open_run(path)
     assert run.reason == "ended by Interrupted"

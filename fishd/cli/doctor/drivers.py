@@ -95,7 +95,7 @@ def force(context: Context) -> Result:
         return fail("the sensor answers, but delivers nothing", "switch its power off and on")
     if suspicions:
         return fail(
-            f"not to be believed in {len(suspicions)} of {len(trials)} ticks: {suspicions[-1]}",
+            f"suspect in {len(suspicions)} of {len(trials)} ticks: {suspicions[-1]}",
             "check the wires of the sensor, its amplifier, and its range",
         )
     return _judge_rate(per_tick, context, "not clipped, not frozen")

@@ -49,7 +49,7 @@ def export(
         f"{exported.path}: {exported.size / 1024:.0f} kB from {exported.checkpoint}, "
         f"{provenance.steps} steps in {provenance.on}"
     )
-    if exported.evaluation.stalled:
+    if exported.evaluation.is_stalled:
         click.echo("careful: it stalls without exploration")
     else:
         click.echo(f"it swims with {format_summary(exported.evaluation)}")

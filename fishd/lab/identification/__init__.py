@@ -3,7 +3,13 @@
 `identify` fits recordings; `experiment` swims a fish with an informative command.
 """
 
-from fishd.lab.identification.estimation import DEFAULT, check, experiment, identify
+from fishd.lab.identification.estimation import (
+    DEFAULT,
+    check,
+    continue_experiment,
+    experiment,
+    identify,
+)
 from fishd.lab.identification.passages import Unidentifiable
 from fishd.lab.identification.result import Channel, Estimate, Fit, Identification
 
@@ -15,6 +21,7 @@ __all__ = [
     "Identification",
     "Unidentifiable",
     "check",
+    "continue_experiment",
     "experiment",
     "identify",
 ]

@@ -65,6 +65,8 @@ REST_S = 4.0
 """Length of the rest before the swim [s]: the tail stands still, so its state is known."""
 MIN_EXPERIMENT_S = 30.0
 """Length of the shortest experiment; a shorter one determines too little [s]."""
+MIN_CONTINUATION_S = REST_S + _SETTLE_S + 2.0 * MIN_PASSAGE_S
+"""Length of the shortest end of an experiment that is worth swimming after an interruption [s]."""
 
 
 def identify(
@@ -241,6 +243,29 @@ def experiment(session: Session, seconds: float = 180.0) -> "DataFrame":
         raise ParameterError(
             f"an experiment of {seconds:g} s: {MIN_EXPERIMENT_S:g} s or more are needed"
         )
+    return _swim_excitation(session, seconds)
+
+
+def continue_experiment(
+    session: Session, recorded: "Sequence[DataFrame]", seconds: float
+) -> "list[DataFrame]":
+    """Swim what is missing of an experiment; return the tables of all its ticks.
+
+    recorded: tables of the interrupted experiment; without any, this is `experiment`
+    seconds: length of the whole experiment [s]
+    Raises the errors of `experiment`.
+    """
+    if not recorded:
+        return [experiment(session, seconds)]
+    session.used = sum(map(len, recorded)) * session.tick
+    missing = seconds - session.used
+    tables = list(recorded)
+    if missing >= MIN_CONTINUATION_S:
+        tables.append(_swim_excitation(session, missing))
+    return tables
+
+
+def _swim_excitation(session: Session, seconds: float) -> "DataFrame":
     ticks = session.rest(REST_S)
     ticks += session.swim("excitation", {}, seconds - REST_S)
     return ticks_to_frame(ticks)

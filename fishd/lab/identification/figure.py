@@ -111,14 +111,14 @@ def format_estimate(estimate: Estimate) -> tuple[str, str, str, str]:
     symbol = _SYMBOLS.get(estimate.name)
     name = f"{estimate.name} {symbol}" if symbol else _PRODUCTS.get(estimate.name, estimate.name)
     value = f"{factor * estimate.value:.{_digits(estimate.narrowest_interval, factor)}f}"
-    if not math.isfinite(estimate.high):
+    if not math.isfinite(estimate.ci95_high):
         return name, value, "not identified", unit
-    return name, value, _interval((estimate.low, estimate.high), factor), unit
+    return name, value, _interval((estimate.ci95_low, estimate.ci95_high), factor), unit
 
 
 def format_if_ratio_holds(estimate: Estimate) -> str:
     """Return the 95 % interval for a known K_y/K; empty where that makes no difference."""
-    if not estimate.if_ratio_holds or not math.isfinite(estimate.high):
+    if not estimate.if_ratio_holds or not math.isfinite(estimate.ci95_high):
         return ""
     return _interval(estimate.if_ratio_holds, _unit(estimate)[0])
 

@@ -44,9 +44,9 @@ class Estimate:
 
     name: str
     value: float
-    low: float
-    """Lower end of the interval; 0 or −inf, with `high` inf, where it is withheld."""
-    high: float
+    ci95_low: float
+    """Lower end of the interval; 0 or −inf, with `ci95_high` inf, where it is withheld."""
+    ci95_high: float
     fitted: bool = True
     """False for a value that was taken from the configuration."""
     if_ratio_holds: tuple[float, float] | None = None
@@ -59,8 +59,8 @@ class Estimate:
 
     @property
     def narrowest_interval(self) -> tuple[float, float]:
-        """Ends of the narrowest interval: `if_ratio_holds`, or else `low` and `high`."""
-        return self.if_ratio_holds or (self.low, self.high)
+        """Ends of the narrowest interval: `if_ratio_holds`, or else `ci95_low` and `ci95_high`."""
+        return self.if_ratio_holds or (self.ci95_low, self.ci95_high)
 
 
 @dataclass(frozen=True)
@@ -204,18 +204,20 @@ class Identification:
         unit = "" if estimate.unit == "1" else f" {estimate.unit}"
         if not estimate.fitted:
             return f"{text}{unit and '  #' + unit}"
-        if not math.isfinite(estimate.high):
+        if not math.isfinite(estimate.ci95_high):
             return f"{text}  # not identified{unit and ',' + unit}"
-        return f"{text}  # {estimate.low:.5g} to {estimate.high:.5g}{unit}"
+        return f"{text}  # {estimate.ci95_low:.5g} to {estimate.ci95_high:.5g}{unit}"
 
 
 def _to_builtins(estimate: Estimate) -> dict[str, Any]:
     """Return an estimate for JSON, which has no infinity: an end that is withheld is None."""
-    low, high = (end if math.isfinite(end) else None for end in (estimate.low, estimate.high))
+    low, high = (
+        end if math.isfinite(end) else None for end in (estimate.ci95_low, estimate.ci95_high)
+    )
     plain: dict[str, Any] = {
         "value": estimate.value,
-        "low": low,
-        "high": high,
+        "ci95_low": low,
+        "ci95_high": high,
         "unit": estimate.unit,
     }
     if not estimate.fitted:

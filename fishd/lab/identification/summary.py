@@ -175,12 +175,17 @@ def _with_free_scale(estimate: Estimate) -> Estimate:
     if estimate.name not in SCALED:
         return estimate
     factor = LATERAL_INERTIA_FACTOR ** abs(SCALED[estimate.name])
-    low, high = estimate.low / factor, estimate.high * factor
+    low, high = estimate.ci95_low / factor, estimate.ci95_high * factor
     if estimate.name == "lateral_inertia_ratio":
-        return replace(estimate, low=low, high=high, fitted=True)
+        return replace(estimate, ci95_low=low, ci95_high=high, fitted=True)
     if not estimate.fitted:
         return estimate
-    return replace(estimate, low=low, high=high, if_ratio_holds=(estimate.low, estimate.high))
+    return replace(
+        estimate,
+        ci95_low=low,
+        ci95_high=high,
+        if_ratio_holds=(estimate.ci95_low, estimate.ci95_high),
+    )
 
 
 def _products(

@@ -109,7 +109,11 @@ def _draw_training(axis: Any, folder: Path) -> None:
     steps = [evaluation.steps for evaluation in evaluations]
     for shares, label, colour in (
         ([evaluation.relative_thrust for evaluation in evaluations], "identified fish", BLUE),
-        ([evaluation.worst for evaluation in evaluations], "worst fish tried", PURPLE),
+        (
+            [evaluation.lowest_relative_thrust for evaluation in evaluations],
+            "worst fish tried",
+            PURPLE,
+        ),
     ):
         values = [100.0 * (math.nan if share is None else share) for share in shares]
         axis.plot(steps, values, color=colour, marker=".", label=label)

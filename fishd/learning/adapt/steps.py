@@ -105,7 +105,7 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
     fitted = Fitted(
         plant=plant,
         rig=msgspec.convert(identification.simulation, SimulationSettings),
-        offset=max(offset.high - offset.value, 0.5 * drift),
+        offset=max(offset.ci95_high - offset.value, 0.5 * drift),
         cloud=draw_cloud(identification, seed),
         model=model,
         identification=identification.to_builtins(),
@@ -321,7 +321,7 @@ def train_policy(
         steps=display.steps,
         folder=best.folder.name,
         relative_thrust=evaluation.relative_thrust,
-        worst_relative_thrust=evaluation.worst,
+        worst_relative_thrust=evaluation.lowest_relative_thrust,
     )
 
 

@@ -40,7 +40,7 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     """Number of control steps that this policy had learned from; in a tank, it may be older."""
     tank_time: float = 0.0
     """Time in the tank until the evaluation [s]."""
-    swam: float | None = None
+    swim_time: float | None = None
     """Time that this policy has swum in all its evaluations [s]; None in simulation."""
     thrust: float
     """Mean thrust [N]: the true one of a simulated fish, the mean of all swims in a tank.
@@ -55,9 +55,9 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     """Tail-beat frequency; 0 where the tail does not beat [Hz]."""
     fullness: float
     """Mean |φ_c|/Φ."""
-    stalled: bool
+    is_stalled: bool
     """Whether the policy does not swim: it hardly moves, or reverses in nearly every tick."""
-    worst: float | None = None
+    lowest_relative_thrust: float | None = None
     """Lowest relative thrust on this and on other fish; None if others were not tried."""
     best: bool = False
     """Whether the policy swims, and is the best until now."""
@@ -65,7 +65,11 @@ class Evaluation(Struct, frozen=True, kw_only=True):
     @property
     def merit(self) -> float:
         """Figure by which the best policy is chosen."""
-        return self.relative_thrust if self.worst is None else self.worst
+        return (
+            self.relative_thrust
+            if self.lowest_relative_thrust is None
+            else self.lowest_relative_thrust
+        )
 
 
 def judge(
@@ -112,7 +116,7 @@ def evaluate_in_simulation(
         relative_thrust=float(report.relative_thrust),
         frequency=float(report.frequency),
         fullness=float(report.fullness),
-        stalled=is_stalled(report.frequency, report.fullness, config.tick),
+        is_stalled=is_stalled(report.frequency, report.fullness, config.tick),
     )
 
 

@@ -37,7 +37,7 @@ class Swim(Struct, frozen=True):
     """Tail-beat frequency [Hz]."""
     fullness: float
     """Mean |φ_c|/Φ."""
-    stalled: bool
+    is_stalled: bool
     """Whether the policy does not swim, or violates the shortest dwell; then the swim is short."""
     seconds: float
     """Length of the swim [s]."""

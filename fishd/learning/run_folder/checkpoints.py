@@ -204,7 +204,7 @@ def read_state(checkpoint: Path) -> State:
         state = msgspec.json.decode(_read_text(checkpoint / STATE), type=dict[str, Any])
         for name in ("latest", "best"):
             if isinstance(state.get(name), dict):
-                state[name] = rename_keys("evaluation", state[name])
+                state[name] = rename_keys("training", state[name])
         return msgspec.convert(state, State)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{checkpoint / STATE}: {_format_error(error)}; {_ADVICE}") from None

@@ -22,8 +22,8 @@ PROGRESS = {
     "relative_thrust": "rollout/relative_thrust",
     "frequency": "rollout/frequency",
     "fullness": "rollout/fullness",
-    "lost": "tank/lost",
-    "blind": "tank/blind",
+    "lost_ticks": "tank/lost_ticks",
+    "blind_ticks": "tank/blind_ticks",
     "paused": "tank/paused",
     "learning_rate": "train/learning_rate",
     "loss": "train/loss",
@@ -61,7 +61,7 @@ class Table(tables.Table):
         try:
             head, *rows = tables.read(self.path)
             at = head.index("steps")
-            head = rename_columns("evaluation", head)
+            head = rename_columns("training", head)
             if tuple(head) != self.columns:
                 raise ValueError(head)
             complete = [row for row in rows if len(row) == len(head)]
@@ -81,7 +81,7 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     path = folder / EVALUATIONS
     try:
         head, *rows = tables.read(path)
-        head = rename_columns("evaluation", head)
+        head = rename_columns("training", head)
         given = [{key: text for key, text in zip(head, row, strict=True) if text} for row in rows]
         return msgspec.convert(given, list[Evaluation], strict=False)
     except NoFile:

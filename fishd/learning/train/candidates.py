@@ -46,13 +46,13 @@ class Candidate(Struct, eq=False, kw_only=True):
     """Number of measured swims."""
     thrust: float = 0.0
     """Mean thrust of the measured swims [N]."""
-    swam: float = 0.0
+    swim_time: float = 0.0
     """Total time of all swims [s]."""
     frequency: float = 0.0
     """Tail beats per second in its latest swim [Hz]."""
     fullness: float = 0.0
     """Mean |φ_c|/Φ in the latest swim."""
-    stalled: bool = False
+    is_stalled: bool = False
     """Whether the policy stalls instead of swimming."""
 
 
@@ -72,13 +72,13 @@ class Candidates:
 
     def add_swim(self, candidate: Candidate, swim: Swim) -> None:
         """Add a swim to the figures of a candidate; remove the candidate if it stalls."""
-        candidate.frequency, candidate.fullness, candidate.stalled = (
+        candidate.frequency, candidate.fullness, candidate.is_stalled = (
             swim.frequency,
             swim.fullness,
-            swim.stalled,
+            swim.is_stalled,
         )
-        candidate.swam += swim.seconds
-        if candidate.stalled:
+        candidate.swim_time += swim.seconds
+        if candidate.is_stalled:
             self.remaining.remove(candidate)
         elif swim.thrust is not None:
             if candidate.swims:
@@ -209,7 +209,7 @@ class TankEvaluations:
         reported = {
             candidate.steps: candidate
             for candidate in self._swum
-            if candidate.stalled or candidate.swims
+            if candidate.is_stalled or candidate.swims
         }
         if best and best is not self.best:
             reported[best.steps] = best
@@ -223,17 +223,17 @@ class TankEvaluations:
         return DeterministicPolicy(self._model.policy, env.perception, env.link.amplitude)
 
     def _row(self, candidate: Candidate, steps: int, best: bool) -> Evaluation:
-        thrust = 0.0 if candidate.stalled else candidate.thrust
+        thrust = 0.0 if candidate.is_stalled else candidate.thrust
         return Evaluation(
             steps=steps,
             policy=candidate.steps,
             tank_time=self._env.tank_time,
-            swam=candidate.swam,
+            swim_time=candidate.swim_time,
             thrust=thrust,
-            thrust_ci95=None if candidate.stalled else self._candidates.ci95(candidate),
+            thrust_ci95=None if candidate.is_stalled else self._candidates.ci95(candidate),
             relative_thrust=thrust / self._env.best_thrust,
             frequency=candidate.frequency,
             fullness=candidate.fullness,
-            stalled=candidate.stalled,
+            is_stalled=candidate.is_stalled,
             best=best,
         )

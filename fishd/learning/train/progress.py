@@ -82,17 +82,21 @@ def format_imitation(number: int, rounds: int, right: float) -> str:
 def format_evaluation(evaluation: "Evaluation") -> str:
     """Format an evaluation in one line."""
     when = f"{evaluation.steps:7d} steps, {format_minutes(evaluation.tank_time):>8} in the tank"
-    if evaluation.swam is None:
+    if evaluation.swim_time is None:
         when += NOT_COUNTED
-    if evaluation.swam is not None and evaluation.policy != evaluation.steps:
+    if evaluation.swim_time is not None and evaluation.policy != evaluation.steps:
         when += f", policy of {evaluation.policy} steps"
-    others = f", worst of other fish {evaluation.worst:.1%}" if evaluation.worst is not None else ""
+    others = (
+        f", worst of other fish {evaluation.lowest_relative_thrust:.1%}"
+        if evaluation.lowest_relative_thrust is not None
+        else ""
+    )
     return f"{when}: {format_summary(evaluation)}{others}"
 
 
 def format_summary(evaluation: "Evaluation") -> str:
     """Format the figures of an evaluation, or state that the policy does not swim."""
-    if evaluation.stalled:
+    if evaluation.is_stalled:
         return "stalled: it does not swim"
     error = evaluation.thrust_ci95
     return format_figures(

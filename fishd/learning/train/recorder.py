@@ -97,7 +97,7 @@ class RunRecorder:
         logger.record("tank/steps", self.steps)
         logger.record("tank/time", self._env.tank_time)
         if self._job.settings.evaluation.every and self.latest:
-            for name in ("thrust", "relative_thrust", "frequency", "fullness", "stalled"):
+            for name in ("thrust", "relative_thrust", "frequency", "fullness", "is_stalled"):
                 logger.record(f"evaluation/{name}", float(getattr(self.latest, name)))
         logger.dump(self.steps)
 
@@ -107,7 +107,7 @@ class RunRecorder:
         self.unimproved += 1
         if evaluation.merit >= self._plateau + MIN_IMPROVEMENT:
             self._plateau, self.unimproved = evaluation.merit, 0
-        return self.add_measured(replace(evaluation, best=is_best and not evaluation.stalled))
+        return self.add_measured(replace(evaluation, best=is_best and not evaluation.is_stalled))
 
     @property
     def has_converged(self) -> bool:
@@ -273,7 +273,7 @@ class RunRecorder:
                 parameters=checkpoints.read_parameters(path),
                 swims=past.swims,
                 thrust=best.thrust if past.swims else 0.0,
-                swam=best.swam or 0.0,
+                swim_time=best.swim_time or 0.0,
                 frequency=best.frequency,
                 fullness=best.fullness,
             )

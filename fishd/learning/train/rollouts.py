@@ -119,8 +119,8 @@ class Rollouts:
         relative_thrust = thrust / env.best_thrust
         frequency = beat_frequency(actions, env.link.tick)
         for name, value in (
-            ("tank/lost", lost),
-            ("tank/blind", blind),
+            ("tank/lost_ticks", lost),
+            ("tank/blind_ticks", blind),
             ("tank/paused", paused),
             ("rollout/reward", float(buffer.rewards.mean())),
             ("rollout/thrust", thrust),

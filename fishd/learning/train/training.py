@@ -263,7 +263,7 @@ class Training:
         )
         if job.settings.evaluation.others:
             others = evaluation.worst_on_others(job.config, policy, job.settings, camera)
-            result = replace(result, worst=min(others, result.relative_thrust))
+            result = replace(result, lowest_relative_thrust=min(others, result.relative_thrust))
         return replace(result, steps=steps, policy=steps, tank_time=env.tank_time)
 
 

@@ -64,7 +64,7 @@ def test_a_healthy_virtual_pi_is_all_well_with_and_without_a_daemon(pi: Bench) -
 def test_the_force_is_judged_by_the_calibration_that_fishd_would_use(pi: Bench) -> None:
     settings = (*pi.settings, "--set", "force_sensor.force_limit=1e-4", *free_telemetry())
     _, findings = doctor(pi.folder, *settings)
-    assert "not to be believed in" in findings["force"][1]
+    assert "suspect in" in findings["force"][1]
     assert "(not calibrated: 1 V counts as 1 N)" in findings["force"][1]
     folder = CalibrationFolder(pi.folder / "state" / "virtual-pi")
     folder.save(ForceCalibration(xx=1e-6, yy=1e-6, loads=5), datetime.datetime.now(datetime.UTC))
@@ -79,8 +79,8 @@ def test_the_force_is_judged_by_the_calibration_that_fishd_would_use(pi: Bench) 
         ("unplugged", "force", "nothing answers at 0x48"),
         ("bus-owned", "adc", "a kernel driver owns 0x48"),
         ("timeout", "adc", "/dev/i2c-1 hangs"),
-        ("frozen-code", "force", "not to be believed"),
-        ("clipped", "force", "not to be believed"),
+        ("frozen-code", "force", "suspect"),
+        ("clipped", "force", "suspect"),
         ("stuck-busy", "force", "switch its power off and on"),
         ("pigpiod-gone", "pigpiod", "Connection refused"),
         ("pigpiod-frozen", "pigpiod", "no answer within"),

@@ -161,7 +161,7 @@ def test_it_draws_until_a_signal_and_restores_the_terminal(daemon: Daemon, numbe
     assert terminal.text.endswith((LEAVE_SCREEN, SHOW_CURSOR))
     assert COLOUR.search(terminal.text)
     assert BRAILLE.search(terminal.text)
-    figures = ("swing", "thrust", "tail beat", "late", "busy", "missed", "lost")
+    figures = ("swing", "thrust", "tail beat", "late", "compute", "skipped", "lost")
     for word in (*figures, "fx mN", "fy mN", "phi_c rad"):
         assert word in terminal.text
     assert "Traceback" not in terminal.text
@@ -272,7 +272,7 @@ def test_late_and_busy_are_the_worst_of_the_ticks_shown() -> None:
 def test_in_slow_motion_the_timing_is_not_shown() -> None:
     screen = render(view_of(map(tick, range(1, 50)), robot="swimmer"))
     assert "tail beat" in screen[1]
-    assert not re.search("late|busy|missed", screen[1])
+    assert not re.search("late|compute|skipped", screen[1])
 
 
 def test_a_fault_is_explained_in_full_however_narrow_the_screen() -> None:

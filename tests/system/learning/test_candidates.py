@@ -89,7 +89,7 @@ def test_a_policy_that_stalls_is_removed_also_if_it_was_the_best() -> None:
         candidates.add_swim(candidate, swum(share))
     assert candidates.best is second
     candidates.add_swim(second, swum(None))
-    assert second.stalled
+    assert second.is_stalled
     assert candidates.best is first
 
 
@@ -100,7 +100,7 @@ def test_a_swim_with_too_many_lost_ticks_is_repeated() -> None:
     candidates.add_swim(candidate, Swim(None, 1.67, 1.0, False, 3.5))
     assert candidates.best is None
     assert candidates.next() is candidate
-    assert candidate.swam == 3.5
+    assert candidate.swim_time == 3.5
 
 
 def test_the_number_of_remaining_candidates_is_limited() -> None:

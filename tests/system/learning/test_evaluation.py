@@ -129,10 +129,12 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
     outcome = train(Job(config=CONFIG, settings=settings, folder=tmp_path / "run"))
     with (tmp_path / "run" / "evaluations.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert all(float(row["worst"]) <= float(row["relative_thrust"]) for row in rows)
+    assert all(
+        float(row["lowest_relative_thrust"]) <= float(row["relative_thrust"]) for row in rows
+    )
     assert outcome.best_evaluation
-    swimming = [float(row["worst"]) for row in rows if row["stalled"] == "0"]
-    assert outcome.best_evaluation.worst == max(swimming)
+    swimming = [float(row["lowest_relative_thrust"]) for row in rows if row["is_stalled"] == "0"]
+    assert outcome.best_evaluation.lowest_relative_thrust == max(swimming)
 
 
 @pytest.mark.parametrize(
@@ -148,4 +150,6 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
 def test_a_policy_that_does_not_swim_is_marked_as_stalled(
     decide: Callable[[Observation], float], stalls: bool
 ) -> None:
-    assert evaluate_in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).stalled is stalls
+    assert (
+        evaluate_in_simulation(CONFIG, decide, EvaluationSettings(seconds=8.0)).is_stalled is stalls
+    )

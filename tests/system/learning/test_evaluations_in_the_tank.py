@@ -78,7 +78,7 @@ def test_a_short_swim_measures_the_thrust_with_any_drift_of_the_sensor(drift: st
 )
 def test_a_policy_that_does_not_swim_is_stopped_after_two_seconds(decide: Policy) -> None:
     swim = swims(env_on()).swim(lambda seen, _: decide(seen))
-    assert swim.stalled
+    assert swim.is_stalled
     assert swim.thrust is None
     assert swim.seconds <= 2.0
 
@@ -177,7 +177,7 @@ def test_a_policy_that_stalls_costs_little_and_ends(monkeypatch: pytest.MonkeyPa
     tank = Tank(monkeypatch, "noise=0.001")
     before = tank.env.tank_time
     (row,) = tank.evaluate(still)
-    assert (row.stalled, row.best, row.thrust_ci95, row.thrust) == (True, False, None, 0.0)
+    assert (row.is_stalled, row.best, row.thrust_ci95, row.thrust) == (True, False, None, 0.0)
     assert tank.env.tank_time - before == pytest.approx(2 * REST_TIME_S + 1.5)
     tank.evaluate(square(6))
     tank.evaluate(square(6))
@@ -192,7 +192,7 @@ def test_where_the_best_stalls_the_next_best_is_reported(monkeypatch: pytest.Mon
     assert tank.best == 1
     tank.policies[1] = still
     results = tank.evaluate(square(6), 40.0)
-    assert {row.policy: (row.stalled, row.best) for row in results}[128] == (True, False)
+    assert {row.policy: (row.is_stalled, row.best) for row in results}[128] == (True, False)
     assert tank.best != 1
 
 
@@ -255,7 +255,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     outcome = training.run()
     best = outcome.best_evaluation
     assert best
-    assert (best.policy, best.stalled, best.swam) == (64, False, 7.0)
+    assert (best.policy, best.is_stalled, best.swim_time) == (64, False, 7.0)
     assert outcome.best == checkpoints.find(job.folder) == job.folder / "best-000064"
     assert same(outcome.best, training.networks[64])
     past = checkpoints.read_card(outcome.best).provenance
@@ -263,7 +263,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
     assert outcome.checkpoint
     assert same(outcome.checkpoint, training.networks[192])  # the newest one has learned since
     table = rows(job.folder / "evaluations.csv")
-    reported = [(row["steps"], row["policy"], row["stalled"], row["best"]) for row in table]
+    reported = [(row["steps"], row["policy"], row["is_stalled"], row["best"]) for row in table]
     assert reported == [
         ("64", "64", "0", "1"),
         ("128", "128", "0", "0"),
@@ -271,7 +271,7 @@ def test_the_checkpoint_has_the_networks_of_the_best_also_of_an_older_one(
         ("192", "192", "1", "0"),
         ("192", "128", "0", "0"),
     ]
-    assert [row["swam"] for row in table] == ["3.5", "3.5", "7.0", "1.5", "7.0"]
+    assert [row["swim_time"] for row in table] == ["3.5", "3.5", "7.0", "1.5", "7.0"]
     assert 0.0 < float(table[2]["thrust_ci95"]) < float(table[0]["thrust_ci95"])
     monkeypatch.delattr(exporting, "evaluate_in_simulation")  # the figures are those of the tank
     exported = exporting.export(outcome.best, tmp_path / "best.onnx")
@@ -289,7 +289,12 @@ def test_a_resumed_training_keeps_the_best_policy(tmp_path: Path, beating: list[
     former = again._recorder.winner
     assert first
     assert former
-    assert (former.steps, former.swims, former.swam, former.thrust) == (64, 2, 7.0, first.thrust)
+    assert (former.steps, former.swims, former.swim_time, former.thrust) == (
+        64,
+        2,
+        7.0,
+        first.thrust,
+    )
     second = again.run()
     assert second.best == job.folder / "best-000064"
     assert same(second.best, training.networks[64])

@@ -31,7 +31,7 @@ from fishd.learning.train.training import train
 def stalled(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
     """A run that has learned nothing."""
     timid = PpoSettings(n_steps=64, n_epochs=1, learning_rate=1e-9, final_learning_rate=1e-9)
-    return train(brief_job(tmp_path_factory.mktemp("stalled") / "run", ppo=timid, steps=64))
+    return train(brief_job(tmp_path_factory.mktemp("is_stalled") / "run", ppo=timid, steps=64))
 
 
 def test_outputs_of_the_file_are_those_of_the_policy(tmp_path: Path, by_force: Outcome) -> None:
@@ -74,7 +74,7 @@ def test_a_policy_that_stalls_is_refused_without_a_file(tmp_path: Path, stalled:
     with pytest.raises(PolicyError, match=r"this policy stalls .* nevertheless with --force"):
         export(stalled.checkpoint, target)
     assert list(tmp_path.iterdir()) == []
-    assert export(stalled.checkpoint, target, force=True).evaluation.stalled
+    assert export(stalled.checkpoint, target, force=True).evaluation.is_stalled
     assert target.exists()
 
 

@@ -83,7 +83,7 @@ def test_ppo_continues_with_the_imitated_policy(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", **{**CHANGES, "steps": 64})
     train(job)
     first, *_ = rows(tmp_path / "run" / "evaluations.csv")
-    assert (first["steps"], first["stalled"]) == ("0", "0")
+    assert (first["steps"], first["is_stalled"]) == ("0", "0")
     card = checkpoints.read_card(tmp_path / "run" / "step-000064")
     assert card.provenance.algorithm == "imitation and PPO"
 
@@ -95,7 +95,7 @@ def test_a_training_stopped_during_imitation_repeats_it(tmp_path: Path) -> None:
     assert not checkpoints.read_state(tmp_path / "run" / "step-000000").imitated
     resumed = train(replace(job, resume=True))
     assert resumed.best_evaluation
-    assert not resumed.best_evaluation.stalled
+    assert not resumed.best_evaluation.is_stalled
     with pytest.raises(ConfigError, match="is finished, with 0 steps"):
         train(replace(job, resume=True))
 

@@ -262,7 +262,7 @@ def test_more_thrust_than_is_possible_is_warned_of(
         relative_thrust=relative_thrust,
         frequency=1.67,
         fullness=1.0,
-        stalled=False,
+        is_stalled=False,
     )
     outcome = Outcome(
         folder=tmp_path / "tank",

@@ -140,8 +140,8 @@ def test_a_training_on_harsh_fish_records_its_worst(tmp_path: Path) -> None:
     job = brief_job(tmp_path / "run", environment=environment, **varied)
     latest = train(job).latest_evaluation
     assert latest
-    assert latest.worst is not None
-    assert latest.worst <= latest.relative_thrust
+    assert latest.lowest_relative_thrust is not None
+    assert latest.lowest_relative_thrust <= latest.relative_thrust
 
 
 def test_with_own_fish_reversals_are_delayed_by_its_own_shortest_dwell() -> None:

@@ -136,7 +136,7 @@ def test_the_best_policy_is_stored_beside_the_newest(tmp_path: Path) -> None:
     witness = Witness()
     job = brief_job(tmp_path / "run", steps=448)
     outcome = train(job, witness)
-    swimming = [e for e in witness.evaluations if not e.stalled]
+    swimming = [e for e in witness.evaluations if not e.is_stalled]
     assert outcome.best_evaluation == max(swimming, key=lambda e: (e.relative_thrust, e.steps))
     assert outcome.best == job.folder / f"best-{outcome.best_evaluation.steps:06d}"
     card = checkpoints.read_card(outcome.best)
@@ -163,7 +163,7 @@ def test_a_training_has_converged_where_a_good_policy_was_not_improved_for_long_
     recorder = Training(job, SimulatedLink(job.config), Display(), lambda: False)._recorder
     converged = []
     for merit in merits:
-        figures = {"thrust": 0.02, "frequency": 1.7, "fullness": 1.0, "stalled": False}
+        figures = {"thrust": 0.02, "frequency": 1.7, "fullness": 1.0, "is_stalled": False}
         recorder.add(Evaluation(relative_thrust=merit, **figures))
         converged.append(recorder.has_converged)
     recorder.close()
@@ -189,7 +189,7 @@ def test_a_policy_that_holds_still_is_marked_and_never_the_best(tmp_path: Path) 
     timid = PpoSettings(n_steps=64, n_epochs=1, learning_rate=1e-9, final_learning_rate=1e-9)
     job = brief_job(tmp_path / "run", ppo=timid)  # hardly learns
     outcome = train(job)
-    assert [row["stalled"] for row in rows(job.folder / "evaluations.csv")] == ["1", "1"]
+    assert [row["is_stalled"] for row in rows(job.folder / "evaluations.csv")] == ["1", "1"]
     assert outcome.best is None
 
 

@@ -41,7 +41,7 @@ def test_without_a_daemon_the_policies_of_this_machine_are_listed(policy_folder:
     assert done.exit_code == 0
     assert "fishctl: no fishd is running; these are the policies of this machine" in done.stderr
     head, *rows = done.stdout.splitlines()
-    heads = "name sees Φ [rad] tick trained in steps relative thrust created folder"
+    heads = "name observes Φ [rad] tick trained in steps relative thrust created folder"
     assert head.split() == heads.split()
     assert rows[0].split() == [
         *("flip", "forces", "0.42", "50", "ms", "simulation", "8000", "98.7%", "2026-11-21"),
@@ -49,7 +49,7 @@ def test_without_a_daemon_the_policies_of_this_machine_are_listed(policy_folder:
     ]
     assert rows[1].split() == ["torch", *["–"] * 7, str(policy_folder)]
     assert rows[2].startswith("    not here: this is a zip archive as torch writes")
-    assert rows[3].startswith("wide   forces  0.8")
+    assert rows[3].startswith("wide   forces    0.8")
     assert len(rows) == 4
 
 

@@ -25,15 +25,19 @@ def test_it_begins_on_the_side_where_the_tail_is() -> None:
 
 
 def test_a_sweep_that_goes_down_is_refused() -> None:
-    with pytest.raises(ParameterError, match=r"highest: 0\.3 Hz is below lowest, 0\.5 Hz"):
-        registry.create("excitation", {"highest": 0.3}, LIMITS)
+    with pytest.raises(ParameterError, match=r"highest_frequency: 0\.3 Hz is below lowest_freq"):
+        registry.create("excitation", {"highest_frequency": 0.3}, LIMITS)
 
 
 def test_no_sweep_goes_beyond_two_ticks_a_beat() -> None:
     limits = replace(LIMITS, tick=0.2)
-    controller = registry.create("excitation", {"lowest": 2.4, "highest": 10.0}, limits)
+    controller = registry.create(
+        "excitation", {"lowest_frequency": 2.4, "highest_frequency": 10.0}, limits
+    )
     controller.activate(observe())
     sides = [controller.update(observe(dt=0.2)) > 0.0 for _ in range(200)]
     assert sum(a != b for a, b in pairwise(sides)) > 190
-    with pytest.raises(ParameterError, match=r"lowest: 3 Hz is too fast for .* at most 2\.5 Hz"):
-        registry.create("excitation", {"lowest": 3.0}, limits)
+    with pytest.raises(
+        ParameterError, match=r"lowest_frequency: 3 Hz is too fast for .* at most 2\.5 Hz"
+    ):
+        registry.create("excitation", {"lowest_frequency": 3.0}, limits)

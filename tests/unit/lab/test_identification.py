@@ -67,7 +67,11 @@ def test_it_finds_fish_and_rig_from_forces_and_commands(identification: Identifi
     for name in ("omega0", "xi", "coupling", "servo_speed", "servo_lag", "thrust_coefficient",
                  "lateral_drag", "rotation"):  # fmt: skip
         assert identification[name].value == pytest.approx(truth[name], rel=0.01), name
-        assert identification[name].low < identification[name].value < identification[name].high
+        assert (
+            identification[name].ci95_low
+            < identification[name].value
+            < identification[name].ci95_high
+        )
     assert identification["servo_delay"].value == pytest.approx(0.04, abs=5e-4)
     assert identification["backlash"].value == pytest.approx(0.02, abs=1e-3)
     # Its configured value, as forces do not determine it.
@@ -85,10 +89,10 @@ def test_products_are_told_and_factors_have_any_ratio(identification: Identifica
                 truth["lateral_drag"]]  # fmt: skip
     for product, value in zip(identification.products, products, strict=True):
         assert product.value == pytest.approx(scale * value, rel=0.01)
-        assert product.high < 1.02 * product.low
+        assert product.ci95_high < 1.02 * product.ci95_low
     for name, factor in (("coupling", 2.0), ("thrust_coefficient", 4.0), ("lateral_drag", 2.0)):
         low, high = identification[name].narrowest_interval
-        interval = identification[name].low, identification[name].high
+        interval = identification[name].ci95_low, identification[name].ci95_high
         assert interval == pytest.approx((low / factor, high * factor))
         assert high < 1.03 * low
 
@@ -102,8 +106,8 @@ def test_quadratic_drag_and_another_lateral_inertia_are_found() -> None:
     identification = identify(table, fix=("coupling",))
     for estimate in identification.estimates:
         if estimate.fitted and estimate.name in truth:
-            width = 0.5 * (estimate.high - estimate.low)
-            low, high = estimate.low - width, estimate.high + width
+            width = 0.5 * (estimate.ci95_high - estimate.ci95_low)
+            low, high = estimate.ci95_low - width, estimate.ci95_high + width
             assert low <= truth[estimate.name] <= high, estimate.name
     assert identification.failed_assumptions == ()
     assert identification["quadratic_drag"].value > 0.4
@@ -137,8 +141,11 @@ def test_a_fish_of_another_kind_is_not_identified_in_one_line(table: pd.DataFram
     white = {"white residual of fx", "white residual of fy"}
     assert white <= set(identification.failed_assumptions)
     assert min(channel.explained_out_of_sample for channel in identification.channels) < 0.9
-    assert (identification["omega0"].low, identification["omega0"].high) == (0.0, math.inf)
-    assert identification.to_builtins()["estimates"]["omega0"]["high"] is None
+    assert (identification["omega0"].ci95_low, identification["omega0"].ci95_high) == (
+        0.0,
+        math.inf,
+    )
+    assert identification.to_builtins()["estimates"]["omega0"]["ci95_high"] is None
     assert identification.covariance[0, 0] > 0.0
     assert "# not identified" in identification.to_yaml()
 
@@ -175,7 +182,7 @@ def test_what_it_writes_is_a_configuration(identification: Identification, tmp_p
     assert config.estimator.leak == pytest.approx(ratio, rel=1e-3)
     for estimate in identification.estimates:
         error = abs(written[estimate.name] - estimate.value)
-        assert error <= 0.01 * (estimate.high - estimate.low), estimate.name
+        assert error <= 0.01 * (estimate.ci95_high - estimate.ci95_low), estimate.name
 
 
 @pytest.mark.slow
@@ -185,7 +192,7 @@ def test_the_interval_of_an_offset_knows_the_mean_drift(seed: int, seconds: floa
     rig = load(None, RIG_OVERRIDES).simulation
     identification = identify(table, start=FISH, rig=rig, fit=["coupling"])
     for name in ("offset_x", "offset_y"):
-        assert identification[name].low < 0.02 < identification[name].high, name
+        assert identification[name].ci95_low < 0.02 < identification[name].ci95_high, name
 
 
 @pytest.mark.parametrize("seconds", [5.0, math.nan, math.inf])
@@ -245,7 +252,7 @@ def test_what_is_not_fitted_is_as_the_configuration_says(table: pd.DataFrame) ->
     identification = identify(table.iloc[:900], **fish, fit=["omega0", "xi"])
     assert identification["rotation"].value == config.simulation.rotation
     assert not identification["rotation"].fitted
-    assert identification["omega0"].low < 11.0 < identification["omega0"].high
+    assert identification["omega0"].ci95_low < 11.0 < identification["omega0"].ci95_high
     assert all(channel.white for channel in identification.channels)
     assert identification.plant["servo_reaction"] == 1e-7
     assert identification.plant["quadratic_drag"] == 1e-3
@@ -263,7 +270,7 @@ def test_the_reaction_of_the_servo_is_found_where_it_is_asked_for() -> None:
 
 
 def interval_width(identification: Identification) -> float:
-    return identification["omega0"].high - identification["omega0"].low
+    return identification["omega0"].ci95_high - identification["omega0"].ci95_low
 
 
 def test_several_runs_are_one_fish(table: pd.DataFrame) -> None:

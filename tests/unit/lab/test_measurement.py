@@ -246,7 +246,7 @@ def test_a_fin_that_takes_its_time_is_told_and_measured_right_with_more_of_it() 
 
 
 def test_a_beat_that_is_longer_than_a_swim_is_told() -> None:
-    slow = {"smaller": 1.0, "lowest": 0.15, "highest": 0.15}
+    slow = {"smaller": 1.0, "lowest_frequency": 0.15, "highest_frequency": 0.15}
     with VirtualSession(RIG) as rig, pytest.raises(ParameterError, match="no whole beat is left"):
         measure(rig, "excitation", slow, 30.0)
 
