@@ -172,10 +172,10 @@ def _swim(task: _Task) -> _Outcome:
         (contestant, reason) for contestant in chosen if (reason := refusal(config, contestant))
     ]
     for contestant, reason in left_out:
-        if is_missing(contestant):  # a misspelt path, not a policy for another fish
-            raise reason
+        if len(left_out) == len(chosen) or is_missing(contestant):
+            raise reason  # a misspelt path is not a policy for another fish
     refused = [contestant for contestant, _ in left_out]
-    accepted = [contestant for contestant in chosen if contestant not in refused] or chosen
+    accepted = [contestant for contestant in chosen if contestant not in refused]
     settle = DEFAULT_SETTLE_S if task.settle is None else task.settle
     with task.keep(None, chosen) as experiment:
         task.fish.announce(task.as_json)

@@ -273,7 +273,7 @@ def record_session(
         if logged and experiment.header.on == "live":
             from fishd.lab.swim_log import SwimLog
 
-            session.log = SwimLog(experiment, writer, session.tick)
+            session.swim_logged = SwimLog(experiment, writer, session.tick).swim
         yield
 
 

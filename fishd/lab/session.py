@@ -28,7 +28,6 @@ from fishd.core.signals import Event, Publisher, Reason, Tick
 from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:
-    from fishd.lab.swim_log import SwimLog
     from fishd.recording.writer import RunWriter, Source
 
 IDLE_LIMIT = 5.0
@@ -75,6 +74,16 @@ def _count(seconds: float, tick: float) -> int:
     return max(1, round(seconds / tick))
 
 
+SwimLogged = Callable[[str, Mapping[str, Any], float, Callable[[], list[Tick]]], list[Tick]]
+"""Function such as `fishd.lab.swim_log.SwimLog.swim`."""
+
+
+def _swim_unlogged(
+    controller: str, parameters: Mapping[str, Any], seconds: float, swim: Callable[[], list[Tick]]
+) -> list[Tick]:
+    return swim()
+
+
 class Session(ABC):
     """One fish under the control of an experiment; a context manager that leaves it at rest."""
 
@@ -100,8 +109,8 @@ class Session(ABC):
         """Function that is called with the tank time, tick by tick [s]."""
         self.listener: Publisher | None = None
         """Receiver of each tick and event, in order; an exception of it ends a swim or a rest."""
-        self.log: SwimLog | None = None
-        """Log of finished swims and rests, which are not repeated in a resumed experiment."""
+        self.swim_logged: SwimLogged = _swim_unlogged
+        """Function that swims or rests, unless a resumed experiment has done so before."""
         self._elapsed = self._planned = 0.0
 
     def __enter__(self) -> Self:
@@ -161,9 +170,7 @@ class Session(ABC):
     ) -> list[Tick]:
         """Swim or rest, unless the log of a resumed experiment has these ticks."""
         with self._timed(seconds):
-            if self.log is None:
-                return swim()
-            return self.log.swim(controller, parameters, seconds, swim)
+            return self.swim_logged(controller, parameters, seconds, swim)
 
     @contextmanager
     def recorded(

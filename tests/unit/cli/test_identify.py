@@ -36,7 +36,7 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     result = json.loads(second.stdout)
     assert result["origin"] == "identify.mcap"
     estimates = result["estimates"]
-    assert estimates["omega0"]["low"] < 11.0 < estimates["omega0"]["high"]
+    assert estimates["omega0"]["ci95_low"] < 11.0 < estimates["omega0"]["ci95_high"]
     assert not estimates["coupling"]["fitted"]
 
     refused = invoke(str(record), "--to", str(fish))
