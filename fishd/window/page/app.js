@@ -25,22 +25,25 @@ const WINDOWS = [15, 30, 60, 120];
 
 const state = {
   name: "", fish: [], session: null, status: null, controllers: [], events: [], jobs: new Map(),
-  connection: null, driver: null, linked: false, helloed: false, lastTick: null, tick: null, interval: 0.05,
+  connection: null, driver: null, linked: false, helloed: false, refused: "", lastTick: null, tick: null, interval: 0.05,
   changedSeq: 0, own: new Set(), selected: null, edited: null, keep: recall("keep", false), estop: null,
   notices: [], reference: null, seconds: recall("seconds", 15),
 };
 let ring = new Ring(0.05), charts, view, stream, drawing = false, valuesAt = 0;
+/** Number of connections in a row that ended without a first message. */
+let failures = 0;
 
 // ---- what the server says ----
 
 const receive = {
   hello(payload) {
+    failures = 0;
     setClient(payload.client);
     stream.client = payload.client;
     sessionStorage.setItem("fishd.client", payload.client);
     Object.assign(state, {
       name: payload.name, fish: payload.fish, session: payload.session, controllers: payload.controllers ?? [],
-      events: payload.events ?? [], connection: payload.connection, driver: payload.driver, linked: true, helloed: true,
+      events: payload.events ?? [], connection: payload.connection, driver: payload.driver, linked: true, helloed: true, refused: "",
       jobs: new Map((payload.jobs ?? []).map((job) => [job.id, job])),
       reference: recall(`reference.${payload.name}`, null), changedSeq: 0,
     });
@@ -177,7 +180,8 @@ function showVirtual(job) {
 
 function freshness() {
   const age = state.lastTick === null ? NaN : (performance.now() - state.lastTick) / 1000;
-  if (!state.helloed) return { kind: "connecting", age };
+  if (!state.helloed && !state.refused) return { kind: "connecting", age };
+  if (state.refused) return { kind: "lost", age, message: state.refused };
   if (!state.linked) return { kind: "lost", age, message: "fishd-window does not answer; the page tries again each second." };
   const said = state.connection?.state;
   if (said === "lost") return { kind: "lost", age, message: state.connection.message || "fishd does not answer." };
@@ -277,8 +281,9 @@ async function pressEstop() {
   while (state.estop === press) {
     press.attempts++;
     try {
-      const { server_ms: serverMs, outcome } = await call("POST", `/api/fish/${encodeURIComponent(state.name || nameInAddress())}/estop`, {}, doubled(ESTOP_TIMEOUT_MS, press.attempts - 1));
-      Object.assign(press, { phase: "done", ms: performance.now() - press.begin, serverMs, outcome });
+      const fish = state.name || nameInAddress() || (await call("GET", "/api/fish"))[0].name;
+      const { server_ms: serverMs, way, outcome } = await call("POST", `/api/fish/${encodeURIComponent(fish)}/estop`, {}, doubled(ESTOP_TIMEOUT_MS, press.attempts - 1));
+      Object.assign(press, { phase: "done", ms: performance.now() - press.begin, serverMs, way, outcome });
       say(`Emergency stop confirmed after ${number(press.ms, 0)} milliseconds.`);
       break;
     } catch (error) {
@@ -343,7 +348,7 @@ function Banner() {
       <div>${mode === "fault" ? html`<b>Fault.</b>` : html`<b>Emergency stop.</b>`}
         ${estop?.phase === "done" && html` <span>Confirmed <b id="estop-ms">${number(estop.ms, 0)} ms</b> after the press${
           Number.isFinite(estop.serverMs) && html` (${number(estop.serverMs, 1)} ms of it in fishd-window and fishd)`}.
-          ${!latched && " The stream has not shown it yet."}</span>`}
+          ${estop.way === "last resort" ? ` fishd did not answer; without it: ${estop.outcome}.` : !latched && " The stream has not shown it yet."}</span>`}
         ${reason && html`<p>${sentence(reason.message)}${reason.remedy && html` <span class="remedy">Before you clear it: ${reason.remedy}.</span>`}</p>`}</div>
       ${latched && html`<button type="button" id="clear-fault" disabled=${session?.scope !== "drive"} onClick=${() => act("clear-fault", {})}>Clear fault</button>`}
     </div>`}
@@ -535,11 +540,22 @@ async function start() {
   changed();
   if (state.session.paired === false) return;
   const before = sessionStorage.getItem("fishd.client") ?? ""; // a page that is loaded again goes on driving
-  stream = new Stream(nameInAddress(), before, (type, payload) => receive[type]?.(payload), (linked) => {
-    state.linked = linked;
-    checkConnection();
-    changed();
-  });
+  stream = new Stream(nameInAddress(), before, (type, payload) => receive[type]?.(payload), noteClosed);
+}
+
+/** Find out why the connection has ended: no server, a device that was revoked, or too many pages. */
+async function noteClosed() {
+  state.linked = false;
+  failures++;
+  checkConnection();
+  changed();
+  const session = await call("GET", "/api/session").catch(() => null);
+  if (state.linked) return;
+  if (session) state.session = session;
+  if (session?.paired === false) state.refused = "this device is no longer paired";
+  else if (session && failures > 1) state.refused = "fishd-window refuses this page, maybe because too many are open; it is tried again";
+  else state.refused = "";
+  changed();
 }
 
 export { charts, receive, state, stream };

@@ -124,10 +124,10 @@ export function* ticksOf(history) {
 export class Stream {
   /**
    * client: identifier that the server gave to this page before, or empty
-   * take: called with type and payload of each message; changed: with whether the server is there
+   * take: called with type and payload of each message; closed: after each end of the connection, before it is opened again
    */
-  constructor(fish, client, take, changed) {
-    Object.assign(this, { fish, client, take, changed });
+  constructor(fish, client, take, closed) {
+    Object.assign(this, { fish, client, take, closed });
     this.beaten = 0;
     this.#connect();
   }
@@ -143,7 +143,7 @@ export class Stream {
       this.take(...JSON.parse(event.data));
     };
     this.socket.onclose = () => {
-      this.changed(false);
+      this.closed();
       setTimeout(() => this.#connect(), RETRY_MS);
     };
   }

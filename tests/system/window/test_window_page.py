@@ -287,6 +287,19 @@ def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
         assert complaints == []
 
 
+def test_a_device_that_is_revoked_says_so(window: WindowProcess, daemon: Daemon) -> None:
+    url = f"http://fish.example:{window.port}/"
+    state = ("--state", str(window.state))
+    done = daemon.fishctl("window", "pair", "--url", url, *state, "--json")
+    link = json.loads(done.stdout)["url"]
+    with open_page(link, "--host-resolver-rules=MAP fish.example 127.0.0.1") as (page, _):
+        expect(page.locator("#connection")).to_contain_text("live")
+        (device,) = json.loads(daemon.fishctl("window", "devices", *state, "--json").stdout)
+        assert daemon.fishctl("window", "revoke", *state, device["id"]).returncode == 0
+        expect(page.locator("#banner")).to_contain_text("This device is no longer paired")
+        expect(page.locator(".pairing")).to_be_visible()
+
+
 def test_a_run_in_simulation_is_drawn_beside_the_live_force(window: WindowProcess) -> None:
     with live_page(window.url) as (page, complaints):
         page.click("#tab-simulate")
