@@ -43,6 +43,7 @@ PLACES = {
     "sweep": "`rows.csv` of `fishctl sweep`",
     "camera of a training": "section `camera` of the settings of a training",
     "training": "`evaluations.csv` and `progress.csv` of a training",
+    "estimate": "estimates of `fishctl identify --json`, also in the folder of `fishctl adapt`",
     "controller excitation": "parameters of `excitation` in a recording",
     "optimise": "`rows.csv` of `fishctl optimise`",
 }

@@ -56,6 +56,7 @@ OLD_NAMES: dict[str, dict[str, str]] = {
         "lost": "lost_ticks",
         "blind": "blind_ticks",
     },
+    "estimate": {"low": "ci95_low", "high": "ci95_high"},
     "controller excitation": {"lowest": "lowest_frequency", "highest": "highest_frequency"},
     "optimise": {
         "error": "thrust_ci95",

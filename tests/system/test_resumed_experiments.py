@@ -23,10 +23,10 @@ def start(daemon: Daemon, folder: Path, *words: str) -> Process:
     return Process(*EXPERIMENT, *command)
 
 
-def resume(daemon: Daemon, verb: str, folder: Path) -> object:
+def resume(daemon: Daemon, verb: str, folder: Path, *options: str) -> object:
     """Resume an experiment, after the lease of a killed one; return its JSON."""
     wait_until(lambda: daemon.status().lease is None)
-    words = ("--resume", str(folder), "--endpoint", daemon.endpoint, "--json")
+    words = ("--resume", str(folder), "--endpoint", daemon.endpoint, "--json", *options)
     ended = call(*EXPERIMENT, verb, *words)
     assert ended.returncode == 0, ended.stderr
     return json.loads(ended.stdout)
@@ -97,7 +97,7 @@ def test_a_killed_identification_swims_what_is_missing(daemon: Daemon, tmp_path:
     wait_until(lambda: part.exists() and count_swum(folder) >= 200)
     swims.end(signal.SIGKILL)
     before = count_swum(folder)
-    result = resume(daemon, "identify", folder)
+    result = resume(daemon, "identify", folder, "--fit", "omega0")
     assert isinstance(result, dict)
     assert result["passages"] == 2
     total = count_swum(folder)

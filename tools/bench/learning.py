@@ -15,7 +15,7 @@ import math
 import statistics
 import tempfile
 import time
-from argparse import Namespace
+from argparse import ArgumentTypeError, Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -50,6 +50,8 @@ PAPER_STEPS, PICTURE_STEPS, PAPER_PICTURE_STEPS, LONG_STEPS = 20_000, 4096, 15_3
 """Control steps of trainings whose length is not the default one."""
 MILESTONES = (500, 1000, 2000, 4000, 8000, 20_000)
 """Numbers of control steps at which learning curves are reported."""
+MIN_STEPS = 512
+"""Number of control steps after which also a training with pictures has an evaluation."""
 NEARLY, GOOD = 0.95, 0.97
 """Relative thrusts whose steps are reported."""
 AMPLITUDES = (0.2, 0.31, 0.42, 0.8)
@@ -399,6 +401,13 @@ def inference_time(policy: str) -> tuple[float, float]:
     return float(median), float(tail)
 
 
+def parse_steps(text: str) -> int:
+    """Return a number of control steps that is enough for an evaluation."""
+    if not text.isdecimal() or int(text) < MIN_STEPS:
+        raise ArgumentTypeError(f"{text}: a whole number of {MIN_STEPS} or more is needed")
+    return int(text)
+
+
 PARTS = {
     "curves": curves,
     "pictures": pictures,
@@ -408,7 +417,10 @@ PARTS = {
 }
 OPTIONS: Options = {
     "--seeds": {"type": int, "default": 10, "help": "trainings of each row; default: 10"},
-    "--steps": {"type": int, "help": "control steps of each training, as a trial; 512 or more"},
+    "--steps": {
+        "type": parse_steps,
+        "help": "control steps of each training, as a trial; 512 or more",
+    },
     "--jobs": {
         "type": int,
         "default": max(1, joblib.cpu_count() - 1),

@@ -12,7 +12,14 @@ from msgspec.structs import replace
 
 from fishd.cli.config import config_option, set_option
 from fishd.cli.experiment_options import On, default_on, on_option
-from fishd.cli.options import endpoint_option, json_option, seed_option, take_option, verb_lease
+from fishd.cli.options import (
+    endpoint_option,
+    json_option,
+    plot_option,
+    seed_option,
+    take_option,
+    verb_lease,
+)
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress
 from fishd.config import adopt, load
@@ -96,6 +103,7 @@ BY_RESUME = "with --resume, which keeps the options of the run"
 @click.option(
     "--cluster", metavar="ADDRESS", help="With --seeds: address of a Dask scheduler that runs them."
 )
+@plot_option("the thrust at each evaluation")
 @json_option
 def ppo(
     on: On | None,
@@ -114,12 +122,18 @@ def ppo(
     seeds: int | None,
     jobs: int | None,
     cluster: str | None,
+    picture: Path | None,
     as_json: bool,
 ) -> int:
     """Train a policy with PPO: checkpoints, tables and TensorBoard logs in a run folder.
 
     After Ctrl-C the fish is at neutral, and --resume continues from the last checkpoint.
     """
+    from fishd.lab import drawing
+    from fishd.learning.run_folder import figure
+
+    if picture:
+        drawing.check(picture)
     run_options: dict[str, Any] = {
         "--config": file,
         "--set": overrides,
@@ -131,6 +145,8 @@ def ppo(
         _refuse(BY_RESUME, {**run_options, **new_run_options, "--seeds": seeds})
     if seeds is None:
         _refuse("without --seeds", {"--jobs": jobs, "--cluster": cluster})
+    elif picture:
+        raise click.UsageError("--plot is for one seed; with --seeds, curves are in seeds.csv")
     elif on == "live":
         raise click.UsageError("--seeds is for simulated fish: there is only one live fish")
     if not resume:
@@ -147,7 +163,10 @@ def ppo(
     job = _add_camera(replace(job, agent=agent, settings=replace(job.settings, **changed)), camera)
     if seeds is not None:
         return _train_seeds(job, seeds, jobs, cluster, as_json)
-    return _train(job, as_json)
+    status = _train(job, as_json)
+    if picture:
+        figure.draw(picture, job.folder)
+    return status
 
 
 def _refuse(why: str, options: dict[str, Any]) -> None:

@@ -2,22 +2,23 @@
 
 import base64
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from fishd.core.old_names import rename_keys
 from fishd.lab import error_budget
-from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, open_figure
+from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, open_figure
 from fishd.lab.identification.figure import format_estimate
 from fishd.lab.identification.fit import LOGARITHMIC
 from fishd.lab.identification.result import Estimate
 from fishd.lab.ranking import format_ratio
 from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State, Verdict
 from fishd.learning.adapt.verdict import NAMES, SQUARE
-from fishd.learning.run_folder.tables import read_evaluations
+from fishd.learning.run_folder.figure import draw_training
 from fishd.virtual.plant.optimum import square_wave
 
 _COLOURS = {"policy": BLUE, "swing": GREEN, SQUARE: ORANGE}
@@ -50,7 +51,7 @@ def draw(state: State, folder: Path, amplitude: float, path: Path) -> None:
         (fit, search), (training, contest) = figure.subplots(2, 2)
         _draw_fit(fit, state.fitted)
         _draw_search(search, state, amplitude)
-        _draw_training(training, folder)
+        draw_training(training, folder)
         _draw_contest(contest, state)
 
 
@@ -61,8 +62,9 @@ def _draw_fit(axis: Any, fitted: Fitted) -> None:
     one that is withheld has no bar.
     """
     shown = []
-    for name, estimate in fitted.identification["estimates"].items():
-        low, high = estimate.get("if_ratio_holds") or (estimate["low"], estimate["high"])
+    for name, estimate in _read_estimates(fitted):
+        ends = estimate["ci95_low"], estimate["ci95_high"]
+        low, high = estimate.get("if_ratio_holds") or ends
         if estimate.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio":
             width = math.nan if low is None or high is None else high - low
             shown.append((name, 50.0 * width / abs(estimate["value"])))
@@ -95,30 +97,6 @@ def _draw_search(axis: Any, state: State, amplitude: float) -> None:
     axis.set_ylabel("thrust (mN)")
     axis.set_title("square waves")
     axis.legend(loc="upper right")
-
-
-def _draw_training(axis: Any, folder: Path) -> None:
-    """Draw the thrust of the policy on the identified fish, and on the worst of its cloud."""
-    axis.set_title("training in simulation")
-    axis.set_xlabel("steps")
-    axis.set_ylabel("% of the best square wave")
-    evaluations = read_evaluations(folder)
-    if not evaluations:
-        axis.text(0.5, 0.5, "no evaluation", ha="center", transform=axis.transAxes)
-        return
-    steps = [evaluation.steps for evaluation in evaluations]
-    for shares, label, colour in (
-        ([evaluation.relative_thrust for evaluation in evaluations], "identified fish", BLUE),
-        (
-            [evaluation.lowest_relative_thrust for evaluation in evaluations],
-            "worst fish tried",
-            PURPLE,
-        ),
-    ):
-        values = [100.0 * (math.nan if share is None else share) for share in shares]
-        axis.plot(steps, values, color=colour, marker=".", label=label)
-    axis.set_ylim(0.0, 105.0)
-    axis.legend(loc="lower right")
 
 
 def _draw_contest(axis: Any, state: State) -> None:
@@ -226,14 +204,20 @@ def _role(name: str, verdict: Verdict) -> str:
     return ", chosen" if name == verdict.chosen_gait else ", undecided"
 
 
+def _read_estimates(fitted: Fitted) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the fitted parameters, also those of an older fishd."""
+    for name, values in fitted.identification["estimates"].items():
+        yield name, rename_keys("estimate", values)
+
+
 def _estimates(fitted: Fitted) -> list[tuple[str, ...]]:
     """Return the rows of the fitted parameters, as `fishctl identify` prints them."""
     rows = []
-    for name, values in fitted.identification["estimates"].items():
+    for name, values in _read_estimates(fitted):
         if values.get("fitted", True):
             # JSON has no infinity: null stands for an end that the data do not determine.
-            low = -math.inf if values["low"] is None else values["low"]
-            high = math.inf if values["high"] is None else values["high"]
+            low = -math.inf if values["ci95_low"] is None else values["ci95_low"]
+            high = math.inf if values["ci95_high"] is None else values["ci95_high"]
             narrow = values.get("if_ratio_holds")
             narrow = (narrow[0], narrow[1]) if narrow else None
             estimate = Estimate(name, values["value"], low, high, if_ratio_holds=narrow)

@@ -299,3 +299,10 @@ def test_a_training_on_a_robot_reads_the_configuration_of_fishd_once(
     assert "no process listens there" in result.stderr
     assert endpoints == [endpoint]
     assert ("plant.omega0 is 11.0 here, 12.5 there" in result.stderr) is bool(changes)
+
+
+def test_a_training_is_drawn(tmp_path: Path) -> None:
+    picture = tmp_path / "training.png"
+    words = ("--on", "simulation", "--steps", "64", "--folder", str(tmp_path / "run"))
+    assert fishctl("learn", "ppo", *words, "--plot", str(picture)).returncode == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
