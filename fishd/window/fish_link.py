@@ -5,7 +5,6 @@ An emergency stop has its own threads and connections, so that it waits for noth
 
 import asyncio
 import logging
-import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -23,6 +22,7 @@ from fishd.core import text
 from fishd.core.addresses import find_control_address
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon
+from fishd.core.process.safe_path import python_command
 from fishd.core.protocol import State
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 
@@ -375,7 +375,7 @@ class FishLink:
 def fishctl_command(*arguments: str) -> list[str]:
     """Return the command that runs fishctl with the Python of this process."""
     code = "from fishd.__main__ import fishctl; fishctl()"
-    return [sys.executable, "-P", "-c", code, *arguments]
+    return python_command("-c", code, *arguments)
 
 
 def _builtins(result: Struct) -> dict[str, Any]:

@@ -11,7 +11,6 @@ import re
 import shlex
 import shutil
 import signal
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
@@ -25,6 +24,7 @@ from msgspec import Meta, Struct
 
 from fishd.core import text
 from fishd.core.errors import FishdError
+from fishd.core.process.safe_path import python_command
 from fishd.core.schema import PRINTABLE
 
 MAX_RUNNING_JOBS = 4
@@ -291,7 +291,7 @@ class Jobs:
 
     async def _spawn(self, words: list[str]) -> asyncio.subprocess.Process:
         return await asyncio.create_subprocess_exec(
-            *(sys.executable, "-P", "-c", _CHILD, *words),
+            *python_command("-c", _CHILD, *words),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
