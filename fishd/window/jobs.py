@@ -345,7 +345,10 @@ class Jobs:
             if time.monotonic() - read >= RUNS_AGE_S:
                 self.runs.mkdir(parents=True, exist_ok=True)
                 output = await self._call(["runs", f"--folder={self.runs}", "--json"])
-                runs = msgspec.json.decode(output)
+                try:
+                    runs = msgspec.json.decode(output)
+                except msgspec.DecodeError:
+                    raise JobError(f"the runs in {self.runs} could not be listed") from None
                 self._list = (time.monotonic(), runs)
             return runs
 

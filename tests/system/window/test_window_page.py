@@ -3,7 +3,6 @@
 import gzip
 import json
 import signal
-import tarfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import resources
@@ -19,8 +18,8 @@ from rigs.window_process import WindowProcess, running_window
 
 pytestmark = needs_browser
 
-AXE = Path(__file__).parents[3] / "build" / "axe-core-4.10.3.tgz"
-"""The program that looks for barriers; `npm pack` fetches it."""
+AXE = resources.files("axe_playwright_python").joinpath("axe.min.js")
+"""The program that looks for barriers."""
 MAX_ASSETS_BYTES = 120_000
 expect.set_options(timeout=PATIENCE * 1e3)
 
@@ -402,15 +401,9 @@ def test_nothing_is_wider_than_the_screen_and_the_emergency_stop_keeps_its_place
         assert page.evaluate("document.documentElement.scrollWidth") == width
 
 
-@pytest.mark.skipif(
-    not AXE.exists(), reason=f"needs: npm pack axe-core@4.10.3 --pack-destination {AXE.parent.name}"
-)
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_no_barrier_is_serious(window: WindowProcess, scheme: str) -> None:
-    with tarfile.open(AXE) as archive:
-        program = archive.extractfile("package/axe.min.js")
-        assert program
-        source = program.read().decode()
+    source = AXE.read_text(encoding="utf-8")
     with live_page(window.url, color_scheme=scheme, bypass_csp=True) as (page, _):
         swim(page)
         for state in ("live", "estop"):
