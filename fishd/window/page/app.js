@@ -4,7 +4,7 @@ import {
   timeOfDay, useState,
 } from "./common.js";
 import { Charts } from "./charts.js";
-import { defaultOf, Drive, request, selectionOf } from "./controls.js";
+import { defaultOf, Drive, driverName, request, selectionOf } from "./controls.js";
 import { Experiments, Runs } from "./experiments.js";
 import { TopView } from "./fish.js";
 import { Ring, Stream, ticksOf } from "./stream.js";
@@ -110,7 +110,7 @@ const receive = {
     changed();
   },
   driver(driver) {
-    if (state.driver?.you_drive && driver && !driver.you_drive) notice("warning", `${driver.device || "Another page"} drives now.`);
+    if (state.driver?.you_drive && driver && !driver.you_drive) notice("warning", `${driverName({ ...state, driver })} drives now.`);
     state.driver = driver;
     changed();
   },
@@ -236,7 +236,7 @@ async function act(op, args, take = false) {
       if (state.own.size > 50) state.own.delete(state.own.values().next().value);
       state.changedSeq = Math.max(state.changedSeq, seq);
       setStatus({ ...state.status, mode, reason, controller, parameters });
-      if (result.previous_holder) notice("warning", `The experiment ${result.previous_holder.name} has lost the fish to this request.`);
+      if (result.previous_holder && !result.previous_holder.name.startsWith(OWN_LEASE)) notice("warning", `The experiment ${result.previous_holder.name} has lost the fish to this request.`);
     }
     if (op === "tare") notice("info", "The present force is zero now.");
     if (op === "clear-fault") state.estop = null;
@@ -287,7 +287,10 @@ async function pressEstop() {
       say(`Emergency stop confirmed after ${number(press.ms, 0)} milliseconds.`);
       break;
     } catch (error) {
-      Object.assign(press, { phase: "failed", message: error.message, remedy: error.remedy });
+      // The window says that fishd is silent, so the window itself answers.
+      const { message, remedy } = error.code === "no-answer" && state.linked && ["stale", "lost"].includes(state.connection?.state)
+        ? { message: "fishd has not answered fishd-window yet", remedy: "" } : error;
+      Object.assign(press, { phase: "failed", message, remedy });
       changed();
       if (error.status === 401 || error.status === 403 || error.status === 404) break;
       await wait(doubled(ESTOP_RETRY_MS, press.attempts - 1));
@@ -318,7 +321,7 @@ function Head() {
   const { kind, age, message } = freshness();
   const mode = state.status?.mode ?? "unknown";
   const lease = experimentOf(state.status);
-  const driver = lease ? `${lease.name} drives` : state.driver ? (state.driver.you_drive ? "you drive" : `${state.driver.device || "another page"} drives`) : "no driver";
+  const driver = lease ? `${lease.name} drives` : state.driver ? (state.driver.you_drive ? "you drive" : `${driverName(state)} drives`) : "no driver";
   return html`
     ${state.fish.length > 1
       ? html`<nav class="tabs" aria-label="Fish"><h1 class="unseen">${state.name}</h1>${state.fish.map((name) => html`<a href=${`?fish=${encodeURIComponent(name)}`}
@@ -342,7 +345,7 @@ function Banner() {
       <span>${sentence(message)} What is greyed is old.</span></div>`}
     ${estop?.phase === "sending" && html`<div class="banner bad"><b>Emergency stop sent …</b></div>`}
     ${estop?.phase === "failed" && html`<div class="banner bad" role="alert"><b>Emergency stop NOT confirmed.</b>
-      <span>${sentence(estop.message)} Sent ${estop.attempts} times. Use the button of the panel, or: fishctl estop. ${sentence(estop.remedy)}</span>
+      <span>${sentence(estop.message)} Sent ${estop.attempts === 1 ? "once" : `${estop.attempts} times`}. Use the button of the panel, or: fishctl estop. ${sentence(estop.remedy)}</span>
       <button type="button" onClick=${forgetEstop}>Do not send it again</button></div>`}
     ${(latched || estop?.phase === "done") && html`<div class="banner bad" id="latched">
       <div>${mode === "fault" ? html`<b>Fault.</b>` : html`<b>Emergency stop.</b>`}

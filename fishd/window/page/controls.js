@@ -81,11 +81,12 @@ function Field({ field, value, disabled, status, edit }) {
   </div>`;
 }
 
-/** Return the parameters that the panel shows: the active ones, the defaults, and what was edited. */
-export function shownParameters(controller, status, edited) {
+/** Return the parameters that the panel shows: what was edited, else the active ones, those of the latest start, or the defaults. */
+export function shownParameters(controller, status, edited, applied) {
   const active = status?.mode === "running" && status.controller === controller.name ? status.parameters : {};
   return Object.fromEntries(controller.parameters.map((field) => [
-    field.name, field.name in edited ? edited[field.name] : field.name in active ? active[field.name] : defaultOf(field),
+    field.name, field.name in edited ? edited[field.name]
+      : field.name in active ? active[field.name] : field.name in applied ? applied[field.name] : defaultOf(field),
   ]));
 }
 
@@ -93,7 +94,7 @@ export function shownParameters(controller, status, edited) {
 export const defaultOf = (field) =>
   "default" in field ? field.default : ({ number: 0, integer: 0, boolean: false, text: "" }[field.kind] ?? null);
 
-/** Return the selected controller, its description, and what was edited of it. */
+/** Return the description of the selected controller, what was edited of it, and what this page has applied. */
 export function selectionOf(state) {
   const kept = recall(`selection.${state.name}`, {});
   const running = state.status?.mode === "running" ? state.status.controller : null;
@@ -102,24 +103,25 @@ export function selectionOf(state) {
   const controller = state.controllers.find((candidate) => candidate.name === name);
   if (!state.edited || state.editedOf !== name) {
     state.edited = kept.name === name ? (kept.edited ?? {}) : {};
+    state.applied = kept.name === name ? (kept.applied ?? {}) : {};
     state.editedOf = name;
   }
-  return { controller, edited: state.edited, running: running === name };
+  return { controller, edited: state.edited, applied: state.applied, running: running === name };
 }
 
 export function Drive({ state, act, changed, changeRole, experiment }) {
   const timer = useRef(0);
   const [text, setText] = useState("");
-  const { controller, edited, running } = selectionOf(state);
+  const { controller, edited, applied, running } = selectionOf(state);
   if (!controller) return html`<h2 id="drive-title">Controller</h2><p class="muted">No fishd has answered yet.</p>`;
-  const parameters = shownParameters(controller, state.status, edited);
-  const keep = () => remember(`selection.${state.name}`, { name: controller.name, edited: state.edited });
+  const parameters = shownParameters(controller, state.status, edited, applied);
+  const keep = () => remember(`selection.${state.name}`, { name: controller.name, edited: state.edited, applied: state.applied });
   const mayDrive = state.session?.scope === "drive";
   const latched = ["fault", "estop"].includes(state.status?.mode);
   const other = state.driver && !state.driver.you_drive;
 
   const select = (name) => {
-    Object.assign(state, { selected: name, edited: {}, editedOf: name });
+    Object.assign(state, { selected: name, edited: {}, applied: {}, editedOf: name });
     remember(`selection.${state.name}`, { name, edited: {} });
     changed();
   };
@@ -133,7 +135,7 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
   };
   const sendEdited = async () => {
     const sent = { ...state.edited };
-    await act("set-parameters", { parameters: sent });
+    if (await act("set-parameters", { parameters: sent })) Object.assign(state.applied, sent);
     // A refused value goes, too: what is shown then is what the fish does.
     for (const key in sent) if (state.edited[key] === sent[key]) delete state.edited[key];
     timer.current = Object.keys(state.edited).length ? setTimeout(sendEdited, SEND_MS) : 0;
@@ -142,7 +144,7 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
   };
   const start = async () => {
     if (await act("set-controller", { name: controller.name, parameters })) {
-      state.edited = {};
+      Object.assign(state, { edited: {}, applied: parameters });
       keep();
       changed();
     }
@@ -155,7 +157,7 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
     ${experiment && html`<p class="note">The experiment <b>${experiment.name}</b> (process ${experiment.pid}${experiment.host && ` on ${experiment.host}`})
       holds the fish. Stop ends it.</p>`}
     ${mayDrive && html`<div class="role">
-      <span>${other ? html`<b>${state.driver.device || "Another page"}</b> drives` : state.driver ? "You drive" : "No page drives"}</span>
+      <span>${other ? html`<b>${driverName(state)}</b> drives` : state.driver ? "You drive" : "No page drives"}</span>
       ${state.driver?.you_drive
         ? html`<button type="button" onClick=${() => changeRole(false)}>Release</button>`
         : html`<button type="button" onClick=${() => changeRole(true, Boolean(other))}>
@@ -201,6 +203,10 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
       </form>
     </div>`;
 }
+
+/** Return the name of the device that drives; another page of the same device has no name of its own. */
+export const driverName = ({ driver, session }) =>
+  (driver.device && driver.device !== session?.device ? driver.device : "another page");
 
 /** Return a controller with parameters as compare takes it: swing:C=0.6,lead=0.1. */
 export function contestant(controller, parameters) {

@@ -24,14 +24,14 @@ export function Experiments({ state, notice, changed, becomeDriver }) {
   const [form, setForm] = useState(() => recall("experiment", {
     kind: "measure", seconds: "", values: "", parameter: "", contestants: "square swing", runs: "", subject: "", note: "",
   }));
-  const { controller, edited } = selectionOf(state);
+  const { controller, edited, applied } = selectionOf(state);
   const set = (key) => (value) => {
     const next = { ...form, [key]: value };
     remember("experiment", next);
     setForm(next);
   };
   const mayDrive = state.session?.scope === "drive";
-  const parameters = controller ? shownParameters(controller, state.status, edited) : {};
+  const parameters = controller ? shownParameters(controller, state.status, edited, applied) : {};
   const own = Object.fromEntries(Object.entries(parameters).filter(([name, value]) => {
     const field = controller.parameters.find((candidate) => candidate.name === name);
     return value !== null && value !== defaultOf(field);
@@ -157,7 +157,8 @@ function Result({ job, status }) {
   if (Array.isArray(result.stretches)) {
     return html`<p class="result">${result.stretches.map((stretch) => html`<b>${stretch.controller}</b>: ${stretch.equal} of
       ${" "}${stretch.ticks} commands are the same${stretch.equal < stretch.ticks && html`, the largest difference is
-      ${" "}${number(stretch.largest, 4)} rad`}. `)}</p>`;
+      ${" "}${number(stretch.largest, 4)} rad`}.
+      ${stretch.equal < stretch.ticks && !stretch.from_start && " It swam already when the recording began, so its past is not known."} `)}</p>`;
   }
   if (!Array.isArray(result) || !result.length) return null;
   return html`<table class="result"><thead><tr><th>${job.kind === "sweep" ? "best point" : "controller"}</th>

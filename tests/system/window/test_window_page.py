@@ -123,6 +123,51 @@ def test_stop_lets_the_fish_rest(window: WindowProcess, daemon: Daemon) -> None:
         assert complaints == []
 
 
+def test_a_stopped_controller_keeps_its_parameters_for_the_next_start(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    with live_page(window.url) as (page, _):
+        swim(page, "square")
+        page.locator("#parameter-frequency").fill("1.5")
+        page.locator("#parameter-frequency").press("Enter")
+        wait_until(lambda: daemon.status().parameters["frequency"] == 1.5)
+        page.click("#stop")
+        expect(page.locator("#mode")).to_have_text("idle")
+        expect(page.locator("#start")).to_have_text("Start square")
+        expect(page.locator("#parameter-frequency")).to_have_value("1.5")
+        page.click("#start")
+        wait_until(lambda: daemon.status().parameters.get("frequency") == 1.5)
+
+
+def test_the_outcome_of_an_emergency_stop_is_in_sight_of_a_page_that_is_scrolled(
+    window: WindowProcess,
+) -> None:
+    with live_page(window.url, viewport={"width": 390, "height": 844}) as (page, _):
+        swim(page)
+        page.evaluate("scrollTo(0, 1200)")
+        page.click("#estop")
+        expect(page.locator("#clear-fault")).to_be_in_viewport(ratio=1)
+        expect(page.locator("#estop-ms")).to_be_in_viewport(ratio=1)
+        page.click("#clear-fault")
+        expect(page.locator("#mode")).to_have_text("idle")
+
+
+def test_a_page_that_loses_the_fish_to_one_of_the_same_device_says_another_page(
+    window: WindowProcess,
+) -> None:
+    with live_page(window.url) as (page, _):
+        swim(page)
+        assert page.context.browser
+        other = page.context.browser.new_page()
+        other.goto(window.url)
+        expect(other.locator("#driver")).to_have_text("another page drives")
+        other.click("#stop")
+        expect(other.locator("#mode")).to_have_text("idle")
+        expect(other.locator("#notices")).to_be_empty()
+        other.get_by_role("button", name="Take over").click()
+        expect(page.locator("#notices")).to_contain_text("Another page drives now.")
+
+
 def test_an_emergency_stop_ends_the_pulses_and_shows_its_time_and_the_way_out(
     tmp_path: Path,
 ) -> None:
