@@ -298,8 +298,9 @@ def assemble(
     def limitations() -> tuple[str, ...]:
         lines = tuple(servo.driver.limitations)
         if sensor.calibration.is_unset:
-            force = f"the force is not calibrated, and shown in {sensor.unit}"
-            lines += (f"{force}: fishctl calibrate force",)
+            lines += (
+                f"the force is not calibrated, and shown in {sensor.unit}: fishctl calibrate force",
+            )
             if config.estimator.kind == "observer":
                 lines += (
                     "estimator.kind: observer needs forces in N, so the fin velocity is wrong",

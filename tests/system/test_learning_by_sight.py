@@ -66,7 +66,7 @@ def test_it_learns_from_the_frames_of_each_tick_in_lockstep(lockstep: Rig) -> No
     assert "from pictures with the feature extractor modes" in done.stdout
     table = rows(lockstep.folder / "progress.csv")
     assert [row["steps"] for row in table] == ["192", "256", "320"]
-    assert {row["lost"] for row in table} == {"0"}
+    assert {row["lost_ticks"] for row in table} == {"0"}
 
 
 @pytest.mark.realtime

@@ -357,7 +357,7 @@ def test_late_actions_are_counted_and_not_learned_from(tmp_path: Path) -> None:
     training = Training(job, Losing(job), Display(), lambda: False)
     outcome = training.run()
     assert outcome.ended == "finished"
-    lost = [int(row["lost"]) for row in rows(job.folder / "progress.csv")]
+    lost = [int(row["lost_ticks"]) for row in rows(job.folder / "progress.csv")]
     # Of 64 ticks, and those at the starts of episodes
     assert all(6 <= number <= 15 for number in lost)
     void = int(training._model.rollout_buffer.void.sum())  # type: ignore[attr-defined]
