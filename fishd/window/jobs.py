@@ -360,7 +360,7 @@ class Jobs:
         if experiment.is_dir():
             picture = next(experiment.glob("*.png"), None)
             if picture is None:
-                raise JobError(f"{name} has no picture; see 'fishctl plot --help'")
+                raise JobError(f"{name} has no picture: one is drawn at the end of an experiment")
             return await asyncio.to_thread(picture.read_bytes)
         if self._waiting_plots >= MAX_WAITING_PLOTS:
             raise JobError("too many pictures are being drawn; try again later")

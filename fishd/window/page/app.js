@@ -15,7 +15,7 @@ const STALE_TICKS = 5;
 const CHECK_MS = 200;
 const VALUES_MS = 250;
 /** Longest wait for the answer to an emergency stop, and pause until it is sent again: at first, and at most. */
-const ESTOP_TIMEOUT_MS = [2000, 12_000];
+const ESTOP_TIMEOUT_MS = [3000, 12_000];
 const ESTOP_RETRY_MS = [250, 2000];
 const NOTICE_MS = { info: 6_000, warning: 20_000, error: 20_000 };
 const MAX_EVENTS = 100;

@@ -24,7 +24,7 @@ export function sliderOf(field, status) {
 /** Return the value in a text field, as the field's kind. */
 function valueOf(field, text) {
   if (field.kind === "boolean" || field.kind === "text" || field.kind === "choice") return text;
-  const value = Number(text);
+  const value = Number(text.replace(",", "."));
   return text.trim() === "" || !Number.isFinite(value) ? text : value;
 }
 
