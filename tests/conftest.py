@@ -8,7 +8,6 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -99,20 +98,8 @@ def refuse_processes(event: str, what: tuple[Any, ...]) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run slow modules first, and long tests before all others, spread over the workers.
-
-    The many short tests then end at the same time on all workers, each of which begins with an
-    equal part of the list (`--dist worksteal`).
-    """
+    """Run slow modules first: the many short tests then spread evenly over the workers."""
     items.sort(key=lambda item: item.path.is_relative_to(UNIT))
-    long = [item for item in items if item.get_closest_marker("long")]
-    others = iter([item for item in items if not item.get_closest_marker("long")])
-    number, ordered = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", 1)), list[pytest.Item]()
-    for worker in range(number):
-        size = (len(items) - len(ordered)) // (number - worker)
-        first = long[worker::number]
-        ordered += [*first, *islice(others, max(0, size - len(first)))]
-    items[:] = [*ordered, *others]
 
 
 def pytest_collection_finish() -> None:

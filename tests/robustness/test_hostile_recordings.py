@@ -70,7 +70,6 @@ def results(folder: Path) -> dict[tuple[str, str], Outcome]:
     return {(outcome.verb, outcome.file.removesuffix(".mcap")): outcome for outcome in outcomes}
 
 
-@pytest.mark.long
 def test_every_verb_ends_with_a_line_and_little_memory(
     results: dict[tuple[str, str], Outcome],
 ) -> None:

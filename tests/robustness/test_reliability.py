@@ -53,7 +53,6 @@ def test_a_fishd_that_is_killed_at_any_moment_leaves_no_pulses() -> None:
     assert any(kill["stopped"] for kill in kills)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("kind", ["raising", "numbers", "importing"])
 def test_nothing_that_a_controller_does_ends_fishd(kind: str) -> None:
     assert misbehaviour.KINDS[kind]().ended == 0

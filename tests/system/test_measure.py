@@ -46,7 +46,6 @@ def start_measurement(daemon: Daemon) -> Process:
     return process
 
 
-@pytest.mark.long
 def test_it_finds_the_thrust_and_fishd_shows_it_from_then_on(daemon: Daemon) -> None:
     words = ("--endpoint", daemon.endpoint, "measure", "swing", "--for", "21", "--json")
     ended = call(*EXPERIMENT, *words)

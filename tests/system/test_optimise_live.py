@@ -7,7 +7,6 @@ import pytest
 from rigs.processes import EXPERIMENT, Daemon, Process, fishctl, one_line, wait_until
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_an_interrupted_search_rests_the_fish_and_goes_on(daemon: Daemon, tmp_path: Path) -> None:
     folder = tmp_path / "run"

@@ -107,7 +107,6 @@ def test_a_signal_finishes_the_file(daemon: Daemon, runs: Path, number: signal.S
     assert re.search(r"all \d+ of \d+ commands equal to the last bit", done.stdout)
 
 
-@pytest.mark.long
 def test_a_kill_of_fishd_loses_nothing_and_the_next_is_recorded(tmp_path: Path, runs: Path) -> None:
     with running(tmp_path, "--set", "start.controller=swing") as first:
         recording = Recording(first, runs, "run")

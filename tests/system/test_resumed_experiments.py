@@ -11,8 +11,6 @@ from rigs.processes import EXPERIMENT, Daemon, Process, call, running, wait_unti
 from fishd.core.errors import RecordingError
 from fishd.recording import open_run
 
-pytestmark = pytest.mark.long
-
 
 def rows(folder: Path) -> list[dict[str, str]]:
     """Return the finished swims and rests of an experiment; none without a table."""

@@ -107,7 +107,6 @@ def locks(tmp_path: Path) -> Iterator[Path]:
     shutil.rmtree(parent)
 
 
-@pytest.mark.long
 def test_fishd_of_another_user_counts_as_owner(folders: tuple[Path, Path], locks: Path) -> None:
     nobody = command_as_nobody()
     start = ("-c", IN_FOLDER.format(folder=str(locks)))

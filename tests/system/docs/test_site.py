@@ -24,7 +24,6 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_the_man_pages_have_every_verb_and_no_page_has_a_warning(tmp_path: Path) -> None:
     options = ["--quiet", "--fail-on-warning", "--conf-dir", str(ROOT / "docs" / "sphinx")]

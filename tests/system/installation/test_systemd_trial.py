@@ -70,7 +70,6 @@ def test_the_trial_finds_the_scheduling_in_the_output_of_its_command(
             trials.check_scheduling(shown)
 
 
-@pytest.mark.long
 def test_the_trial_knows_a_fault_in_the_log(tmp_path: Path) -> None:
     with running(tmp_path, "--set", "start.controller=remote") as daemon:
         wait_until(lambda: daemon.status().mode == "fault")  # no agent answers

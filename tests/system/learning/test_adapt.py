@@ -283,7 +283,6 @@ class Stopped(BaseException):
     """The exception of Ctrl-C."""
 
 
-@pytest.mark.long
 @pytest.mark.slow
 def test_a_resume_repeats_no_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adaptation, "train_policy", no_policy)
