@@ -98,7 +98,7 @@ def _centred_crop(axis: Axis, size: int, picture: tuple[int, int], crop: Square)
     height, shorter = picture[0], min(picture)
     side = crop.side * shorter
     half = 0.5 * side / height
-    # Where the square is after it was moved inside the picture.
+    # Middle of the square, after it was moved inside the picture.
     middle = min(max(crop.y, half), 1.0 - half)
     middle += axis.offset * side / size / height
     room = 2.0 * min(middle, 1.0 - middle) * height

@@ -19,7 +19,7 @@ from fishd.window.main import serve, window_options
 from fishd.window.settings import WindowSettings, load
 
 if TYPE_CHECKING:
-    from fishd.window.devices import Devices
+    from fishd.window.devices import Devices, Scope
 
 ANSWER_TIMEOUT_S = 2.0
 """Longest wait for the answer of a page that runs already [s]."""
@@ -80,7 +80,7 @@ def start(**values: Any) -> int:
     "from the settings]",
 )
 @json_option
-def pair(scope: str, url: str | None, as_json: bool, **values: Any) -> None:
+def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
     """Print a link and a QR code that pair a device.
 
     It pairs one device, within ten minutes. The code is for a terminal.
@@ -91,7 +91,7 @@ def pair(scope: str, url: str | None, as_json: bool, **values: Any) -> None:
     base = url or _network_url(settings)
     if urlsplit(base).scheme not in ("http", "https"):
         raise click.BadParameter("http://HOST:PORT/ or https://HOST/ is needed", param_hint="--url")
-    token = _open_devices(settings).invite(scope)  # type: ignore[arg-type]
+    token = _open_devices(settings).invite(scope)
     link = f"{base.rstrip('/')}/#pair={token}"
     if as_json:
         print_json({"url": link, "scope": scope, "seconds": INVITATION_S})

@@ -8,7 +8,7 @@ from fishd.core.schema import unit
 
 
 class LoopSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings of the control loop and its guard; `Config` has them as keys of its own."""
+    """Settings of the control loop and its guard; `Config` inherits its keys."""
 
     tick: Annotated[float, unit("s", "Period of the loop.", ge=0.002, le=0.2)] = 0.05
     amplitude_limit: Annotated[

@@ -55,7 +55,7 @@ class ApiError(FishdError):
 
 
 class Access(NamedTuple):
-    """What the sender of a request may do."""
+    """Permissions of the sender of a request."""
 
     scope: Scope | None
     """None for a device that is not paired."""

@@ -70,7 +70,7 @@ class Driver:
         return time.monotonic() - self.page.seen > DRIVER_TIMEOUT_S
 
     def describe_to(self, page: LivePage) -> dict[str, object]:
-        """Return the driver as a page is told."""
+        """Return the description of the driver for a page."""
         mine = page.client == self.page.client
         return {"client": self.page.client, "device": self.page.device, "you_drive": mine}
 

@@ -38,7 +38,7 @@ class WindowSettings(Struct, frozen=True, forbid_unknown_fields=True):
     ] = {}
     names: Annotated[
         tuple[str, ...],
-        note("Further host names by which browsers reach this machine, as of a reverse proxy."),
+        note("Further host names of this machine for browsers, such as that of a reverse proxy."),
     ] = ()
     origins: Annotated[
         tuple[str, ...], note("Origins whose Foxglove or Lichtblick may read the fish.")

@@ -314,7 +314,7 @@ class _RequestLog(logging.LoggerAdapter[logging.Logger]):
     def exception(self, msg: object, *args: Any, exc_info: Any = True, **options: Any) -> None:
         """Log an error of the server with its traceback, a malformed request in one line.
 
-        A page that is gone before it has its answer is no error of the server.
+        A page that closes before its answer is not an error of the server.
         """
         if isinstance(exc_info, http_exceptions.HttpProcessingError | ConnectionError):
             self._log_malformed(args[0] if args else "", exc_info)

@@ -249,9 +249,9 @@ def experiment(session: Session, seconds: float = 180.0) -> "DataFrame":
 def continue_experiment(
     session: Session, recorded: "Sequence[DataFrame]", seconds: float
 ) -> "list[DataFrame]":
-    """Swim what is missing of an experiment; return the tables of all its ticks.
+    """Swim the missing part of an experiment; return the tables of all its ticks.
 
-    recorded: tables of the interrupted experiment; without any, this is `experiment`
+    recorded: tables of the interrupted experiment; if empty, this is `experiment`
     seconds: length of the whole experiment [s]
     Raises the errors of `experiment`.
     """
