@@ -12,10 +12,9 @@ from fishd import __version__
 from fishd.camera.settings import CameraSettings, hide_secrets, load
 from fishd.camera.sources.base import Source
 from fishd.core import text
-from fishd.core.console import complain, run
-from fishd.core.errors import FishdError, install_command
-from fishd.core.process.interruption import on_signal
-from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
+from fishd.core.console import complain, log_format_option, run
+from fishd.core.errors import install_command
+from fishd.core.process.service import run_service
 from fishd.core.process.shutdown import exit_now
 
 log = logging.getLogger(__name__)
@@ -51,13 +50,7 @@ def open_source(settings: CameraSettings) -> Source:
     metavar="KEY=VALUE",
     help="Override one key of the settings, such as source=v4l2. Repeatable.",
 )
-@click.option(
-    "--log-format",
-    type=click.Choice(["text", "json"]),
-    default="text",
-    show_default=True,
-    help="How logs on standard error look.",
-)
+@log_format_option
 @click.version_option(__version__, prog_name=NAME)
 def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> int:
     """Publish the frames of a camera above the tail until SIGINT (Ctrl-C), SIGTERM or SIGHUP.
@@ -74,23 +67,15 @@ def camera(path: Path | None, overrides: tuple[str, ...], log_format: str) -> in
         complain(
             NAME, f"{text.error_message(error)}; install it with: {install_command('camera')}", 1
         )
-    logs = LogWriter(log_format)
-    logging.getLogger("linuxpy").setLevel(logging.WARNING)
-    if path is not None:
-        warn_of_readers(path, settings)
-    stopping = threading.Event()
-    try:
-        with on_signal(stopping.set), Server(settings, source) as server:
+
+    def serve(stopping: threading.Event) -> None:
+        logging.getLogger("linuxpy").setLevel(logging.WARNING)
+        if path is not None:
+            warn_of_readers(path, settings)
+        with Server(settings, source) as server:
             server.run(stopping.is_set)
-    except FishdError as error:
-        log.critical("%s", error)
-        return 1
-    except Exception:
-        log.critical("fishd-camera failed", exc_info=True)
-        return 1
-    finally:
-        logs.close(UNHURRIED_FLUSH_TIMEOUT_S)
-    return 0
+
+    return run_service(NAME, log_format, serve)
 
 
 def warn_of_readers(path: Path, settings: CameraSettings) -> None:

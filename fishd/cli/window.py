@@ -14,9 +14,10 @@ import click
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, print_json
 from fishd.core import text
+from fishd.core.console import log_format_option
 from fishd.core.errors import StartupError
-from fishd.window.main import serve, window_options
-from fishd.window.settings import WindowSettings, load
+from fishd.window.main import load_options, serve, window_options
+from fishd.window.settings import WindowSettings
 
 if TYPE_CHECKING:
     from fishd.window.devices import Devices, Scope
@@ -37,19 +38,11 @@ def window(ctx: click.Context) -> None:
         ctx.exit(ctx.invoke(open_page))
 
 
-def _load(values: dict[str, Any]) -> WindowSettings:
-    """Return the settings that the options of a verb name."""
-    fish, endpoint = values["fish"], click.get_current_context().find_root().obj
-    if endpoint and not fish:
-        fish = {"fish": endpoint}
-    return load(values["path"], listen=values["listen"], fish=fish, state=values["state"])
-
-
 @window.command("open")
 @window_options
 def open_page(**values: Any) -> int:
     """Open the page in a browser; start it unless it runs."""
-    settings = _load(values)
+    settings = load_options(**values)
     url = _local_url(settings)
     if _answers(url):
         _show(url)
@@ -59,9 +52,10 @@ def open_page(**values: Any) -> int:
 
 @window.command()
 @window_options
-def start(**values: Any) -> int:
+@log_format_option
+def start(log_format: str, **values: Any) -> int:
     """Serve the page until Ctrl-C, as fishd-window does."""
-    return serve(_load(values))
+    return serve(load_options(**values), log_format)
 
 
 @window.command()
@@ -87,7 +81,7 @@ def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
     """
     from fishd.window.devices import INVITATION_S
 
-    settings = _load(values)
+    settings = load_options(**values)
     base = url or _network_url(settings)
     if urlsplit(base).scheme not in ("http", "https"):
         raise click.BadParameter("http://HOST:PORT/ or https://HOST/ is needed", param_hint="--url")
@@ -108,7 +102,7 @@ def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
 @json_option
 def devices(as_json: bool, **values: Any) -> None:
     """List the paired devices."""
-    paired = _open_devices(_load(values)).all()
+    paired = _open_devices(load_options(**values)).all()
     if as_json:
         keys = ("id", "name", "scope", "paired", "seen")
         print_json([{key: getattr(device, key) for key in keys} for device in paired])
@@ -128,7 +122,7 @@ def revoke(device: str, as_json: bool, **values: Any) -> None:
 
     DEVICE is its name or id, as `fishctl window devices` shows it.
     """
-    removed = _open_devices(_load(values)).revoke(device)
+    removed = _open_devices(load_options(**values)).revoke(device)
     if as_json:
         print_json({"id": removed.id, "name": removed.name})
     else:

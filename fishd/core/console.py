@@ -22,6 +22,16 @@ MAX_COMPLAINT_CHARACTERS = 5000
 """Maximum length of an error message, which may list all keys of the configuration [characters]."""
 
 
+log_format_option = click.option(
+    "--log-format",
+    type=click.Choice(["text", "json"]),
+    default="text",
+    show_default=True,
+    help="Format of the log on standard error.",
+)
+"""Option of each program that writes a log."""
+
+
 def status_line(status: "Status") -> str:
     """Return mode, controller, frequency, thrust, power, lateness and missed ticks in one line.
 

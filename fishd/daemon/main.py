@@ -23,7 +23,7 @@ from fishd.controllers import registry
 from fishd.controllers.policy.runtime import preload
 from fishd.core import addresses
 from fishd.core.clock import Clock, SlowClock, SystemClock, Ticker, VirtualClock
-from fishd.core.console import run, status_line
+from fishd.core.console import log_format_option, run, status_line
 from fishd.core.errors import ConfigError, FishdError, ServoError
 from fishd.core.process import realtime
 from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
@@ -296,13 +296,7 @@ async def swim(
     default=None,
     help="Print a status line every second; the default if standard output is a terminal.",
 )
-@click.option(
-    "--log-format",
-    type=click.Choice(["text", "json"]),
-    default="text",
-    show_default=True,
-    help="Format of the log on standard error.",
-)
+@log_format_option
 @click.version_option(__version__, prog_name="fishd")
 def fishd(
     path: Path | None, overrides: tuple[str, ...], print_status: bool | None, log_format: str

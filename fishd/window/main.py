@@ -2,6 +2,8 @@
 
 import asyncio
 import logging
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,16 +12,17 @@ import click
 
 from fishd import __version__
 from fishd.core import text
-from fishd.core.console import complain, run
-from fishd.core.errors import FishdError, install_command
-from fishd.core.process.interruption import on_signal
-from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
+from fishd.core.console import complain, log_format_option, run
+from fishd.core.errors import install_command
+from fishd.core.process.service import run_service
 from fishd.core.process.shutdown import exit_now
 from fishd.core.process.systemd_notify import SystemdNotifier
 from fishd.window.settings import DEFAULT_LISTEN, WindowSettings, load
 
 log = logging.getLogger(__name__)
 NAME = "fishd-window"
+NOTIFY_PERIOD_S = 1.0
+"""Longest time between two notifications of systemd [s]."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -66,29 +69,27 @@ def window_options(function: F) -> F:
     return function
 
 
+def load_options(
+    *, path: Path | None, listen: str | None, fish: dict[str, str], state: str | None
+) -> WindowSettings:
+    """Return the settings that these options name; `fishctl --endpoint` names the fish, too."""
+    endpoint = click.get_current_context().find_root().obj
+    if endpoint and not fish:
+        fish = {"fish": endpoint}
+    return load(path, listen=listen, fish=fish, state=state)
+
+
 @click.command(NAME, context_settings={"help_option_names": ["-h", "--help"]})
 @window_options
-@click.option(
-    "--log-format",
-    type=click.Choice(["text", "json"]),
-    default="text",
-    show_default=True,
-    help="How logs on standard error look.",
-)
+@log_format_option
 @click.version_option(__version__, prog_name=NAME)
-def window(
-    path: Path | None,
-    listen: str | None,
-    fish: dict[str, str],
-    state: str | None,
-    log_format: str,
-) -> int:
+def window(log_format: str, **values: Any) -> int:
     """Serve a page of the fish for people at the tank, until SIGINT (Ctrl-C), SIGTERM or SIGHUP.
 
     Exit status: 0 after a clean stop, 1 when something failed, 2 for a wrong option, 78 when the
     settings are wrong.
     """
-    return serve(load(path, listen=listen, fish=fish, state=state), log_format)
+    return serve(load_options(**values), log_format)
 
 
 def serve(
@@ -101,40 +102,23 @@ def serve(
     when_up: is called with the address of the page
     """
     try:
-        from fishd.window.api import Window
+        from fishd.window.window_server import WindowServer
     except ImportError as error:
         complain(
             NAME, f"{text.error_message(error)}; install it with: {install_command('window')}", 1
         )
-    logs = LogWriter(log_format)
 
-    async def run_window() -> None:
-        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+    async def run_window(stopping: threading.Event) -> None:
         notifier = SystemdNotifier()
-        with on_signal(lambda: loop.call_soon_threadsafe(ended.set)):
-            async with Window(settings) as server:
-                log.info("the fish is at %s", server.url)
-                when_up(server.url)
-                while not ended.is_set():
-                    notifier.ticked(loop.time())
-                    try:
-                        async with asyncio.timeout(1.0):
-                            await ended.wait()
-                    except TimeoutError:
-                        continue
-                notifier.stopping()
+        async with WindowServer(settings) as server:
+            log.info("the fish is at %s", server.url)
+            when_up(server.url)
+            while not stopping.is_set():
+                notifier.ticked(time.monotonic())
+                await asyncio.to_thread(stopping.wait, NOTIFY_PERIOD_S)
+            notifier.stopping()
 
-    try:
-        asyncio.run(run_window())
-    except FishdError as error:
-        log.critical("%s", error)
-        return 1
-    except Exception:
-        log.critical("fishd-window failed", exc_info=True)
-        return 1
-    finally:
-        logs.close(UNHURRIED_FLUSH_TIMEOUT_S)
-    return 0
+    return run_service(NAME, log_format, lambda stopping: asyncio.run(run_window(stopping)))
 
 
 def main() -> None:

@@ -12,8 +12,10 @@ from urllib.parse import urlsplit
 import aiohttp
 import msgspec
 
-from rigs.processes import PATIENCE, Process
+from rigs.processes import PATIENCE, Process, fishctl
 
+NETWORK_HOST = "fish.example"
+"""Name by which devices of the network reach a window."""
 START = "from fishd.__main__ import fishd_window; fishd_window()"
 
 
@@ -31,7 +33,7 @@ class WindowProcess(Process):
         """
         self.state = folder / "window"
         config = folder / "window.yaml"
-        config.write_text(f"runs: {folder}/runs\nnames: [fish.example]\n{settings}\n")
+        config.write_text(f"runs: {folder}/runs\nnames: [{NETWORK_HOST}]\n{settings}\n")
         options = ("--config", str(config), "--state", str(self.state), "--listen", "127.0.0.1:0")
         pairs = [word for name, where in fish.items() for word in ("--fish", f"{name}={where}")]
         code = f"{changes}\n{START}"
@@ -49,6 +51,21 @@ class WindowProcess(Process):
     def port(self) -> int:
         """Port of the page."""
         return urlsplit(self.url).port or 0
+
+    def ask(self, verb: str, *words: str) -> str:
+        """Return what a verb of `fishctl window` about its devices prints."""
+        done = fishctl("window", verb, "--state", str(self.state), *words)
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout
+
+    def invite(self, scope: str = "drive") -> str:
+        """Return a link that pairs a device of the network."""
+        url = f"{self.url.replace('127.0.0.1', NETWORK_HOST)}/"
+        link = msgspec.json.decode(self.ask("pair", "--scope", scope, "--url", url, "--json"))[
+            "url"
+        ]
+        assert re.fullmatch(rf"http://{NETWORK_HOST}:\d+/#pair=[\w-]{{22}}", link)
+        return str(link)
 
 
 @contextlib.contextmanager

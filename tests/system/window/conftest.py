@@ -1,9 +1,11 @@
-"""A window of the daemon of a module, and one per test for tests that disturb it."""
+"""A window of the daemon of a module, and some of a single test for tests that disturb it."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
-from rigs.processes import Daemon
+from rigs.processes import Daemon, running
+from rigs.virtual_pi_process import Pi, virtual_pi
 from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
 
 
@@ -26,3 +28,34 @@ def shared_window(
 def window(shared_window: WindowProcess, daemon: Daemon) -> WindowProcess:
     """Return the window of a module, whose fish is at rest."""
     return shared_window
+
+
+@pytest.fixture
+def new_window(daemon: Daemon, tmp_path: Path) -> Iterator[WindowProcess]:
+    """Yield a window of a single test, which no page drives yet."""
+    with running_window(tmp_path, fish=daemon.endpoint) as process:
+        yield process
+
+
+@pytest.fixture
+def own_window(own_daemon: Daemon, tmp_path: Path) -> Iterator[WindowProcess]:
+    """Yield a window of a fishd that the test may kill."""
+    with running_window(tmp_path, fish=own_daemon.endpoint) as process:
+        yield process
+
+
+@pytest.fixture
+def pi(tmp_path: Path) -> Iterator[Pi]:
+    """Yield a virtual Raspberry Pi with a true servo and a true sensor."""
+    with virtual_pi(tmp_path) as pi:
+        yield pi
+
+
+@pytest.fixture
+def pi_window(pi: Pi, tmp_path: Path) -> Iterator[WindowProcess]:
+    """Yield a window of the fish on that Raspberry Pi."""
+    with (
+        running(tmp_path, *pi.settings) as daemon,
+        running_window(tmp_path, fish=daemon.endpoint) as window,
+    ):
+        yield window

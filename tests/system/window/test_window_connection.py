@@ -6,30 +6,28 @@ from pathlib import Path
 
 import pytest
 from rigs.processes import Daemon, running
-from rigs.window_process import Browser, open_page, run, running_window
+from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
 
 
 def test_a_fishd_that_hangs_is_stale_then_lost_then_live(
-    own_daemon: Daemon, tmp_path: Path
+    own_daemon: Daemon, own_window: WindowProcess
 ) -> None:
-    with running_window(tmp_path, fish=own_daemon.endpoint) as window:
+    async def test() -> None:
+        async with Browser(own_window.url) as browser, open_page(browser) as page:
+            await page.until("ticks")
+            os.kill(own_daemon.pid, signal.SIGSTOP)
+            try:
+                stale = await page.until("connection", lambda c: c["state"] == "stale")
+                assert stale["age"] > 0.0
+                assert "no tick for" in stale["message"]
+                lost = await page.until("connection", lambda c: c["state"] == "lost")
+                assert "it hangs, is stopped or is overloaded" in lost["message"]
+            finally:
+                os.kill(own_daemon.pid, signal.SIGCONT)
+            await page.until("connection", lambda c: c["state"] == "live")
+            await page.until("ticks")
 
-        async def test() -> None:
-            async with Browser(window.url) as browser, open_page(browser) as page:
-                await page.until("ticks")
-                os.kill(own_daemon.pid, signal.SIGSTOP)
-                try:
-                    stale = await page.until("connection", lambda c: c["state"] == "stale")
-                    assert stale["age"] > 0.0
-                    assert "no tick for" in stale["message"]
-                    lost = await page.until("connection", lambda c: c["state"] == "lost")
-                    assert "it hangs, is stopped or is overloaded" in lost["message"]
-                finally:
-                    os.kill(own_daemon.pid, signal.SIGCONT)
-                await page.until("connection", lambda c: c["state"] == "live")
-                await page.until("ticks")
-
-        run(test())
+    run(test())
 
 
 def test_a_fishd_that_is_killed_is_lost_and_its_successor_is_announced(tmp_path: Path) -> None:
@@ -75,15 +73,13 @@ def test_a_window_shows_several_fish_by_name_and_waits_for_one_that_is_off(
 
 @pytest.mark.realtime
 def test_a_page_is_told_within_a_second_that_ticks_have_ended(
-    own_daemon: Daemon, tmp_path: Path
+    own_daemon: Daemon, own_window: WindowProcess
 ) -> None:
-    with running_window(tmp_path, fish=own_daemon.endpoint) as window:
+    async def test() -> None:
+        async with Browser(own_window.url) as browser, open_page(browser) as page:
+            await page.until("ticks")
+            os.kill(own_daemon.pid, signal.SIGKILL)
+            told = await page.until("connection", lambda c: c["state"] in ("stale", "lost"))
+            assert told["age"] < 1.0
 
-        async def test() -> None:
-            async with Browser(window.url) as browser, open_page(browser) as page:
-                await page.until("ticks")
-                os.kill(own_daemon.pid, signal.SIGKILL)
-                told = await page.until("connection", lambda c: c["state"] in ("stale", "lost"))
-                assert told["age"] < 1.0
-
-        run(test())
+    run(test())

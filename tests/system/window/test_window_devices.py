@@ -11,35 +11,29 @@ from typing import Any
 import aiohttp
 import pytest
 from rigs.processes import Daemon, fishctl, one_line
-from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
+from rigs.window_process import (
+    NETWORK_HOST,
+    Browser,
+    WindowProcess,
+    open_page,
+    run,
+    running_window,
+)
 
 from fishd.window import devices
 from fishd.window.devices import DeviceError, Devices
 
-HOST = "fish.example"
 
-
-def ask(window: WindowProcess, verb: str, *words: str) -> str:
-    """Return what a verb of `fishctl window` prints."""
-    done = fishctl("window", verb, "--state", str(window.state), *words)
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout
-
-
-def invite(window: WindowProcess, scope: str) -> str:
-    """Return a new token."""
-    url = f"{window.url.replace('127.0.0.1', HOST)}/"
-    answer = json.loads(ask(window, "pair", "--scope", scope, "--url", url, "--json"))
-    match = re.fullmatch(rf"http://{HOST}:\d+/#pair=([\w-]{{22}})", answer["url"])
-    assert match
-    return match[1]
+def token_of(link: str) -> str:
+    """Return the token in a link that pairs."""
+    return link.rpartition("=")[2]
 
 
 @asynccontextmanager
 async def paired(window: WindowProcess, scope: str, name: str) -> AsyncIterator[Browser]:
     """Yield the browser of a paired device in the network."""
-    async with Browser(window.url, HOST) as browser:
-        body = {"token": invite(window, scope), "name": name}
+    async with Browser(window.url, NETWORK_HOST) as browser:
+        body = {"token": token_of(window.invite(scope)), "name": name}
         session = await browser.post("/api/pair", body)
         assert (session["device"], session["scope"], session["loopback"]) == (name, scope, False)
         yield browser
@@ -55,7 +49,7 @@ async def refuse_page(browser: Browser) -> int:
 
 def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProcess) -> None:
     async def test() -> None:
-        async with Browser(window.url, HOST) as browser:
+        async with Browser(window.url, NETWORK_HOST) as browser:
             session = await browser.get("/api/session")
             assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
             for path in ("/api/fish", "/api/jobs", "/api/runs", "/api/fish/fish/history"):
@@ -70,8 +64,11 @@ def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProcess) -
 
 def test_a_token_pairs_one_device_and_no_second_one(window: WindowProcess) -> None:
     async def test() -> None:
-        token = invite(window, "watch")
-        async with Browser(window.url, HOST) as first, Browser(window.url, HOST) as second:
+        token = token_of(window.invite("watch"))
+        async with (
+            Browser(window.url, NETWORK_HOST) as first,
+            Browser(window.url, NETWORK_HOST) as second,
+        ):
             async with first.session.post(
                 "/api/pair", json={"token": token, "name": "A"}
             ) as answer:
@@ -122,7 +119,7 @@ def test_a_revoked_device_loses_its_page_and_the_fish_stops(window: WindowProces
         async with Browser(window.url) as here, open_page(here) as watcher:
             async with paired(window, "drive", "stolen") as browser, open_page(browser) as page:
                 await page.swim()
-                removed = ask(window, "revoke", "stolen")
+                removed = window.ask("revoke", "stolen")
                 assert removed == "stolen is no longer paired\n"
                 while (await page.sock.receive()).type is aiohttp.WSMsgType.TEXT:
                     pass
@@ -137,9 +134,9 @@ def test_a_revoked_device_loses_its_page_and_the_fish_stops(window: WindowProces
 def test_the_devices_are_listed_without_any_secret(window: WindowProcess) -> None:
     async def test() -> None:
         async with paired(window, "watch", "listed"):
-            text = ask(window, "devices")
+            text = window.ask("devices")
             assert re.search(r"(?m)^\w{8}  watch  seen \d{4}-\d\d-\d\d \d\d h  listed$", text)
-            listed: list[dict[str, Any]] = json.loads(ask(window, "devices", "--json"))
+            listed: list[dict[str, Any]] = json.loads(window.ask("devices", "--json"))
             assert listed[-1].keys() == {"id", "name", "scope", "paired", "seen"}
 
     run(test())
@@ -191,7 +188,7 @@ def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:
             options = {"protocols": ["foxglove.sdk.v1"]}
             async with browser.session.ws_connect("/foxglove", **options) as sock:
                 await sock.receive_str()
-                ask(window, "revoke", "viewer")
+                window.ask("revoke", "viewer")
                 while not sock.closed:
                     await sock.receive()
 
@@ -207,7 +204,9 @@ def test_with_pair_all_a_browser_on_this_machine_needs_pairing(
             async with Browser(window.url) as browser:
                 assert await browser.refusal("/api/fish") == (401, "not-paired")
                 assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
-                session = await browser.post("/api/pair", {"token": invite(window, "drive")})
+                session = await browser.post(
+                    "/api/pair", {"token": token_of(window.invite("drive"))}
+                )
                 assert (session["scope"], session["loopback"]) == ("drive", False)
                 assert await browser.get("/api/fish")
 

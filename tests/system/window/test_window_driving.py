@@ -119,17 +119,17 @@ def test_no_other_device_continues_as_the_driver(window: WindowProcess) -> None:
     run(test())
 
 
-def test_a_window_that_is_killed_leaves_no_fish_swimming(daemon: Daemon, tmp_path: Path) -> None:
-    with running_window(tmp_path, fish=daemon.endpoint) as process:
+def test_a_window_that_is_killed_leaves_no_fish_swimming(
+    new_window: WindowProcess, daemon: Daemon
+) -> None:
+    async def test() -> None:
+        async with Browser(new_window.url) as browser, open_page(browser) as page:
+            await page.swim()
+            os.kill(new_window.pid, signal.SIGKILL)
 
-        async def test() -> None:
-            async with Browser(process.url) as browser, open_page(browser) as page:
-                await page.swim()
-                os.kill(process.pid, signal.SIGKILL)
-
-        run(test())
-        wait_until(lambda: daemon.status().mode == "idle")
-        assert daemon.status().lease_expiry
+    run(test())
+    wait_until(lambda: daemon.status().mode == "idle")
+    assert daemon.status().lease_expiry
 
 
 def test_a_fish_that_an_experiment_holds_is_taken_only_on_request(

@@ -8,7 +8,7 @@ import pytest
 from rigs.processes import Daemon
 from rigs.window_process import Browser, WindowProcess, open_page, run
 
-from fishd.window.api import is_loopback
+from fishd.window.access import is_loopback
 
 REBOUND = [
     "evil.example", "127.attacker.example", "127.0.0.1.attacker.example", "localhost.evil.example",

@@ -13,14 +13,15 @@ import pytest
 from playwright.sync_api import Page, expect
 from rigs.browser import needs_browser, open_page
 from rigs.processes import PATIENCE, Daemon, running, wait_until
-from rigs.virtual_pi_process import virtual_pi
-from rigs.window_process import WindowProcess, running_window
+from rigs.virtual_pi_process import Pi
+from rigs.window_process import NETWORK_HOST, WindowProcess
 
 pytestmark = needs_browser
 
 AXE = resources.files("axe_playwright_python").joinpath("axe.min.js")
 """The program that looks for barriers."""
 MAX_ASSETS_BYTES = 120_000
+RESOLVED = f"--host-resolver-rules=MAP {NETWORK_HOST} 127.0.0.1"
 expect.set_options(timeout=PATIENCE * 1e3)
 
 # Runs in the page: `app` is its own module, with the state that it shows.
@@ -57,10 +58,9 @@ LINE_AT = """([second]) => {
 
 
 @pytest.fixture
-def window(daemon: Daemon, tmp_path: Path) -> Iterator[WindowProcess]:
-    """Yield a window that no page drives yet."""
-    with running_window(tmp_path, fish=daemon.endpoint) as process:
-        yield process
+def window(new_window: WindowProcess) -> WindowProcess:
+    """Return a window that no page drives yet."""
+    return new_window
 
 
 @contextmanager
@@ -169,14 +169,9 @@ def test_a_page_that_loses_the_fish_to_one_of_the_same_device_says_another_page(
 
 
 def test_an_emergency_stop_ends_the_pulses_and_shows_its_time_and_the_way_out(
-    tmp_path: Path,
+    pi: Pi, pi_window: WindowProcess
 ) -> None:
-    with (
-        virtual_pi(tmp_path) as pi,
-        running(tmp_path, *pi.settings) as daemon,
-        running_window(tmp_path, fish=daemon.endpoint) as window,
-        live_page(window.url) as (page, complaints),
-    ):
+    with live_page(pi_window.url) as (page, complaints):
         swim(page)
         wait_until(lambda: pi.pulse() > 0.0)
         page.click("#estop")
@@ -193,14 +188,9 @@ def test_an_emergency_stop_ends_the_pulses_and_shows_its_time_and_the_way_out(
 
 
 def test_a_fault_of_a_true_sensor_marks_its_samples_and_shows_reason_and_remedy(
-    tmp_path: Path,
+    pi: Pi, pi_window: WindowProcess
 ) -> None:
-    with (
-        virtual_pi(tmp_path) as pi,
-        running(tmp_path, *pi.settings) as daemon,
-        running_window(tmp_path, fish=daemon.endpoint) as window,
-        live_page(window.url) as (page, complaints),
-    ):
+    with live_page(pi_window.url) as (page, complaints):
         swim(page)
         expect(page.locator("#view")).to_contain_text("tail, as commanded")
         pi.control("inject", "clipped")
@@ -228,12 +218,9 @@ def test_an_emergency_stop_works_when_the_stream_is_stale(
 
 
 def test_a_killed_fishd_shows_at_once_and_a_new_one_is_said(
-    own_daemon: Daemon, tmp_path: Path
+    own_daemon: Daemon, own_window: WindowProcess, tmp_path: Path
 ) -> None:
-    with (
-        running_window(tmp_path, fish=own_daemon.endpoint) as window,
-        live_page(window.url) as (page, _),
-    ):
+    with live_page(own_window.url) as (page, _):
         own_daemon.end(signal.SIGKILL)
         expect(page.locator("body.stale")).to_have_count(1)
         expect(page.locator("#connection")).to_contain_text("lost")
@@ -260,12 +247,9 @@ def test_a_page_whose_server_hangs_says_so_by_its_own_clock(
 
 @pytest.mark.realtime
 def test_old_values_are_grey_within_a_second_and_the_page_is_painted_within_half(
-    own_daemon: Daemon, tmp_path: Path
+    own_daemon: Daemon, own_window: WindowProcess
 ) -> None:
-    with (
-        running_window(tmp_path, fish=own_daemon.endpoint) as window,
-        live_page(window.url) as (page, _),
-    ):
+    with live_page(own_window.url) as (page, _):
         paint = page.evaluate("performance.getEntriesByType('paint')[0].startTime")
         page.evaluate(f"""(async () => {{ {APP}
             new MutationObserver(() => {{
@@ -313,12 +297,9 @@ def test_a_change_by_another_client_is_said_and_shown(
 def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
     window: WindowProcess, daemon: Daemon
 ) -> None:
-    url = f"http://fish.example:{window.port}/"
-    done = daemon.fishctl(
-        "window", "pair", "--scope=watch", "--url", url, "--state", str(window.state), "--json"
-    )
-    link = json.loads(done.stdout)["url"]
-    with open_page(url, "--host-resolver-rules=MAP fish.example 127.0.0.1") as (page, complaints):
+    link = window.invite("watch")
+    url = link.partition("#")[0]
+    with open_page(url, RESOLVED) as (page, complaints):
         expect(page.locator(".pairing")).to_contain_text("not paired")
         page.goto(link)
         expect(page.locator("#connection")).to_contain_text("live")
@@ -331,15 +312,11 @@ def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
         assert complaints == []
 
 
-def test_a_device_that_is_revoked_says_so(window: WindowProcess, daemon: Daemon) -> None:
-    url = f"http://fish.example:{window.port}/"
-    state = ("--state", str(window.state))
-    done = daemon.fishctl("window", "pair", "--url", url, *state, "--json")
-    link = json.loads(done.stdout)["url"]
-    with open_page(link, "--host-resolver-rules=MAP fish.example 127.0.0.1") as (page, _):
+def test_a_device_that_is_revoked_says_so(window: WindowProcess) -> None:
+    with open_page(window.invite(), RESOLVED) as (page, _):
         expect(page.locator("#connection")).to_contain_text("live")
-        (device,) = json.loads(daemon.fishctl("window", "devices", *state, "--json").stdout)
-        assert daemon.fishctl("window", "revoke", *state, device["id"]).returncode == 0
+        (device,) = json.loads(window.ask("devices", "--json"))
+        window.ask("revoke", device["id"])
         expect(page.locator("#banner")).to_contain_text("This device is no longer paired")
         expect(page.locator(".pairing")).to_be_visible()
 

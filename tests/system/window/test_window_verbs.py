@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, wait_until
-from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
+from rigs.window_process import Browser, WindowProcess, open_page, run
 
 
 def test_a_page_that_runs_is_opened_and_not_started_again(window: WindowProcess) -> None:
@@ -58,23 +58,21 @@ def test_a_wrong_key_is_named_with_its_line(tmp_path: Path) -> None:
 
 
 def test_the_end_of_the_window_stops_its_fish_and_its_experiments(
-    daemon: Daemon, tmp_path: Path
+    new_window: WindowProcess, daemon: Daemon, tmp_path: Path
 ) -> None:
-    with running_window(tmp_path, fish=daemon.endpoint) as process:
+    async def test() -> None:
+        async with Browser(new_window.url) as browser, open_page(browser) as page:
+            job = {"fish": "fish", "kind": "record", "options": {"name": "endless"}}
+            await page.post("/api/jobs", job)
+            await page.until("job", lambda j: "recording to" in "".join(j["lines"]))
+            await page.swim()
+            new_window.process.send_signal(signal.SIGTERM)
+            while not page.sock.closed:
+                await page.sock.receive()
 
-        async def test() -> None:
-            async with Browser(process.url) as browser, open_page(browser) as page:
-                job = {"fish": "fish", "kind": "record", "options": {"name": "endless"}}
-                await page.post("/api/jobs", job)
-                await page.until("job", lambda j: "recording to" in "".join(j["lines"]))
-                await page.swim()
-                process.process.send_signal(signal.SIGTERM)
-                while not page.sock.closed:
-                    await page.sock.receive()
-
-        run(test())
-        process.process.wait()
-        assert process.process.returncode == 0
-        wait_until(lambda: daemon.status().mode == "idle")
-        assert daemon.status().lease is None
-        assert (tmp_path / "runs" / "endless.mcap").exists()
+    run(test())
+    new_window.process.wait()
+    assert new_window.process.returncode == 0
+    wait_until(lambda: daemon.status().mode == "idle")
+    assert daemon.status().lease is None
+    assert (tmp_path / "runs" / "endless.mcap").exists()

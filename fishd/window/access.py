@@ -1,0 +1,152 @@
+"""Access to the window: who sends a request, what it may do, and the pairing of devices.
+
+A request from the network needs a paired device; an emergency stop is open to each of them.
+"""
+
+import logging
+from typing import Annotated, Any, NamedTuple
+
+from aiohttp import web
+from msgspec import Meta, Struct
+
+from fishd import __version__
+from fishd.window.answers import ApiError, NoArguments, read_body, success
+from fishd.window.devices import Device, Devices, Scope
+from fishd.window.web_server import host_name, parse_ip
+
+log = logging.getLogger(__name__)
+
+COOKIE = "fishd_window"
+COOKIE_S = 365 * 86400
+FORWARDED = ("Forwarded", "X-Forwarded-For", "X-Forwarded-Host", "X-Real-IP", "Via")
+"""Headers by which a reverse proxy shows that the browser is elsewhere."""
+
+
+class Access(NamedTuple):
+    """Permissions of the sender of a request."""
+
+    scope: Scope | None
+    """None for a device that is not paired."""
+    device: Device | None
+    """None for a browser on this machine, which needs no pairing, and without a scope."""
+    loopback: bool
+
+    @property
+    def name(self) -> str:
+        """Name of the device."""
+        return self.device.name if self.device else "this machine"
+
+    @property
+    def device_id(self) -> str:
+        """Identifier of the device; empty for a browser on this machine."""
+        return self.device.id if self.device else ""
+
+    def describe(self) -> dict[str, Any]:
+        """Return the permissions as a page gets them."""
+        return {
+            "paired": self.scope is not None,
+            "scope": self.scope,
+            "device": self.name if self.scope else None,
+            "loopback": self.loopback,
+            "version": __version__,
+        }
+
+
+class Pairing(Struct, forbid_unknown_fields=True):
+    """Body of pair."""
+
+    token: Annotated[str, Meta(max_length=200)]
+    name: Annotated[str, Meta(max_length=1000)] = ""
+
+
+class AccessControl:
+    """The permissions of each request, and the requests that pair a device."""
+
+    def __init__(self, devices: Devices, pair_all: bool) -> None:
+        """pair_all: whether browsers on this machine need pairing, too"""
+        self._devices, self._pair_all = devices, pair_all
+        self.routes = [
+            web.get("/api/session", self._get_session),
+            web.post("/api/pair", self._pair),
+            web.post("/api/unpair", self._unpair),
+        ]
+
+    def find(self, request: web.Request) -> Access:
+        """Return the permissions of a request."""
+        device = self._devices.find(request.cookies.get(COOKIE))
+        loopback = not self._pair_all and is_loopback(request)
+        scope: Scope | None = "drive" if loopback else device.scope if device else None
+        return Access(scope, None if loopback else device, loopback)
+
+    def find_device(self, device_id: str) -> Access:
+        """Return the permissions of a device; raise `DeviceError` if it is not paired."""
+        if not device_id:
+            return Access("drive", None, True)
+        device = self._devices.get(device_id)
+        return Access(device.scope, device, False)
+
+    def paired_ids(self) -> set[str]:
+        """Return the identifiers of all devices that have access."""
+        return {device.id for device in self._devices.all()} | {""}
+
+    def require(self, request: web.Request, scope: Scope) -> Access:
+        """Return the permissions of a request; raise `ApiError` if they do not suffice."""
+        if request.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+            raise ApiError(403, "other-origin", "this request is from a page of another site")
+        access = self.find(request)
+        if access.scope is None:
+            raise ApiError(
+                401,
+                "not-paired",
+                "this device is not paired",
+                "run 'fishctl window pair' on the fish's computer, and open the link here",
+            )
+        if scope == "drive" and access.scope != "drive":
+            raise ApiError(
+                403,
+                "only-watch",
+                "this device may only watch",
+                "pair it again with 'fishctl window pair --scope drive'",
+            )
+        return access
+
+    async def _get_session(self, request: web.Request) -> web.Response:
+        return success(self.find(request).describe())
+
+    async def _pair(self, request: web.Request) -> web.Response:
+        pairing = await read_body(request, Pairing)
+        device, secret = self._devices.pair(pairing.token, pairing.name)
+        log.info("%s is paired, to %s", device.name, device.scope)
+        response = success(Access(device.scope, device, False).describe())
+        response.set_cookie(
+            COOKIE,
+            secret,
+            max_age=COOKIE_S,
+            path="/",
+            httponly=True,
+            samesite="Strict",
+            secure=request.headers.get("Origin", "").startswith("https:"),
+        )
+        return response
+
+    async def _unpair(self, request: web.Request) -> web.Response:
+        await read_body(request, NoArguments)
+        if device := self._devices.find(request.cookies.get(COOKIE)):
+            self._devices.revoke(device.id)
+        response = success(None)
+        response.del_cookie(COOKIE, path="/", httponly=True, samesite="Strict")
+        return response
+
+
+def is_loopback(request: web.Request) -> bool:
+    """Return whether a request is from a browser of this machine, and not through a proxy."""
+    name = host_name(request.host)
+    if any(header in request.headers for header in FORWARDED):
+        return False
+    return _is_loopback(request.remote or "") and (name == "localhost" or _is_loopback(name))
+
+
+def _is_loopback(name: str) -> bool:
+    address = parse_ip(name)
+    mapped = getattr(address, "ipv4_mapped", None)
+    return address is not None and (mapped or address).is_loopback

@@ -1,0 +1,117 @@
+"""Answers of the window's requests as JSON, and what is wrong with a request."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from typing import Any, TypeVar
+
+import msgspec
+from aiohttp import web
+from msgspec import Struct
+
+from fishd.core import text
+from fishd.core.decoding import decoder
+from fishd.core.errors import FishdError, NoDaemon, ParameterError, Refused
+from fishd.window import web_server
+from fishd.window.devices import DeviceError
+from fishd.window.fish_link import Busy
+from fishd.window.jobs import JobError
+from fishd.window.live import encode
+
+log = logging.getLogger(__name__)
+
+T = TypeVar("T")
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class ApiError(FishdError):
+    """A request that is refused."""
+
+    def __init__(self, status: int, code: str, message: str, remedy: str = "") -> None:
+        super().__init__(message)
+        self.status, self.code, self.remedy = status, code, remedy
+
+
+class NoArguments(Struct, forbid_unknown_fields=True):
+    """Body of a request without arguments."""
+
+
+async def read_body(request: web.Request, kind: type[T]) -> T:
+    """Return the body of a request; raise `ApiError`."""
+    if request.content_type != "application/json":
+        raise ApiError(415, "bad-request", "Content-Type: application/json is needed")
+    try:
+        async with asyncio.timeout(web_server.REQUEST_TIMEOUT_S):
+            body = await request.read()
+    except TimeoutError:
+        raise ApiError(408, "bad-request", "the body of the request has not come") from None
+    try:
+        data = decoder(Any)(body or b"{}")
+    except msgspec.DecodeError as error:
+        raise ApiError(400, "bad-request", f"not JSON: {text.error_message(error)}") from None
+    return convert(data, kind)
+
+
+def convert(data: Any, kind: type[T], prefix: str = "") -> T:
+    """Return data as a struct; raise `ApiError`, whose message begins with `prefix`."""
+    try:
+        return msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        message = f"{prefix}{text.error_message(error)}"
+        raise ApiError(400, "bad-arguments", message) from None
+
+
+def success(result: Any) -> web.Response:
+    """Return the answer to a request that was carried out."""
+    body = encode({"ok": True, "result": result})
+    return web.Response(body=body, content_type="application/json")
+
+
+@web.middleware
+async def answer_in_json(request: web.Request, handler: Handler) -> web.StreamResponse:
+    """Answer errors of requests below /api/ as JSON, others as text."""
+    headers: Any = {}
+    try:
+        return await handler(request)
+    except web.HTTPException as error:
+        if not request.path.startswith("/api/"):
+            raise
+        refusal = ApiError(error.status, error.reason.lower().replace(" ", "-"), error.text or "")
+        headers = error.headers
+    except FishdError as error:
+        refusal = _refusal(error)
+    except ConnectionError:  # the page has gone
+        raise
+    except Exception as error:
+        log.error("%s failed: %s", request.path, text.describe_error(error), exc_info=True)
+        refusal = ApiError(500, "internal", f"a mistake in fishd: {text.describe_error(error)}")
+    failure = {"code": refusal.code, "message": str(refusal).strip(), "remedy": refusal.remedy}
+    response = web.Response(
+        status=refusal.status,
+        body=encode({"ok": False, "error": failure}),
+        content_type="application/json",
+    )
+    web_server.finish(response)
+    if "Allow" in headers:
+        response.headers["Allow"] = headers["Allow"]
+    return response
+
+
+def _refusal(error: FishdError) -> ApiError:
+    """Return an error of fishd or of the window with its status."""
+    message = text.error_message(error)
+    if isinstance(error, ApiError):
+        return error
+    if isinstance(error, Refused):
+        return ApiError(409, text.quoted(error.code), message)
+    if isinstance(error, NoDaemon):
+        return ApiError(503, "no-daemon", message)
+    if isinstance(error, Busy):
+        return ApiError(503, "busy", message)
+    if isinstance(error, JobError):
+        return ApiError(409, "job", message)
+    if isinstance(error, DeviceError):
+        return ApiError(403, "device", message)
+    if isinstance(error, ParameterError):
+        return ApiError(400, "bad-arguments", message)
+    return ApiError(500, "failed", message)

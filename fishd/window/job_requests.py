@@ -1,0 +1,67 @@
+"""Requests of a page for experiments, and for the runs that they leave."""
+
+from typing import Any
+
+from aiohttp import web
+from msgspec import Struct
+
+from fishd.core import text
+from fishd.window.access import AccessControl
+from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
+from fishd.window.jobs import DRIVING_KINDS, KINDS, Jobs
+from fishd.window.pages import Pages
+
+
+class JobRequest(Struct, forbid_unknown_fields=True):
+    """Body of a job."""
+
+    fish: str
+    kind: str
+    options: dict[str, Any] = {}
+
+
+class JobRequests:
+    """The requests about jobs and runs."""
+
+    def __init__(self, access: AccessControl, pages: Pages, jobs: Jobs) -> None:
+        self._access, self._pages, self._jobs = access, pages, jobs
+        self.routes = [
+            web.get("/api/jobs", self._list_jobs),
+            web.post("/api/jobs", self._start_job),
+            web.post("/api/jobs/{job}/stop", self._stop_job),
+            web.get("/api/runs", self._list_runs),
+            web.get("/api/runs/{run}/plot.png", self._plot_run),
+        ]
+
+    async def _list_jobs(self, request: web.Request) -> web.Response:
+        self._access.require(request, "watch")
+        return success(self._jobs.all())
+
+    async def _start_job(self, request: web.Request) -> web.Response:
+        access = self._access.require(request, "drive")
+        body = await read_body(request, JobRequest)
+        link, page = self._pages.find_link(body.fish), self._pages.find_page(request, access)
+        if body.kind not in KINDS:
+            message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(KINDS)}"
+            raise ApiError(400, "unknown-kind", message)
+        options = convert(body.options, KINDS[body.kind], f"{body.kind}: ")
+        if body.kind in DRIVING_KINDS:
+            self._pages.require_driver(link.name, page)
+            await link.give_back()  # the experiment takes the fish itself
+        job = self._jobs.start(body.kind, link.name, link.endpoint_options, options)
+        self._pages.tell_job(job)
+        return success(job)
+
+    async def _stop_job(self, request: web.Request) -> web.Response:
+        self._access.require(request, "drive")
+        await read_body(request, NoArguments)
+        return success(self._jobs.stop(request.match_info["job"]))
+
+    async def _list_runs(self, request: web.Request) -> web.Response:
+        self._access.require(request, "watch")
+        return success(await self._jobs.list_runs())
+
+    async def _plot_run(self, request: web.Request) -> web.Response:
+        self._access.require(request, "watch")
+        picture = await self._jobs.plot(request.match_info["run"])
+        return web.Response(body=picture, content_type="image/png")

@@ -1,0 +1,70 @@
+"""Server of the page of the fish: its files, its WebSockets, and its requests."""
+
+import asyncio
+from importlib import resources
+
+from aiohttp import web
+
+from fishd.window.access import AccessControl
+from fishd.window.answers import answer_in_json
+from fishd.window.devices import Devices
+from fishd.window.fish_requests import FishRequests
+from fishd.window.foxglove import PROTOCOL
+from fishd.window.job_requests import JobRequests
+from fishd.window.jobs import Jobs
+from fishd.window.pages import Pages
+from fishd.window.settings import WindowSettings
+from fishd.window.web_server import WebServer, file_routes
+
+MAX_BODY_BYTES = 16 * 2**10
+
+
+class WindowServer(WebServer):
+    """Server of the page; an asynchronous context manager in one event loop."""
+
+    def __init__(self, settings: WindowSettings) -> None:
+        """Raises `DeviceError` where the state folder cannot be used."""
+        access = AccessControl(Devices(settings.state_folder), settings.pair_all)
+        self._jobs = Jobs(settings.runs_folder, lambda job: self._pages.tell_job(job))
+        self._pages = Pages(settings.endpoints, access, self._jobs.all, lambda: self.viewers)
+        host, port = settings.address
+        routes = [
+            *file_routes(resources.files(__package__).joinpath("page"), "index.html"),
+            web.get("/live", self._serve_live),
+            web.get("/foxglove", self._serve_foxglove),
+            *access.routes,
+            *FishRequests(access, self._pages).routes,
+            *JobRequests(access, self._pages, self._jobs).routes,
+        ]
+        super().__init__(
+            host,
+            port,
+            routes,
+            names=settings.names,
+            middlewares=[answer_in_json],
+            readers={"/foxglove": frozenset(settings.origins)},
+            max_body_bytes=MAX_BODY_BYTES,
+            advice="name another one with --listen",
+        )
+
+    async def __aenter__(self) -> "WindowServer":
+        """Listen, and follow the fish; raises `StartupError`."""
+        await super().__aenter__()
+        self._run = asyncio.create_task(self._pages.run())
+        return self
+
+    async def __aexit__(self, *details: object) -> None:
+        """Return the fish, and close all pages."""
+        self._run.cancel()
+        await asyncio.gather(self._run, return_exceptions=True)
+        await self._jobs.close()
+        await self._pages.close()
+        await super().__aexit__(*details)
+
+    async def _serve_live(self, request: web.Request) -> web.StreamResponse:
+        with self._pages.open_live(request) as page:
+            return await self.serve_viewer(request, page)
+
+    async def _serve_foxglove(self, request: web.Request) -> web.StreamResponse:
+        with self._pages.open_foxglove(request) as page:
+            return await self.serve_viewer(request, page, [PROTOCOL])
