@@ -86,6 +86,14 @@ $(VENV)/installed-docs: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --constraint tools/constraints.txt --editable '.[docs]'
 	@touch $@
 
+.PHONY: release packages
+
+release: $(VENV)/installed-dev  ## Build, check and try the packages of a version, and name the next steps
+	$(BIN)/python tools/release.py
+
+packages: $(VENV)/installed-dev  ## The same for the checkout as it is, without a version of its own
+	$(BIN)/python tools/release.py --rehearse
+
 .PHONY: install-pi uninstall-pi trial-systemd trial-arm64 release-check
 
 install-pi:  ## Install fishd on this Raspberry Pi, or renew it; needs sudo

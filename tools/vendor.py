@@ -27,6 +27,9 @@ def fetch(package: dict[str, Any], folder: Path) -> None:
     digest = base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode()
     check(name, package, "integrity", f"sha512-{digest}")
     with tarfile.open(archive) as files:
+        description = files.extractfile("package/package.json")
+        assert description
+        check(name, package, "license", json.load(description)["license"])
         for entry in package["files"]:
             member = files.extractfile(f"package/{entry['source']}")
             if member is None:

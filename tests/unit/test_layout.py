@@ -12,6 +12,7 @@
 6. The table in docs/explanation/rooms.md is written by `make docs`.
 """
 
+import json
 import re
 from email import message_from_bytes
 from graphlib import TopologicalSorter
@@ -19,6 +20,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+from rigs.documents import ROOT
 from rigs.wheel import build
 
 import rooms as tool
@@ -60,10 +62,16 @@ def test_the_page_lists_every_room_with_its_own_words() -> None:
     assert between(DOCS / "explanation" / "rooms.md", "rooms") == tool.summary()
 
 
-def test_a_wheel_carries_its_licence(tmp_path: Path) -> None:
+def test_a_wheel_carries_its_licence_and_those_of_the_libraries_in_it(tmp_path: Path) -> None:
     with ZipFile(build(tmp_path)) as wheel:
         files = {name.partition(".dist-info/")[2]: name for name in wheel.namelist()}
         metadata = message_from_bytes(wheel.read(files["METADATA"]))
         licence = wheel.read(files["licenses/LICENSE"]).decode()
-    assert (metadata["License-Expression"], metadata["License-File"]) == ("MIT", "LICENSE")
+    vendor = ROOT / "fishd" / "window" / "page" / "vendor"
+    manifest = json.loads((vendor / "manifest.json").read_bytes())
+    assert {package["license"] for package in manifest["packages"]} == {"MIT", "Apache-2.0"}
+    assert metadata["License-Expression"] == "MIT AND Apache-2.0"
+    licences = {str(path.relative_to(ROOT)) for path in vendor.glob("*.LICENSE")}
+    assert set(metadata.get_all("License-File", [])) == {"LICENSE", *licences}
+    assert {f"licenses/{path}" for path in licences} <= files.keys()
     assert licence.startswith("MIT License\n\nCopyright (c) 2026 The fishd authors\n")

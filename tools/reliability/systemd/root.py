@@ -76,7 +76,7 @@ def _wheels(folder: Path) -> None:
     """Collect all wheels of the installation, which runs without a network."""
     progress("collecting wheels")
     pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    wanted = [f"{CHECKOUT}[{core_extras()}]", "hatchling"]
+    wanted = [f"{CHECKOUT}[{core_extras()}]", "hatchling", "hatch-vcs"]
     subprocess.run([*pip, "wheel", "--wheel-dir", folder, *wanted], check=True)
     for own in folder.glob("fishd-*.whl"):
         own.unlink()  # the installation builds this wheel itself
