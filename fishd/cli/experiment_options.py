@@ -1,7 +1,7 @@
 """Command line that all experiments share: choice of the fish, folder, and how one ends."""
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import wraps
 from itertools import pairwise
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fishd.lab.session import Session
 
 On = Literal["live", "simulation"]
-_RUN_ONLY_OPTIONS = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0}
+RUN_ONLY_OPTIONS = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0}
 """Options that a resumed experiment does not take over, and the number of words after each."""
 _COMMAND = "fishd.words"
 """Key of the command line in click's context, for the header of an experiment."""
@@ -210,7 +210,7 @@ def _folder_options(function: F, otherwise: str) -> F:
             kind=verb_words(context),
             path=resume or folder or default_folder(verb_words(context)),
             resume=resume is not None,
-            command=tuple(context.meta.get(_COMMAND, ())),
+            command=kept_arguments(context),
             is_named=bool(resume or folder),
         )
         return function(*args, place=place, **values)
@@ -289,34 +289,51 @@ def _read_header(folder: Path) -> "Header":
     return read_header(folder)
 
 
-def restore_arguments(context: click.Context, args: list[str]) -> list[str]:
-    """Return the arguments of a verb, after those of the experiment that `--resume` names.
+def _read_command(context: click.Context, folder: Path) -> list[str]:
+    """Return the arguments of the experiment in a folder."""
+    from fishd.core.old_names import OLD_OPTIONS
 
-    The arguments are kept for the header of a new experiment.
+    header = _read_header(folder)
+    if header.kind != verb_words(context):
+        raise click.UsageError(
+            f"--resume {folder}: it is of another verb: fishctl {header.kind} --resume {folder}"
+        )
+    return [OLD_OPTIONS.get(word, word) for word in header.command]
+
+
+def restore_arguments(
+    context: click.Context,
+    args: list[str],
+    read_command: Callable[[click.Context, Path], list[str]] = _read_command,
+    run_only: Mapping[str, int] = RUN_ONLY_OPTIONS,
+) -> list[str]:
+    """Return the arguments of a verb, after those of what `--resume` names.
+
+    The arguments are kept for a later `--resume`: see `kept_arguments`.
+
+    read_command: returns the arguments that are kept in a folder or file
+    run_only: options that are not kept, and the number of words after each
     """
-    folder = next((b for a, b in pairwise(args) if a == "--resume"), None)
-    folder = folder or next((a[9:] for a in args if a.startswith("--resume=")), None)
-    if folder is not None and (not args or args[0].startswith("-")):
-        from fishd.core.old_names import OLD_OPTIONS
-
-        header = _read_header(Path(folder))
-        if header.kind != verb_words(context):
-            raise click.UsageError(
-                f"--resume {folder}: it is of another verb: fishctl {header.kind} --resume {folder}"
-            )
-        args = [*(OLD_OPTIONS.get(word, word) for word in header.command), *args]
-    context.meta[_COMMAND] = list(_without_run_options(args))
+    path = next((b for a, b in pairwise(args) if a == "--resume"), None)
+    path = path or next((a[9:] for a in args if a.startswith("--resume=")), None)
+    if path is not None and args[0].startswith("-"):
+        args = [*read_command(context, Path(path)), *args]
+    context.meta[_COMMAND] = list(_without_options(args, run_only))
     return args
 
 
-def _without_run_options(args: Sequence[str]) -> Iterator[str]:
-    """Yield the arguments that a resumed experiment takes over."""
+def kept_arguments(context: click.Context) -> tuple[str, ...]:
+    """Return the arguments that a resumed experiment or swim takes over."""
+    return tuple(context.meta.get(_COMMAND, ()))
+
+
+def _without_options(args: Sequence[str], run_only: Mapping[str, int]) -> Iterator[str]:
     words = iter(args)
     for word in words:
         name, equals, _ = word.partition("=")
-        if name not in _RUN_ONLY_OPTIONS:
+        if name not in run_only:
             yield word
-        elif _RUN_ONLY_OPTIONS[name] and not equals:
+        elif run_only[name] and not equals:
             next(words, None)
 
 

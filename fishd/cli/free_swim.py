@@ -2,14 +2,15 @@
 
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from fishd.cli.options import F, FiniteRange
+from fishd.cli.experiment_options import RUN_ONLY_OPTIONS, kept_arguments, restore_arguments
+from fishd.cli.options import ControllerGroup, F, FiniteRange, RenamedOption
 from fishd.cli.output import echo, echo_rows, format_controller, print_json
 from fishd.cli.progress import show_progress
 from fishd.core import files, text
@@ -27,21 +28,26 @@ DEFAULT_SETTLE_S = 8.0
 """Time that a swimmer needs from rest to a steady speed, roughly [s]."""
 
 
+_RUN_ONLY_OPTIONS = RUN_ONLY_OPTIONS | dict.fromkeys(
+    ("--to", "--save", "--checkpoint", "--film", "--record"), 1
+)
+"""Options that a resumed swim does not take over, and the number of words after each."""
+
+
 class SwimmerOptions(NamedTuple):
     """Values of the options that only a free swimmer has."""
 
-    checkpoint: Path | None
+    target: Path | None
+    """File of the swim: .npz, or .csv without midlines and state."""
     checkpoint_every: float
     resume: Path | None
-    save: Path | None
     film: Path | None
 
     def refuse(self) -> None:
         """Raise `UsageError` if one of them was given; call this for a tethered fish."""
         for option, path in (
-            ("--checkpoint", self.checkpoint),
+            ("--to", self.target),
             ("--resume", self.resume),
-            ("--save", self.save),
             ("--film", self.film),
         ):
             if path is not None:
@@ -52,19 +58,16 @@ class SwimmerOptions(NamedTuple):
 
     def check(self) -> None:
         """Raise `ParameterError` if a file cannot or must not be written."""
-        for path in (self.checkpoint, self.save, self.film):
+        for path in (self.target, self.film):
             if path is not None:
                 _check_writable(path)
-        for option, path in (("--checkpoint", self.checkpoint), ("--resume", self.resume)):
-            if path and self.save and _is_same_file(path, self.save):
-                raise ParameterError(f"{path}: {option} and --save need different files")
-        checkpoint = self.checkpoint
+        target = self.target
         if (
-            checkpoint
-            and os.path.lexists(checkpoint)
-            and not (self.resume and _is_same_file(checkpoint, self.resume))
+            target
+            and os.path.lexists(target)
+            and not (self.resume and target.resolve() == self.resume.resolve())
         ):
-            raise ParameterError(f"{checkpoint} exists: --resume it, or remove it")
+            raise ParameterError(f"{target} exists: --resume it, or give another file")
 
 
 def _check_writable(path: Path) -> None:
@@ -76,44 +79,61 @@ def _check_writable(path: Path) -> None:
         raise ParameterError(f"{path}: {problem}") from None
 
 
-def _is_same_file(first: Path, second: Path) -> bool:
-    """Return whether both paths lead to the same file, existing or not."""
-    return first.resolve() == second.resolve() or (
-        first.exists() and second.exists() and first.samefile(second)
-    )
-
-
 def swimmer_options(function: F) -> F:
-    """Add `--checkpoint`, `--checkpoint-every`, `--resume`, `--save` and `--film`."""
+    """Add `--to`, `--checkpoint-every`, `--resume` and `--film`."""
 
-    def file_option(name: str, about: str) -> Callable[[F], F]:
-        kind = click.Path(path_type=Path, dir_okay=False)
-        return click.option(name, type=kind, metavar="FILE", help=f"For a swimmer: {about}")
+    def file_option(*names: str, about: str, former: Sequence[str] = ()) -> Callable[[F], F]:
+        return click.option(
+            *names,
+            cls=RenamedOption,
+            former=former,
+            type=click.Path(path_type=Path, dir_okay=False),
+            metavar="FILE",
+            help=f"For a swimmer: {about}",
+        )
 
     decorators: list[Callable[[Any], Any]] = [
-        file_option("--film", "paint its wake while it swims: a .webp or .gif file."),
-        file_option(
-            "--save",
-            "write its track, one row per tick, to this .csv file, or with its midlines to this "
-            ".npz file.",
-        ),
+        file_option("--film", about="paint its wake while it swims: a .webp or .gif file."),
         file_option(
             "--resume",
-            "continue from this checkpoint; with the same controller --seconds is the duration of "
-            "the whole swim, including the part before.",
+            about="continue the swim in this .npz file, in the same file and with the same "
+            "options, to the length of --for; with a CONTROLLER, begin another swim where that one "
+            "ended.",
         ),
         click.option(
             "--checkpoint-every",
             type=FiniteRange(min=0.1),
             default=DEFAULT_CHECKPOINT_INTERVAL_S,
             show_default=True,
-            help="Simulated time between two checkpoints [s].",
+            help="For a swimmer: simulated time between two writes of the .npz file [s].",
         ),
-        file_option("--checkpoint", "write the state for --resume to this file, also at Ctrl-C."),
+        file_option(
+            "--to",
+            "target",
+            former=("--save", "--checkpoint"),
+            about="write its track, midlines and state for --resume to this new .npz file, also "
+            "at Ctrl-C; or its track alone to a .csv file.",
+        ),
     ]
     for decorator in decorators:
         function = decorator(function)
     return function
+
+
+class SimulateGroup(ControllerGroup):
+    """The verb `simulate`, for which `--resume` restores the options of a swim in a file."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments after those of the resumed swim."""
+        return super().parse_args(
+            ctx, restore_arguments(ctx, args, _read_command, _RUN_ONLY_OPTIONS)
+        )
+
+
+def _read_command(_: click.Context, path: Path) -> list[str]:
+    from fishd.virtual.swimmer import checkpoint
+
+    return [*checkpoint.load(path).command, "--to", str(path)]
 
 
 def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
@@ -122,62 +142,47 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
     arguments: configuration, controller, parameters, seconds, settle time, publisher, begun
     Raises `FishdError` and OSError.
     """
-    from fishd.lab.simulation.free_swim import CheckpointSettings
+    from fishd.lab.simulation.free_swim import SwimFile
     from fishd.lab.simulation.free_swim import swim as run
     from fishd.virtual.swimmer import checkpoint, track
-    from fishd.virtual.swimmer.midlines import Midlines
 
-    if options.save:
-        track.check_name(options.save)
+    target = options.target
+    if target:
+        track.check_name(target)
     options.check()
-    checkpointing = (
-        CheckpointSettings(options.checkpoint, options.checkpoint_every)
-        if options.checkpoint
+    command = kept_arguments(click.get_current_context())
+    file = (
+        SwimFile(target, options.checkpoint_every, command)
+        if target and target.suffix == ".npz"
         else None
     )
     resume = checkpoint.load(options.resume) if options.resume else None
     interrupted = threading.Event()
-    midlines = Midlines()
     with (
         on_signal(interrupted.set),
         _open_film(arguments[0], options) as film,
         show_progress(arguments[3], "s", err=as_json) as bar,
     ):
-
-        def watch(fish: "Swimmer") -> None:
-            film(fish)
-            if options.save and options.save.suffix == ".npz":
-                midlines.add(fish)
-
         outcome = run(
             *arguments,
             progress=lambda passed, speed: bar.at(passed, f"{speed * 1e3:.1f} mm/s"),
-            keeping=checkpointing,
+            file=file,
             resume=resume,
             ended=interrupted.is_set,
-            watch=watch,
+            watch=film,
             lost=lambda error: bar.warn(
-                f"fishctl: {options.checkpoint}: the checkpoint cannot be written: "
-                f"{error.strerror or error}; the fish swims on"
+                f"fishctl: {target}: the swim cannot be written: {error.strerror or error}; the "
+                "fish swims on"
             ),
         )
     is_unsaved = False
-    if options.save and len(outcome.track):
-        if resume and options.save.suffix == ".npz":
-            midlines.put_before(options.save, outcome.track.rows())
-            if len(midlines) < len(outcome.track):
-                start = min(midlines.start, resume.time)
-                echo(
-                    f"fishctl: {options.save}: its midlines begin at {start:.2f} s: to keep "
-                    "earlier ones, give --save the NPZ file of the first part",
-                    err=True,
-                )
+    if target and not file and len(outcome.track):
         try:
-            track.save(outcome.track, options.save, midlines.arrays())
+            track.save_table(outcome.track, target)
         except OSError as error:
             is_unsaved = True
             reason = error.strerror or error
-            echo(f"fishctl: {options.save}: the track cannot be written: {reason}", err=True)
+            echo(f"fishctl: {target}: the track cannot be written: {reason}", err=True)
     if outcome.report and as_json:
         print_json(outcome.report)
     elif outcome.report:
@@ -209,17 +214,15 @@ def _open_film(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[
 
 
 def _describe_checkpoint(outcome: "SwimResult", options: SwimmerOptions) -> str:
-    """Return a clause about the checkpoint from which the run can be resumed."""
+    """Return a clause about the file from which the swim can be resumed."""
     if outcome.checkpoint_time is not None:
         return (
-            f"its last checkpoint is at {outcome.checkpoint_time:.2f} s: "
-            f"--resume {options.checkpoint}"
+            f"its last checkpoint is at {outcome.checkpoint_time:.2f} s; resume with: "
+            f"fishctl simulate --resume {options.target}"
         )
     if options.resume:
         return f"its last checkpoint is {options.resume}"
-    return "no checkpoint was written" + (
-        "" if options.checkpoint else ": --checkpoint FILE writes one"
-    )
+    return "no checkpoint was written" + ("" if options.target else ": --to FILE.npz writes one")
 
 
 def _report_rows(report: "SwimReport") -> list[tuple[str, str]]:

@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
@@ -104,6 +104,22 @@ def seed_option(what: str, default: int | None = 0) -> Callable[[F], F]:
         show_default=default is not None,
         help=f"Seed of the random number generator of {what}.",
     )
+
+
+class RenamedOption(click.Option):
+    """Option that also accepts former names, which help does not show."""
+
+    def __init__(self, *args: Any, former: Sequence[str], **kwargs: Any) -> None:
+        """former: former names, such as `--save`"""
+        super().__init__(*args, **kwargs)
+        self._former = former
+
+    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
+        """Make the option and its former names known to the parser."""
+        names = self.opts
+        self.opts = [*names, *self._former]
+        super().add_to_parser(parser, ctx)
+        self.opts = names
 
 
 def daemon_options(function: F) -> F:

@@ -8,8 +8,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import fish_options
-from fishd.cli.free_swim import DEFAULT_SETTLE_S, SwimmerOptions, swim, swimmer_options
-from fishd.cli.options import ControllerGroup, for_option, json_option
+from fishd.cli.free_swim import (
+    DEFAULT_SETTLE_S,
+    SimulateGroup,
+    SwimmerOptions,
+    swim,
+    swimmer_options,
+)
+from fishd.cli.options import for_option, json_option
 from fishd.cli.output import (
     echo,
     echo_rows,
@@ -57,7 +63,7 @@ def _simulate_options(function: Any) -> Any:
     return run_options(record(swimmer_options(function)))
 
 
-@click.group(cls=ControllerGroup, options=_simulate_options)
+@click.group(cls=SimulateGroup, options=_simulate_options)
 def simulate() -> None:
     """Swim a simulated fish in virtual time, with the loop that runs on the robot."""
 

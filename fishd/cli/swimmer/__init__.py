@@ -6,7 +6,7 @@ from fishd.cli.verbs import Verb, Verbs
 
 VERBS = {
     "Draw": {
-        "wake": Verb("swimmer.draw", "wake", "Draw the water around it, from a checkpoint."),
+        "wake": Verb("swimmer.draw", "wake", "Draw the water around it."),
         "midlines": Verb("swimmer.draw", "midlines", "Draw how its body moves in a beat."),
     },
 }

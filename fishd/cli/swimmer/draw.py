@@ -5,41 +5,36 @@ from typing import Any
 
 import click
 
-from fishd.cli.options import F, FiniteRange, json_option
+from fishd.cli.options import F, FiniteRange, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, print_paths
 from fishd.core import text
 from fishd.lab.swimmer import wake as water
-from fishd.lab.swimmer.midlines import compute_envelope, draw_midlines, read_midlines
+from fishd.lab.swimmer.midlines import compute_envelope, draw_midlines
 from fishd.recording.folder import check_new_files
 from fishd.virtual.swimmer import checkpoint
 
 
 def picture_options(function: F) -> F:
-    """Add `--to`, `--form` and `--force`."""
+    """Add the argument SWIM, `--plot`, `--force` and `--json`."""
     decorators: tuple[Any, ...] = (
-        click.option("--force", is_flag=True, help="Replace existing files."),
-        click.option(
-            "--form",
-            type=click.Choice(["png", "svg", "pdf"]),
-            default="png",
-            show_default=True,
-            help="Format of the pictures.",
-        ),
-        click.option(
-            "--to",
-            "target",
-            type=click.Path(path_type=Path, file_okay=False, exists=True),
-            default=Path(),
-            help="The folder to write to. [default: the current folder]",
-        ),
+        json_option,
+        click.option("--force", is_flag=True, help="Replace an existing file."),
+        plot_option("it"),
+        click.argument("file", metavar="SWIM", type=click.Path(path_type=Path, readable=False)),
     )
     for decorator in decorators:
         function = decorator(function)
     return function
 
 
+def _picture_path(picture: Path | None, file: Path, what: str, force: bool) -> Path:
+    """Return the file of a picture of a swim; raises `ParameterError` if it must not be written."""
+    path = picture or Path(f"{file.stem}-{what}.png")
+    check_new_files([path], replace=force)
+    return path
+
+
 @click.command()
-@click.argument("file", metavar="SWIM", type=click.Path(path_type=Path, readable=False))
 @click.option(
     "--settle",
     type=FiniteRange(min=0.0),
@@ -48,18 +43,15 @@ def picture_options(function: F) -> F:
     help="Time before the first beat to use [s].",
 )
 @picture_options
-@json_option
-def midlines(
-    file: Path, settle: float, target: Path, form: str, force: bool, as_json: bool
-) -> None:
+def midlines(file: Path, settle: float, picture: Path | None, force: bool, as_json: bool) -> None:
     """Draw the midlines of a tail beat relative to the mean, and the amplitude along the body.
 
-    SWIM is a file of 'fishctl simulate ... --save FILE.npz'. The picture is named after it:
-    FILE-midlines.png.
+    SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is
+    FILE-midlines.png in this folder.
     """
-    path = target / f"{file.stem}-midlines.{form}"
-    check_new_files([path], replace=force)
-    envelope = compute_envelope(*read_midlines(file), settle)
+    path = _picture_path(picture, file, "midlines", force)
+    time, lines = checkpoint.load(file).midlines.arrays()
+    envelope = compute_envelope(time, lines.astype(float), settle)
     beats = len(envelope.periods)
     frequency = beats / float(envelope.periods.sum())
     title = f"{text.line(file.stem)}: midlines of the last of {format_count(beats, 'beat')}, "
@@ -74,15 +66,12 @@ def midlines(
 
 
 @click.command()
-@click.argument("file", metavar="CHECKPOINT", type=click.Path(path_type=Path, readable=False))
 @click.option(
     "--field",
-    "fields",
     type=click.Choice(water.QUANTITIES),
-    multiple=True,
-    default=("vorticity", "speed"),
+    default="vorticity",
     show_default=True,
-    help="Quantity to draw. Repeatable.",
+    help="Quantity to draw.",
 )
 @click.option(
     "--whole", is_flag=True, help="Draw the whole tank, not only the fish and its near wake."
@@ -94,32 +83,23 @@ def midlines(
     "pictures of such a fish]",
 )
 @picture_options
-@json_option
 def wake(
     file: Path,
-    fields: tuple[water.Quantity, ...],
+    field: water.Quantity,
     whole: bool,
     limit: float | None,
-    target: Path,
-    form: str,
+    picture: Path | None,
     force: bool,
     as_json: bool,
 ) -> None:
-    """Draw vorticity and speed of the water, and the body in it.
+    """Draw the water at the end of a swim, and the body in it.
 
-    CHECKPOINT is a file of 'fishctl simulate ... --checkpoint FILE'. The pictures are named after
-    it: FILE-vorticity.png.
+    SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is
+    FILE-vorticity.png in this folder.
     """
-    fields = tuple(dict.fromkeys(fields))
-    if limit is not None and len(fields) > 1:
-        raise click.UsageError(
-            "--limit applies to one field, and there are several: give one --field"
-        )
-    paths = {field: target / f"{file.stem}-{field}.{form}" for field in fields}
-    check_new_files(paths.values(), replace=force)
+    path = _picture_path(picture, file, field, force)
     fish = water.restore_fish(checkpoint.load(file))
     window = (water.whole_window if whole else water.window_around)(fish.settings)
-    for field, path in paths.items():
-        scene = water.take_view(fish, field, window, water.COLUMNS)
-        water.draw_wake(scene, limit or water.choose_colour_limit(fish.settings, field), path)
-    print_paths(paths.values(), as_json)
+    scene = water.take_view(fish, field, window, water.COLUMNS)
+    water.draw_wake(scene, limit or water.choose_colour_limit(fish.settings, field), path)
+    print_paths([path], as_json)

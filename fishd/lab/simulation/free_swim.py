@@ -1,7 +1,8 @@
-"""A swim of the free swimmer in virtual time: its track, a report, and checkpoints."""
+"""A swim of the free swimmer in virtual time: its track, a report, and its file."""
 
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from fishd.virtual.swimmer.checkpoint import Checkpoint, CheckpointError
 from fishd.virtual.swimmer.fish import Diverged
 from fishd.virtual.swimmer.gait import Gait, gait
 from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.midlines import Midlines
 from fishd.virtual.swimmer.robot import Swimmer
 from fishd.virtual.swimmer.track import Track
 
@@ -30,9 +32,9 @@ class SwimReport(Gait, frozen=True, kw_only=True):
     controller: str
     parameters: dict[str, Any]
     seconds: float
-    """Length of the swim, including the part before a checkpoint [s]."""
+    """Length of the swim, including the part before it was resumed [s]."""
     resumed: float | None
-    """Time of the checkpoint from which the swim resumed, with the controller reset [s]."""
+    """Time at which the swim resumed, with the controller reset [s]; None if it did not."""
     ticks: int
     mode: str
     """Mode at the end."""
@@ -44,13 +46,15 @@ class SwimReport(Gait, frozen=True, kw_only=True):
     """Ratio of simulated time to computing time."""
 
 
-class CheckpointSettings(Struct, frozen=True):
-    """Settings of the checkpoints of a swim."""
+class SwimFile(Struct, frozen=True):
+    """Settings of the file of a swim, from which it can be resumed."""
 
     path: Path
-    """Path of the checkpoint, which is overwritten."""
+    """Path of the file, which is overwritten."""
     every: float = 5.0
-    """Interval in simulated time [s]."""
+    """Simulated time between two writes [s]."""
+    command: Sequence[str] = ()
+    """Arguments of `fishctl simulate` that a resumed swim takes over."""
 
 
 class SwimResult(NamedTuple):
@@ -62,9 +66,9 @@ class SwimResult(NamedTuple):
     error: Diverged | None
     """Error of the simulation that ended the swim; None if there was none."""
     checkpoint_time: float | None
-    """Time of the latest written checkpoint [s]."""
+    """Time at which the file of the swim was last written [s]."""
     checkpoint_error: OSError | None
-    """Error of writing the latest checkpoint; None if it was written."""
+    """Error of the last write of this file; None if it was written."""
     complete: bool
     """True where the swim has the requested length."""
 
@@ -79,7 +83,7 @@ def swim(
     on_start: Callable[[VirtualRun], None] = lambda run: None,
     *,
     progress: Callable[[float, float], None] = lambda passed, speed: None,
-    keeping: CheckpointSettings | None = None,
+    file: SwimFile | None = None,
     resume: Checkpoint | None = None,
     ended: Callable[[], bool] = lambda: False,
     watch: Callable[[Swimmer], None] = lambda fish: None,
@@ -89,11 +93,11 @@ def swim(
 
     publisher, on_start: see `fishd.lab.simulation.simulate`
     progress: called after each tick with the time [s] and the mean speed since it settled [m/s]
-    keeping: settings of checkpoints; the last one is written at the end
-    resume: checkpoint to resume from; with the same controller the time before it counts
+    file: file of the swim, which is also written at the end
+    resume: earlier swim to resume; with the same controller the time before it counts
     ended: called after each tick; the swim ends where it returns True
     watch: called with the fish after each tick
-    lost: called with the first error of writing a checkpoint; the swim continues
+    lost: called with the first error of writing the file; the swim continues
     Raises `UnknownController`, `ParameterError`, `MissingPackage` and `CheckpointError`.
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
@@ -105,17 +109,23 @@ def swim(
             f"needed after the settling time of {settle:g} s"
         )
     settings = settings_of(config)
-    writer = _CheckpointWriter(keeping, lost)
+    writer = _FileWriter(file, lost)
     resumed_rows: Array | None = None
+    midlines = Midlines()
     if resume:
         resume.check(settings)
         if (resume.controller, resume.parameters) == (name, msgspec.to_builtins(parameter_values)):
-            resumed_rows = resume.track
+            resumed_rows, midlines = resume.track, resume.midlines
             if len(resumed_rows) >= ticks:
                 raise CheckpointError(
-                    f"{resume.path}: the checkpoint is of {resume.time:.2f} s already; give more "
-                    "--seconds"
+                    f"{resume.path}: this swim is {resume.time:.2f} s long already; give a longer "
+                    "--for"
                 )
+        elif file and file.path.exists() and file.path.samefile(resume.path):
+            raise CheckpointError(
+                f"{resume.path}: this swim is of another controller or of other parameters; give "
+                "another file to --to"
+            )
     with VirtualRun(config, publisher or EncodingPublisher()) as run:
         fish = run.swimmer
         assert fish
@@ -129,12 +139,13 @@ def swim(
         fish.compile()
         on_start(run)
         run.loop.set_controller(name, controller)
-        next_checkpoint = fish.fish.time + keeping.every if keeping else float("inf")
+        next_write = fish.fish.time + file.every if file else math.inf
         start_time = time.perf_counter()
         mean_speed = _Speed(fish, first - resumed_ticks)
 
-        def write_checkpoint() -> None:
-            writer.write(fish, track, settings, name, parameter_values)
+        def write_file() -> None:
+            command = file.command if file else ()
+            writer.write(fish, track, midlines, settings, name, parameter_values, command)
 
         while len(track) < ticks:
             command = run.loop.applied
@@ -142,16 +153,18 @@ def swim(
             if fish.trouble:
                 break
             track.add(fish, command)
+            if file:
+                midlines.add(fish)
             watch(fish)
             progress(len(track) * config.tick, mean_speed.mean())
-            if fish.fish.time >= next_checkpoint - 1e-9:
-                write_checkpoint()
-                next_checkpoint += keeping.every if keeping else 0.0
+            if file and fish.fish.time >= next_write - 1e-9:
+                write_file()
+                next_write += file.every
             if ended():
                 break
         elapsed = time.perf_counter() - start_time
         if not fish.trouble and len(track) > resumed_ticks:
-            write_checkpoint()
+            write_file()
         loop = run.loop
         report = None
         if len(track) > first + 1:
@@ -184,23 +197,23 @@ def settings_of(config: Config) -> dict[str, Any]:
     return settings
 
 
-class _CheckpointWriter:
-    """A writer of checkpoints; an error does not end the swim."""
+class _FileWriter:
+    """A writer of the file of a swim; an error does not end the swim."""
 
-    def __init__(self, keeping: CheckpointSettings | None, lost: Callable[[OSError], None]) -> None:
-        self._keeping, self._lost = keeping, lost
+    def __init__(self, file: SwimFile | None, lost: Callable[[OSError], None]) -> None:
+        self._file, self._lost = file, lost
         self._has_reported = False
         self.time: float | None = None
-        """Time of the latest written checkpoint [s]."""
+        """Time at which the file was last written [s]."""
         self.error: OSError | None = None
-        """Error of writing the latest checkpoint; None if it was written."""
+        """Error of the last write; None if the file was written."""
 
-    def write(self, fish: Swimmer, *others: Any) -> None:
-        """Write a checkpoint, if requested; others: further arguments of `checkpoint.save`."""
-        if not self._keeping:
+    def write(self, fish: Swimmer, *content: Any) -> None:
+        """Write the file, if there is one; content: further arguments of `checkpoint.save`."""
+        if not self._file:
             return
         try:
-            checkpoint.save(self._keeping.path, fish, *others)
+            checkpoint.save(self._file.path, fish, *content)
         except OSError as error:
             self.error = error
             if not self._has_reported:

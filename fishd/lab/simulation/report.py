@@ -113,7 +113,7 @@ def check_whole_beat(report: Report, seconds: float, settle: float) -> None:
     if report.reversals and not report.frequency:
         raise ParameterError(
             f"{report.controller}: no whole tail beat in the {seconds - settle:g} s after the "
-            f"{settle:g} s of --settle, so the mean thrust is undefined; give more --seconds"
+            f"{settle:g} s of --settle, so the mean thrust is undefined; give a longer --for"
         )
 
 

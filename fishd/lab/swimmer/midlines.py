@@ -1,20 +1,15 @@
 """Motion of the body in a tail beat: midlines relative to the mean, and their amplitudes."""
 
-import io
 import os
-import zipfile
 from collections.abc import Iterator
 from itertools import pairwise
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.core import files
 from fishd.core.errors import FishdError
 from fishd.lab.drawing import BLACK, GREY, open_figure
-from fishd.virtual.swimmer.track import MAX_FILE_BYTES
 
 Array = NDArray[np.float64]
 PHASE_COUNT = 64
@@ -43,30 +38,6 @@ class Envelope(NamedTuple):
     """Amplitude of each position across the axis; shape (beats, slices)."""
     periods: Array
     """Periods of the beats [s]; shape (beats,)."""
-
-
-def read_midlines(path: Path) -> tuple[Array, Array]:
-    """Read the times, shape (n,) [s], and the midlines, shape (n, points, 2) [m].
-
-    path: file written by `fishctl simulate --save`
-    Raises `FishdError`.
-    """
-    needed = "a swim that fishctl simulate --save FILE.npz has written"
-    try:
-        content = files.read(path, MAX_FILE_BYTES, "a swim")
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            time, lines = (
-                np.asarray(arrays[name], np.float64) for name in ("midline_time", "midlines")
-            )
-    except files.FileProblem as problem:
-        raise FishdError(f"{path}: {problem}; {needed} is needed") from None
-    except KeyError:
-        raise FishdError(f"{path}: it contains no midlines; {needed} is needed") from None
-    except (ValueError, TypeError, EOFError, OSError, zipfile.BadZipFile, AttributeError):
-        raise FishdError(f"{path}: not an NPZ file of arrays; {needed} is needed") from None
-    if lines.ndim != 3 or lines.shape[1] < 10 or lines.shape[2] != 2 or len(time) != len(lines):
-        raise FishdError(f"{path}: its midlines have the wrong shape; {needed} is needed")
-    return time, lines
 
 
 def compute_envelope(time: Array, midlines: Array, since: float = 0.0) -> Envelope:

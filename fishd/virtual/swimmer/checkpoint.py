@@ -1,12 +1,12 @@
-"""Checkpoints, which store the complete state of a swim in one NPZ file.
+"""The NPZ file of a swim: its track, its midlines, and the state from which it resumes.
 
-Body, water, time, track and command continue exactly. The controller is not stored: it restarts
-from the current command.
+Body, water, time and command continue exactly. The controller is not stored: it restarts from the
+current command.
 """
 
 import io
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,17 +17,20 @@ from msgspec import Struct
 from fishd.core import files
 from fishd.core.errors import FishdError
 from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.midlines import POINT_COUNT, Midlines
 from fishd.virtual.swimmer.robot import Swimmer
 from fishd.virtual.swimmer.track import COLUMNS, MAX_FILE_BYTES, Track
 
-FORMAT = 2
+FORMAT = 3
 _STATE = "state."
+MIDLINE_ARRAYS = ("midline_time", "midlines")
 
 
 class _About(Struct):
     settings: dict[str, Any]
     controller: str
     parameters: dict[str, Any]
+    command: list[str]
 
 
 class CheckpointError(FishdError):
@@ -42,9 +45,13 @@ class Checkpoint(NamedTuple):
     """Settings that the motion depends on, as in the configuration."""
     controller: str
     parameters: dict[str, Any]
+    command: list[str]
+    """Arguments of `fishctl simulate` that a resumed swim takes over."""
     state: dict[str, Array]
     track: Array
     """Rows up to the checkpoint, shape (ticks, columns)."""
+    midlines: Midlines
+    """Midlines up to the checkpoint."""
 
     @property
     def time(self) -> float:
@@ -68,7 +75,7 @@ class Checkpoint(NamedTuple):
         time, end = int(self.state["steps"]) * step, self.track[-1, 0]
         if abs(time - end) > 0.5 * step:
             raise _damaged(
-                self.path, "track", f"ends at {end:.6g} s, and the fish is at {time:.6g} s"
+                self.path, "time", f"ends at {end:.6g} s, and the fish is at {time:.6g} s"
             )
         swimmer.restore(self.state)
 
@@ -100,22 +107,25 @@ def save(
     path: Path,
     swimmer: Swimmer,
     track: Track,
+    midlines: Midlines,
     settings: Mapping[str, Any],
     controller: str,
     parameters: Mapping[str, Any],
+    command: Sequence[str] = (),
 ) -> None:
-    """Write a checkpoint atomically; raises OSError."""
+    """Write the file of a swim atomically; raises OSError."""
     about = {
         "format": FORMAT,
         "columns": list(COLUMNS),
         "settings": settings,
         "controller": controller,
         "parameters": parameters,
+        "command": command,
     }
     content = io.BytesIO()
     arrays: dict[str, Any] = {_STATE + name: array for name, array in swimmer.state().items()}
-    about_text = np.array(msgspec.json.encode(about).decode())
-    np.savez(content, about=about_text, track=track.rows(), **arrays)
+    arrays |= {**track.columns(), **dict(zip(MIDLINE_ARRAYS, midlines.arrays(), strict=True))}
+    np.savez(content, about=np.array(msgspec.json.encode(about).decode()), **arrays)
     files.write_atomically(path, content.getvalue())
 
 
@@ -145,22 +155,28 @@ def load(path: Path) -> Checkpoint:
                 f"{path}: it is of another version of fishd, whose track has other columns"
             )
         about = msgspec.convert(about, _About)
-        track = arrays.pop("track")
+        rows = [arrays.pop(name) for name in COLUMNS]
+        midline_time, midlines = (arrays.pop(name) for name in MIDLINE_ARRAYS)
     except CheckpointError:
         raise
     except Exception:  # NumPy and zipfile raise many kinds of errors for other files
-        raise CheckpointError(f"{path}: it is not a checkpoint of a swimmer") from None
-    if track.ndim != 2 or track.shape[1] != len(COLUMNS) or not len(track):
-        raise _damaged(path, "track", f"is of shape {track.shape}, not a row for each tick")
-    if track.dtype != np.float64 or not np.isfinite(track).all():
-        raise _damaged(path, "track", "has values that are not finite numbers")
+        raise CheckpointError(f"{path}: it is not a swim of 'fishctl simulate --to'") from None
+    for name, row in zip(COLUMNS, rows, strict=True):
+        if row.shape != (len(rows[0]),) or not len(row):
+            raise _damaged(path, name, f"is of shape {row.shape}, not a value for each tick")
+        if row.dtype != np.float64 or not np.isfinite(row).all():
+            raise _damaged(path, name, "has values that are not finite numbers")
+    if midlines.shape != (*midline_time.shape, POINT_COUNT, 2) or midline_time.ndim != 1:
+        raise _damaged(path, "midlines", f"is of shape {midlines.shape}, not a midline a tick")
     return Checkpoint(
         path=path,
         settings=about.settings,
         controller=about.controller,
         parameters=about.parameters,
+        command=about.command,
         state={name.removeprefix(_STATE): array for name, array in arrays.items()},
-        track=track,
+        track=np.stack(rows, axis=1),
+        midlines=Midlines(midline_time, midlines),
     )
 
 

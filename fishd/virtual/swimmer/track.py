@@ -1,12 +1,9 @@
 """Track of a swim, with a row of numbers for each tick, and its files."""
 
-import io
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fishd.core.errors import ParameterError
 from fishd.core.files import write_atomically
@@ -109,19 +106,8 @@ def check_name(path: Path) -> None:
         raise ParameterError(f"{path}: there is no folder {path.parent}")
 
 
-def save(
-    track: Track, path: Path, others: Mapping[str, NDArray[np.floating]] | None = None
-) -> None:
-    """Write a CSV file with a header, or an NPZ file with an array for each column.
-
-    others: additional arrays for an NPZ file
-    Raises OSError.
-    """
-    if path.suffix == ".csv":
-        lines = [",".join(COLUMNS)]
-        lines += [",".join(f"{value:.9g}" for value in row) for row in track.rows().tolist()]
-        write_atomically(path, "\n".join(lines) + "\n")
-        return
-    content, arrays = io.BytesIO(), cast(dict[str, Any], track.columns() | dict(others or {}))
-    np.savez_compressed(content, **arrays)
-    write_atomically(path, content.getvalue())
+def save_table(track: Track, path: Path) -> None:
+    """Write a CSV file with a header; raises OSError."""
+    lines = [",".join(COLUMNS)]
+    lines += [",".join(f"{value:.9g}" for value in row) for row in track.rows().tolist()]
+    write_atomically(path, "\n".join(lines) + "\n")

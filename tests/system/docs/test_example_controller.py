@@ -76,8 +76,8 @@ def test_a_bad_parameter_is_one_line(option: str, complaint: str) -> None:
 
 def test_the_page_about_it_shows_what_a_run_prints(site: Path) -> None:
     page = (ROOT / "docs" / "how-to" / "writing-a-controller.md").read_text(encoding="utf-8")
-    shown = page.partition("$ fishctl simulate chirp --seconds 130\n")[2].partition("timing ")[0]
-    swum = fishctl(site, "simulate", "chirp", "--seconds", "130").stdout
+    shown = page.partition("$ fishctl simulate chirp --for 130\n")[2].partition("timing ")[0]
+    swum = fishctl(site, "simulate", "chirp", "--for", "130").stdout
     assert shown == swum.split("timing ")[0]
 
 

@@ -12,7 +12,7 @@ from rigs.processes import fishctl, one_line
 def swum(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with the files of a swim of 0.8 s."""
     folder = tmp_path_factory.mktemp("swum")
-    files = ["--checkpoint", "end.npz", "--save", "swim.npz", "--film", "wake.webp"]
+    files = ["--to", "swim.npz", "--film", "wake.webp"]
     paths = [str(folder / word) if "." in word else word for word in files]
     lengths = ("--seconds", "0.8", "--settle", "0.2")
     done = fishctl("simulate", "square", "--frequency", "4", *lengths, *OPTIONS, *paths)
@@ -28,40 +28,46 @@ def test_a_film_is_painted_while_it_swims(swum: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_wake_is_drawn_from_a_checkpoint(swum: Path, tmp_path: Path) -> None:
-    words = ("swimmer", "wake", str(swum / "end.npz"), "--to", str(tmp_path))
+def test_the_wake_is_drawn_from_a_swim(
+    swum: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    words = ("swimmer", "wake", str(swum / "swim.npz"))
     done = fishctl(*words)
     assert (done.returncode, done.stderr) == (0, "")
-    names = ["end-vorticity.png", "end-speed.png"]
-    assert done.stdout.split() == [str(tmp_path / name) for name in names]
-    assert all((tmp_path / name).stat().st_size > 20_000 for name in names)
+    assert done.stdout == "swim-vorticity.png\n"
+    picture = tmp_path / "swim-vorticity.png"
+    assert picture.stat().st_size > 20_000
+    words = (*words, "--plot", str(picture))
     assert "already exists; use --force to replace it" in one_line(fishctl(*words))
     assert fishctl(*words, "--force", "--field", "pressure", "--limit", "5").returncode == 0
 
 
 @pytest.mark.slow
 def test_midlines_are_drawn_from_a_saved_swim(swum: Path, tmp_path: Path) -> None:
-    words = ("swimmer", "midlines", str(swum / "swim.npz"), "--to", str(tmp_path))
-    done = fishctl(*words, "--settle", "0.2", "--form", "svg")
+    words = ("swimmer", "midlines", str(swum / "swim.npz"), "--plot")
+    done = fishctl(*words, str(tmp_path / "beat.svg"), "--settle", "0.2")
     assert (done.returncode, done.stderr) == (0, "")
-    assert (tmp_path / "swim-midlines.svg").stat().st_size > 10_000
+    assert (tmp_path / "beat.svg").stat().st_size > 10_000
     assert " Hz, tail ±0." in done.stdout
-    assert "does not complete a beat" in one_line(fishctl(*words, "--settle", "0.65"))
+    late = (str(tmp_path / "late.svg"), "--settle", "0.65")
+    assert "does not complete a beat" in one_line(fishctl(*words, *late))
 
 
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["wake", "swim.npz"], "it is not a checkpoint of a swimmer"),
+        (["wake", "wake.webp"], "it is not a swim of 'fishctl simulate --to'"),
         (["wake", "none.npz"], "no such file"),
-        (["wake", "end.npz", "--limit", "5"], "--limit applies to one field"),
-        (["midlines", "end.npz"], "it contains no midlines"),
-        (["midlines", "wake.webp"], "not an NPZ file"),
+        (["midlines", "wake.webp"], "it is not a swim of 'fishctl simulate --to'"),
     ],
 )
-def test_nothing_to_draw_is_told(swum: Path, tmp_path: Path, words: list[str], named: str) -> None:
+def test_nothing_to_draw_is_told(
+    swum: Path, tmp_path: Path, words: list[str], named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     verb, file, *rest = words
-    line = one_line(fishctl("swimmer", verb, str(swum / file), *rest, "--to", str(tmp_path)))
+    line = one_line(fishctl("swimmer", verb, str(swum / file), *rest))
     assert named in line
     assert not list(tmp_path.iterdir())
 

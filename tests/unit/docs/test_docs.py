@@ -14,6 +14,7 @@ from fishd.camera.main import camera
 from fishd.cli.doctor import checks
 from fishd.cli.doctor.base import Context
 from fishd.cli.main import fishctl
+from fishd.cli.options import ControllerGroup
 from fishd.config import Config, keys, load
 from fishd.controllers.policy import checksum, file, library, operators
 from fishd.controllers.policy.card import CARD_KEY, FORMAT, Card, Provenance
@@ -64,6 +65,9 @@ def find_mistake(command: click.Command, words: list[str]) -> str | None:
     flags = {"--help": True, "--version": True} | flags_of(command)
     rest = iter(words)
     for word in rest:
+        if word == "--resume" and isinstance(command, ControllerGroup):  # its controller is kept
+            command = command.get_command(context, "square") or command
+            flags |= flags_of(command)
         if word.startswith("--"):
             name, equals, _ = word.partition("=")
             if name not in flags:
