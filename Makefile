@@ -86,7 +86,19 @@ $(VENV)/installed-docs: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --constraint tools/constraints.txt --editable '.[docs]'
 	@touch $@
 
-.PHONY: release packages
+.PHONY: release packages lock
+
+# Extras of which a robot may have all; both packages named RPi are locked, one of them is installed.
+LOCKED := pi record policy camera window lab rpi-gpio rpi-lgpio
+# UPGRADE=--upgrade takes the newest versions; without it, only what must change changes.
+lock: $(VENV)/installed-dev  ## Write tools/locks: versions and hashes of the packages of a robot
+	@for python in 3.11 3.13; do for machine in x86_64 aarch64; do \
+	  $(BIN)/uv pip compile --quiet --no-config --generate-hashes --no-annotate $(UPGRADE) \
+	    --custom-compile-command "make lock" --python-version $$python \
+	    --python-platform $$machine-manylinux_2_36 $(LOCKED:%=--extra %) pyproject.toml \
+	    --output-file tools/locks/python$$python.txt || exit 1; \
+	done; done   # the second finds the first; their hashes are those of all machines
+
 
 release: $(VENV)/installed-dev  ## Build, check and try the packages of a version, and name the next steps
 	$(BIN)/python tools/release.py

@@ -7,8 +7,10 @@
 #              button and status light. Where it cannot be had, all else is installed, and it says so
 # FISHD_CAMERA yes: install what fishd-camera needs, too; once it is there, it is renewed
 # FISHD_WINDOW yes: install what the page fishd-window needs, too; once it is there, it is renewed
+# FISHD_LOCK   no: install the newest packages that fishd permits, instead of those of tools/locks
 # DESTDIR      a folder to install into, without touching the running system
-# pip's own variables work too: PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER installs without a network.
+# pip's own variables work too: PIP_NO_INDEX=1 PIP_FIND_LINKS=FOLDER installs without a network, and
+# without the lock, as wheels that were built elsewhere have other hashes.
 set -euo pipefail
 umask 022
 checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -87,10 +89,12 @@ pip() { "$venv/bin/python" -I -m pip --quiet --disable-pip-version-check "$@"; }
 # The same, with its complaints in a file, for `why`.
 try_pip() { pip "$@" 2>"$workspace/pip.log"; }
 
-# What pip's complaints amount to: build, network, space or other.
+# What pip's complaints amount to: hash, build, network, space or other.
 why() {
   local log=$1
-  if grep -qE 'Failed building wheel|Building wheel for .* did not run|metadata-generation-failed' "$log"; then
+  if grep -q 'DO NOT MATCH THE HASHES' "$log"; then
+    echo hash
+  elif grep -qE 'Failed building wheel|Building wheel for .* did not run|metadata-generation-failed' "$log"; then
     echo build
   elif grep -qE 'connection broken|Connection(Pool|Error| refused| reset)|name resolution|timed out|(Proxy|SSL|HTTP)Error|Network is unreachable' "$log"; then
     echo network
@@ -107,6 +111,7 @@ why() {
 mend() {
   case $(why "$workspace/pip.log") in
     build) echo "a package has no wheel for this Python and could not be built: sudo apt install $1" ;;
+    hash) echo "a package is another file than that of tools/locks: do not trust it; FISHD_LOCK=no takes it" ;;
     network) echo "the network failed, not fishd: check it" ;;
     space) echo "the disk is full: make room" ;;
     other) echo "see what pip says" ;;
@@ -116,6 +121,40 @@ mend() {
 give_up() {
   cat "$workspace/pip.log" >&2
   fail "$1; $(mend "gcc python3-dev"), then run this again"
+}
+
+# Writes what these requirements need into locked.txt, with the versions and hashes of the lock of this
+# Python; nothing, where there is none. pip compares hashes only in a list of all packages.
+lock_packages() {
+  local version lock
+  version=$("$venv/bin/python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+  lock=$checkout/tools/locks/python$version.txt
+  : >"$workspace/locked.txt"
+  [[ -e $lock && ${FISHD_LOCK:-} != no && ${PIP_NO_INDEX:-0} == 0 ]] || return 0
+  [[ $(about_python "$PYTHON") == "64 linux-"* ]] || return 0
+  sed -nE 's/^([^ #]+==[^ ]+).*/\1/p' "$lock" >"$workspace/versions.txt"
+  try_pip install --dry-run --ignore-installed --constraint "$workspace/versions.txt" \
+    --report "$workspace/report.json" "$@" || return
+  "$venv/bin/python" -I - "$workspace/report.json" "$lock" >"$workspace/locked.txt" <<'PYTHON'
+import json, re, sys
+
+with open(sys.argv[1]) as report, open(sys.argv[2]) as lock:
+    packages = {package["metadata"]["name"] for package in json.load(report)["install"]}
+    entries = re.split(r"^(?=\w)", lock.read(), flags=re.MULTILINE)
+names = {re.sub(r"[-_.]+", "-", name).lower() for name in packages}
+print(*(entry for entry in entries if entry.partition("==")[0] in names), sep="", end="")
+PYTHON
+  step "packages: versions and hashes are those of tools/locks/python$version.txt"
+}
+
+# With all hashes where locked.txt lists packages, else what these requirements resolve to.
+pip_locked() {
+  local action=("${@:1:$#-1}")
+  if [[ -s $workspace/locked.txt ]]; then
+    try_pip "${action[@]}" --require-hashes --no-deps --requirement "$workspace/locked.txt"
+  else
+    try_pip "$@"
+  fi
 }
 
 install_package() {
@@ -128,7 +167,8 @@ install_package() {
     try_pip wheel --no-deps --wheel-dir "$workspace" "$checkout" || give_up "building fishd failed"
     wheel=$(echo "$workspace"/fishd-*.whl)
   fi
-  try_pip install "${wheel}[$extras]" || give_up "installing fishd's packages failed"
+  { lock_packages "${wheel}[$extras]" && pip_locked install "${wheel}[$extras]"; } ||
+    give_up "installing fishd's packages failed"
   pip install --force-reinstall --no-deps "$wheel" # the same version may have other contents
   step "fishd $("$venv/bin/python" -I -c 'import fishd; print(fishd.__version__)') with the extras $extras"
 }
@@ -157,7 +197,7 @@ install_gpio() {
   fi
   if [[ $extra == rpi-lgpio ]]; then packages="swig $packages"; fi
   # PYPI: lgpio has its C library in its sources, and builds that instead of asking for the system's.
-  if ! PYPI=1 try_pip wheel --wheel-dir "$workspace/gpio" "$wanted"; then
+  if ! { lock_packages "$wanted" && PYPI=1 pip_locked wheel --wheel-dir "$workspace/gpio" "$wanted"; }; then
     grep -E '^ERROR|error:' "$workspace/pip.log" | tail -n 3 | sed 's/^ */  pip: /' || true
     step "E-stop button and status light are NOT available: no $extra. All else is installed."
     step "To have them: $(mend "$packages"); then: sudo make install-pi${FISHD_GPIO:+ FISHD_GPIO=$extra}"

@@ -303,6 +303,17 @@ def test_a_network_that_fails_is_not_taken_for_a_missing_compiler(pi: Pi, tmp_pa
         assert "apt install" not in said
 
 
+def test_a_package_with_another_hash_than_the_locked_one_is_refused(pi: Pi, tmp_path: Path) -> None:
+    wheel_of(tmp_path, "rpi_lgpio")  # its version is the locked one
+    options = {"PIP_NO_INDEX": "0", "PIP_INDEX_URL": tmp_path.as_uri()}
+    options |= {"PIP_EXTRA_INDEX_URL": "", "PIP_CONFIG_FILE": os.devnull}
+    options |= {"PIP_FIND_LINKS": str(tmp_path)}
+    lines = "\n".join(pi.run("install_gpio", "rpi-lgpio", **options))
+    assert "a package is another file than that of tools/locks: do not trust it" in lines
+    lines = "\n".join(pi.run("install_gpio", "rpi-lgpio", FISHD_LOCK="no", **options))
+    assert "rpi-lgpio: installed" in lines
+
+
 @pytest.mark.parametrize(
     ("bits", "platform", "extras"),
     [
