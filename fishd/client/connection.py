@@ -105,6 +105,13 @@ class Connection:
             "or is overloaded; 'fishctl release --config FILE' stops the servo without it"
         )
 
+    def lost_command_error(self, op: str) -> NoDaemon:
+        """Return the error for a command whose connection was lost before the answer."""
+        return NoDaemon(
+            f"the connection to {self.endpoint} was lost before the answer to {op}: it is not "
+            "known whether fishd has carried it out; 'fishctl status' shows the state of the fish"
+        )
+
     def _listener(self) -> Listener | None:
         """Return the listener of a Unix socket, None if unknown; raise PermissionError."""
         return find_listener(self._path) if self._path else None

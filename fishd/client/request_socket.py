@@ -34,15 +34,19 @@ class RequestSocket(Dealer[bytes | FishError]):
             self.send(request)
         return is_ready
 
-    def receive_by(self, deadline: float, connection: int | None = None) -> bytes:
+    def is_connected(self, connection: int) -> bool:
+        """Return whether the connection of this number still exists."""
+        return self._ready and self.connections == connection
+
+    def receive_by(self, deadline: float, connection: int) -> bytes:
         """Return a reply; empty if none has come by `deadline` [s, monotonic].
 
-        connection: number of the connection of the request; return empty on the next one
+        connection: number of the connection of the request; return empty once it is lost
         Raise `FishError` for an invalid message.
         """
         while not self.state()[1]:
-            is_new = connection is not None and connection != self.connections
-            if is_new or not self._wait_until(deadline):
+            self._check_interrupted()
+            if not self.is_connected(connection) or not self._wait_until(deadline):
                 return b""
         reply = self._inbox.popleft()
         if isinstance(reply, FishError):
@@ -56,10 +60,13 @@ class RequestSocket(Dealer[bytes | FishError]):
             with suppress(OSError):
                 connected.shutdown(socket.SHUT_RDWR)
 
-    def _wait_until(self, deadline: float) -> bool:
-        """Wait until `state` may have changed; return False after the deadline [s]."""
+    def _check_interrupted(self) -> None:
         if self._interrupted:
             raise FishError("the client was closed during a request")
+
+    def _wait_until(self, deadline: float) -> bool:
+        """Wait until `state` may have changed; return False after the deadline [s]."""
+        self._check_interrupted()
         remaining = deadline - time.monotonic()
         if remaining > 0.0:
             self.wait(remaining)

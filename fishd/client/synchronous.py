@@ -39,8 +39,8 @@ T = TypeVar("T")
 class Fish(Connection):
     """Connection to a daemon; use it as a context manager, from one thread.
 
-    Every request raises `NoDaemon` if no answer comes in time, and `Refused` if the daemon answers
-    with an error.
+    Every request raises `NoDaemon` if no answer comes in time or the connection is lost before, and
+    `Refused` if the daemon answers with an error.
     """
 
     def __init__(
@@ -278,16 +278,17 @@ class Fish(Connection):
         for deadline in answer_deadlines(self.timeout + patience, again=patience >= 0.0):
             while sent_on is not None or connection.send_by(deadline, request):
                 sent_on = sent_on or connection.connections
-                is_read = op in READ_OPERATIONS
-                reply = connection.receive_by(deadline, sent_on if is_read else None)
+                reply = connection.receive_by(deadline, sent_on)
                 if reply:
                     result = self.result((reply,), identity, kind)
                     if result is not None:
                         return result
-                elif is_read and sent_on != connection.connections:
+                elif connection.is_connected(sent_on):
+                    break
+                elif op in READ_OPERATIONS:
                     sent_on = None
                 else:
-                    break
+                    raise self.lost_command_error(op)
         raise self.no_answer_error(patience)
 
     def _subscribe(self, kinds: dict[bytes, type[T]], *, forever: bool = False) -> Iterator[T]:

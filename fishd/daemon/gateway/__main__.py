@@ -52,6 +52,7 @@ def main(number: str) -> int:
                 try:
                     pid = os.fork()
                 except OSError as error:
+                    pid = 0
                     outcome = f"it cannot be started: {error.strerror}"
                 else:
                     if not pid:
@@ -67,7 +68,7 @@ def main(number: str) -> int:
                 if former is not None:
                     status = os.waitstatus_to_exitcode(os.waitpid(former, 0)[1])
                     outcome = outcome or f"its process ended with status {status}"
-                connection.send(link.started(kind, outcome))
+                connection.send(link.started(kind, pid, outcome))
             else:
                 return 0
     except ConnectionError:  # fishd was killed

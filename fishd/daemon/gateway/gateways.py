@@ -1,10 +1,12 @@
 """Gateways from the side of fishd: links to processes that are restarted when they end or hang.
 
 Each process answers heartbeats over its link. A gateway that does not is killed by its parent, the
-fork server, and replaced; a fork server that does not is killed together with its gateways.
+fork server, and replaced; a fork server that does not is killed together with its gateways. A
+process that does not answer because it gets no processor time is kept.
 """
 
 import asyncio
+import logging
 import os
 import select
 import socket
@@ -34,10 +36,13 @@ from fishd.daemon.gateway.link import (
     STARTED,
     TELEMETRY,
     join_frames,
-    kind_and_outcome,
     pair,
+    read_started,
     start,
 )
+from fishd.daemon.gateway.starvation import Thread, is_starved, read_threads
+
+log = logging.getLogger(__name__)
 
 BEAT_S = 0.08
 """Time between two heartbeats [s]."""
@@ -47,6 +52,11 @@ MAX_STARTING = 25
 """Longest start of a gateway, in heartbeats; after that it counts as hung."""
 MAX_SERVER_STARTING = 750
 """Longest start of the fork server, in heartbeats: a busy Pi may take long to load Python."""
+MAX_STARVED = 125
+"""Number of unanswered heartbeats in a row from which on a process is killed even if it got no
+processor time."""
+ANSWER_FRACTION = 0.25
+"""Fraction of the permitted time after which a process that computes could have answered."""
 MIN_PERIOD_S = 0.05
 """Shortest time between two starts of a gateway [s]."""
 MIN_FAILED_PERIOD_S = 0.25
@@ -69,34 +79,64 @@ _ENVIRONMENT = {"MALLOC_ARENA_MAX": "2", "MALLOC_TRIM_THRESHOLD_": "1048576"}
 class _Peer:
     """Process at the other end of a link; only for the thread of the asyncio loop."""
 
-    def __init__(self, max_unanswered: int, max_starting: int) -> None:
+    def __init__(self, name: str, max_unanswered: int, max_starting: int) -> None:
+        self._name = name
         self._events = asyncio.get_running_loop()
         self._link: socket.socket | None = None
         self._serves = False
         self._unanswered = 0
         """Heartbeats since the latest sign of life."""
         self._max_unanswered, self._max_starting = max_unanswered, max_starting
+        self._threads: list[Thread] = []
+        """Threads of the process when an answer was first missed."""
+        self._was_starved = False
         self._enabled = True
         self._reading = False
 
     def beat(self) -> None:
-        """Send a heartbeat, or close the link to a process that left too many unanswered."""
+        """Send a heartbeat, or close the link to a process that hangs."""
         if self._link is None or not self._reading:  # an answer may be waiting unread
             return
-        if self._unanswered >= (self._max_unanswered if self._serves else self._max_starting):
+        permitted = self._max_unanswered if self._serves else self._max_starting
+        if self._unanswered == 1:
+            self._threads = read_threads(self._pid())
+        elif self._unanswered >= permitted and self._hangs(permitted):
             self._handle_loss(f"it left {self._unanswered} heartbeats unanswered")
             return
         self._unanswered += 1
-        if self._serves:
+        if self._serves and self._unanswered <= permitted:
             with suppress(
                 OSError
             ):  # the link is full, or a read will notice the end of the process
                 self._link.send(PING)
 
+    def _hangs(self, permitted: int) -> bool:
+        """Return whether the process had a chance to answer; log once that it had none."""
+        assert self._link
+        if self._unanswered >= max(permitted, MAX_STARVED):
+            return True
+        answer_s = ANSWER_FRACTION * permitted * BEAT_S
+        if not is_starved(self._threads, read_threads(self._pid()), answer_s):
+            # It may have answered just now, before it fell asleep.
+            return not select.select([self._link], [], [], 0.0)[0]
+        if not self._was_starved:
+            self._was_starved = True
+            log.warning(
+                "%s gets no processor time on this busy machine; fishd waits for it for up to %g s",
+                self._name,
+                MAX_STARVED * BEAT_S,
+            )
+        return False
+
+    def _pid(self) -> int:
+        """Return the number of the process that is to answer."""
+        raise NotImplementedError
+
     def _connect(self, ours: socket.socket) -> None:
         self._link = ours
         self._serves = False
         self._unanswered = 0
+        self._was_starved = False
         self._listen(self._enabled)
 
     def _read_message(self) -> None:
@@ -147,7 +187,9 @@ class ForkServer(_Peer):
 
     def __init__(self) -> None:
         """Start the process; must be called in a running asyncio loop. Raises `StartupError`."""
-        super().__init__(MAX_UNANSWERED[TELEMETRY], MAX_SERVER_STARTING)
+        super().__init__(
+            "the fork server of the gateways", MAX_UNANSWERED[TELEMETRY], MAX_SERVER_STARTING
+        )
         self.gateways: dict[str, Gateway] = {}
         self._timer: asyncio.TimerHandle | None = None
         try:
@@ -194,8 +236,11 @@ class ForkServer(_Peer):
 
     def _take(self, message: bytes) -> None:
         if message.startswith(STARTED):
-            kind, outcome = kind_and_outcome(message)
-            self.gateways[kind].started(outcome)
+            kind, pid, outcome = read_started(message)
+            self.gateways[kind].started(pid, outcome)
+
+    def _pid(self) -> int:
+        return self._process.pid
 
     def _handle_loss(self, why: str) -> None:
         """Kill the process, which also ends its gateways, and start it again later."""
@@ -229,7 +274,7 @@ class Gateway(_Peer):
         listener: socket that clients connect to; it stays open during restarts of the process
         address: ZeroMQ address of the listener
         """
-        super().__init__(MAX_UNANSWERED[kind], MAX_STARTING)
+        super().__init__(f"the gateway of {kind}", MAX_UNANSWERED[kind], MAX_STARTING)
         self.kind = kind
         self.address = address
         self.take: Callable[[bytes], None] = lambda message: None
@@ -244,6 +289,8 @@ class Gateway(_Peer):
         self._server = server
         self._enabled = kind == TELEMETRY  # it sends only that it serves, and why it ends
         self._why = ""
+        self._number = 0
+        """Number of the process; 0 until the fork server has started it."""
         self._notice = ""
         """Limit that the process says it has exceeded."""
         self._started_at = 0.0
@@ -310,8 +357,10 @@ class Gateway(_Peer):
         if self._serves or self._server.serves:
             super().beat()
 
-    def started(self, outcome: str) -> None:
-        """Store how the process before this one ended."""
+    def started(self, pid: int, outcome: str) -> None:
+        """Store the number of the process, and how the one before it ended."""
+        self._number = pid
+        self._threads = read_threads(pid)
         self._why = self._why or outcome
 
     def server_lost(self, why: str) -> None:
@@ -327,7 +376,11 @@ class Gateway(_Peer):
             self._server.fork(self.kind, self.address, theirs, self._listener)
             stack.pop_all()
         self._started_at = self._events.time()
+        self._number = 0
         self._connect(ours)
+
+    def _pid(self) -> int:
+        return self._number or self._server._pid()
 
     def _take(self, message: bytes) -> None:
         if message.startswith(NOTICE):

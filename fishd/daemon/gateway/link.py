@@ -39,17 +39,19 @@ def kind_and_address(message: bytes) -> tuple[str, str]:
     return kind, address
 
 
-def started(kind: str, outcome: str) -> bytes:
+def started(kind: str, pid: int, outcome: str) -> bytes:
     """Return the answer to a request for a gateway.
 
+    pid: number of its process; 0 if it could not be started
     outcome: text on how the previous gateway ended, or why this one could not be started
     """
-    return STARTED + f"{kind} {outcome}".encode()
+    return STARTED + f"{kind} {pid} {outcome}".encode()
 
 
-def kind_and_outcome(message: bytes) -> tuple[str, str]:
-    """Return the kind and the outcome in the answer to a request for a gateway."""
-    return kind_and_address(message)
+def read_started(message: bytes) -> tuple[str, int, str]:
+    """Return kind, number of the process and outcome in the answer to a request for a gateway."""
+    kind, pid, outcome = message[1:].decode().split(" ", 2)
+    return kind, int(pid), outcome
 
 
 def join_frames(topic: bytes, payload: bytes) -> bytes:

@@ -127,6 +127,59 @@ def test_a_hanging_gateway_is_replaced_and_costs_no_tick(shared_daemon: Daemon, 
     assert after.mode == "running"
 
 
+def test_a_gateway_that_computes_without_end_is_replaced(tmp_path: Path) -> None:
+    spin = tmp_path / "spin"
+    code = f"""
+import os, sys
+def patch():
+    router = sys.modules["fishd.daemon.gateway.router"].Router
+    pass_on = router._pass_on
+    def spin(self):
+        while os.path.exists({str(spin)!r}):
+            pass
+        pass_on(self)
+    router._pass_on = spin
+if "fishd.daemon.gateway" in sys.orig_argv:
+    os.register_at_fork(after_in_child=patch)
+"""
+    (tmp_path / "sitecustomize.py").write_text(code)
+    with running(tmp_path, under=("env", f"PYTHONPATH={tmp_path}:{ROOT}")) as daemon:
+        spinning = both_gateways(daemon)["control"]
+        spin.touch()
+        wait_until(lambda: gateways(daemon).get("control", spinning) != spinning)
+        assert gone(spinning)
+        spin.unlink()
+        wait_until(lambda: restarts(daemon, "control") >= 1)
+        _, _, errors = daemon.end()
+    assert re.search(r"the gateway of control was started again: it left \d+ heartbeats", errors)
+
+
+def test_a_starved_gateway_is_kept_with_the_command_that_it_holds(daemon: Daemon) -> None:
+    """A processor with a real-time task leaves 5 % to all other processes, once a second."""
+    pid, processor = both_gateways(daemon)["control"], min(os.sched_getaffinity(0))
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
+        fish.status()
+        for thread in Path(f"/proc/{pid}/task").iterdir():
+            os.sched_setaffinity(int(thread.name), {processor})
+        code = f"""
+import os, time
+os.sched_setaffinity(0, {{{processor}}})
+os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+print("spins", flush=True)
+end = time.monotonic() + 2.0
+while time.monotonic() < end:
+    pass
+"""
+        with Process(sys.executable, "-c", code) as spinner:
+            if not spinner.process.stdout.readline():
+                pytest.skip("no real-time priority is permitted here: run as root")
+            while spinner.process.poll() is None:
+                assert fish.mark("starved").mode == "running"
+        assert fish.status().recovered_errors.get("control_restarts", 0) == 0
+    assert both_gateways(daemon)["control"] == pid
+    assert daemon.end()[2].count("the gateway of control gets no processor time") == 1
+
+
 def test_a_fork_server_that_hangs_is_replaced_with_its_gateways(daemon: Daemon) -> None:
     hung = fork_server(daemon)
     former = both_gateways(daemon)
@@ -466,17 +519,34 @@ def test_hanging_gateways_end_in_parallel(tmp_path: Path, monkeypatch: pytest.Mo
     wait_until(lambda: all(gone(pid) for pid in hung))
 
 
-@pytest.mark.parametrize("answers", [True, False])
-def test_only_heartbeats_that_are_left_unanswered_count(answers: bool) -> None:
+@pytest.mark.parametrize(
+    ("answers", "ended", "unanswered"),
+    [
+        (True, True, None),
+        (False, True, 4),
+        (False, False, 12),  # this process could run and has hardly computed since: it is starved
+    ],
+)
+def test_only_heartbeats_that_a_process_could_answer_count(
+    answers: bool,
+    ended: bool,
+    unanswered: int | None,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr("fishd.daemon.gateway.gateways.MAX_STARVED", 12)
     lost = []
 
     class Peer(_Peer):
+        def _pid(self) -> int:
+            return 2**22 + 1 if ended else os.getpid()
+
         def _handle_loss(self, why: str) -> None:
             lost.append(why)
             self._drop_link()
 
     async def beat() -> None:
-        peer = Peer(max_unanswered=4, max_starting=6)
+        peer = Peer("this process", max_unanswered=4, max_starting=6)
         ours, theirs = link.pair()
         with ours, theirs:
             peer._connect(ours)
@@ -489,13 +559,14 @@ def test_only_heartbeats_that_are_left_unanswered_count(answers: bool) -> None:
                 await asyncio.sleep(0.001)
                 if lost:
                     break
-                assert theirs.recv(100) == link.PING
                 if answers:
+                    assert theirs.recv(100) == link.PING
                     theirs.send(link.PONG)
                     await asyncio.sleep(0.001)
 
     asyncio.run(beat())
-    assert lost == ([] if answers else ["it left 4 heartbeats unanswered"])
+    assert lost == ([] if answers else [f"it left {unanswered} heartbeats unanswered"])
+    assert caplog.text.count("this process gets no processor time") == (not answers and not ended)
 
 
 def test_a_gateway_that_ends_at_once_is_started_again_and_again_but_not_in_a_spin() -> None:
