@@ -220,7 +220,9 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
                     raise
                 except FishdError as error:
                     ended, status = f"{error}; {ending.hint}", 1
-            if ending.is_interrupted:
+            if ended:
+                ending.is_interrupted = True
+            elif ending.is_interrupted:
                 ended, status = f"interrupted; the fish rests; {ending.hint}", INTERRUPTED
             _write_result(experiment, live.standings())
     return _Outcome(

@@ -356,7 +356,19 @@ class ExperimentEnding:
         """experiment: None where nothing is kept"""
         self.hint = f"resume with: {experiment.resume_command}" if experiment else "nothing is kept"
         """How the experiment is resumed, for a message."""
-        self.is_interrupted = False
+        self._experiment = experiment
+        self._is_interrupted = False
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether the experiment ends before it is complete."""
+        return self._is_interrupted
+
+    @is_interrupted.setter
+    def is_interrupted(self, value: bool) -> None:
+        self._is_interrupted = value
+        if self._experiment:
+            self._experiment.is_interrupted = value
 
     @contextmanager
     def measuring(self, *errors: type[FishdError]) -> Iterator[None]:

@@ -6,10 +6,12 @@ import socket
 import sys
 import webbrowser
 from datetime import datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import click
+from msgspec.structs import replace
 
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, print_json
@@ -22,6 +24,8 @@ from fishd.window.settings import WindowSettings
 if TYPE_CHECKING:
     from fishd.window.devices import Devices, Scope
 
+SERVICE_STATE = Path("/var/lib/fishd-window")
+"""State folder of the service `fishd-window`."""
 ANSWER_TIMEOUT_S = 2.0
 """Longest wait for the answer of a page that runs already [s]."""
 
@@ -38,11 +42,26 @@ def window(ctx: click.Context) -> None:
         ctx.exit(ctx.invoke(open_page))
 
 
+def _load_running(**values: Any) -> WindowSettings:
+    """Return the settings of the window that runs, unless the options name another one."""
+    from fishd.window.register import find_running
+
+    settings = load_options(**values)
+    if values["path"] or values["listen"]:
+        return settings
+    for folder in (settings.state_folder, *(() if values["state"] else (SERVICE_STATE,))):
+        for entry in find_running(folder):
+            return replace(
+                settings, listen=entry.listen, names=entry.names, state=os.fspath(folder)
+            )
+    return settings
+
+
 @window.command("open")
 @window_options
 def open_page(**values: Any) -> int:
     """Open the page in a browser; start it unless it runs."""
-    settings = load_options(**values)
+    settings = _load_running(**values)
     url = _local_url(settings)
     if _answers(url):
         _show(url)
@@ -75,13 +94,13 @@ def start(log_format: str, **values: Any) -> int:
 )
 @json_option
 def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
-    """Print a link and a QR code that pair a device.
+    """Print a link and a QR code that pair a device with the window that runs.
 
     It pairs one device, within ten minutes. The code is for a terminal.
     """
     from fishd.window.devices import INVITATION_S
 
-    settings = load_options(**values)
+    settings = _load_running(**values)
     base = url or _network_url(settings)
     if urlsplit(base).scheme not in ("http", "https"):
         raise click.BadParameter("http://HOST:PORT/ or https://HOST/ is needed", param_hint="--url")
@@ -102,7 +121,7 @@ def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
 @json_option
 def devices(as_json: bool, **values: Any) -> None:
     """List the paired devices."""
-    paired = _open_devices(load_options(**values)).all()
+    paired = _open_devices(_load_running(**values)).all()
     if as_json:
         keys = ("id", "name", "scope", "paired", "seen")
         print_json([{key: getattr(device, key) for key in keys} for device in paired])
@@ -122,7 +141,7 @@ def revoke(device: str, as_json: bool, **values: Any) -> None:
 
     DEVICE is its name or id, as `fishctl window devices` shows it.
     """
-    removed = _open_devices(load_options(**values)).revoke(device)
+    removed = _open_devices(_load_running(**values)).revoke(device)
     if as_json:
         print_json({"id": removed.id, "name": removed.name})
     else:

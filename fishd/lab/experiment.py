@@ -4,8 +4,9 @@ sweep, optimise and adapt write all results into such a folder; a training marks
 the same header. Files are written atomically, and each row immediately.
 """
 
+import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -19,18 +20,20 @@ from fishd.core import files
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
 from fishd.core.old_names import rename_columns
-from fishd.core.process.lockfile import LockHeld, NotALock, locked
+from fishd.core.process.lockfile import LockHeld, NotALock, find_lock_holder, locked
 from fishd.lab import tables
 from fishd.lab.tables import Table
 from fishd.recording.folder import runs_folder
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 
-HEADER, ROWS = "experiment.json", "rows.csv"
+HEADER, ROWS, RESULT = "experiment.json", "rows.csv", "result.json"
+LOCK = "experiment"
+"""File of a folder whose lock is held while something is measured there."""
 MAX_TABLE_BYTES = 256 * 2**20
 """Size of the largest table [bytes]: 2.6 kB for each of the points that a sweep may have."""
 IRRELEVANT_KEYS = ("control", "name", "panel", "realtime", "start", "state_folder", "telemetry")
 """Sections and keys of a configuration that do not affect the thrust."""
-_NOT_COMPARED = ("began", "command", "version")
+_NOT_COMPARED = ("began", "command", "ended", "version")
 
 On = Literal["live", "simulation"]
 T = TypeVar("T", bound=Struct)
@@ -64,6 +67,8 @@ class Header(Struct, frozen=True, kw_only=True):
     """Arguments of the verb, which `--resume` starts from."""
     began: str = ""
     """Local time of the start, in ISO 8601."""
+    ended: str | None = None
+    """Local time at which it was complete, in ISO 8601; empty before, None where it is unknown."""
     version: str = __version__
 
 
@@ -73,6 +78,8 @@ class Experiment:
     def __init__(self, path: Path, header: Header) -> None:
         self.path = path
         self.header = header
+        self.is_interrupted = False
+        """Whether it ends before it is complete."""
         self._table: Table
 
     @property
@@ -178,12 +185,16 @@ def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iter
         _check_same(path, read_header(path), header)
     _make_folder(path)
     try:
-        with locked(path / "experiment", remove=True):
+        with locked(path / LOCK, remove=True):
             experiment = Experiment(path, header)
             if not resume:
                 check_free(path)
-                experiment.write_struct(HEADER, _with_start_time(header))
+                started = _with_start_time(header)
+                experiment.write_struct(HEADER, msgspec.structs.replace(started, ended=""))
             yield experiment
+            if not experiment.is_interrupted:
+                ended = msgspec.structs.replace(read_header(path), ended=_now())
+                experiment.write_struct(HEADER, ended)
     except LockHeld as taken:
         raise ConfigError(f"{path}: another experiment uses it, process {taken.pid}") from None
     except NotALock as error:
@@ -209,8 +220,11 @@ def _make_folder(path: Path) -> None:
 
 def _with_start_time(header: Header) -> Header:
     """Return the header with the current time as its start."""
-    began = datetime.now().astimezone().isoformat(timespec="seconds")
-    return msgspec.structs.replace(header, began=began)
+    return msgspec.structs.replace(header, began=_now())
+
+
+def _now() -> str:
+    return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
 def check_free(path: Path) -> None:
@@ -249,6 +263,45 @@ def count_rows(path: Path) -> int | None:
         return max(0, len(tables.read(path / ROWS, MAX_TABLE_BYTES)) - 1)
     except FileProblem:
         return None
+
+
+def find_largest_thrust(path: Path) -> tuple[float, float | None] | None:
+    """Return the largest thrust of an experiment, with the half-width of its 95 % interval.
+
+    None where no thrust is in its result or, before its end, in its table.
+    """
+    thrusts = []
+    for result in _read_results(path):
+        thrust, half_width = (_read_number(result.get(key)) for key in ("thrust", "thrust_ci95"))
+        if thrust is not None:
+            thrusts.append((thrust, half_width))
+    return max(thrusts, key=lambda pair: pair[0], default=None)
+
+
+def _read_results(path: Path) -> Iterable[Mapping[str, Any]]:
+    try:
+        if (path / RESULT).exists():
+            content = files.read(path / RESULT, MAX_TABLE_BYTES, "a result")
+            results = msgspec.json.decode(content, type=list[dict[str, Any]] | dict[str, Any])
+            return results if isinstance(results, list) else [results]
+        head, *rows = tables.read(path / ROWS, MAX_TABLE_BYTES) or [[]]
+        return [dict(zip(head, row, strict=False)) for row in rows]
+    except (FileProblem, msgspec.DecodeError):
+        return []
+
+
+def _read_number(value: Any) -> float | None:
+    """Return a finite number of a table or of JSON; None for anything else."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def is_in_use(path: Path) -> bool:
+    """Return whether a process measures in the folder of an experiment."""
+    return bool(find_lock_holder(path / LOCK))
 
 
 _OTHER_FOLDER = "choose a new folder with --folder"

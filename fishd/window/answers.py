@@ -13,9 +13,9 @@ from fishd.core import text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, NoDaemon, ParameterError, Refused
 from fishd.window import web_server
+from fishd.window.children import JobError
 from fishd.window.devices import DeviceError
 from fishd.window.fish_link import Busy
-from fishd.window.jobs import JobError
 from fishd.window.live import encode
 
 log = logging.getLogger(__name__)

@@ -1,14 +1,17 @@
 """Requests of a page for experiments, and for the runs that they leave."""
 
+from collections.abc import Iterable
 from typing import Any
 
 from aiohttp import web
 from msgspec import Struct
 
 from fishd.core import text
+from fishd.core.signals import ControllerInfo
 from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
-from fishd.window.jobs import DRIVING_KINDS, KINDS, Jobs
+from fishd.window.job_options import DRIVING_KINDS, KINDS
+from fishd.window.jobs import Jobs
 from fishd.window.pages import Pages
 
 
@@ -45,6 +48,7 @@ class JobRequests:
             message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(KINDS)}"
             raise ApiError(400, "unknown-kind", message)
         options = convert(body.options, KINDS[body.kind], f"{body.kind}: ")
+        _check_parameters(options, link.controllers)
         if body.kind in DRIVING_KINDS:
             self._pages.require_driver(link.name, page)
             await link.give_back()  # the experiment takes the fish itself
@@ -59,9 +63,23 @@ class JobRequests:
 
     async def _list_runs(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")
-        return success(await self._jobs.list_runs())
+        return success(await self._jobs.runs.list_all())
 
     async def _plot_run(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")
-        picture = await self._jobs.plot(request.match_info["run"])
+        picture = await self._jobs.runs.plot(request.match_info["run"])
         return web.Response(body=picture, content_type="image/png")
+
+
+def _check_parameters(options: Any, controllers: Iterable[ControllerInfo]) -> None:
+    """Raise `ApiError` unless each name is that of a parameter, and so no other option."""
+    names = {
+        field.name
+        for info in controllers
+        if info.name == getattr(options, "controller", None)
+        for field in info.parameters
+    }
+    for name in getattr(options, "parameters", {}):
+        if name not in names:
+            message = f"{options.controller} has no parameter '{text.quoted(name)}'"
+            raise ApiError(400, "bad-arguments", message)

@@ -1,9 +1,12 @@
 """Server of the page of the fish: its files, its WebSockets, and its requests."""
 
 import asyncio
+from contextlib import AsyncExitStack
 from importlib import resources
+from urllib.parse import urlsplit
 
 from aiohttp import web
+from msgspec import Raw
 
 from fishd.window.access import AccessControl
 from fishd.window.answers import answer_in_json
@@ -12,7 +15,9 @@ from fishd.window.fish_requests import FishRequests
 from fishd.window.foxglove import PROTOCOL
 from fishd.window.job_requests import JobRequests
 from fishd.window.jobs import Jobs
+from fishd.window.live import encode
 from fishd.window.pages import Pages
+from fishd.window.register import Register, take_lost_jobs
 from fishd.window.settings import WindowSettings
 from fishd.window.web_server import WebServer, file_routes
 
@@ -25,7 +30,13 @@ class WindowServer(WebServer):
     def __init__(self, settings: WindowSettings) -> None:
         """Raises `DeviceError` where the state folder cannot be used."""
         access = AccessControl(Devices(settings.state_folder), settings.pair_all)
-        self._jobs = Jobs(settings.runs_folder, lambda job: self._pages.tell_job(job))
+        self._settings, self._register = settings, Register(settings.state_folder)
+        self._jobs = Jobs(
+            settings.runs_folder,
+            tell=lambda job: self._pages.tell_job(job),
+            keep=lambda jobs: self._register.change(jobs=[Raw(encode(job)) for job in jobs]),
+            show_folder=settings.runs is not None,
+        )
         self._pages = Pages(settings.endpoints, access, self._jobs.all, lambda: self.viewers)
         host, port = settings.address
         routes = [
@@ -49,17 +60,26 @@ class WindowServer(WebServer):
 
     async def __aenter__(self) -> "WindowServer":
         """Listen, and follow the fish; raises `StartupError`."""
-        await super().__aenter__()
-        self._run = asyncio.create_task(self._pages.run())
+        async with AsyncExitStack() as stack:
+            stack.enter_context(self._register)
+            await super().__aenter__()
+            self._jobs.take_lost(take_lost_jobs(self._settings.state_folder))
+            host = self._settings.listen.rpartition(":")[0]
+            listen = f"{host}:{urlsplit(self.url).port}"
+            entry = self._register.change(listen=listen, names=self._settings.names)
+            await asyncio.wrap_future(entry)
+            self._run = asyncio.create_task(self._pages.run())
+            self._stack = stack.pop_all()
         return self
 
     async def __aexit__(self, *details: object) -> None:
         """Return the fish, and close all pages."""
-        self._run.cancel()
-        await asyncio.gather(self._run, return_exceptions=True)
-        await self._jobs.close()
-        await self._pages.close()
-        await super().__aexit__(*details)
+        async with self._stack:
+            self._run.cancel()
+            await asyncio.gather(self._run, return_exceptions=True)
+            await self._jobs.close()
+            await self._pages.close()
+            await super().__aexit__(*details)
 
     async def _serve_live(self, request: web.Request) -> web.StreamResponse:
         with self._pages.open_live(request) as page:

@@ -15,7 +15,13 @@ from fishd.cli.recording.files import folder_option, format_damage
 from fishd.core import text
 from fishd.core.console import format_power
 from fishd.core.errors import ConfigError, RecordingError
-from fishd.lab.experiment import Header, count_rows, list_experiments
+from fishd.lab.experiment import (
+    Header,
+    count_rows,
+    find_largest_thrust,
+    is_in_use,
+    list_experiments,
+)
 from fishd.recording.folder import Overview, read_overviews, runs_folder
 from fishd.recording.summary import Summary
 
@@ -32,8 +38,8 @@ def runs(folder: Path | None, as_json: bool) -> int:
 
     'thrust' is the mean while the fish swam, in mN unless another unit is shown, with its 95 %
     confidence interval. If the zero of the sensor was never known, it is the mean measured force,
-    drift and offset included, ± ?. 'power' is the mean power into the servo. 'lost' counts ticks of
-    fishd that are not in the file.
+    drift and offset included, ± ?. An experiment shows the largest of its thrusts. 'power' is the
+    mean power into the servo. 'lost' counts ticks of fishd that are not in the file.
     """
     place = folder or runs_folder()
     recordings = list(read_overviews(place))
@@ -65,6 +71,13 @@ class _ExperimentSummary(Struct):
     began: str
     rows: int | None
     """Number of rows of its table; None without a table."""
+    state: str
+    """`running`, `finished`, `unfinished`, or empty where that is unknown."""
+    thrust: float | None = None
+    """Thrust of a measurement, or the largest of the results [N]."""
+    thrust_ci95: float | None = None
+    """Half-width of the 95 % confidence interval of `thrust` [N]."""
+    force_unit: str = "N"
     problem: str = ""
     """Reason why it cannot be read; empty if it can."""
 
@@ -72,9 +85,26 @@ class _ExperimentSummary(Struct):
     def read(cls, path: Path, header: "Header | ConfigError") -> "_ExperimentSummary":
         """Return the summary of an experiment."""
         if isinstance(header, ConfigError):
-            return cls(path.name, str(path), "–", "–", "", None, str(header))
-        rows = count_rows(path)
-        return cls(path.name, str(path), header.kind, header.on, header.began, rows)
+            return cls(path.name, str(path), "–", "–", "", None, "", problem=str(header))
+        thrust, half_width = find_largest_thrust(path) or (None, None)
+        return cls(
+            path.name,
+            str(path),
+            header.kind,
+            header.on,
+            header.began,
+            count_rows(path),
+            _find_state(path, header),
+            thrust,
+            half_width,
+            header.force_unit,
+        )
+
+
+def _find_state(path: Path, header: Header) -> str:
+    if is_in_use(path):
+        return "running"
+    return "" if header.ended is None else "finished" if header.ended else "unfinished"
 
 
 def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
@@ -85,15 +115,18 @@ def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
     table.add_column("experiment", overflow="fold")
     for head in ("began", "kind", "fish"):
         table.add_column(head, no_wrap=True)
-    table.add_column("rows", justify="right", no_wrap=True)
+    for head in ("rows", "thrust"):
+        table.add_column(head, justify="right", no_wrap=True)
+    table.add_column("about", no_wrap=True)
     for experiment in experiments:
-        rows = "–" if experiment.rows is None else str(experiment.rows)
         table.add_row(
             text.line(experiment.name),
             _format_start(experiment.began),
             experiment.kind,
             experiment.on,
-            rows,
+            "–" if experiment.rows is None else str(experiment.rows),
+            _format_thrust(experiment),
+            "" if experiment.state == "finished" else experiment.state,
         )
     Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
 
@@ -139,7 +172,7 @@ def _print_recordings(recordings: list[Overview]) -> None:
     Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
 
 
-def _format_thrust(summary: Summary) -> str:
+def _format_thrust(summary: "Summary | _ExperimentSummary") -> str:
     """Return the thrust in mN, or thousandths of another unit, with its interval if known."""
     if summary.thrust is None:
         return "–"

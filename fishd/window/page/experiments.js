@@ -15,12 +15,28 @@ const input = (label, value, set, more = {}) => html`<label class="row"><span>${
   <input value=${value} autocomplete="off" onInput=${(event) => set(event.target.value)} ...${more} /></label>`;
 
 /** Kinds that swim the fish, and so need the driver's role. */
-const DRIVING = ["measure", "sweep", "compare"];
+const DRIVING = ["measure", "sweep", "compare", "resume"];
+
+/** Start a job; take the driver's role first where it needs it. Say why it was refused, and offer to take the fish. */
+async function startJob({ state, notice, changed, becomeDriver }, kind, options, take = false) {
+  const drives = DRIVING.includes(kind);
+  try {
+    if (drives && (take || !state.driver?.you_drive)) await becomeDriver(take);
+    const more = drives && take ? { take } : {};
+    const job = await call("POST", "/api/jobs", { fish: state.name, kind, options: { ...options, ...more } });
+    state.jobs.set(job.id, job);
+    changed();
+  } catch (error) {
+    const remedies = { driven: "Take over", "not-driver": "Take over", leased: "Take the fish" };
+    notice("error", error.message, error.remedy, remedies[error.code] && [remedies[error.code], () => startJob({ state, notice, changed, becomeDriver }, kind, options, true)]);
+  }
+}
 
 /** Leave out what is not given: the server has its own defaults. */
 const given = (options) => Object.fromEntries(Object.entries(options).filter(([, value]) => value !== null));
 
-export function Experiments({ state, notice, changed, becomeDriver }) {
+export function Experiments(page) {
+  const { state, notice } = page;
   const [form, setForm] = useState(() => recall("experiment", {
     kind: "measure", seconds: "", values: "", parameter: "", contestants: "square swing", runs: "", subject: "", note: "",
   }));
@@ -48,23 +64,9 @@ export function Experiments({ state, notice, changed, becomeDriver }) {
       default: return { controller: controller.name, parameters: own, seconds };
     }
   };
-  const start = async (event) => {
+  const start = (event) => {
     event.preventDefault();
-    await send(false);
-  };
-  const send = async (take) => {
-    const { kind } = form;
-    const drives = DRIVING.includes(kind);
-    try {
-      if (drives && (take || !state.driver?.you_drive)) await becomeDriver(take);
-      const more = drives && take ? { take } : {};
-      const job = await call("POST", "/api/jobs", { fish: state.name, kind, options: { ...given(options()), ...more } });
-      state.jobs.set(job.id, job);
-      changed();
-    } catch (error) {
-      const remedies = { driven: "Take over", "not-driver": "Take over", leased: "Take the fish" };
-      notice("error", error.message, error.remedy, remedies[error.code] && [remedies[error.code], () => send(true)]);
-    }
+    startJob(page, form.kind, given(options()));
   };
   const jobs = [...state.jobs.values()].filter(({ fish }) => !fish || fish === state.name).sort((a, b) => b.started - a.started).slice(0, 8);
   const uses = ["measure", "sweep", "simulate"].includes(form.kind);
@@ -100,20 +102,21 @@ export function Experiments({ state, notice, changed, becomeDriver }) {
       </div>
     </form>
     <ul class="jobs" aria-label="Started experiments">
-      ${jobs.map((job) => html`<${Job} key=${job.id} job=${job} state=${state} notice=${notice} mayDrive=${mayDrive} />`)}
+      ${jobs.map((job) => html`<${Job} key=${job.id} job=${job} state=${state} notice=${notice} mayDrive=${mayDrive}
+        resume=${() => startJob(page, "resume", { run: job.run })} />`)}
     </ul>`;
 }
 
 /** Return the expected duration of a job from its command line; null if it has none. */
 function expected(command) {
-  const option = command.find((word) => word.startsWith("--for="));
-  return ["measure", "record"].includes(command[1]) && option ? Number(option.slice(6)) : null;
+  const place = command.indexOf("--for");
+  return ["measure", "record"].includes(command[1]) && place > 0 ? Number(command[place + 1]) : null;
 }
 
 /** Quote a word as a shell needs it. */
 const quote = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
 
-function Job({ job, state, notice, mayDrive }) {
+function Job({ job, state, notice, mayDrive, resume }) {
   const [, tick] = useState(0);
   const runs = job.state === "running";
   useEffect(() => {
@@ -126,8 +129,9 @@ function Job({ job, state, notice, mayDrive }) {
   const stop = () => call("POST", `/api/jobs/${job.id}/stop`).catch((error) => notice("error", error.message, error.remedy));
   return html`<li class=${`job ${job.state}`}>
     <div class="job-head"><b>${KINDS[job.kind]?.title ?? "Rerun"}</b><span class="pill small">${job.state}</span>
-      <span class="muted">${duration(elapsed)}${runs && total ? ` of about ${duration(total)}` : ""}</span>
-      ${runs && html`<button type="button" disabled=${!mayDrive} onClick=${stop}>Stop</button>`}</div>
+      <span class="muted">${job.state === "lost" ? "" : duration(elapsed)}${runs && total ? ` of about ${duration(total)}` : ""}</span>
+      ${runs && html`<button type="button" disabled=${!mayDrive} onClick=${stop}>Stop</button>`}
+      ${job.resumable && html`<button type="button" disabled=${!mayDrive} onClick=${resume}>Resume</button>`}</div>
     ${runs && html`<progress max=${total ?? undefined} value=${total ? Math.min(elapsed, total) : undefined}
       aria-label=${`Progress of ${job.kind}`}></progress>`}
     <code tabindex="0" aria-label="Command line">${job.command.map(quote).join(" ")}</code>
@@ -169,9 +173,12 @@ function Result({ job, status }) {
 }
 
 const MAX_RUNS = 40;
+/** Kinds of experiments that the server resumes. */
+const RESUMABLE = ["measure", "sweep", "compare"];
 const shortDate = new Intl.DateTimeFormat([], { month: "short", day: "numeric", hour: "2-digit", minute: "2-digit", hour12: false });
 
-export function Runs({ state, notice, changed }) {
+export function Runs(page) {
+  const { state } = page;
   const [runs, setRuns] = useState(null);
   const [failure, setFailure] = useState(null);
   const [open, setOpen] = useState(null);
@@ -183,15 +190,7 @@ export function Runs({ state, notice, changed }) {
   useEffect(() => {
     if (state.session?.paired) load();
   }, [finished, state.session?.paired]);
-  const rerun = async (run) => {
-    try {
-      const job = await call("POST", "/api/jobs", { fish: state.name, kind: "rerun", options: { run: run.name } });
-      state.jobs.set(job.id, job);
-      changed();
-    } catch (error) {
-      notice("error", error.message, error.remedy);
-    }
-  };
+  const mayDrive = state.session?.scope === "drive";
   const begin = (run) => run.began ?? run.about?.started ?? "";
   const list = (runs ?? []).slice().sort((a, b) => begin(b).localeCompare(begin(a))).slice(0, MAX_RUNS);
   return html`
@@ -207,6 +206,7 @@ export function Runs({ state, notice, changed }) {
           const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, run.thrust_ci95 == null ? NaN : run.thrust_ci95 * factor);
           return html`<tr key=${run.name} class=${run.damaged ? "damaged" : ""}>
             <td>${run.name}${run.damaged && html` <span class="pill small" title=${run.damaged}>damaged</span>`}
+              ${["running", "recording", "unfinished"].includes(run.state) && html` <span class="pill small">${run.state}</span>`}
               ${run.problem && html`<br /><small>${run.problem}</small>`}</td><td>${run.kind === "recording" ? Object.keys(run.swim_ticks ?? {}).join(", ") || "at rest" : run.kind}</td><td>${begin(run) && shortDate.format(new Date(begin(run)))}</td>
             <td class="right">${run.duration === undefined ? (run.rows ? `${run.rows} rows` : "") : duration(run.duration)}</td>
             <td class="right">${middle} ${error} ${run.thrust == null ? "" : unit}</td>
@@ -215,7 +215,9 @@ export function Runs({ state, notice, changed }) {
               <button type="button" aria-expanded=${open === run.name} aria-label=${`Plot of ${run.name}`}
                 onClick=${() => setOpen(open === run.name ? null : run.name)}>${open === run.name ? "Close" : "Plot"}</button>
               ${run.kind === "recording" && html`<button type="button" aria-label=${`Rerun ${run.name}`}
-                title="Runs the controller again on each recorded tick and compares its commands" onClick=${() => rerun(run)}>Rerun</button>`}
+                title="Runs the controller again on each recorded tick and compares its commands" onClick=${() => startJob(page, "rerun", { run: run.name })}>Rerun</button>`}
+              ${run.state === "unfinished" && RESUMABLE.includes(run.kind) && run.on === "live" && html`<button type="button" aria-label=${`Resume ${run.name}`}
+                disabled=${!mayDrive} onClick=${() => startJob(page, "resume", { run: run.name })}>Resume</button>`}
             </td></tr>
             ${open === run.name && html`<tr class="plot-row"><td colspan="7"><${Plot} key=${run.name} name=${run.name} /></td></tr>`}`;
         })}</tbody></table></div>`}`;

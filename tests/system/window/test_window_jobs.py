@@ -1,5 +1,6 @@
 """Experiments of the page: true verbs of fishctl, their progress, and their ends."""
 
+import shlex
 from typing import Any
 
 import pytest
@@ -70,10 +71,37 @@ def test_an_experiment_takes_the_fish_from_the_page_and_lets_it_rest_when_stoppe
             assert status["lease"]["name"] == "measure square"
             await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
             await page.post(f"/api/jobs/{job['id']}/stop")
-            assert (await end_of(page, job))["state"] == "stopped"
+            ended = await end_of(page, job)
+            assert (ended["state"], ended["resumable"]) == ("stopped", True)
 
     run(test())
     assert daemon.status().lease is None
+
+
+def test_an_experiment_shows_what_a_person_would_type_and_leaves_a_thrust_among_the_runs(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    async def test() -> None:
+        async with Browser(window.url) as browser, open_page(browser) as page:
+            await page.drive()
+            options = {"controller": "square", "parameters": {"frequency": 1.5}, "seconds": 21}
+            job = await start(page, "measure", **options)
+            shown = f"fishctl measure square --frequency 1.5 --for 21 --endpoint {daemon.endpoint}"
+            assert shlex.join(job["command"]) == shown
+            ended = await end_of(page, job)
+            assert ended["state"] == "done", ended["lines"]
+            (run_,) = [r for r in await browser.get("/api/runs") if r["name"] == job["run"]]
+            result = ended["result"]
+            for key in ("thrust", "thrust_ci95"):
+                assert run_[key] == result[key] > 0.0
+            assert (run_["state"], ended["resumable"]) == ("finished", False)
+            async with browser.session.get(f"/api/runs/{job['run']}/plot.png") as response:
+                assert (await response.read()).startswith(b"\x89PNG")
+            await page.drive()
+            refused = {"fish": "fish", "kind": "resume", "options": {"run": "none"}}
+            assert await page.refusal("/api/jobs", refused) == (409, "job")
+
+    run(test())
 
 
 def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: WindowProcess) -> None:
@@ -96,6 +124,7 @@ def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: WindowProce
         ("fly", {}, "unknown-kind"),
         ("measure", {"controller": "--help"}, "bad-arguments"),
         ("measure", {"controller": "square", "parameters": {"--config": 1}}, "bad-arguments"),
+        ("measure", {"controller": "square", "parameters": {"config": "a"}}, "bad-arguments"),
         (
             "measure",
             {"controller": "ppo", "parameters": {"policy": "/etc/passwd"}},
@@ -107,6 +136,7 @@ def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: WindowProce
         ("record", {"note": "bell\x07"}, "bad-arguments"),
         ("compare", {"contestants": ["--folder=/"]}, "bad-arguments"),
         ("rerun", {"run": "/etc/passwd"}, "bad-arguments"),
+        ("resume", {"run": "../above"}, "bad-arguments"),
         ("simulate", {"controller": "square", "seconds": 1e9}, "bad-arguments"),
         ("simulate", {"controller": "square", "jobs": 9}, "bad-arguments"),
     ],

@@ -1,12 +1,13 @@
 """`fishctl window` and `fishd-window`: they open a page that runs, start one, and end in order."""
 
+import json
 import re
 import signal
 from pathlib import Path
 
 import pytest
 from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, wait_until
-from rigs.window_process import Browser, WindowProcess, open_page, run
+from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
 
 
 def test_a_page_that_runs_is_opened_and_not_started_again(window: WindowProcess) -> None:
@@ -76,3 +77,16 @@ def test_the_end_of_the_window_stops_its_fish_and_its_experiments(
     wait_until(lambda: daemon.status().mode == "idle")
     assert daemon.status().lease is None
     assert (tmp_path / "runs" / "endless.mcap").exists()
+
+
+def test_a_window_that_runs_is_found_by_its_state_folder(daemon: Daemon, tmp_path: Path) -> None:
+    state = ("--state", str(tmp_path / "window"))
+    refused = one_line(fishctl("window", "pair", *state))
+    assert "the page listens at 127.0.0.1:8880, which no other device reaches" in refused
+    options = ("--listen", "0.0.0.0:0")
+    with running_window(tmp_path, *options, fish=daemon.endpoint) as process:
+        link = json.loads(process.ask("pair", "--json"))["url"]
+        assert re.fullmatch(rf"http://[^/]+:{process.port}/#pair=[\w-]{{22}}", link)
+        opened = process.ask("open")
+        assert opened == f"the fish is at http://127.0.0.1:{process.port}/\n"
+    assert [path.name for path in process.state.glob("window-*")] == []

@@ -138,6 +138,9 @@ def test_a_signal_rests_the_fish_and_keeps_what_was_measured(
         f"{folder}\n"
     )
     assert (folder / "rows.csv").read_text().count("\n") == 3
+    (listed,) = json.loads(fishctl("runs", "--folder", str(tmp_path), "--json").stdout)
+    assert (listed["state"], listed["rows"]) == ("unfinished", 2)
+    assert listed["thrust"] > 0.0
 
 
 def test_an_experiment_is_resumed_by_its_own_verb_with_its_own_options(tmp_path: Path) -> None:
@@ -165,6 +168,10 @@ def test_a_measurement_keeps_header_recording_and_result_and_is_listed(tmp_path:
     assert len(open_run(folder / "measure.mcap").ticks) == round(result["seconds"] / 0.05)
     (listed,) = json.loads(fishctl("runs", "--folder", str(tmp_path), "--json").stdout)
     assert (listed["name"], listed["kind"], listed["on"]) == ("first", "measure", "simulation")
+    assert (listed["thrust"], listed["thrust_ci95"]) == (result["thrust"], result["thrust_ci95"])
+    assert listed["state"] == "finished"
+    printed = fishctl("runs", "--folder", str(tmp_path)).stdout
+    assert f"{1e3 * result['thrust']:.2f} ± {1e3 * result['thrust_ci95']:.2f}" in printed
     (folder / "experiment.json").write_text("{}")
     done = fishctl("runs", "--folder", str(tmp_path))
     assert done.returncode == 1

@@ -1,0 +1,104 @@
+"""The windows that run, and the jobs of those that were killed.
+
+Each window has a file in its state folder, which is locked while the window lives. By it, `fishctl
+window` finds the window, and a later window learns which experiments were lost with an earlier one.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
+from os import getpid
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+from fishd.core import files
+from fishd.core.decoding import decoder
+from fishd.core.errors import StartupError
+from fishd.core.files import write_atomically
+from fishd.core.process.lockfile import LockHeld, find_lock_holder, lock_path, locked
+from fishd.window.settings import WindowSettings
+
+MAX_FILE_BYTES = 2**20
+_PATTERN = "window-*.json"
+
+
+class RunningWindow(Struct, frozen=True):
+    """What a window writes about itself."""
+
+    listen: str
+    """Address at which it listens, such as `0.0.0.0:8880`."""
+    names: tuple[str, ...] = ()
+    """Further host names by which browsers reach it."""
+    jobs: list[msgspec.Raw] = []
+    """Its jobs that run, as JSON."""
+
+
+_decode: Callable[[bytes], RunningWindow] = decoder(RunningWindow)
+
+
+class Register:
+    """The entry of this window; a context manager."""
+
+    def __init__(self, folder: Path) -> None:
+        """folder: state folder, which exists"""
+        self._path = folder / f"window-{getpid()}.json"
+        self._stack = ExitStack()
+        self._entry = RunningWindow("")
+
+    def __enter__(self) -> "Register":
+        try:
+            self._stack.enter_context(locked(self._path, remove=True))
+        except (OSError, LockHeld) as error:
+            raise StartupError(f"{lock_path(self._path)} cannot be locked: {error}") from None
+        self._stack.callback(self._path.unlink, missing_ok=True)
+        # A disk may be slow, and an emergency stop must not wait for it.
+        self._disk = self._stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="register"))
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stack.close()
+
+    def change(self, **fields: Any) -> Future[None]:
+        """Change fields of the entry, soon; without space on the disk, it stays as it was."""
+        self._entry = msgspec.structs.replace(self._entry, **fields)
+        return self._disk.submit(self._write, msgspec.json.encode(self._entry))
+
+    def _write(self, content: bytes) -> None:
+        with suppress(OSError):
+            write_atomically(self._path, content)
+
+
+def find_running(folder: Path) -> list[RunningWindow]:
+    """Return the windows that run, those that the network reaches first."""
+    running = [entry for path, entry in _read_entries(folder) if find_lock_holder(path)]
+    return sorted(running, key=lambda entry: WindowSettings(listen=entry.listen).is_local)
+
+
+def take_lost_jobs(folder: Path) -> list[msgspec.Raw]:
+    """Return the jobs of the windows that were killed, and remove their entries."""
+    jobs = list[msgspec.Raw]()
+    for path, entry in _read_entries(folder):
+        if not find_lock_holder(path):
+            jobs += entry.jobs
+            path.unlink(missing_ok=True)
+            lock_path(path).unlink(missing_ok=True)
+    return jobs
+
+
+def _read_entries(folder: Path) -> Iterator[tuple[Path, RunningWindow]]:
+    """Yield the entries that can be read, of windows that run or do not."""
+    paths: Sequence[Path] = []
+    with suppress(OSError):  # there is no such folder, or this user may not read it
+        paths = sorted(folder.glob(_PATTERN))
+    for path in paths:
+        with suppress(files.FileProblem, msgspec.DecodeError):
+            yield path, _decode(files.read(path, MAX_FILE_BYTES, "a running window"))
