@@ -2,6 +2,7 @@
 
 import shlex
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
@@ -15,7 +16,7 @@ from fishd.cli.experiment_options import (
     fish_choice,
     folder_options,
 )
-from fishd.cli.options import FiniteRange, json_option, seed_option
+from fishd.cli.options import FiniteRange, json_option, plot_option, seed_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress
 from fishd.core.errors import FishdError
@@ -51,6 +52,7 @@ DEFAULT_STEPS = 6400
 )
 @fish_choice
 @folder_options
+@plot_option("fit, search, training and comparison")
 @json_option
 def adapt(
     budget: float,
@@ -59,6 +61,7 @@ def adapt(
     no_command: bool,
     fish: ChosenFish,
     place: ExperimentFolder,
+    picture: Path | None,
     as_json: bool,
 ) -> int:
     """Find the best gait of an unknown fish, in five minutes of tank time.
@@ -80,9 +83,9 @@ def adapt(
     from fishd.lab.session import LiveSession
     from fishd.learning.adapt import report
     from fishd.learning.adapt.adaptation import Adaptation
-    from fishd.learning.adapt.state import AdaptFolder
+    from fishd.learning.adapt.state import PICTURE, AdaptFolder
 
-    drawing.check_installed()
+    drawing.check(picture or PICTURE)
     fish.refuse_other({}, {"--no-command": no_command})
     settings = {"steps": steps, "seed": seed}
     with fish.session() as session:
@@ -99,6 +102,8 @@ def adapt(
                 state = Adaptation(session, run, budget, steps, seed, show).run()
                 words = format_command(_chosen_gait(state), fish)
                 files = report.write(run, session.amplitude, words)
+                if picture:
+                    report.draw(run, session.amplitude, picture)
             if ending.is_interrupted:
                 return ending.interrupted(f"{run.state.tank_time:.0f} s of tank time are kept")
         if as_json:

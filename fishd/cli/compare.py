@@ -21,7 +21,7 @@ from fishd.cli.experiment_options import (
     live_folder_options,
     record_session,
 )
-from fishd.cli.options import for_option, json_option, plot_option
+from fishd.cli.options import camera_config_option, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress
 from fishd.config import Config, check_tethered
@@ -78,11 +78,11 @@ class _Outcome(NamedTuple):
 @fish_choice
 @click.option(
     "--camera",
-    metavar="FILE|ENDPOINT",
-    help="For policies that see pictures: in simulation, the YAML file of a simulated camera, such "
-    "as config/camera-web.yaml; live, the endpoint of fishd-camera. [default: a good simulated "
-    "camera; live, $FISHD_CAMERA or that of this machine]",
+    metavar="ADDRESS",
+    help="For policies that see pictures, live: request address of fishd-camera. [default: "
+    "$FISHD_CAMERA, else that of this machine]",
 )
+@camera_config_option("For policies that see pictures, in simulation: ")
 @click.option(
     "--agent",
     metavar="ADDRESS",
@@ -98,6 +98,7 @@ def compare(
     settle: float | None,
     fish: ChosenFish,
     camera: str | None,
+    camera_config: str | None,
     agent: str | None,
     place: ExperimentFolder,
     as_json: bool,
@@ -122,12 +123,12 @@ def compare(
     Exit status 1 if this fish refuses a contestant, such as a policy for another amplitude, or if
     a run ends in mode fault; the other contestants are still compared.
     """
-    fish.refuse_other({"--settle": settle}, {"--agent": agent})
+    fish.refuse_other({"--settle": settle, "--camera-config": camera_config}, {"--agent": agent})
     if picture:
         from fishd.lab import drawing
 
         drawing.check(picture)
-    task = _Task(contestants, fish, seconds, settle, runs, camera, place, as_json)
+    task = _Task(contestants, fish, seconds, settle, runs, camera_config or camera, place, as_json)
     outcome = _measure(task, agent) if fish.on == "live" else _swim(task)
     status = _report(outcome, runs, as_json)
     if picture and outcome.standings:
@@ -144,6 +145,7 @@ class _Task(NamedTuple):
     settle: float | None
     runs: int
     camera: str | None
+    """File of a simulated camera; address of the camera of a live fish."""
     place: ExperimentFolder
     as_json: bool
 
@@ -247,7 +249,8 @@ def _check_camera(camera: str | None, chosen: "list[Contestant]") -> None:
         if contestant.controller == "ppo"
     )
     if camera is not None and not any(map(may_see_pictures, policies)):
-        raise click.UsageError("--camera cannot be given here: no contestant sees pictures")
+        option = "--camera" if "://" in camera else "--camera-config"
+        raise click.UsageError(f"{option} cannot be given here: no contestant sees pictures")
 
 
 def _default_contestants(config: Config) -> "list[Contestant]":

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import fish_options
-from fishd.cli.options import json_option
+from fishd.cli.options import RenamedOption, json_option, plot_option
 from fishd.cli.output import echo, echo_rows, print_json, warn_of_fin
 from fishd.config import check_tethered, load
 from fishd.virtual.plant.parameters import PlantParameters, without_extensions
@@ -40,18 +40,19 @@ def _check_amplitudes(
     callback=_check_amplitudes,
     help="Φ [rad]; default: amplitude_limit. Repeatable.",
 )
-@click.option("--control", is_flag=True, help="Find the best command of any shape, too.")
 @click.option(
-    "--plot",
-    "picture",
-    type=click.Path(path_type=Path, dir_okay=False),
-    help="With --control: draw command, costate and thrust into this file (.png, .svg).",
+    "--any-shape",
+    cls=RenamedOption,
+    former=("--control",),
+    is_flag=True,
+    help="Find the best command of any shape, too.",
 )
+@plot_option("command, costate and thrust of --any-shape")
 @json_option
 @fish_options
 def optimum(
     amplitudes: tuple[float, ...],
-    control: bool,
+    any_shape: bool,
     picture: Path | None,
     file: Path | None,
     overrides: tuple[str, ...],
@@ -61,7 +62,7 @@ def optimum(
 
     Prints the square wave of the best frequency, and its limits for a fast servo (the wheel
     follows at once) and a slow one (the wheel always turns at full speed); Φ_s separates the two.
-    --control computes the best periodic command of any shape within ±Φ, which takes some seconds.
+    --any-shape computes the best periodic command of any shape within ±Φ, which takes some seconds.
     """
     from fishd.lab import drawing
     from fishd.lab import optimum as lab
@@ -70,16 +71,16 @@ def optimum(
     check_tethered(config.robot, "optimum")
     plant = config.plant
     angles = amplitudes or (config.amplitude_limit,)
-    if control and len(angles) > 1:
-        raise click.UsageError("--control takes one --amplitude at a time")
-    if picture and not control:
-        raise click.UsageError("--plot draws what --control finds: give both")
+    if any_shape and len(angles) > 1:
+        raise click.UsageError("--any-shape takes one --amplitude at a time")
+    if picture and not any_shape:
+        raise click.UsageError("--plot draws what --any-shape finds: give both")
     if picture:
         drawing.check(picture)
     best = lab.best_square_waves(plant, angles)
     fast, slow = lab.fast_servo(plant, angles), lab.slow_servo(plant, angles)
     limit = lab.saturation_amplitude(plant)
-    best_control = lab.optimal_control(plant, angles[0]) if control else None
+    best_control = lab.optimal_control(plant, angles[0]) if any_shape else None
     for k, amplitude in enumerate(angles):
         warn_of_fin(best.fin_amplitude[k], f" at ±{amplitude:g} rad")
     if as_json:
@@ -101,7 +102,7 @@ def optimum(
             )
         if best_control:
             echo_rows(_control_rows(best_control))
-        _print_ignored(plant, control)
+        _print_ignored(plant, any_shape)
     if best_control and picture:
         from fishd.lab.optimum.figure import draw
 
@@ -124,7 +125,7 @@ def _control_rows(control: "OptimalControl") -> list[tuple[str, str]]:
     ]
 
 
-def _print_ignored(plant: PlantParameters, control: bool) -> None:
+def _print_ignored(plant: PlantParameters, any_shape: bool) -> None:
     ideal = without_extensions(plant)
     left_out = [
         f"plant.{name}"
@@ -132,7 +133,7 @@ def _print_ignored(plant: PlantParameters, control: bool) -> None:
         if getattr(plant, name) != getattr(ideal, name)
     ]
     if left_out:
-        subject = "the limits and the optimal control leave" if control else "the limits leave"
+        subject = "the limits and the optimal control leave" if any_shape else "the limits leave"
         echo(f"fishctl: {subject} out {', '.join(left_out)}", err=True)
 
 

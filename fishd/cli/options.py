@@ -122,6 +122,18 @@ class RenamedOption(click.Option):
         self.opts = names
 
 
+def camera_config_option(scope: str = "", former: Sequence[str] = ()) -> Callable[[F], F]:
+    """Return the option `--camera-config`; scope: when it can be given."""
+    return click.option(
+        "--camera-config",
+        cls=RenamedOption,
+        former=former,
+        metavar="FILE",
+        help=f"{scope}YAML file of a simulated camera, such as config/camera-web.yaml. [default: a "
+        "good camera]",
+    )
+
+
 def daemon_options(function: F) -> F:
     """Add `--endpoint` and `--json`."""
     return endpoint_option(json_option(function))

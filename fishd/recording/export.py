@@ -4,7 +4,6 @@ import itertools
 import math
 import shutil
 from pathlib import Path
-from typing import Literal
 
 import msgspec
 import numpy as np
@@ -20,12 +19,13 @@ from fishd.recording.folder import check_new_files
 from fishd.recording.images import RecordedFrame
 from fishd.recording.reader import Run
 
-Format = Literal["csv", "parquet"]
+FORMATS = (".csv", ".parquet")
 
 
-def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> list[Path]:
+def export(run: Run, path: Path, *, replace: bool = False) -> list[Path]:
     """Write `NAME.csv` and `NAME-events.csv`, or the same as Parquet, and return their paths.
 
+    path: file of the ticks, whose suffix chooses the format
     With frames of a camera, also `NAME-frames.npy`, all frames as one array of shape (number,
     height, width), and `NAME-frames.csv`, one row per frame.
 
@@ -37,21 +37,23 @@ def export(run: Run, folder: Path, form: Format, *, replace: bool = False) -> li
     replace: whether to replace existing files
     Raise `RecordingError`.
     """
+    form, folder, name = path.suffix, path.parent, path.stem
+    if form not in FORMATS:
+        raise RecordingError(f"{path}: a name that ends in {' or '.join(FORMATS)} is needed")
     if not run.entries and not run.frame_heads:
         why = f" ({run.damage_reason})" if run.damage_reason else ""
         raise RecordingError(f"{run.path} contains nothing to export{why}")
-    tables = {folder / f"{run.name}.{form}": run.frame()}
-    tables[folder / f"{run.name}-events.{form}"] = _event_table(run)
-    pictures = folder / f"{run.name}-frames.npy"
+    tables = {path: run.frame(), folder / f"{name}-events{form}": _event_table(run)}
+    pictures = folder / f"{name}-frames.npy"
     if run.frame_heads:
-        tables[folder / f"{run.name}-frames.{form}"] = _frame_table(run)
+        tables[folder / f"{name}-frames{form}"] = _frame_table(run)
     check_new_files([*tables, *([pictures] if run.frame_heads else [])], replace=replace)
     about = b""
-    if form == "parquet":
+    if form == ".parquet":
         about = msgspec.json.encode({"about": run.about, "configs": run.configs})
     for path, table in tables.items():
         try:
-            if form == "csv":
+            if form == ".csv":
                 write_atomically(path, _escape_texts(table).to_csv(index=False))
             else:
                 _write_parquet(path, table, about, run)

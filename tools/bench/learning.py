@@ -226,8 +226,7 @@ def draw(
     if options.write:
         drawn = {
             row.replace("`", ""): [
-                ([p.steps for p in run.points], [p.relative_thrust for p in run.points])
-                for run in trainings[row]
+                ([point.steps for point in run.points], run.best) for run in trainings[row]
             ]
             for row in shown
         }

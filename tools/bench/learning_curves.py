@@ -1,26 +1,15 @@
 """Figure of the learning curves of `tools/bench learning`."""
 
+import math
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from pathlib import Path
 
 import numpy as np
 
-from fishd.lab.drawing import open_figure
+from fishd.lab.drawing import BLUE, GREY, open_figure
 
-_CURVES = (
-    ("#0072b2", "-", 2.6),
-    ("#d55e00", (0, (3, 1.5)), 1.4),
-    ("#009e73", "-", 1.2),
-    ("#cc79a7", (0, (1, 1)), 1.6),
-    ("#000000", (0, (6, 1.5, 1, 1.5)), 1.1),
-    ("#e69f00", "-", 0.9),
-)
-"""Colours, line styles and widths [points] of the curves.
-
-The colours, by Okabe and Ito, are suitable for colour-blind people. Later curves are thinner or
-have gaps, so that an earlier curve below remains visible."""
-_FIRST, _TICKS = 200, (200, 500, 1000, 2000, 5000, 10_000, 20_000)
+_COLUMNS = 3
+_FIRST, _TICKS = 200, (200, 1000, 5000, 20_000)
 """First number of control steps on the axis, and its ticks."""
 _LOWEST = 60
 """Relative thrust at the begin of the axis [%]."""
@@ -29,37 +18,31 @@ _LOWEST = 60
 def learning_curves(
     path: Path, curves: Mapping[str, Sequence[tuple[Sequence[int], Sequence[float]]]], goal: float
 ) -> None:
-    """Draw relative thrust against steps: median and range of the seeds of each training.
+    """Draw relative thrust against steps: a panel for each training, with seeds and their median.
 
-    curves: seeds of each training, each as steps and relative thrusts
+    curves: seeds of each training, each as steps and the relative thrust of its best policy so far
     goal: relative thrust that is drawn as a line
     Raises `FishdError` where the file cannot be written, and `MissingPackage`.
     """
     steps_shown = max(seeds[0][0][-1] for seeds in curves.values())
-    with open_figure(path, (6.4, 3.8)) as figure:
-        axis = figure.subplots()
-        for (color, style, width), (label, seeds) in zip(cycle(_CURVES), curves.items()):
+    rows = math.ceil(len(curves) / _COLUMNS)
+    with open_figure(path, (6.4, 0.5 + 1.6 * rows)) as figure:
+        grid = figure.subplots(rows, _COLUMNS, sharex=True, sharey=True, squeeze=False)
+        for axis, (label, seeds) in zip(grid.flat, curves.items(), strict=False):
+            axis.set_title(label, fontsize=8, fontweight="normal")
             steps = np.array(seeds[0][0])
             relative_thrust = 100.0 * np.array([relative_thrusts for _, relative_thrusts in seeds])
-            low, high = relative_thrust.min(0), relative_thrust.max(0)
-            axis.fill_between(steps, low, high, color=color, alpha=0.1, linewidth=0)
-            for edge in (low, high):
-                axis.plot(steps, edge, color=color, linestyle=style, linewidth=0.5, alpha=0.6)
-            middle = np.median(relative_thrust, 0)
-            axis.plot(steps, middle, color=color, linestyle=style, linewidth=width, label=label)
-        axis.axhline(
-            100.0 * goal,
-            color="0.45",
-            linewidth=0.7,
-            linestyle="--",
-            label=f"{100.0 * goal:.0f} %",
-        )
+            axis.axhline(100.0 * goal, color=GREY, linewidth=0.7, linestyle="--")
+            axis.step(steps, relative_thrust.T, where="post", color=BLUE, linewidth=0.6, alpha=0.4)
+            axis.step(steps, np.median(relative_thrust, 0), where="post", color=BLUE, linewidth=1.8)
+        for axis in grid.flat[len(curves) :]:
+            axis.set_axis_off()
+        axis = grid[0][0]
         axis.set_xscale("log")
         axis.set_xlim(_FIRST, steps_shown)
         ticks = [tick for tick in _TICKS if _FIRST <= tick <= steps_shown]
         axis.set_xticks(ticks, [f"{tick:,}".replace(",", " ") for tick in ticks])
         axis.minorticks_off()
         axis.set_ylim(_LOWEST, 101)
-        axis.set_xlabel("control steps")
-        axis.set_ylabel(f"relative thrust (%, from {_LOWEST} % up)")
-        figure.legend(loc="outside lower center", ncols=3)
+        figure.supxlabel(f"control steps; dashed line: {100.0 * goal:.0f} %", fontsize=9)
+        figure.supylabel(f"relative thrust so far (%, from {_LOWEST} % up)", fontsize=9)

@@ -10,7 +10,7 @@ import click
 from fishd.cli.calibrate import load_files
 from fishd.cli.calibrate.force_dialogue import Dialogue
 from fishd.cli.calibrate.load_files import NEWTONS
-from fishd.cli.options import FiniteRange, endpoint_option, for_option
+from fishd.cli.options import FiniteRange, RenamedOption, endpoint_option, for_option
 from fishd.cli.output import echo
 from fishd.cli.prompts import choose, input_interrupted
 from fishd.client import Fish
@@ -61,11 +61,15 @@ _POOR_RESIDUAL = 0.02
     "earlier (fx_N,fy_N,vx_V,vy_V), which are fitted at once.",
 )
 @click.option(
-    "--record",
+    "--to",
+    "record",
+    cls=RenamedOption,
+    former=("--record",),
     type=click.Path(path_type=Path),
+    metavar="FILE",
     help="Write each measured load to this CSV file, which --loads reads.",
 )
-@click.option("--force", "replace", is_flag=True, help="Replace the file of --record if it exists.")
+@click.option("--force", "replace", is_flag=True, help="Replace the file of --to if it exists.")
 @click.option("--yes", is_flag=True, help="Save without asking.")
 @endpoint_option
 def force(
@@ -91,7 +95,7 @@ def force(
     measured = [Load(step.fx, step.fy, *step.volts) for step in steps if step.volts]
     if measured and record:
         raise click.UsageError(
-            f"--record keeps what is measured now, but {plan} holds loads measured earlier; give "
+            f"--to keeps what is measured now, but {plan} holds loads measured earlier; give "
             "one of the two"
         )
     if record:

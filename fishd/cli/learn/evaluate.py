@@ -10,7 +10,7 @@ import click
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.config import fish_options
-from fishd.cli.options import for_option, json_option
+from fishd.cli.options import RenamedOption, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress
 from fishd.config import load
@@ -33,13 +33,14 @@ PIPE_COLUMNS = 1000
     shell_complete=complete_contestant,
 )
 @click.option(
-    "--fish",
-    "which",
+    "--variation",
+    cls=RenamedOption,
+    former=("--fish",),
     type=click.Choice(["changes", "random", "harsh"]),
     default="harsh",
     show_default=True,
-    help="changes: one imperfection of a rig at a time; random: twenty fish with all of them, in "
-    "random sizes; harsh: both.",
+    help="How the fish differ. changes: one imperfection of a rig at a time; random: twenty fish "
+    "with all of them, in random sizes; harsh: both.",
 )
 @for_option("Length of each run [s].", default=60.0, kind=click.FLOAT)
 @click.option(
@@ -49,15 +50,17 @@ PIPE_COLUMNS = 1000
     show_default=True,
     help="Time of each run before measurements begin [s].",
 )
+@plot_option("the thrust of each on each fish")
 @fish_options
 @json_option
 def evaluate(
     contestants: tuple[str, ...],
-    which: str,
+    variation: str,
     seconds: float,
     settle: float,
     file: Path | None,
     overrides: tuple[str, ...],
+    picture: Path | None,
     as_json: bool,
 ) -> int:
     """Let policies and controllers swim many other fish, in virtual time.
@@ -69,16 +72,22 @@ def evaluate(
     chatter" is the longest stretch of reversals in consecutive ticks.
     Exit status 1 when a run ends in mode fault.
     """
+    from fishd.lab import drawing
+    from fishd.lab.compare import survey_figure
     from fishd.lab.compare.contestants import parse
     from fishd.lab.compare.survey import CHANGES, harsh_fish, survey
 
+    if picture:
+        drawing.check(picture)
     parsed = [parse(text) for text in contestants]
-    fish = list(CHANGES) if which != "random" else []
+    fish = list(CHANGES) if variation != "random" else []
     singles = len(fish)
-    fish += harsh_fish() if which != "changes" else ()
+    fish += harsh_fish() if variation != "changes" else ()
     configs = [(changed, load(file, (*overrides, *changed.overrides))) for changed in fish]
     with show_progress(len(parsed) * len(fish) * seconds, "s swum") as bar:
         surveys = survey(configs, parsed, seconds, settle, bar.at)
+    if picture:
+        survey_figure.draw(picture, surveys)
     if as_json:
         print_json(surveys)
     else:

@@ -15,28 +15,31 @@ from fishd.core.errors import PolicyError
 @click.option(
     "--to",
     "target",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="File to write. [default: the name of the run and .onnx, in this folder]",
+    type=click.Path(path_type=Path),
+    metavar="FILE|FOLDER",
+    default=Path(),
+    help="File to write (.onnx), or a folder for a file named after the run. [default: this "
+    "folder]",
 )
 @click.option("--newest", is_flag=True, help="Export the newest checkpoint instead of the best.")
-@click.option("--force", is_flag=True, help="Overwrite FILE; and export a policy that stalls, too.")
+@click.option(
+    "--force", is_flag=True, help="Overwrite the file; and export a policy that stalls, too."
+)
 @click.option("--note", default="", help="Remark that is stored in the file.")
 @json_option
-def export(
-    run: Path, target: Path | None, newest: bool, force: bool, note: str, as_json: bool
-) -> None:
+def export(run: Path, target: Path, newest: bool, force: bool, note: str, as_json: bool) -> None:
     """Write the policy of RUN, a run folder or one of its checkpoints, to one .onnx file."""
     from fishd.controllers.policy.library import SUFFIX
     from fishd.learning.export import export as write
     from fishd.learning.run_folder import checkpoints
     from fishd.learning.train.progress import format_summary
 
-    if target and target.suffix != SUFFIX:
+    if not target.is_dir() and target.suffix != SUFFIX:
         raise PolicyError(f"{target}: the name of a policy file must end in {SUFFIX}")
     checkpoint = checkpoints.find(run, latest=newest)
     run_folder = run if checkpoint != run else run.resolve().parent
-    target = target or Path(f"{run_folder.resolve().name}{SUFFIX}")
+    if target.is_dir():
+        target /= f"{run_folder.resolve().name}{SUFFIX}"
     if target.is_file() and not force:
         raise PolicyError(f"{target}: exists already; --force overwrites it, --to names another")
     exported = write(checkpoint, target, force=force, note=note)

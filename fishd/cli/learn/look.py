@@ -6,7 +6,7 @@ import click
 
 from fishd.cli.completion import complete_policy
 from fishd.cli.config import fish_options
-from fishd.cli.options import for_option, json_option, plot_option
+from fishd.cli.options import camera_config_option, for_option, json_option, plot_option
 from fishd.cli.output import print_json
 from fishd.config import load
 
@@ -14,18 +14,14 @@ from fishd.config import load
 @click.command()
 @click.argument("policy", metavar="NAME|FILE", shell_complete=complete_policy)
 @plot_option("the heat map over the mean picture")
-@click.option(
-    "--camera",
-    metavar="FILE",
-    help="YAML file of a simulated camera, such as config/camera-web.yaml. [default: a good one]",
-)
+@camera_config_option(former=("--camera",))
 @for_option("Length of the swim [s]; the first 5 s are left out.", default=15.0, kind=click.FLOAT)
 @json_option
 @fish_options
 def look(
     policy: str,
     picture: Path | None,
-    camera: str | None,
+    camera_config: str | None,
     seconds: float,
     file: Path | None,
     overrides: tuple[str, ...],
@@ -42,7 +38,7 @@ def look(
 
     if picture:
         drawing.check(picture)
-    config, camera_settings = load(file, overrides), cameras.load_simulated(camera)
+    config, camera_settings = load(file, overrides), cameras.load_simulated(camera_config)
     result = looking.look(policy, config, camera_settings, seconds)
     if as_json:
         print_json({"policy": policy, "share": result.share, "area": result.area})

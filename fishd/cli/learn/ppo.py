@@ -13,6 +13,8 @@ from msgspec.structs import replace
 from fishd.cli.config import config_option, set_option
 from fishd.cli.experiment_options import On, default_on, on_option
 from fishd.cli.options import (
+    RenamedOption,
+    camera_config_option,
     endpoint_option,
     json_option,
     plot_option,
@@ -53,11 +55,11 @@ BY_RESUME = "with --resume, which keeps the options of the run"
 )
 @click.option(
     "--camera",
-    metavar="FILE|ENDPOINT",
-    help="With --see: in simulation, the YAML file of a simulated camera, such as "
-    "config/camera-web.yaml; live, the request address of its fishd-camera. [default: a good "
-    "simulated one; $FISHD_CAMERA, else that of this machine]",
+    metavar="ADDRESS",
+    help="With --see, live: request address of fishd-camera. [default: $FISHD_CAMERA, else that of "
+    "this machine]",
 )
+@camera_config_option("With --see, in simulation: ")
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
@@ -79,8 +81,10 @@ BY_RESUME = "with --resume, which keeps the options of the run"
     "each of several seeds has its folder: runs/ten/seed-3.",
 )
 @click.option(
-    "--from",
+    "--fine-tune",
     "parent",
+    cls=RenamedOption,
+    former=("--from",),
     type=click.Path(path_type=Path),
     metavar="FOLDER",
     help="Begin with the best networks of another run, or with those of one of its checkpoints: "
@@ -112,6 +116,7 @@ def ppo(
     settings_file: Path | None,
     see: Literal["force", "camera", "both"] | None,
     camera: str | None,
+    camera_config: str | None,
     steps: int | None,
     seed: int | None,
     folder: Path | None,
@@ -140,13 +145,11 @@ def ppo(
         "--settings": settings_file,
     }
     run_options |= {"--see": see, "--seed": seed}
-    new_run_options = {"--folder": folder, "--from": parent}
+    new_run_options = {"--folder": folder, "--fine-tune": parent}
     if resume:
         _refuse(BY_RESUME, {**run_options, **new_run_options, "--seeds": seeds})
     if seeds is None:
         _refuse("without --seeds", {"--jobs": jobs, "--cluster": cluster})
-    elif picture:
-        raise click.UsageError("--plot is for one seed; with --seeds, curves are in seeds.csv")
     elif on == "live":
         raise click.UsageError("--seeds is for simulated fish: there is only one live fish")
     if not resume:
@@ -157,15 +160,19 @@ def ppo(
             "here: this swims in this process, and no fishd has to reach it", {"--agent": agent}
         )
         if resume:
-            _refuse(BY_RESUME, {"--camera": camera})
+            _refuse(BY_RESUME, {"--camera": camera, "--camera-config": camera_config})
+    else:
+        _refuse("here: the fish is live; give --camera", {"--camera-config": camera_config})
     given_settings = {"steps": steps, "seed": seed, "see": see}
     changed = {name: value for name, value in given_settings.items() if value is not None}
-    job = _add_camera(replace(job, agent=agent, settings=replace(job.settings, **changed)), camera)
+    job = replace(job, agent=agent, settings=replace(job.settings, **changed))
+    job = _add_camera(job, camera_config or camera)
     if seeds is not None:
-        return _train_seeds(job, seeds, jobs, cluster, as_json)
-    status = _train(job, as_json)
+        status, draw = _train_seeds(job, seeds, jobs, cluster, as_json), figure.draw_seeds
+    else:
+        status, draw = _train(job, as_json), figure.draw
     if picture:
-        figure.draw(picture, job.folder)
+        draw(picture, job.folder)
     return status
 
 
@@ -230,7 +237,10 @@ def _prepare_job(
 
 
 def _add_camera(job: "Job", camera: str | None) -> "Job":
-    """Return the job with its camera, if any; raise `ConfigError` and `ParameterError`."""
+    """Return the job with its camera, if any; raise `ConfigError` and `ParameterError`.
+
+    camera: file of a simulated camera; address of the camera of a live fish
+    """
     from fishd.camera import settings as cameras
     from fishd.learning.run_folder import runs
     from fishd.learning.settings import check
@@ -320,7 +330,9 @@ def _find_run_folder(path: Path) -> Path:
 
     if not path.is_dir():
         problem = "a policy file has no value network" if path.exists() else "no such folder"
-        raise ConfigError(f"--from {path}: {problem}; give a run folder or one of its checkpoints")
+        raise ConfigError(
+            f"--fine-tune {path}: {problem}; give a run folder or one of its checkpoints"
+        )
     return path if (path / SETTINGS).exists() else path.parent
 
 

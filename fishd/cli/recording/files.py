@@ -2,14 +2,14 @@
 
 import math
 import shlex
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
 
 import click
 from msgspec.structs import asdict
 
-from fishd.cli.options import FiniteRange, json_option
+from fishd.cli.options import F, FiniteRange, json_option
 from fishd.cli.output import echo, format_count, print_json, print_json_line, print_paths
 from fishd.core.addresses import control_address, find_control_address
 from fishd.core.process.interruption import raise_on_first_signal
@@ -41,6 +41,30 @@ def format_damage(ticks: int, reason: str = "") -> str:
     return f"damaged: {format_count(ticks, 'tick')} lost" + (f" ({reason})" if reason else "")
 
 
+def _target_option(suffixes: str) -> Callable[[F], F]:
+    return click.option(
+        "--to",
+        "target",
+        type=click.Path(path_type=Path),
+        default=Path(),
+        metavar="FILE|FOLDER",
+        help=f"File to write ({suffixes}), or a folder for files named after the recording. "
+        "[default: this folder]",
+    )
+
+
+def _target_paths(target: Path, name: str, forms: Sequence[str], form: str | None) -> list[Path]:
+    """Return the files to write: the target, or in that folder a file for each form.
+
+    form: the only form in that folder; None for all
+    """
+    if target.is_dir():
+        return [target / f"{name}.{chosen}" for chosen in ([form] if form else forms)]
+    if form and target.suffix != f".{form}":
+        raise click.UsageError(f"--{form}: --to {target} is a file of another format, or no folder")
+    return [target]
+
+
 @click.command()
 @click.argument("run")
 @click.option("--csv", "form", flag_value="csv", help="Write text, which every program reads.")
@@ -50,19 +74,13 @@ def format_damage(ticks: int, reason: str = "") -> str:
     flag_value="parquet",
     help="Write Parquet, which is smaller and faster to read.",
 )
-@click.option(
-    "--to",
-    "target",
-    type=click.Path(path_type=Path, file_okay=False),
-    default=Path(),
-    help="Folder to write to; default: this one.",
-)
+@_target_option(".csv, .parquet")
 @click.option("--force", is_flag=True, help="Replace existing files.")
 @folder_option
 @json_option
 def export(
     run: str,
-    form: Literal["csv", "parquet"] | None,
+    form: str | None,
     target: Path,
     force: bool,
     folder: Path | None,
@@ -74,9 +92,12 @@ def export(
     """
     from fishd.recording.export import export as write
 
-    if form is None:
-        raise click.UsageError("--csv or --parquet is needed")
-    print_paths(write(open_recording(run, folder), target, form, replace=force), as_json)
+    recorded = open_recording(run, folder)
+    forms = ("csv", "parquet")
+    path, *others = _target_paths(target, recorded.name, forms, form)
+    if others:
+        raise click.UsageError("--csv or --parquet is needed, or the name of a file for --to")
+    print_paths(write(recorded, path, replace=force), as_json)
 
 
 @click.command()
@@ -87,13 +108,7 @@ def export(
 @click.option(
     "--until", "end", type=FiniteRange(min=0), help="End at this time [s]; default: the end."
 )
-@click.option(
-    "--to",
-    "target",
-    type=click.Path(path_type=Path, file_okay=False, exists=True),
-    default=Path(),
-    help="Folder to write to; default: this one.",
-)
+@_target_option(".png, .svg, .pdf, .html")
 @click.option("--png", "only", flag_value="png", help="Draw only the picture.")
 @click.option("--html", "only", flag_value="html", help="Draw only the interactive page.")
 @click.option("--force", is_flag=True, help="Replace existing files.")
@@ -119,16 +134,16 @@ def plot(
 
     recorded = open_recording(run, folder)
     run_traces = traces(recorded, begin, math.inf if end is None else end)
-    forms = [only] if only else ["png", "html"]
-    paths = {form: target / f"{recorded.name}.{form}" for form in forms}
-    check_new_files(paths.values(), replace=force)
-    if "png" in paths:
-        draw_run(run_traces, paths["png"])
-    if "html" in paths:
-        from fishd.lab.run_page import write_page
+    paths = _target_paths(target, recorded.name, ("png", "html"), only)
+    check_new_files(paths, replace=force)
+    for path in paths:
+        if path.suffix == ".html":
+            from fishd.lab.run_page import write_page
 
-        write_page(run_traces, paths["html"])
-    print_paths(paths.values(), as_json)
+            write_page(run_traces, path)
+        else:
+            draw_run(run_traces, path)
+    print_paths(paths, as_json)
 
 
 @click.command()

@@ -35,23 +35,21 @@ def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
     Raises `FishdError` where one cannot be written.
     """
     picture = run.path / PICTURE
-    trained = run.state.trained.folder if run.state.trained else ""
-    draw(run.state, run.path / (trained or TRAINING), amplitude, picture)
+    draw(run, amplitude, picture)
     run.experiment.write(PAGE, page(run.state, picture.read_bytes(), again))
     return picture, run.path / PAGE
 
 
-def draw(state: State, folder: Path, amplitude: float, path: Path) -> None:
-    """Draw fit, search, training and comparison, a panel each.
-
-    folder: folder of the training
-    """
+def draw(run: AdaptFolder, amplitude: float, path: Path) -> None:
+    """Draw fit, search, training and comparison, a panel each; amplitude: Φ [rad]."""
+    state = run.state
     assert state.fitted
+    trained = state.trained.folder if state.trained else ""
     with open_figure(path, (10.0, 7.0)) as figure:
         (fit, search), (training, contest) = figure.subplots(2, 2)
         _draw_fit(fit, state.fitted)
         _draw_search(search, state, amplitude)
-        draw_training(training, folder)
+        draw_training(training, run.path / (trained or TRAINING))
         _draw_contest(contest, state)
 
 

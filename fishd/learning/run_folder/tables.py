@@ -36,7 +36,7 @@ PROGRESS = {
     "deviation": "train/std",
 }
 """Columns of progress.csv, and the keys that they have in TensorBoard."""
-EVALUATIONS = "evaluations.csv"
+EVALUATIONS, SEEDS = "evaluations.csv", "seeds.csv"
 SUMMARY = (
     "steps",
     "seeds",

@@ -60,7 +60,7 @@ class Job(Struct, frozen=True, kw_only=True):
         if self.on == "live" and self.settings.imitation.rounds and not self.is_begun:
             raise ConfigError(
                 "imitation.rounds: the best beat of a robot's fish is not known: learn from "
-                "simulated ones, and go on here with --from; or set it to 0"
+                "simulated ones, and go on here with --fine-tune; or set it to 0"
             )
 
     @property

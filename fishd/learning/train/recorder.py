@@ -238,7 +238,7 @@ class RunRecorder:
         if state.on != job.on:
             raise ConfigError(
                 f"{job.folder} was trained on {state.on}; to go on with its networks on another "
-                f"fish, begin a new run: --on {job.on} --from {job.folder}"
+                f"fish, begin a new run: --on {job.on} --fine-tune {job.folder}"
             )
         card = self._check_card(self.checkpoint)
         if state.is_finished(job.settings.steps):

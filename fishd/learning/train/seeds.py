@@ -51,7 +51,7 @@ def train_seeds(
     the folder is in use, and `FishdError` where no scheduler answers.
     """
     from fishd.lab.experiment import check_free, mark_folder
-    from fishd.learning.run_folder.tables import write_summary
+    from fishd.learning.run_folder.tables import SEEDS, write_summary
 
     folder = job.folder.absolute()
     waiting = [_make_job(job, folder, index) for index in range(seeds)]
@@ -73,7 +73,7 @@ def train_seeds(
         except Killed as killed:
             for index in killed.unfinished:
                 add_outcome(index, _make_failure(waiting[index], "its process was killed"))
-    write_summary(folder / "seeds.csv", [job.folder for job in waiting])
+    write_summary(folder / SEEDS, [job.folder for job in waiting])
     return [outcomes[index] for index in range(seeds)]
 
 

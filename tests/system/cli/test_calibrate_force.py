@@ -53,7 +53,7 @@ def test_guided_loads_make_true_forces_of_voltages_and_say_how_well_they_are_kno
     talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path
 ) -> None:
     record = tmp_path / "loads.csv"
-    words = ("--unit", "g", "--seconds", "0.3", "--record", str(record))
+    words = ("--unit", "g", "--seconds", "0.3", "--to", str(record))
     dialogue = talk(daemon, "calibrate", "force", *words)
     plan = dialogue.expect("-y")
     assert all(name in plan for name in ("zero", "+x", "-x", "+y"))
@@ -122,7 +122,7 @@ def test_loads_that_make_no_fit_can_be_measured_again_and_none_is_lost(
     talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path
 ) -> None:
     record = tmp_path / "loads.csv"
-    words = ("--seconds", "0.3", "--yes", "--record", str(record))
+    words = ("--seconds", "0.3", "--yes", "--to", str(record))
     dialogue = talk(daemon, "calibrate", "force", *words)
     measure(dialogue, rig, 0.0, 0.0)
     measure(dialogue, rig, -0.2, 0.0, "0.2")  # pulled the wrong way
@@ -230,7 +230,7 @@ def test_loads_outlive_a_fishd_without_an_answer(talk: Talk, rig: Bench, daemon:
 def test_a_full_disk_costs_no_load(talk: Talk, rig: Bench, daemon: Daemon, tmp_path: Path) -> None:
     record = tmp_path / "folder" / "loads.csv"
     record.parent.mkdir()
-    words = ("--seconds", "0.6", "--yes", "--record", str(record))
+    words = ("--seconds", "0.6", "--yes", "--to", str(record))
     dialogue = talk(daemon, "calibrate", "force", *words)
     measure(dialogue, rig, 0.0, 0.0)
     dialogue.expect("load [N]")

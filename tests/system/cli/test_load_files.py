@@ -36,10 +36,10 @@ def test_what_was_measured_earlier_cannot_be_recorded(tmp_path: Path) -> None:
     measured = tmp_path / "measured.csv"
     measured.write_text("fx_N,fy_N,vx_V,vy_V\n" + "".join(f"{x},{y},{x},{y}\n" for x, y in PLAN))
     record = tmp_path / "record.csv"
-    words = ("--loads", str(measured), "--record", str(record))
+    words = ("--loads", str(measured), "--to", str(record))
     ended = fishctl_alone(tmp_path, "calibrate", "force", *words)
     assert (ended.returncode, ended.stdout) == (2, "")
-    assert re.match(rf"fishctl: --record keeps what .* {measured} holds .*\n$", ended.stderr)
+    assert re.match(rf"fishctl: --to keeps what .* {measured} holds .*\n$", ended.stderr)
     assert not record.exists()
 
 
@@ -48,7 +48,7 @@ def test_the_file_for_recorded_loads_is_checked_before_the_first_load(
 ) -> None:
     record = tmp_path / "loads.csv"
     record.write_text("precious\n")
-    words = ("calibrate", "force", "--record")
+    words = ("calibrate", "force", "--to")
     ended = daemon.fishctl(*words, str(record))
     assert one_line(ended) == f"fishctl: {record}: is there already; --force replaces it\n"
     assert record.read_text() == "precious\n"

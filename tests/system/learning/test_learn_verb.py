@@ -63,7 +63,7 @@ def test_a_run_a_resume_and_a_run_that_begins_with_its_networks(
     assert result.returncode == 0, result.stderr
     assert f"resumed from {folder}/step-000128" in result.stdout
     assert [row["steps"] for row in rows(folder / "progress.csv")] == ["64", "128", "192"]
-    result = learn("ppo", "--from", str(folder), "--folder", "second", "--steps", "64")
+    result = learn("ppo", "--fine-tune", str(folder), "--folder", "second", "--steps", "64")
     assert result.returncode == 0, result.stderr
     assert runs.read(Path("second"))[1].ppo == runs.read(folder)[1].ppo
     note = checkpoints.read_card(checkpoints.newest(Path("second"))).provenance.note
@@ -88,7 +88,7 @@ def test_mistakes_are_one_line(tmp_path: Path) -> None:
     assert "holds several trainings, seed-0 to seed-0; name one of them" in line
     for name, what in (("a.onnx", "a policy file has no value network"), ("b", "no such")):
         (tmp_path / "a.onnx").touch()
-        status, line = complaint("ppo", "--from", str(tmp_path / name))
+        status, line = complaint("ppo", "--fine-tune", str(tmp_path / name))
         assert status == 78
         assert what in line
     status, line = complaint("ppo", "--seeds", "2", "--on", "live")

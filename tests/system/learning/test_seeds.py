@@ -47,7 +47,8 @@ def _no_trainer_stays() -> Iterator[None]:
 def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Done]:
     """The run folder, which must not be changed, and the output of two seeds in two processes."""
     folder = tmp_path_factory.mktemp("two")
-    done = fishctl(*command(folder, "--seeds", "2", "--jobs", "2", "--seed", "5"))
+    words = ("--seeds", "2", "--jobs", "2", "--seed", "5", "--plot", str(folder / "seeds.png"))
+    done = fishctl(*command(folder, *words))
     return folder / "run", done
 
 
@@ -111,6 +112,7 @@ def test_every_seed_has_a_folder_and_all_share_a_table(two: tuple[Path, Done]) -
     with (run / "seeds.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["steps"] for row in rows] == ["64", "128"]
+    assert (run.parent / "seeds.png").read_bytes().startswith(b"\x89PNG")
     first, second = (read_evaluations(run / f"seed-{index}") for index in (0, 1))
     assert first != second
     assert float(rows[-1]["lowest"]) == min(first[-1].relative_thrust, second[-1].relative_thrust)

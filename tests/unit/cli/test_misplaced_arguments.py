@@ -67,7 +67,7 @@ def test_an_address_in_place_of_the_file_of_a_simulated_camera_is_refused(eye: s
 def test_a_true_camera_cannot_see_a_simulated_fish(eye: str) -> None:
     file = ROOT / "config" / "camera.yaml"
     for verb in (("learn", "look"), ("compare",)):
-        line = one_line(fishctl(*verb, eye, "--camera", str(file)))
+        line = one_line(fishctl(*verb, eye, "--camera-config", str(file)))
         assert line.startswith(f"fishctl: {file}: source is v4l2; in simulation a simulated camera")
 
 
@@ -82,6 +82,8 @@ def test_a_file_in_place_of_the_address_of_a_camera_is_refused(verb: str) -> Non
 
 
 def test_a_camera_that_no_contestant_looks_through_is_refused() -> None:
-    done = fishctl("compare", "swing", "hold", "--camera", str(ROOT / "config/camera-web.yaml"))
+    done = fishctl(
+        "compare", "swing", "hold", "--camera-config", str(ROOT / "config/camera-web.yaml")
+    )
     assert done.returncode == 2
-    assert "--camera cannot be given here: no contestant sees pictures" in one_line(done)
+    assert "--camera-config cannot be given here: no contestant sees pictures" in one_line(done)

@@ -31,7 +31,7 @@ def test_it_shows_the_best_square_wave_and_the_limits_of_the_configured_fish() -
 @pytest.mark.slow
 def test_optimal_control_is_printed_and_drawn(tmp_path: Path) -> None:
     picture = tmp_path / "best.svg"
-    done = invoke("--control", "--plot", str(picture), *QUICK_SERVO)
+    done = invoke("--any-shape", "--plot", str(picture), *QUICK_SERVO)
     assert done.exit_code == 0
     assert "|φ_c| = Φ in 100.0% of the time" in done.output
     assert picture.read_text(encoding="utf-8").startswith("<?xml")
@@ -48,7 +48,7 @@ def test_a_figure_that_cannot_be_written_is_refused_before_anything_is_computed(
     file: str, complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fishd.lab.optimum.optimal_control", lambda *_: pytest.fail("computed"))
-    done = invoke("--control", "--plot", str(tmp_path / file))
+    done = invoke("--any-shape", "--plot", str(tmp_path / file))
     assert isinstance(done.exception, FishdError)
     assert complaint in str(done.exception)
 
@@ -65,7 +65,7 @@ def test_ignored_parameters_are_reported() -> None:
 
 
 def test_optimal_control_is_for_one_amplitude_at_a_time() -> None:
-    done = invoke("--control", "--amplitude", "0.2", "--amplitude", "0.3")
+    done = invoke("--any-shape", "--amplitude", "0.2", "--amplitude", "0.3")
     assert done.exit_code == 2
     assert "one --amplitude at a time" in done.output
 

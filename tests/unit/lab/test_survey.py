@@ -58,9 +58,10 @@ def test_mild_fish_are_as_random_as_harsh_ones_and_their_rigs_are_clean() -> Non
     assert mild(3) == mild(3)
 
 
-def test_the_verb_has_a_column_for_each_contestant() -> None:
-    entries = ("swing", "square:frequency=1.7")
-    done = fishctl("learn", "evaluate", *entries, "--fish", "changes", *BRIEF)
+def test_the_verb_has_a_column_for_each_contestant(tmp_path: Path) -> None:
+    words = ("swing", "square:frequency=1.7", "--variation", "changes", *BRIEF)
+    done = fishctl("learn", "evaluate", *words, "--plot", str(tmp_path / "survey.png"))
+    assert (tmp_path / "survey.png").read_bytes().startswith(b"\x89PNG")
     assert (done.returncode, done.stderr) == (0, "")
     head, *rows = done.stdout.splitlines()
     assert head.split() == ["fish", "swing", "square:frequency=1.7"]

@@ -142,7 +142,7 @@ def test_a_recording_that_was_cut_off_is_finished_with_its_frames(
 def test_frames_are_exported_as_one_array_with_a_table_of_their_times(
     path: Path, frames: list[Frame], tmp_path: Path
 ) -> None:
-    written = export(open_run(path), tmp_path, "csv")
+    written = export(open_run(path), tmp_path / "run.csv")
     names = ["run.csv", "run-events.csv", "run-frames.csv", "run-frames.npy"]
     assert [file.name for file in written] == names
     array = np.load(tmp_path / "run-frames.npy", mmap_mode="r")
@@ -151,7 +151,7 @@ def test_frames_are_exported_as_one_array_with_a_table_of_their_times(
     times = pandas.read_csv(tmp_path / "run-frames.csv")
     assert list(times.time) == [frame.time for frame in frames]
     with pytest.raises(RecordingError, match="use --force to replace it"):
-        export(open_run(path), tmp_path, "csv")
+        export(open_run(path), tmp_path / "run.csv")
 
 
 def test_frames_recorded_meanwhile_are_not_exported(tmp_path: Path, frames: list[Frame]) -> None:
@@ -163,7 +163,7 @@ def test_frames_recorded_meanwhile_are_not_exported(tmp_path: Path, frames: list
         writer.frame(head(frames[1], 2), frames[1].pixels)
         writer.flush()
         assert len(list(run.frames())) == len(run.frame_heads) == 1
-        export(run, tmp_path, "csv")
+        export(run, tmp_path / "run.csv")
     assert np.load(tmp_path / "run-frames.npy").shape == (1, 84, 84)
 
 
@@ -173,5 +173,5 @@ def test_frames_of_several_sizes_are_no_array(tmp_path: Path, frames: list[Frame
         writer.frame(head(frames[0], 1), frames[0].pixels)
         writer.frame(head(frames[1], 2), frames[1].pixels[:40, :40].copy())
     with pytest.raises(RecordingError, match="frames of 84 x 84 px and of 40 x 40 px"):
-        export(open_run(writer.path), tmp_path, "csv")
+        export(open_run(writer.path), tmp_path / "run.csv")
     assert not list(tmp_path.glob("*.part"))

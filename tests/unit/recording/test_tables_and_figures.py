@@ -37,6 +37,10 @@ def test_a_table_has_every_bit_of_every_tick(path: Path, tmp_path: Path, form: s
     again = fishctl("export", str(path), f"--{form}", "--to", str(tmp_path))
     assert "already exists; use --force to replace it" in one_line(again)
     assert fishctl("export", str(path), f"--{form}", "--to", str(tmp_path), "--force").stdout
+    named = fishctl("export", str(path), "--to", str(tmp_path / f"other.{form}"))
+    assert named.stdout.split() == [
+        str(tmp_path / f"other{part}.{form}") for part in ("", "-events")
+    ]
     if form == "parquet":
         about = json.loads(pyarrow.parquet.read_schema(table).metadata[b"fishd"])
         assert about["configs"]["0"]["tick"] == 0.05
@@ -51,6 +55,8 @@ def test_a_recording_is_drawn_as_picture_and_as_page(path: Path, tmp_path: Path)
     assert not re.search(r"<(script|link|img)[^>]*(src|href)=", html)
     assert "Plotly.newPlot" in html
     assert "<b>stiff</b>" not in html
+    drawn = fishctl("plot", str(path), "--to", str(tmp_path / "only.svg"), "--json")
+    assert json.loads(drawn.stdout) == [str(tmp_path / "only.svg")]
     refused = fishctl("plot", str(path), "--to", str(tmp_path))
     assert "already exists; use --force to replace it" in one_line(refused)
     nothing = fishctl("plot", str(path), "--from", "9", "--to", str(tmp_path))
