@@ -9,7 +9,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -106,12 +106,15 @@ def status_rows(state: "CameraState") -> list[tuple[str, str]]:
 @click.option(
     "--whole", is_flag=True, help="Show the whole picture of the camera, not only the crop."
 )
-def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole: bool) -> None:
+@json_option
+def view(
+    address: str | None, png: Path | None, follow: bool, axis: bool, whole: bool, as_json: bool
+) -> None:
     """Show the camera's picture in the terminal: what frames show, with the axis of motion.
 
     With --follow and --axis the axis of motion is drawn in, once the tail has moved for some
-    seconds. If standard output is not a terminal, a line is printed instead; with --follow, one a
-    second.
+    seconds. If standard output is not a terminal, and with --json, a line is printed instead; with
+    --follow, one a second.
     """
     from fishd.camera.axis import AxisWatch
     from fishd.camera.client import CameraClient
@@ -124,13 +127,17 @@ def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole:
         watch = AxisWatch()
         if follow:
             with suppress(KeyboardInterrupt):
-                _follow(client, watch, whole)
+                _follow(client, watch, whole, as_json)
             return
         _await_picture(client, watch, whole)
         if axis:
             _find_axis(client, watch)
         if png:
             _write_png(client, watch, whole, png)
+        if as_json:
+            print_json({"path": png, **read_facts(client, watch)})
+        elif png:
+            echo(f"{png}: {format_facts(client, watch)}")
         elif _can_draw():
             from rich.console import Console
 
@@ -143,18 +150,30 @@ def view(address: str | None, png: Path | None, follow: bool, axis: bool, whole:
             echo(format_facts(client, watch))
 
 
-def format_facts(client: "CameraClient", watch: "AxisWatch") -> str:
-    """Return the latest frame in one line: its number, age, rate, losses, and the axis."""
+def read_facts(client: "CameraClient", watch: "AxisWatch") -> dict[str, Any]:
+    """Return number, rate [Hz], age [s] and losses of the latest frame, and the axis [px, rad]."""
     assert client.latest
     header = client.latest.header
-    parts = [f"frame {header.seq}"]
-    if client.state.rate:
-        parts.append(f"{client.state.rate:.1f} a second")
-    parts.append(f"{(header.available - header.time) * 1e3:.0f} ms old when it came")
-    if header.dropped_frames or client.missed:
-        parts.append(f"lost: {header.dropped_frames + client.missed}")
-    if watch.axis:
-        parts.append(f"axis {watch.axis.offset:+.1f} px, {watch.axis.tilt * 57.29578:+.1f}°")
+    return {
+        "frame": header.seq,
+        "rate": client.state.rate,
+        "age": header.available - header.time,
+        "lost": header.dropped_frames + client.missed,
+        "axis": {"offset": watch.axis.offset, "tilt": watch.axis.tilt} if watch.axis else None,
+    }
+
+
+def format_facts(client: "CameraClient", watch: "AxisWatch") -> str:
+    """Return the same facts in one line of text."""
+    facts = read_facts(client, watch)
+    parts = [f"frame {facts['frame']}"]
+    if facts["rate"]:
+        parts.append(f"{facts['rate']:.1f} a second")
+    parts.append(f"{facts['age'] * 1e3:.0f} ms old when it came")
+    if facts["lost"]:
+        parts.append(f"lost: {facts['lost']}")
+    if axis := facts["axis"]:
+        parts.append(f"axis {axis['offset']:+.1f} px, {axis['tilt'] * 57.29578:+.1f}°")
     return ", ".join(parts)
 
 
@@ -182,11 +201,14 @@ def _read_frames(client: "CameraClient", watch: "AxisWatch", seconds: float) -> 
         watch.add(frame)
 
 
-def _follow(client: "CameraClient", watch: "AxisWatch", whole: bool) -> None:
+def _follow(client: "CameraClient", watch: "AxisWatch", whole: bool, as_json: bool) -> None:
     _await_picture(client, watch, whole)
-    if not _can_draw():
+    if as_json or not _can_draw():
         while True:
-            echo(format_facts(client, watch))
+            if as_json:
+                print_json_line(read_facts(client, watch))
+            else:
+                echo(format_facts(client, watch))
             _read_for(client, watch, 1.0)
     from rich.console import Group
     from rich.text import Text
@@ -230,7 +252,6 @@ def _write_png(client: "CameraClient", watch: "AxisWatch", whole: bool, png: Pat
 
     colours = _draw_picture(client, watch, whole)
     drawing.write_png(png, colours if whole else drawing.enlarge(colours))
-    echo(f"{png}: {format_facts(client, watch)}")
 
 
 def _can_draw() -> bool:

@@ -145,8 +145,12 @@ def test_without_a_camera_a_verb_says_so_in_one_line(tmp_path: Path) -> None:
         ), verb
 
 
-def test_a_view_without_a_terminal_is_a_line() -> None:
+def test_a_view_without_a_terminal_is_a_line_and_for_a_program_json(tmp_path: Path) -> None:
     line = output_of("view")
+    facts = json.loads(output_of("view", "--json", "--plot", tmp_path / "now.png"))
+    assert facts["path"] == str(tmp_path / "now.png")
+    assert facts["frame"] > 0
+    assert 0.0 < facts["age"] < PATIENCE
     assert re.fullmatch(r"frame \d+, (29|30|31)\.\d a second, \d+ ms old when it came\n", line)
 
 
