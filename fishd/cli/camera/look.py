@@ -135,7 +135,7 @@ def view(
         if png:
             _write_png(client, watch, whole, png)
         if as_json:
-            print_json({"path": png, **read_facts(client, watch)})
+            print_json({"path": str(png) if png else None, **read_facts(client, watch)})
         elif png:
             echo(f"{png}: {format_facts(client, watch)}")
         elif _can_draw():
