@@ -95,7 +95,7 @@ class Verbs(click.Group):
         verb = self._verbs.get(cmd_name)
         if verb is None:
             return None
-        with _pause_garbage_collector():
+        with pause_garbage_collector():
             module = import_module(f"fishd.cli.{verb.module}")
         command: click.Command = getattr(module, verb.command)
         return command
@@ -131,8 +131,8 @@ class Verbs(click.Group):
 
 
 @contextmanager
-def _pause_garbage_collector() -> Iterator[None]:
-    """Pause the garbage collector during an import, where it takes a tenth of the time."""
+def pause_garbage_collector() -> Iterator[None]:
+    """Pause the garbage collector: in imports it takes a tenth of the time, in drawing a fifth."""
     was_enabled = gc.isenabled()
     gc.disable()
     try:

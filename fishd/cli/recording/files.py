@@ -11,6 +11,7 @@ from msgspec.structs import asdict
 
 from fishd.cli.options import F, FiniteRange, json_option
 from fishd.cli.output import echo, format_count, print_json, print_json_line, print_paths
+from fishd.cli.verbs import pause_garbage_collector
 from fishd.core.addresses import control_address, find_control_address
 from fishd.core.process.interruption import raise_on_first_signal
 from fishd.recording import Run, open_run
@@ -114,6 +115,7 @@ def export(
 @click.option("--force", is_flag=True, help="Replace existing files.")
 @folder_option
 @json_option
+@pause_garbage_collector()
 def plot(
     run: str,
     begin: float,
