@@ -45,6 +45,7 @@ docs: $(VENV)/installed-docs  ## Write the generated parts of docs/, and build b
 	$(BIN)/python tools/protocol_reference.py --write
 	$(BIN)/python tools/verb_reference.py --write
 	$(BIN)/python tools/rooms.py --write
+	$(BIN)/python tools/boards.py --write
 	$(SPHINX) -b html docs build/docs/html
 	$(SPHINX) -b man docs build/docs/man
 	@echo "Open build/docs/html/README.html, or: man build/docs/man/fishctl.1"

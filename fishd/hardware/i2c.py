@@ -157,7 +157,7 @@ def _bus(machine: Machine, number: int, section: str) -> Result:
 
 def _speed(machine: Machine, number: int) -> Result:
     """Check the speed of the bus that the device tree states."""
-    bit_rate = _read_bit_rate(machine, number)
+    bit_rate = read_bit_rate(machine, number)
     if bit_rate is None:
         return skipped("the kernel does not state the speed of this bus")
     if bit_rate < FAST_BIT_RATE:
@@ -174,7 +174,7 @@ def _speed(machine: Machine, number: int) -> Result:
     return ok(f"{bit_rate / 1e3:.0f} kbit/s")
 
 
-def _read_bit_rate(machine: Machine, number: int) -> int | None:
+def read_bit_rate(machine: Machine, number: int) -> int | None:
     """Return the bit rate of the bus in the device tree [bit/s]; None if it is not there."""
     for folder in _ADAPTERS:
         path = machine.path(f"{folder}/i2c-{number}/of_node/clock-frequency")

@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Struct
 
 from common.report import quantile
+from fishd.cli.doctor.bench import cyclictest
 
 PLAIN_LOOP = """
 import asyncio, json, os, sys, time
@@ -32,8 +33,6 @@ async def run():
 print(json.dumps(asyncio.run(run())))
 """
 """asyncio.sleep to absolute deadlines; prints the lateness of each tick [s]."""
-MAX_HISTOGRAM_US = 100_000
-"""Range of cyclictest's histogram [µs]; later wake-ups count as this."""
 
 
 class Lateness(Struct, frozen=True):
@@ -81,11 +80,7 @@ def start_all(period: float, seconds: float, priority: int) -> list[Contestant]:
     loop = [sys.executable, "-c", PLAIN_LOOP, str(period), str(count), str(priority)]
     started = [Contestant(loop, period, _parse_loop)]
     if shutil.which("cyclictest"):
-        policy = [f"--priority={priority}"] if priority else ["--policy=other"]
-        # Without --laptop, cyclictest keeps the CPUs out of deep sleep, for every contestant.
-        command = ["cyclictest", "--quiet", "--mlockall", "--laptop", *policy]
-        command += [f"--interval={period * 1e6:.0f}", f"--histogram={MAX_HISTOGRAM_US}"]
-        command += [f"--duration={max(1, seconds):.0f}"]
+        command = cyclictest.command(period, seconds, priority)
         started.append(Contestant(command, period, _parse_cyclictest))
     return started
 
@@ -95,14 +90,5 @@ def _parse_loop(output: str, period: float) -> Lateness:
 
 
 def _parse_cyclictest(output: str, period: float) -> Lateness:
-    late: list[float] = []
-    worst = 0.0
-    for line in output.splitlines():
-        words = line.split()
-        if line.startswith("# Max Latencies:"):
-            worst = float(words[-1])
-        elif line.startswith("# Histogram Overflows:"):
-            late += [MAX_HISTOGRAM_US * 1e-6] * int(words[-1])
-        elif len(words) == 2 and words[0].isdigit() and int(words[1]):
-            late += [int(words[0]) * 1e-6] * int(words[1])
+    late, worst = cyclictest.parse(output)
     return msgspec.structs.replace(lateness("cyclictest", period, late), worst=worst)

@@ -10,10 +10,10 @@ import click
 from fishd.cli.config import load_service, service_option, set_option
 from fishd.cli.doctor import computer, drivers, service, software, timing
 from fishd.cli.doctor.base import Context
-from fishd.cli.options import endpoint_option, json_option
+from fishd.cli.options import endpoint_option, for_option, json_option
 from fishd.cli.output import echo, format_count, print_json
 from fishd.core import text
-from fishd.core.errors import MissingPackage, install_command
+from fishd.core.errors import MissingPackage, StartupError, install_command
 from fishd.hardware.checks import Check, Result, fail
 from fishd.hardware.registry import driver_packages
 
@@ -25,17 +25,51 @@ _COLOURS = {"ok": "green", "warning": "yellow", "FAIL": "red", "skipped": "brigh
 @set_option
 @endpoint_option
 @json_option
+@click.option(
+    "--bench",
+    is_flag=True,
+    help="Measure this board with two wires and without the servo, and write a report to send.",
+)
+@click.option("--yes", is_flag=True, help="With --bench: do not ask about the wires.")
+@click.option(
+    "--loop-gpio",
+    type=click.IntRange(0, 27),
+    default=23,
+    show_default=True,
+    help="With --bench: pin that the wire from the servo's pin leads to, Broadcom number.",
+)
+@for_option("With --bench: length of the swim [s].", default=10.0)
+@click.option(
+    "--to",
+    "output",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path(),
+    help="With --bench: folder of the report; default: this one.",
+)
 def doctor(
-    file: Path | None, overrides: tuple[str, ...], endpoint: str | None, as_json: bool
+    file: Path | None,
+    overrides: tuple[str, ...],
+    endpoint: str | None,
+    as_json: bool,
+    bench: bool,
+    yes: bool,
+    loop_gpio: int,
+    seconds: float,
+    output: Path,
 ) -> int:
     """Check everything that fishd needs with this configuration, and print remedies.
 
     Only what the configured robot needs is checked. Nothing moves and nothing is changed; a
     running fishd is asked and not disturbed. Exit status 1 when a check failed, 78 when the
     configuration is wrong.
+
+    With --bench, the servo must be unplugged: the pulses of a swim are measured, and their end
+    after a kill, the ADC, its bus, and how late ticks come. See docs/how-to/bench.md.
     """
     config, used_file = load_service(file, overrides)
     context = Context(config, used_file, endpoint or config.control.address)
+    if bench:
+        return _measure_board(context, overrides, loop_gpio, seconds, output, yes)
     findings = []
     for name, result in examine(context):
         result = result._replace(message=text.line(result.message))
@@ -54,6 +88,25 @@ def doctor(
         if not config.kind.has_hardware:
             echo("a simulated fish needs no hardware, so none was checked")
     return 1 if counts["FAIL"] else 0
+
+
+def _measure_board(
+    context: Context,
+    overrides: tuple[str, ...],
+    loop_gpio: int,
+    seconds: float,
+    output: Path,
+    yes: bool,
+) -> int:
+    from fishd.cli.doctor.bench import measurement
+    from fishd.cli.doctor.bench.swim import Bench
+
+    measurement.check_wiring(context, loop_gpio)
+    if occupied := context.occupied("owns the hardware"):
+        raise StartupError(f"{occupied.message}; stop it first, such as: sudo systemctl stop fishd")
+    if not yes:
+        measurement.confirm(context, loop_gpio)
+    return measurement.run(Bench(context, overrides, loop_gpio, seconds), output, _print)
 
 
 def _print(name: str, result: Result) -> None:

@@ -2,6 +2,7 @@
 
 import math
 from collections import deque
+from collections.abc import Iterator
 from typing import NamedTuple
 
 SERVO_FRAME = 0.02
@@ -14,6 +15,14 @@ class Pulses(NamedTuple):
     time: float
     width: float
     frame: float
+
+
+class Edge(NamedTuple):
+    """Change of the level of a pin."""
+
+    time: float
+    """[s]"""
+    level: int
 
 
 class PulseTrain:
@@ -68,6 +77,21 @@ class PulseTrain:
         if now.width >= now.frame * 1e6:
             return 1
         return int(time - _frame_start(time, now.frame) < now.width * 1e-6 - _EDGE_TOLERANCE_S)
+
+    def edges(self, begin: float, end: float) -> Iterator[Edge]:
+        """Yield the edges from `begin` to before `end` [s], which is not in the future."""
+        entries = list(self._log)
+        ends = [entry.time for entry in entries[1:]] + [end]
+        for entry, entry_end in zip(entries, ends, strict=False):  # there may be no entries
+            first, last = max(begin, entry.time), min(end, entry_end)
+            if not entry.width or first >= last:
+                continue
+            frame = math.floor(first / entry.frame + _FRAME_TOLERANCE)
+            while (start := frame * entry.frame) < last:
+                for edge in (Edge(start, 1), Edge(start + entry.width * 1e-6, 0)):
+                    if first <= edge.time < last:
+                        yield edge
+                frame += 1
 
     def _forget_after(self, time: float) -> None:
         while self._log and self._log[-1].time >= time:

@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from fishd.core.schema import note, unit
 from fishd.hardware.force_sensor.ads1115 import Channel, I2cAddress
@@ -35,6 +35,25 @@ class VirtualPiSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     adc_noise: Annotated[
         float, unit("1", "RMS noise of a conversion, in steps of the ADC.", ge=0, le=100)
     ] = 1.0
+    adc_gain: Annotated[
+        float, unit("1", "Ratio of the ADC's codes to those of a perfect one.", ge=0.5, le=2)
+    ] = 1.0
+    loop_gpio: Annotated[
+        Gpio | None,
+        note(
+            "Pin to which a wire from the servo's pin leads, for 'fishctl doctor --bench'; null: "
+            "no wire."
+        ),
+    ] = None
+    filter_time: Annotated[
+        Annotated[float, Meta(ge=0, le=10)] | None,
+        unit(
+            "s",
+            "Time constant of a resistor from the servo's pin to A0, with a capacitor from A0 to "
+            "ground, for 'fishctl doctor --bench'; they replace the amplifier at A0. 0: a bare "
+            "wire; null: the amplifier.",
+        ),
+    ] = None
     power_meter: Annotated[
         Literal["ina219", "ina226"] | None,
         note("Chip that measures the servo's power, at 0x40 on the same bus; null: none."),

@@ -17,12 +17,15 @@ from fishd.virtual.pi.i2c import I2cBus
 from fishd.virtual.pi.ina import CHIPS
 from fishd.virtual.pi.lgpio import Pins
 from fishd.virtual.pi.pigpiod.daemon import Pigpiod
+from fishd.virtual.pi.rc_filter import RcFilter
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.tank import Tank
 from fishd.virtual.plant.parameters import PlantParameters
 
 POWER_METER_ADDRESS = 0x40
 """I2C address of the power meter."""
+_MUX_OF_A0 = (0, 1, 4)
+"""Mux bits of the inputs A0-A1, A0-A3 and A0; the other two pins are at ground beside a filter."""
 _MAX_CONVERSION_S = 0.2
 """Upper bound of the time of a conversion at the slowest data rate [s]."""
 
@@ -84,9 +87,15 @@ class VirtualPi:
         self.pigpiod = Pigpiod(clock, self.faults, settings.pigpio_port)
         pulse = partial(self.pigpiod.width, settings.servo_gpio)
         self.tank = Tank(settings, plant, imperfections, tick, pulse, clock.monotonic())
-        self.chip = Ads1115Chip(
-            clock, self.tank.volts, self.faults, settings.adc_noise, seed=seed + 2
-        )
+        self._filter: RcFilter | None = None
+        if settings.filter_time is not None:
+            edges = partial(self.pigpiod.edges, settings.servo_gpio)
+            self._filter = RcFilter(edges, settings.filter_time)
+        if settings.loop_gpio is not None:
+            self.pigpiod.connect(settings.loop_gpio, settings.servo_gpio)
+        is_plain = self._filter is None and settings.adc_gain == 1.0
+        volts = self.tank.volts if is_plain else self._volts
+        self.chip = Ads1115Chip(clock, volts, self.faults, settings.adc_noise, seed=seed + 2)
         self.bus.attach(settings.address, self.chip)
         if settings.power_meter:
             supply = imperfections.motor.voltage
@@ -125,6 +134,14 @@ class VirtualPi:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _volts(self, mux: int, begin: float, end: float) -> float:
+        """Do as `Tank.volts`, with the filter at A0, if any, and the gain of the ADC."""
+        if self._filter and mux in _MUX_OF_A0:
+            volts = self._filter.mean(begin, end)
+        else:
+            volts = self.tank.volts(mux, begin, end)
+        return self.settings.adc_gain * volts
 
     def set_level(self, gpio: int, level: int | None) -> None:
         """Drive a pin of the header from outside, None: stop; raises ValueError for another pin."""

@@ -5,6 +5,7 @@ unknown command, and logged.
 """
 
 import logging
+import random
 import struct
 from collections.abc import Callable
 from enum import Enum, auto
@@ -13,7 +14,7 @@ from itertools import count
 from fishd.virtual.pi.pigpiod import errors
 from fishd.virtual.pi.pigpiod.errors import PigpioError, check
 from fishd.virtual.pi.pigpiod.script import PARAMETER_COUNT, Script
-from fishd.virtual.pi.pulse_train import PulseTrain
+from fishd.virtual.pi.pulse_train import Edge, PulseTrain
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +38,10 @@ NAMES = _NAMES.split()
 """All commands of pigpio, by number."""
 
 _STATUS = struct.Struct(f"<{PARAMETER_COUNT + 1}i")
+_REPORT = struct.Struct("<HHII")
+"""Report of a notification: sequence, flags, tick [µs], levels."""
+JITTER_S = 1e-4
+"""Largest delay of an edge by the fault pulse-jitter [s]."""
 GPIO_COUNT = 32
 """Number of GPIOs."""
 HEADER_GPIOS = range(2, 28)
@@ -99,6 +104,19 @@ class Pin:
         self.requested = requested
 
 
+class Notification:
+    """Reports of the edges of some GPIOs to one client."""
+
+    def __init__(self, send: Callable[[bytes], None]) -> None:
+        self.send = send
+        self.mask = 0
+        """GPIOs to report, as bits."""
+        self.since = 0.0
+        """End of the time that is reported [s]."""
+        self.levels = 0
+        self.sequence = 0
+
+
 class Pins:
     """All GPIOs; each method is a command of pigpio and raises `PigpioError`.
 
@@ -108,6 +126,8 @@ class Pins:
 
     def __init__(self) -> None:
         self.pins = [Pin(gpio) for gpio in range(GPIO_COUNT)]
+        self.wires: dict[int, int] = {}
+        """GPIOs that a wire connects to another one, by GPIO."""
 
     def reset(self, time: float) -> None:
         """Reset as after a restart of the daemon.
@@ -121,11 +141,17 @@ class Pins:
 
     def levels(self, time: float) -> int:
         """Return all levels as bits."""
-        return sum(pin.level(time) << gpio for gpio, pin in enumerate(self.pins))
+        return sum(self.driver(gpio).level(time) << gpio for gpio in range(GPIO_COUNT))
+
+    def driver(self, gpio: int) -> Pin:
+        """Return the GPIO that drives this one: at the other end of a wire, or itself."""
+        pin = self.pins[gpio]
+        return self.pins[self.wires.get(gpio, gpio)] if pin.mode == INPUT else pin
 
     def level(self, time: float, gpio: int) -> int:
         """Return the level of one GPIO."""
-        return self._pin(gpio).level(time)
+        self._pin(gpio)
+        return self.driver(gpio).level(time)
 
     def write(self, time: float, gpio: int, level: int) -> int:
         """Make a GPIO an output with a level; pulses end at once."""
@@ -215,6 +241,9 @@ class Commands:
     def __init__(self) -> None:
         self.pins = pins = Pins()
         self._scripts: dict[int, Script] = {}
+        self.notifications: dict[int, Notification] = {}
+        """Notifications by handle."""
+        self._random = random.Random(0)
         self._logged: set[int] = set()
         """Unknown commands that were logged."""
         self._handlers: dict[str, Callable[[float, int, int, bytes], int]] = {
@@ -244,15 +273,55 @@ class Commands:
             "BR2": lambda _, __, ___, ____: 0,
             "TICK": lambda time, _, __, ___: int(time * 1e6),
             "HWVER": lambda _, __, ___, ____: HARDWARE_REVISION,
-            # pigpio.pi() sends these to open and close a handle for notifications.
-            "NOIB": lambda _, __, ___, ____: 0,
-            "NC": lambda _, __, ___, ____: 0,
+            "NB": self._begin_notification,
+            "NC": lambda _, handle, __, ___: self._end_notification(handle),
         }
 
     def restart(self, time: float) -> None:
         """Reset as after a restart: without pulses and scripts."""
         self.pins.reset(time)
         self._scripts.clear()
+        self.notifications.clear()
+
+    def open_notification(self, send: Callable[[bytes], None]) -> int:
+        """Return the handle of new notifications for a client, which report no GPIOs yet."""
+        handle = next(number for number in count() if number not in self.notifications)
+        self.notifications[handle] = Notification(send)
+        return handle
+
+    def _begin_notification(self, time: float, handle: int, mask: int, _: bytes) -> int:
+        check(handle in self.notifications, errors.BAD_HANDLE)
+        notification = self.notifications[handle]
+        notification.mask, notification.since = mask, time
+        notification.levels = self.pins.levels(time)
+        return 0
+
+    def _end_notification(self, handle: int) -> int:
+        check(self.notifications.pop(handle, None) is not None, errors.BAD_HANDLE)
+        return 0
+
+    def notify(self, time: float, jitter: bool) -> None:
+        """Report the edges of pulses before a time [s], up to which the scripts have run.
+
+        jitter: whether each edge is reported up to `JITTER_S` late
+        """
+        for notification in list(self.notifications.values()):
+            changes: dict[Edge, int] = {}
+            for gpio in range(GPIO_COUNT):
+                if notification.mask >> gpio & 1:
+                    for edge in self.pins.driver(gpio).train.edges(notification.since, time):
+                        changes[edge] = changes.get(edge, 0) | 1 << gpio
+            reports = b""
+            for (when, level), bits in sorted(changes.items()):
+                levels = notification.levels
+                notification.levels = levels | bits if level else levels & ~bits
+                late = self._random.uniform(0.0, JITTER_S) if jitter else 0.0
+                tick = int((when + late) * 1e6) & 0xFFFFFFFF
+                reports += _REPORT.pack(notification.sequence, 0, tick, notification.levels)
+                notification.sequence = notification.sequence + 1 & 0xFFFF
+            notification.since = time
+            if reports:
+                notification.send(reports)
 
     def resume(self, time: float) -> None:
         """Continue at a time [s] after a pause."""

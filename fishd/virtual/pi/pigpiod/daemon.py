@@ -18,12 +18,13 @@ from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.pigpiod import errors
 from fishd.virtual.pi.pigpiod.commands import NAMES, Commands
 from fishd.virtual.pi.pigpiod.script import MAX_DELAY_MS
+from fishd.virtual.pi.pulse_train import Edge
 
 POLL_PERIOD_S = 5e-3
 """Time between two checks of the clock while a delay or a fault is active [s]."""
 MAX_EXTENSION_BYTES = 65_535
 """Largest extension of a command; pigpiod drops a client that announces more [bytes]."""
-_MILS = NAMES.index("MILS")
+_MILS, _OPEN_NOTIFICATION = NAMES.index("MILS"), NAMES.index("NOIB")
 _HEADER = struct.Struct("<4I")
 """Header of a command: number, p1, p2, length of the extension; in a reply, the result is last."""
 
@@ -38,6 +39,8 @@ class Connection:
         self._commands = commands
         self._input = bytearray()
         self._late_reply = b""
+        self.notification: int | None = None
+        """Handle of the notifications that this connection receives."""
         self.due = math.inf
         """End of a delay that the client has requested [s]."""
 
@@ -88,7 +91,9 @@ class Connection:
 
     def _answer(self, time: float, number: int, p1: int, p2: int, extension: bytes) -> None:
         extra_bytes = b""
-        if number != _MILS:
+        if number == _OPEN_NOTIFICATION:
+            result = self.notification = self._commands.open_notification(self._send)
+        elif number != _MILS:
             result, extra_bytes = self._commands.execute(time, number, p1, p2, extension)
         else:
             result = 0 if p1 <= MAX_DELAY_MS else errors.BAD_MILS_DELAY
@@ -159,6 +164,16 @@ class Pigpiod:
             self._catch_up()
             return self._commands.pins.pins[gpio].train.history
 
+    def edges(self, gpio: int, begin: float, end: float) -> list[Edge]:
+        """Return the edges of a pin from `begin` to before `end` [s], at most until now."""
+        with self._lock:
+            self._catch_up()
+            return list(self._commands.pins.pins[gpio].train.edges(begin, end))
+
+    def connect(self, gpio: int, source: int) -> None:
+        """Connect a pin to another one, which drives it while it is an input."""
+        self._commands.pins.wires[gpio] = source
+
     def stands_still(self) -> bool:
         """Return whether it is frozen; then it does not answer until the clock advances."""
         with self._lock:
@@ -206,6 +221,7 @@ class Pigpiod:
             self._frozen = frozen
         if not frozen:
             self._commands.advance(now)
+            self._commands.notify(now, not faults.none and faults.active("pulse-jitter"))
             for connection in list(self._connections.values()):
                 if connection.due <= now and not connection.end_delay(now):
                     self._drop(connection)
@@ -231,6 +247,8 @@ class Pigpiod:
         if self._gone or self._frozen:
             return POLL_PERIOD_S
         due = min((connection.due for connection in self._connections.values()), default=math.inf)
+        if self._commands.notifications:
+            return POLL_PERIOD_S
         # Polled, because a virtual clock may advance at any speed.
         return None if due == math.inf else min(POLL_PERIOD_S, max(0.0, due - now))
 
@@ -250,6 +268,8 @@ class Pigpiod:
 
     def _drop(self, connection: Connection) -> None:
         del self._connections[connection.socket.fileno()]
+        if connection.notification is not None:
+            self._commands.notifications.pop(connection.notification, None)
         self._epoll.unregister(connection.socket)
         connection.socket.close()
 

@@ -55,10 +55,10 @@ def test_what_cannot_be_done_is_answered_with_pigpios_error(
 
 
 def test_what_is_not_emulated_is_refused(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
-    assert bench.result("notify_begin", 0, 1) == pigpio.PI_UNKNOWN_COMMAND
+    assert bench.result("set_pull_up_down", 4, 2) == pigpio.PI_UNKNOWN_COMMAND
     assert bench.result("store_script", b"tag 0 inr p0 jmp 0") == pigpio.PI_BAD_SCRIPT_CMD
     command, instruction = caplog.messages
-    assert "command NB (19) is not emulated" in command
+    assert "command PUD (2) is not emulated" in command
     assert "'inr' is not one of the emulated instructions: tag, " in instruction
 
 
