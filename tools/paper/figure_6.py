@@ -25,7 +25,7 @@ CRITERIA = (0.0, 0.6)
 TICK = 0.002
 """Shortest tick of fishd, so that reversals are hardly delayed [s]."""
 CELL = 1.0
-"""Size of the cells of the figure [mm]; the step in ms has the same number on all grids."""
+"""Size of the cells of the figure [mm]; the step is half of the number, in ms."""
 CELLS = (2.0, 1.0, 0.5)
 """Sizes of the cells of the refinement [mm]."""
 NOT_STEADY = "never"
@@ -55,7 +55,7 @@ def config(cell: float) -> Config:
     """Return the default swimmer on such a grid; cell: size of the cells [mm]"""
     numerics = "swimmer.numerics."
     return load(
-        CONFIG, (f"tick={TICK}", f"{numerics}cell={1e-3 * cell}", f"{numerics}step={1e-3 * cell}")
+        CONFIG, (f"tick={TICK}", f"{numerics}cell={1e-3 * cell}", f"{numerics}step={0.5e-3 * cell}")
     )
 
 

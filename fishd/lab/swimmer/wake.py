@@ -101,13 +101,15 @@ def take_view(fish: Fish, quantity: Quantity, window: Window, columns: int) -> V
     x = window.left + pixel * (np.arange(columns) + 0.5)
     y = window.bottom + (window.top - window.bottom) / rows * (np.arange(rows) + 0.5)
     values, at_x, at_y = _read_quantity(fish, quantity)
-    offset = fish.travelled
+    along, across = fish.travelled
     motion = fish.motion()
     return View(
         quantity,
         _interpolate(values, at_x, at_y, x, y).T,
-        Window(window.left + offset, window.right + offset, window.bottom, window.top),
-        fish.outline() + np.array([offset, 0.0]),
+        Window(
+            window.left + along, window.right + along, window.bottom + across, window.top + across
+        ),
+        fish.outline() + fish.travelled,
         motion.time,
         motion.speed,
         motion.x,

@@ -31,7 +31,7 @@ def build_beam(settings: SwimmerSettings) -> Beam:
         lambda X: half_thickness(body, X),
         lambda X: plane * (2.0 * half_thickness(body, X)) ** 3 / 12.0,
         numerics.segments,
-        0.5 * numerics.cell,
+        numerics.cell,
         density=body.excess_density,
         viscous_time=body.viscosity / body.young,
     )

@@ -1,222 +1,321 @@
 """Faces of the grid that a body covers, and the effect of the body on the water there.
 
-A face that a body covers in part is a mixture of body and water. The velocity of the mixture is the
-average of both over a cell around the face (Maertens and Weymouth, Comput. Methods Appl. Mech. Eng.
-283, 2015, doi:10.1016/j.cma.2014.09.007; here with a kernel one cell wide):
+A face near the surface of a body is a mixture of body and water. The velocity of the mixture is the
+average of both with a kernel around the face (Maertens and Weymouth, Comput. Methods Appl. Mech.
+Eng. 283, 2015, doi:10.1016/j.cma.2014.09.007; here χ = 1 − μ₀):
 
-    share · body + (1 − share) · water + moment · ∇(water − body)
+    χ · body + (1 − χ) · water + μ₁ · ∇(water − body)
 
-The moment is that of the part of the cell that is water. Without it, the method has first order:
-the water next to a body moves with it, and the boundary layer is too thick by about half a cell.
+The kernel is a cosine with a half width of one cell, ½(1 + cos πr), in both directions. μ₁ is the
+first moment of the water in it. Without it, the method has first order: the water next to a body
+moves with it, and the boundary layer is too thick by about half a cell.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from fishd.virtual.swimmer.grid import Array
+from fishd.virtual.swimmer.grid import MAX_SIZE_RATIO, Array, Field
 
 
 class Covered(NamedTuple):
-    """Coverage of each face by a body, arrays of shape (nx, ny)."""
+    """Faces of one velocity component that a body covers at least in part; arrays of one length."""
 
-    share: Array
-    """Fraction of the cell around a face that is body."""
+    i: NDArray[np.int64]
+    j: NDArray[np.int64]
     owner: NDArray[np.int64]
-    """Index of the nearest slice of the body; −1 where nothing is covered."""
-    moment_x: Array
-    """First moment along x of the water in that cell, in cells."""
-    moment_y: Array
-    """First moment along y of the water in that cell, in cells."""
+    """Index of the nearest slice of the body."""
+    chi: Array
+    """χ, the fraction of the kernel around the face that is body."""
+    mu1_x: Array
+    """First moment μ₁ along x of the water in the kernel [cells]."""
+    mu1_y: Array
+    """First moment μ₁ along y of the water in the kernel [cells]."""
+
+    def dense(self, shape: tuple[int, int]) -> Array:
+        """Return χ of all faces, an array of this shape."""
+        chi = np.zeros(shape)
+        chi[self.i, self.j] = self.chi
+        return chi
+
+
+@njit(inline="always")
+def kernel_integral(r: float) -> float:  # pragma: no cover
+    """Return the part of the kernel that lies below r [cells]."""
+    if r >= 1.0:
+        return 1.0
+    if r <= -1.0:
+        return 0.0
+    return 0.5 * (1.0 + r + math.sin(math.pi * r) / math.pi)
+
+
+@njit(inline="always")
+def kernel_moment(r: float) -> float:  # pragma: no cover
+    """Return the first moment of the part of the kernel that lies above r [cells]."""
+    if abs(r) >= 1.0:
+        return 0.0
+    angle = math.pi * r
+    return 0.25 * (1.0 - r * r) - 0.5 * (
+        r * math.sin(angle) / math.pi + (1.0 + math.cos(angle)) / math.pi**2
+    )
 
 
 def circle(px: Array, py: Array, radius: float, h: float) -> Covered:
     """Return the coverage by a circle.
 
-    px, py: positions of the faces relative to its centre, shapes (nx, 1) and (1, ny) [m]
+    px, py: positions of the faces relative to its centre, shapes (nx,) and (ny,) [m]
     h: size of a cell [m]
     """
-    distance_from_centre = np.hypot(px, py)
-    reach = (distance_from_centre - radius) / h
-    moment = 0.5 * np.clip(0.25 - reach**2, 0.0, None) / np.maximum(distance_from_centre, 0.5 * h)
-    share = np.clip(0.5 - reach, 0.0, 1.0)
-    return Covered(share, np.where(share > 0.0, 0, -1), moment * px, moment * py)
+    i, j = np.nonzero(np.hypot(px[:, None], py[None]) < radius + h)
+    x, y = px[i], py[j]
+    distance = np.hypot(x, y)
+    reach = (distance - radius) / h
+    chi = np.array([1.0 - kernel_integral(r) for r in reach])
+    mu1 = np.array([kernel_moment(r) for r in reach]) / np.maximum(distance, 0.5 * h)
+    return Covered(i, j, np.zeros_like(i), chi, mu1 * x, mu1 * y)
 
 
-def slip(values: Array, covered: Covered) -> Array:
-    """Return the contribution of the water beside surfaces to each face, moment · ∇water."""
-    out = np.zeros(values.shape)
-    out[1:-1] = covered.moment_x[1:-1] * (values[2:] - values[:-2])
-    out[:, 1:-1] += covered.moment_y[:, 1:-1] * (values[:, 2:] - values[:, :-2])
-    return 0.5 * out
+class Painter:
+    """Coverage of the faces of one velocity component by a moving body."""
 
+    def __init__(self, px: Array, py: Array, h: float) -> None:
+        """px, py: positions of the faces [m]; h: size of a cell around the body [m]"""
+        self.px, self.py, self._h = px, py, h
+        self._nearest = np.full((len(px), len(py)), np.inf)
+        self._owner = np.full((len(px), len(py)), -1)
 
-@njit(inline="always")
-def _beside(reach: float, h: float) -> float:  # pragma: no cover
-    """Return the first moment of the water beyond a surface at the distance `reach` from a face.
+    def paint(
+        self,
+        places: Array,
+        angle: Array,
+        half_thickness: Array,
+        taper: Array,
+        spacing: float,
+        clamped: bool,
+    ) -> Covered:
+        """Return the coverage by the slices of a body.
 
-    It refers to the cell around the face, and is relative to the size of the cell; 0 where the
-    surface is outside the cell.
-    """
-    share = reach / h
-    return 0.5 * max(0.25 - share * share, 0.0)
+        places, angle, half_thickness, taper, spacing: those of the slices
+        clamped: whether the body continues before its first slice
+        """
+        margin = float(half_thickness.max()) + 2.0 * self._h
+        box = []
+        for positions, along in ((self.px, places[:, 0]), (self.py, places[:, 1])):
+            first = int(np.searchsorted(positions, along.min() - margin))
+            last = int(np.searchsorted(positions, along.max() + margin))
+            gaps = np.diff(positions[first:last])
+            assert gaps.max() < MAX_SIZE_RATIO * self._h, "it covers coarse cells"
+            box += [first, last]
+        slices = places, angle, half_thickness, taper, spacing, clamped
+        fields = self.px, self.py, *box, self._nearest, self._owner
+        covered: Covered = _paint(*slices, self._h, *fields)
+        return covered
 
 
 @njit(cache=True)
-def paint(  # pragma: no cover
+def _paint(  # pragma: no cover
     places: Array,
     angle: Array,
     half_thickness: Array,
     taper: Array,
     spacing: float,
+    clamped: bool,
     h: float,
     px: Array,
     py: Array,
-    clamped: bool,
+    first_i: int,
+    end_i: int,
+    first_j: int,
+    end_j: int,
+    nearest: Array,
+    owner: NDArray[np.int64],
 ) -> Covered:
-    """Return the coverage of the faces at px, py by the slices of a body.
+    """Return the coverage of the faces in a box.
 
-    places, angle, half_thickness, taper, spacing: those of the slices
-    h: size of a cell [m]; clamped: whether the body continues beyond its first slice
+    nearest, owner: square of the distance to the nearest slice, and its index; infinite and −1 in
+    between calls
     """
-    nx, ny = px.size, py.size
-    cover, owner = np.zeros((nx, ny)), np.full((nx, ny), -1)
-    moment_x, moment_y = np.zeros((nx, ny)), np.zeros((nx, ny))
-    nearest = np.full((nx, ny), np.inf)
     last = places.shape[0] - 1
+    x0, y0 = px[first_i], py[first_j]
+    count = 0
     for s in range(last + 1):
         x, y = places[s, 0], places[s, 1]
         c, n = np.cos(angle[s]), np.sin(angle[s])
         reach = half_thickness[s] + h
-        ends = s == 0 or s == last
-        along_reach = spacing + (h if ends else 0.0)
+        along_reach = spacing + (h if s in (0, last) else 0.0)
         wide, high = abs(c) * along_reach + abs(n) * reach, abs(n) * along_reach + abs(c) * reach
-        i0 = max(0, int(np.ceil((x - wide - px[0]) / h)))
-        i1 = min(nx - 1, int((x + wide - px[0]) / h))
-        j0 = max(0, int(np.ceil((y - high - py[0]) / h)))
-        j1 = min(ny - 1, int((y + high - py[0]) / h))
-        for i in range(i0, i1 + 1):
-            for j in range(j0, j1 + 1):
-                rx, ry = px[i] - x, py[j] - y
-                along, across = rx * c + ry * n, ry * c - rx * n
-                if abs(along) > along_reach:
+        i0 = max(first_i, first_i + int(np.ceil((x - wide - x0) / h)))
+        i1 = min(end_i, first_i + 1 + int((x + wide - x0) / h))
+        j0 = max(first_j, first_j + int(np.ceil((y - high - y0) / h)))
+        j1 = min(end_j, first_j + 1 + int((y + high - y0) / h))
+        for i in range(i0, i1):
+            rx = px[i] - x
+            for j in range(j0, j1):
+                ry = py[j] - y
+                if abs(rx * c + ry * n) > along_reach:
                     continue
                 distance = rx * rx + ry * ry
-                if distance >= nearest[i, j]:
-                    continue
-                nearest[i, j] = distance
-                half = max(half_thickness[s] + taper[s] * along, 0.0)
-                above, below = min(across + 0.5 * h, half), max(across - 0.5 * h, -half)
-                share = max(above - below, 0.0) / h
-                beside = _beside(half - across, h) - _beside(half + across, h)
-                ahead = 0.0
-                if ends and not (s == 0 and clamped):
-                    beyond = (along if s == last else -along) - 0.5 * spacing
-                    end = min(max(0.5 - beyond / h, 0.0), 1.0)
-                    ahead = (1.0 if s == last else -1.0) * _beside(beyond, h) * share
-                    share, beside = share * end, beside * end
-                cover[i, j] = share
-                moment_x[i, j] = ahead * c - beside * n
-                moment_y[i, j] = ahead * n + beside * c
-                owner[i, j] = s if share > 0.0 else -1
-    return Covered(cover, owner, moment_x, moment_y)
+                if distance < nearest[i, j]:
+                    count += nearest[i, j] == np.inf
+                    nearest[i, j] = distance
+                    owner[i, j] = s
+    covered = Covered(
+        np.empty(count, np.int64), np.empty(count, np.int64), np.empty(count, np.int64),
+        np.empty(count), np.empty(count), np.empty(count),
+    )  # fmt: skip
+    count = 0
+    for i in range(first_i, end_i):
+        for j in range(first_j, end_j):
+            s = owner[i, j]
+            if s < 0:
+                continue
+            nearest[i, j], owner[i, j] = np.inf, -1
+            rx, ry = px[i] - places[s, 0], py[j] - places[s, 1]
+            c, n = np.cos(angle[s]), np.sin(angle[s])
+            along, across = rx * c + ry * n, ry * c - rx * n
+            half = max(half_thickness[s] + taper[s] * along, 0.0)
+            above, below = (half - across) / h, (-half - across) / h
+            chi = kernel_integral(above) - kernel_integral(below)
+            beside = kernel_moment(above) - kernel_moment(below)
+            ahead = 0.0
+            if s == last or (s == 0 and not clamped):
+                outwards = 1.0 if s == last else -1.0
+                end = (outwards * along - 0.5 * spacing) / h
+                ahead = outwards * kernel_moment(end) * chi
+                inside = 1.0 - kernel_integral(end)
+                chi, beside = chi * inside, beside * inside
+            if chi <= 0.0:
+                continue
+            covered.i[count], covered.j[count], covered.owner[count] = i, j, s
+            covered.chi[count] = chi
+            covered.mu1_x[count] = ahead * c - beside * n
+            covered.mu1_y[count] = ahead * n + beside * c
+            count += 1
+    return Covered(
+        covered.i[:count], covered.j[:count], covered.owner[:count],
+        covered.chi[:count], covered.mu1_x[:count], covered.mu1_y[:count],
+    )  # fmt: skip
 
 
 @njit(inline="always")
-def _slip(  # pragma: no cover
-    values: Array, moment_x: Array, moment_y: Array, i: int, j: int
+def _moment_term(  # pragma: no cover
+    values: Field, covered: Covered, m: int
 ) -> float:
-    """Return the contribution of the water beside a surface to a face.
-
-    The values include one more face on each side.
-    """
-    along: float = moment_x[i, j] * (values[i + 2, j + 1] - values[i, j + 1])
-    across: float = moment_y[i, j] * (values[i + 1, j + 2] - values[i + 1, j])
+    """Return μ₁ · ∇water of the m-th covered face."""
+    i, j = covered.i[m], covered.j[m]
+    along: float = covered.mu1_x[m] * (float(values[i + 1, j]) - float(values[i - 1, j]))
+    across: float = covered.mu1_y[m] * (float(values[i, j + 1]) - float(values[i, j - 1]))
     return 0.5 * (along + across)
+
+
+@njit(inline="always")
+def _lever(  # pragma: no cover
+    k: int, covered: Covered, m: int, places: Array, positions: Array
+) -> float:
+    """Return the velocity of the m-th covered face per angular velocity of its slice [m]."""
+    if k == 0:
+        return float(places[covered.owner[m], 1] - positions[covered.j[m]])
+    return float(positions[covered.i[m]] - places[covered.owner[m], 0])
+
+
+@njit(inline="always")
+def _turn_moment(k: int, covered: Covered, m: int) -> float:  # pragma: no cover
+    """Return −μ₁ · ∇body of the m-th covered face, per angular velocity of its slice [cells]."""
+    return float(covered.mu1_y[m] if k == 0 else -covered.mu1_x[m])
 
 
 @njit(cache=True)
 def gather(  # pragma: no cover
+    k: int,
+    covered: Covered,
+    velocity: Field,
     places: Array,
-    on_u: tuple[Covered, Array, Array, Array],
-    on_v: tuple[Covered, Array, Array, Array],
+    positions: Array,
     mass: float,
     h: float,
-) -> tuple[Array, Array]:
-    """Return the mass matrices (slices, 3, 3) and momenta (slices, 3) of the water in the slices.
+    matrix: Array,
+    momentum: Array,
+) -> None:
+    """Add the mass matrices (slices, 3, 3) and momenta (slices, 3) of the water in the slices.
 
     They describe the change by `impose`, so that the momentum of water and body together is
     conserved. The matrix is not symmetric: a rotating body moves the water of a cell at the moment
     of that cell (the column), but the reaction of the cell acts on the body at its face (the row).
     Energy is therefore conserved only up to the resolution of the grid.
 
-    on_u, on_v: coverage, velocities of these faces and one more on each side, positions
+    k: 0 for the faces of u, 1 for those of v; velocity: that component of all faces
+    positions: y of the faces of u, x of the faces of v [m]
     mass: mass of the water in a cell, one metre deep [kg]
     """
-    matrix, momentum = np.zeros((places.shape[0], 3, 3)), np.zeros((places.shape[0], 3))
-    (cover, owner, moment_x, moment_y), speed, px, py = on_u
-    for i in range(px.size):
-        for j in range(py.size):
-            s = owner[i, j]
-            if s < 0:
-                continue
-            m, lever = mass * cover[i, j], places[s, 1] - py[j]
-            turn = m * lever + mass * moment_y[i, j] * h
-            carried = m * speed[i + 1, j + 1] - mass * _slip(speed, moment_x, moment_y, i, j)
-            matrix[s, 0, 0] += m
-            matrix[s, 0, 2] += turn
-            matrix[s, 2, 0] += m * lever
-            matrix[s, 2, 2] += turn * lever
-            momentum[s, 0] += carried
-            momentum[s, 2] += lever * carried
-    (cover, owner, moment_x, moment_y), speed, px, py = on_v
-    for i in range(px.size):
-        for j in range(py.size):
-            s = owner[i, j]
-            if s < 0:
-                continue
-            m, lever = mass * cover[i, j], px[i] - places[s, 0]
-            turn = m * lever - mass * moment_x[i, j] * h
-            carried = m * speed[i + 1, j + 1] - mass * _slip(speed, moment_x, moment_y, i, j)
-            matrix[s, 1, 1] += m
-            matrix[s, 1, 2] += turn
-            matrix[s, 2, 1] += m * lever
-            matrix[s, 2, 2] += turn * lever
-            momentum[s, 1] += carried
-            momentum[s, 2] += lever * carried
-    return matrix, momentum
+    for m in range(covered.i.size):
+        s = covered.owner[m]
+        lever = _lever(k, covered, m, places, positions)
+        body = mass * covered.chi[m]
+        turn = body * lever + mass * _turn_moment(k, covered, m) * h
+        water = float(velocity[covered.i[m], covered.j[m]])
+        carried = body * water - mass * _moment_term(velocity, covered, m)
+        matrix[s, k, k] += body
+        matrix[s, k, 2] += turn
+        matrix[s, 2, k] += body * lever
+        matrix[s, 2, 2] += turn * lever
+        momentum[s, k] += carried
+        momentum[s, 2] += lever * carried
 
 
 @njit(cache=True)
 def impose(  # pragma: no cover
-    velocity: Array,
-    places: Array,
+    k: int,
     covered: Covered,
-    before: Array,
-    ahead: Array,
-    cross_positions: Array,
+    velocity: Field,
+    motion: Array,
+    places: Array,
+    positions: Array,
     h: float,
-    is_u: bool,
-) -> None:
-    """Set the velocity of the covered faces to that of their slice, in place in `ahead`.
+) -> float:
+    """Give covered faces the velocity of the mixture, in place; return the sum of the changes.
 
-    before: previous `ahead`, with one more face on each side
-    other: y of the faces for u, x of the faces for v [m]
+    motion: velocities and angular velocity of the slices, shape (slices, 3)
+    k, velocity, places, positions, h: as for `gather`
     """
-    cover, owner, moment_x, moment_y = covered
-    for i in range(owner.shape[0]):
-        for j in range(owner.shape[1]):
-            s = owner[i, j]
-            if s < 0:
-                continue
-            turn = velocity[s, 2]
-            if is_u:
-                slice_velocity = velocity[s, 0] + turn * (places[s, 1] - cross_positions[j])
-                bend = turn * moment_y[i, j] * h
-            else:
-                slice_velocity = velocity[s, 1] + turn * (cross_positions[i] - places[s, 0])
-                bend = -turn * moment_x[i, j] * h
-            slip = _slip(before, moment_x, moment_y, i, j) + bend
-            ahead[i, j] += cover[i, j] * (slice_velocity - before[i + 1, j + 1]) + slip
+    total = 0.0
+    changes = np.empty(covered.i.size)
+    for m in range(changes.size):
+        s = covered.owner[m]
+        turn = motion[s, 2]
+        body = motion[s, k] + turn * _lever(k, covered, m, places, positions)
+        water = float(velocity[covered.i[m], covered.j[m]])
+        surface = _moment_term(velocity, covered, m) + turn * _turn_moment(k, covered, m) * h
+        changes[m] = covered.chi[m] * (body - water) + surface
+        total += changes[m]
+    for m in range(changes.size):
+        velocity[covered.i[m], covered.j[m]] += velocity.dtype.type(changes[m])
+    return total
+
+
+@njit(cache=True)
+def cover(  # pragma: no cover
+    covered: Covered, chi: Field, fixed_chi: Field, sign: float
+) -> None:
+    """Write χ of covered faces: that of the fixed bodies, plus `sign` times that of this body."""
+    for m in range(covered.i.size):
+        i, j = covered.i[m], covered.j[m]
+        chi[i, j] = fixed_chi[i, j] + chi.dtype.type(sign * covered.chi[m])
+
+
+@njit(cache=True)
+def weigh_cells(  # pragma: no cover
+    k: int, covered: Covered, chi_u: Field, chi_v: Field, weight: Field
+) -> None:
+    """Write the weights of the divergence of the cells beside covered faces: 0 inside a body.
+
+    A bent body is longer on one side and shorter on the other. If its inner cells were free of
+    divergence, short steps would prevent it from bending.
+    """
+    for m in range(covered.i.size):
+        for side in (-1, 0):
+            i, j = covered.i[m] + (side if k == 0 else 0), covered.j[m] + (side if k else 0)
+            inside = chi_u[i, j] * chi_u[i + 1, j] * chi_v[i, j] * chi_v[i, j + 1]
+            weight[i, j] = weight.dtype.type(1.0) - inside

@@ -9,6 +9,7 @@ import numpy as np
 from fishd.core.schema import Problem
 from fishd.virtual.swimmer.body import build_beam, curvature, half_thickness
 from fishd.virtual.swimmer.settings import (
+    DISSIPATION,
     MAX_COURANT,
     MIN_CELLS_PER_LENGTH,
     MIN_CELLS_PER_THICKNESS,
@@ -22,12 +23,14 @@ MAX_TAIL_TURN_RAD = 2.5
 """Largest angle of the tail to the head [rad]."""
 MAX_CELLS = 1_000_000
 """Largest number of cells; a step then takes seconds, and 1 GB of memory."""
-MAX_DIFFUSION_NUMBER = 0.125
-"""Largest ν Δt/h²: the limit of stability of explicit diffusion by Adams–Bashforth in two
-dimensions. Advection uses up the same limit, that of waves of two cells."""
-_ADVECTION_FRACTION = 4.0 / 3.0 * 1.4
-"""Fraction of that limit for each cell that the tail is expected to pass in a step: 4/3 by fluxes
-of third order, in water that is up to 1.4 times as fast."""
+MAX_DECAY = 6.0 / 11.0
+"""Largest decay in a step of waves of two cells, the limit of stability of third-order
+Adams–Bashforth."""
+MAX_DIFFUSION_NUMBER = MAX_DECAY / 8.0
+"""Largest ν Δt/h² in two dimensions. The dissipation of the fluxes uses up the same limit."""
+_ADVECTION_FRACTION = 4.0 / 3.0 * DISSIPATION / MAX_DECAY * 1.4
+"""Fraction of that limit for each cell that the tail is expected to pass in a step, in water that
+is up to 1.4 times as fast."""
 MIN_SEGMENT_CELLS = 1.5
 """Smallest length of a segment of the beam [cells]; shorter ones move too little water."""
 MIN_THICKNESS_FRACTION = 0.05
@@ -138,16 +141,13 @@ def _check_profile(body: Body) -> None:
 def _check_tank(settings: SwimmerSettings) -> None:
     body, water, numerics = settings.body, settings.water, settings.numerics
     beam = build_beam(settings)
-    centre = float(beam.share @ beam.X)
-    longer = max(centre + MAX_LEAD_LENGTHS * body.length, body.length - centre)
-    around = float(beam.half_thickness.max()) + 2.0 * numerics.cell
-    fine = 2.0 * (longer + around) / body.length
+    around = float(beam.half_thickness.max()) + 3.0 * numerics.cell
+    fine = 1.0 + 2.0 * (MAX_LEAD_LENGTHS + around / body.length)
     if numerics.fine_length < fine:
         raise Problem(
             ("swimmer", "numerics", "fine_length"),
-            f"{numerics.fine_length:g} is too short for a fish whose centre of mass, "
-            f"{centre / body.length:.2g} of its length from the head, is in the middle: at least "
-            f"{math.ceil(fine * 100.0 - 1e-9) / 100.0:g}",
+            f"{numerics.fine_length:g} is too short for a fish {around:.2g} m thick with cells of "
+            f"{numerics.cell:g} m: at least {math.ceil(fine * 100.0 - 1e-9) / 100.0:g}",
         )
     for key, size, share in (
         ("length", water.length, numerics.fine_length),

@@ -21,7 +21,7 @@ of the rear body, because the thin tip flutters."""
 FOLLOW_TIME = 0.05
 """Time constant with which the grid takes on the speed of the fish [s]."""
 RECENTRE_RATE = 2.0
-"""Rate at which the grid recentres on the fish [1/s]."""
+"""Rate at which the grid recentres on the middle of the fish [1/s]."""
 MAX_COURANT_NUMBER = 1.0
 """Courant number above which the computation is invalid."""
 _MAX_STEP_LENGTHS = 0.05
@@ -110,7 +110,7 @@ class Fish:
         self.activation = 0.0
         """Activation a, −1 to 1, during the latest step."""
         self._steps = 0
-        self._travelled = 0.0
+        self._travelled = np.zeros(2)
         self._drive = self.beam.drive(lambda X: curvature(settings, X))
         self._couple = self.beam.couple()
         # Moment of inertia of a rod with length and mass of the fish, and added one of a plate of
@@ -161,10 +161,15 @@ class Fish:
         self._steps += 1
         self._account(before)
         speed = float(beam.share @ body.velocity[:, 0])
-        place = float(beam.share @ beam.shape(beam.q)[0][:, 0])
-        self._travelled += dt * self.flow.grid_velocity
-        target = speed + RECENTRE_RATE * place
-        self.flow.grid_velocity += dt / FOLLOW_TIME * (target - self.flow.grid_velocity)
+        places, _ = beam.shape(beam.q)
+        grid_velocity = self.flow.grid_velocity
+        self._travelled += dt * grid_velocity
+        target = speed + RECENTRE_RATE * 0.5 * float(places[:, 0].min() + places[:, 0].max())
+        grid_velocity[0] += dt / FOLLOW_TIME * (target - grid_velocity[0])
+        # Across, it follows the mean over `_STEER_TIME`, and not the motion within a beat.
+        y = float(beam.share @ places[:, 1])
+        self._averaged_y += dt / _STEER_TIME * (y - self._averaged_y)
+        grid_velocity[1] = RECENTRE_RATE * self._averaged_y
         if self._steps % _CHECK_PERIOD_STEPS == 0:
             courant = self.flow.courant_number(dt)
             if not courant < MAX_COURANT_NUMBER:
@@ -189,13 +194,13 @@ class Fish:
         gain = self.settings.steering
         if not gain:
             return 0.0
-        places, angle = self.beam.shape(self.beam.q)
+        _, angle = self.beam.shape(self.beam.q)
         heading = float(self.beam.share @ angle)
         share = self.dt / _STEER_TIME
         heading_rate = (heading - self._averaged_heading) / _STEER_TIME
         self._averaged_heading += share * (heading - self._averaged_heading)
-        self._averaged_y += share * (float(self.beam.share @ places[:, 1]) - self._averaged_y)
-        target = min(_MAX_STEER_RAD, max(-_MAX_STEER_RAD, _STEER_REACH * self._averaged_y))
+        y = float(self._travelled[1]) + self._averaged_y
+        target = min(_MAX_STEER_RAD, max(-_MAX_STEER_RAD, _STEER_REACH * y))
         pull = _STEER_RATE * (target - self._averaged_heading) - heading_rate
         return gain * _STEER_RATE * self._inertia * pull
 
@@ -233,14 +238,14 @@ class Fish:
         forward_rate = float(relative @ along) + front_rate[2] * lateral
         return Motion(
             time=self.time,
-            x=self._travelled + float(centre[0]),
-            y=float(centre[1]),
+            x=float(self._travelled[0] + centre[0]),
+            y=float(self._travelled[1] + centre[1]),
             speed=-float(mean[0]),
             heading=heading,
             tail_angle=math.atan2(lateral, forward),
             tail_rate=float(lateral_rate * forward - forward_rate * lateral)
             / (forward**2 + lateral**2),
-            tail_y=float(places[-1, 1]),
+            tail_y=float(self._travelled[1] + self.midline()[-1, 1]),
             thrust=-float(self._hydrodynamic[:, 0].sum()),
             side_force=float(self._hydrodynamic[:, 1].sum()),
         )
@@ -253,19 +258,21 @@ class Fish:
         return np.concatenate([places + offset, (places - offset)[::-1]])
 
     def midline(self) -> Array:
-        """Return the positions of the slices on the grid, shape (slices, 2) [m]."""
-        return self.beam.shape(self.beam.q)[0]
+        """Return the positions of head, slices and tail on the grid, shape (slices + 2, 2) [m]."""
+        places, angle = self.beam.shape(self.beam.q)
+        half = 0.5 * self.beam.spacing * np.array([math.cos(angle[-1]), math.sin(angle[-1])])
+        return np.concatenate([[self.beam.q[:2]], places, [places[-1] + half]])
 
     @property
-    def travelled(self) -> float:
-        """Distance that the grid has moved along x in the laboratory [m]."""
+    def travelled(self) -> Array:
+        """Distance that the grid has moved in the laboratory, along x and y [m]."""
         return self._travelled
 
     def state(self) -> dict[str, Array]:
         """Return the complete state by name."""
         return self.body.state() | {
             "steps": np.array(self._steps),
-            "travelled": np.array(self._travelled),
+            "travelled": self._travelled.copy(),
             "activation": np.array(self.activation),
             "steered": np.array([self._averaged_heading, self._averaged_y]),
             "work": self._work.copy(),
@@ -276,7 +283,7 @@ class Fish:
         """Restore a result of `state` exactly."""
         self.body.restore(state)
         self._steps = int(state["steps"])
-        self._travelled = float(state["travelled"])
+        self._travelled = state["travelled"].copy()
         self.activation = float(state["activation"])
         self._averaged_heading, self._averaged_y = map(float, state["steered"])
         self._work, self._hydrodynamic = state["work"].copy(), state["hydrodynamic"].copy()

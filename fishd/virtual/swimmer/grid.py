@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Field = NDArray[np.floating]
+"""Values on the grid, of single or double precision."""
 MAX_SIZE_RATIO = 1.001
 """Largest ratio of the sizes of cells that count as equal."""
 

@@ -2,8 +2,8 @@
 
 The method is direct forcing on a fixed grid (Fadlun et al., J. Comput. Phys. 161, 2000,
 doi:10.1006/jcph.2000.6484), with the fraction of the cell around a face that the body covers
-(Kajishima and Takiguchi, Int. J. Heat Fluid Flow 23, 2002, doi:10.1016/S0142-727X(02)00159-5), of
-second order (see `covers`). Inside the body, the water of the grid represents its mass: the
+(Kajishima and Takiguchi, Int. J. Heat Fluid Flow 23, 2002, doi:10.1016/S0142-727X(02)00159-5), and
+a moment term (see `covers`). Inside the body, the water of the grid represents its mass: the
 momentum there, projected on the motions of the beam, gives the motion of the beam. No forces are
 exchanged between two solvers, so that light bodies are as stable as heavy ones.
 """
@@ -12,9 +12,17 @@ import numpy as np
 
 from fishd.core.errors import FishdError
 from fishd.virtual.swimmer.beam import Beam
-from fishd.virtual.swimmer.covers import Covered, circle, gather, impose, paint, slip
+from fishd.virtual.swimmer.covers import (
+    Covered,
+    Painter,
+    circle,
+    cover,
+    gather,
+    impose,
+    weigh_cells,
+)
 from fishd.virtual.swimmer.flow import Flow
-from fishd.virtual.swimmer.grid import MAX_SIZE_RATIO, Array
+from fishd.virtual.swimmer.grid import MAX_SIZE_RATIO, Array, Field
 
 IMPLICIT = 0.55
 """Fraction of the new shape in the elastic forces of a step; with 0.5, the shortest waves of the
@@ -33,10 +41,15 @@ class Immersed:
         """density: density of the water [kg/m³]"""
         self.flow, self.density, self.beam = flow, density, beam
         grid = flow.grid
+        self._painters = Painter(grid.x, grid.yc, grid.h), Painter(grid.xc, grid.y, grid.h)
+        self._positions = grid.yc, grid.xc
+        """Positions of the faces of u and v that the rotation of a body depends on [m]."""
         self._fixed: tuple[Covered, Covered] | None = None
-        self._fixed_weight = np.ones((grid.nx, grid.ny))
-        self._divergence_weight = self._fixed_weight.copy()
-        self._last_box = slice(0, 0), slice(0, 0)
+        self._fixed_chi = np.zeros_like(flow.u), np.zeros_like(flow.v)
+        self._chi = np.zeros_like(flow.u), np.zeros_like(flow.v)
+        self._divergence_weight = np.ones_like(flow.p)
+        self._covered: tuple[Covered, Covered] | None = None
+        """Coverage by the beam in the latest step."""
         self._cell_mass = density * grid.h**2
         self.fixed_impulse = np.zeros(2)
         """Impulse that the circle took from the water in the latest step [N s]."""
@@ -53,70 +66,76 @@ class Immersed:
     def add_circle(self, x: float, y: float, radius: float) -> None:
         """Add a rigid circle in the fine part of the grid; lengths in m."""
         grid = self.flow.grid
-        on_u = circle(grid.x[:, None] - x, grid.yc[None] - y, radius, grid.h)
-        on_v = circle(grid.xc[:, None] - x, grid.y[None] - y, radius, grid.h)
+        on_u = circle(grid.x - x, grid.yc - y, radius, grid.h)
+        on_v = circle(grid.xc - x, grid.y - y, radius, grid.h)
         self._fixed = on_u, on_v
-        self._fixed_weight = _divergence_weight(on_u.share, on_v.share)
-        self._divergence_weight = self._fixed_weight.copy()
+        for covered, fixed in zip(self._fixed, self._fixed_chi, strict=True):
+            fixed[covered.i, covered.j] = covered.chi
+        self._cover(self._fixed, 0.0)
 
     def step(self, dt: float, forces: Array | None = None) -> None:
         """Advance by `dt` [s]; forces: those on the beam's unknowns in the middle of the step."""
         self.flow.predict(dt)
         if self._fixed:
-            self._hold(*self._fixed)
+            self._hold(self._fixed)
         if self.beam:
             self._move(self.beam, dt, forces)
         self.flow.project(dt, self._divergence_weight)
 
-    def _hold(self, on_u: Covered, on_v: Covered) -> None:
+    def _hold(self, fixed: tuple[Covered, Covered]) -> None:
         """Bring the water inside the circle to rest."""
-        flow = self.flow
-        removed_u = on_u.share * flow.ahead_u - slip(flow.ahead_u, on_u)
-        removed_v = on_v.share * flow.ahead_v - slip(flow.ahead_v, on_v)
-        self.fixed_impulse = self._cell_mass * np.array([removed_u.sum(), removed_v.sum()])
-        flow.ahead_u -= removed_u
-        flow.ahead_v -= removed_v
+        changes = self._impose(fixed, np.zeros((1, 3)), np.zeros((1, 2)))
+        self.fixed_impulse = -self._cell_mass * np.array(changes)
+
+    def _impose(
+        self, covered: tuple[Covered, Covered], motion: Array, places: Array
+    ) -> tuple[float, float]:
+        """Impose the motion of a body; return the sums of the changes of u and v [m/s]."""
+        flow, h = self.flow, self.flow.grid.h
+        on_u, on_v = covered
+        at_u, at_v = self._positions
+        return (
+            impose(0, on_u, flow.predicted_u, motion, places, at_u, h),
+            impose(1, on_v, flow.predicted_v, motion, places, at_v, h),
+        )
+
+    def _cover(self, covered: tuple[Covered, Covered], sign: float) -> None:
+        """Update χ of these faces and the weights of the divergence of the cells beside them.
+
+        sign: 1 to add this body to the fixed one, 0 to remove it
+        """
+        for on_faces, chi, fixed in zip(covered, self._chi, self._fixed_chi, strict=True):
+            cover(on_faces, chi, fixed, sign)
+        for k in (0, 1):
+            weigh_cells(k, covered[k], *self._chi, self._divergence_weight)
 
     def _move(self, beam: Beam, dt: float, forces: Array | None) -> None:
         """Compute the new motion of the beam, and impose it on the water inside the beam."""
-        flow, grid, h = self.flow, self.flow.grid, self.flow.grid.h
+        flow, h = self.flow, self.flow.grid.h
         travel = np.zeros(beam.size)
-        travel[0] = flow.grid_velocity
+        travel[:2] = flow.grid_velocity
         places, angle = beam.shape(beam.q + dt * (1.5 * beam.rate - 0.5 * self._before - travel))
-        i, j = self._box(places, float(beam.half_thickness.max()))
-        faces_u = slice(i.start, i.stop + 1), j
-        faces_v = i, slice(j.start, j.stop + 1)
-        body = places, angle, beam.half_thickness, beam.taper, beam.spacing, h
-        on_u = paint(*body, grid.x[faces_u[0]], grid.yc[j], beam.clamped)
-        on_v = paint(*body, grid.xc[i], grid.y[faces_v[1]], beam.clamped)
+        self._check_place(places, float(beam.half_thickness.max()))
+        body = places, angle, beam.half_thickness, beam.taper, beam.spacing, beam.clamped
+        on_u, on_v = (painter.paint(*body) for painter in self._painters)
         if self._fixed:
-            _exclude_fixed(on_u, self._fixed[0], faces_u)
-            _exclude_fixed(on_v, self._fixed[1], faces_v)
-        around_u = _copy_with_margin(flow.ahead_u, faces_u)
-        around_v = _copy_with_margin(flow.ahead_v, faces_v)
-        self.mass, momentum = gather(
-            places,
-            (on_u, around_u, grid.x[faces_u[0]], grid.yc[j]),
-            (on_v, around_v, grid.xc[i], grid.y[faces_v[1]]),
-            self._cell_mass,
-            h,
-        )
+            _exclude_fixed(on_u, self._fixed_chi[0])
+            _exclude_fixed(on_v, self._fixed_chi[1])
+        self.mass, momentum = np.zeros_like(self.mass), np.zeros_like(self.velocity)
+        for k, covered, predicted in ((0, on_u, flow.predicted_u), (1, on_v, flow.predicted_v)):
+            water = predicted, places, self._positions[k], self._cell_mass, h
+            gather(k, covered, *water, self.mass, momentum)
         moves = beam.motion(angle)
         rate = self._solve(beam, dt, moves, momentum, forces)
         self.velocity = moves @ rate
         self.force = ((self.mass @ self.velocity[:, :, None])[:, :, 0] - momentum) / dt
-        moving = self.velocity, places
-        impose(*moving, on_u, around_u, flow.ahead_u[faces_u], grid.yc[j], h, True)
-        impose(*moving, on_v, around_v, flow.ahead_v[faces_v], grid.xc[i], h, False)
+        self._impose((on_u, on_v), self.velocity, places)
         beam.q = beam.q + dt * (0.5 * (rate + beam.rate) - travel)
         self._before, beam.rate = beam.rate, rate
-        share_u, share_v = on_u.share, on_v.share
-        if self._fixed:
-            share_u = share_u + self._fixed[0].share[faces_u]
-            share_v = share_v + self._fixed[1].share[faces_v]
-        self._divergence_weight[self._last_box] = self._fixed_weight[self._last_box]
-        self._divergence_weight[i, j] = _divergence_weight(share_u, share_v)
-        self._last_box = i, j
+        if self._covered:
+            self._cover(self._covered, 0.0)
+        self._covered = on_u, on_v
+        self._cover(self._covered, 1.0)
 
     def _solve(
         self, beam: Beam, dt: float, moves: Array, momentum: Array, forces: Array | None
@@ -137,20 +156,17 @@ class Immersed:
         rate[first:] = np.linalg.solve(system[first:, first:], momenta[first:])
         return rate
 
-    def _box(self, places: Array, half_thickness: float) -> tuple[slice, slice]:
-        """Return the cells around the body; raises `LeftTheGrid` where some are coarse."""
+    def _check_place(self, places: Array, half_thickness: float) -> None:
+        """Raise `LeftTheGrid` where the cells around the body are coarse."""
         grid = self.flow.grid
-        ranges = []
-        for axis, edges, all_sizes in ((0, grid.x, grid.dx), (1, grid.y, grid.dy)):
-            low = places[:, axis].min() - half_thickness - 2.0 * grid.h
-            high = places[:, axis].max() + half_thickness + 2.0 * grid.h
+        for axis, edges, sizes in ((0, grid.x, grid.dx), (1, grid.y, grid.dy)):
+            low = places[:, axis].min() - half_thickness - 3.0 * grid.h
+            high = places[:, axis].max() + half_thickness + 3.0 * grid.h
             if not (edges[1] < low and high < edges[-2]):
                 raise LeftTheGrid("the body left the water")
             first, last = np.searchsorted(edges, [low, high])
-            ranges.append(slice(int(first) - 1, int(last)))
-            if all_sizes[ranges[-1]].max() > MAX_SIZE_RATIO * grid.h:
+            if sizes[int(first) - 1 : int(last)].max() > MAX_SIZE_RATIO * grid.h:
                 raise LeftTheGrid("the body left the part of the grid with small cells")
-        return ranges[0], ranges[1]
 
     def state(self) -> dict[str, Array]:
         """Return the complete state by name."""
@@ -172,24 +188,9 @@ class Immersed:
             self._before, self.velocity = state["rate_before"].copy(), state["velocity"].copy()
 
 
-def _copy_with_margin(values: Array, faces: tuple[slice, slice]) -> Array:
-    """Return a copy of these faces with one more on every side."""
-    i, j = faces
-    return values[i.start - 1 : i.stop + 1, j.start - 1 : j.stop + 1].copy()
-
-
-def _exclude_fixed(covered: Covered, fixed: Covered, faces: tuple[slice, slice]) -> None:
+def _exclude_fixed(covered: Covered, fixed_chi: Field) -> None:
     """Remove from the coverage of the beam the part that a fixed body covers."""
-    np.minimum(covered.share, 1.0 - fixed.share[faces], out=covered.share)
-    is_free = fixed.share[faces] == 0.0
-    np.multiply(covered.moment_x, is_free, out=covered.moment_x)
-    np.multiply(covered.moment_y, is_free, out=covered.moment_y)
-
-
-def _divergence_weight(cover_u: Array, cover_v: Array) -> Array:
-    """Return weights of the divergence: 0 in cells inside a body.
-
-    A bent body is longer on one side and shorter on the other. If its inner cells were free of
-    divergence, short steps would prevent it from bending.
-    """
-    return np.asarray(1.0 - cover_u[1:] * cover_u[:-1] * cover_v[:, 1:] * cover_v[:, :-1])
+    fixed = fixed_chi[covered.i, covered.j]
+    np.minimum(covered.chi, 1.0 - fixed, out=covered.chi)
+    for moment in (covered.mu1_x, covered.mu1_y):
+        np.multiply(moment, fixed == 0.0, out=moment)

@@ -27,9 +27,7 @@ class Midlines:
         indices = np.linspace(0, len(line) - 1, POINT_COUNT)
         sparse = [np.interp(indices, np.arange(len(line)), part) for part in line.T]
         self._time.append(fish.time)
-        self._lines.append(
-            np.stack([sparse[0] + fish.travelled, sparse[1]], axis=1).astype(np.float32)
-        )
+        self._lines.append((np.stack(sparse, axis=1) + fish.travelled).astype(np.float32))
 
     def arrays(self) -> tuple[Array, NDArray[np.float32]]:
         """Return times, shape (n,) [s], and midlines, shape (n, POINT_COUNT, 2) [m]."""

@@ -7,17 +7,18 @@ rounding on a stretched grid, at the cost of two matrix products, which are halv
 
 import numpy as np
 from numba import njit
+from numpy.typing import DTypeLike
 from scipy.linalg import eigh_tridiagonal
 from threadpoolctl import threadpool_limits
 
-from fishd.virtual.swimmer.grid import Array, Grid
+from fishd.virtual.swimmer.grid import Array, Field, Grid
 
 
 class Poisson:
     """Solver of ∇²φ = f on the cells of a grid: dφ/dn = 0 at three sides, φ = 0 at the right."""
 
-    def __init__(self, grid: Grid) -> None:
-        self._grid = grid
+    def __init__(self, grid: Grid, dtype: DTypeLike = np.float64) -> None:
+        """dtype: precision of the fields"""
         # Applies to the whole process, intentionally: these matrices are too small for several
         # threads, which wait for each other on a busy machine; a step took ten times as long.
         threadpool_limits(1, "blas")
@@ -30,49 +31,58 @@ class Poisson:
         root = np.sqrt(grid.dy)
         values, vectors = eigh_tridiagonal(diagonal / grid.dy, upper / (root[1:] * root[:-1]))
         to_modes, from_modes = root[:, None] * vectors, vectors.T / root[None, :]
+        order = np.arange(grid.ny - 1, -1, -1)  # the first mode is constant across
         self._half = 0
         if np.allclose(grid.dy, grid.dy[::-1], rtol=1e-9, atol=0.0):
             # The modes of an even grid alternate between even and odd: the products are halved.
-            self._half = half = (grid.ny + 1) // 2
-            order = np.concatenate([np.arange(grid.ny - 1, -1, -2), np.arange(grid.ny - 2, -1, -2)])
-            values, to_modes, from_modes = values[order], to_modes[:, order], from_modes[order]
+            self._half = (grid.ny + 1) // 2
+            order = np.concatenate([order[::2], order[1::2]])
+        half = self._half
+        values, to_modes, from_modes = values[order], to_modes[:, order], from_modes[order]
+        if half:
             # The fold adds the middle row, where there is one, to itself.
             to_modes[half - 1] *= 1.0 if grid.ny % 2 == 0 else 0.5
             to_modes, from_modes = to_modes[:half], from_modes[:, :half]
-        self._to_modes = np.ascontiguousarray(to_modes[:, : self._half or None])
-        self._from_modes = np.ascontiguousarray(from_modes[: self._half or None])
-        self._to_odd = np.ascontiguousarray(to_modes[:, self._half :])
-        self._from_odd = np.ascontiguousarray(from_modes[self._half :])
+
+        def prepared(matrix: Array) -> Field:
+            return np.ascontiguousarray(matrix, dtype)
+
+        self._to_modes = prepared(to_modes[:, : half or None])
+        self._from_modes = prepared(from_modes[: half or None])
+        self._to_odd, self._from_odd = prepared(to_modes[:, half:]), prepared(from_modes[half:])
+        self._dx = prepared(grid.dx)
         # Reused, because a new allocation costs as much as one of the products.
-        self._even, self._odd = (np.empty((grid.nx, self._half)) for _ in range(2))
-        self._modes, self._solution = (np.empty((grid.nx, grid.ny)) for _ in range(2))
-        along = np.diff(grid.xc)
-        lower = np.zeros(grid.nx)
-        higher = np.zeros(grid.nx)
-        lower[1:] = 1.0 / along
-        higher[:-1] = 1.0 / along
-        middle = -(lower + higher)
-        middle[-1] -= 2.0 / grid.dx[-1]  # φ = 0 half a cell beyond the last centre
+        self._even, self._odd = (np.empty((grid.nx, half), dtype) for _ in range(2))
+        self._modes, self._solution = (np.empty((grid.nx, grid.ny), dtype) for _ in range(2))
+        self._gaps = np.append(np.diff(grid.xc), 0.5 * grid.dx[-1])
+        coupling = 1.0 / self._gaps  # φ = 0 half a cell beyond the last centre
+        middle = -(coupling + np.append(0.0, coupling[:-1]))
         # Factorisation for each mode of the matrix, which is symmetric before the division by dx.
         pivots = np.empty((grid.nx, grid.ny))
         pivots[0] = middle[0] + values * grid.dx[0]
         for i in range(1, grid.nx):
-            pivots[i] = middle[i] + values * grid.dx[i] - lower[i] ** 2 / pivots[i - 1]
-        self._inverse_pivots = 1.0 / pivots
-        self._coupling = lower
+            pivots[i] = middle[i] + values * grid.dx[i] - coupling[i - 1] ** 2 / pivots[i - 1]
+        self._inverse_pivots = prepared(1.0 / pivots)
+        self._coupling = prepared(np.append(0.0, coupling[:-1]))
 
-    def solve(self, f: Array) -> Array:
+    def solve(self, f: Field) -> Field:
         """Return φ [m² times the unit of f], overwritten by the next call; f: shape (nx, ny)."""
-        grid, half = self._grid, self._half
-        if not half:
-            modes = (f * grid.dx[:, None]) @ self._to_modes
-            _sweep(modes, self._coupling, self._inverse_pivots)
-            return np.asarray(modes @ self._from_modes)
-        even, odd, modes = self._even, self._odd, self._modes
-        _fold(f, grid.dx, even, odd)
-        np.matmul(even, self._to_modes, out=modes[:, :half])
-        np.matmul(odd, self._to_odd, out=modes[:, half:])
+        half = self._half
+        modes = self._modes
+        if half:
+            even, odd = self._even, self._odd
+            _fold(f, self._dx, even, odd)
+            np.matmul(even, self._to_modes, out=modes[:, :half])
+            np.matmul(odd, self._to_odd, out=modes[:, half:])
+        else:
+            np.matmul(f * self._dx[:, None], self._to_modes, out=modes)
+        # In single precision, the recurrence of the constant mode would lose all digits.
+        slope = np.cumsum(modes[:, 0], dtype=np.float64) * self._gaps
+        constant = -np.cumsum(slope[::-1])[::-1]
         _sweep(modes, self._coupling, self._inverse_pivots)
+        modes[:, 0] = constant
+        if not half:
+            return np.matmul(modes, self._from_modes, out=self._solution)
         np.matmul(modes[:, :half], self._from_modes, out=even)
         np.matmul(modes[:, half:], self._from_odd, out=odd)
         _unfold(even, odd, self._solution)
@@ -80,7 +90,7 @@ class Poisson:
 
 
 @njit(cache=True)
-def _fold(f: Array, dx: Array, even: Array, odd: Array) -> None:  # pragma: no cover
+def _fold(f: Field, dx: Field, even: Field, odd: Field) -> None:  # pragma: no cover
     """Compute the even and the odd part across, times the width of the cells."""
     nx, ny = f.shape
     for i in range(nx):
@@ -90,7 +100,7 @@ def _fold(f: Array, dx: Array, even: Array, odd: Array) -> None:  # pragma: no c
 
 
 @njit(cache=True)
-def _unfold(even: Array, odd: Array, solution: Array) -> None:  # pragma: no cover
+def _unfold(even: Field, odd: Field, solution: Field) -> None:  # pragma: no cover
     nx, ny = solution.shape
     for i in range(nx):
         for j in range(even.shape[1]):
@@ -99,7 +109,7 @@ def _unfold(even: Array, odd: Array, solution: Array) -> None:  # pragma: no cov
 
 
 @njit(cache=True, fastmath=True)
-def _sweep(values: Array, coupling: Array, inverse_pivots: Array) -> None:  # pragma: no cover
+def _sweep(values: Field, coupling: Field, inverse_pivots: Field) -> None:  # pragma: no cover
     nx, ny = values.shape
     for i in range(1, nx):
         c = coupling[i]

@@ -6,10 +6,12 @@ from msgspec import Meta, Struct
 
 from fishd.core.schema import unit
 
-MAX_COURANT = 0.42
-"""Largest fraction of a cell that the tail is expected to pass in a step. Advection by
-Adams–Bashforth with fluxes of third order is stable up to 0.585, and the water around the tail is
-up to 1.4 times as fast."""
+DISSIPATION = 0.3
+"""Dissipation of the fluxes, as a fraction of that of the upwind-biased scheme of third order."""
+MAX_COURANT = 0.35
+"""Largest fraction of a cell that the tail is expected to pass in a step. Advection by third-order
+Adams–Bashforth with the fluxes of `flow` is stable up to 0.498, and the water around the tail is up
+to 1.4 times as fast."""
 MIN_CELLS_PER_LENGTH = 40
 MIN_CELLS_PER_THICKNESS = 6
 
@@ -80,8 +82,8 @@ class Water(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class Numerics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings of the grid and the step."""
 
-    cell: Annotated[float, unit("m", "Size of the cells around the fish.", gt=0.0, le=0.1)] = 1e-3
-    step: Annotated[float, unit("s", "Time step.", gt=0.0, le=0.1)] = 1e-3
+    cell: Annotated[float, unit("m", "Size of the cells around the fish.", gt=0.0, le=0.1)] = 5e-4
+    step: Annotated[float, unit("s", "Time step.", gt=0.0, le=0.1)] = 4e-4
     segments: Annotated[
         int,
         Meta(
@@ -91,11 +93,11 @@ class Numerics(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         ),
     ] = 25
     fine_length: Annotated[
-        float, unit("1", "Length of the part with small cells, in lengths of the fish.", ge=1.4)
-    ] = 2.0
+        float, unit("1", "Length of the part with small cells, in lengths of the fish.", ge=1.2)
+    ] = 1.3
     fine_width: Annotated[
         float, unit("1", "Width of the part with small cells, in lengths of the fish.", ge=0.5)
-    ] = 1.1
+    ] = 0.6
     stretch_along: Annotated[
         float, unit("1", "Ratio of adjacent cells outside, along the tank.", ge=1.0, le=1.2)
     ] = 1.04

@@ -81,7 +81,7 @@ def test_a_fish_that_is_lost_is_a_point_without_a_speed(
     result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), None)
     assert result
     assert result.speed is None
-    assert "the swimmer cannot go on at 0.04" in result.failure
+    assert "the swimmer cannot go on at 0.02" in result.failure
 
 
 def test_a_swim_is_stopped_before_its_end(config: Config) -> None:
@@ -145,7 +145,7 @@ def test_a_sweep_of_swimmers_is_a_table_of_speeds_with_their_recordings(
 
 
 def test_a_grid_with_a_fish_that_cannot_be_computed_is_refused_first(tmp_path: Path) -> None:
-    words = ("sweep", "square", "--vary", "swimmer.numerics.cell=0.002,0.02")
+    words = ("sweep", "square", "--vary", "swimmer.numerics.cell=0.001,0.02")
     line = one_line(fishctl(*words, "--config", str(FILE), "--folder", str(tmp_path / "run")))
     assert "swimmer.numerics.cell" in line
     assert "too coarse" in line

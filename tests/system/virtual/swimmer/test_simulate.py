@@ -159,12 +159,12 @@ def bad(array: np.ndarray[Any, Any], value: float) -> np.ndarray[Any, Any]:
 @pytest.mark.parametrize(
     ("name", "change", "complaint"),
     [
-        ("state.u", lambda u: u[:1], r"u is of shape \(1, \d+\) and type float64, and needs to be"),
+        ("state.u", lambda u: u[:1], r"u is of shape \(1, \d+\) and type float32, and needs to be"),
         ("state.p", lambda p: p.astype(complex), r"p is of shape .* and type complex128"),
         ("state.velocity", lambda v: bad(v, np.inf), "velocity has values that are not finite"),
         ("state.robot", lambda r: bad(r, np.nan), "robot has values that are not finite"),
         ("state.steps", lambda steps: -steps, "steps is negative"),
-        ("state.steps", lambda steps: steps + 10, "time ends at 4 s, and the fish is at 4.02 s"),
+        ("state.steps", lambda steps: steps + 10, "time ends at 4 s, and the fish is at 4.01 s"),
         ("speed", lambda speed: bad(speed, np.nan), "speed has values that are not finite"),
         ("x", lambda x: x[:0], "x is of shape"),
         ("midlines", lambda midlines: midlines[:, :5], "midlines is of shape"),

@@ -26,7 +26,7 @@ def test_a_fish_that_stops_beating_comes_to_rest(steering: int) -> None:
     fish = Fish(coarse(f"swimmer.steering={steering}").swimmer)
     swim(fish, 2.0, 2.5)
     speed, left = fish.motion().speed, [kinetic_energy(fish)]
-    for _ in range(2):
+    for _ in range(6):
         swim(fish, 2.0, 0.0)
         left.append(kinetic_energy(fish))
     assert speed > 0.05

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.typing import DTypeLike
 
 from fishd.virtual.swimmer.beam import Beam
 from fishd.virtual.swimmer.flow import Flow
@@ -13,11 +14,16 @@ EI = 2e-3
 
 
 def swimmer(
-    *, cell: float = CELL, excess: float = 0.0, clamped: bool = False, stream: float = 0.0
+    *,
+    cell: float = CELL,
+    excess: float = 0.0,
+    clamped: bool = False,
+    stream: float = 0.0,
+    dtype: DTypeLike = np.float32,
 ) -> Immersed:
     """Return a bar in a small tank, with its head at (0.1, 0.06)."""
     grid = Grid(edges(0.0, 0.3, (0.07, 0.2), cell, 1.1), edges(0.0, 0.12, (0.02, 0.1), cell, 1.1))
-    flow = Flow(grid, 1e-6, "slip", inlet=np.full(grid.ny, stream))
+    flow = Flow(grid, 1e-6, "slip", inlet=np.full(grid.ny, stream), dtype=dtype)
     flow.u[:] = stream
     beam = Beam(
         LENGTH,
@@ -48,15 +54,19 @@ def momentum(body: Immersed) -> float:
 
 
 @pytest.mark.parametrize("excess", [0.0, 3000.0])
-def test_water_and_body_together_keep_their_momentum(excess: float) -> None:
-    body = swimmer(excess=excess)
+@pytest.mark.parametrize(("dtype", "relative"), [(np.float64, 1e-12), (np.float32, 1e-6)])
+def test_water_and_body_together_keep_their_momentum(
+    excess: float, dtype: DTypeLike, relative: float
+) -> None:
+    body = swimmer(excess=excess, dtype=dtype)
     forces = bend(body, 6.0)
     forces[0] = 2.0  # an external force
+    gained = 0.0
     for _ in range(20):
-        before = momentum(body)
         body.step(2e-3, forces)
-        gained = body.density * body.flow.boundary_impulse + 2e-3 * 2.0
-        assert momentum(body) - before == pytest.approx(gained, abs=1e-12)
+        gained += body.density * body.flow.boundary_impulse + 2e-3 * 2.0
+        largest = max(2e-3 * 2.0, float(np.abs(body.force).sum()) * 2e-3)
+        assert momentum(body) == pytest.approx(gained, abs=relative * largest)
 
 
 def compute_bend(steps: int) -> float:
@@ -88,7 +98,7 @@ def test_a_light_body_is_as_stable_as_a_heavy_one(excess: float) -> None:
 def test_a_loose_body_drifts_with_the_stream() -> None:
     body = swimmer(stream=0.1)
     beam_of(body).rate[0] = 0.1
-    body.flow.grid_velocity = 0.1
+    body.flow.grid_velocity[0] = 0.1
     body.flow.inlet[:] = 0.1
     for _ in range(50):
         body.step(4e-3)
@@ -124,7 +134,8 @@ def test_water_rests_in_a_circle_and_pushes_it_downstream() -> None:
 
 
 def test_the_drag_of_a_circle_does_not_depend_on_the_step() -> None:
-    assert circle_in_stream(60)[1] == pytest.approx(circle_in_stream(240)[1], rel=0.02)
+    """Up to ν Δt/h² = 0.01; around a fish it is 0.003. A longer step moves the wall inwards."""
+    assert circle_in_stream(240)[1] == pytest.approx(circle_in_stream(960)[1], rel=0.02)
 
 
 @pytest.mark.parametrize(

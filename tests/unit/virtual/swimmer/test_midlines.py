@@ -18,7 +18,7 @@ def test_midlines_are_where_the_body_was_in_the_laboratory() -> None:
     assert time == pytest.approx(0.01 * np.arange(1, 31))
     assert lines.shape == (30, POINT_COUNT, 2)
     fish = robot.fish
-    assert lines[-1, 0] == pytest.approx(fish.midline()[0] + (fish.travelled, 0.0), abs=1e-6)
-    assert lines[-1, -1] == pytest.approx(fish.midline()[-1] + (fish.travelled, 0.0), abs=1e-6)
+    assert lines[-1, 0] == pytest.approx(fish.midline()[0] + fish.travelled, abs=1e-6)
+    assert lines[-1, -1] == pytest.approx(fish.midline()[-1] + fish.travelled, abs=1e-6)
     pieces = np.linalg.norm(np.diff(lines, axis=1), axis=2)
     assert pieces.sum(axis=1) == pytest.approx(0.1, rel=0.02)  # it bends, and keeps its length

@@ -29,7 +29,7 @@ def test_a_configuration_is_checked_without_what_computes_the_fish() -> None:
     ("override", "complaint"),
     [
         ("tick=0.0125", "tick: 0.0125 s is not a multiple of swimmer.numerics.step, "
-         "0.001 s; 0.012 s would be"),
+         "0.0004 s; 0.0124 s would be"),
         ("swimmer.numerics.cell=0.005", "swimmer.numerics.cell: 0.005 m is too coarse"),
         ("swimmer.numerics.step=0.005", "swimmer.numerics.step: 0.005 s is beyond the limit"),
         ("swimmer.body.length=0.3", "swimmer.water.width: a tank of 0.2 m is too small"),
@@ -55,18 +55,19 @@ def test_the_profile_that_a_complaint_gives_as_an_example_is_accepted() -> None:
 @pytest.mark.parametrize("profile", ["[[0, 0.3], [1, 0.02]]", "[[0, 0.02], [1, 0.3]]"])
 def test_small_cells_that_end_before_the_fish_does_are_refused(profile: str) -> None:
     body = [f"swimmer.body.profile={profile}"]
-    with pytest.raises(ConfigError, match=r"swimmer\.numerics\.fine_length: 1\.4") as refusal:
-        load(FILE, [*body, "swimmer.numerics.fine_length=1.4"])
+    with pytest.raises(ConfigError, match=r"swimmer\.numerics\.fine_length: 1\.2") as refusal:
+        load(FILE, [*body, "swimmer.numerics.fine_length=1.2"])
     least = str(refusal.value).rpartition("at least ")[2]
-    assert 1.5 < float(least) < 1.7
+    assert 1.3 < float(least) < 1.4
     load(FILE, [*body, f"swimmer.numerics.fine_length={least}"])
 
 
 @pytest.mark.parametrize("viscosity", ["1e-4", "1e-3"])
 def test_what_is_carried_along_and_viscosity_share_one_limit_of_the_step(viscosity: str) -> None:
-    water = [f"swimmer.water.viscosity={viscosity}"]
+    water = [f"swimmer.water.viscosity={viscosity}", "swimmer.numerics.cell=0.001"]
     with pytest.raises(ConfigError, match="the tail would pass") as refusal:
-        load(FILE, water)  # with 1e-4, ν Δt/h² is 0.1: either would do alone
+        # With 1e-4, ν Δt/h² is 0.06: either would do alone.
+        load(FILE, [*water, "swimmer.numerics.step=0.0006"])
     longest = str(refusal.value).rpartition("at most ")[2].removesuffix(" s")
     tick = round(0.01 / float(longest)) * float(longest)
     load(FILE, [*water, f"swimmer.numerics.step={longest}", f"tick={tick:.9g}"])
