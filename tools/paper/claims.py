@@ -47,7 +47,7 @@ def sections() -> list[tuple[str, str, str]]:
 def section(name: str) -> str:
     """Return the text between the markers of this name."""
     if name == REFINEMENT:
-        cells = " | ".join(f"{cell:g} mm" for cell in figure_6.CELLS)
+        cells = " | ".join(f"{cell:g} mm" for cell in figure_6.shown().cells)
         return table(f"speed (mm/s), cells of | {cells}", refinement())
     words = {True: "yes", False: "**no**", None: "–"}
     return table(
@@ -278,7 +278,7 @@ def learning() -> Iterator[Claim]:
 
 
 def swimming() -> Iterator[Claim]:
-    """Return the claims on the free swimmer, on cells of 1 mm."""
+    """Return the claims on the free swimmer."""
     fastest_waves = list(figure_6.fastest())
     if not fastest_waves:  # without results yet
         return
@@ -316,9 +316,10 @@ def swimming() -> Iterator[Claim]:
 
 def refinement() -> Iterator[tuple[str, str, str, str]]:
     """Return the table of swims, with their speeds on cells of each size."""
+    stored = figure_6.shown()
     for controller, setting in figure_6.REFINED:
         what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
-        rows = [figure_6.row_of(figure_6.Case(controller, setting, c)) for c in figure_6.CELLS]
+        rows = [stored.row(figure_6.Case(controller, setting, cell)) for cell in stored.cells]
         yield (
             f"{controller}, {what}",
             *(_speed(row) if row else "–" for row in rows),
@@ -330,7 +331,8 @@ def _speed(row: dict[str, Any]) -> str:
 
 
 def _swum(controller: str) -> list[dict[str, Any]]:
-    return read(figure_6.NAME, controller=controller, cell_mm=figure_6.CELL)
+    stored = figure_6.shown()
+    return read(stored.name, controller=controller, cell_mm=stored.cell)
 
 
 def _steps(policy: str) -> int:

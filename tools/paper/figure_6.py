@@ -1,6 +1,8 @@
 """Figure 6: the speed of the free swimmer against frequency, also on finer grids.
 
-The finest grid takes hours: existing rows of figure-6.csv are not computed again.
+Each swim is stored when it ends, and stored swims are not computed again: `make figures` resumes
+after an interruption. The swims of `FINE` take two hours on one core that does nothing else. Until
+all of them are stored, the figure is the one of `EARLIER`.
 """
 
 from collections.abc import Iterator
@@ -24,10 +26,8 @@ FREQUENCIES = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0)
 CRITERIA = (0.0, 0.6)
 TICK = 0.002
 """Shortest tick of fishd, so that reversals are hardly delayed [s]."""
-CELL = 1.0
-"""Size of the cells of the figure [mm]; the step is half of the number, in ms."""
-CELLS = (2.0, 1.0, 0.5)
-"""Sizes of the cells of the refinement [mm]."""
+STEPS = {1.0: 0.5, 0.5: 0.4, 0.25: 0.2}
+"""Time step [ms] for each size of the cells [mm]."""
 NOT_STEADY = "never"
 """Text for a speed that still changed at the end."""
 CONFIG = Path(__file__).resolve().parents[2] / "config" / "swimmer.yaml"
@@ -43,19 +43,50 @@ class Case(NamedTuple):
     """Size of the cells [mm]."""
 
 
-FIGURE = [
-    *(Case(wave, frequency, CELL) for wave in WAVES for frequency in FREQUENCIES),
-    *(Case("swing", criterion, CELL) for criterion in CRITERIA),
-]
 REFINED = (("square", 3.0), ("sine", 2.0), ("swing", 0.6))
-CASES = FIGURE + [Case(*each, cell) for cell in CELLS if cell != CELL for each in REFINED]
+"""Controllers and settings that swim on all grids."""
+
+
+class Table(NamedTuple):
+    """Table of stored swims."""
+
+    name: str
+    cell: float
+    """Size of the cells of the figure [mm]."""
+    cells: tuple[float, ...]
+    """Sizes of the cells of the refinement [mm]."""
+
+    def cases(self) -> list[Case]:
+        """Return every swim of the table."""
+        waves = [Case(wave, frequency, self.cell) for wave in WAVES for frequency in FREQUENCIES]
+        swings = [Case("swing", criterion, self.cell) for criterion in CRITERIA]
+        others = [cell for cell in self.cells if cell != self.cell]
+        return waves + swings + [Case(*swim, cell) for cell in others for swim in REFINED]
+
+    def row(self, case: Case) -> dict[str, Any] | None:
+        """Return the row of a swim; None before it is stored."""
+        if not (FOLDER / f"{self.name}.csv").exists():
+            return None
+        having = {"controller": case.controller, "setting": case.setting, "cell_mm": case.cell}
+        return next(iter(read(self.name, **having)), None)
+
+
+FINE = Table("figure-6-fine", 0.5, (1.0, 0.5, 0.25))
+EARLIER = Table("figure-6", 1.0, (2.0, 1.0, 0.5))
+"""Table of version 0.1.0, whose solver needed finer cells for the same accuracy."""
+
+
+def shown() -> Table:
+    """Return the table of the figure."""
+    return FINE if all(map(FINE.row, FINE.cases())) else EARLIER
 
 
 def config(cell: float) -> Config:
     """Return the default swimmer on such a grid; cell: size of the cells [mm]"""
     numerics = "swimmer.numerics."
+    step = 1e-3 * STEPS[cell]
     return load(
-        CONFIG, (f"tick={TICK}", f"{numerics}cell={1e-3 * cell}", f"{numerics}step={0.5e-3 * cell}")
+        CONFIG, (f"tick={TICK}", f"{numerics}cell={1e-3 * cell}", f"{numerics}step={step:g}")
     )
 
 
@@ -74,26 +105,19 @@ def swim(case: Case, lengths: Lengths | None = None) -> SpeedResult:
 
 def compute(jobs: int) -> None:
     """Compute every swim that is not in the table; each is stored when it ends."""
-    rows = {case: row for case in CASES if (row := row_of(case))}
-    missing = [case for case in CASES if case not in rows]
+    cases = FINE.cases()
+    rows = {case: row for case in cases if (row := FINE.row(case))}
+    missing = [case for case in cases if case not in rows]
     missing.sort(key=lambda case: case.cell)  # start with the longest
     parallel = joblib.Parallel(jobs, batch_size=1, return_as="generator_unordered")
     for case, result in parallel(joblib.delayed(_numbered)(case) for case in missing):
         rows[case] = _row(case, result)
-        progress(NAME, f"{case}", f"{1e3 * (result.speed or 0.0):.2f} mm/s")
-        write(NAME, [rows[each] for each in CASES if each in rows])
+        progress(FINE.name, f"{case}", f"{1e3 * (result.speed or 0.0):.2f} mm/s")
+        write(FINE.name, [rows[each] for each in cases if each in rows])
 
 
 def _numbered(case: Case) -> tuple[Case, SpeedResult]:
     return case, swim(case)
-
-
-def row_of(case: Case) -> dict[str, Any] | None:
-    """Return the row of a swim in the table."""
-    if not (FOLDER / f"{NAME}.csv").exists():
-        return None
-    having = {"controller": case.controller, "setting": case.setting, "cell_mm": case.cell}
-    return next(iter(read(NAME, **having)), None)
 
 
 def _row(case: Case, result: SpeedResult) -> Row:
@@ -117,20 +141,21 @@ def _row(case: Case, result: SpeedResult) -> Row:
 
 def draw() -> None:
     """Draw speeds over frequencies on the left, over the size of the cells on the right."""
+    table = shown()
     with drawing.open_figure(FOLDER / f"{NAME}.svg", (8.4, 3.9)) as figure:
         left, right = figure.subplots(1, 2, sharey=True, width_ratios=(5, 2))
         styles = zip(WAVES, (BLACK, BLUE, ORANGE), "so^", strict=True)
         colours = {}
         for wave, colour, marker in styles:
-            rows = read(NAME, controller=wave, cell_mm=CELL)
+            rows = read(table.name, controller=wave, cell_mm=table.cell)
             colours[wave] = colour, marker
             _bars(left, rows, "setting", colour, marker, wave, "-")
         for criterion, marker, colour in zip(CRITERIA, "vD", (PURPLE, GREEN), strict=True):
-            rows = read(NAME, controller="swing", setting=criterion, cell_mm=CELL)
+            rows = read(table.name, controller="swing", setting=criterion, cell_mm=table.cell)
             colours["swing"] = colour, marker
             _bars(left, rows, "frequency_Hz", colour, marker, f"swing, C = {criterion:g}", "")
         for (controller, setting), line in zip(REFINED, ("-", (0, (5, 2)), ":"), strict=True):
-            rows = read(NAME, controller=controller, setting=setting)
+            rows = read(table.name, controller=controller, setting=setting)
             rows.sort(key=lambda row: float(row["cell_mm"]))
             what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
             _bars(right, rows, "cell_mm", *colours[controller], f"{controller}, {what}", line)
@@ -141,7 +166,7 @@ def draw() -> None:
         left.set_ylabel("speed (mm/s)")
         left.set_xlim(0.0, 6.3)
         right.set_xlabel("size of the cells (mm)")
-        right.set_xlim(0.0, 2.2)
+        right.set_xlim(0.0, 1.1 * max(table.cells))
 
 
 def _bars(
@@ -170,8 +195,9 @@ def _bars(
 
 def fastest() -> Iterator[tuple[float, str, list[str]]]:
     """Yield for each frequency the fastest wave, and those equally fast within the intervals."""
+    table = shown()
     for frequency in FREQUENCIES:
-        rows = {wave: row_of(Case(wave, frequency, CELL)) for wave in WAVES}
+        rows = {wave: table.row(Case(wave, frequency, table.cell)) for wave in WAVES}
         speeds = {
             wave: (row["speed_mm_per_s"], row["ci95_mm_per_s"]) for wave, row in rows.items() if row
         }
