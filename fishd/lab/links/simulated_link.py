@@ -61,6 +61,7 @@ class _LoopOnFish:
         fish = simulated_fish(config)
         self.loop = build_loop(config, fish.robot(metered=metered), clock, None)
         self.loop.set_controller("agent", FunctionController(config, decide))
+        self.truth = fish.truth
         self.sight = camera.make_sight(fish.truth, config.tick) if camera else None
         self._slots = virtual_slots(clock, config.tick)
         self.turn = self.loop.observe(next(self._slots))
@@ -129,6 +130,10 @@ class SimulatedLink:
         """Return the frames of the simulated camera; None without a camera."""
         fish = self._swimming()
         return fish.sight.look(fish.turn.observation.time) if fish.sight else None
+
+    def truth(self) -> Truth:
+        """Return the true state of the fish at this tick."""
+        return self._swimming().truth()
 
     def pause(self, seconds: float) -> None:
         """Do nothing: virtual time stands still while the agent learns."""

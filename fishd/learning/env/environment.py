@@ -21,12 +21,13 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 
+from fishd.camera.simulated import SimulatedCameraSettings, TailPainter
 from fishd.config import Config, check_tethered
 from fishd.controllers.dwell import Dwell
 from fishd.controllers.policy.card import Feature, FeatureName, Window
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import ConfigError
-from fishd.core.signals import Observation
+from fishd.core.signals import Observation, Truth
 from fishd.lab.links.link import Link, LinkLost
 from fishd.learning.env.perception import Perception
 from fishd.learning.extractors import FeatureExtractor, random_angles
@@ -80,6 +81,10 @@ def features(config: Config, settings: EnvironmentSettings) -> tuple[Feature, ..
 
 Vector = NDArray[np.float32]
 
+PICTURE = SimulatedCameraSettings(noise=0.0)
+"""Settings of a picture without noise."""
+PICTURE_SIZE = 256
+"""Height and width of a picture [px]."""
 _OBSERVATION_BOUND = 1e6
 """Bound of the observation space: finite, as tools expect, and never reached."""
 MIN_PAUSE_S, MAX_PAUSE_S = 10.0, 120.0
@@ -109,7 +114,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
     0). A step with `lost` or `blind` truncates its episode.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 (as Gymnasium defines it)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (as Gymnasium's)
 
     def __init__(
         self,
@@ -117,11 +122,13 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         config: Config,
         settings: EnvironmentSettings,
         extractor: FeatureExtractor | None = None,
+        truth: Callable[[], Truth] | None = None,
     ) -> None:
         """
         link: link to the fish
         config: configuration that the scales are computed from
         extractor: feature extractor of an agent that sees pictures, fitted before the first step
+        truth: returns the true state of a simulated fish, for `render`; None draws no pictures
 
         Raises `ConfigError` where the fish has another tick or Φ than `config`, or swims freely.
         """
@@ -145,6 +152,10 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self.observation_space, self.action_space = spaces(self.perception.inputs)
         self.best_thrust = best_thrust(config)
         """Mean thrust of the best square wave of the configured fish [N]."""
+        self.metadata = self.metadata | {"render_fps": round(1.0 / link.tick)}
+        self.render_mode = "rgb_array" if truth else None
+        self._truth = truth
+        self._painter = TailPainter(PICTURE, PICTURE_SIZE) if truth else None
         self._steps = 0
         self._begun = self._closed = False
         self.latest: Observation
@@ -212,6 +223,18 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         truncated = self._steps >= self.settings.episode or lost + info["blind"] > 0
         self._paused = 0.0
         return self._agent_inputs(), reward, False, truncated, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Return the fish from above, its head to the left: height, width and 3 colours.
+
+        None without a `render_mode`; raises `ResetNeeded` before the first episode.
+        """
+        if not (self._painter and self._truth):
+            return None
+        if not self._begun:
+            raise ResetNeeded("no episode has begun: call reset before render")
+        grey = self._painter.paint(self._truth().alpha, 0.0, 0.0)
+        return np.repeat(grey[:, :, np.newaxis], 3, axis=2)
 
     def swim(self, angle: float) -> int:
         """Swim one tick at an angle [rad], or at the previous one if it would reverse too soon.

@@ -39,11 +39,15 @@ def swim(
     settings: YAML file of a training, of which `see`, `environment`, `camera` and `randomisation`
         are used; a feature extractor that must be fitted is fitted to a random excitation first
     camera: YAML file of the simulated camera, for settings with `see: camera` or `both`
-    render_mode: None, as the environment draws no pictures
+    render_mode: `rgb_array` for pictures of the fish from above; None for none
 
     Raises `ConfigError`.
     """
-    _refuse_rendering(render_mode)
+    if render_mode not in (None, "rgb_array"):
+        raise ConfigError(
+            f"render_mode={render_mode!r} is not valid: 'rgb_array' is needed, or none; the "
+            "wrapper RenderCollection collects its pictures, RecordVideo writes them"
+        )
     from fishd.camera import settings as cameras
     from fishd.lab.links.simulated_link import Camera, SimulatedLink
     from fishd.learning.env.environment import SwimEnv
@@ -56,7 +60,8 @@ def swim(
     sight = Camera(cameras.load_simulated(camera), chosen.camera.stack) if extractor else None
     metered = bool(chosen.seen.power_price)
     link = SimulatedLink(fish, episode_fish(chosen.randomisation), sight, metered=metered)
-    env = SwimEnv(link, fish, chosen.seen, extractor)
+    truth = link.truth if render_mode else None
+    env = SwimEnv(link, fish, chosen.seen, extractor, truth)
     if extractor and not extractor.is_fitted:
         env.reset(seed=0)
         env.excite_randomly(chosen.seed, chosen.camera.random_excitation)
@@ -83,11 +88,15 @@ def swim_on_daemon(
     camera: request address of the camera, for settings with `see: camera` or `both`
     experiment: name of the lease, as `fishctl status` shows it
     take: whether to take the fish from an experiment that holds it
-    render_mode: None, as the environment draws no pictures
+    render_mode: None, as nothing draws a fish whose true angles are unknown
 
     Raises `ConfigError`, also where tick or Φ differ from those of fishd, and `FishError`.
     """
-    _refuse_rendering(render_mode)
+    if render_mode is not None:
+        raise ConfigError(
+            f"render_mode={render_mode!r} is not valid: the true angles of this fish are unknown; "
+            "leave it out, and see the fish with 'fishctl watch'"
+        )
     from fishd.lab.links.fishd_link import FishdLink, config_of
     from fishd.learning.env.environment import SwimEnv
     from fishd.learning.extractors import make_extractor
@@ -106,11 +115,3 @@ def swim_on_daemon(
     except BaseException:
         link.close()
         raise
-
-
-def _refuse_rendering(mode: str | None) -> None:
-    if mode is not None:
-        raise ConfigError(
-            f"render_mode={mode!r} is not valid: the environment draws no pictures; leave it out, "
-            "and see the fish with 'fishctl watch', or with 'fishctl plot' after a recording"
-        )

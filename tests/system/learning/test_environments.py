@@ -5,7 +5,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import RenderCollection
 from msgspec.structs import replace
 from rigs.processes import Daemon, running, sets
 from rigs.swimming import BRIEF, Resting, brief_job
@@ -23,17 +25,54 @@ from fishd.learning.settings import EnvironmentSettings
 STILL = ("simulation.noise=0.0",)
 
 
-def test_the_environment_in_process_passes_both_checkers() -> None:
-    env = gymnasium.make("fishd/Swim-v0", overrides=("simulation.noise=0.001",))
-    check_env(env.unwrapped, skip_render_check=True)
+@pytest.mark.parametrize("mode", [None, "rgb_array"])
+def test_the_environment_in_process_passes_both_checkers(mode: str | None) -> None:
+    env = gymnasium.make("fishd/Swim-v0", overrides=("simulation.noise=0.001",), render_mode=mode)
+    check_env(env.unwrapped)
     check_for_baselines(env.unwrapped, warn=True)
 
 
-def test_an_environment_refuses_to_be_rendered_in_one_sentence() -> None:
-    with pytest.raises(
-        ConfigError, match="render_mode='human' is not valid: the environment draws"
-    ):
-        gymnasium.make("fishd/Swim-v0", render_mode="human")
+def test_pictures_show_the_tail_from_above() -> None:
+    env = RenderCollection(
+        gymnasium.make("fishd/Swim-v0", overrides=STILL, render_mode="rgb_array")
+    )
+    assert env.metadata["render_fps"] == 20
+    env.reset(seed=1)
+    for _ in range(8):
+        env.step(np.ones(1, np.float32))
+    pictures: Any = env.render()
+    assert [(picture.shape, picture.dtype) for picture in pictures] == [((256, 256, 3), "u1")] * 9
+    alpha = env.unwrapped.link.truth().alpha  # type: ignore[attr-defined]
+    dark = np.argwhere(pictures[-1][:, 200, 0] < 130).mean()
+    assert alpha > 0.1
+    assert dark > 127.5 + 20
+    assert np.array_equal(pictures[-1][:, :, 0], pictures[-1][:, :, 2])
+    assert env.render() == []
+
+
+def test_the_frame_rate_of_pictures_is_that_of_ticks() -> None:
+    env = gymnasium.make("fishd/Swim-v0", overrides=("tick=0.02",), render_mode="rgb_array")
+    assert env.metadata["render_fps"] == 50
+    with pytest.raises(ResetNeeded, match="call reset before render"):
+        env.unwrapped.render()
+
+
+def test_an_environment_without_render_mode_draws_nothing() -> None:
+    env = gymnasium.make("fishd/Swim-v0").unwrapped
+    env.reset()
+    assert env.render() is None
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "words"),
+    [
+        ("fishd/Swim-v0", "human", "render_mode='human' is not valid: 'rgb_array' is needed"),
+        ("fishd/SwimOnDaemon-v0", "rgb_array", "the true angles of this fish are unknown"),
+    ],
+)
+def test_another_render_mode_is_refused_in_one_sentence(name: str, mode: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        gymnasium.make(name, render_mode=mode)
 
 
 def test_an_environment_is_made_from_the_files_of_fish_and_training(tmp_path: Path) -> None:
