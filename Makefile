@@ -53,7 +53,7 @@ docs: $(VENV)/installed-docs  ## Write the generated parts of docs/, and build b
 figures: $(VENV)/installed-dev  ## Compute the paper's figures and numbers again, into docs/
 	$(BIN)/python tools/paper
 
-vendor: $(VENV)/bin/python  ## Fetch the libraries of the window's page again, with npm, and verify them
+vendor: $(VENV)/bin/python  ## Fetch the libraries of the window's page and of tests again, with npm, and verify them
 	$(BIN)/python tools/vendor.py
 
 bench: $(VENV)/installed-dev  ## Measure lateness, load and start-up on this machine
