@@ -224,7 +224,7 @@ class SwimEnv(gymnasium.Env[Vector, Vector]):
         self._paused = 0.0
         return self._agent_inputs(), reward, False, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Return the fish from above, its head to the left: height, width and 3 colours.
 
         None without a `render_mode`; raises `ResetNeeded` before the first episode.
