@@ -44,7 +44,7 @@ DEFAULT_STEPS = 6400
     show_default=True,
     help="Control steps of the training, which runs in simulation while the fish rests.",
 )
-@seed_option("cloud and training")
+@seed_option("the cloud of models and of the training")
 @click.option(
     "--no-command",
     is_flag=True,

@@ -36,7 +36,7 @@ REPORT_INTERVAL_S = 1.0
 @click.argument("policy", metavar="NAME|FILE", shell_complete=complete_policy)
 @click.option(
     "--camera",
-    metavar="ENDPOINT",
+    metavar="ADDRESS",
     help="Request address of fishd-camera, for a policy that sees pictures. [default: "
     "$FISHD_CAMERA, else that of this machine]",
 )
@@ -61,12 +61,12 @@ def agent(
 ) -> int:
     """Let a policy swim the fish of a running fishd, tick by tick, until Ctrl-C.
 
-    It chooses each angle in this program, as the agent of fishd's controller `remote`: on the
-    robot's own computer or on another one. So a policy that sees pictures can swim, although fishd
-    has no pictures: they come from a running fishd-camera. Policies that see forces swim, too.
+    The policy runs in this program, on the robot's computer or on another one, as the agent of
+    fishd's controller `remote`. Policies that see pictures can swim only in this way; the pictures
+    come from a running fishd-camera. Policies that see forces can swim in this way, too.
 
     Without frames for 0.25 s the fish waits at neutral; after 2 s the camera counts as lost.
-    However this ends, the fish is at neutral. Exit status 1 if the policy does not fit the robot
+    At the end, the fish is always at neutral. Exit status 1 if the policy does not fit the robot
     or the camera, or one of them is lost.
     """
     for package in ("onnx", "onnxruntime"):

@@ -118,8 +118,8 @@ def compare(
     measurement and of the sensor's calibration, which is the same fraction of all thrusts.
     The verdict names the contestants that may be the best, by intervals that hold together in 95 %
     of cases, and chooses the simplest of them.
-    |φ_c|/Φ is the mean magnitude of the command. square is that divided by the rms: square wave 1,
-    sine 0.900, triangle 0.866.
+    The column |φ_c|/Φ is the mean magnitude of the command. 'square' is this magnitude divided by
+    the rms value: 1 for a square wave, 0.900 for a sine, 0.866 for a triangle wave.
     Exit status 1 if this fish refuses a contestant, such as a policy for another amplitude, or if
     a run ends in mode fault; the other contestants are still compared.
     """

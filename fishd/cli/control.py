@@ -95,7 +95,7 @@ def clear_fault(endpoint: str | None, as_json: bool) -> None:
 @click.argument("words", metavar="TEXT", type=Utf8Text())
 @daemon_options
 def mark(words: str, endpoint: str | None, as_json: bool) -> None:
-    """Put a mark in the event stream, such as what you just changed on the rig."""
+    """Write a mark into the event stream, such as what you have changed on the rig."""
     with client.Fish(endpoint) as fish:
         state = fish.mark(words)
     if as_json:

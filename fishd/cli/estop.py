@@ -26,16 +26,16 @@ _TIMEOUT_S = 0.3
     "--config",
     "file",
     type=click.Path(path_type=Path, readable=False),
-    help="YAML file of the daemon, for the last resort. [default: the recipe that the daemon "
-    "wrote, else as for release]",
+    help="YAML file of the daemon, for the last resort. [default: the file that the daemon "
+    "wrote for this, else as for release]",
 )
 @daemon_options
 def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) -> int:
     """Emergency stop: no more pulses, at once, until 'fishctl clear-fault'.
 
-    Prints which way it took: the control socket; or fishd's separate socket for emergency stops,
-    if the first does not answer within 0.1 s; or the last resort without the daemon, as 'fishctl
-    release'. Exit status 0 if there are no more pulses.
+    It tries three ways, and prints which one worked: fishd's control socket; fishd's separate
+    socket for emergency stops, if the first does not answer within 0.1 s; and the last resort
+    without the daemon, as 'fishctl release'. Exit status 0 if there are no more pulses.
     """
     with Fish(endpoint) as fish:
         path = socket_path(fish.endpoint)

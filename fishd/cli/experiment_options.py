@@ -168,8 +168,8 @@ def _fish_choice(function: F, *, live_config: bool) -> F:
 on_option = click.option(
     "--on",
     type=click.Choice(["live", "simulation"]),
-    help="The fish of the running fishd, real or simulated; or one in virtual time. [default: live "
-    "if a fishd runs and no --config is given]",
+    help="live: the fish of the running fishd, real or simulated; simulation: a fish in virtual "
+    "time. [default: live if a fishd runs and neither --config nor --set is given]",
 )
 
 
@@ -195,7 +195,7 @@ def folder_options(function: F) -> F:
 
 def live_folder_options(function: F) -> F:
     """Add the same options to a verb that uses `keep_experiment`."""
-    return _folder_options(function, "; in simulation, none, and nothing is kept")
+    return _folder_options(function, "; in simulation none: nothing is kept")
 
 
 def _folder_options(function: F, otherwise: str) -> F:

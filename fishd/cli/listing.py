@@ -122,9 +122,9 @@ def policies(ctx: click.Context, endpoint: str | None, as_json: bool) -> None:
 @daemon_options
 @click.pass_context
 def show(ctx: click.Context, policy: str, endpoint: str | None, as_json: bool) -> None:
-    """Print what a policy file says about itself.
+    """Print what a policy file says about its policy.
 
-    Its inputs, what it fits, and how it was trained.
+    This is its inputs, the robot and camera that it fits, and how it was trained.
     """
     from fishd.controllers.policy import library
 

@@ -90,8 +90,9 @@ def optimise_options(function: Any) -> Any:
 def optimise() -> None:
     """Search the parameters of a controller that give the most thrust, in a minute of swimming.
 
-    The fish swims with a candidate, rests, and swims with the next. A Gaussian process chooses it
-    from all measurements and their errors. The other parameters of the controller may be set, too.
+    The fish swims with a candidate, rests, and swims with the next. A Gaussian process chooses
+    the candidates from all measurements and their errors. The other parameters of the controller
+    may be set, too.
     --resume continues an interrupted search; --budget may then be larger.
     """
 

@@ -32,14 +32,14 @@ _ANSWER_S = 0.3
 def release(file: Path | None, overrides: tuple[str, ...], as_json: bool) -> int:
     """Send the servo to neutral and stop its pulses, without the daemon.
 
-    A fishd that still drives the servo is first sent an emergency stop; one that does not answer
-    is in fault when it resumes.
+    If a fishd still drives the servo, it first gets an emergency stop. A fishd that does not answer
+    will be in mode fault when it resumes.
 
     systemd runs this when the service has ended (ExecStopPost). A servo without pulses is not
     touched. Exit status 1 when the servo cannot be reached or has pulses at the end, and when no
     configuration names a servo: the defaults are those of a simulated fish. If a file says that the
-    fish is simulated, there is nothing to release, which is a success. Once it has started, neither
-    a lost session nor Ctrl-C ends it halfway.
+    fish is simulated, there is nothing to release, which is a success. Ctrl-C or a
+    lost session does not interrupt it.
     """
     config, source = _load_without_bad_folder(file, overrides)
     service_result = os.environ.get("SERVICE_RESULT")

@@ -35,8 +35,8 @@ ANSWER_TIMEOUT_S = 2.0
 def window(ctx: click.Context) -> None:
     """Show the fish on a web page for people at the tank, and control it there.
 
-    Without a further word, opens the page, and first starts it unless it runs. On this machine the
-    page is free; other devices need to be paired.
+    Without a command, opens the page; if it does not run, starts it first. On this machine the page
+    needs no pairing; other devices do.
     """
     if ctx.invoked_subcommand is None:
         ctx.exit(ctx.invoke(open_page))
@@ -96,7 +96,7 @@ def start(log_format: str, **values: Any) -> int:
 def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
     """Print a link and a QR code that pair a device with the window that runs.
 
-    It pairs one device, within ten minutes. The code is for a terminal.
+    It pairs one device, within ten minutes. The QR code is drawn in a terminal only.
     """
     from fishd.window.devices import INVITATION_S
 

@@ -48,7 +48,7 @@ JOIN_TIMEOUT_S = 1.0
 @camera_option
 @json_option
 def status(address: str | None, as_json: bool) -> None:
-    """Show the state of the camera: since when, its rate, the age of frames, and losses."""
+    """Show the state of the camera and its beginning, the rate, the age of frames, and losses."""
     import zmq
 
     from fishd.camera.requests import CameraRequests, find_camera

@@ -59,8 +59,8 @@ def doctor(
 ) -> int:
     """Check everything that fishd needs with this configuration, and print remedies.
 
-    Only what the configured robot needs is checked. Nothing moves and nothing is changed; a
-    running fishd is asked and not disturbed. Exit status 1 when a check failed, 78 when the
+    Only what the configured robot needs is checked. Nothing moves and nothing is changed,
+    also in a fishd that runs. Exit status 1 when a check failed, 78 when the
     configuration is wrong.
 
     With --bench, the servo must be unplugged: the pulses of a swim are measured, and their end

@@ -50,7 +50,7 @@ PIPE_COLUMNS = 1000
     show_default=True,
     help="Time of each run before measurements begin [s].",
 )
-@plot_option("the thrust of each on each fish")
+@plot_option("the thrust of each contestant on each fish")
 @fish_options
 @json_option
 def evaluate(

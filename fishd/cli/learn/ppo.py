@@ -130,7 +130,7 @@ def ppo(
     picture: Path | None,
     as_json: bool,
 ) -> int:
-    """Train a policy with PPO: checkpoints, tables and TensorBoard logs in a run folder.
+    """Train a policy with PPO; write checkpoints, tables and TensorBoard logs to a run folder.
 
     After Ctrl-C the fish is at neutral, and --resume continues from the last checkpoint.
     """

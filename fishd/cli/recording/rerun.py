@@ -36,9 +36,9 @@ def rerun(
     """Run a controller again on each recorded tick, and compare its commands.
 
     RUN is a path, a name in the folder of recordings, or 'latest'. The controller sees the recorded
-    forces and angles. The controller that swam gives the same commands to the last bit, from each
-    of its starts in the recording; exit status 1 if it does not, or if none swam. A controller that
-    swam before the recording began is compared, too, but not judged.
+    forces and angles. The recorded controller must give the same commands to the last bit, from
+    each of its starts in the recording. Exit status 1 if it does not, or if no controller swam. A
+    controller that started before the recording is compared, too, but a difference is no failure.
 
     fishctl rerun latest --controller swing C=0.4
     """

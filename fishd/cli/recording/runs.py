@@ -37,9 +37,9 @@ def runs(folder: Path | None, as_json: bool) -> int:
     """List recordings and experiments, each the oldest first.
 
     'thrust' is the mean while the fish swam, in mN unless another unit is shown, with its 95 %
-    confidence interval. If the zero of the sensor was never known, it is the mean measured force,
-    drift and offset included, ± ?. An experiment shows the largest of its thrusts. 'power' is the
-    mean power into the servo. 'lost' counts ticks of fishd that are not in the file.
+    confidence interval. If the zero of the sensor was never known, it is the mean measured force
+    with drift and offset, and its interval is '?'. An experiment shows the largest of its thrusts.
+    'power' is the mean power into the servo. 'lost' counts ticks of fishd that are not in the file.
     """
     place = folder or runs_folder()
     recordings = list(read_overviews(place))

@@ -46,8 +46,8 @@ def _picture_path(picture: Path | None, file: Path, what: str, force: bool) -> P
 def midlines(file: Path, settle: float, picture: Path | None, force: bool, as_json: bool) -> None:
     """Draw the midlines of a tail beat relative to the mean, and the amplitude along the body.
 
-    SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is
-    FILE-midlines.png in this folder.
+    SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is a .png
+    file in this folder, named after SWIM.
     """
     path = _picture_path(picture, file, "midlines", force)
     time, lines = checkpoint.load(file).midlines.arrays()
@@ -94,8 +94,8 @@ def wake(
 ) -> None:
     """Draw the water at the end of a swim, and the body in it.
 
-    SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is
-    FILE-vorticity.png in this folder.
+    SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is a .png
+    file in this folder, named after SWIM.
     """
     path = _picture_path(picture, file, field, force)
     fish = water.restore_fish(checkpoint.load(file))
