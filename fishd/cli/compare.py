@@ -206,6 +206,7 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
         chosen = chosen or _default_contestants(session.read_config())
         _check_camera(task.camera, chosen)
         live = LiveComparison(session, chosen)
+        live.check(task.seconds)  # before the experiment has a folder
         with task.keep(session, chosen) as experiment:
             task.fish.announce(task.as_json)
             ending = ExperimentEnding(experiment)

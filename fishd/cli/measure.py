@@ -68,11 +68,12 @@ def _measure(
 ) -> int:
     from fishd.lab import drawing
     from fishd.lab.measurement import measure as run_measurement
-    from fishd.lab.measurement import summarise
+    from fishd.lab.measurement import plan, summarise
     from fishd.lab.session import LiveSession
 
     if picture:
         drawing.check(picture)
+    plan(seconds, parameters, settle)  # before the experiment has a folder
     settings = {"controller": name, "parameters": parameters, "for": seconds, "settle": settle}
     with (
         fish.session() as session,

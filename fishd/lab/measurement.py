@@ -266,9 +266,9 @@ def plan(
     rest = _rest_settle_time(settle) + MEAN_REST_S - REST_SETTLE_TIME_S
     if not 2 * swim + 3 * rest <= seconds <= MAX_MEASUREMENT_S:  # NaN is not
         raise ParameterError(
-            f"a measurement of {seconds:g} s is not possible: two swims of {swim:.3g} s between "
-            f"three rests of {rest:.3g} s need {2 * swim + 3 * rest:.4g} s, and the limit is "
-            f"{MAX_MEASUREMENT_S:g} s"
+            f"a measurement of {seconds:g} s is not possible: {2 * swim + 3 * rest:.4g} to "
+            f"{MAX_MEASUREMENT_S:g} s are needed, for two or more swims of {swim:.3g} s between "
+            f"rests of {rest:.3g} s"
         )
     count = math.floor((seconds - rest) / (swim + rest) + 1e-9)
     shortest = (

@@ -13,6 +13,7 @@ from rigs.processes import (
     Process,
     Subscriber,
     call,
+    one_line,
     running,
     wait_until,
 )
@@ -62,6 +63,15 @@ def test_it_finds_the_thrust_and_fishd_shows_it_from_then_on(daemon: Daemon) -> 
         return ci95 < 2e-3 and abs(status.thrust - result["thrust"]) <= ci95
 
     wait_until(is_shown)
+
+
+@pytest.mark.parametrize("verb", ["measure", "compare"])
+def test_a_length_that_is_too_short_is_refused_and_leaves_no_folder(
+    daemon: Daemon, runs: Path, verb: str
+) -> None:
+    line = one_line(daemon.fishctl(verb, "swing", "--for", "5"))
+    assert "a measurement of 5 s is not possible: 20.25 to 3600 s are needed" in line
+    assert not list(runs.iterdir())
 
 
 def test_another_controller_in_the_middle_ends_it_and_swims_on(daemon: Daemon) -> None:

@@ -37,8 +37,7 @@ class LiveComparison:
 
         Raises `ParameterError` for a time that is too short, `Disturbed` and `NoDaemon`.
         """
-        for contestant in self.contestants:
-            plan(seconds, contestant.parameters)
+        self.check(seconds)
         excluded = set[int]()
         order = [index for _ in range(runs) for index in range(len(self.contestants))]
         for index in order:
@@ -56,6 +55,11 @@ class LiveComparison:
                 excluded.add(index)
                 continue
             self._measured[index].append(measurement)
+
+    def check(self, seconds: float) -> None:
+        """Raise `ParameterError` if a run of this length is not possible."""
+        for contestant in self.contestants:
+            plan(seconds, contestant.parameters)
 
     def standings(self) -> list[Standing]:
         """Return the standings of all measured contestants, in the given order."""
