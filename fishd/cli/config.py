@@ -142,7 +142,13 @@ def show(
 
 @config.command()
 @click.argument("name", required=False)
-@click.option("--to", "target", type=click.Path(path_type=Path), help="Write it into this file.")
+@click.option(
+    "--to",
+    "target",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write it into this file.",
+)
 def example(name: str | None, target: Path | None) -> None:
     """Print an example of a configuration file, or list the examples.
 

@@ -94,7 +94,7 @@ def start(log_format: str, **values: Any) -> int:
 )
 @json_option
 def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
-    """Print a link and a QR code that pair a device with the window that runs.
+    """Print a link and a QR code that pair a device with the page.
 
     It pairs one device, within ten minutes. The QR code is drawn in a terminal only.
     """

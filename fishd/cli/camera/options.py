@@ -31,6 +31,7 @@ png_option = click.option(
     "--plot",
     "png",
     type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
     help="Write the picture into this file.",
 )
 

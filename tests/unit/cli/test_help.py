@@ -81,11 +81,20 @@ def test_a_time_that_is_no_number_is_a_wrong_use(verb: str) -> None:
 
 
 WITHOUT_JSON = {
-    *("calibrate force", "calibrate servo", "camera view", "completion", "config example"),
+    *("calibrate force", "calibrate servo", "completion", "config example"),
     *("virtual-pi clear", "virtual-pi inject", "virtual-pi press", "virtual-pi run"),
     *("config schema", "virtual-pi release-button", "window", "window open", "window start"),
 }
-"""Verbs that print no result: dialogues, pictures in the terminal, scripts, or nothing."""
+"""Verbs that print no result: dialogues, scripts, or nothing."""
+METAVARS = {
+    "--camera": {"ADDRESS", "[ADDRESS]"},
+    "--camera-config": {"FILE"},
+    "--plot": {"FILE"},
+    "--record": {"FILE"},
+    "--resume": {"FILE", "FOLDER"},
+    "--to": {"FILE", "FILE|FOLDER"},
+}
+"""What may follow an option, in any verb."""
 EXPERIMENTS = ("measure", "compare", "sweep", "optimise", "identify", "adapt", "learn ppo")
 
 
@@ -98,6 +107,8 @@ def test_all_verbs_have_one_vocabulary() -> None:
         assert ("--for" in own_options) == ("--seconds" in own_options), verb
         assert not own_options & {"--tank-time", "--out", "--output", "--figure"}, verb
         for parameter in command.params:
+            for name in METAVARS.keys() & set(parameter.opts):
+                assert parameter.metavar in METAVARS[name], (verb, name)
             if "--seed" in parameter.opts:
                 assert isinstance(parameter, click.Option)
                 assert (parameter.help or "").startswith("Seed of the random number generator of")

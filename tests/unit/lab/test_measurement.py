@@ -94,9 +94,7 @@ def test_swims_and_rests_differ_in_length_so_that_no_drift_keeps_time_with_them(
 
 @pytest.mark.parametrize("seconds", [10.0, float("nan"), float("inf"), -1.0, 1e9])
 def test_a_length_that_is_not_possible_is_told_with_what_is_needed(seconds: float) -> None:
-    with pytest.raises(
-        ParameterError, match=r"20\.25 to 3600 s are needed, for two or more swims of 6 s"
-    ):
+    with pytest.raises(ParameterError, match=r"20\.25 to 3600 s are needed, for two or more"):
         plan(seconds, {})
 
 
