@@ -33,7 +33,7 @@ def draw(control: OptimalControl, path: str | os.PathLike[str]) -> None:
         midpoints = edges[:-1] + 0.5 * edges[1]
         costate.plot(midpoints, _repeat_twice(control.costate), color=GREEN)
         costate.set_yticks((-1, 0, 1))
-        costate.set_ylabel("costate $p$\nof the wheel (1)")
+        costate.set_ylabel("costate $p$\nof the wheel (–)")
         force.axhline(0.0, color="0.8", lw=0.7)
         force.plot(midpoints, 1e3 * _repeat_twice(control.force), color=BLACK)
         force.axhline(1e3 * control.thrust, color=ORANGE, ls=(0, (4, 2)))

@@ -125,7 +125,7 @@ def draw_midlines(envelope: Envelope, title: str, path: str | os.PathLike[str]) 
             envelope.midlines[:: PHASE_COUNT // LINE_COUNT], colours, strict=True
         ):
             upper.plot(*line.T, color=colour, linewidth=1.0)
-        upper.set_ylabel("y/L (1)")
+        upper.set_ylabel("y/L (–)")
         upper.set_aspect("equal", adjustable="datalim")
         upper.set_title(title, fontweight="normal")
         phases = ScalarMappable(
@@ -133,7 +133,7 @@ def draw_midlines(envelope: Envelope, title: str, path: str | os.PathLike[str]) 
             ListedColormap(colours),
         )
         bar = figure.colorbar(phases, cax=upper.inset_axes((1.01, 0.0, 0.018, 1.0)))
-        bar.set_label("phase of the beat (1)")
+        bar.set_label("phase of the beat (–)")
         bar.set_ticks([0.0, 0.25, 0.5, 0.75, 1.0])
         bar.minorticks_off()
         lower.fill_between(
@@ -142,8 +142,8 @@ def draw_midlines(envelope: Envelope, title: str, path: str | os.PathLike[str]) 
         lower.plot(envelope.along, mean, color=BLACK)
         lower.set_ylim(bottom=0.0)
         lower.set_xlim(-0.05, 1.05)
-        lower.set_xlabel("x/L (1), from the head on")
-        lower.set_ylabel("amplitude/L (1)")
+        lower.set_xlabel("x/L (–), from the head on")
+        lower.set_ylabel("amplitude/L (–)")
         beats = len(envelope.amplitudes)
         spread_note = f", and how {beats} beats differ (standard deviation)" if beats > 1 else ""
         lower.set_title(
