@@ -43,6 +43,7 @@ _COLOURS = {"ok": "green", "warning": "yellow", "FAIL": "red", "skipped": "brigh
     "--to",
     "output",
     type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
     default=Path(),
     help="With --bench: folder of the report; default: this one.",
 )

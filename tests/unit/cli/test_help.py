@@ -92,7 +92,7 @@ METAVARS = {
     "--plot": {"FILE"},
     "--record": {"FILE"},
     "--resume": {"FILE", "FOLDER"},
-    "--to": {"FILE", "FILE|FOLDER"},
+    "--to": {"FILE", "FOLDER", "FILE|FOLDER"},
 }
 """What may follow an option, in any verb."""
 EXPERIMENTS = ("measure", "compare", "sweep", "optimise", "identify", "adapt", "learn ppo")
