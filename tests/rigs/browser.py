@@ -2,28 +2,47 @@
 
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page, sync_playwright
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 
 
+_SHARED: list[Browser] = []
+
+
 @contextmanager
-def open_page(url: str, *options: str, **settings: Any) -> Iterator[tuple[Page, list[str]]]:
-    """Yield the page, and its problems: errors, and requests that leave this machine.
+def shared_browser(*options: str) -> Iterator[Browser]:
+    """Let `open_page` open its pages in one browser; inside, asyncio cannot start a loop.
 
     options: further ones of Chromium's command line
-    settings: those of a page of playwright, such as `color_scheme`
     """
-    complaints: list[str] = []
     with sync_playwright() as playwright:
         arguments = ["--no-sandbox", "--disable-gpu", *options]
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        _SHARED.append(browser)
+        try:
+            yield browser
+        finally:
+            _SHARED.remove(browser)
+            browser.close()
+
+
+@contextmanager
+def open_page(url: str, **settings: Any) -> Iterator[tuple[Page, list[str]]]:
+    """Yield the page, and its problems: errors, and requests that leave this machine.
+
+    It shares no cookie, storage or cache with other pages.
+
+    settings: those of a page of playwright, such as `color_scheme`
+    """
+    complaints: list[str] = []
+    with nullcontext(_SHARED[-1]) if _SHARED else shared_browser() as browser:
         page = browser.new_page(**{"viewport": {"width": 1100, "height": 760}, **settings})
         page.on("console", lambda message: complaints.append(message.text))
         page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -45,4 +64,5 @@ def open_page(url: str, *options: str, **settings: Any) -> Iterator[tuple[Page, 
             page.goto(url)
             yield page, complaints
         finally:
-            browser.close()
+            for context in browser.contexts:
+                context.close()

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from playwright.sync_api import Page, expect
-from rigs.browser import needs_browser, open_page
+from rigs.browser import needs_browser, open_page, shared_browser
 from rigs.processes import PATIENCE, Daemon, running, wait_until
 from rigs.virtual_pi_process import Pi
 from rigs.window_process import NETWORK_HOST, WindowProcess
@@ -55,6 +55,13 @@ LINE_AT = """([second]) => {
   }
   return false;
 }"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def browser() -> Iterator[None]:
+    """Open one browser for the pages of this module."""
+    with shared_browser(RESOLVED):
+        yield
 
 
 @pytest.fixture
@@ -299,7 +306,7 @@ def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
 ) -> None:
     link = window.invite("watch")
     url = link.partition("#")[0]
-    with open_page(url, RESOLVED) as (page, complaints):
+    with open_page(url) as (page, complaints):
         expect(page.locator(".pairing")).to_contain_text("not paired")
         page.goto(link)
         expect(page.locator("#connection")).to_contain_text("live")
@@ -313,7 +320,7 @@ def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
 
 
 def test_a_device_that_is_revoked_says_so(window: WindowProcess) -> None:
-    with open_page(window.invite(), RESOLVED) as (page, _):
+    with open_page(window.invite()) as (page, _):
         expect(page.locator("#connection")).to_contain_text("live")
         (device,) = json.loads(window.ask("devices", "--json"))
         window.ask("revoke", device["id"])
