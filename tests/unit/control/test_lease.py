@@ -95,6 +95,19 @@ def test_a_lease_is_over_once_another_client_has_the_fish_or_a_fault_has_come(
     assert refusal.value.code == "no-lease"
 
 
+def test_a_lease_that_ran_out_can_be_renewed_unless_it_was_forgotten() -> None:
+    rig = Rig()
+    lease = experiment(rig)
+    rig.loop.stop()
+    rig.run_for(2.0 * SECONDS)
+    rig.loop.lease.forget("that of another experiment")
+    rig.loop.lease.renew(lease)
+    rig.run_for(2.0 * SECONDS)
+    rig.loop.lease.forget(lease)
+    with pytest.raises(Refused, match="no longer holds the fish"):
+        rig.loop.lease.renew(lease)
+
+
 def test_a_second_experiment_is_refused_with_the_holder_and_its_time() -> None:
     rig = Rig()
     lease = experiment(rig, seconds=60.0)

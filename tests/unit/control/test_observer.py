@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from rigs.harness import Rig, fragile_rig
 
+from fishd.control.estimators.observer import Observer
 from fishd.core.errors import SensorError
 from fishd.lab.simulation import simulate
 
@@ -71,3 +72,17 @@ def test_swing_with_the_observer_bears_a_slow_servo(kind: str, least: float, mos
 
     config = load(None, [f"estimator.kind={kind}", "plant.servo_delay=0.1", *REAL])
     assert least < simulate(config, "swing", {}, seconds=60).relative_thrust <= most
+
+
+def test_a_reversed_lateral_force_leaves_the_motion_unknown_and_the_offset_reversed() -> None:
+    rig = Rig(OBSERVER, *REAL).start("square", frequency=1.7)
+    observer = rig.loop._estimator
+    assert isinstance(observer, Observer)
+    unknown = observer._covariance
+    rig.run_for(10)
+    offset = observer._offset
+    assert offset == pytest.approx(0.02, abs=0.01)
+    assert np.trace(observer._covariance) < 0.1 * np.trace(unknown)
+    observer.reverse_fy()
+    assert observer._offset == -offset
+    np.testing.assert_array_equal(observer._covariance, unknown)

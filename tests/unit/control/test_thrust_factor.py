@@ -8,6 +8,7 @@ from typing import NamedTuple
 import pytest
 
 from fishd.control.estimators.live_thrust import LiveThrust
+from fishd.control.estimators.thrust_factor import DRIFT_LAG_S, Drift
 from fishd.core.signals import Observation
 
 TICK = 0.3
@@ -118,3 +119,13 @@ def test_the_factor_is_unbiased_over_20_000_beats_whatever_the_noise_and_the_dri
     assert abs(mean) < 0.01
     assert sum(abs(error.error) < error.ci95 for error in errors) > 0.9 * len(errors)
     assert all(abs(error.error) < 3.0 * error.ci95 for error in errors)
+
+
+@pytest.mark.parametrize(("sigmas", "lasts"), [(1.9, 0.5), (2.1, DRIFT_LAG_S)])
+def test_only_a_change_that_is_clear_of_the_noise_counts_as_a_drift_that_goes_on(
+    sigmas: float, lasts: float
+) -> None:
+    drift, noise, lag = Drift(0.0), 1e-6, 0.5
+    change = sigmas * math.sqrt(2.0 * noise)
+    drift.add(change, lag, noise)
+    assert drift.rate == pytest.approx((change**2 - 2.0 * noise) * lasts / lag**2)

@@ -1,12 +1,15 @@
 """`swing --C auto`: it finds the C of fish that are not like the model, and says what it does."""
 
+import math
+from itertools import groupby
+
 import pytest
 from msgspec.structs import replace
 from rigs.harness import LIMITS, Rig, observe
 
 from fishd.config import load
 from fishd.controllers import registry
-from fishd.controllers.criterion_search import LADDER, START_INDEX
+from fishd.controllers.criterion_search import LADDER, START_INDEX, CriterionSearch, Phase
 from fishd.core.errors import ParameterError
 from fishd.lab.compare.survey import harsh
 from fishd.lab.simulation import simulate
@@ -114,3 +117,43 @@ def test_it_is_refused_where_the_force_does_not_tell_the_thrust() -> None:
         registry.create("swing", {"C": "auto"}, replace(LIMITS, tick=0.2))
     with pytest.raises(ParameterError, match=r"lead: 0.1 s is not valid with C auto"):
         registry.create("swing", {"C": "auto", "lead": 0.1}, LIMITS)
+
+
+def swim_half_beat(search: CriterionSearch, number: int, amplitude: float) -> None:
+    for tick in range(10):
+        fx = amplitude * (1.0 - math.cos(2.0 * math.pi * (tick + 0.5) / 10.0))
+        search.update(fx, 0.0, 0.05, 1.0 if number % 2 else -1.0)
+
+
+@pytest.mark.parametrize(("former_swims", "then"), [(True, Phase.WATCH), (False, Phase.TRIAL)])
+def test_a_gait_that_stays_lost_is_left_for_the_one_before_which_is_begun_again(
+    former_swims: bool, then: Phase
+) -> None:
+    search = CriterionSearch()
+    former = search._place
+    search._place += 2
+    search._launch(1.0)
+    seen = []
+    for number in range(60):
+        seen.append((search.phase, search._place))
+        swims = former_swims and search._place == former
+        swim_half_beat(search, number, 1.0 if swims else 0.01)
+    phases = (Phase.LAUNCH, Phase.BEFORE)
+    tried = [(phase, place) for place in (former + 2, former) for phase in phases]
+    assert [state for state, _ in groupby(seen)][:5] == [*tried, (then, former)]
+
+
+@pytest.mark.parametrize(
+    ("change", "restarts"), [(0.67, True), (0.8, False), (1.2, False), (1.33, True)]
+)
+def test_a_watched_gait_that_becomes_much_weaker_or_stronger_restarts_the_search(
+    change: float, restarts: bool
+) -> None:
+    search = CriterionSearch()
+    search._trials = []
+    seen = []
+    for number in range(60):
+        swim_half_beat(search, number, 1.0 if number < 30 else change)
+        seen.append(search.phase)
+    assert seen[29] is Phase.WATCH
+    assert (Phase.TRIAL in seen[30:]) is restarts

@@ -166,8 +166,8 @@ def test_after_its_time_a_pause_is_silence(rig: Rig, agent: ScriptedAgent) -> No
 def test_virtual_time_stands_still_in_a_pause(still: Rig, agent: ScriptedAgent) -> None:
     def pausing(seen: dict[str, Any]) -> dict[str, Any] | None:
         if agent.seen.count(seen) == 1:  # and again after the pause
-            agent.send(agent.pause(30.0))
-            agent.send(agent.pause(0.0))
+            for seconds in (30.0, 20.0, 0.0, 0.0):
+                agent.send(agent.pause(seconds))
             return None
         return agent.action(0.1)
 

@@ -206,6 +206,14 @@ def test_answers_of_another_session_are_told_from_late_ones(rig: Rig, agent: Scr
     assert "5 ticks in a row (5 were for another session)" in reason(rig)
 
 
+def test_late_answers_are_counted_in_the_reason(rig: Rig, agent: ScriptedAgent) -> None:
+    connect(rig, agent)
+    swim(rig, agent)
+    for _ in range(5):
+        assert run_answered_tick(rig, agent, 0.3, seq=remote(rig)._seq).phi_c == 0.0
+    assert "5 ticks in a row (5 answers were late)" in reason(rig)
+
+
 def test_before_the_first_action_wrong_answers_count_too(rig: Rig, agent: ScriptedAgent) -> None:
     connect(rig, agent, first_action=2.0)
     for _ in range(9):
