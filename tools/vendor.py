@@ -65,7 +65,7 @@ def make_bundle(manifest: dict[str, Any], folder: Path) -> None:
     (OF_TESTS / bundle["file"]).write_bytes(made.stdout)
     licences = []
     for name, version in packages.items():
-        if name != "esbuild":  # it adds nothing of its own
+        if name != "esbuild":  # no code of it is in the file
             (licence,) = (folder / "node_modules" / name).glob("LICENSE*")
             text = licence.read_text(encoding="utf-8").replace("\r\n", "\n").strip()
             licences.append(f"{name} {version}\n\n{text}\n")
