@@ -5,7 +5,7 @@ import {
 } from "./common.js";
 import { Charts } from "./charts.js";
 import { defaultOf, Drive, driverName, request, selectionOf } from "./controls.js";
-import { Experiments, Runs } from "./experiments.js";
+import { Experiments, plain, Runs } from "./experiments.js";
 import { TopView } from "./fish.js";
 import { Ring, Stream, ticksOf } from "./stream.js";
 
@@ -104,7 +104,7 @@ const receive = {
     const before = state.jobs.get(job.id);
     state.jobs.set(job.id, job);
     if (before?.state === "running" && job.state !== "running") {
-      notice(job.state === "failed" ? "error" : "info", `${job.kind}: ${job.state}`, job.state === "failed" ? (job.lines?.at(-1) ?? "") : "");
+      notice(job.state === "failed" ? "error" : "info", `${job.kind}: ${job.state}`, job.state === "failed" ? plain(job.lines?.at(-1) ?? "") : "");
     }
     showVirtual(job);
     changed();
@@ -180,13 +180,14 @@ function showVirtual(job) {
 
 function freshness() {
   const age = state.lastTick === null ? NaN : (performance.now() - state.lastTick) / 1000;
+  if (state.session?.paired === false) return { kind: "not paired", age };
   if (!state.helloed && !state.refused) return { kind: "connecting", age };
   if (state.refused) return { kind: "lost", age, message: state.refused };
   if (!state.linked) return { kind: "lost", age, message: "fishd-window does not answer; the page tries again each second." };
   const said = state.connection?.state;
   if (said === "lost") return { kind: "lost", age, message: state.connection.message || "fishd does not answer." };
   if (!(age <= Math.max(STALE_S, STALE_TICKS * state.interval)) || said === "stale") {
-    return { kind: "stale", age, message: state.connection?.message || "No ticks arrive from fishd." };
+    return { kind: "stale", age, message: state.connection?.message || "No ticks arrive." };
   }
   return { kind: "live", age };
 }
@@ -195,6 +196,7 @@ let shownKind = "";
 function checkConnection() {
   const { kind, message } = freshness();
   document.body.classList.toggle("stale", kind !== "live");
+  document.body.classList.toggle("unpaired", kind === "not paired");
   if (kind !== shownKind) {
     shownKind = kind;
     say(kind === "live" ? "Connection live." : (message ?? "Connecting."));
@@ -290,9 +292,9 @@ async function pressEstop() {
       // The window says that fishd is silent, so the window itself answers.
       const { message, remedy } = error.code === "no-answer" && state.linked && ["stale", "lost"].includes(state.connection?.state)
         ? { message: "fishd has not answered fishd-window yet", remedy: "" } : error;
-      Object.assign(press, { phase: "failed", message, remedy });
+      Object.assign(press, { phase: "failed", message, remedy, isLast: [401, 403, 404].includes(error.status) });
       changed();
-      if (error.status === 401 || error.status === 403 || error.status === 404) break;
+      if (press.isLast) break;
       await wait(doubled(ESTOP_RETRY_MS, press.attempts - 1));
     }
   }
@@ -327,10 +329,10 @@ function Head() {
       ? html`<nav class="tabs" aria-label="Fish"><h1 class="unseen">${state.name}</h1>${state.fish.map((name) => html`<a href=${`?fish=${encodeURIComponent(name)}`}
           aria-current=${name === state.name ? "page" : undefined}>${name}</a>`)}</nav>`
       : html`<h1>${state.name || "fishd"}</h1>`}
-    <span class=${`pill mode ${mode}`} id="mode">${mode === "estop" ? "E-stop" : mode}</span>
+    ${kind !== "not paired" && html`<span class=${`pill mode ${mode}`} id="mode">${mode === "estop" ? "E-stop" : mode}</span>`}
     <span class=${`pill connection ${kind}`} id="connection" title=${message ?? ""}>
-      <span class="dot"></span>${kind === "live" ? "live" : kind} <span class="age">${kind === "connecting" ? "" : Number.isFinite(age) ? duration(age) : "no tick yet"}</span></span>
-    <span class="driver" id="driver">${driver}</span>`;
+      <span class="dot"></span>${kind === "live" ? "live" : kind} <span class="age">${kind === "connecting" || kind === "not paired" ? "" : Number.isFinite(age) ? duration(age) : "no tick yet"}</span></span>
+    ${kind !== "not paired" && html`<span class="driver" id="driver">${driver}</span>`}`;
 }
 
 function Banner() {
@@ -346,7 +348,7 @@ function Banner() {
     ${estop?.phase === "sending" && html`<div class="banner bad"><b>Emergency stop sent …</b></div>`}
     ${estop?.phase === "failed" && html`<div class="banner bad" role="alert"><b>Emergency stop NOT confirmed.</b>
       <span>${sentence(estop.message)} Sent ${estop.attempts === 1 ? "once" : `${estop.attempts} times`}. Use the button of the panel, or: fishctl estop. ${sentence(estop.remedy)}</span>
-      <button type="button" onClick=${forgetEstop}>Do not send it again</button></div>`}
+      <button type="button" onClick=${forgetEstop}>${estop.isLast ? "Close" : "Do not send it again"}</button></div>`}
     ${(latched || estop?.phase === "done") && html`<div class="banner bad" id="latched">
       <div>${mode === "fault" ? html`<b>Fault.</b>` : html`<b>Emergency stop.</b>`}
         ${estop?.phase === "done" && html` <span>Confirmed <b id="estop-ms">${number(estop.ms, 0)} ms</b> after the press${
@@ -367,7 +369,7 @@ function Pairing() {
     await pair(token.trim(), name.trim());
   };
   return html`<form class="banner pairing" onSubmit=${send}>
-    <b>This device is not paired.</b><span>On the machine of fishd-window, fishctl window prints a code for it.</span>
+    <b>This device is ${state.helloed ? "no longer" : "not"} paired.</b><span>Run fishctl window pair on the fish's computer, then open its link here, or type its last part, after #pair=.</span>
     <label>Code <input value=${token} required autocomplete="one-time-code" onInput=${(event) => setToken(event.target.value)} /></label>
     <label>Name of this device <input value=${name} placeholder="tablet" maxlength="40" onInput=${(event) => setName(event.target.value)} /></label>
     <button class="primary">Pair</button></form>`;
@@ -413,20 +415,20 @@ function Values() {
   const age = largest("sample_age_ms"), late = largest("lateness_us") / 1000, period = ring.period * 1000;
   return html`
     <${Card} title="Thrust" value=${thrust} extra=${error} unit=${unit}
-      note=${!tick ? "" : half == null ? "mean F_x: the zero is unknown" : "mean over whole beats, 95 %"} />
-    <${Card} title="Tail beat" value=${tick?.frequency ? number(tick.frequency, 2) : "–"} unit="Hz" note=${tick?.frequency ? `${number(60 * tick.frequency, 0)} a minute` : "no beats"} />
+      note=${!tick ? "" : half == null ? "mean F_x: the zero is unknown" : tick.mode === "running" ? "mean of whole beats" : "at rest"} />
+    <${Card} title="Tail beat" value=${tick?.frequency ? number(tick.frequency, 2) : "–"} unit=${tick?.frequency ? "Hz" : ""} note=${tick?.frequency ? `${number(60 * tick.frequency, 0)} a minute` : tick && "no beats"} />
     ${tick?.speed !== undefined && html`<${Card} title="Speed" value=${number(1000 * tick.speed, 1)} unit="mm/s" note="true speed of the simulated fish" />`}
     <${Card} title="Relative thrust" value=${relative} extra=${relativeError} unit=${reference ? "%" : ""} note=${reference?.text ?? ""}>
       <button type="button" class="link" disabled=${!tick} onClick=${setReference}>${reference ? "again" : "take this as 100 %"}</button><//>
-    <${Card} title="Servo power" value=${number(status?.power ?? NaN, 2)} unit="W" note=${status?.power == null ? "no power meter" : "mean of 2 s"} />
+    <${Card} title="Servo power" value=${number(status?.power ?? NaN, 2)} unit=${status?.power == null ? "" : "W"} note=${!status ? "" : status.power == null ? "no power meter" : "mean of 2 s"} />
     <${Card} title="Controller" value=${status ? (status.mode === "running" ? status.controller : "none") : "–"}
       note=${status ? (status.mode === "running" ? ownText(status.controller, status.parameters) || "default parameters" : status.servo_on ? "servo at neutral" : "servo without pulses") : ""} />
     <${Card} title="Sensor age" value=${number(age, 1)} unit="ms" level=${age > 2 * period ? "warn" : ""}
       note=${tick?.suspect ? `suspect: ${tick.suspect}` : "largest of 1 s"} />
     <${Card} title="Tick lateness" value=${number(late, 2)} unit="ms" level=${late > 0.5 * period ? "warn" : ""}
-      note=${`${status?.overruns ?? 0} overruns, ${status?.missed_slots ?? 0} missed`} />
+      note=${status && `${status.overruns} overruns, ${status.missed_slots} missed`} />
     <${Card} title="Tick" value=${tick ? `#${tick.seq}` : "–"} level=${ring.lost ? "warn" : ""}
-      note=${ring.lost ? `${ring.lost} lost on the way here` : "none lost on the way"} />`;
+      note=${ring.lost ? `${ring.lost} lost on the way in 2 min` : tick && "none lost in 2 min"} />`;
 }
 
 function Events() {
@@ -512,6 +514,8 @@ function buildStaticParts() {
       schedule();
     }}>${WINDOWS.map((seconds) => html`<option value=${seconds}>${seconds} s</option>`)}</select></label></div>
     <div id="plots"></div>`, section);
+  const banner = byId("banner");
+  new ResizeObserver(() => document.documentElement.style.setProperty("--banner", `${banner.offsetHeight}px`)).observe(banner);
   charts = new Charts(byId("plots"), state.seconds);
   charts.setRing(ring);
 }
@@ -555,8 +559,7 @@ async function noteClosed() {
   const session = await call("GET", "/api/session").catch(() => null);
   if (state.linked) return;
   if (session) state.session = session;
-  if (session?.paired === false) state.refused = "this device is no longer paired";
-  else if (session && failures > 1) state.refused = "fishd-window refuses this page, maybe because too many are open; it is tried again";
+  if (session?.paired && failures > 1) state.refused = "fishd-window refuses this page, maybe because too many are open; it is tried again";
   else state.refused = "";
   changed();
 }

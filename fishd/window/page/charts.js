@@ -41,7 +41,7 @@ const CHARTS = [
   { key: "fy", title: ["Force F", "y"], force: true, series: [line("fy", "fy"), points("suspect_fy")] },
   {
     key: "phi", title: ["Command φ", "c"], unit: "rad", limits: true, stepped: true,
-    series: [line("phi_c", "phi", { stepped: true }), line("phi", "alpha", { name: "wheel" })],
+    series: [line("phi_c", "phi", { stepped: true, name: "command" }), line("phi", "alpha", { name: "wheel" })],
   },
   { key: "fin_velocity", title: ["Fin velocity, estimated"], unit: "", series: [line("fin_velocity", "fin")] },
   { key: "alpha", title: ["Fin angle α, true"], unit: "rad", smallest: 0.1, truth: true, series: [line("alpha", "alpha")] },

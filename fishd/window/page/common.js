@@ -23,6 +23,7 @@ export function significant(value, digits = 3) {
 export function interval(value, halfWidth) {
   if (!Number.isFinite(value)) return ["–", ""];
   if (!Number.isFinite(halfWidth) || halfWidth <= 0) return [significant(value), `±${NBSP}?`];
+  if (halfWidth < 1e-6 * Math.abs(value)) return [significant(value, 4), "(exact)"];
   const decimals = Math.min(8, Math.max(0, 1 - Math.floor(Math.log10(halfWidth))));
   return [number(value, decimals), `±${NBSP}${number(halfWidth, decimals)}`];
 }

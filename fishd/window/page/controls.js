@@ -49,6 +49,7 @@ function Field({ field, value, disabled, status, edit }) {
   const specials = [...(field.optional ? ["null"] : []), ...(field.words ?? [])];
   const shown = typeof value === "number" ? +value.toPrecision(6) : special === null ? value : "";
   const fallback = typeof defaultOf(field) === "number" ? defaultOf(field) : slider?.high;
+  const nullName = field.name === "amplitude" ? "limit" : "default";
   const numeric = field.kind === "number" || field.kind === "integer";
   const send = (text) => edit(field.name, valueOf(field, text));
   let input;
@@ -70,14 +71,14 @@ function Field({ field, value, disabled, status, edit }) {
       ${specials.map((word) => html`<label class="special"><input type="checkbox" disabled=${disabled}
         checked=${special === word}
         onChange=${(event) => edit(field.name, event.target.checked ? (word === "null" ? null : word) : fallback)} />
-        ${word === "null" ? (field.name === "amplitude" ? "limit" : "default") : word}</label>`)}
+        ${word === "null" ? nullName : word}</label>`)}
       ${input}<span class="unit">${unitText(field.unit)}</span>
     </span>
     ${slider && html`<input type="range" class="slider" aria-label=${`${field.name}, slider`} min=${slider.low} max=${slider.high}
       step=${slider.step} disabled=${disabled || special !== null} value=${special === null ? value : fallback}
       onInput=${(event) => edit(field.name, Number(event.target.value))} />
       <span class="bounds"><span>${short(slider.low)}</span><span>${short(slider.high)}</span></span>`}
-    <small id=${`${id}-help`}>${field.description}</small>
+    <small id=${`${id}-help`}>${field.description.replace("null:", `${nullName}:`)}</small>
   </div>`;
 }
 
@@ -153,11 +154,11 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
 
   return html`
     <h2 id="drive-title">Controller</h2>
-    ${!mayDrive && html`<p class="note">This device may only watch and use the E-stop.</p>`}
+    ${!mayDrive && html`<p class="note">This device may only watch and use the E‑stop.</p>`}
     ${experiment && html`<p class="note">The experiment <b>${experiment.name}</b> (process ${experiment.pid}${experiment.host && ` on ${experiment.host}`})
       holds the fish. Stop ends it.</p>`}
     ${mayDrive && html`<div class="role">
-      <span>${other ? html`<b>${driverName(state)}</b> drives` : state.driver ? "You drive" : "No page drives"}</span>
+      <span>${other ? html`<b>${driverName(state).replace(/^another page$/, "Another page")}</b> drives` : state.driver ? "You drive" : "No page drives"}</span>
       ${state.driver?.you_drive
         ? html`<button type="button" onClick=${() => changeRole(false)}>Release</button>`
         : html`<button type="button" onClick=${() => changeRole(true, Boolean(other))}>

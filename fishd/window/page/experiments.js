@@ -35,23 +35,28 @@ async function startJob({ state, notice, changed, becomeDriver }, kind, options,
 /** Leave out what is not given: the server has its own defaults. */
 const given = (options) => Object.fromEntries(Object.entries(options).filter(([, value]) => value !== null));
 
+/** Return the selected controller with those of its parameters that are not the defaults. */
+function selectionWithOwn(state) {
+  const { controller, edited, applied } = selectionOf(state);
+  const own = Object.entries(controller ? shownParameters(controller, state.status, edited, applied) : {}).filter(([name, value]) => {
+    const field = controller.parameters.find((candidate) => candidate.name === name);
+    return value !== null && value !== defaultOf(field);
+  });
+  return { controller, own: Object.fromEntries(own) };
+}
+
 export function Experiments(page) {
   const { state, notice } = page;
   const [form, setForm] = useState(() => recall("experiment", {
     kind: "measure", seconds: "", values: "", parameter: "", contestants: "square swing", runs: "", subject: "", note: "",
   }));
-  const { controller, edited, applied } = selectionOf(state);
+  const { controller, own } = selectionWithOwn(state);
   const set = (key) => (value) => {
     const next = { ...form, [key]: value };
     remember("experiment", next);
     setForm(next);
   };
   const mayDrive = state.session?.scope === "drive";
-  const parameters = controller ? shownParameters(controller, state.status, edited, applied) : {};
-  const own = Object.fromEntries(Object.entries(parameters).filter(([name, value]) => {
-    const field = controller.parameters.find((candidate) => candidate.name === name);
-    return value !== null && value !== defaultOf(field);
-  }));
   const names = (controller?.parameters ?? []).filter(({ kind }) => kind === "number" || kind === "integer").map(({ name }) => name);
   const varied = names.includes(form.parameter) ? form.parameter : names[0];
   const seconds = form.seconds.trim() === "" ? null : Number(form.seconds);
@@ -107,11 +112,28 @@ export function Experiments(page) {
     </ul>`;
 }
 
-/** Return the expected duration of a job from its command line; null if it has none. */
-function expected(command) {
-  const place = command.indexOf("--for");
-  return ["measure", "record"].includes(command[1]) && place > 0 ? Number(command[place + 1]) : null;
+/** Return the number of values that a sweep measures for a word such as 1,1.5,2 or 0.4:4:0.2. */
+const countValues = (word) => word.split(",").reduce((sum, part) => {
+  const [low, high, step] = part.split(":").map(Number);
+  return sum + (step > 0 ? Math.floor((high - low) / step + 1e-6) + 1 : 1);
+}, 0);
+
+/** Return the expected duration of a job from its command line; null if it is not known. */
+function expected([, verb, ...words]) {
+  const valueOf = (name) => (words.includes(name) ? words[words.indexOf(name) + 1] : null);
+  const each = Number(valueOf("--for") ?? NaN);
+  const place = words.findIndex((word) => word.startsWith("--"));
+  const times = {
+    measure: () => 1, record: () => 1,
+    sweep: () => words.reduce((product, word) => product * (/^[\d.]+[,:]/.test(word) ? countValues(word) : 1), 1),
+    compare: () => place * Number(valueOf("--runs") ?? 1),
+  }[verb];
+  const seconds = times ? times() * each : NaN;
+  return seconds > 0 ? seconds : null;
 }
+
+/** Return a line of fishctl without its name. */
+export const plain = (line) => line.replace(/^fishctl: /, "");
 
 /** Quote a word as a shell needs it. */
 const quote = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
@@ -125,18 +147,18 @@ function Job({ job, state, notice, mayDrive, resume }) {
     return () => clearInterval(timer);
   }, [runs]);
   const elapsed = (job.ended ?? Date.now() / 1000) - job.started;
-  const total = expected(job.command);
+  const total = expected(job.command), ends = runs && total && elapsed > total;
   const stop = () => call("POST", `/api/jobs/${job.id}/stop`).catch((error) => notice("error", error.message, error.remedy));
   return html`<li class=${`job ${job.state}`}>
     <div class="job-head"><b>${KINDS[job.kind]?.title ?? "Rerun"}</b><span class="pill small">${job.state}</span>
-      <span class="muted">${job.state === "lost" ? "" : duration(elapsed)}${runs && total ? ` of about ${duration(total)}` : ""}</span>
+      <span class="muted">${job.state === "lost" ? "" : duration(elapsed)}${ends ? ", soon at its end" : runs && total ? ` of about ${duration(total)}` : ""}</span>
       ${runs && html`<button type="button" disabled=${!mayDrive} onClick=${stop}>Stop</button>`}
       ${job.resumable && html`<button type="button" disabled=${!mayDrive} onClick=${resume}>Resume</button>`}</div>
-    ${runs && html`<progress max=${total ?? undefined} value=${total ? Math.min(elapsed, total) : undefined}
+    ${runs && html`<progress key=${`${total && !ends}`} max=${total ?? undefined} value=${total && !ends ? elapsed : undefined}
       aria-label=${`Progress of ${job.kind}`}></progress>`}
     <code tabindex="0" aria-label="Command line">${job.command.map(quote).join(" ")}</code>
     <${Result} job=${job} status=${state.status} />
-    ${job.state !== "done" && job.lines?.length > 0 && html`<p class="last">${job.lines.at(-1)}</p>`}
+    ${job.state !== "done" && !(job.state === "stopped" && job.result) && job.lines?.length > 0 && html`<p class="last">${plain(job.lines.at(-1))}</p>`}
   </li>`;
 }
 
@@ -159,7 +181,8 @@ function Result({ job, status }) {
       && html` at <b>${number(result.frequency, 2)} Hz</b>`}</p>`;
   }
   if (Array.isArray(result.stretches)) {
-    return html`<p class="result">${result.stretches.map((stretch) => html`<b>${stretch.controller}</b>: ${stretch.equal} of
+    return html`<p class="result">${result.stretches.map((stretch) => html`<b>${stretch.controller}</b>${
+      stretch.controller === stretch.recorded ? "" : ` in place of ${stretch.recorded}`}: ${stretch.equal} of
       ${" "}${stretch.ticks} commands are the same${stretch.equal < stretch.ticks && html`, the largest difference is
       ${" "}${number(stretch.largest, 4)} rad`}.
       ${stretch.equal < stretch.ticks && !stretch.from_start && " It swam already when the recording began, so its past is not known."} `)}</p>`;
@@ -190,7 +213,6 @@ export function Runs(page) {
   useEffect(() => {
     if (state.session?.paired) load();
   }, [finished, state.session?.paired]);
-  const mayDrive = state.session?.scope === "drive";
   const begin = (run) => run.began ?? run.about?.started ?? "";
   const list = (runs ?? []).slice().sort((a, b) => begin(b).localeCompare(begin(a))).slice(0, MAX_RUNS);
   return html`
@@ -200,7 +222,7 @@ export function Runs(page) {
       ? html`<p class="muted">None yet. Record, measure or sweep, and it is listed here.</p>`
       : html`<div class="scroll" tabindex="0" role="region" aria-label="Table of runs"><table>
         <thead><tr><th>name</th><th>what</th><th>began</th><th class="right">length</th><th class="right">thrust</th>
-          <th class="right">lost</th><th><span class="unseen">what to do</span></th></tr></thead>
+          <th class="right">lost ticks</th><th><span class="unseen">what to do</span></th></tr></thead>
         <tbody>${list.map((run) => {
           const [factor, unit] = forceUnit(run);
           const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, run.thrust_ci95 == null ? NaN : run.thrust_ci95 * factor);
@@ -208,19 +230,38 @@ export function Runs(page) {
             <td>${run.name}${run.damaged && html` <span class="pill small" title=${run.damaged}>damaged</span>`}
               ${["running", "recording", "unfinished"].includes(run.state) && html` <span class="pill small">${run.state}</span>`}
               ${run.problem && html`<br /><small>${run.problem}</small>`}</td><td>${run.kind === "recording" ? Object.keys(run.swim_ticks ?? {}).join(", ") || "at rest" : run.kind}</td><td>${begin(run) && shortDate.format(new Date(begin(run)))}</td>
-            <td class="right">${run.duration === undefined ? (run.rows ? `${run.rows} rows` : "") : duration(run.duration)}</td>
+            <td class="right">${run.duration !== undefined ? duration(run.duration) : run.kind === "sweep" && run.rows ? `${run.rows} points` : ""}</td>
             <td class="right">${middle} ${error} ${run.thrust == null ? "" : unit}</td>
             <td class="right">${run.lost_ticks ?? ""}</td>
             <td class="actions">
-              <button type="button" aria-expanded=${open === run.name} aria-label=${`Plot of ${run.name}`}
-                onClick=${() => setOpen(open === run.name ? null : run.name)}>${open === run.name ? "Close" : "Plot"}</button>
-              ${run.kind === "recording" && html`<button type="button" aria-label=${`Rerun ${run.name}`}
-                title="Runs the controller again on each recorded tick and compares its commands" onClick=${() => startJob(page, "rerun", { run: run.name })}>Rerun</button>`}
-              ${run.state === "unfinished" && RESUMABLE.includes(run.kind) && run.on === "live" && html`<button type="button" aria-label=${`Resume ${run.name}`}
-                disabled=${!mayDrive} onClick=${() => startJob(page, "resume", { run: run.name })}>Resume</button>`}
+              <button type="button" aria-expanded=${open === run.name} aria-label=${`${open === run.name ? "Close" : "Open"} ${run.name}`}
+                onClick=${() => setOpen(open === run.name ? null : run.name)}>${open === run.name ? "Close" : "Open"}</button>
             </td></tr>
-            ${open === run.name && html`<tr class="plot-row"><td colspan="7"><${Plot} key=${run.name} name=${run.name} /></td></tr>`}`;
+            ${open === run.name && html`<tr class="plot-row"><td colspan="7"><${Run} key=${run.name} run=${run} page=${page} /></td></tr>`}`;
         })}</tbody></table></div>`}`;
+}
+
+/** What is known of a run, what can be done with it, and its picture. */
+function Run({ run, page }) {
+  const { state } = page;
+  const { controller, own } = selectionWithOwn(state);
+  const mayDrive = state.session?.scope === "drive";
+  const { subject, note, operator } = run.about ?? {};
+  const about = [subject, note, operator && `by ${operator}`].filter(Boolean).join("; ");
+  const rerun = (options) => () => startJob(page, "rerun", { run: run.name, ...options });
+  const resumable = run.state === "unfinished" && run.on === "live" && RESUMABLE.includes(run.kind);
+  return html`
+    ${about && html`<p>${about}</p>`}
+    <p class="muted">${run.path}</p>
+    ${run.kind === "recording" && html`<div class="buttons">
+      <button type="button" disabled=${!mayDrive} onClick=${rerun({})}>Rerun as recorded</button>
+      ${controller && html`<button type="button" disabled=${!mayDrive} onClick=${rerun({ controller: controller.name, parameters: own })}>
+        Rerun with ${[controller.name, parametersText(own)].join(" ").trim()}</button>`}
+      <span class="muted">Runs a controller again on the recorded forces, and compares its commands. The fish rests.</span></div>`}
+    ${resumable && html`<div class="buttons"><button type="button" class="primary" disabled=${!mayDrive}
+      onClick=${() => startJob(page, "resume", { run: run.name })}>Resume</button>
+      <span class="muted">It ended before it was complete; nothing is measured again.</span></div>`}
+    ${(run.kind === "recording" || run.state !== "unfinished") && html`<${Plot} name=${run.name} />`}`;
 }
 
 function Plot({ name }) {

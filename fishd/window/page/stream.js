@@ -33,14 +33,18 @@ export class Ring {
       if (tick.t < before.t - CLOCK_JUMP_S) this.clear();
       else if (tick.t <= before.t) return;
       else if (tick.seq !== before.seq + 1 || tick.t - before.t > Math.max(1, 4 * this.period)) {
-        if (tick.seq > before.seq) this.lost += tick.seq - before.seq - 1;
+        if (tick.seq > before.seq + 1) {
+          this.lost += tick.seq - before.seq - 1;
+          this.lostAt = tick.t;
+        }
         this.#row();
         this.#write("t", 0.5 * (tick.t + before.t));
       }
     }
+    if (this.lost && tick.t - this.lostAt > KEPT_S) this.lost = 0;
     this.#row();
     for (const name in tick) {
-      if (typeof tick[name] === "number") this.#write(name, tick[name]);
+      if (typeof tick[name] === "number" && (name !== "phi_c" || tick.servo_on !== false)) this.#write(name, tick[name]);
     }
     for (const name in tick.quantities) this.#write(QUANTITY + name, tick.quantities[name]);
     if (tick.suspect) {

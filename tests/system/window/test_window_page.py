@@ -338,6 +338,35 @@ def test_a_run_in_simulation_is_drawn_beside_the_live_force(window: WindowProces
         assert complaints == []
 
 
+def test_without_pulses_no_command_is_drawn(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, _):
+        swim(page)
+        command = page.locator("figure", has_text="Command").locator("output")
+        expect(command).not_to_have_text("–")
+        page.click("#estop")
+        expect(page.locator("#mode")).to_have_text("E-stop")
+        expect(command).to_have_text("–")
+
+
+def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, complaints):
+        swim(page)
+        page.click("#tab-record")
+        page.get_by_label("Seconds").fill("1")
+        page.get_by_label("Note").fill("a; $(b) 'c'")
+        page.click("#experiment .primary")
+        expect(page.locator(".job.done")).to_be_visible()
+        page.select_option("#controller", "sine")
+        page.locator("#runs").get_by_role("button", name="Open").click()
+        expect(page.locator("#runs")).to_contain_text("a; $(b) 'c'")
+        expect(page.locator("#runs img")).to_be_visible()
+        page.get_by_role("button", name="Rerun with sine").click()
+        expect(page.locator(".job code").first).to_contain_text("--controller sine")
+        expect(page.locator(".job.done")).to_have_count(2)
+        expect(page.locator(".job").first).to_contain_text("sine in place of swing")
+        assert complaints == []
+
+
 def test_lost_ticks_are_drawn_as_a_gap_and_suspect_samples_are_marked(
     window: WindowProcess,
 ) -> None:
