@@ -107,6 +107,19 @@ release: $(VENV)/installed-dev  ## Build, check and try the packages of a versio
 packages: $(VENV)/installed-dev  ## The same for the checkout as it is, without a version of its own
 	$(BIN)/python tools/release.py --rehearse
 
+.PHONY: deb trial-deb
+
+# DEB_MACHINE=arm64 DEB_PYTHON=3.13 is for a Raspberry Pi with Trixie.
+DEB_MACHINE ?= $(shell dpkg --print-architecture 2>/dev/null || echo amd64)
+DEB_PYTHON ?= 3.11
+deb: docs $(VENV)/installed-dev  ## Build the Debian package: DEB_MACHINE=amd64|arm64 DEB_PYTHON=3.11|3.13
+	$(BIN)/python tools/deb --machine $(DEB_MACHINE) --python $(DEB_PYTHON)
+	@command -v lintian >/dev/null || { echo "lintian is missing: sudo apt install lintian"; exit 1; }
+	lintian --fail-on error,warning,info --display-info --tag-display-limit 0 dist/fishd_*_$(DEB_MACHINE).deb
+
+trial-deb: docs $(VENV)/installed-dev  ## Install, upgrade, remove and purge it under a real systemd; needs root
+	$(BIN)/python tools/reliability deb --write
+
 .PHONY: install-pi uninstall-pi trial-systemd trial-arm64 release-check
 
 install-pi:  ## Install fishd on this Raspberry Pi, or renew it; needs sudo

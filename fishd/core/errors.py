@@ -78,7 +78,12 @@ def install_command(extra: str = "") -> str:
 
     pip = f"{shlex.quote(sys.executable)} -m pip install"
     try:
-        origin = json.loads(Distribution.from_name("fishd").read_text("direct_url.json") or "{}")
+        distribution = Distribution.from_name("fishd")
+        if (
+            distribution.read_text("INSTALLER") or ""
+        ).strip() == "dpkg":  # its environment is fixed
+            pip = "python3 -m venv ~/fishd && ~/fishd/bin/pip install"
+        origin = json.loads(distribution.read_text("direct_url.json") or "{}")
     except PackageNotFoundError:  # runs from its sources, without an installation
         origin = {"url": ".", "dir_info": {"editable": True}}
     suffix = f"[{extra}]" if extra else ""

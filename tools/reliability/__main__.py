@@ -9,6 +9,7 @@ from common.report import run  # noqa: E402
 
 NAMES = (
     "deaths",
+    "deb",
     "kills",
     "misbehaviour",
     "mutations",

@@ -1,6 +1,7 @@
 """fishd as installed from a wheel, without the checkout: its files, and its hints about extras."""
 
 import os
+import shutil
 import sys
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -67,6 +68,19 @@ def test_it_brings_the_units_of_systemd(installed: Path) -> None:
     shipped = installed / "fishd" / "shipped" / "systemd"
     units = [path.name for path in (ROOT / "systemd").iterdir()]
     assert sorted(path.name for path in shipped.iterdir()) == sorted(units)
+
+
+def test_a_missing_extra_of_the_debian_package_gets_an_environment_of_its_own(
+    installed: Path, tmp_path: Path
+) -> None:
+    (info,) = installed.glob("fishd-*.dist-info")
+    without = shutil.ignore_patterns("direct_url.json")
+    copy = shutil.copytree(info, tmp_path / info.name, ignore=without)
+    (copy / "INSTALLER").write_text("dpkg\n")
+    start = "from fishd.core.errors import install_command; print(install_command('lab'))"
+    path = f"{tmp_path}:{installed}"
+    done = call(sys.executable, "-c", start, cwd=tmp_path, env=os.environ | {"PYTHONPATH": path})
+    assert done.stdout == "python3 -m venv ~/fishd && ~/fishd/bin/pip install 'fishd[lab]'\n"
 
 
 def test_a_missing_extra_is_installed_from_where_the_wheel_was(

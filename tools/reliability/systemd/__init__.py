@@ -32,7 +32,7 @@ OPTIONS: Options = {
 def measure(options: Namespace) -> Report:
     """Run every trial; raises `BrokenPromise`, and SystemExit where trials are not possible."""
     check_machine(options.base)
-    with _work_folder(options.keep) as work, Container(build(work, options.base)) as container:
+    with work_folder(options.keep) as work, Container(build(work, options.base)) as container:
         return _try_all(container)
 
 
@@ -115,7 +115,8 @@ def _watching(container: Container, pulses: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _work_folder(keep: bool) -> Iterator[Path]:
+def work_folder(keep: bool) -> Iterator[Path]:
+    """Make a folder for the context, and remove it afterwards unless it is to be kept."""
     folder = Path(tempfile.mkdtemp(prefix="fishd-systemd-trial-"))
     try:
         yield folder

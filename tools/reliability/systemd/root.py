@@ -12,7 +12,7 @@ CHECKOUT = Path(__file__).resolve().parents[3]
 _SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
 """Debian's release with the same Python as this one, so that binary wheels are compatible."""
 _TOOLS = {"debootstrap": "debootstrap", "systemd-nspawn": "systemd-container", "git": "git"}
-_PACKAGES = "systemd,systemd-sysv,dbus,make,python3,python3-venv"
+_PACKAGES = "systemd,systemd-sysv,dbus,make,python3,python3-venv,udev"
 
 
 def check_machine(base: Path | None) -> None:
@@ -39,13 +39,7 @@ def build(work: Path, base: Path | None) -> Path:
 
     base: folder that keeps the bare Debian between trials; made when it does not exist
     """
-    root = work / "root"
-    if base is None:
-        _debootstrap(root)
-    else:
-        if not base.exists():
-            _debootstrap(base)
-        subprocess.run(["cp", "--archive", base, root], check=True)
+    root = make_debian(work, base)
     checkout = root / "root" / "fishd"
     checkout.mkdir()
     listed = subprocess.run(
@@ -59,6 +53,18 @@ def build(work: Path, base: Path | None) -> Path:
             (checkout / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(CHECKOUT / name, checkout / name)
     _wheels(root / "root" / "wheels")
+    return root
+
+
+def make_debian(work: Path, base: Path | None) -> Path:
+    """Make the bare Debian of `build`, and return its folder."""
+    root = work / "root"
+    if base is None:
+        _debootstrap(root)
+    else:
+        if not base.exists():
+            _debootstrap(base)
+        subprocess.run(["cp", "--archive", base, root], check=True)
     return root
 
 

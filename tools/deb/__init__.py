@@ -1,0 +1,1 @@
+"""Debian package of fishd, with a virtual environment of its own."""
