@@ -11,6 +11,8 @@ from rigs.processes import EXPERIMENT, Daemon, Process, call, running, wait_unti
 from fishd.core.errors import RecordingError
 from fishd.recording import open_run
 
+pytestmark = pytest.mark.realtime
+
 
 def rows(folder: Path) -> list[dict[str, str]]:
     """Return the finished swims and rests of an experiment; none without a table."""
