@@ -21,6 +21,8 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 for variable in ("COLUMNS", "LINES"):  # which workers set; a terminal reports its size itself
     os.environ.pop(variable, None)
 os.environ["FISHD_CONFIG"] = ""  # ignores the configuration of a service on this machine
+if "--realtime" in sys.argv:  # set before `rigs.processes` is loaded, which chooses the fishd
+    os.environ["JUDGES_REAL_TIME"] = "1"
 
 # Hardly any object that is loaded before the first test becomes garbage.
 gc.disable()
@@ -73,7 +75,6 @@ def pytest_configure(config: pytest.Config) -> None:
         sys.addaudithook(refuse_processes)
     elif config.option.realtime:
         config.option.markexpr = "realtime"
-        os.environ["JUDGES_REAL_TIME"] = "1"
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
