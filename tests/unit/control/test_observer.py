@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from rigs.harness import Rig, fragile_rig
 
-from fishd.control.estimators.observer import Observer
+from fishd.control.estimators.observer import Observer, _exponential
 from fishd.core.errors import SensorError
 from fishd.lab.simulation import simulate
 
@@ -86,3 +86,9 @@ def test_a_reversed_lateral_force_leaves_the_motion_unknown_and_the_offset_rever
     observer.reverse_fy()
     assert observer._offset == -offset
     np.testing.assert_array_equal(observer._covariance, unknown)
+
+
+def test_the_exponential_of_a_matrix_is_that_of_scipy() -> None:
+    expm = pytest.importorskip("scipy.linalg", reason="install the extra 'lab'").expm
+    matrix = np.array([[0.1, -0.3], [0.4, 0.05]])
+    np.testing.assert_allclose(_exponential(matrix), expm(matrix), rtol=1e-14)
