@@ -231,7 +231,7 @@ def _report_rows(report: "SwimReport") -> list[tuple[str, str]]:
     resumed = f", started again at {report.resumed:.2f} s" if report.resumed is not None else ""
     return [
         ("controller", f"{format_controller(report.controller, report.parameters)}{resumed}"),
-        ("speed", f"{text.format_measured(report.speed, report.speed_ci95, 'm/s')}, {beats}"),
+        ("speed", f"{format_speed(report.speed, report.speed_ci95, report.grid_error)}, {beats}"),
         *_trend_rows(report),
         ("frequency", f"{report.frequency:.3f} Hz" if report.frequency else "–"),
         ("heading", f"{report.heading:+.3f} rad"),
@@ -253,6 +253,14 @@ def _report_rows(report: "SwimReport") -> list[tuple[str, str]]:
             f"{report.real_time_factor:.3g} × real time",
         ),
     ]
+
+
+def format_speed(speed: float, ci95: float | None, grid_error: float | None) -> str:
+    """Return a speed with its errors by averaging and by the grid."""
+    value = text.format_measured(speed, ci95, "m/s")
+    if grid_error is None:
+        return f"{value}, grid error not known (fishctl swimmer refine)"
+    return f"{value}, {text.format_half_width(grid_error)} by the grid"
 
 
 def _trend_rows(report: "SwimReport") -> list[tuple[str, str]]:

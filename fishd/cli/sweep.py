@@ -16,6 +16,7 @@ from fishd.cli.experiment_options import (
     fish_choice,
     folder_options,
 )
+from fishd.cli.free_swim import format_speed
 from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, warn_of_fin
 from fishd.cli.progress import show_progress
@@ -264,6 +265,7 @@ class _Sweep:
                 if best.whole_ticks:
                     description = _format_whole_ticks(best.whole_ticks, quantity.unit)
                     echo(f"{curve.label}, of whole ticks: {description}")
+            _echo_grid_errors(folder, points)
             echo(f"table: {folder.path / 'rows.csv'}")
         if any(curve.peak for curve in all_curves):
             stem = folder.path / quantity.name
@@ -285,12 +287,31 @@ class _Sweep:
         return 1 if any(folder.results[folder.key(point)].failure for point in points) else 0
 
 
+def _echo_grid_errors(folder: "SweepFolder", points: "list[Point]") -> None:
+    """Print what the grid adds to the errors of speeds."""
+    if folder.quantity.name != "speed":
+        return
+    results = [folder.results.get(folder.key(point)) for point in points]
+    errors = [getattr(result, "grid_error", None) for result in results if result]
+    known = [error for error in errors if error is not None]
+    if known:
+        echo(f"by the grid: at most {text.format_half_width(max(known))} mm/s")
+    if len(known) < len(errors):
+        echo(
+            f"by the grid: not known at {len(errors) - len(known)} of "
+            f"{format_count(len(errors), 'point')}; 'fishctl swimmer refine' estimates it"
+        )
+
+
 def _format_result(result: "PointResult", quantity: "Quantity") -> str:
     if result.value is None:
         return f"no {quantity.name}: {result.failure}"
     beats = f", {result.beat_frequency:.2f} Hz" if result.beat_frequency else ""
     steady = "" if getattr(result, "settled_time", 0.0) is not None else ", not yet steady"
-    return f"{text.format_measured(result.value, result.value_ci95, quantity.unit)}{beats}{steady}"
+    value = text.format_measured(result.value, result.value_ci95, quantity.unit)
+    if quantity.name == "speed":
+        value = format_speed(result.value, result.value_ci95, getattr(result, "grid_error", None))
+    return f"{value}{beats}{steady}"
 
 
 def _format_best(best: "Best", unit: str, unit_of_value: str) -> str:

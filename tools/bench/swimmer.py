@@ -1,7 +1,8 @@
-"""Accuracy of the free swimmer, compared with published values of two flows.
+"""Accuracy of the free swimmer, compared with published values, and its cost.
 
     turek-hron    elastic flag behind a cylinder, cases FSI3 and FSI2; eight minutes
-    cylinder      fixed cylinder at a Reynolds number of 100, far from any wall; six minutes
+    cylinder      fixed cylinder at a Reynolds number of 100, far from any wall; one minute
+    impulsive, anguilliform, rigid, cost: see `swimmer_flows`; one minute, three, three, and seconds
 
 Turek and Hron, Proposal for numerical benchmarking of fluid–structure interaction between an
 elastic object and laminar incompressible flow, Springer 2006, doi:10.1007/3-540-34596-5_15. The
@@ -26,6 +27,7 @@ from typing import NamedTuple  # noqa: E402
 
 import numpy as np  # noqa: E402
 
+from bench import swimmer_flows  # noqa: E402
 from common.machine import machine_in_short  # noqa: E402
 from common.report import Options, Report, progress, table  # noqa: E402
 from fishd.virtual.swimmer.beam import Beam, Profile  # noqa: E402
@@ -84,7 +86,7 @@ CASES = {
         },
     ),
     "FSI2": Case(
-        1.0, 10000.0, 0.5e6, ((5e-3, 16.0), (2.5e-3, 16.0)), 8e-4, 0.05,
+        1.0, 10000.0, 0.5e6, ((5e-3, 16.0), (2.5e-3, 16.0)), 5e-4, 0.05,
         {
             PROPOSAL: (Wave(1.23e-3, 80.6e-3), 2.0, "208.8 ± 73.8", "0.9 ± 234.2"),
             FEATFLOW: (Wave(1.30e-3, 81.6e-3), 1.93, "215.1 ± 77.7", "0.6 ± 237.8"),
@@ -267,7 +269,7 @@ def outside(value: float, band: tuple[float, float]) -> float:
     return value / nearest - 1.0
 
 
-FLOWS = {"turek-hron": turek_hron, "cylinder": cylinder}
+FLOWS = {"turek-hron": turek_hron, "cylinder": cylinder, **swimmer_flows.FLOWS}
 OPTIONS: Options = {
     "--finest": {
         "type": float,

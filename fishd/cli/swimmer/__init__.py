@@ -5,6 +5,9 @@ import click
 from fishd.cli.verbs import Verb, Verbs
 
 VERBS = {
+    "Measure": {
+        "refine": Verb("swimmer.refine", "refine", "Estimate the error of its speed by the grid."),
+    },
     "Draw": {
         "wake": Verb("swimmer.draw", "wake", "Draw the water around it."),
         "midlines": Verb("swimmer.draw", "midlines", "Draw how its body moves in a beat."),
@@ -14,7 +17,7 @@ VERBS = {
 
 @click.group(cls=Verbs, verbs=VERBS)
 def swimmer() -> None:
-    """Draw a fish that swims freely: its wake, its midlines.
+    """Draw a fish that swims freely: its wake, its midlines; refine its grid.
 
     'fishctl simulate' swims it and writes the files that these verbs read; 'fishctl sweep'
     measures its speed.

@@ -16,6 +16,7 @@ from fishd.core.errors import ParameterError
 from fishd.core.signals import Publisher, Reason
 from fishd.lab.simulation.report import count_ticks
 from fishd.lab.simulation.virtual_run import EncodingPublisher, VirtualRun
+from fishd.lab.swimmer.refinement import find_grid_error
 from fishd.virtual.swimmer import checkpoint
 from fishd.virtual.swimmer.checkpoint import Checkpoint, CheckpointError
 from fishd.virtual.swimmer.fish import Diverged
@@ -42,6 +43,8 @@ class SwimReport(Gait, frozen=True, kw_only=True):
     """Reason of mode fault."""
     fallback: Reason | None
     """Reason why the fallback took over; None if it did not."""
+    grid_error: float | None
+    """Half-width of the error of `speed` by the grid [m/s]; None if it is not known."""
     real_time_factor: float
     """Ratio of simulated time to computing time."""
 
@@ -179,6 +182,7 @@ def swim(
                 mode=loop.supervisor.mode.value,
                 reason=loop.supervisor.reason,
                 fallback=loop.active.fallback,
+                grid_error=find_grid_error(config, name, parameter_values),
                 real_time_factor=(len(track) - resumed_ticks) * config.tick / elapsed,
             )
     return SwimResult(

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from fishd.lab.simulation import Beats, VirtualRun
 from fishd.lab.statistics import per_watt, student95
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import PointResult, Result, SpeedResult, SweepFolder
+from fishd.lab.swimmer.refinement import find_grid_error
 from fishd.recording.writer import RunWriter
 from fishd.virtual.plant.optimum import best_square_wave
 from fishd.virtual.swimmer.track import Track
@@ -270,7 +272,9 @@ def swim_freely(
                 first = _find_first_row(track, beat_starts, lengths, config)
             if len(track) % _STOP_CHECK_TICKS == 0 and stop():
                 return None
-    return _make_result(track, beat_starts, first, lengths, config)
+    values = msgspec.structs.asdict(controller.parameters)
+    result = _make_result(track, beat_starts, first, lengths, config)
+    return replace(result, grid_error=find_grid_error(config, point.controller, values))
 
 
 def _is_long_enough(track: Track, beat_starts: list[int], lengths: Lengths, tick: float) -> bool:

@@ -61,6 +61,8 @@ class SpeedResult(Struct, frozen=True):
     """Mean forward speed over whole tail beats [m/s]; None if there is `failure`."""
     speed_ci95: float | None = None
     """Half-width of the 95 % confidence interval of `speed` [m/s]; None if unknown."""
+    grid_error: float | None = None
+    """Half-width of the error of `speed` by the grid [m/s]; None if it is not known."""
     beat_frequency: float = 0.0
     """Tail beats per second; 0 if the tail does not beat [Hz]."""
     beats: int = 0

@@ -139,11 +139,12 @@ def _paint(  # pragma: no cover
     between calls
     """
     last = places.shape[0] - 1
+    cosines, sines = np.cos(angle), np.sin(angle)
     x0, y0 = px[first_i], py[first_j]
     count = 0
     for s in range(last + 1):
         x, y = places[s, 0], places[s, 1]
-        c, n = np.cos(angle[s]), np.sin(angle[s])
+        c, n = cosines[s], sines[s]
         reach = half_thickness[s] + h
         along_reach = spacing + (h if s in (0, last) else 0.0)
         wide, high = abs(c) * along_reach + abs(n) * reach, abs(n) * along_reach + abs(c) * reach
@@ -174,7 +175,7 @@ def _paint(  # pragma: no cover
                 continue
             nearest[i, j], owner[i, j] = np.inf, -1
             rx, ry = px[i] - places[s, 0], py[j] - places[s, 1]
-            c, n = np.cos(angle[s]), np.sin(angle[s])
+            c, n = cosines[s], sines[s]
             along, across = rx * c + ry * n, ry * c - rx * n
             half = max(half_thickness[s] + taper[s] * along, 0.0)
             above, below = (half - across) / h, (-half - across) / h

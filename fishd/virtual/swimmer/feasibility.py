@@ -141,7 +141,7 @@ def _check_profile(body: Body) -> None:
 def _check_tank(settings: SwimmerSettings) -> None:
     body, water, numerics = settings.body, settings.water, settings.numerics
     beam = build_beam(settings)
-    around = float(beam.half_thickness.max()) + 3.0 * numerics.cell
+    around = float(beam.half_thickness.max()) + 2.0 * numerics.cell
     fine = 1.0 + 2.0 * (MAX_LEAD_LENGTHS + around / body.length)
     if numerics.fine_length < fine:
         raise Problem(

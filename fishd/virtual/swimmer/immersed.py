@@ -160,8 +160,8 @@ class Immersed:
         """Raise `LeftTheGrid` where the cells around the body are coarse."""
         grid = self.flow.grid
         for axis, edges, sizes in ((0, grid.x, grid.dx), (1, grid.y, grid.dy)):
-            low = places[:, axis].min() - half_thickness - 3.0 * grid.h
-            high = places[:, axis].max() + half_thickness + 3.0 * grid.h
+            low = places[:, axis].min() - half_thickness - 2.0 * grid.h
+            high = places[:, axis].max() + half_thickness + 2.0 * grid.h
             if not (edges[1] < low and high < edges[-2]):
                 raise LeftTheGrid("the body left the water")
             first, last = np.searchsorted(edges, [low, high])

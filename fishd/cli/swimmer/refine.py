@@ -1,0 +1,137 @@
+"""The verb `fishctl swimmer refine`, which swims a fish on several grids."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+import msgspec
+
+from fishd.cli.config import fish_options
+from fishd.cli.free_swim import format_speed
+from fishd.cli.options import ControllerGroup, F, FiniteRange, json_option
+from fishd.cli.output import echo, echo_rows, format_controller, print_json
+from fishd.config import load
+from fishd.controllers import registry
+from fishd.core import text
+from fishd.core.errors import FishdError, ParameterError
+from fishd.lab.sweep.grid import Lengths, Point
+from fishd.lab.sweep.measuring import swim_freely
+from fishd.lab.swimmer import refinement
+from fishd.lab.swimmer.refinement import Estimate, GridSpeed, Refinement
+
+
+def refine_options(function: F) -> F:
+    """Add the options of a refinement."""
+    for option in (
+        json_option,
+        fish_options,
+        click.option(
+            "--settle",
+            type=FiniteRange(min=0.0),
+            help="Time before the measured beats [s]. [default: 4, or until its speed is steady]",
+        ),
+        click.option(
+            "--periods",
+            type=click.IntRange(min=2),
+            help="Smallest number of measured beats. [default: 10]",
+        ),
+        click.option(
+            "--grids",
+            type=click.IntRange(2, 3),
+            default=3,
+            show_default=True,
+            help="Number of grids: twice the configured cells, these cells, and half of them, "
+            "which takes some ten times as long as these.",
+        ),
+    ):
+        function = option(function)
+    return function
+
+
+@click.group(cls=ControllerGroup, options=refine_options)
+def refine() -> None:
+    """Swim on grids of two or three cell sizes, and estimate the error of the speed.
+
+    The error is stored for this fish and controller, and 'fishctl simulate' and 'fishctl sweep'
+    print it with the speed.
+    """
+
+
+@refine.action
+def _refine(
+    name: str,
+    parameters: dict[str, Any],
+    grids: int,
+    periods: int | None,
+    settle: float | None,
+    file: Path | None,
+    overrides: tuple[str, ...],
+    as_json: bool,
+) -> int:
+    config = load(file, overrides)
+    if config.kind.is_tethered:
+        raise ParameterError(
+            f"robot: {config.robot} has no grid; a swimmer is needed, such as --config "
+            "config/swimmer.yaml"
+        )
+    fishes = []
+    for cell, step in refinement.choose_grids(config, grids):
+        keys = (f"swimmer.numerics.cell={cell:.9g}", f"swimmer.numerics.step={step:.9g}")
+        fishes.append(load(file, (*overrides, *keys)))
+    controller = registry.create(name, parameters, config.limits)
+    values = msgspec.to_builtins(msgspec.structs.asdict(controller.parameters))
+    lengths = Lengths.of(config, settle, periods)
+    speeds = []
+    for fish in fishes:
+        numerics = fish.swimmer.numerics
+        result = swim_freely(Point(name, parameters), fish, lengths, None)
+        assert result
+        if result.speed is None:
+            raise FishdError(f"cells of {1e3 * numerics.cell:g} mm: {result.failure}")
+        speeds.append(
+            GridSpeed(
+                cell=numerics.cell,
+                step=numerics.step,
+                speed=result.speed,
+                speed_ci95=result.speed_ci95,
+            )
+        )
+        if not as_json:
+            echo_rows([_format_grid(speeds[-1])])
+    swims = Refinement(
+        fish=refinement.describe_fish(config),
+        controller=name,
+        parameters=values,
+        grids=tuple(speeds),
+    )
+    path = refinement.save(swims)
+    found = refinement.estimate(swims.grids)
+    if as_json:
+        errors = [found.error(each.cell) for each in speeds]
+        print_json({"swims": swims, "estimate": found._asdict(), "grid_errors": errors})
+        return 0
+    finest = speeds[-1]
+    echo_rows(
+        [
+            ("controller", format_controller(name, values)),
+            ("order", _describe_order(found, len(speeds))),
+            ("limit", f"{text.format_measured(found.limit, None, 'm/s')} for small cells"),
+            ("speed", format_speed(finest.speed, finest.speed_ci95, found.error(finest.cell))),
+        ]
+    )
+    echo(path)
+    return 0
+
+
+def _format_grid(grid: GridSpeed) -> tuple[str, str]:
+    speed = text.format_measured(grid.speed, grid.speed_ci95, "m/s")
+    return f"{1e3 * grid.cell:g} mm", f"{speed}, steps of {1e3 * grid.step:.3g} ms"
+
+
+def _describe_order(found: Estimate, grids: int) -> str:
+    if grids == 2:
+        return f"{found.used_order:g}, assumed: two grids do not show it"
+    observed = "none is observed" if found.order is None else f"{found.order:.2f} observed"
+    if found.is_converging:
+        return observed
+    return f"{observed}: not converging yet, so that the error is only a guess; use smaller cells"
