@@ -7,6 +7,7 @@ import pytest
 from rigs.coarse_swimmer import FILE, OPTIONS, coarse
 from rigs.processes import fishctl, one_line, sets
 
+from fishd.config import load
 from fishd.core.errors import FishdError
 from fishd.lab.swimmer import refinement
 from fishd.lab.swimmer.refinement import GridSpeed, Refinement
@@ -113,3 +114,11 @@ def test_a_fish_without_a_grid_cannot_be_refined() -> None:
     line = one_line(fishctl("swimmer", "refine", "square"))
     assert "robot: simulated has no grid; a swimmer is needed" in line
     assert str(FILE.name) in line
+
+
+def test_the_error_of_the_square_wave_of_the_default_fish_is_shipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    wave = {"frequency": 3.0, "amplitude": None}
+    assert refinement.find_grid_error(load(FILE), "square", wave) == pytest.approx(0.079, abs=1e-3)

@@ -147,3 +147,20 @@ def test_a_body_that_leaves_is_told(place: tuple[float, float], message: str) ->
     beam_of(body).q[:2] = place
     with pytest.raises(LeftTheGrid, match=message):
         body.step(1e-3)
+
+
+def test_a_cylinder_that_starts_at_once_has_the_published_drag() -> None:
+    """Koumoutsakos and Leonard, J. Fluid Mech. 296, 1995: Re 550, at Ut/R = 0.794 and 2.893."""
+    h = 1.0 / 40
+    grid = Grid(edges(-8.0, 8.0, (-0.8, 1.2), h, 1.08), edges(-8.0, 8.0, (-0.7, 0.7), h, 1.08))
+    flow = Flow(grid, 1.0 / 550.0, "slip", inlet=np.ones(grid.ny))
+    flow.u[:] = 1.0
+    body = Immersed(flow, 1.0)
+    body.add_circle(0.0, 0.0, 0.5)
+    dt = 0.15 * h
+    drag = []
+    for _ in range(round(1.5 / dt)):
+        body.step(dt)
+        drag.append(2.0 * float(body.fixed_impulse[0]) / dt)
+    times = 2.0 * dt * (np.arange(len(drag)) + 0.5)
+    assert np.interp([0.794, 2.893], times, drag) == pytest.approx([0.703, 1.287], rel=0.05)
