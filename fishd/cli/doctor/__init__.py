@@ -70,7 +70,7 @@ def doctor(
     config, used_file = load_service(file, overrides)
     context = Context(config, used_file, endpoint or config.control.address)
     if bench:
-        return _measure_board(context, overrides, loop_gpio, seconds, output, yes)
+        return _measure_board(context, overrides, loop_gpio, seconds, output, yes, as_json)
     findings = []
     for name, result in examine(context):
         result = result._replace(message=text.line(result.message))
@@ -98,6 +98,7 @@ def _measure_board(
     seconds: float,
     output: Path,
     yes: bool,
+    as_json: bool,
 ) -> int:
     from fishd.cli.doctor.bench import measurement
     from fishd.cli.doctor.bench.swim import Bench
@@ -107,7 +108,9 @@ def _measure_board(
         raise StartupError(f"{occupied.message}; stop it first, such as: sudo systemctl stop fishd")
     if not yes:
         measurement.confirm(context, loop_gpio)
-    return measurement.run(Bench(context, overrides, loop_gpio, seconds), output, _print)
+    return measurement.run(
+        Bench(context, overrides, loop_gpio, seconds), output, None if as_json else _print
+    )
 
 
 def _print(name: str, result: Result) -> None:

@@ -56,11 +56,12 @@ class EdgeReader:
         self._receive()
         whole = len(self._received) // _REPORT.size * _REPORT.size
         for _, flags, tick, levels in _REPORT.iter_unpack(self._received[:whole]):
+            if flags:  # a sign of life, once a minute
+                continue
             changed, self._levels = self._levels ^ levels, levels
-            if flags == 0:
-                for gpio in self._gpios:
-                    if changed >> gpio & 1:
-                        edges[gpio].append(Edge(self._seconds(tick), levels >> gpio & 1))
+            for gpio in self._gpios:
+                if changed >> gpio & 1:
+                    edges[gpio].append(Edge(self._seconds(tick), levels >> gpio & 1))
         self._received = self._received[whole:]
         return edges
 

@@ -1,11 +1,12 @@
 """`fishctl doctor --bench` on the virtual Pi, with its wires as drawn and with mistakes."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
 import pytest
-from rigs.processes import Daemon, fishctl, one_line, running, sets
+from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, running, sets, wait_until
 from rigs.virtual_pi_process import Pi, virtual_pi
 
 WIRED = ("virtual_pi.loop_gpio=23", "virtual_pi.filter_time=0.1")
@@ -118,6 +119,27 @@ def test_what_cannot_be_measured_is_refused_in_one_line(
 ) -> None:
     own = sets(f"control.address=ipc://{tmp_path}/control")
     assert words in one_line(fishctl("doctor", "--bench", *own, *options))
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_measurement(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    own = sets("robot=pi", f"control.address=ipc://{tmp_path}/control")
+    refused = fishctl("doctor", "--bench", "--yes", "--to", str(tmp_path / "file" / "sub"), *own)
+    assert "cannot be written: Not a directory" in one_line(refused)
+
+
+def test_a_bench_that_is_ended_ends_its_fishd(tmp_path: Path) -> None:
+    with virtual_pi(tmp_path, "virtual_pi.loop_gpio=23") as pi:
+        own = sets(f"control.address=ipc://{tmp_path}/control")
+        verb = ("doctor", "--bench", "--yes", "--for", "60", "--to", str(tmp_path / "reports"))
+        environment = os.environ | {"TMPDIR": str(tmp_path)}
+        with Process(FISHCTL, *verb, *pi.settings, *own, env=environment) as process:
+            wait_until(lambda: any(tmp_path.glob("fishd-bench-*/control")))
+            status, _, errors = process.end()
+        assert status == 130  # as after Ctrl-C
+        assert errors.strip() == "fishctl: interrupted"
+        assert not any(tmp_path.glob("fishd-bench-*"))
+        pi.wait_until_released()
 
 
 def test_a_running_fishd_is_not_disturbed(tmp_path: Path) -> None:

@@ -1,9 +1,10 @@
 """Measurement of a board: its parts in their order, the report, and the drawing of the wires."""
 
+import errno
 import os
 import platform
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -16,7 +17,7 @@ from fishd.cli.doctor.base import Context
 from fishd.cli.doctor.bench import analog, pulses, swim
 from fishd.cli.doctor.bench.report import BenchReport, Board, Finding, page
 from fishd.cli.doctor.bench.swim import Bench
-from fishd.cli.output import echo
+from fishd.cli.output import echo, print_json
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ConfigError, FishError, ServoError, StartupError
 from fishd.core.files import write_atomically
@@ -116,26 +117,43 @@ Unplug the servo, and take the amplifier off A0 of the ADS1115. Then two wires:
 A part whose wire is missing is left out, and the report says so."""
 
 
-def run(bench: Bench, output: Path, print_line: Print) -> int:
-    """Measure the board, print a line for each result, and write the report; return the status."""
+def run(bench: Bench, output: Path, print_line: Print | None) -> int:
+    """Measure the board, write the report, and return the exit status.
+
+    print_line: prints each result; None prints the whole report as JSON at the end
+    """
     context = bench.context
     now = datetime.now(UTC)
+    stem = output / f"fishd-bench-{now:%Y%m%d-%H%M%S}"
     report = BenchReport(f"{now:%Y-%m-%d}", describe_board(context))
+    with _explain_folder(output):  # before the measurement, not after it
+        output.mkdir(parents=True, exist_ok=True)
+        if not os.access(output, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     with raise_on_first_signal():
         for name, result in _measure(bench, report):
             report.findings.append(Finding(name, *result))
-            print_line(name, result)
+            if print_line:
+                print_line(name, result)
     report.board = msgspec.structs.replace(report.board, temperature=_temperature(context))
-    stem = output / f"fishd-bench-{now:%Y%m%d-%H%M%S}"
-    try:
-        output.mkdir(parents=True, exist_ok=True)
+    with _explain_folder(output):
         data = msgspec.json.format(msgspec.json.encode(report), indent=1)
         write_atomically(stem.with_suffix(".json"), data + b"\n", new=True)
         write_atomically(stem.with_suffix(".md"), page(report), new=True)
-    except OSError as error:
-        raise ConfigError(f"--to {output}: cannot be written: {error.strerror}") from None
-    echo(f"{stem}.json and {stem}.md: written; send both, see docs/reference/boards.md")
+    if print_line:
+        echo(f"{stem}.json and {stem}.md: written; send both, see docs/reference/boards.md")
+    else:
+        print_json(report)
     return int(any(finding.level == "FAIL" for finding in report.findings))
+
+
+@contextmanager
+def _explain_folder(folder: Path) -> Iterator[None]:
+    """Translate errors of writing into a folder to `ConfigError`."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(f"--to {folder}: cannot be written: {error.strerror}") from None
 
 
 def _measure(bench: Bench, report: BenchReport) -> Iterator[tuple[str, Result]]:
@@ -210,13 +228,8 @@ def _measure_filter(bench: Bench, report: BenchReport, settings: Ads1115Settings
 def _measure_pulses(bench: Bench, report: BenchReport) -> Iterator[tuple[str, Result]]:
     settings = bench.context.config.servo
     if not isinstance(settings, PigpioSettings):
-        yield (
-            "pulses",
-            skipped(
-                f"servo.driver: {settings.driver}: edges are not measured, because only pigpiod "
-                "reports the times of edges"
-            ),
-        )
+        message = f"servo.driver: {settings.driver}: only pulses of pigpiod are measured"
+        yield "pulses", skipped(message)
         return
     gpios = [gpio for gpio in HEADER_PINS if gpio not in BUSY_PINS]
     gpios += [] if settings.gpio in gpios else [settings.gpio]
