@@ -1,6 +1,6 @@
 """Requests of a page for experiments, and for the runs that they leave."""
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from typing import Any
 
 from aiohttp import web
@@ -48,7 +48,8 @@ class JobRequests:
             message = f"no such kind '{text.quoted(body.kind)}'; valid: {', '.join(KINDS)}"
             raise ApiError(400, "unknown-kind", message)
         options = convert(body.options, KINDS[body.kind], f"{body.kind}: ")
-        _check_parameters(options, link.controllers)
+        if getattr(options, "parameters", None):
+            _check_parameters(options, link.controllers)
         if body.kind in DRIVING_KINDS:
             self._pages.require_driver(link.name, page)
             await link.give_back()  # the experiment takes the fish itself
@@ -71,15 +72,17 @@ class JobRequests:
         return web.Response(body=picture, content_type="image/png")
 
 
-def _check_parameters(options: Any, controllers: Iterable[ControllerInfo]) -> None:
+def _check_parameters(options: Any, controllers: Collection[ControllerInfo]) -> None:
     """Raise `ApiError` unless each name is that of a parameter, and so no other option."""
+    if not controllers:
+        raise ApiError(503, "no-daemon", "fishd has not answered yet, so no controller is known")
     names = {
         field.name
         for info in controllers
         if info.name == getattr(options, "controller", None)
         for field in info.parameters
     }
-    for name in getattr(options, "parameters", {}):
+    for name in options.parameters:
         if name not in names:
             message = f"{options.controller} has no parameter '{text.quoted(name)}'"
             raise ApiError(400, "bad-arguments", message)

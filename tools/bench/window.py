@@ -1,5 +1,6 @@
 """Memory and processor time of `fishd-window` with three open pages, and its emergency stop.
 
+The lateness of fishd's ticks is measured without and with the pages, in turn, in the same run.
 The stop is measured on a virtual Pi: from the press in the page to the last pulse of the servo.
 """
 
@@ -9,6 +10,8 @@ import os
 import tempfile
 import time
 from argparse import Namespace
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +29,10 @@ STOPS = 20
 MAX_MEGABYTES = 60.0
 MAX_CPU = 0.05
 MAX_STOP_S = 0.2
+MAX_LATENESS_CHANGE = 0.2
+"""Largest relative change of the 99th percentile of the lateness by the pages."""
+BLOCKS = 4
+"""Number of times that lateness is measured without, and with pages."""
 GPIO = 18
 
 
@@ -36,12 +43,22 @@ class Figures(Struct):
     """Resident memory with the pages open [MB]."""
     cpu: float
     """Fraction of one core."""
+    lateness_without: float
+    """99th percentile of the lateness of ticks without pages [µs]."""
+    lateness_with: float
+    """99th percentile of the lateness of ticks with the pages open [µs]."""
+    load: float
+    """Load average of the machine in the minute before."""
     stops: list[float]
     """Time from the press to the last change of the pulses [s]."""
 
 
 OPTIONS: Options = {
-    "--seconds": {"type": float, "default": 30.0, "help": "to watch; default 30"},
+    "--seconds": {
+        "type": float,
+        "default": 30.0,
+        "help": "to watch without, and as long with pages; default 30",
+    },
     "--stops": {"type": int, "default": STOPS, "help": f"emergency stops; default {STOPS}"},
 }
 
@@ -52,8 +69,19 @@ def cpu_seconds(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-async def watch(window: Window, seconds: float) -> tuple[float, float]:
-    """Return memory [MB] and fraction of a core while three pages read ticks."""
+class Watched(Struct):
+    """What was measured while pages were open and closed in turn."""
+
+    megabytes: float
+    cpu: float
+    lateness_without: list[float]
+    """Lateness of each tick [µs]."""
+    lateness_with: list[float]
+
+
+@asynccontextmanager
+async def open_pages(window: Window) -> AsyncIterator[None]:
+    """Open pages that read all ticks, within the context."""
     async with aiohttp.ClientSession(f"http://127.0.0.1:{window.port}") as session:
 
         async def read() -> None:
@@ -62,15 +90,34 @@ async def watch(window: Window, seconds: float) -> tuple[float, float]:
                     pass
 
         readers = [asyncio.create_task(read()) for _ in range(VIEWERS)]
-        await asyncio.sleep(2.0)
-        start, before = time.monotonic(), cpu_seconds(window.pid)
-        await asyncio.sleep(seconds)
-        cpu = (cpu_seconds(window.pid) - before) / (time.monotonic() - start)
-        size = memory(window.pid)
-        for reader in readers:
-            reader.cancel()
-        await asyncio.gather(*readers, return_exceptions=True)
-    return size, cpu
+        try:
+            yield
+        finally:
+            for reader in readers:
+                reader.cancel()
+            await asyncio.gather(*readers, return_exceptions=True)
+
+
+async def watch(window: Window, fishd: Fishd, seconds: float) -> Watched:
+    """Return memory, processor time and lateness; seconds: without, and with pages, in all [s]."""
+    part = seconds / BLOCKS
+    without, with_pages = list[float](), list[float]()
+    cpu = 0.0
+
+    async def read_lateness() -> list[float]:
+        fishd.waiting_ticks()
+        await asyncio.sleep(part)
+        return [tick.lateness_us for tick in fishd.waiting_ticks()]
+
+    for _ in range(BLOCKS):
+        without += await read_lateness()
+        async with open_pages(window):
+            await asyncio.sleep(2.0)
+            start, before = time.monotonic(), cpu_seconds(window.pid)
+            with_pages += await read_lateness()
+            cpu += (cpu_seconds(window.pid) - before) / (time.monotonic() - start) / BLOCKS
+            size = memory(window.pid)
+    return Watched(size, cpu, without, with_pages)
 
 
 def press(window: Window) -> Any:
@@ -121,8 +168,15 @@ def measure(options: Namespace) -> Report:
         folder = Path(name)
         with Fishd() as fishd, Window(fishd.endpoint, name) as window:
             fishd.next_tick(TIMEOUT_S)
-            size, cpu = asyncio.run(watch(window, options.seconds))
-        figures = Figures(size, cpu, measure_stops(options.stops, folder))
+            load = os.getloadavg()[0]
+            watched = asyncio.run(watch(window, fishd, options.seconds))
+        without, with_pages = (
+            quantile(lateness, 0.99)
+            for lateness in (watched.lateness_without, watched.lateness_with)
+        )
+        size, cpu = watched.megabytes, watched.cpu
+        stops = measure_stops(options.stops, folder)
+        figures = Figures(size, cpu, without, with_pages, load, stops)
     middle, highest = quantile(figures.stops, 0.5), max(figures.stops)
     rows = [
         [f"memory with {VIEWERS} pages", f"{figures.megabytes:.0f} MB", f"{MAX_MEGABYTES:.0f} MB"],
@@ -131,11 +185,22 @@ def measure(options: Namespace) -> Report:
             f"{100 * cpu:.1f} % of a core",
             f"{100 * MAX_CPU:.0f} %",
         ],
+        ["lateness p99 without pages", f"{without:.0f} µs", ""],
+        [
+            f"lateness p99 with {VIEWERS} pages",
+            f"{with_pages:.0f} µs ({with_pages / without - 1:+.0%})",
+            f"±{MAX_LATENESS_CHANGE:.0%}",
+        ],
         ["emergency stop, median", f"{1e3 * middle:.0f} ms", ""],
         ["emergency stop, highest", f"{1e3 * highest:.0f} ms", f"{1e3 * MAX_STOP_S:.0f} ms"],
     ]
     processor, cores = list(machine().values())[:2]
-    words = f"{len(figures.stops)} stops; {cores} cores of an {processor}."
-    broken = size > MAX_MEGABYTES or cpu > MAX_CPU or highest > MAX_STOP_S
+    ticks = len(watched.lateness_with)
+    words = (
+        f"{len(figures.stops)} stops; {ticks} ticks with pages, and as many without, in turn; load "
+        f"average {load:.1f} at the start; {cores} cores of an {processor}."
+    )
+    is_later = with_pages > (1.0 + MAX_LATENESS_CHANGE) * without
+    broken = size > MAX_MEGABYTES or cpu > MAX_CPU or highest > MAX_STOP_S or is_later
     text = f"{table('the window | measured | at most', rows)}\n\n{words}"
     return Report({"bench window": text}, figures, broken=broken)

@@ -17,6 +17,7 @@ NAMES = (
     "soak",
     "systemd",
     "window",
+    "window_kills",
 )
 
 if __name__ == "__main__":

@@ -1,11 +1,14 @@
 """Experiments of the page: true verbs of fishctl, their progress, and their ends."""
 
+import os
 import shlex
+import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
-from rigs.processes import Daemon
-from rigs.window_process import Browser, Page, WindowProcess, open_page, run
+from rigs.processes import Daemon, wait_until
+from rigs.window_process import Browser, Page, WindowProcess, open_page, run, running_window
 
 
 async def start(page: Page, kind: str, **options: Any) -> Any:
@@ -162,3 +165,35 @@ def test_a_job_that_fails_says_why(window: WindowProcess) -> None:
             assert await page.refusal("/api/jobs/99/stop") == (409, "job")
 
     run(test())
+
+
+def test_an_experiment_that_is_lost_with_its_window_is_listed_by_the_next_one_and_resumed(
+    new_window: WindowProcess, daemon: Daemon, tmp_path: Path
+) -> None:
+    async def lose() -> None:
+        async with Browser(new_window.url) as browser, open_page(browser) as page:
+            await page.drive()
+            await start(page, "measure", controller="square", seconds=21)
+            await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
+            os.kill(new_window.pid, signal.SIGKILL)
+
+    run(lose())
+    wait_until(lambda: daemon.status().mode == "idle" and daemon.status().lease is None)
+    with running_window(tmp_path, fish=daemon.endpoint) as window:
+
+        async def resume() -> None:
+            async with Browser(window.url) as browser, open_page(browser) as page:
+                (lost,) = page.hello["jobs"]
+                assert (lost["state"], lost["resumable"]) == ("lost", True)
+                assert "the fish came to rest; what was measured until then" in lost["lines"][-1]
+                await page.drive()
+                job = await start(page, "resume", run=lost["run"])
+                assert job["command"][:3] == ["fishctl", "measure", "--resume"]
+                await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
+                await page.post(f"/api/jobs/{job['id']}/stop")
+                assert (await end_of(page, job))["state"] == "stopped"
+            assert list(window.state.glob("window-*.json")) == [
+                window.state / f"window-{window.pid}.json"
+            ]
+
+        run(resume())
