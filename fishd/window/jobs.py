@@ -159,6 +159,10 @@ class Jobs:
             raise JobError(f"{self._folder} cannot be created: {error.strerror}") from None
         if kind == "resume":
             kind, run, words = self._resume(options)
+            for job in self._jobs.values():
+                if job.run == run and job.resumable:
+                    job.resumable = False
+                    self._tell(job)
         else:
             words = list_words(kind, options)
             run = f"{kind}-{datetime.now():%Y%m%d-%H%M%S}" if kind in DRIVING_KINDS else ""

@@ -46,8 +46,9 @@ export function duration(seconds) {
   return `${(seconds / 3600).toFixed(1)}${NBSP}h`;
 }
 
-/** Return a message as a sentence: with a capital letter and a full stop. */
-export const sentence = (text) => (text ? text[0].toUpperCase() + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
+/** Return a message as a sentence: with a full stop and a capital letter, unless it begins with the name of a program. */
+export const sentence = (text) => (text
+  ? (/^fish(d|ctl)\b/.test(text) ? text[0] : text[0].toUpperCase()) + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
 
 /** Return the local time of day of a unix time. */
 export const timeOfDay = (t) => new Date(t * 1000).toLocaleTimeString([], { hour12: false });

@@ -189,6 +189,7 @@ def test_an_experiment_that_is_lost_with_its_window_is_listed_by_the_next_one_an
                 await page.drive()
                 job = await start(page, "resume", run=lost["run"])
                 assert job["command"][:3] == ["fishctl", "measure", "--resume"]
+                await page.until("job", lambda j: j["id"] == lost["id"] and not j["resumable"])
                 await page.until("ticks", lambda ticks: ticks[-1]["controller"] == "square")
                 await page.post(f"/api/jobs/{job['id']}/stop")
                 assert (await end_of(page, job))["state"] == "stopped"
