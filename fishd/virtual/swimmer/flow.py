@@ -164,8 +164,8 @@ class Flow:
         _divergence(*predicted, *sizes, 1.0 / dt, weight, source)
         change = self._poisson.solve(source)
         before = grid.dy @ (self.p[-1] - self.p[0])
-        _correct_u(self.predicted_u, change, on_u.inverse_size_x, dt, self.u)
-        _correct_v(self.predicted_v, change, on_v.inverse_size_y, dt, self.v)
+        _correct_u(self.predicted_u, change, on_u.inverse_size_x, dt, self._u)
+        _correct_v(self.predicted_v, change, on_v.inverse_size_y, dt, self._v)
         self.u[0] = self.predicted_u[0]
         beyond = self.u.dtype.type(2.0 * dt / self._between_x[-1])
         self.u[-1] = self.predicted_u[-1] + beyond * change[-1]
@@ -381,25 +381,27 @@ def _divergence(  # pragma: no cover
 def _correct_u(  # pragma: no cover
     predicted: Field, change: Field, inverse_size: Field, dt: float, u: Field
 ) -> None:
-    """Write u* minus the new pressure's push, inside the boundaries."""
+    """Write u* minus the new pressure's push, inside the boundaries; u: with its ghost values."""
     nx, ny = change.shape
     for i in range(1, nx):
         scale = u.dtype.type(dt) * inverse_size[i - 1]
+        out = u[i + PAD, PAD : PAD + ny]
         for j in range(ny):
-            u[i, j] = predicted[i, j] - scale * (change[i, j] - change[i - 1, j])
+            out[j] = predicted[i, j] - scale * (change[i, j] - change[i - 1, j])
 
 
 @njit(cache=True, fastmath=True)
 def _correct_v(  # pragma: no cover
     predicted: Field, change: Field, inverse_size: Field, dt: float, v: Field
 ) -> None:
-    """Write v* minus the new pressure's push, inside the boundaries."""
+    """Write v* minus the new pressure's push, inside the boundaries; v: with its ghost values."""
     nx, ny = change.shape
     step = v.dtype.type(dt)
     for i in range(nx):
-        for j in range(1, ny):
-            push = step * inverse_size[j - 1] * (change[i, j] - change[i, j - 1])
-            v[i, j] = predicted[i, j] - push
+        out, before = v[i + PAD, PAD + 1 : PAD + ny], predicted[i, 1:ny]
+        below, above = change[i, : ny - 1], change[i, 1:]
+        for j in range(ny - 1):
+            out[j] = before[j] - step * inverse_size[j] * (above[j] - below[j])
 
 
 @njit(cache=True)
