@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 unexport PYTHONDONTWRITEBYTECODE
 AHEAD := $(shell [ "$$(nice -n -20 nice 2>/dev/null)" = -20 ] && echo nice -n -20)
 
-.PHONY: help run test test-realtime test-fast lint docs figures vendor bench clean
+.PHONY: help run test test-realtime test-fast lint docs docs-versions figures vendor bench clean
 
 help:  ## List what there is to make
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | expand -t 15
@@ -49,6 +49,9 @@ docs: $(VENV)/installed-docs  ## Write the generated parts of docs/, and build b
 	$(SPHINX) -b html docs build/docs/html
 	$(SPHINX) -b man docs build/docs/man
 	@echo "Open build/docs/html/README.html, or: man build/docs/man/fishctl.1"
+
+docs-versions: $(VENV)/installed-docs  ## Build the site of each tag and of the checkout into build/site
+	$(BIN)/python tools/site_versions.py
 
 figures: $(VENV)/installed-dev  ## Compute the paper's figures and numbers again, into docs/
 	$(BIN)/python tools/paper
@@ -134,4 +137,5 @@ trial-systemd: $(VENV)/installed-dev  ## Start, hang and kill fishd under a real
 trial-arm64: $(VENV)/installed-dev  ## Install on arm64 Debian 12 and 13 under qemu; needs root, an hour
 	FISHCTL=$(CURDIR)/$(BIN)/fishctl tools/arm64_trial.sh
 
-release-check: lint test test-realtime trial-systemd trial-arm64  ## All of these, once before each release; needs root
+release-check: $(VENV)/installed-dev  ## Run every check once before a release, and print one table; needs root
+	$(BIN)/python tools/release_check.py

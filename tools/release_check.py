@@ -1,0 +1,58 @@
+"""Runs every check of a release and prints one table; a failed one does not stop the others.
+
+`make release-check` needs root and the tools that each check names. `--only NAME ...` runs some.
+"""
+
+import argparse
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from common.report import progress, table
+
+ROOT = Path(__file__).resolve().parents[1]
+LOGS = ROOT / "build" / "release-check"
+PYTEST = [sys.executable, "-m", "pytest"]
+CHECKS: dict[str, list[str]] = {
+    "lint": ["make", "lint"],
+    "docs": ["make", "docs"],
+    "docs links": [*PYTEST, "tests/unit/docs"],
+    "docs versions": ["make", "docs-versions"],
+    "examples": [*PYTEST, "tests/system/docs", "tests/system/test_docs_examples.py"],
+    "tests": ["make", "test"],
+    "real-time tests": ["make", "test-realtime"],
+    "packages": ["make", "packages"],
+    "Debian package": ["make", "deb"],
+    "trial of the Debian package": ["make", "trial-deb"],
+    "systemd trial": ["make", "trial-systemd"],
+    "arm64 trial": ["make", "trial-arm64"],
+}
+"""Command of each check, by its name in the table."""
+
+
+def run(name: str, command: list[str]) -> tuple[str, str, str]:
+    """Run a check; return its row: name, seconds and result."""
+    log = LOGS / f"{name.replace(' ', '-')}.log"
+    started = time.monotonic()
+    with log.open("wb") as file:
+        code = subprocess.run(
+            command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, check=False
+        ).returncode
+    result = f"FAILED with exit status {code}: {log.relative_to(ROOT)}" if code else "passed"
+    progress(name, result)
+    return name, f"{time.monotonic() - started:.0f}", result
+
+
+def main() -> None:
+    """Run the checks of the command line; exit with 1 if one has failed."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", nargs="+", choices=CHECKS, default=[*CHECKS], metavar="NAME")
+    LOGS.mkdir(parents=True, exist_ok=True)
+    rows = [run(name, CHECKS[name]) for name in parser.parse_args().only]
+    print(table("check | seconds | result", rows))
+    sys.exit(any(result != "passed" for *_, result in rows))
+
+
+if __name__ == "__main__":
+    main()
