@@ -49,7 +49,7 @@ class Job(Struct):
     kind: str
     fish: str
     command: list[str]
-    """What a person would type."""
+    """Words that a person would type."""
     state: Literal["running", "done", "failed", "stopped", "lost"]
     """`lost`: its window was killed."""
     started: float

@@ -27,14 +27,14 @@ _PATTERN = "window-*.json"
 
 
 class RunningWindow(Struct, frozen=True):
-    """What a window writes about itself."""
+    """Entry of a window in the register."""
 
     listen: str
     """Address at which it listens, such as `0.0.0.0:8880`."""
     names: tuple[str, ...] = ()
     """Further host names by which browsers reach it."""
     jobs: list[msgspec.Raw] = []
-    """Its jobs that run, as JSON."""
+    """Jobs of the window that run, as JSON."""
 
 
 _decode: Callable[[bytes], RunningWindow] = decoder(RunningWindow)
@@ -68,7 +68,7 @@ class Register:
         self._stack.close()
 
     def change(self, **fields: Any) -> Future[None]:
-        """Change fields of the entry, soon; without space on the disk, it stays as it was."""
+        """Change fields of the entry soon; a full disk keeps the earlier entry."""
         self._entry = msgspec.structs.replace(self._entry, **fields)
         return self._disk.submit(self._write, msgspec.json.encode(self._entry))
 

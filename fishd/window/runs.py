@@ -22,7 +22,7 @@ _RUN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]*", re.A)
 
 
 class Header(Struct):
-    """What the window needs of the header of an experiment."""
+    """Part of the header of an experiment that the window needs."""
 
     kind: str
     on: str

@@ -70,7 +70,7 @@ def cpu_seconds(pid: int) -> float:
 
 
 class Watched(Struct):
-    """What was measured while pages were open and closed in turn."""
+    """Measurements while pages were open and closed in turn."""
 
     megabytes: float
     cpu: float
