@@ -80,7 +80,7 @@ def test_a_fish_that_swims_keeps_its_program_while_that_computes(daemon: Daemon)
 
 
 def test_a_second_verb_is_refused_unless_it_takes_the_fish(daemon: Daemon) -> None:
-    second = ("measure", "sine", "--for", "15")
+    second = ("measure", "sine", "--for", "21")
     with swimming(daemon) as program:
         refused = daemon.fishctl(*second)
         assert (refused.returncode, refused.stdout) == (1, "")

@@ -15,7 +15,7 @@ from fishd.client import Fish, NoDaemon
 NAMES = sorted({*sys.stdlib_module_names, *importlib.metadata.packages_distributions(), "fishd"})
 STARTS_PROCESSES = (
     r"^ *(import|from) (joblib|multiprocessing|concurrent|torch.multiprocessing)\b"
-    r"(?!\.futures import ThreadPoolExecutor$)|SubprocVec"  # its threads are no processes
+    r"(?!\.futures import (Future, )?ThreadPoolExecutor$)|SubprocVec"  # threads are no processes
 )
 
 
