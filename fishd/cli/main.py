@@ -1,6 +1,7 @@
 """The `fishctl` command: its verbs, loaded when they are called, and its error messages."""
 
 import gc
+import os
 import sys
 import warnings
 
@@ -67,6 +68,7 @@ VERBS = {
     "Check and configure": {
         "doctor": Verb("doctor", "doctor", "Check this machine, and print remedies."),
         "config": Verb("config", "config", "Check and show the configuration, print its schema."),
+        "keygen": Verb("keygen", "keygen", "Make a key for access over the network."),
         "completion": Verb("completion", "completion", "Print the completion script of a shell."),
     },
 }
@@ -94,11 +96,16 @@ WORD_HINTS = {
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 @click.option("--endpoint", metavar="ADDRESS", help="Control socket of the daemon to talk to.")
+@click.option("--keys", metavar="FOLDER", help="Keys for access over the network.")
 @click.version_option(__version__, prog_name="fishctl")
 @click.pass_context
-def fishctl(ctx: click.Context, endpoint: str | None) -> None:
+def fishctl(ctx: click.Context, endpoint: str | None, keys: str | None) -> None:
     """Talk to fishd, the daemon that runs a robotic fish, or swim a simulated one."""
     ctx.obj = endpoint
+    if keys:
+        from fishd.core.addresses import KEYS_VARIABLE
+
+        os.environ[KEYS_VARIABLE] = keys  # also for the programs that this one starts
 
 
 def main() -> None:

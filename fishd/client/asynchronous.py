@@ -5,8 +5,8 @@ import functools
 import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager, closing
-from typing import Any, Concatenate, ParamSpec, Self, TypeVar
+from contextlib import asynccontextmanager, closing, suppress
+from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
 
 import zmq.asyncio
 
@@ -15,9 +15,12 @@ from fishd.client.lease import LeaseRenewal, report_unreturned
 from fishd.client.synchronous import Fish
 from fishd.client.zmq_sockets import connect_subscriber
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishError, LeaseLost
+from fishd.core.errors import FishError, LeaseLost, NoDaemon
 from fishd.core.protocol import State
-from fishd.core.signals import Event, Tick
+from fishd.core.signals import Event, Status, Tick
+
+if TYPE_CHECKING:
+    from fishd.core.keys import Access
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -56,6 +59,15 @@ class AsyncFish:
         self._fish = Fish(endpoint, timeout=timeout, telemetry=telemetry)
         self._lock = threading.Lock()
         self._context = zmq.asyncio.Context()
+
+    @property
+    def access(self) -> "Access | None":
+        """Keys of this client and of the fishd, as in `Fish`."""
+        return self._fish.access
+
+    def with_telemetry(self, status: Status) -> Status:
+        """Return a status with the address at which this client gets telemetry."""
+        return self._fish.with_telemetry(status)
 
     async def __aenter__(self) -> Self:
         return self
@@ -134,10 +146,17 @@ class AsyncFish:
     async def _subscribe(self, topic: bytes, kind: type[T]) -> AsyncIterator[T]:
         fish = self._fish
         address = fish.telemetry_address or (await self.status()).telemetry
-        patience = -1 if kind is Event else int(fish.timeout * 1e3)
+        forever = kind is Event
+        patience = -1 if forever and not fish.access else int(fish.timeout * 1e3)
         decode: Callable[[bytes], T] = decoder(kind)
-        with closing(connect_subscriber(self._context, address, topic)) as socket:
-            while await socket.poll(patience) or await socket.poll(LATE_ANSWER_WAIT_MS):
-                fish.check_lease()
-                yield fish.read(decode, await socket.recv_multipart())
-        raise fish.no_telemetry_error()
+        socket = connect_subscriber(self._context, address, topic, access=fish.access)
+        with closing(socket):
+            while True:
+                while await socket.poll(patience) or await socket.poll(LATE_ANSWER_WAIT_MS):
+                    fish.check_lease()
+                    yield fish.read(decode, await socket.recv_multipart())
+                if fish.access:
+                    with suppress(NoDaemon):
+                        await self.status()  # raises an error if the key is no longer known
+                if not forever:
+                    raise fish.no_telemetry_error()

@@ -28,9 +28,11 @@ from fishd.core.errors import (
 )
 from fishd.core.process.unix_sockets import Listener, find_listener, find_trust_problem, is_deserted
 from fishd.core.protocol import State
+from fishd.core.signals import Status
 
 if TYPE_CHECKING:
     from fishd.client.lease import LeaseRenewal
+    from fishd.core.keys import Access
 
 T = TypeVar("T")
 
@@ -53,6 +55,8 @@ class Connection:
     def __init__(self, endpoint: str | None, timeout: float, telemetry: str | None) -> None:
         self.endpoint = endpoint or find_control_address()
         self._path = socket_path(self.endpoint)
+        self.access = _find_access(self.endpoint)
+        """Keys of this client and of the fishd; None for a connection without keys."""
         self._was_named = bool(endpoint or os.environ.get(ENDPOINT_VARIABLE))
         self.timeout = timeout
         self.telemetry_address = telemetry
@@ -186,9 +190,24 @@ class Connection:
         if self.held and self.held.lost:
             raise self.held.lost
 
+    def with_telemetry(self, status: Status) -> Status:
+        """Return a status with the address at which this client gets telemetry."""
+        if not self.access:
+            return status
+        host, port = self.endpoint.rpartition(":")[0], status.keyed_telemetry.rpartition(":")[2]
+        return msgspec.structs.replace(status, telemetry=f"{host}:{port}")
+
     def no_telemetry_error(self) -> NoDaemon:
         """Return the error for missing telemetry."""
         return self._no_daemon(f"no telemetry within {self.timeout:g} s")
+
+
+def _find_access(endpoint: str) -> "Access | None":
+    if not endpoint.startswith("tcp:"):
+        return None
+    from fishd.core import keys
+
+    return keys.find_access(endpoint)
 
 
 def answer_deadlines(seconds: float, *, again: bool) -> Iterator[float]:

@@ -2,29 +2,26 @@
 
 import socket
 import time
+from abc import ABC, abstractmethod
+from collections import deque
 from contextlib import suppress
 
-from fishd.core.errors import FishError, NoDaemon
+from fishd.core.errors import FishError, NoDaemon, NoKey
 from fishd.core.zmtp import Dealer
 
 MAX_REPLY_BYTES = 64 * 2**20
 """Maximum size of a reply [bytes]."""
 
 
-class RequestSocket(Dealer[bytes | FishError]):
-    """Connection to the control socket of a daemon."""
+class Requests(ABC):
+    """Requests and replies over a connection to a daemon."""
 
-    RETRY_S = 0.02
-    HANDSHAKE_S = 30.0
-
-    def __init__(self, endpoint: str) -> None:
-        """Raises `NoDaemon` if the endpoint is not an address."""
-        self._endpoint = endpoint
-        self._interrupted = False
-        try:
-            super().__init__(endpoint, MAX_REPLY_BYTES)
-        except ValueError as error:
-            raise NoDaemon(f"'{endpoint}' is not an address: {error}") from None
+    connections: int
+    """Number of connections established until the latest `state`."""
+    _inbox: deque[bytes | FishError]
+    _endpoint: str
+    _interrupted = False
+    _ready = False
 
     def send_by(self, deadline: float, request: bytes) -> bool:
         """Send a request once the daemon accepts it; return False after the deadline [s]."""
@@ -53,12 +50,25 @@ class RequestSocket(Dealer[bytes | FishError]):
             raise reply
         return reply
 
+    @abstractmethod
+    def state(self) -> tuple[bool, bool]:
+        """Return whether a message can be sent, and whether there is one to receive."""
+
+    @abstractmethod
+    def send(self, payload: bytes) -> None:
+        """Send a message; only if `state` allows it."""
+
+    @abstractmethod
+    def wait(self, seconds: float) -> None:
+        """Wait until `state` may have changed, at most for this time [s]."""
+
+    @abstractmethod
     def interrupt(self) -> None:
         """End the wait of another thread, whose request then raises `FishError`."""
-        self._interrupted = True
-        if connected := self._socket:
-            with suppress(OSError):
-                connected.shutdown(socket.SHUT_RDWR)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Disconnect; may be called twice."""
 
     def _check_interrupted(self) -> None:
         if self._interrupted:
@@ -71,6 +81,41 @@ class RequestSocket(Dealer[bytes | FishError]):
         if remaining > 0.0:
             self.wait(remaining)
         return remaining > 0.0
+
+
+class RequestSocket(Dealer[bytes | FishError], Requests):
+    """Connection to the control socket of a daemon."""
+
+    RETRY_S = 0.02
+    HANDSHAKE_S = 30.0
+
+    def __init__(self, endpoint: str) -> None:
+        """Raises `NoDaemon` if the endpoint is not an address."""
+        self._endpoint = endpoint
+        try:
+            super().__init__(endpoint, MAX_REPLY_BYTES)
+        except ValueError as error:
+            raise NoDaemon(f"'{endpoint}' is not an address: {error}") from None
+
+    def state(self) -> tuple[bool, bool]:
+        """Return whether a message can be sent, and whether there is one to receive."""
+        state = super().state()
+        if self.needs_key:
+            from fishd.core.keys import KNOWN_FILE, client_folder
+
+            raise NoKey(
+                f"the fishd at {self._endpoint} needs a key, and {client_folder() / KNOWN_FILE} "
+                f"has no line '{self._endpoint} KEY'; add it, with the key of that fishd, and make "
+                "a key for this client with 'fishctl keygen'"
+            )
+        return state
+
+    def interrupt(self) -> None:
+        """End the wait of another thread, whose request then raises `FishError`."""
+        self._interrupted = True
+        if connected := self._socket:
+            with suppress(OSError):
+                connected.shutdown(socket.SHUT_RDWR)
 
     def _decode(self, payload: bytes) -> bytes:
         return payload

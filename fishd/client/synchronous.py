@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -14,10 +14,10 @@ from fishd.client.connection import (
     Connection,
     answer_deadlines,
 )
-from fishd.client.request_socket import RequestSocket
+from fishd.client.request_socket import Requests, RequestSocket
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishError, LeaseLost, NoDaemon, Untrusted
+from fishd.core.errors import FishError, LeaseLost, NoDaemon, NoKey, Untrusted
 from fishd.core.protocol import (
     LOADING_TIMEOUT_S,
     READ_OPERATIONS,
@@ -56,7 +56,7 @@ class Fish(Connection):
         telemetry: address of the telemetry socket; None for the address that the daemon reports
         """
         super().__init__(endpoint, timeout, telemetry)
-        self._socket: RequestSocket | None = None
+        self._socket: Requests | None = None
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         """ZeroMQ context of telemetry, created by the first subscription."""
 
@@ -87,7 +87,7 @@ class Fish(Connection):
         timeout: time to wait for it [s]; None for that of other requests
         """
         patience = 0.0 if timeout is None else timeout - self.timeout
-        return self._call(Status, "status", patience=patience)
+        return self.with_telemetry(self._call(Status, "status", patience=patience))
 
     def controllers(self) -> list[ControllerInfo]:
         """Return the controllers of the daemon, with their parameters."""
@@ -269,9 +269,18 @@ class Fish(Connection):
         patience: time that the answer may take in addition to the timeout; negative to wait for no
             late answer [s]
         """
+        try:
+            return self._exchange(kind, op, patience, args)
+        except NoKey:  # the next request connects again
+            if self._socket:
+                self._socket.close()
+                self._socket = None
+            raise
+
+    def _exchange(self, kind: type[T], op: str, patience: float, args: dict[str, Any]) -> T:
         if self._socket is None:
             self.check_endpoint()
-            self._socket = RequestSocket(self.endpoint)
+            self._socket = self._open_socket()
         connection = self._socket
         identity, request = self.request(op, args)
         sent_on = None
@@ -291,25 +300,37 @@ class Fish(Connection):
                     raise self.lost_command_error(op)
         raise self.no_answer_error(patience)
 
+    def _open_socket(self) -> Requests:
+        if not self.access:
+            return RequestSocket(self.endpoint)
+        from fishd.client.keyed_socket import KeyedRequestSocket
+
+        return KeyedRequestSocket(self.endpoint, self.access)
+
     def _subscribe(self, kinds: dict[bytes, type[T]], *, forever: bool = False) -> Iterator[T]:
         """Return an iterator of the messages of these topics; forever: wait without limit."""
         address = self.telemetry_address or self.status().telemetry
-        patience = -1 if forever else int(self.timeout * 1e3)
+        patience = -1 if forever and not self.access else int(self.timeout * 1e3)
         decoders = {topic: decoder(kind) for topic, kind in kinds.items()}
         import zmq
 
         from fishd.client.zmq_sockets import connect_subscriber
 
         self._context = self._context or zmq.Context()
-        socket = connect_subscriber(self._context, address, *kinds)
+        socket = connect_subscriber(self._context, address, *kinds, access=self.access)
 
         def messages() -> Iterator[T]:
             with closing(socket):
-                while socket.poll(patience) or socket.poll(LATE_ANSWER_WAIT_MS):
-                    self.check_lease()
-                    frames = socket.recv_multipart()
-                    if decode := decoders.get(frames[0]):
-                        yield self.read(decode, frames)
-            raise self.no_telemetry_error()
+                while True:
+                    while socket.poll(patience) or socket.poll(LATE_ANSWER_WAIT_MS):
+                        self.check_lease()
+                        frames = socket.recv_multipart()
+                        if decode := decoders.get(frames[0]):
+                            yield self.read(decode, frames)
+                    if self.access:
+                        with suppress(NoDaemon):
+                            self.status()  # raises an error if the key is no longer known
+                    if not forever:
+                        raise self.no_telemetry_error()
 
         return messages()

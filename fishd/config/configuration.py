@@ -18,6 +18,7 @@ from fishd.config.consistency import (
     check_estimator,
     check_i2c_addresses,
     check_lockstep,
+    check_network,
     check_neutral,
     check_pins,
     check_pulses,
@@ -133,7 +134,8 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         note(
             "ZeroMQ address of the ROUTER socket: ipc://PATH or tcp://127.0.0.1:PORT. null: a "
             "socket named control in $RUNTIME_DIRECTORY, else in $XDG_RUNTIME_DIR/fishd, else in a "
-            "private folder under /tmp. From another machine, use an ssh tunnel."
+            "private folder under /tmp. From another machine, use an ssh tunnel, or the section "
+            "network."
         ),
     ] = None
     lease: Annotated[
@@ -146,6 +148,20 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             le=MAX_LEASE_S,
         ),
     ] = DEFAULT_LEASE_S
+
+
+class NetworkSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Access over the network, for clients with a key; all that they exchange is encrypted."""
+
+    keys: Annotated[
+        str | None,
+        note(
+            "Folder with fishd's key and the known keys of clients, written by 'fishctl keygen'; "
+            "null: no access over the network."
+        ),
+    ] = None
+    control: Annotated[str, note("Address of requests: tcp://HOST:PORT.")] = "tcp://0.0.0.0:9877"
+    telemetry: Annotated[str, note("Address of telemetry: tcp://HOST:PORT.")] = "tcp://0.0.0.0:9878"
 
 
 class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -237,6 +253,9 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
     )
     telemetry: Annotated[TelemetrySettings, note("Publication of telemetry.")] = TelemetrySettings()
     control: Annotated[ControlSettings, note("Requests and leases.")] = ControlSettings()
+    network: Annotated[NetworkSettings, note("Access over the network, with keys.")] = (
+        NetworkSettings()
+    )
     realtime: Annotated[RealtimeSettings, note("Scheduling and memory.")] = RealtimeSettings()
 
     @property
@@ -344,6 +363,11 @@ Check = Callable[[Config], None]
 CHECKS: tuple[Check, ...] = (
     lambda c: check_start(c.start.controller, c.start.parameters, c.limits),
     lambda c: check_addresses(c.telemetry.address, c.control.address),
+    lambda c: (
+        check_network(c.telemetry.address, c.network.control, c.network.telemetry)
+        if c.network.keys
+        else None
+    ),
     lambda c: check_state_folder(c.state_folder),
     lambda c: check_drivers(c.robot, c.tick, c.driver_settings),
     lambda c: check_neutral(c.servo),

@@ -11,7 +11,7 @@ from typing import Any
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core import files
-from fishd.core.addresses import ADDRESS_FORM, find_listen_problem, is_local
+from fishd.core.addresses import ADDRESS_FORM, Ipc, find_listen_problem, is_local, parse
 from fishd.core.errors import ParameterError, UnknownController
 from fishd.core.process.unix_sockets import check_length
 from fishd.core.robots import find_kind
@@ -60,6 +60,22 @@ def check_addresses(telemetry: str, control: str | None) -> None:
         raise Problem(("control", "address"), f"'{control}' is not valid: {complaint}")
     if control == telemetry:
         raise Problem(("control", "address"), f"'{control}' is already the address of telemetry")
+
+
+def check_network(telemetry: str, keyed_control: str, keyed_telemetry: str) -> None:
+    """Check the addresses for clients with a key, and that no other is open to the network."""
+    for key, address in (("control", keyed_control), ("telemetry", keyed_telemetry)):
+        complaint = find_listen_problem(address)
+        if not complaint and isinstance(parse(address), Ipc):
+            complaint = "tcp://HOST:PORT is needed"
+        if complaint:
+            raise Problem(("network", key), f"'{address}' is not valid: {complaint}")
+    if not is_local(telemetry):
+        raise Problem(
+            ("telemetry", "address"),
+            f"'{telemetry}' could be read without a key, but network.keys is set; write an address "
+            "of this machine, such as tcp://127.0.0.1:9872",
+        )
 
 
 def check_state_folder(folder: str | None) -> None:

@@ -23,6 +23,7 @@ from fishd.core.process.runtime_folder import runtime_folder
 
 ADDRESS_FORM = "tcp://HOST:PORT or ipc://PATH is needed"
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
+KEYS_VARIABLE = "FISHD_KEYS"
 ADDRESS_IN_USE = "it is in use, by another fishd perhaps; end that, or choose another address"
 _SERVICE_SOCKET = Path("/run/fishd/control")
 _MAX_PENDING_CONNECTIONS = 128

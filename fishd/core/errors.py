@@ -125,6 +125,10 @@ class Untrusted(NoDaemon):
     """Another user's process listens where the fishd of this user would."""
 
 
+class NoKey(FishError):
+    """The endpoint needs a key that this client lacks, or refuses the client's key."""
+
+
 class Refused(FishError, RuntimeError):
     """The daemon refused the request.
 

@@ -503,6 +503,9 @@ class Status(Struct, frozen=True):
         Reason | None,
         note("Reason why the fish rests after a lease that was not renewed; null otherwise."),
     ] = None
+    keyed_telemetry: Annotated[
+        str, note("Address of telemetry for [clients with a key](#keys); empty for none.")
+    ] = ""
 
     def shows_restart_since(self, earlier: "Status") -> bool:
         """Return whether this is the status of another fishd than the one of `earlier`."""

@@ -27,6 +27,9 @@ _MORE_FLAG, _LONG_FLAG, _COMMAND_FLAG = 1, 2, 4
 """Flags of a frame: others follow, its size has 8 bytes, it is a command."""
 _GREETING = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 
+_VERSION_END = 11
+"""End of the version in a greeting; the mechanism follows later."""
+
 
 def _property(name: bytes, value: bytes) -> bytes:
     return bytes([len(name)]) + name + len(value).to_bytes(4, "big") + value
@@ -62,7 +65,12 @@ class Dealer(ABC, Generic[T]):
         """Whether to stay with the peer of this connection, and never reconnect."""
         self.lost = False
         """Whether the connection to that peer was lost."""
+        self.needs_key = False
+        """Whether the peer has refused a connection without a key."""
         self._socket: socket.socket | None = None
+        self._was_cut = False
+        """Whether the peer ended the last handshake; then it sends its mechanism, such as CURVE,
+        only if it has not received ours yet."""
         self._greeting_taken = False
         self._ready = False
         """Whether the peer has sent its greeting and READY."""
@@ -174,7 +182,7 @@ class Dealer(ABC, Generic[T]):
         failure = self._socket.connect_ex(target)  # type: ignore[arg-type]
         if failure not in (0, errno.EINPROGRESS):
             raise ConnectionError  # also where the queue of the peer is full: EAGAIN
-        self._unsent = _GREETING + _READY
+        self._unsent = _GREETING[:_VERSION_END] if self._was_cut else _GREETING + _READY
         self._poll.register(self._socket, select.EPOLLIN | select.EPOLLOUT)
 
     def _write(self, data: bytes) -> None:
@@ -218,8 +226,12 @@ class Dealer(ABC, Generic[T]):
             raise ConnectionError
         if len(self._received) < len(_GREETING):
             return False
-        if self._received[12:32].rstrip(b"\0") != b"NULL":
+        mechanism = self._received[12:32].rstrip(b"\0")
+        if mechanism != b"NULL":
+            self.needs_key = mechanism == b"CURVE"
             raise ConnectionError
+        if self._was_cut:
+            self._write(_GREETING[_VERSION_END:] + _READY)
         del self._received[: len(_GREETING)]
         self._greeting_taken = True
         return True
@@ -272,6 +284,7 @@ class Dealer(ABC, Generic[T]):
         self._socket.close()  # also removes it from epoll
         self._socket = None
         self.lost = self.lost or self.bound
+        self._was_cut = not self._ready and bool(self._received)
         self._ready = self._greeting_taken = False
         self._unsent = b""
         self._received.clear()

@@ -34,17 +34,18 @@ class ControlServer:
         self._per_tick = max(1, math.floor(MAX_REQUEST_RATE * tick))
         self._remaining = self._per_tick
         self._tasks: set[asyncio.Task[None]] = set()
-        self.send: Callable[[bytes], bool] = lambda message: True
-        """Function that sends a message to the gateway at once; False if the link is full."""
         self.read: Callable[[bool], object] = lambda enabled: None
-        """Function that enables or disables reading further requests from the gateway."""
+        """Function that enables or disables reading further requests from the gateways."""
 
-    def take(self, message: bytes) -> None:
-        """Start to answer a request that came over the link."""
+    def take(self, send: Callable[[bytes], bool], message: bytes) -> None:
+        """Start to answer a request that came over a link.
+
+        send: function that sends a message over that link at once; False if the link is full
+        """
         self._remaining -= 1
         if self._remaining <= 0:
             self.read(False)
-        task = asyncio.create_task(self._answer(*link.number_and_payload(message)))
+        task = asyncio.create_task(self._answer(send, *link.number_and_payload(message)))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -59,9 +60,9 @@ class ControlServer:
         for task in self._tasks:
             task.cancel()
 
-    async def _answer(self, number: int, payload: bytes) -> None:
+    async def _answer(self, send: Callable[[bytes], bool], number: int, payload: bytes) -> None:
         for part in link.reply(number, await self._reply(1e-9 * number, payload)):
-            while not self.send(part):  # an incomplete reply keeps its request open
+            while not send(part):  # an incomplete reply keeps its request open
                 await asyncio.sleep(_SEND_RETRY_S)
 
     async def reply_to_estop(self, payload: bytes) -> bytes:

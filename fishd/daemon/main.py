@@ -77,10 +77,11 @@ class Daemon:
             address = config.control.address or addresses.control_address()
             stack.enter_context(addresses.claim_address(address))
             stack.enter_context(addresses.claim_address(config.telemetry.address))
-            self._gateways = Gateways(address, config.telemetry.address, stack)
+            network = config.network if config.network.keys else None
+            self._gateways = Gateways(address, config.telemetry.address, stack, network)
             # Before the gateways end, after the servo is released.
             stack.callback(realtime.drop_priority)
-            self._telemetry = Telemetry(self._gateways.telemetry.send)
+            self._telemetry = Telemetry(self._gateways.publish)
             self._mock_ticks = None if self._virtual else mock_ticks(config)
             controllers = registry.describe_all()  # imports the controllers of other packages
             if not self._virtual:
@@ -115,6 +116,7 @@ class Daemon:
                 self._gateways.telemetry.address,
                 self.is_realtime,
                 self._gateways.counters,
+                self._gateways.keyed_telemetry,
             )
             self._server = ControlServer(self._operations.perform, config.tick)
             self._gateways.serve(self._server, self._loop.reporter)
@@ -140,13 +142,14 @@ class Daemon:
     async def run(self, stopping: asyncio.Event) -> None:
         """Tick until `stopping` is set, then fade to neutral."""
         log.info(
-            "fishd %s drives the %s robot every %g ms%s; control %s, telemetry %s",
+            "fishd %s drives the %s robot every %g ms%s; control %s, telemetry %s%s",
             __version__,
             self._loop.robot.name,
             self._config.tick * 1e3,
             " of virtual time" if self._virtual else "",
             self._gateways.control.address,
             self._gateways.telemetry.address,
+            f"; with keys {keyed}" if (keyed := self._gateways.keyed_control) else "",
         )
         realtime.freeze_garbage_collector()
         if self._slow:

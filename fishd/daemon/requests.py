@@ -44,6 +44,7 @@ class Operations:
         telemetry: str,
         realtime: bool,
         counters: Callable[[], dict[str, int]] = dict,
+        keyed_telemetry: str = "",
     ) -> None:
         """Prepare to answer requests.
 
@@ -52,10 +53,12 @@ class Operations:
         telemetry: address of telemetry for clients
         realtime: whether the loop runs under SCHED_FIFO
         counters: function that returns the numbers of recovered errors outside of the robot
+        keyed_telemetry: address of telemetry for clients with a key; empty for none
         """
         self._loop = loop
         self._clock = clock
         self._telemetry = telemetry
+        self._keyed_telemetry = keyed_telemetry
         self._realtime = realtime
         self._counters = counters
         self._calibrations = calibration_requests
@@ -149,6 +152,7 @@ class Operations:
             leak=loop.found_leak,
             lease=loop.lease.holder,
             lease_expiry=loop.lease.expired,
+            keyed_telemetry=self._keyed_telemetry,
         )
 
     def _limitations(self) -> tuple[str, ...]:

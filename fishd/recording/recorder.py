@@ -4,20 +4,24 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
 
 import msgspec
 import zmq
 
 from fishd.client import Fish
+from fishd.client.zmq_sockets import set_keys
 from fishd.core import addresses, text
 from fishd.core.camera_frames import Pixels
-from fishd.core.errors import FishError, RecordingError, Refused
+from fishd.core.errors import FishError, NoDaemon, RecordingError, Refused
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status
 from fishd.recording.images import FrameHead
 from fishd.recording.summary import TickHead
 from fishd.recording.writer import CHANNELS, RunWriter
+
+if TYPE_CHECKING:
+    from fishd.core.keys import Access
 
 DRAIN_INTERVAL_S = 0.2
 """Interval at which messages are read from their queue, to wake up rarely [s]."""
@@ -110,8 +114,9 @@ class Recorder:
     def __enter__(self) -> Self:
         """Begin the recording; raise `NoDaemon`, `Refused`, `RecordingError`."""
         try:
-            self._described = self._ask()
-            self._telemetry.connect(self._described.status.telemetry)
+            with Fish(self._endpoint) as fish:
+                self._described = describe_daemon(fish)
+                self._telemetry.connect(self._described.status.telemetry, fish.access)
             self._open()
         except BaseException:
             self._close()
@@ -245,10 +250,12 @@ class Recorder:
         """Reconnect telemetry if fishd has another address now; otherwise it reconnects itself."""
         try:
             with Fish(self._endpoint, timeout=0.5) as fish:
-                self._telemetry.connect(fish.status().telemetry)
-        except FishError:
+                self._telemetry.connect(fish.status().telemetry, fish.access)
+        except FishError as error:
             if not self._gone:
-                self._tell("fishd does not answer: the recording waits for it")
+                is_silent = isinstance(error, NoDaemon)
+                why = "fishd does not answer" if is_silent else text.line(str(error))
+                self._tell(f"{why}: the recording waits for it")
             self._gone = True
 
     def _check_room(self) -> None:
@@ -300,11 +307,12 @@ class Telemetry:
             self._socket.subscribe(topic.encode())
         self._address = ""
 
-    def connect(self, address: str) -> None:
-        """Subscribe to this address only."""
-        if address != self._address:
+    def connect(self, address: str, access: "Access | None") -> None:
+        """Subscribe to this address only; with keys, connect again."""
+        if address != self._address or access:  # ZeroMQ does not retry with a key that was refused
             if self._address:
                 self._socket.disconnect(self._address)
+            set_keys(self._socket, access)
             self._socket.set(zmq.IPV6, addresses.is_ipv6(address))
             self._socket.connect(address)
             self._address = address

@@ -151,7 +151,8 @@ class FishLink:
         if self._state != "restarted":
             self._set_connection("stale", "no tick has come yet")
         address = status.telemetry
-        socket = connect_subscriber(self._context, address, b"tick", b"event", b"status")
+        topics, access = (b"tick", b"event", b"status"), self._fish.access
+        socket = connect_subscriber(self._context, address, *topics, access=access)
         with closing(socket):
             while self.status and self.status.telemetry == address:
                 if await socket.poll(int(STALE_AFTER_S * 1e3)):
@@ -171,7 +172,9 @@ class FishLink:
                 self._tell("event", frames[-1])
                 self._pass_on("event", event.t, frames[-1])
             elif frames[0] == b"status":
-                status = await self._take_status(_decode_status(frames[-1]))
+                status = await self._take_status(
+                    self._fish.with_telemetry(_decode_status(frames[-1]))
+                )
                 self._pass_on("status", status.t, frames[-1])
         except msgspec.DecodeError as error:
             raise FishError(

@@ -139,7 +139,7 @@ class SimulatedSource:
         view = _View(self._settings, self._size, description, sink)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
-            socket = connect_subscriber(context, status.telemetry, b"tick")
+            socket = connect_subscriber(context, status.telemetry, b"tick", access=fish.access)
             offset = ClockOffset(clock_reader(fish))
             view.ahead = offset.update().seconds
             last_tick_time, last_seq = time.monotonic(), 0

@@ -35,6 +35,7 @@ def main(number: str) -> int:
 
     gc.freeze()  # keeps memory pages shared with the gateways
     modules = {link.TELEMETRY: publisher, link.CONTROL: router}
+    modules |= {link.KEYED_TELEMETRY: publisher, link.KEYED_CONTROL: router}
     connection = socket.socket(fileno=int(number))
     connection.setblocking(True)
     children: dict[str, int] = {}
@@ -99,12 +100,18 @@ def _run(module: ModuleType, address: str, connection: socket.socket, listener: 
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     server = context.socket(module.SOCKET)
     module.configure(server)
+    address, _, keys = address.partition(" ")
+    known = None
+    if keys:
+        from fishd.daemon.gateway.keys import require_keys
+
+        known = require_keys(server, *keys.split(" ", 1))
     server.set(zmq.USE_FD, listener)
     server.bind(address)
     limits = ResourceLimits(module.MAX_MEMORY_BYTES, module.MAX_CONNECTIONS)
     with suppress(OSError):  # see below
         connection.send(link.READY)
-    why = module.run(connection, server, limits)
+    why = module.run(connection, server, limits, known)
     if why:
         with suppress(OSError):  # fishd has ended, or the link is full
             connection.send(link.NOTICE + why.encode())

@@ -19,15 +19,18 @@ from functools import partial
 
 import msgspec
 
+from fishd.config.configuration import NetworkSettings
 from fishd.control.reporting import Reporter
-from fishd.core import addresses
-from fishd.core.errors import StartupError
+from fishd.core import addresses, files
+from fishd.core.errors import ConfigError, StartupError
 from fishd.core.process import safe_path
 from fishd.core.signals import Event, Status, Tick
 from fishd.daemon.control_server import ControlServer
 from fishd.daemon.gateway.link import (
     CONTROL,
     END,
+    KEYED_CONTROL,
+    KEYED_TELEMETRY,
     MAX_MESSAGE_BYTES,
     NOTICE,
     PING,
@@ -44,9 +47,11 @@ from fishd.daemon.gateway.starvation import Thread, is_starved, read_threads
 
 log = logging.getLogger(__name__)
 
+TELEMETRIES = {TELEMETRY, KEYED_TELEMETRY}
+
 BEAT_S = 0.08
 """Time between two heartbeats [s]."""
-MAX_UNANSWERED = {CONTROL: 4, TELEMETRY: 8}
+MAX_UNANSWERED = {CONTROL: 4, TELEMETRY: 8, KEYED_CONTROL: 4, KEYED_TELEMETRY: 8}
 """Number of unanswered heartbeats in a row from which on a gateway counts as hung."""
 MAX_STARTING = 25
 """Longest start of a gateway, in heartbeats; after that it counts as hung."""
@@ -67,7 +72,7 @@ MIN_SERVER_PERIOD_S = 1.0
 """Shortest time between two starts of the fork server [s]."""
 RECONNECT_TIME_S = 1.0
 """Time for subscribers to connect again after a gateway has started to serve [s]."""
-MAX_REPORT_DELAY_S = {CONTROL: 2.0, TELEMETRY: 30.0}
+MAX_REPORT_DELAY_S = {CONTROL: 2.0, TELEMETRY: 30.0, KEYED_CONTROL: 2.0, KEYED_TELEMETRY: 30.0}
 """Time after which a restart is reported, even if the new gateway does not serve yet [s]."""
 END_TIMEOUT_S = 0.5
 """Longest time for a gateway to pass on the last messages before it ends [s]."""
@@ -266,15 +271,17 @@ class Gateway(_Peer):
     """Link to the process of one socket."""
 
     def __init__(
-        self, kind: str, listener: socket.socket, address: str, server: ForkServer
+        self, kind: str, listener: socket.socket, address: str, server: ForkServer, keys: str = ""
     ) -> None:
         """Start the process; must be called in a running asyncio loop.
 
-        kind: TELEMETRY or CONTROL
+        kind: TELEMETRY or CONTROL, or the same with keys
         listener: socket that clients connect to; it stays open during restarts of the process
         address: ZeroMQ address of the listener
+        keys: secret key and folder of the keys, for a kind with keys
         """
-        super().__init__(f"the gateway of {kind}", MAX_UNANSWERED[kind], MAX_STARTING)
+        name = f"the gateway of {kind.replace('-', ' ')}"
+        super().__init__(name, MAX_UNANSWERED[kind], MAX_STARTING)
         self.kind = kind
         self.address = address
         self.take: Callable[[bytes], None] = lambda message: None
@@ -287,7 +294,8 @@ class Gateway(_Peer):
         """Function called with the latest reason after a restart, or after its deadline."""
         self._listener = listener
         self._server = server
-        self._enabled = kind == TELEMETRY  # it sends only that it serves, and why it ends
+        self._keys = keys
+        self._enabled = kind in TELEMETRIES  # it sends only that it serves, and why it ends
         self._why = ""
         self._number = 0
         """Number of the process; 0 until the fork server has started it."""
@@ -373,7 +381,8 @@ class Gateway(_Peer):
         ours, theirs = pair()
         with theirs, ExitStack() as stack:
             stack.callback(ours.close)
-            self._server.fork(self.kind, self.address, theirs, self._listener)
+            where = f"{self.address} {self._keys}".rstrip()
+            self._server.fork(self.kind, where, theirs, self._listener)
             stack.pop_all()
         self._started_at = self._events.time()
         self._number = 0
@@ -412,7 +421,7 @@ class Gateway(_Peer):
     def _handle_ready(self) -> None:
         """Report a restart; of telemetry, when subscribers have had time to connect again."""
         if self._report_timer:
-            pause = RECONNECT_TIME_S if self.kind == TELEMETRY else 0.0
+            pause = RECONNECT_TIME_S if self.kind in TELEMETRIES else 0.0
             self._report_at(min(self._report_deadline, self._events.time() + pause))
 
     def _report_at(self, when: float) -> None:
@@ -426,58 +435,103 @@ class Gateway(_Peer):
 
 
 class Gateways:
-    """Both gateways, which listen at their addresses until `stack` is closed."""
+    """All gateways, which listen at their addresses until `stack` is closed."""
 
-    def __init__(self, control: str, telemetry: str, stack: ExitStack) -> None:
+    def __init__(
+        self, control: str, telemetry: str, stack: ExitStack, network: NetworkSettings | None = None
+    ) -> None:
         """Start the gateways; must be called in a running asyncio loop.
 
         control, telemetry: addresses, which must be `claimed`
-        Raises `StartupError`.
+        network: settings of the access over the network; None for no such access
+        Raises `StartupError`, and `ConfigError` for a file of keys.
         """
         self._events = asyncio.get_running_loop()
+        keys = _read_keys(network.keys or "") if network else ""
         self._server = ForkServer()
         stack.callback(self._server.close)
         self.control = _open(CONTROL, control, self._server, stack)
         self.telemetry = _open(TELEMETRY, telemetry, self._server, stack)
-        stack.callback(self.control.end)  # so that both end at the same time
+        self._controls, self._telemetries = [self.control], [self.telemetry]
+        self.keyed_telemetry = self.keyed_control = ""
+        """Addresses for clients with a key; empty without keys."""
+        if network:
+            for kind, address, gateways in (
+                (KEYED_CONTROL, network.control, self._controls),
+                (KEYED_TELEMETRY, network.telemetry, self._telemetries),
+            ):
+                gateways.append(_open(kind, address, self._server, stack, keys))
+            self.keyed_control = self._controls[-1].address
+            self.keyed_telemetry = self._telemetries[-1].address
+        for gateway in (*self._controls, *self._telemetries):
+            stack.callback(gateway.end)  # so that all end at the same time
+        self._peers = (self._server, *self._controls, *self._telemetries)
         self._beat()
         stack.callback(lambda: self._timer.cancel())
 
+    @property
+    def publish(self) -> Callable[[bytes], object]:
+        """Function that sends a message to all subscribers."""
+        return self._publish if self.keyed_telemetry else self.telemetry.send
+
+    def _publish(self, message: bytes) -> None:
+        for gateway in self._telemetries:
+            gateway.send(message)
+
     def serve(self, server: ControlServer, reporter: Reporter) -> None:
         """Pass on requests and replies, and report when a gateway was started again."""
-        server.send, server.read = self.control.send, self.control.read
-        self.control.take = server.take
-        self.control.read(True)
-        for gateway in (self.control, self.telemetry):
+        server.read = self._read
+        for gateway in self._controls:
+            gateway.take = partial(server.take, gateway.send)
+        self._read(True)
+        for gateway in (*self._controls, *self._telemetries):
             gateway.on_restart = partial(_report_event, reporter, gateway.kind)
 
+    def _read(self, enabled: bool) -> None:
+        for gateway in self._controls:
+            gateway.read(enabled)
+
     def _beat(self) -> None:
-        for peer in (self._server, self.control, self.telemetry):
+        for peer in self._peers:
             peer.beat()
         self._timer = self._events.call_later(BEAT_S, self._beat)
 
     def counters(self) -> dict[str, int]:
         """Return the numbers of recovered errors since start."""
         return {
-            "telemetry_lost": self.telemetry.lost,
-            "telemetry_restarts": self.telemetry.restarts,
-            "control_restarts": self.control.restarts,
+            "telemetry_lost": sum(gateway.lost for gateway in self._telemetries),
+            "telemetry_restarts": sum(gateway.restarts for gateway in self._telemetries),
+            "control_restarts": sum(gateway.restarts for gateway in self._controls),
         }
 
 
-def _open(kind: str, address: str, server: ForkServer, stack: ExitStack) -> Gateway:
-    listener = addresses.listen(address, f"{kind}.address", group=kind == CONTROL)
+def _open(kind: str, address: str, server: ForkServer, stack: ExitStack, keys: str = "") -> Gateway:
+    key = kind.replace("keyed-", "network.") if keys else f"{kind}.address"
+    listener = addresses.listen(address, key, group=kind == CONTROL)
     stack.callback(listener.close)
+    where = addresses.reachable_address(address, listener)
     try:
-        gateway = Gateway(kind, listener, addresses.reachable_address(address, listener), server)
+        gateway = Gateway(kind, listener, where, server, keys)
     except OSError as error:
         raise StartupError(f"the gateway of {kind} cannot be started: {error.strerror}") from None
     stack.callback(gateway.close)
     return gateway
 
 
+def _read_keys(name: str) -> str:
+    """Return fishd's secret key and its folder; raise `ConfigError` for a wrong file there."""
+    from fishd.core import keys
+
+    folder = files.expand_user(name).absolute()
+    secret = keys.read_secret(folder)
+    _, mistakes = keys.read_known(folder)
+    if mistakes:
+        raise ConfigError(mistakes[0])
+    return f"{secret} {folder}"
+
+
 def _report_event(reporter: Reporter, kind: str, why: str) -> None:
-    message = f"the gateway of {kind} was started again: {why}"
+    message = f"the gateway of {kind.replace('-', ' ')} was started again: {why}"
     reporter.event("gateway", message, "warning", gateway=kind)
 
 

@@ -7,7 +7,8 @@ MAX_MESSAGE_BYTES = 65536
 """Largest size of a message on a link [bytes]; longer replies are sent in parts."""
 
 TELEMETRY, CONTROL = "telemetry", "control"
-"""Kinds of gateways."""
+KEYED_TELEMETRY, KEYED_CONTROL = "keyed-telemetry", "keyed-control"
+"""Kinds of gateways; only clients with a known key connect to the latter two."""
 
 REQUEST, READY, NOTICE, END = b"?", b"^", b"!", b"."
 """First bytes of a client's request, of the start and the end of a gateway, and of fishd's end."""

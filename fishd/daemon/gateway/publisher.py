@@ -3,11 +3,15 @@
 import select
 import socket
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import zmq
 
 from fishd.daemon.gateway.limits import ResourceLimits
 from fishd.daemon.gateway.link import END, PING, PONG, split_frames
+
+if TYPE_CHECKING:
+    from fishd.daemon.gateway.keys import KnownKeys
 
 SOCKET = zmq.PUB
 MAX_MEMORY_BYTES = 16 * 2**20
@@ -25,11 +29,16 @@ _CHECK_PERIOD_MS = 100
 """Longest time between two checks of the limits [ms]."""
 
 
-def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits) -> str:
-    """Publish until fishd ends; return the exceeded limit, if any."""
+def run(
+    link: socket.socket,
+    server: "zmq.Socket[bytes]",
+    limits: ResourceLimits,
+    known: "KnownKeys | None",
+) -> str:
+    """Publish until fishd ends; return the exceeded limit, if any, or which key was removed."""
     poller = select.poll()
     poller.register(link, select.POLLIN)
-    while not (why := limits.exceeded()):
+    while not (why := limits.exceeded() or (known.find_change() if known else "")):
         if not poller.poll(_CHECK_PERIOD_MS):
             continue
         try:

@@ -4,6 +4,7 @@ import socket
 import time
 from collections import deque
 from contextlib import suppress
+from typing import TYPE_CHECKING
 
 import zmq
 
@@ -11,6 +12,9 @@ from fishd.core import protocol
 from fishd.core.errors import Refused
 from fishd.daemon.gateway.limits import ResourceLimits
 from fishd.daemon.gateway.link import END, MAX_MESSAGE_BYTES, PING, PONG, Replies, request
+
+if TYPE_CHECKING:
+    from fishd.daemon.gateway.keys import KnownKeys
 
 SOCKET = zmq.ROUTER
 MAX_MEMORY_BYTES = 48 * 2**20
@@ -65,11 +69,16 @@ class Router:
     """Router of requests from a ROUTER socket to the link to fishd; clients take turns."""
 
     def __init__(
-        self, link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits
+        self,
+        link: socket.socket,
+        server: "zmq.Socket[bytes]",
+        limits: ResourceLimits,
+        known: "KnownKeys | None",
     ) -> None:
         self._link = link
         self._server = server
         self._limits = limits
+        self._known = known
         self._clients: dict[bytes, _Client] = {}
         self._urgent: deque[bytes] = deque()
         self._turns: deque[_Client] = deque()
@@ -124,22 +133,31 @@ class Router:
     def _take_requests(self) -> None:
         for _ in range(_REQUESTS_PER_TURN):
             try:
-                frames = self._server.recv_multipart(zmq.DONTWAIT)
+                if self._known:
+                    messages = self._server.recv_multipart(zmq.DONTWAIT, copy=False)
+                    frames = [message.bytes for message in messages]
+                    key = str(messages[-1].get("User-Id"))
+                else:
+                    frames, key = self._server.recv_multipart(zmq.DONTWAIT), ""
             except zmq.Again:
                 return
             envelope, payload = frames[:-1], frames[-1]
             if len(envelope) == 1 or (len(envelope) == 2 and not envelope[1]):
-                self._take(envelope, payload)
+                self._take(envelope, payload, key)
 
-    def _take(self, envelope: list[bytes], payload: bytes) -> None:
+    def _take(self, envelope: list[bytes], payload: bytes, key: str) -> None:
         now = time.monotonic()
         client = self._clients.get(envelope[0])
         if client is None:
             client = self._clients[envelope[0]] = _Client(now)
         client.seen = now
         try:
-            urgent = protocol.decode_request(payload).op in URGENT_OPERATIONS
-            urgent = urgent and len(self._urgent) < MAX_OPEN_REQUESTS  # limits a flood of them
+            operation = protocol.decode_request(payload).op
+            if self._known:
+                self._known.check(key, operation)
+            urgent = (
+                operation in URGENT_OPERATIONS and len(self._urgent) < MAX_OPEN_REQUESTS
+            )  # limits a flood of them
             waiting = len(client.waiting)
             if waiting >= max(1, MAX_WAITING_REQUESTS // max(1, len(self._turns))) and not urgent:
                 raise Refused("busy", f"{waiting} of your requests are already waiting; slow down")
@@ -199,6 +217,11 @@ def configure(server: "zmq.Socket[bytes]") -> None:
     server.set(zmq.HANDSHAKE_IVL, HANDSHAKE_TIMEOUT_MS)
 
 
-def run(link: socket.socket, server: "zmq.Socket[bytes]", limits: ResourceLimits) -> str:
+def run(
+    link: socket.socket,
+    server: "zmq.Socket[bytes]",
+    limits: ResourceLimits,
+    known: "KnownKeys | None",
+) -> str:
     """Pass on requests and replies until fishd ends; return the exceeded limit, if any."""
-    return Router(link, server, limits).run()
+    return Router(link, server, limits, known).run()

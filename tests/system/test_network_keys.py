@@ -1,0 +1,278 @@
+"""Access over the network: a real fishd, whose clients have keys, over TCP."""
+
+import contextlib
+import json
+import re
+import sys
+from collections import deque
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import pytest
+import zmq
+from rigs.documents import FENCE, ROOT
+from rigs.keyed_daemon import KeyedDaemon
+from rigs.processes import (
+    FISHCTL,
+    PATIENCE,
+    Daemon,
+    Process,
+    Subscriber,
+    call,
+    one_line,
+    sets,
+)
+from rigs.window_process import Browser, open_page, run, running_window
+
+from fishd.client import Fish, Refused
+from fishd.core.errors import NoKey
+
+SILENCE_S = 5.0
+"""Time without a message after which a client looks for the reason [s]."""
+
+
+@pytest.fixture(scope="module")
+def keyed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KeyedDaemon]:
+    """Yield a fishd that knows `driver` and `watcher`, and does not know `stranger`."""
+    rig = KeyedDaemon(tmp_path_factory.mktemp("k"), driver="drive", watcher="watch", stranger="")
+    with rig.running():
+        yield rig
+
+
+@pytest.fixture
+def as_client(monkeypatch: pytest.MonkeyPatch, keyed: KeyedDaemon) -> Iterator[type["Client"]]:
+    with contextlib.ExitStack() as stack:
+        Client.monkeypatch, Client.keyed, Client.stack = monkeypatch, keyed, stack
+        yield Client
+
+
+class Client:
+    """Connections of the clients of a test."""
+
+    monkeypatch: pytest.MonkeyPatch
+    keyed: KeyedDaemon
+    stack: contextlib.ExitStack
+
+    @classmethod
+    def connect(cls, name: str, timeout: float = PATIENCE) -> Fish:
+        cls.monkeypatch.setenv("FISHD_KEYS", str(cls.keyed.folder / name))
+        return cls.stack.enter_context(Fish(cls.keyed.endpoint, timeout=timeout))
+
+
+def test_a_client_with_the_role_drive_drives(as_client: type[Client]) -> None:
+    fish = as_client.connect("driver")
+    state = fish.set_controller("swing", C=0.5)
+    assert next(tick for tick in fish.ticks() if tick.seq >= state.seq).controller == "swing"
+    with fish.lease("experiment"):
+        assert fish.set_parameters(C=0.6).parameters["C"] == 0.6
+    assert fish.estop("enough").mode == "estop"
+    assert fish.estop_taken_by == "control"
+    assert fish.clear_fault().mode == "idle"
+
+
+def test_a_client_with_the_role_watch_reads_but_does_not_drive(
+    as_client: type[Client], keyed: KeyedDaemon
+) -> None:
+    fish = as_client.connect("watcher")
+    assert next(fish.ticks()).seq
+    assert fish.config()["network"]["control"] == keyed.endpoint
+    for command in (fish.stop, fish.estop, lambda: fish.set_controller("swing")):
+        with pytest.raises(Refused, match=r"needs the role drive; .* watcher, has the role watch"):
+            command()
+    assert fish.status().mode == "idle"
+    refused = keyed.fishctl("watcher", "set-controller", "swing")
+    assert "'set-controller' needs the role drive" in one_line(refused)
+
+
+def test_a_key_that_fishd_does_not_know_is_named_at_once(
+    as_client: type[Client], keyed: KeyedDaemon
+) -> None:
+    line = re.escape(f"'drive {keyed.key('stranger')} NAME'")
+    stranger = as_client.connect("stranger")
+    for _ in range(2):
+        with pytest.raises(NoKey, match=f"this key is not known to the fishd at .*: add .*{line}"):
+            stranger.status()
+    keyed.add("watch", "stranger")
+    assert stranger.status().robot == "simulated"
+    keyed.remove("stranger")
+
+
+def test_a_client_without_a_key_is_told_that_it_needs_one(keyed: KeyedDaemon) -> None:
+    with Fish(keyed.endpoint, timeout=PATIENCE) as fish, pytest.raises(NoKey, match="needs a key"):
+        fish.status()
+    done = call(FISHCTL, "--endpoint", keyed.endpoint, "status")
+    assert f"has no line '{keyed.endpoint} KEY'; add it" in one_line(done)
+
+
+def test_another_key_of_fishd_than_the_expected_one_is_named(
+    as_client: type[Client], keyed: KeyedDaemon
+) -> None:
+    keyed.know("driver", keyed.key("watcher"))
+    fish = as_client.connect("driver")
+    keyed.know("driver", keyed.key("fishd"))
+    with pytest.raises(NoKey, match=r"has another key than in its line in .*known, or"):
+        fish.status()
+
+
+def test_a_key_for_a_fishd_that_uses_none_is_refused(as_client: type[Client]) -> None:
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as plain:
+        port = plain.bind_to_random_port("tcp://127.0.0.1")
+        known = as_client.keyed.folder / "stranger" / "known"
+        known.write_text(f"tcp://127.0.0.1:{port} {as_client.keyed.key('fishd')}\n")
+        as_client.monkeypatch.setenv("FISHD_KEYS", str(known.parent))
+        fish = as_client.stack.enter_context(Fish(f"tcp://127.0.0.1:{port}", timeout=PATIENCE))
+        with pytest.raises(NoKey, match="or uses no keys; compare the line"):
+            fish.status()
+    as_client.keyed.know("stranger", as_client.keyed.key("fishd"))
+
+
+def test_a_removed_key_ends_at_once_for_connections_that_exist(
+    as_client: type[Client], keyed: KeyedDaemon
+) -> None:
+    keyed.add("drive", "stranger")
+    wait = (
+        "import asyncio\n"
+        "from fishd.client import AsyncFish\n"
+        "async def wait():\n"
+        f"    async with AsyncFish({keyed.endpoint!r}, timeout={SILENCE_S}) as fish:\n"
+        "        print((await fish.status()).mode, flush=True)\n"
+        "        async for event in fish.events(): pass\n"
+        "asyncio.run(wait())\n"
+    )
+    environment = keyed.environment("stranger")
+    with Process(sys.executable, "-c", wait, env=environment) as waiting:
+        assert waiting.process.stdout
+        assert waiting.process.stdout.readline() == "idle\n"
+        guest, driver = as_client.connect("stranger", SILENCE_S), as_client.connect("driver")
+        guest_ticks, driver_ticks, events = guest.ticks(), driver.ticks(), driver.events()
+        next(guest_ticks)
+        next(driver_ticks)
+        keyed.remove("stranger")
+        with pytest.raises(Refused, match=r"is no longer known to fishd: see .*known"):
+            guest.stop()
+        removal = next(event for event in events if event.kind == "gateway")
+        assert removal.message.endswith("fishd/known: removed: stranger")
+        seq = driver.status().seq
+        assert any(tick.seq > seq for tick in driver_ticks)  # the others have connected again
+        with pytest.raises(Refused, match="is no longer known"):
+            list(guest_ticks)
+        assert "no longer known" in waiting.finish()[2]
+
+
+def test_a_change_of_role_holds_from_the_next_request_on(
+    as_client: type[Client], keyed: KeyedDaemon
+) -> None:
+    keyed.add("drive", "stranger")
+    fish = as_client.connect("stranger")
+    assert fish.stop().mode == "idle"
+    keyed.remove("stranger")
+    keyed.add("watch", "stranger")
+    with pytest.raises(Refused, match="has the role watch"):
+        fish.stop()
+    assert fish.status().mode == "idle"
+    keyed.remove("stranger")
+
+
+def test_a_malformed_line_lets_only_its_own_client_out(
+    as_client: type[Client], tmp_path: Path
+) -> None:
+    keyed = as_client.keyed = KeyedDaemon(tmp_path, driver="drive", watcher="watch")
+    as_client.stack.enter_context(keyed.running())
+    driver = as_client.connect("driver")
+    events = driver.events()
+    assert driver.stop().mode == "idle"
+    keyed.write(keyed.known.read_text().replace("watch", "wach"))
+    assert driver.stop().mode == "idle"
+    with pytest.raises(NoKey, match="not known"):
+        as_client.connect("watcher").status()
+    problem = next(event for event in events if event.kind == "gateway")
+    assert "known, line 3: 'drive KEY NAME'" in problem.message
+
+
+def test_an_emptied_file_lets_no_client_in_but_not_while_it_is_written(
+    as_client: type[Client], keyed: KeyedDaemon
+) -> None:
+    driver = as_client.connect("driver")
+    before = keyed.known.read_text()
+    with keyed.known.open("w") as file:
+        assert driver.stop().mode == "idle"  # as an editor that empties the file and then writes it
+        file.write(before)
+    assert driver.stop().mode == "idle"
+    for change in (keyed.known.unlink, partial(keyed.write, "")):
+        change()
+        with pytest.raises(Refused, match="no longer known"):
+            deque(iter(driver.stop, None), maxlen=0)
+        keyed.write(before)
+        assert driver.stop().mode == "idle"
+
+
+def test_sockets_of_this_machine_need_no_key(keyed: KeyedDaemon) -> None:
+    assert keyed.daemon.fishctl("stop").returncode == 0
+    with Subscriber(keyed.daemon.telemetry) as subscriber:
+        assert subscriber.until(mode="idle")
+
+
+def test_verbs_that_follow_telemetry_work_with_a_key(keyed: KeyedDaemon, tmp_path: Path) -> None:
+    watched = keyed.fishctl("watcher", "watch", "--for", "0.5", "--json")
+    assert (watched.returncode, watched.stderr) == (0, "")
+    assert json.loads(watched.stdout.splitlines()[0])["mode"] == "idle"
+    recorded = keyed.fishctl("watcher", "record", "--for", "1", "--json", str(tmp_path / "a.mcap"))
+    assert recorded.returncode == 0, recorded.stderr
+    assert (tmp_path / "a.mcap").exists()
+
+
+def test_the_window_works_with_a_key(
+    keyed: KeyedDaemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def swim(url: str) -> None:
+        async with Browser(url) as browser, open_page(browser) as page:
+            await page.swim()
+
+    monkeypatch.setenv("FISHD_KEYS", str(keyed.folder / "driver"))
+    with running_window(tmp_path, fish=keyed.endpoint) as window:
+        run(swim(window.url))
+
+
+def test_keys_made_with_fishctl_connect_two_that_add_the_printed_lines(tmp_path: Path) -> None:
+    rig = KeyedDaemon(tmp_path / "k")
+    made = call(FISHCTL, "keygen", "--to", str(rig.folder / "anna"))
+    assert made.returncode == 0, made.stderr
+    (line,) = re.findall(r"^(drive .{40} \S+)$", made.stdout, re.MULTILINE)
+    rig.write(f"{line}\n")
+    rig.know("anna", rig.key("fishd"))
+    with rig.running():
+        command = (FISHCTL, "--keys", f"{rig.folder}/anna", "--endpoint", rig.endpoint)
+        assert "running: swing" in call(*command, "set-controller", "swing").stdout
+    other = json.loads(call(FISHCTL, "keygen", "--to", f"{rig.folder}/bob", "--json").stdout)
+    assert other == {"folder": f"{rig.folder}/bob", "public_key": rig.key("bob")}
+    again = call(FISHCTL, "keygen", "--to", str(rig.folder / "anna"))
+    assert "anna/key: it exists, and is not overwritten" in one_line(again)
+
+
+def test_a_plain_client_connects_as_the_page_says(keyed: KeyedDaemon) -> None:
+    page = (ROOT / "docs" / "reference" / "protocol.md").read_text(encoding="utf-8")
+    (example,) = [code for _, code in FENCE.findall(page) if "CURVE_SERVERKEY" in code]
+    arguments = (keyed.endpoint, str(keyed.folder / "watcher"), keyed.key("fishd"))
+    done = call(sys.executable, "-c", example, *arguments)
+    assert (done.stdout, done.stderr) in (("idle\n", ""), ("running\n", ""))
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        (["network.keys=nowhere"], "nowhere/key: there is no such file; 'fishctl keygen --to"),
+        (["network.control=ipc:///tmp/x"], "network.control: 'ipc:///tmp/x' is not valid: tcp://"),
+        (["telemetry.address=tcp://0.0.0.0:0"], "could be read without a key, but network.keys"),
+    ],
+    ids=["no key", "not TCP", "open telemetry"],
+)
+def test_fishd_does_not_start_with_wrong_access(
+    settings: list[str], problem: str, tmp_path: Path
+) -> None:
+    rig = KeyedDaemon(tmp_path / "k")
+    with Daemon(tmp_path, *rig.settings, *sets(*settings)) as daemon:
+        status, _, errors = daemon.finish()
+    assert status == 78
+    assert problem in errors
+    assert errors.count("\n") == 1
