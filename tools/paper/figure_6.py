@@ -73,7 +73,7 @@ class Table(NamedTuple):
 
 FINE = Table("figure-6-fine", 0.5, (1.0, 0.5, 0.25))
 EARLIER = Table("figure-6", 1.0, (2.0, 1.0, 0.5))
-"""Table of version 0.1.0, whose solver needed finer cells for the same accuracy."""
+"""Table of an earlier solver, with more dissipation (commit 547eb826)."""
 
 
 def shown() -> Table:
