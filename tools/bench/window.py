@@ -30,7 +30,7 @@ MAX_MEGABYTES = 60.0
 MAX_CPU = 0.05
 MAX_STOP_S = 0.2
 MAX_LATENESS_CHANGE = 0.2
-"""Largest relative change of the 99th percentile of the lateness by the pages."""
+"""Largest relative increase of the 99th percentile of the lateness by the pages."""
 BLOCKS = 4
 """Number of times that lateness is measured without, and with pages."""
 GPIO = 18
@@ -189,7 +189,7 @@ def measure(options: Namespace) -> Report:
         [
             f"lateness p99 with {VIEWERS} pages",
             f"{with_pages:.0f} µs ({with_pages / without - 1:+.0%})",
-            f"±{MAX_LATENESS_CHANGE:.0%}",
+            f"{MAX_LATENESS_CHANGE:+.0%}",
         ],
         ["emergency stop, median", f"{1e3 * middle:.0f} ms", ""],
         ["emergency stop, highest", f"{1e3 * highest:.0f} ms", f"{1e3 * MAX_STOP_S:.0f} ms"],
