@@ -351,7 +351,9 @@ KEEP_RED_ROW = """() => {
     if (!facts.axis) return;
     draw = drawn;
     const middle = Math.floor(canvas.width / 2);
-    const data = context.getImageData(middle, 0, 1, canvas.height).data;
+    const copy = new OffscreenCanvas(1, canvas.height).getContext("2d", {willReadFrequently: true});
+    copy.drawImage(canvas, -middle, 0);
+    const data = copy.getImageData(0, 0, 1, canvas.height).data;
     const rows = [];
     for (let row = 0; row < canvas.height; row++)
       if (data[4 * row] > 200 && data[4 * row + 2] < 120) rows.push(row);

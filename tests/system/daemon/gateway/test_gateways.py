@@ -147,7 +147,7 @@ if "fishd.daemon.gateway" in sys.orig_argv:
         spinning = both_gateways(daemon)["control"]
         spin.touch()
         wait_until(lambda: gateways(daemon).get("control", spinning) != spinning)
-        assert gone(spinning)
+        wait_until(lambda: gone(spinning))
         spin.unlink()
         wait_until(lambda: restarts(daemon, "control") >= 1)
         _, _, errors = daemon.end()
