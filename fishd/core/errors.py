@@ -79,9 +79,8 @@ def install_command(extra: str = "") -> str:
     pip = f"{shlex.quote(sys.executable)} -m pip install"
     try:
         distribution = Distribution.from_name("fishd")
-        if (
-            distribution.read_text("INSTALLER") or ""
-        ).strip() == "dpkg":  # its environment is fixed
+        installer = distribution.read_text("INSTALLER") or ""
+        if installer.strip() == "dpkg":  # the environment of a Debian package must not change
             pip = "python3 -m venv ~/fishd && ~/fishd/bin/pip install"
         origin = json.loads(distribution.read_text("direct_url.json") or "{}")
     except PackageNotFoundError:  # runs from its sources, without an installation

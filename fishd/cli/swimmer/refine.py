@@ -104,22 +104,23 @@ def _refine(
         parameters=values,
         grids=tuple(speeds),
     )
-    path = refinement.save(swims)
-    found = refinement.estimate(swims.grids)
+    total = refinement.estimate(swims.grids)
+    errors = [total.error(grid.cell) for grid in speeds]
     if as_json:
-        errors = [found.error(each.cell) for each in speeds]
-        print_json({"swims": swims, "estimate": found._asdict(), "grid_errors": errors})
-        return 0
-    finest = speeds[-1]
-    echo_rows(
-        [
-            ("controller", format_controller(name, values)),
-            ("order", _describe_order(found, len(speeds))),
-            ("limit", f"{text.format_measured(found.limit, None, 'm/s')} for small cells"),
-            ("speed", format_speed(finest.speed, finest.speed_ci95, found.error(finest.cell))),
-        ]
-    )
-    echo(path)
+        print_json({"swims": swims, "estimate": total._asdict(), "grid_errors": errors})
+    else:
+        finest = speeds[-1]
+        echo_rows(
+            [
+                ("controller", format_controller(name, values)),
+                ("order", _describe_order(total, len(speeds))),
+                ("limit", f"{text.format_measured(total.limit, None, 'm/s')} for small cells"),
+                ("speed", format_speed(finest.speed, finest.speed_ci95, errors[-1])),
+            ]
+        )
+    path = refinement.save(swims)  # after the result is shown: it may fail
+    if not as_json:
+        echo(path)
     return 0
 
 
@@ -128,10 +129,10 @@ def _format_grid(grid: GridSpeed) -> tuple[str, str]:
     return f"{1e3 * grid.cell:g} mm", f"{speed}, steps of {1e3 * grid.step:.3g} ms"
 
 
-def _describe_order(found: Estimate, grids: int) -> str:
+def _describe_order(estimate: Estimate, grids: int) -> str:
     if grids == 2:
-        return f"{found.used_order:g}, assumed: two grids do not show it"
-    observed = "none is observed" if found.order is None else f"{found.order:.2f} observed"
-    if found.is_converging:
+        return f"{estimate.used_order:g}, assumed: two grids do not show it"
+    observed = "none is observed" if estimate.order is None else f"{estimate.order:.2f} observed"
+    if estimate.is_converging:
         return observed
     return f"{observed}: not converging yet, so that the error is only a guess; use smaller cells"

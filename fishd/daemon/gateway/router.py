@@ -155,9 +155,8 @@ class Router:
             operation = protocol.decode_request(payload).op
             if self._known:
                 self._known.check(key, operation)
-            urgent = (
-                operation in URGENT_OPERATIONS and len(self._urgent) < MAX_OPEN_REQUESTS
-            )  # limits a flood of them
+            # A flood of urgent requests must not displace the others.
+            urgent = operation in URGENT_OPERATIONS and len(self._urgent) < MAX_OPEN_REQUESTS
             waiting = len(client.waiting)
             if waiting >= max(1, MAX_WAITING_REQUESTS // max(1, len(self._turns))) and not urgent:
                 raise Refused("busy", f"{waiting} of your requests are already waiting; slow down")

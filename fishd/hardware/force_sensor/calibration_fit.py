@@ -139,8 +139,17 @@ def _factor(residual_projection: _Vectors, errors: _Vectors, shape: _Vectors) ->
         modes.append(np.linalg.eigvalsh(spread.T @ (weight[:, axis, np.newaxis] * spread)))
     expected = np.concatenate(modes)
     freedom = expected.sum() ** 2 / (expected**2).sum()
-    widening = np.interp(-1.0 / max(freedom, 1.0), -1.0 / np.array(_FREEDOM), np.log(_STUDENT))
-    return float((weight * errors**2).sum() / expected.sum() * (np.exp(widening) / 1.96) ** 2)
+    widening = student95(freedom) / 1.96
+    return float((weight * errors**2).sum() / expected.sum() * widening**2)
+
+
+def student95(freedom: float) -> float:
+    """Return the half-width of a 95 % interval, in standard errors, by Student's t.
+
+    freedom: degrees of freedom. `fishd.lab.statistics` has it exactly, but needs SciPy.
+    """
+    quantile = np.interp(-1.0 / max(freedom, 1.0), -1.0 / np.array(_FREEDOM), np.log(_STUDENT))
+    return float(np.exp(quantile))
 
 
 def _with_load_error(covariance: _Vectors, gains: _Vectors, load_ci95: float) -> Covariance:

@@ -105,6 +105,7 @@ def swim(
     """
     controller = registry.create(name, parameters, replace(config.limits, virtual=True))
     parameter_values = msgspec.structs.asdict(controller.parameters)
+    grid_error = find_grid_error(config, name, parameter_values)  # raises before the swim
     ticks, first = count_ticks(seconds, settle, config.tick)
     if first + 1 >= ticks:
         raise ParameterError(
@@ -182,7 +183,7 @@ def swim(
                 mode=loop.supervisor.mode.value,
                 reason=loop.supervisor.reason,
                 fallback=loop.active.fallback,
-                grid_error=find_grid_error(config, name, parameter_values),
+                grid_error=grid_error,
                 real_time_factor=(len(track) - resumed_ticks) * config.tick / elapsed,
             )
     return SwimResult(

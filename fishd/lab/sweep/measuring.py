@@ -249,6 +249,8 @@ def swim_freely(
     controller = registry.create(
         point.controller, point.parameters, replace(config.limits, virtual=True)
     )
+    values = msgspec.structs.asdict(controller.parameters)
+    grid_error = find_grid_error(config, point.controller, values)  # raises before the swim
     track = Track()
     beat_starts: list[int] = []
     with VirtualRun(config, publisher) as run:
@@ -272,9 +274,8 @@ def swim_freely(
                 first = _find_first_row(track, beat_starts, lengths, config)
             if len(track) % _STOP_CHECK_TICKS == 0 and stop():
                 return None
-    values = msgspec.structs.asdict(controller.parameters)
     result = _make_result(track, beat_starts, first, lengths, config)
-    return replace(result, grid_error=find_grid_error(config, point.controller, values))
+    return replace(result, grid_error=grid_error)
 
 
 def _is_long_enough(track: Track, beat_starts: list[int], lengths: Lengths, tick: float) -> bool:

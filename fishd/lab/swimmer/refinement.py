@@ -9,10 +9,10 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 
 from fishd.config import Config
 from fishd.core import files
@@ -34,7 +34,7 @@ FILE = "swimmer-refinements.json"
 class GridSpeed(Struct, frozen=True, kw_only=True):
     """Speed of a swim on one grid."""
 
-    cell: float
+    cell: Annotated[float, Meta(gt=0.0)]
     """Size of the cells around the fish [m]."""
     step: float
     """Time step [s]."""
@@ -51,7 +51,7 @@ class Refinement(Struct, frozen=True, kw_only=True):
     """Settings of the fish, without those of the grid."""
     controller: str
     parameters: dict[str, Any]
-    grids: tuple[GridSpeed, ...]
+    grids: Annotated[tuple[GridSpeed, ...], Meta(min_length=2, max_length=3)]
     """Speeds, the coarsest grid first."""
 
 

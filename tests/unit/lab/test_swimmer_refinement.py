@@ -1,4 +1,4 @@
-"""Error of a speed by the grid: its order, its limit, and where it is stored and found."""
+"""Error of a speed by the grid: its order, its limit, and where it is stored and total."""
 
 import json
 from pathlib import Path
@@ -28,29 +28,29 @@ def test_speeds_that_converge_show_their_order_and_up_to_the_second_their_limit(
     order: float, ratio: float
 ) -> None:
     speeds = [0.13 - 0.004 * ratio ** (k * order) for k in (2, 1, 0)]
-    found = refinement.estimate(grids(*speeds, ratio=ratio))
-    assert found.order == pytest.approx(order)
-    assert found.is_converging
+    total = refinement.estimate(grids(*speeds, ratio=ratio))
+    assert total.order == pytest.approx(order)
+    assert total.is_converging
     if order <= 2.0:
-        assert found.limit == pytest.approx(0.13)
-        assert found.error(1e-3) == pytest.approx(1.25 * 0.004)
-        assert found.error(ratio * 1e-3) == pytest.approx(1.25 * 0.004 * ratio**order)
+        assert total.limit == pytest.approx(0.13)
+        assert total.error(1e-3) == pytest.approx(1.25 * 0.004)
+        assert total.error(ratio * 1e-3) == pytest.approx(1.25 * 0.004 * ratio**order)
 
 
 @pytest.mark.parametrize("speeds", [(0.09, 0.105, 0.119), (0.10, 0.12, 0.11), (0.10, 0.11, 0.13)])
 def test_speeds_that_do_not_converge_have_three_times_their_last_change_as_error(
     speeds: tuple[float, float, float],
 ) -> None:
-    found = refinement.estimate(grids(*speeds))
-    assert not found.is_converging
-    assert found.error(1e-3) == pytest.approx(3.0 * abs(speeds[2] - speeds[1]))
+    total = refinement.estimate(grids(*speeds))
+    assert not total.is_converging
+    assert total.error(1e-3) == pytest.approx(3.0 * abs(speeds[2] - speeds[1]))
 
 
 def test_two_grids_are_of_second_order_with_a_larger_factor_of_safety() -> None:
-    found = refinement.estimate(grids(0.10, 0.13))
-    assert (found.order, found.used_order) == (None, 2.0)
-    assert found.limit == pytest.approx(0.14)
-    assert found.error(1e-3) == pytest.approx(3.0 * 0.01)
+    total = refinement.estimate(grids(0.10, 0.13))
+    assert (total.order, total.used_order) == (None, 2.0)
+    assert total.limit == pytest.approx(0.14)
+    assert total.error(1e-3) == pytest.approx(3.0 * 0.01)
 
 
 def test_steps_of_all_grids_fit_into_a_tick() -> None:
@@ -80,16 +80,25 @@ def test_an_error_is_found_for_the_same_fish_and_gait_on_any_grid(
     assert refinement.find_grid_error(other, "square", PARAMETERS) is None
 
 
-def test_a_damaged_file_of_refinements_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+GRID = {"cell": 1e-3, "step": 5e-4, "speed": 0.1}
+ONE_GRID = {"fish": {}, "controller": "square", "parameters": {}, "grids": [GRID]}
+
+
+@pytest.mark.parametrize("content", ["[{]", json.dumps([ONE_GRID])])
+def test_a_damaged_file_of_refinements_is_named_before_a_swim_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    path = tmp_path / "fishd" / refinement.FILE
+    path, swim = tmp_path / "fishd" / refinement.FILE, tmp_path / "swim.npz"
     path.parent.mkdir()
-    path.write_text("[{]")
+    path.write_text(content)
     with pytest.raises(FishdError, match="remove it and run fishctl swimmer refine again") as error:
         refinement.find_grid_error(coarse(), "square", PARAMETERS)
     assert str(path) in str(error.value)
+    times = ("--for", "0.2", "--settle", "0.1")
+    line = one_line(fishctl("simulate", "square", *OPTIONS, *times, "--to", str(swim)))
+    assert str(path) in line
+    assert not swim.exists()
 
 
 @pytest.mark.slow

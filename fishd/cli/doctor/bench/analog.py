@@ -14,6 +14,7 @@ from fishd.core.clock import Clock, SystemClock
 from fishd.hardware import i2c
 from fishd.hardware.checks import Result, fail, ok, warning
 from fishd.hardware.force_sensor.ads1115 import Ads1115Settings
+from fishd.hardware.force_sensor.calibration_fit import student95
 
 SUPPLY_V, SUPPLY_TOLERANCE = 3.3, 0.05
 """Nominal voltage of a pin at level 1 [V], and the tolerated error of the slope, mostly of that."""
@@ -170,24 +171,20 @@ def measure_filter(
             )
     time_constant = _time_constant(rise, volts[0], volts[1])
     x, y = np.array(duties), np.array(volts)
-    (slope, offset), residuals = np.polyfit(x, y, 1), None
+    slope, offset = np.polyfit(x, y, 1)
     residuals = y - (slope * x + offset)
     freedom = len(x) - 2
     deviation = math.sqrt(float(residuals @ residuals) / freedom)
     slope_error = deviation / math.sqrt(float(((x - x.mean()) ** 2).sum()))
     return Filter(
         float(slope),
-        _T_95[freedom] * slope_error,
+        student95(freedom) * slope_error,
         float(offset),
         float(np.abs(residuals).max()),
         time_constant,
         duties,
         volts,
     )
-
-
-_T_95 = {1: 12.7, 2: 4.30, 3: 3.18, 4: 2.78, 5: 2.57, 6: 2.45}
-"""Quantile of Student's t for a 95 % confidence interval, by degrees of freedom."""
 
 
 def judge_filter(measured: Filter) -> Result:

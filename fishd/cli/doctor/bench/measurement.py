@@ -79,8 +79,11 @@ def check_wiring(context: Context, loop_gpio: int) -> None:
         raise ConfigError(
             f"robot: {config.robot} has no board to measure: robot: pi or virtual-pi is needed"
         )
-    used = {servo_gpio(context): "servo.gpio", config.panel.estop_gpio: "panel.estop_gpio"}
-    used[config.panel.led_gpio] = "panel.led_gpio"
+    used: dict[int | None, str] = {
+        swim.find_servo_gpio(context): "servo.gpio",
+        config.panel.estop_gpio: "panel.estop_gpio",
+        config.panel.led_gpio: "panel.led_gpio",
+    }
     if loop_gpio in used or loop_gpio in BUSY_PINS:
         raise ConfigError(
             f"--loop-gpio {loop_gpio}: {used.get(loop_gpio, 'a bus')} uses this pin; a free one is "
@@ -88,19 +91,9 @@ def check_wiring(context: Context, loop_gpio: int) -> None:
         )
 
 
-def servo_gpio(context: Context) -> int:
-    """Return the servo's pin; raise `ConfigError` if its driver has none on the header."""
-    gpio = getattr(context.config.servo, "gpio", None)
-    if gpio is None:
-        raise ConfigError(
-            f"servo.driver: {context.config.servo.driver} has no pin of the Pi's header to measure"
-        )
-    return int(gpio)
-
-
 def drawing(context: Context, loop_gpio: int) -> str:
     """Return a drawing of the two wires."""
-    servo = servo_gpio(context)
+    servo = swim.find_servo_gpio(context)
     pins = f"pin {HEADER_PINS[servo]} (GPIO {servo}, the servo's)"
     loop = f"pin {HEADER_PINS[loop_gpio]} (GPIO {loop_gpio})"
     return f"""\

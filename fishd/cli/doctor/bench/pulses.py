@@ -56,15 +56,16 @@ def summarise(pulses: Sequence[Pulse], sent: Sequence[float]) -> Pulses:
         missing=sum(frames) - len(frames),
         width=statistics.fmean(pulse.width for pulse in pulses),
         error=statistics.fmean(errors),
-        deviation_p99=_p99(deviations),
+        deviation_p99=find_p99(deviations),
         deviation_max=deviations[-1],
         period=mean * 1e3,
-        jitter_p99=_p99(jitter),
+        jitter_p99=find_p99(jitter),
         jitter_max=jitter[-1],
     )
 
 
-def _p99(ascending: Sequence[float]) -> float:
+def find_p99(ascending: Sequence[float]) -> float:
+    """Return the value that 99 % of the sorted values do not exceed."""
     return ascending[min(len(ascending) - 1, int(0.99 * len(ascending)))]
 
 

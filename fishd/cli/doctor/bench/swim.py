@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from fishd.cli.doctor.base import Context
 from fishd.cli.doctor.bench import cyclictest
-from fishd.cli.doctor.bench.pulses import Pulse, find_ending, find_pulses, summarise
+from fishd.cli.doctor.bench.pulses import Pulse, find_ending, find_p99, find_pulses, summarise
 from fishd.cli.doctor.bench.report import BenchReport, Ending, Lateness
 from fishd.client import Fish
-from fishd.core.errors import FishError, NoDaemon, StartupError
+from fishd.core.errors import ConfigError, FishError, NoDaemon, StartupError
 from fishd.core.process.safe_path import python_command
 from fishd.core.signals import Status, Tick
 from fishd.hardware.servo import pulses
@@ -56,6 +56,16 @@ class Bench(NamedTuple):
     loop_gpio: int
     seconds: float
     """Length of the swim [s]."""
+
+
+def find_servo_gpio(context: Context) -> int:
+    """Return the servo's pin; raise `ConfigError` if its driver has none on the header."""
+    gpio = getattr(context.config.servo, "gpio", None)
+    if gpio is None:
+        raise ConfigError(
+            f"servo.driver: {context.config.servo.driver} has no pin of the Pi's header to measure"
+        )
+    return int(gpio)
 
 
 @contextmanager
@@ -174,8 +184,7 @@ def _swim_for(fish: Fish, seconds: float) -> list[Tick]:
 
 def _percentiles(values: list[float]) -> tuple[float, float, float]:
     ordered = sorted(values)
-    last = len(ordered) - 1
-    return ordered[last // 2], ordered[min(last, int(0.99 * len(ordered)))], ordered[last]
+    return ordered[(len(ordered) - 1) // 2], find_p99(ordered), ordered[-1]
 
 
 def _loop_pulses(bench: Bench, edges: "dict[int, list[Edge]]") -> list[Pulse]:
@@ -183,7 +192,7 @@ def _loop_pulses(bench: Bench, edges: "dict[int, list[Edge]]") -> list[Pulse]:
     looped = find_pulses(edges[bench.loop_gpio])
     if len(looped) >= MIN_PULSES:
         return looped
-    servo_gpio = bench.context.config.servo.gpio  # type: ignore[attr-defined]
+    servo_gpio = find_servo_gpio(bench.context)
     sent = len(edges[servo_gpio])
     if sent < 2 * MIN_PULSES:
         raise MissingWire(f"pigpiod reports no pulses on GPIO {servo_gpio}, the servo's pin")
