@@ -28,12 +28,12 @@ def bench(pi: Pi, *options: str) -> tuple[int, dict[str, tuple[str, str]], dict[
     return done.returncode, findings, report
 
 
+@pytest.mark.realtime
 def test_a_wired_board_is_measured_from_its_bus_to_the_end_of_its_pulses(tmp_path: Path) -> None:
     with virtual_pi(tmp_path, *WIRED) as pi:
         status, findings, report = bench(pi)
     print(findings)
-    timed = {"i2c speed"}  # a busy machine looks like a slow bus
-    assert {level for name, (level, _) in findings.items() if name not in timed} == {"ok"}
+    assert {level for level, _ in findings.values()} == {"ok"}
     assert status == 0
     assert report["format"] == "fishd-bench 1"
     assert report["board"]["model"] == "virtual Pi"
