@@ -15,7 +15,8 @@ from fishd.core.errors import ConfigError, NoKey
 
 SECRET_FILE, PUBLIC_FILE, KNOWN_FILE = "key", "key.pub", "known"
 ROLES = ("watch", "drive")
-"""Roles of clients: `watch` receives telemetry and reads, `drive` may do everything."""
+"""Roles of clients: `watch` receives telemetry, reads and may request an emergency stop; `drive`
+may do everything."""
 
 _MAX_BYTES = 2**16
 _KEY = re.compile(r"[0-9A-Za-z.:+=^!/*?&<>()\[\]{}@%$#-]{40}")

@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import os
 import re
+import signal
 import sys
 from collections import deque
 from collections.abc import Iterator
@@ -12,6 +14,7 @@ from pathlib import Path
 import pytest
 import zmq
 from rigs.documents import FENCE, ROOT
+from rigs.gateway_processes import fork_server, gateways
 from rigs.keyed_daemon import KeyedDaemon
 from rigs.processes import (
     FISHCTL,
@@ -22,10 +25,12 @@ from rigs.processes import (
     call,
     one_line,
     sets,
+    wait_until,
 )
 from rigs.window_process import Browser, open_page, run, running_window
 
 from fishd.client import Fish, Refused
+from fishd.client.zmq_sockets import connect_subscriber
 from fishd.core.errors import NoKey
 
 SILENCE_S = 5.0
@@ -71,16 +76,19 @@ def test_a_client_with_the_role_drive_drives(as_client: type[Client]) -> None:
     assert fish.clear_fault().mode == "idle"
 
 
-def test_a_client_with_the_role_watch_reads_but_does_not_drive(
+def test_a_client_with_the_role_watch_reads_and_stops_but_does_not_drive(
     as_client: type[Client], keyed: KeyedDaemon
 ) -> None:
     fish = as_client.connect("watcher")
     assert next(fish.ticks()).seq
     assert fish.config()["network"]["control"] == keyed.endpoint
-    for command in (fish.stop, fish.estop, lambda: fish.set_controller("swing")):
+    assert fish.estop("danger").mode == "estop"
+    for command in (fish.stop, fish.clear_fault, lambda: fish.set_controller("swing")):
         with pytest.raises(Refused, match=r"needs the role drive; .* watcher, has the role watch"):
             command()
-    assert fish.status().mode == "idle"
+    assert keyed.fishctl("watcher", "estop").returncode == 0
+    assert fish.status().mode == "estop"
+    as_client.connect("driver").clear_fault()
     refused = keyed.fishctl("watcher", "set-controller", "swing")
     assert "'set-controller' needs the role drive" in one_line(refused)
 
@@ -160,6 +168,24 @@ def test_a_removed_key_ends_at_once_for_connections_that_exist(
         assert "no longer known" in waiting.finish()[2]
 
 
+def test_a_refused_subscriber_gets_telemetry_once_its_key_is_known(
+    as_client: type[Client], keyed: KeyedDaemon
+) -> None:
+    address = as_client.connect("driver").status().telemetry
+    access = as_client.connect("stranger").access
+    with zmq.Context() as context:
+        messages = connect_subscriber(context, address, b"tick", access=access)
+        monitor = messages.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL)
+        for _ in range(2):
+            assert monitor.poll(PATIENCE * 1e3)
+            monitor.recv_multipart()
+        keyed.add("watch", "stranger")
+        assert messages.poll(PATIENCE * 1e3)
+        assert messages.recv_multipart()[0] == b"tick"
+        context.destroy(linger=0)
+    keyed.remove("stranger")
+
+
 def test_a_change_of_role_holds_from_the_next_request_on(
     as_client: type[Client], keyed: KeyedDaemon
 ) -> None:
@@ -190,6 +216,23 @@ def test_a_malformed_line_lets_only_its_own_client_out(
     assert "known, line 3: 'drive KEY NAME'" in problem.message
 
 
+def test_a_malformed_line_from_a_restart_of_telemetry_is_named_once(
+    as_client: type[Client], tmp_path: Path
+) -> None:
+    keyed = as_client.keyed = KeyedDaemon(tmp_path, driver="drive")
+    as_client.stack.enter_context(keyed.running())
+    with Subscriber(keyed.daemon.telemetry, b"event") as subscriber:
+        subscriber.connected()
+        parent = fork_server(keyed.daemon)
+        wait_until(lambda: "keyed-tel" in gateways(keyed.daemon))
+        os.kill(parent, signal.SIGSTOP)
+        os.kill(gateways(keyed.daemon)["keyed-tel"], signal.SIGKILL)
+        keyed.write(f"{keyed.known.read_text()}nonsense\n")
+        os.kill(parent, signal.SIGCONT)
+        event = subscriber.until(kind="gateway", level="warning")
+    assert "fishd/known, line 3: 'drive KEY NAME'" in event["message"]
+
+
 def test_an_emptied_file_lets_no_client_in_but_not_while_it_is_written(
     as_client: type[Client], keyed: KeyedDaemon
 ) -> None:
@@ -211,6 +254,25 @@ def test_sockets_of_this_machine_need_no_key(keyed: KeyedDaemon) -> None:
     assert keyed.daemon.fishctl("stop").returncode == 0
     with Subscriber(keyed.daemon.telemetry) as subscriber:
         assert subscriber.until(mode="idle")
+
+
+def test_a_window_recovers_once_its_removed_key_is_known_again(
+    keyed: KeyedDaemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def watch(url: str) -> None:
+        async with Browser(url) as browser, open_page(browser) as page:
+            await page.until("ticks")
+            keyed.remove("stranger")
+            lost = await page.until("connection", lambda link: link["state"] == "lost")
+            assert "known to" in lost["message"]
+            keyed.add("watch", "stranger")
+            await page.until("connection", lambda link: link["state"] == "live")
+
+    keyed.add("watch", "stranger")
+    monkeypatch.setenv("FISHD_KEYS", str(keyed.folder / "stranger"))
+    with running_window(tmp_path, fish=keyed.endpoint) as window:
+        run(watch(window.url))
+    keyed.remove("stranger")
 
 
 def test_verbs_that_follow_telemetry_work_with_a_key(keyed: KeyedDaemon, tmp_path: Path) -> None:

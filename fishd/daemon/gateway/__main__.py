@@ -110,7 +110,7 @@ def _run(module: ModuleType, address: str, connection: socket.socket, listener: 
     server.bind(address)
     limits = ResourceLimits(module.MAX_MEMORY_BYTES, module.MAX_CONNECTIONS)
     with suppress(OSError):  # see below
-        connection.send(link.READY)
+        connection.send(link.READY + (known.mistake.encode() if known else b""))
     why = module.run(connection, server, limits, known)
     if why:
         with suppress(OSError):  # fishd has ended, or the link is full

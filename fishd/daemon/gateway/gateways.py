@@ -156,14 +156,14 @@ class _Peer:
             self._handle_loss("")
             return
         self._unanswered = 0
-        if message == READY:
+        if message.startswith(READY):
             self._serves = True
-            self._handle_ready()
+            self._handle_ready(message[1:].decode(errors="replace"))
         elif message != PONG:
             self._take(message)
 
-    def _handle_ready(self) -> None:
-        """Handle the message that the process has started to serve."""
+    def _handle_ready(self, mistake: str) -> None:
+        """Handle the message that the process has started to serve, in spite of a mistake."""
 
     def _take(self, message: bytes) -> None:
         raise NotImplementedError
@@ -301,6 +301,8 @@ class Gateway(_Peer):
         """Number of the process; 0 until the fork server has started it."""
         self._notice = ""
         """Limit that the process says it has exceeded."""
+        self._mistake = ""
+        """What the process found wrong with the file of known keys when it started."""
         self._started_at = 0.0
         """Time of the latest start [s]."""
         self._report_timer: asyncio.TimerHandle | None = None
@@ -418,8 +420,9 @@ class Gateway(_Peer):
             self._report_deadline = self._events.time() + MAX_REPORT_DELAY_S[self.kind]
             self._report_at(self._report_deadline)
 
-    def _handle_ready(self) -> None:
+    def _handle_ready(self, mistake: str) -> None:
         """Report a restart; of telemetry, when subscribers have had time to connect again."""
+        self._mistake = mistake
         if self._report_timer:
             pause = RECONNECT_TIME_S if self.kind in TELEMETRIES else 0.0
             self._report_at(min(self._report_deadline, self._events.time() + pause))
@@ -431,7 +434,8 @@ class Gateway(_Peer):
 
     def _report_restart(self) -> None:
         self._report_timer = None
-        self.on_restart(self._why or "its process ended")
+        why = self._why or "its process ended"
+        self.on_restart(why if self._mistake in why else f"{why}; {self._mistake}")
 
 
 class Gateways:

@@ -12,6 +12,8 @@ from fishd.core import keys
 from fishd.core.errors import ConfigError, Refused
 from fishd.core.protocol import READ_OPERATIONS
 
+WATCH_OPERATIONS = READ_OPERATIONS | {"estop"}
+"""Operations for which the role `watch` is enough."""
 SETTLE_TIME_S, EMPTY_SETTLE_TIME_S = 0.1, 1.0
 """Age of a change of the file from which on it is read, and of an empty file, which an editor may
 still write [s]."""
@@ -32,6 +34,8 @@ class KnownKeys:
         while not self._stamp:
             self._update()
             time.sleep(SETTLE_TIME_S / 10)
+        self.mistake: str = self._change
+        """What was wrong with the file at the start, or ""."""
         self._change = ""
 
     def find(self, key: str) -> keys.KnownKey | None:
@@ -68,7 +72,7 @@ class KnownKeys:
         client = self.find(key)
         if client is None:
             raise Refused("no-key", f"the key {key} is no longer known to fishd: see {self.path}")
-        if client.what != "drive" and operation not in READ_OPERATIONS:
+        if client.what != "drive" and operation not in WATCH_OPERATIONS:
             raise Refused(
                 "no-key",
                 f"'{operation}' needs the role drive; the key of this client, {client.name or key},"
@@ -85,11 +89,15 @@ class KnownKeys:
 
 
 def require_keys(server: "zmq.Socket[bytes]", secret: str, folder: str) -> KnownKeys:
-    """Let only clients with a key in this folder connect to a socket; call it before `bind`."""
+    """Let only clients with a key in this folder connect to a socket; call it before `bind`.
+
+    A client that sends requests hears that its key is not known. A subscriber hears nothing, and
+    its ZeroMQ tries again; after a refusal that it hears, it would not.
+    """
     known = KnownKeys(Path(folder))
     handshakes = server.context.socket(zmq.REP)
     handshakes.bind("inproc://zeromq.zap.01")
-    arguments = handshakes, known
+    arguments = handshakes, known, b"300" if server.socket_type == zmq.PUB else b"400"
     threading.Thread(target=_judge_handshakes, args=arguments, name="keys", daemon=True).start()
     server.set(zmq.CURVE_SERVER, 1)
     server.set(zmq.CURVE_SECRETKEY, secret.encode())
@@ -97,13 +105,13 @@ def require_keys(server: "zmq.Socket[bytes]", secret: str, folder: str) -> Known
     return known
 
 
-def _judge_handshakes(handshakes: "zmq.Socket[bytes]", known: KnownKeys) -> None:
+def _judge_handshakes(handshakes: "zmq.Socket[bytes]", known: KnownKeys, refusal: bytes) -> None:
     """Answer requests of ZeroMQ's authentication protocol (ZAP) until the context ends."""
     with suppress(zmq.ContextTerminated):
         while True:
             version, number, *_, raw_key = handshakes.recv_multipart()
             key = z85.encode(raw_key)
-            status = b"200" if known.find(key.decode()) else b"400"
+            status = b"200" if known.find(key.decode()) else refusal
             # A message of this client has its key as its User-Id.
             handshakes.send_multipart([version, number, status, b"", key, b""])
     handshakes.close()

@@ -11,7 +11,8 @@ KEYED_TELEMETRY, KEYED_CONTROL = "keyed-telemetry", "keyed-control"
 """Kinds of gateways; only clients with a known key connect to the latter two."""
 
 REQUEST, READY, NOTICE, END = b"?", b"^", b"!", b"."
-"""First bytes of a client's request, of the start and the end of a gateway, and of fishd's end."""
+"""First bytes of a client's request, of the start and the end of a gateway, and of fishd's end; a
+start may name a mistake in the file of known keys."""
 PING, PONG = b"~", b"-"
 """First bytes of a heartbeat and of the answer to it."""
 START, STARTED = b"*", b"/"
