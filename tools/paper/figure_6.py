@@ -107,13 +107,18 @@ def compute(jobs: int) -> None:
     """Compute every swim that is not in the table; each is stored when it ends."""
     cases = FINE.cases()
     rows = {case: row for case in cases if (row := FINE.row(case))}
-    missing = [case for case in cases if case not in rows]
-    missing.sort(key=lambda case: case.cell)  # start with the longest
+    missing = sorted((case for case in cases if case not in rows), key=_turn)
     parallel = joblib.Parallel(jobs, batch_size=1, return_as="generator_unordered")
     for case, result in parallel(joblib.delayed(_numbered)(case) for case in missing):
         rows[case] = _row(case, result)
         progress(FINE.name, f"{case}", f"{1e3 * (result.speed or 0.0):.2f} mm/s")
         write(FINE.name, [rows[each] for each in cases if each in rows])
+
+
+def _turn(case: Case) -> tuple[Any, ...]:
+    """Return a key that puts the swims of the left panel first, and the longest last."""
+    last = case.controller == "triangle"
+    return case.cell != FINE.cell, -case.cell, last, case.controller == "swing", case.setting
 
 
 def _numbered(case: Case) -> tuple[Case, SpeedResult]:

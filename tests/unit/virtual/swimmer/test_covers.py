@@ -134,10 +134,14 @@ def find_wall(surface: float, diffusion: float) -> float:
     return float(y[-1] - u[-1] / (u[-1] - u[-2]) - surface)
 
 
-@pytest.mark.parametrize("diffusion", [0.0016, 0.0032, 0.0064])
+@pytest.mark.parametrize(
+    ("diffusion", "wander", "mean"),
+    [(0.0005, 0.26, 0.02), (0.0016, 0.23, 0.05), (0.0032, 0.21, 0.07), (0.0064, 0.21, 0.09)],
+)
 def test_the_wall_that_water_feels_stays_near_the_surface_as_that_sweeps_a_cell(
-    diffusion: float,
+    diffusion: float, wander: float, mean: float
 ) -> None:
+    """A kernel without a slope, one cell wide, has 0.56 and 0.20."""
     offsets = [find_wall(surface, diffusion) for surface in np.arange(0.0, 1.0, 0.125)]
-    assert max(offsets) - min(offsets) < 0.25  # a kernel without a slope, one cell wide: 0.56
-    assert abs(float(np.mean(offsets))) < 0.1  # … 0.20
+    assert max(offsets) - min(offsets) < wander
+    assert abs(float(np.mean(offsets))) < mean
