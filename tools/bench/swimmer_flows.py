@@ -56,7 +56,7 @@ class GivenBody(Immersed):
         self._rates = rates
 
     def _solve(
-        self, beam: Beam, dt: float, moves: Array, momentum: Array, forces: Array | None
+        self, beam: Beam, dt: float, jacobian: Array, momentum: Array, forces: Array | None
     ) -> Array:
         """Return the rates that keep the total momentum of the body in all rigid motions."""
         self.time += dt
@@ -67,9 +67,9 @@ class GivenBody(Immersed):
         rigid = np.zeros((beam.size, 3))
         rigid[0, 0] = rigid[1, 1] = 1.0
         rigid[2:, 2] = 1.0
-        modes = (moves @ rigid).reshape(-1, 3)
-        mass = (self.mass @ (moves @ rigid)).reshape(-1, 3)
-        bent = (self.mass @ (moves @ shape)[:, :, None])[:, :, 0]
+        modes = (jacobian @ rigid).reshape(-1, 3)
+        mass = (self.mass @ (jacobian @ rigid)).reshape(-1, 3)
+        bent = (self.mass @ (jacobian @ shape)[:, :, None])[:, :, 0]
         return np.asarray(
             shape + rigid @ np.linalg.solve(modes.T @ mass, modes.T @ (momentum - bent).ravel())
         )

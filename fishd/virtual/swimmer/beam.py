@@ -107,10 +107,10 @@ class Beam:
 
     def motion(self, angle: Array) -> Array:
         """Return the Jacobian of vx, vy and θ̇ of the slices, shape (slices, 3, size)."""
-        moves = np.zeros((self.slices, 3, self.size))
-        moves[:, 0, 0] = moves[:, 1, 1] = 1.0
+        jacobian = np.zeros((self.slices, 3, self.size))
+        jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
         for row, lever in ((0, -np.sin(angle)), (1, np.cos(angle))):
             steps = self.spacing * lever[:, None] * self._weights
-            moves[:, row, 2:] = np.cumsum(steps, axis=0) - 0.5 * steps
-        moves[:, 2, 2:] = self._weights
-        return moves
+            jacobian[:, row, 2:] = np.cumsum(steps, axis=0) - 0.5 * steps
+        jacobian[:, 2, 2:] = self._weights
+        return jacobian

@@ -135,8 +135,10 @@ def _paint(  # pragma: no cover
 ) -> Covered:
     """Return the coverage of the faces in a box.
 
-    nearest, owner: square of the distance to the nearest slice, and its index; infinite and −1 in
-    between calls
+    The first loop finds the nearest slice of each face, the second the coverage by that slice.
+
+    nearest, owner: square of the distance to the nearest slice, and its index; infinite and −1
+        before and after each call
     """
     last = places.shape[0] - 1
     cosines, sines = np.cos(angle), np.sin(angle)
@@ -180,20 +182,20 @@ def _paint(  # pragma: no cover
             half = max(half_thickness[s] + taper[s] * along, 0.0)
             above, below = (half - across) / h, (-half - across) / h
             chi = kernel_integral(above) - kernel_integral(below)
-            beside = kernel_moment(above) - kernel_moment(below)
-            ahead = 0.0
+            moment_across = kernel_moment(above) - kernel_moment(below)
+            moment_along = 0.0
             if s == last or (s == 0 and not clamped):
                 outwards = 1.0 if s == last else -1.0
                 end = (outwards * along - 0.5 * spacing) / h
-                ahead = outwards * kernel_moment(end) * chi
+                moment_along = outwards * kernel_moment(end) * chi
                 inside = 1.0 - kernel_integral(end)
-                chi, beside = chi * inside, beside * inside
+                chi, moment_across = chi * inside, moment_across * inside
             if chi <= 0.0:
                 continue
             covered.i[count], covered.j[count], covered.owner[count] = i, j, s
             covered.chi[count] = chi
-            covered.mu1_x[count] = ahead * c - beside * n
-            covered.mu1_y[count] = ahead * n + beside * c
+            covered.mu1_x[count] = moment_along * c - moment_across * n
+            covered.mu1_y[count] = moment_along * n + moment_across * c
             count += 1
     return Covered(
         covered.i[:count], covered.j[:count], covered.owner[:count],
@@ -297,7 +299,7 @@ def impose(  # pragma: no cover
 
 
 @njit(cache=True)
-def cover(  # pragma: no cover
+def update_chi(  # pragma: no cover
     covered: Covered, chi: Field, fixed_chi: Field, sign: float
 ) -> None:
     """Write χ of covered faces: that of the fixed bodies, plus `sign` times that of this body."""

@@ -68,12 +68,12 @@ def estimate(settings: SwimmerSettings) -> Estimate:
     places, _ = beam.shape(bent)
     deflection = abs(float(places[-1, 1]))
     mass = (water.density + body.excess_density) * beam.share * beam.area
-    moves = beam.motion(np.zeros(beam.slices))[:, 1, 1:]
-    M = moves.T @ (mass[:, None] * moves)
+    jacobian = beam.motion(np.zeros(beam.slices))[:, 1, 1:]
+    M = jacobian.T @ (mass[:, None] * jacobian)
     half = 0.5 * body.length
     angle = np.arccos(beam.X / half - 1.0)
     for n in range(1, 21):
-        share = 2.0 / math.pi * beam.spacing / half * np.sin(n * angle) @ moves
+        share = 2.0 / math.pi * beam.spacing / half * np.sin(n * angle) @ jacobian
         M += water.density * math.pi * half**2 / n * np.outer(share, share)
     squares = np.sort(np.linalg.eigvals(np.linalg.solve(M, beam.K[1:, 1:])).real)
     omega = math.sqrt(max(float(squares[2]), 0.0))  # the first two modes are rigid motions

@@ -33,7 +33,7 @@ ADAMS_BASHFORTH = np.array(
 
 
 class Stencil(NamedTuple):
-    """Sizes around the values of one velocity component: those inside the boundaries.
+    """Sizes of the volumes around the values of one velocity component, inside the boundaries.
 
     u is inside at 1 ≤ i < nx, and v at 1 ≤ j < ny. Arrays along x count i, arrays along y count j,
     from the first value inside.
@@ -46,14 +46,14 @@ class Stencil(NamedTuple):
     inverse_size_x: Field
     inverse_size_y: Field
     inverse_gap_x: Field
-    """One over the distance to the value before, and at the end to that after the last [1/m]."""
+    """Inverse distances of values to those before, and of the last to that after it [1/m]."""
     inverse_gap_y: Field
     weight_x: Field
-    """Weight, for each j, of the value of u below in the mean of two that carries through the
-    right side of the volume."""
+    """Weights, for each j, of the first of the two values of u whose mean flows through the right
+    side of the volume: the left one for the volumes of u, the lower one for those of v."""
     weight_y: Field
-    """Weight, for each i, of the value of v to the left in the mean of two that carries through the
-    lower side."""
+    """Weights, for each i, of the first of the two values of v whose mean flows through the lower
+    side: the left one for the volumes of u, the lower one for those of v."""
 
 
 class Flow:
@@ -97,6 +97,7 @@ class Flow:
         """Sum of N(u) along x over all inner faces at these steps, from the boundaries [m³/s²]."""
         self._past_steps = 0
         """Number of steps whose rates are known, at most 2."""
+        # Distances between the centres of cells; at the ends, those to the mirror images.
         self._between_x = np.concatenate([grid.dx[:1], np.diff(grid.xc), grid.dx[-1:]])
         self._between_y = np.concatenate([grid.dy[:1], np.diff(grid.yc), grid.dy[-1:]])
         halves = np.full(grid.nx, 0.5), np.full(grid.ny, 0.5)
@@ -123,7 +124,7 @@ class Flow:
         self.u[0] = self.inlet
         _fill_ghosts(self._u, self._v, 1.0 if self._slip else -1.0)
         weights = ADAMS_BASHFORTH[self._past_steps]
-        numbers = *self.grid_velocity, self.viscosity, dt, *weights
+        scalars = *self.grid_velocity, self.viscosity, dt, *weights
         crossed = []
         for k, rates, predicted in (
             (0, self._rates_u, self.predicted_u),
@@ -131,7 +132,7 @@ class Flow:
         ):
             rates.insert(0, rates.pop())
             fields = (self._u, self._v)[k], self._u, self._v, self.p
-            crossed.append(_advance(k, *fields, *rates, predicted, self._stencils[k], *numbers))
+            crossed.append(_advance(k, *fields, *rates, predicted, self._stencils[k], *scalars))
         self._crossed = np.array([crossed[0], *self._crossed[:2]])
         self._past_steps = min(2, self._past_steps + 1)
         self.boundary_impulse = dt * float(weights @ self._crossed)
@@ -227,7 +228,7 @@ def _stencil(
 
 
 def _weights(sizes: Array) -> Array:
-    """Return the weight of the value before in each mean of two neighbours but the outermost."""
+    """Return the weight of the first value in the mean of each pair of neighbours."""
     return np.asarray(sizes[:-1] / (sizes[:-1] + sizes[1:]))
 
 
@@ -300,17 +301,18 @@ def _advance(  # pragma: no cover
 
     k: 0 for u, 1 for v; q: that component, with its ghost values
     rate: N(u), an output; rate1, rate2: those of the two steps before
+    wx, wy: velocity of the grid; nu: viscosity; new, old, older: weights of the three rates
     """
     real = q.dtype.type
     weights = flux_weights(real)
     speed_x, speed_y, viscosity = real(wx), real(wy), real(nu)
-    step, none, one = real(dt), real(0.0), real(1.0)
+    step, zero, one = real(dt), real(0.0), real(1.0)
     a0, a1, a2 = real(dt * new), real(dt * old), real(dt * older)
     first_i, first_j = 1 - k, k
     rows, n = stencil.size_x.size, stencil.size_y.size
     low, high = PAD + first_j, PAD + first_j + n
     west, east, south = np.empty(n, q.dtype), np.empty(n, q.dtype), np.empty(n + 1, q.dtype)
-    share, inverse_gap_y = stencil.weight_x[:n], stencil.inverse_gap_y[: n + 1]
+    weight_x, inverse_gap_y = stencil.weight_x[:n], stencil.inverse_gap_y[: n + 1]
     inverse_y = stencil.inverse_size_y[:n]
     crossed = 0.0
     for row in range(-1, rows):
@@ -321,7 +323,7 @@ def _advance(  # pragma: no cover
         left, right = u[a + k, low - k : high - k], u[a + 1, low:high]
         diffusion = viscosity * stencil.inverse_gap_x[row + 1]
         for j in range(n):
-            speed = share[j] * left[j] + (one - share[j]) * right[j] - speed_x
+            speed = weight_x[j] * left[j] + (one - weight_x[j]) * right[j] - speed_x
             east[j] = face_flux(speed, before2[j], before[j], after[j], after2[j], weights) - (
                 diffusion * (after[j] - before[j])
             )
@@ -334,15 +336,15 @@ def _advance(  # pragma: no cover
             below2, below = q[a, low - 2 : high - 1], q[a, low - 1 : high]
             above, above2 = q[a, low : high + 1], q[a, low + 1 : high + 2]
             lower, upper = v[a - 1 + k, low - k : high + 1 - k], v[a, low : high + 1]
-            part = stencil.weight_y[row]
+            weight_y = stencil.weight_y[row]
             for j in range(n + 1):
-                speed = part * lower[j] + (one - part) * upper[j] - speed_y
+                speed = weight_y * lower[j] + (one - weight_y) * upper[j] - speed_y
                 south[j] = face_flux(speed, below2[j], below[j], above[j], above2[j], weights) - (
                     viscosity * inverse_gap_y[j] * (above[j] - below[j])
                 )
             crossed -= (float(south[n]) - float(south[0])) * stencil.size_x[row]
             inverse_x = stencil.inverse_size_x[row]
-            along, across = (inverse_x, none) if k == 0 else (none, one)
+            along, across = (inverse_x, zero) if k == 0 else (zero, one)
             after_p, before_p = p[i, first_j : first_j + n], p[i - 1 + k, :n]
             now, then = rate[i, first_j : first_j + n], rate1[i, first_j : first_j + n]
             earlier, out = rate2[i, first_j : first_j + n], predicted[i, first_j : first_j + n]
@@ -381,7 +383,10 @@ def _divergence(  # pragma: no cover
 def _correct_u(  # pragma: no cover
     predicted: Field, change: Field, inverse_size: Field, dt: float, u: Field
 ) -> None:
-    """Write u* minus the new pressure's push, inside the boundaries; u: with its ghost values."""
+    """Write u* minus Δt times the gradient of the change of pressure, inside the boundaries.
+
+    u: an output, with its ghost values
+    """
     nx, ny = change.shape
     for i in range(1, nx):
         scale = u.dtype.type(dt) * inverse_size[i - 1]
@@ -394,7 +399,10 @@ def _correct_u(  # pragma: no cover
 def _correct_v(  # pragma: no cover
     predicted: Field, change: Field, inverse_size: Field, dt: float, v: Field
 ) -> None:
-    """Write v* minus the new pressure's push, inside the boundaries; v: with its ghost values."""
+    """Write v* minus Δt times the gradient of the change of pressure, inside the boundaries.
+
+    v: an output, with its ghost values
+    """
     nx, ny = change.shape
     step = v.dtype.type(dt)
     for i in range(nx):

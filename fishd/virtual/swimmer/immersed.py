@@ -16,15 +16,15 @@ from fishd.virtual.swimmer.covers import (
     Covered,
     Painter,
     circle,
-    cover,
     gather,
     impose,
+    update_chi,
     weigh_cells,
 )
 from fishd.virtual.swimmer.flow import Flow
 from fishd.virtual.swimmer.grid import MAX_SIZE_RATIO, Array, Field
 
-IMPLICIT = 0.55
+IMPLICIT_FRACTION = 0.55
 """Fraction of the new shape in the elastic forces of a step; with 0.5, the shortest waves of the
 beam would not decay."""
 _DIAGONAL = np.arange(3)
@@ -71,7 +71,7 @@ class Immersed:
         self._fixed = on_u, on_v
         for covered, fixed in zip(self._fixed, self._fixed_chi, strict=True):
             fixed[covered.i, covered.j] = covered.chi
-        self._cover(self._fixed, 0.0)
+        self._update_coverage(self._fixed, 0.0)
 
     def step(self, dt: float, forces: Array | None = None) -> None:
         """Advance by `dt` [s]; forces: those on the beam's unknowns in the middle of the step."""
@@ -99,13 +99,13 @@ class Immersed:
             impose(1, on_v, flow.predicted_v, motion, places, at_v, h),
         )
 
-    def _cover(self, covered: tuple[Covered, Covered], sign: float) -> None:
+    def _update_coverage(self, covered: tuple[Covered, Covered], sign: float) -> None:
         """Update χ of these faces and the weights of the divergence of the cells beside them.
 
         sign: 1 to add this body to the fixed one, 0 to remove it
         """
         for on_faces, chi, fixed in zip(covered, self._chi, self._fixed_chi, strict=True):
-            cover(on_faces, chi, fixed, sign)
+            update_chi(on_faces, chi, fixed, sign)
         for k in (0, 1):
             weigh_cells(k, covered[k], *self._chi, self._divergence_weight)
 
@@ -125,28 +125,28 @@ class Immersed:
         for k, covered, predicted in ((0, on_u, flow.predicted_u), (1, on_v, flow.predicted_v)):
             water = predicted, places, self._positions[k], self._cell_mass, h
             gather(k, covered, *water, self.mass, momentum)
-        moves = beam.motion(angle)
-        rate = self._solve(beam, dt, moves, momentum, forces)
-        self.velocity = moves @ rate
+        jacobian = beam.motion(angle)
+        rate = self._solve(beam, dt, jacobian, momentum, forces)
+        self.velocity = jacobian @ rate
         self.force = ((self.mass @ self.velocity[:, :, None])[:, :, 0] - momentum) / dt
         self._impose((on_u, on_v), self.velocity, places)
         beam.q = beam.q + dt * (0.5 * (rate + beam.rate) - travel)
         self._before, beam.rate = beam.rate, rate
         if self._covered:
-            self._cover(self._covered, 0.0)
+            self._update_coverage(self._covered, 0.0)
         self._covered = on_u, on_v
-        self._cover(self._covered, 1.0)
+        self._update_coverage(self._covered, 1.0)
 
     def _solve(
-        self, beam: Beam, dt: float, moves: Array, momentum: Array, forces: Array | None
+        self, beam: Beam, dt: float, jacobian: Array, momentum: Array, forces: Array | None
     ) -> Array:
         """Return the rates of the unknowns at the end of the step, from the total momentum."""
-        flat = moves.reshape(-1, beam.size)
+        flat = jacobian.reshape(-1, beam.size)
         total_mass = self.mass.copy()
         total_mass[:, _DIAGONAL, _DIAGONAL] += beam.excess
-        M = flat.T @ (total_mass @ moves).reshape(-1, beam.size)
+        M = flat.T @ (total_mass @ jacobian).reshape(-1, beam.size)
         momenta = flat.T @ (momentum + beam.excess * self.velocity).ravel()
-        reach = 0.5 * IMPLICIT * dt
+        reach = 0.5 * IMPLICIT_FRACTION * dt
         momenta -= dt * (beam.K @ (beam.q + reach * beam.rate))
         if forces is not None:
             momenta += dt * forces
