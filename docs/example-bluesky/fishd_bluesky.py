@@ -49,7 +49,7 @@ class Task:
 
 
 class Frequency:
-    """Frequency of the tail: what a scan moves."""
+    """Frequency of the tail, which a scan sets."""
 
     def __init__(self, fish: "SwimmingFish") -> None:
         self.name, self.parent = f"{fish.name}_frequency", fish
@@ -72,7 +72,7 @@ class Frequency:
 
 
 class SwimmingFish:
-    """Fish under the control of a plan, from `stage` to `unstage`: what a scan reads."""
+    """Fish under the control of a plan, from `stage` to `unstage`; a scan reads its thrust."""
 
     parent = None
 

@@ -80,8 +80,6 @@ class CameraClient:
         """Newest frame as the camera sent it."""
         self.view: PublishedView | None = None
         """Newest picture for people."""
-        self.strange = 0
-        """Number of messages that could not be decoded, or had another version."""
         self.missed = 0
         """Number of frames that were sent but did not arrive."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
@@ -278,7 +276,6 @@ class CameraClient:
             except zmq.Again:
                 break
             except BadMessage as error:
-                self.strange += 1
                 self._last_problem = str(error)
                 continue
             if isinstance(message, PublishedFrame):

@@ -150,7 +150,7 @@ def _rows(report: "Report", config: Config, settle: float) -> list[tuple[str, st
             f"{report.relative_thrust:.1%} of the best square wave at ±{report.amplitude:g} rad",
         ),
         ("", f"({best}, where half beats need not be whole ticks)"),
-        *([("", _ROUNDING_NOTE)] if config.robot == "virtual-pi" else []),
+        *([("", _ROUNDING_NOTE)] if config.kind.is_virtual else []),
         (
             "timing",
             f"{report.ticks} ticks of {report.microseconds_per_tick:.0f} µs, "

@@ -118,11 +118,12 @@ def check_drivers(robot: str, tick: float, driver_settings: DriverSettings) -> N
 
     tick: period of the loop [s]
     """
-    if not find_kind(robot).has_hardware:  # their loop may be faster than the hardware permits
+    kind = find_kind(robot)
+    if not kind.has_hardware:  # their loop may be faster than the hardware permits
         tick = math.inf
     for section, settings in driver_settings.sections().items():
         driver: type[Driver[Any]] = find_driver(section, settings.driver)
-        if robot == "virtual-pi" and not driver.on_virtual_pi:
+        if kind.is_virtual and not driver.on_virtual_pi:
             raise Problem(
                 (section, "driver"),
                 f"'{settings.driver}' is not valid: the virtual Pi has an ADS1115, pigpiod and an "

@@ -12,6 +12,8 @@ class RobotKind(NamedTuple):
     """Whether its time is that of the computer's clock, so that a tick can be late."""
     has_hardware: bool = False
     """Whether it has drivers and calibrations, for parts that are real or emulated."""
+    is_virtual: bool = False
+    """Whether that hardware is emulated: a virtual Pi."""
     extra: str = ""
     """Extra of the package fishd that it needs, such as `pi`; empty for none."""
 
@@ -19,7 +21,7 @@ class RobotKind(NamedTuple):
 ROBOTS = {
     "simulated": RobotKind(),
     "pi": RobotKind(has_hardware=True, extra="pi"),
-    "virtual-pi": RobotKind(has_hardware=True, extra="pi"),
+    "virtual-pi": RobotKind(has_hardware=True, is_virtual=True, extra="pi"),
     "swimmer": RobotKind(is_tethered=False, is_real_time=False, extra="swimmer"),
 }
 """Kind of each robot, by its name in the configuration and in `Status.robot`."""

@@ -30,8 +30,8 @@ class Machine(ABC):
 
     @property
     @abstractmethod
-    def robot(self) -> str:
-        """`pi` or `virtual-pi`."""
+    def is_virtual(self) -> bool:
+        """Whether the robot's hardware is a virtual Pi, beside this machine."""
 
     @property
     def model(self) -> str:

@@ -272,7 +272,8 @@ def learning() -> Iterator[Claim]:
     yield Claim(
         "from images: 4 frames of 84 × 84, compressed to 512 numbers",
         "settings of [learning-camera-paper.yaml](../../config/learning-camera-paper.yaml); the "
-        "points of figure 3 have the eye `modes`, see [the camera](../how-to/camera.md)",
+        "points of figure 3 have the feature extractor `modes`, see "
+        "[the camera](../how-to/camera.md)",
         None,
     )
 

@@ -170,8 +170,8 @@ def sections() -> list[tuple[str, str, str]]:
         ],
     )
     every = (
-        f"{everything}\n\nEach cell is the median of {SEEDS} runs; two of one cell differ by no "
-        f"more than {percent(spread[widest])} points "
+        f"{everything}\n\nEach cell is the median of {SEEDS} runs; two runs of one cell differ by "
+        f"no more than {percent(spread[widest])} points "
         f"(C = {CRITERIA[widest[0]]:g} and ω₀Φ/Ω = {RATIOS[widest[1]]:g})."
     )
     detailed = f"{claims}\n\nC = {RECOMMENDED:g} in detail, in %:\n\n{details}"

@@ -157,9 +157,9 @@ def soak_virtual_pi(ticks: int, seed: int) -> str:
             memory.after(slot.index + 1)
         counters = robot.counters()
     spelled = ", ".join(f"{count} {name}" for name, count in sorted(injected.items()))
-    survived = ", ".join(f"{count} {name}" for name, count in counters.items())
+    recovered = ", ".join(f"{count} {name}" for name, count in counters.items())
     line = verdict(f"virtual Pi, {ticks} ticks", publisher, memory)
-    return f"{line}; injected: {spelled}; survived: {survived}"
+    return f"{line}; injected: {spelled}; recovered from: {recovered}"
 
 
 def soak_channels(reads: int, seed: int) -> str:
@@ -192,10 +192,10 @@ def soak_channels(reads: int, seed: int) -> str:
                 raise BrokenPromise(f"read {2 * pairs}: {measurement}")
             pairs += measurement.samples
         errors = sensor.counters()
-    survived = ", ".join(f"{count} {name}" for name, count in errors.items())
+    recovered = ", ".join(f"{count} {name}" for name, count in errors.items())
     return (
         f"channels, {2 * pairs} reads with 1 % failing transfers: no value of the wrong channel; "
-        f"survived: {survived}; {failures} windows without a pair"
+        f"recovered from: {recovered}; {failures} windows without a pair"
     )
 
 

@@ -169,7 +169,7 @@ class Chip:
         self._counts_per_us = 1e-6 * settings.oscillator / (self.pre_scale + 1)
 
     def set_up(self, sleep: Callable[[float], None]) -> None:
-        """Wake the chip at our frequency; a channel without pulses gets none."""
+        """Start the oscillator with the frequency of the settings; no channel begins pulses."""
         mode = self.read(MODE1)
         if self.read(PRE_SCALE) != self.pre_scale:
             self._write(MODE1, mode & ~RESTART | SLEEP)

@@ -124,9 +124,9 @@ class Context(Machine):
     """Folder that holds /sys, /proc, /dev and so on."""
 
     @property
-    def robot(self) -> str:
-        """Robot of the configuration."""
-        return self.config.robot
+    def is_virtual(self) -> bool:
+        """Whether the hardware of the robot is a virtual Pi."""
+        return self.config.kind.is_virtual
 
     @cached_property
     def daemon(self) -> Running | Unreachable | None:
@@ -188,7 +188,7 @@ class Context(Machine):
     def plugged_in(self) -> Iterator[None]:
         """Attach the bus to this process if the robot is a virtual Pi; raise `StartupError`."""
         with ExitStack() as stack:
-            if self.robot == "virtual-pi":
+            if self.is_virtual:
                 assembly.plug_in_virtual_pi(self.config, stack)
             yield
 

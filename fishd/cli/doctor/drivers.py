@@ -85,8 +85,8 @@ def force(context: Context) -> Result:
     except MissingPackage:
         raise
     except (ConfigError, StartupError) as error:
-        virtual = config.robot == "virtual-pi"
-        return fail(str(error), START_VIRTUAL_PI if virtual else "mend what this line says")
+        remedy = START_VIRTUAL_PI if context.is_virtual else "mend what this line says"
+        return fail(str(error), remedy)
     except SensorError as error:
         return fail(str(error), "mend what the lines above say first")
     suspicions = [suspicion for _, suspicion in trials if suspicion]

@@ -64,7 +64,7 @@ def packages(context: Context) -> Result:
     ]
     if problems:
         return fail("; ".join(problems), install_command(kind.extra))
-    user = f"robot {context.robot}" + (f" with {' and '.join(drivers)}" if drivers else "")
+    user = f"robot {context.config.robot}" + (f" with {' and '.join(drivers)}" if drivers else "")
     return ok(f"all {len(requirements)} that {user} needs, under {sys.executable}")
 
 

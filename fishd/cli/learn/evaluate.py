@@ -73,7 +73,7 @@ def evaluate(
     Exit status 1 when a run ends in mode fault.
     """
     from fishd.lab import drawing
-    from fishd.lab.compare import survey_figure
+    from fishd.lab.compare import figures
     from fishd.lab.compare.contestants import parse
     from fishd.lab.compare.survey import CHANGES, harsh_fish, survey
 
@@ -87,7 +87,7 @@ def evaluate(
     with show_progress(len(parsed) * len(fish) * seconds, "s swum") as bar:
         surveys = survey(configs, parsed, seconds, settle, bar.at)
     if picture:
-        survey_figure.draw(picture, surveys)
+        figures.draw_survey(picture, surveys)
     if as_json:
         print_json(surveys)
     else:

@@ -217,8 +217,7 @@ class Pigpio(ServoDriver[PigpioSettings]):
 
 def _pigpiod(machine: Machine, settings: PigpioSettings) -> Result:
     """Check pigpiod through fishd's own client, which has a time limit for every step."""
-    virtual = machine.robot == "virtual-pi"
-    if not virtual and "Raspberry Pi 5" in machine.model:
+    if not machine.is_virtual and "Raspberry Pi 5" in machine.model:
         return fail("pigpio does not work on a Pi 5", "set servo.driver: sysfs-pwm")
     from fishd.hardware.servo.pigpio_client import open_client
 
@@ -229,7 +228,7 @@ def _pigpiod(machine: Machine, settings: PigpioSettings) -> Result:
             duration = time.monotonic() - started
     except ServoError as error:
         is_frozen = "answer" in str(error)
-        if virtual:
+        if machine.is_virtual:
             remedy = f"{START_VIRTUAL_PI}; its port must be that of servo.port"
         elif is_frozen:
             remedy = "sudo systemctl restart pigpiod"

@@ -1,4 +1,4 @@
-"""Figure of a comparison: command, fin, force and result of each contestant."""
+"""Figures of a comparison and of a survey: what each contestant does, and its thrust."""
 
 import math
 import os
@@ -10,9 +10,12 @@ import numpy as np
 from fishd.core import text
 from fishd.core.beats import upward_reversals
 from fishd.lab.compare.comparison import TRACE_S, Standing, Trace
-from fishd.lab.drawing import BLACK, BLUE, ORANGE, open_figure, plain
+from fishd.lab.compare.survey import ContestantSurvey
+from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, open_figure, plain
 
 _WHISKER_GREY = "0.2"
+_COLOURS, _MARKERS = (BLUE, ORANGE, GREEN, PURPLE, BLACK), "osD^v"
+"""Colour and marker of each contestant of a survey."""
 _FORCES = ("$F_x$, drift subtracted", "$F_x$ as measured")
 """Labels of the force, for a real fish and for a simulated one."""
 _THRUSTS = ("thrust, measured", "true mean $F_x$")
@@ -63,6 +66,29 @@ def draw(
         legends = [axis.get_legend_handles_labels() for axis in axes[0]]
         handles, labels = ([item for pair in legends for item in pair[k]] for k in (0, 1))
         figure.legend(handles, labels, loc="outside lower left", ncols=3)
+
+
+def draw_survey(path: str | os.PathLike[str], surveys: Sequence[ContestantSurvey]) -> None:
+    """Draw a row for each fish, and in it a mark for each contestant; raises `FishdError`."""
+    names = [result.fish for result in surveys[0].fish]
+    with open_figure(path, (6.4, 1.1 + 0.2 * len(names))) as figure:
+        axis = figure.subplots()
+        for place, surveyed in enumerate(surveys):
+            axis.plot(
+                [100.0 * result.relative_thrust for result in surveyed.fish],
+                range(len(names)),
+                linestyle="",
+                marker=_MARKERS[place % len(_MARKERS)],
+                color=_COLOURS[place % len(_COLOURS)],
+                alpha=0.8,
+                label=plain(surveyed.contestant),
+            )
+        axis.axvline(100.0, color=GREY, linewidth=0.7, linestyle="--")
+        axis.set_yticks(range(len(names)), names)
+        axis.invert_yaxis()
+        axis.grid(axis="y", color="0.9", linewidth=0.5)
+        axis.set_xlabel("thrust, % of the best square wave of the same fish")
+        figure.legend(loc="outside lower center", ncols=2)
 
 
 def _from_upward_reversal(trace: Trace) -> Trace:

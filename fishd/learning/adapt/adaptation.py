@@ -52,7 +52,7 @@ class Adaptation:
         """
         session: entered by the caller; the plant and the rig of its configuration are not used
         tank_time: time for all steps that need the fish, rests included [s]; at least
-            `steps.MIN_TANK_TIME_S`
+            150, so that the excitation takes 30, the shortest time that a fit accepts
         steps: number of steps of the training
         """
         self._session = session

@@ -64,8 +64,6 @@ MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ = 0.3, 8.0
 """Bounds of the search of square waves, whatever the fit [Hz]."""
 BUDGET = {"excitation": 0.2, "swing": 0.14, "search": 0.2}
 """Shares of the tank time; the comparison uses the remainder."""
-MIN_TANK_TIME_S = 150.0
-"""Shortest tank time [s]: its excitation takes 30 s, the shortest that a fit accepts."""
 CLOUD_SIZE = 32
 """Number of fish in the cloud."""
 EPISODE = 128

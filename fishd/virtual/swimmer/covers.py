@@ -35,12 +35,6 @@ class Covered(NamedTuple):
     mu1_y: Array
     """First moment μ₁ along y of the water in the kernel [cells]."""
 
-    def dense(self, shape: tuple[int, int]) -> Array:
-        """Return χ of all faces, an array of this shape."""
-        chi = np.zeros(shape)
-        chi[self.i, self.j] = self.chi
-        return chi
-
 
 @njit(inline="always")
 def kernel_integral(r: float) -> float:  # pragma: no cover

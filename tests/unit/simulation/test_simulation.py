@@ -20,8 +20,6 @@ from fishd.virtual.imperfections import Imperfections
 from fishd.virtual.plant.base import TrueWindow
 from fishd.virtual.plant.optimum import square_wave
 
-REALISTIC = ["simulation.offset_y=0.02", "simulation.drift=0.02", "simulation.rotation=0.1"]
-
 
 @pytest.mark.parametrize("start", [0.0, 12_345.67])
 def test_the_same_seed_drifts_in_the_same_way_whenever_it_starts(start: float) -> None:

@@ -60,7 +60,6 @@ HEADER_PINS = {
     21: 40,
 }
 """Pin of the 40-pin header by GPIO."""
-LOOP_GPIO = 23
 BUSY_PINS = (0, 1, 2, 3, 14, 15)
 """GPIOs of buses, which change for other reasons."""
 WIDTHS = 5
@@ -169,7 +168,7 @@ def _measure_adc(bench: Bench, report: BenchReport) -> Iterator[tuple[str, Resul
             import adafruit_extended_bus  # noqa: F401
         with context.plugged_in():
             configured: float | None = read_bit_rate(context, settings.bus)
-            if context.robot == "virtual-pi":
+            if context.is_virtual:
                 configured = context.config.virtual_pi.bus_speed
             with analog.open_bus(settings) as bus:
                 report.bus = analog.measure_bus(bus, settings.address, configured)
@@ -278,7 +277,7 @@ def describe_board(context: Context) -> Board:
     lines = context.text("/etc/os-release").splitlines()
     names = [line.partition("=")[2].strip('"') for line in lines if line.startswith("PRETTY_NAME=")]
     return Board(
-        model="virtual Pi" if context.robot == "virtual-pi" else context.model,
+        model="virtual Pi" if context.is_virtual else context.model,
         architecture=f"{kernel.machine}, {platform.architecture()[0]}",
         system=names[0] if names else "unknown system",
         kernel=kernel.release,
