@@ -54,7 +54,7 @@ class Sample(NamedTuple):
     phi_c: float
     """Instruction angle from this tick on [rad]."""
     swims: bool
-    """True while a controller swims the fish."""
+    """Whether a controller drives the fish."""
     watts: float = math.nan
     """Mean electrical power of the servo since the tick before [W]; NaN where unknown."""
 
@@ -498,9 +498,8 @@ def _cut_blocks(phase: Sequence[Sample], tick: float, first: int, settle: float)
         # The force of a tick is the mean over the period before it; its angle applies after it.
         window = phase[start + 1 : end + 1]
         beat_count, beats, cut_index = beats, 0, index
-        if phase[end].seq - phase[start].seq != len(
-            window
-        ):  # a tick was lost: the beats are not whole
+        is_whole = phase[end].seq - phase[start].seq == len(window)
+        if not is_whole:  # a tick was lost
             continue
         yield Block(
             time=(0.5 * (phase[start].seq + phase[end].seq) - first) * tick,

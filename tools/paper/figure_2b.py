@@ -128,6 +128,6 @@ def draw() -> None:
         panels[-1].set_xlabel("time (s)")
         panels[-1].set_xlim(0.0, float(time[-1]) + FINE_TICK)
         panels[0].set_title(
-            "lines: best square wave in the loop; dots: optimal control, not told the shape",
+            "lines: best square wave in the loop; dots: optimal control of any shape",
             fontweight="normal",
         )

@@ -51,7 +51,7 @@ _POOR_RESIDUAL = 0.02
     default=DEFAULT_LOAD_ERROR,
     show_default=True,
     help="Largest error that all loads have in common, as a fraction of a load, such as that of "
-    "the scale. No fit can see it; it becomes part of the calibration's uncertainty.",
+    "the scale. No fit can find it; it becomes part of the calibration's uncertainty.",
 )
 @click.option(
     "--loads",
@@ -85,7 +85,7 @@ def force(
     """Calibrate the force sensor with known loads.
 
     You hang the loads: none at first, then one each along +x, -x, +y and -y, and these four
-    again: how the two differ shows how well the gains are known. F_x is positive forward, F_y to
+    again: their differences show how well the gains are known. F_x is positive forward, F_y to
     the fish's left. The daemon measures. Nothing changes before you have seen the fit and
     confirmed it.
     """
@@ -158,13 +158,13 @@ def _explain_doubtful_sign(
         return ""
     if reversed_now:
         return (
-            "F_y is reversed, as was seen when the tail last set off, and this calibration leaves "
-            "it so: were +y and -y interchanged? If not, the servo turns the wrong way: "
+            "F_y is reversed, as the last start of the tail has shown, and this calibration leaves "
+            "it reversed: were +y and -y interchanged? If not, the servo turns the wrong way: "
             "'fishctl calibrate servo'"
         )
     return (
-        "this calibration turns F_y round, which was right when the tail last set off: were +y and "
-        "-y interchanged?"
+        "this calibration reverses F_y, whose sign was right at the last start of the tail: were "
+        "+y and -y interchanged?"
     )
 
 

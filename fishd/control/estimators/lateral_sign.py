@@ -79,7 +79,7 @@ class LateralSign:
         if not self.reversed:
             return ""
         return (
-            "F_y is reversed: it pushed the way in which the tail set off, "
+            "F_y is reversed: it pushed in the direction in which the tail began to move, "
             f"{CONSEQUENCES[self.treatment]}; where a positive angle moves the tail to the fish's "
             "left, mend F_y with 'fishctl calibrate force' (+y pulls to its left), else "
             "servo.direction with 'fishctl calibrate servo'"

@@ -69,7 +69,6 @@ def _draw_fit(axis: Any, fitted: Fitted) -> None:
     places = np.arange(len(shown))[::-1]
     axis.barh(places, [width for _, width in shown], color=BLUE, height=0.6)
     axis.set_yticks(places, [name for name, _ in shown])
-    axis.set_xscale("log")
     axis.set_xlabel("half-width of the 95 % interval, % of the value")
     axis.set_title("the fish, as fitted")
 

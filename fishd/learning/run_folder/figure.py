@@ -57,7 +57,7 @@ def draw_training(axis: Any, folder: Path) -> None:
         return
     steps = [evaluation.steps for evaluation in evaluations]
     for shares, label, colour in (
-        ([evaluation.relative_thrust for evaluation in evaluations], "its fish", BLUE),
+        ([evaluation.relative_thrust for evaluation in evaluations], "fish of the training", BLUE),
         ([item.lowest_relative_thrust for item in evaluations], "worst fish tried", PURPLE),
     ):
         if any(share is not None for share in shares):

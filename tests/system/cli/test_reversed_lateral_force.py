@@ -13,7 +13,7 @@ from fishd.client import Fish
 from fishd.core.calibration import ForceCalibration
 
 LINE = (
-    "F_y is reversed: it pushed the way in which the tail set off, "
+    "F_y is reversed: it pushed in the direction in which the tail began to move, "
     "so controllers are shown it with the other sign"
 )
 
@@ -71,7 +71,7 @@ def test_status_doctor_and_calibrate_force_say_it_and_the_right_calibration_ends
 
     calibrate = ("calibrate", "force", "--yes", "--loads")
     wrong = interchanged.fishctl(*calibrate, loads_file(rig.folder, -1))
-    assert "reversed, as was seen when the tail last set off, and this calibration" in wrong.stderr
+    assert "reversed, as the last start of the tail has shown, and this calibration" in wrong.stderr
     assert interchanged.fishctl(*calibrate, loads_file(rig.folder, 1)).stderr == ""
     assert LINE not in interchanged.fishctl("status").stdout
 
@@ -82,4 +82,4 @@ def test_a_calibration_that_would_reverse_a_force_is_doubted(rig: Bench, daemon:
         assert fish.status().fy_reversed is False
         wait_until(lambda: fish.status().phi_c == 0.0)
     ended = daemon.fishctl("calibrate", "force", "--loads", loads_file(rig.folder, -1), "--yes")
-    assert "turns F_y round, which was right when the tail last set off" in ended.stderr
+    assert "reverses F_y, whose sign was right at the last start of the tail" in ended.stderr

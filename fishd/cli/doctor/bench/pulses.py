@@ -70,7 +70,7 @@ def find_p99(ascending: Sequence[float]) -> float:
 
 
 def judge(pulses: Pulses) -> Result:
-    """Return the line about the pulses of one part."""
+    """Return the line about the pulses of one part of the swim."""
     message = (
         f"{pulses.count} pulses, 99 % within {pulses.deviation_p99:.0f} µs of what fishd sent "
         f"(at most {pulses.deviation_max:.0f}), every {pulses.period:.3f} ms ± "

@@ -20,7 +20,7 @@ print([name for name in ("numba", "scipy") if name in sys.modules])
 
 
 @pytest.mark.slow
-def test_a_configuration_is_checked_without_what_computes_the_fish() -> None:
+def test_a_configuration_is_checked_without_loading_the_solver() -> None:
     done = call(sys.executable, "-c", CHECKS)
     assert done.stdout == "[]\n"
 
@@ -39,7 +39,9 @@ def test_a_configuration_is_checked_without_what_computes_the_fish() -> None:
         ("lockstep=true", "lockstep: true is not valid with robot: swimmer"),
     ],
 )  # fmt: skip
-def test_what_makes_no_sense_is_refused_with_its_key(override: str, complaint: str) -> None:
+def test_settings_that_contradict_one_another_are_refused_with_their_key(
+    override: str, complaint: str
+) -> None:
     done = fishctl("config", "check", str(FILE), "--set", override)
     assert done.returncode == 78
     assert complaint in one_line(done)
@@ -63,17 +65,17 @@ def test_small_cells_that_end_before_the_fish_does_are_refused(profile: str) -> 
 
 
 @pytest.mark.parametrize("viscosity", ["1e-4", "1e-3"])
-def test_what_is_carried_along_and_viscosity_share_one_limit_of_the_step(viscosity: str) -> None:
+def test_advection_and_viscosity_share_one_limit_of_the_step(viscosity: str) -> None:
     water = [f"swimmer.water.viscosity={viscosity}", "swimmer.numerics.cell=0.001"]
     with pytest.raises(ConfigError, match="the tail would pass") as refusal:
-        # With 1e-4, ν Δt/h² is 0.06: either would do alone.
+        # With 1e-4, ν Δt/h² is 0.06: each of the two alone would permit this step.
         load(FILE, [*water, "swimmer.numerics.step=0.0006"])
     longest = str(refusal.value).rpartition("at most ")[2].removesuffix(" s")
     tick = round(0.01 / float(longest)) * float(longest)
     load(FILE, [*water, f"swimmer.numerics.step={longest}", f"tick={tick:.9g}"])
 
 
-def test_other_robots_do_not_mind_what_is_said_of_a_swimmer() -> None:
+def test_other_robots_ignore_the_settings_of_a_swimmer() -> None:
     assert load(None, ["swimmer.numerics.cell=0.005"]).robot == "simulated"
 
 
