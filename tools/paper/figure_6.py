@@ -15,15 +15,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import joblib
+import msgspec
 
 from common.report import progress
 from fishd.config import Config, load
+from fishd.controllers import registry
 from fishd.lab import drawing
 from fishd.lab.drawing import BLACK, BLUE, GREEN, ORANGE, PURPLE
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Lengths, swim_freely
 from fishd.lab.sweep.results import SpeedResult
-from fishd.lab.swimmer.refinement import GridSpeed, estimate
+from fishd.lab.swimmer.refinement import GridSpeed, estimate, find_grid_error
 from paper.runs import FOLDER, Row, column, read, write
 
 NAME = "figure-6"
@@ -47,6 +49,11 @@ class Case(NamedTuple):
     """Frequency of a wave [Hz], or C."""
     cell: float
     """Size of the cells [mm]."""
+
+    def point(self) -> Point:
+        """Return the controller with its parameter."""
+        name = "C" if self.controller == "swing" else "frequency"
+        return Point(self.controller, {name: self.setting})
 
 
 REFINED = (("square", 3.0), ("sine", 2.0), ("swing", 0.6))
@@ -80,13 +87,23 @@ class Table(NamedTuple):
         return next(iter(read(self.name, **having)), None)
 
     def grid_error(self, controller: str, setting: float, cell: float) -> float | None:
-        """Return the half-width of a speed's error by the grid [mm/s]; None if not known."""
+        """Return the half-width of a speed's error by the grid [mm/s]; None if not known.
+
+        Without all grids in the table, it is that of the shipped refinement, where there is one.
+        """
         rows = [self.row(Case(controller, setting, size)) for size in self.cells]
         grids = [
             GridSpeed(cell=row["cell_mm"], step=math.nan, speed=row["speed_mm_per_s"])
             for row in rows
             if row
         ]
+        if len(grids) < len(self.cells):
+            fish, start = config(cell), Case(controller, setting, cell).point()
+            parameters = registry.create(controller, start.parameters, fish.limits).parameters
+            values = msgspec.structs.asdict(parameters)
+            error = find_grid_error(fish, controller, values, shipped_only=True)
+            if error is not None:
+                return 1e3 * error
         return estimate(grids).error(cell) if len(grids) > 1 else None
 
 
@@ -109,39 +126,39 @@ def config(cell: float) -> Config:
     )
 
 
-def swim(case: Case, lengths: Lengths | None = None) -> SpeedResult:
-    """Run a swim as `fishctl sweep` does; raises SystemExit where the simulation diverged."""
-    name = "C" if case.controller == "swing" else "frequency"
+def swim(case: Case) -> tuple[Case, SpeedResult]:
+    """Run a swim as `fishctl sweep` does; return it with its case."""
     fish = config(case.cell)
-    point = Point(case.controller, {name: case.setting})
-    lengths = lengths or Lengths.of(fish, None, None)
-    result = swim_freely(point, fish, lengths, None)
+    result = swim_freely(case.point(), fish, Lengths.of(fish, None, None), None)
     assert result
-    if result.failure:
-        raise SystemExit(f"{point.label()} at {case.cell:g} mm: {result.failure}")
-    return result
+    return case, result
 
 
 def compute(jobs: int) -> None:
-    """Compute every swim that is not in the table; each is stored when it ends."""
+    """Compute every swim that is not in the table; each is stored when it ends.
+
+    Raise SystemExit after the last one if the simulation diverged in any.
+    """
     cases = FINE.cases()
     rows = {case: row for case in cases if (row := FINE.row(case))}
     missing = sorted((case for case in cases if case not in rows), key=_turn)
+    problems = []
     parallel = joblib.Parallel(jobs, batch_size=1, return_as="generator_unordered")
-    for case, result in parallel(joblib.delayed(_numbered)(case) for case in missing):
+    for case, result in parallel(joblib.delayed(swim)(case) for case in missing):
+        if result.failure:
+            problems.append(f"{case}: {result.failure}")
+            continue
         rows[case] = _row(case, result)
         progress(FINE.name, f"{case}", f"{1e3 * (result.speed or 0.0):.2f} mm/s")
         write(FINE.name, [rows[each] for each in cases if each in rows])
+    if problems:
+        raise SystemExit("\n".join(problems))
 
 
 def _turn(case: Case) -> tuple[Any, ...]:
     """Return a key that puts the swims of the left panel first, and the longest last."""
     last = case.controller == "triangle"
     return case.cell != FINE.cell, -case.cell, last, case.controller == "swing", case.setting
-
-
-def _numbered(case: Case) -> tuple[Case, SpeedResult]:
-    return case, swim(case)
 
 
 def _row(case: Case, result: SpeedResult) -> Row:

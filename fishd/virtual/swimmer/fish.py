@@ -152,7 +152,8 @@ class Fish:
         except LeftTheGrid as error:
             fastest = float(np.abs(body.velocity[:, :2]).max())
             if fastest * dt < _MAX_STEP_LENGTHS * self.settings.body.length:
-                raise self._diverged(f"{error}; swimmer.steering keeps it there") from None
+                remedy = "more swimmer.steering, or a larger swimmer.numerics.fine_width, may help"
+                raise self._diverged(f"{error}; {remedy}") from None
             raise self._diverged(
                 "the motion grew without bounds; a shorter swimmer.numerics.step may help"
             ) from None
