@@ -265,16 +265,18 @@ def count_rows(path: Path) -> int | None:
         return None
 
 
-def find_largest_thrust(path: Path) -> tuple[float, float | None] | None:
-    """Return the largest thrust of an experiment, with the half-width of its 95 % interval.
+def find_largest_thrust(path: Path) -> tuple[float, float | None, float | None] | None:
+    """Return the largest thrust of an experiment, with two half-widths of its 95 % interval.
 
-    None where no thrust is in its result or, before its end, in its table.
+    The first is statistical, the second includes the calibration. None where no thrust is in its
+    result or, before its end, in its table.
     """
     thrusts = []
     for result in _read_results(path):
-        thrust, half_width = (_read_number(result.get(key)) for key in ("thrust", "thrust_ci95"))
+        keys = ("thrust", "thrust_ci95", "total_ci95")
+        thrust, statistical, total = (_read_number(result.get(key)) for key in keys)
         if thrust is not None:
-            thrusts.append((thrust, half_width))
+            thrusts.append((thrust, statistical, total))
     return max(thrusts, key=lambda pair: pair[0], default=None)
 
 

@@ -37,8 +37,9 @@ def runs(folder: Path | None, as_json: bool) -> int:
     """List recordings and experiments, each the oldest first.
 
     'thrust' is the mean while the fish swam, in mN unless another unit is shown, with its 95 %
-    confidence interval. If the zero of the sensor was never known, it is the mean measured force
-    with drift and offset, and its interval is '?'. An experiment shows the largest of its thrusts.
+    confidence interval, which includes the calibration where that is known. If the zero of the
+    sensor was never known, it is the mean measured force with drift and offset, and its interval is
+    '?'. An experiment shows the largest of its thrusts.
     'power' is the mean power into the servo. 'lost' counts ticks of fishd that are not in the file.
     """
     place = folder or runs_folder()
@@ -76,7 +77,9 @@ class _ExperimentSummary(Struct):
     thrust: float | None = None
     """Thrust of a measurement, or the largest of the results [N]."""
     thrust_ci95: float | None = None
-    """Half-width of the 95 % confidence interval of `thrust` [N]."""
+    """Half-width of the 95 % confidence interval of `thrust`, statistical [N]."""
+    total_ci95: float | None = None
+    """The same with the calibration; None where that is not known [N]."""
     force_unit: str = "N"
     problem: str = ""
     """Reason why it cannot be read; empty if it can."""
@@ -86,7 +89,7 @@ class _ExperimentSummary(Struct):
         """Return the summary of an experiment."""
         if isinstance(header, ConfigError):
             return cls(path.name, str(path), "–", "–", "", None, "", problem=str(header))
-        thrust, half_width = find_largest_thrust(path) or (None, None)
+        thrust, statistical, total = find_largest_thrust(path) or (None, None, None)
         return cls(
             path.name,
             str(path),
@@ -96,7 +99,8 @@ class _ExperimentSummary(Struct):
             count_rows(path),
             _find_state(path, header),
             thrust,
-            half_width,
+            statistical,
+            total,
             header.force_unit,
         )
 
@@ -176,11 +180,12 @@ def _format_thrust(summary: "Summary | _ExperimentSummary") -> str:
     """Return the thrust in mN, or thousandths of another unit, with its interval if known."""
     if summary.thrust is None:
         return "–"
-    error = "?" if summary.thrust_ci95 is None else _format_thousandths(summary.thrust_ci95)
+    half_width = getattr(summary, "total_ci95", None) or summary.thrust_ci95
+    error = "?" if half_width is None else _format_thousandths(half_width)
     unit = "" if summary.force_unit == "N" else f" m{text.quoted(summary.force_unit)}"
     if error == "0.00":  # a thrust without noise
         name = "" if summary.force_unit == "N" else summary.force_unit
-        return text.format_measured(summary.thrust, summary.thrust_ci95, name)
+        return text.format_measured(summary.thrust, half_width, name)
     return f"{_format_thousandths(summary.thrust)} ± {error}{unit}"
 
 

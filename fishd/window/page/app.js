@@ -40,7 +40,7 @@ const receive = {
     failures = 0;
     setClient(payload.client);
     stream.client = payload.client;
-    sessionStorage.setItem("fishd.client", payload.client);
+    remember("client", payload.client, "sessionStorage");
     Object.assign(state, {
       name: payload.name, fish: payload.fish, session: payload.session, controllers: payload.controllers ?? [],
       events: payload.events ?? [], connection: payload.connection, driver: payload.driver, linked: true, helloed: true, refused: "",
@@ -546,7 +546,7 @@ async function start() {
   }
   changed();
   if (state.session.paired === false) return;
-  const before = sessionStorage.getItem("fishd.client") ?? ""; // a page that is loaded again goes on driving
+  const before = recall("client", "", "sessionStorage"); // a page that is loaded again goes on driving
   stream = new Stream(nameInAddress(), before, (type, payload) => receive[type]?.(payload), noteClosed);
 }
 

@@ -314,6 +314,7 @@ export class Charts {
     this.length = Math.min(this.ring.capacity, Math.ceil(seconds / this.ring.period) + 64);
     this.times = this.newColumn();
     for (const chart of this.all) chart.data = [this.times, ...chart.definition.series.map(() => this.newColumn())];
+    this.#drawVirtual();
     this.dirty = true;
   }
 
@@ -410,8 +411,12 @@ export class Charts {
     chart.setTitle([`${text}: virtual F`, "x"]);
     chart.data = [curve.time, milli(curve.fx), milli(curve.thrust)];
     chart.size();
-    const last = curve.time.at(-1);
-    chart.draw(last - this.seconds, last);
+    this.#drawVirtual();
+  }
+
+  #drawVirtual() {
+    const chart = this.virtualChart, last = chart.data[0].at(-1);
+    if (!chart.root.hidden) chart.draw(last - this.seconds, last);
   }
 
   #findGaps() {

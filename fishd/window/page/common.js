@@ -3,6 +3,7 @@ export { html, render, useEffect, useLayoutEffect, useMemo, useRef, useState } f
 
 const NBSP = "\u00a0";
 const REQUEST_TIMEOUT_MS = 20_000;
+const PICTURE_TIMEOUT_MS = 120_000;
 
 /** Return a number with a fixed number of decimals and a true minus sign; a dash if there is none. */
 export function number(value, decimals) {
@@ -51,7 +52,13 @@ export const sentence = (text) => (text
   ? (/^fish(d|ctl)\b/.test(text) ? text[0] : text[0].toUpperCase()) + text.slice(1) + (/[.!?]$/.test(text) ? "" : ".") : "");
 
 /** Return the local time of day of a unix time. */
-export const timeOfDay = (t) => new Date(t * 1000).toLocaleTimeString([], { hour12: false });
+export const timeOfDay = (t) => new Date(t * 1000).toLocaleTimeString([], { hourCycle: "h23" });
+
+/** Return the number in a text, also with a decimal comma; the text if it is not a number. */
+export function numberIn(text) {
+  const value = Number(text.replace(",", "."));
+  return text.trim() === "" || !Number.isFinite(value) ? text : value;
+}
 
 /** Return parameters as fishctl takes them: C=0.6 amplitude=0.4. */
 export function parametersText(parameters) {
@@ -75,7 +82,7 @@ export function setClient(id) {
   clientId = id;
 }
 
-/** Return the result of a request, or raise `Refusal`. */
+/** Return the result of a request, which may be a picture, or raise `Refusal`. */
 export async function call(method, path, body, timeout = REQUEST_TIMEOUT_MS) {
   const options = { method, signal: AbortSignal.timeout(timeout), cache: "no-store" };
   if (method === "POST") {
@@ -86,7 +93,8 @@ export async function call(method, path, body, timeout = REQUEST_TIMEOUT_MS) {
   try {
     const response = await fetch(path, options);
     status = response.status;
-    reply = await response.json();
+    const isPicture = response.headers.get("Content-Type")?.startsWith("image/");
+    reply = isPicture ? { ok: true, result: await response.blob() } : await response.json();
   } catch (error) {
     const message = status
       ? `fishd-window answered with status ${status} and no reason`
@@ -99,23 +107,23 @@ export async function call(method, path, body, timeout = REQUEST_TIMEOUT_MS) {
   return reply.result;
 }
 
-/** Return a picture, or raise an error with the server's reason. */
-export async function fetchPicture(path) {
-  const response = await fetch(path);
-  if (response.ok) return response.blob();
-  throw new Error((await response.json()).error.message);
-}
+/** Return a picture, which the server may have to draw first, or raise `Refusal`. */
+export const fetchPicture = (path) => call("GET", path, null, PICTURE_TIMEOUT_MS);
 
-/** Read a value that this browser keeps, or return the default. */
-export function recall(key, standard) {
+/** Read a value that this browser keeps, by default for all its tabs, or return the default. */
+export function recall(key, standard, storage = "localStorage") {
   try {
-    return JSON.parse(localStorage.getItem(`fishd.${key}`)) ?? standard;
+    return JSON.parse(globalThis[storage].getItem(`fishd.${key}`)) ?? standard;
   } catch {
     return standard;
   }
 }
 
-/** Keep a value in this browser. */
-export function remember(key, value) {
-  localStorage.setItem(`fishd.${key}`, JSON.stringify(value));
+/** Keep a value in this browser, unless its settings forbid that. */
+export function remember(key, value, storage = "localStorage") {
+  try {
+    globalThis[storage].setItem(`fishd.${key}`, JSON.stringify(value));
+  } catch {
+    // The page works without it.
+  }
 }

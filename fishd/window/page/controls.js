@@ -1,5 +1,5 @@
 // The controller and its parameters, from their description; stop, tare, mark.
-import { call, html, parametersText, recall, remember, unitText, useRef, useState } from "./common.js";
+import { call, html, numberIn, parametersText, recall, remember, unitText, useRef, useState } from "./common.js";
 
 const SEND_MS = 150;
 const STEPS = 200;
@@ -23,9 +23,7 @@ export function sliderOf(field, status) {
 
 /** Return the value in a text field, as the field's kind. */
 function valueOf(field, text) {
-  if (field.kind === "boolean" || field.kind === "text" || field.kind === "choice") return text;
-  const value = Number(text.replace(",", "."));
-  return text.trim() === "" || !Number.isFinite(value) ? text : value;
+  return ["boolean", "text", "choice"].includes(field.kind) ? text : numberIn(text);
 }
 
 /** A text field that keeps what is being typed while the page is drawn again. */

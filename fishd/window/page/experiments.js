@@ -1,5 +1,5 @@
 // Experiments as child processes of the server, with the command line that each ran, and kept runs.
-import { call, duration, fetchPicture, forceUnit, html, interval, number, parametersText, recall, remember, sentence, useEffect, useState } from "./common.js";
+import { call, duration, fetchPicture, forceUnit, html, interval, number, numberIn, parametersText, recall, remember, sentence, useEffect, useState } from "./common.js";
 import { contestant, defaultOf, selectionOf, shownParameters } from "./controls.js";
 
 const KINDS = {
@@ -32,6 +32,9 @@ async function startJob({ state, notice, changed, becomeDriver }, kind, options,
   }
 }
 
+/** Return the half-width of a thrust's interval, with the calibration where that is known. */
+const halfWidthOf = ({ thrust_ci95: statistical, total_ci95: total }) => total ?? statistical;
+
 /** Leave out what is not given: the server has its own defaults. */
 const given = (options) => Object.fromEntries(Object.entries(options).filter(([, value]) => value !== null));
 
@@ -59,12 +62,12 @@ export function Experiments(page) {
   const mayDrive = state.session?.scope === "drive";
   const names = (controller?.parameters ?? []).filter(({ kind }) => kind === "number" || kind === "integer").map(({ name }) => name);
   const varied = names.includes(form.parameter) ? form.parameter : names[0];
-  const seconds = form.seconds.trim() === "" ? null : Number(form.seconds);
+  const seconds = form.seconds.trim() === "" ? null : numberIn(form.seconds);
 
   const options = () => {
     switch (form.kind) {
       case "record": return { seconds, subject: form.subject || null, note: form.note || null };
-      case "compare": return { contestants: form.contestants.split(/\s+/).filter(Boolean), seconds, runs: form.runs ? Number(form.runs) : null };
+      case "compare": return { contestants: form.contestants.split(/\s+/).filter(Boolean), seconds, runs: form.runs.trim() === "" ? null : numberIn(form.runs) };
       case "sweep": return { controller: controller.name, parameters: { ...own, [varied]: form.values }, seconds };
       default: return { controller: controller.name, parameters: own, seconds };
     }
@@ -177,7 +180,7 @@ function Result({ job, status }) {
       Drawn beside F<sub>x</sub>, and dashed in the thrust chart.</p>`;
   }
   if (Number.isFinite(result.thrust)) {
-    return html`<p class="result">Thrust <b>${thrust(result.thrust, result.thrust_ci95)}</b>${Number.isFinite(result.frequency)
+    return html`<p class="result">Thrust <b>${thrust(result.thrust, halfWidthOf(result))}</b>${Number.isFinite(result.frequency)
       && html` at <b>${number(result.frequency, 2)} Hz</b>`}</p>`;
   }
   if (Array.isArray(result.stretches)) {
@@ -191,14 +194,14 @@ function Result({ job, status }) {
   return html`<table class="result"><thead><tr><th>${job.kind === "sweep" ? "best point" : "controller"}</th>
     <th class="right">thrust</th></tr></thead><tbody>
     ${result.map((row) => html`<tr><td>${row.contestant ?? row.controller} ${row.contestant ? "" : parametersText(row.parameters)}</td>
-      <td class="right">${thrust(row.thrust, row.thrust_ci95)}</td></tr>`)}
+      <td class="right">${thrust(row.thrust, halfWidthOf(row))}</td></tr>`)}
   </tbody></table>`;
 }
 
 const MAX_RUNS = 40;
 /** Kinds of experiments that the server resumes. */
 const RESUMABLE = ["measure", "sweep", "compare"];
-const shortDate = new Intl.DateTimeFormat([], { month: "short", day: "numeric", hour: "2-digit", minute: "2-digit", hour12: false });
+const shortDate = new Intl.DateTimeFormat([], { month: "short", day: "numeric", hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
 
 export function Runs(page) {
   const { state } = page;
@@ -225,7 +228,8 @@ export function Runs(page) {
           <th class="right">lost ticks</th><th><span class="unseen">what to do</span></th></tr></thead>
         <tbody>${list.map((run) => {
           const [factor, unit] = forceUnit(run);
-          const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, run.thrust_ci95 == null ? NaN : run.thrust_ci95 * factor);
+          const half = halfWidthOf(run);
+          const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, half == null ? NaN : half * factor);
           return html`<tr key=${run.name} class=${run.damaged ? "damaged" : ""}>
             <td>${run.name}${run.damaged && html` <span class="pill small" title=${run.damaged}>damaged</span>`}
               ${["running", "recording", "unfinished"].includes(run.state) && html` <span class="pill small">${run.state}</span>`}

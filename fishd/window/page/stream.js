@@ -1,6 +1,8 @@
 // The live stream: a WebSocket that is opened again when it is lost, and the ring that keeps its ticks.
 const RETRY_MS = 1000;
 const HEARTBEAT_MS = 2000;
+/** Time without a message after which a connection is taken for dead; the server sends one each second. */
+const SILENCE_MS = 5000;
 const KEPT_S = 120;
 const MAX_ROWS = 24_000;
 const MAX_COLUMNS = 64;
@@ -141,15 +143,26 @@ export class Stream {
     const query = new URLSearchParams();
     if (this.fish) query.set("fish", this.fish);
     if (this.client) query.set("client", this.client); // goes on driving
-    this.socket = new WebSocket(`${scheme}://${location.host}/live?${query}`);
-    this.socket.onmessage = (event) => {
-      this.#beat();
-      this.take(...JSON.parse(event.data));
-    };
-    this.socket.onclose = () => {
+    const socket = (this.socket = new WebSocket(`${scheme}://${location.host}/live?${query}`));
+    let silence;
+    const end = () => {
+      clearTimeout(silence);
+      socket.onmessage = socket.onclose = null;
+      socket.close();
       this.closed();
       setTimeout(() => this.#connect(), RETRY_MS);
     };
+    const listen = () => {
+      clearTimeout(silence);
+      silence = setTimeout(end, SILENCE_MS);
+    };
+    listen();
+    socket.onmessage = (event) => {
+      listen();
+      this.#beat();
+      this.take(...JSON.parse(event.data));
+    };
+    socket.onclose = end;
   }
 
   /** Give a sign of life; not from a timer, as browsers slow the timers of hidden tabs. */

@@ -10,7 +10,7 @@ import aiohttp
 import pytest
 from rigs.documents import ROOT
 from rigs.processes import Daemon
-from rigs.window_process import Browser, WindowProcess, run, running_window
+from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, run, running_window
 
 from fishd.core.schema import fields_of
 from fishd.window.foxglove import CHANNELS, PROTOCOL
@@ -97,6 +97,22 @@ def test_only_origins_of_the_settings_and_paired_devices_read(
             assert await connect("/foxglove", "fish.example") == 401
 
         run(test())
+
+
+def test_a_program_of_another_machine_reads_once_it_is_paired_until_it_is_revoked(
+    window: WindowProcess,
+) -> None:
+    async def test() -> None:
+        async with Browser(window.url, NETWORK_HOST) as browser:
+            token = window.invite("watch").partition("#pair=")[2]
+            await browser.post("/api/pair", {"token": token, "name": "viewer"})
+            async with browser.session.ws_connect("/foxglove", protocols=[PROTOCOL]) as sock:
+                assert (await read_text(sock))["op"] == "serverInfo"
+                window.ask("revoke", "viewer")
+                while not sock.closed:
+                    await sock.receive()
+
+    run(test())
 
 
 def leaves(layout: Any) -> Iterator[str]:

@@ -95,7 +95,7 @@ def test_an_experiment_shows_what_a_person_would_type_and_leaves_a_thrust_among_
             assert ended["state"] == "done", ended["lines"]
             (run_,) = [r for r in await browser.get("/api/runs") if r["name"] == job["run"]]
             result = ended["result"]
-            for key in ("thrust", "thrust_ci95"):
+            for key in ("thrust", "thrust_ci95", "total_ci95"):
                 assert run_[key] == result[key] > 0.0
             assert (run_["state"], ended["resumable"]) == ("finished", False)
             async with browser.session.get(f"/api/runs/{job['run']}/plot.png") as response:

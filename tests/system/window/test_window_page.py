@@ -252,6 +252,32 @@ def test_a_page_whose_server_hangs_says_so_by_its_own_clock(
         expect(page.locator("#connection")).to_contain_text("live")
 
 
+def test_a_page_whose_connection_is_dead_opens_another_one(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, _):
+        window.process.send_signal(signal.SIGSTOP)
+        try:
+            with page.expect_websocket():
+                pass
+        finally:
+            window.process.send_signal(signal.SIGCONT)
+        expect(page.locator("#connection")).to_contain_text("live")
+
+
+def test_a_page_works_in_a_browser_that_keeps_nothing(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, complaints):
+        page.add_init_script("""for (const name of ["localStorage", "sessionStorage"])
+            Object.defineProperty(globalThis, name, { get() { throw new Error("forbidden"); } });
+        """)
+        page.reload()
+        expect(page.locator("#connection")).to_contain_text("live")
+        swim(page)
+        page.click("#tab-record")
+        page.fill("#experiment label:has-text('Seconds') input", "0,5")
+        page.click("#experiment button.primary")
+        expect(page.locator(".job code")).to_contain_text("--for 0.5")
+        assert complaints == []
+
+
 @pytest.mark.realtime
 def test_old_values_are_grey_within_a_second_and_the_page_is_painted_within_half(
     own_daemon: Daemon, own_window: WindowProcess
@@ -416,6 +442,17 @@ def test_the_memory_of_the_page_is_the_same_after_a_day_of_ticks(window: WindowP
         after = heap()
         print(f"JS heap before {before:.1f} MB, after a day {after:.1f} MB")
         assert abs(after - before) <= 5.0
+
+
+def test_the_first_press_of_tab_leads_to_the_emergency_stop(window: WindowProcess) -> None:
+    with live_page(window.url) as (page, _):
+        swim(page)
+        page.reload()
+        expect(page.locator("#mode")).to_have_text("running")
+        page.keyboard.press("Tab")
+        assert page.evaluate("document.activeElement.id") == "estop"
+        page.keyboard.press("Enter")
+        expect(page.locator("#estop-ms")).to_be_visible()
 
 
 def test_the_keyboard_reaches_everything_and_the_focus_is_visible(window: WindowProcess) -> None:

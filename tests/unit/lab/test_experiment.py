@@ -168,10 +168,11 @@ def test_a_measurement_keeps_header_recording_and_result_and_is_listed(tmp_path:
     assert len(open_run(folder / "measure.mcap").ticks) == round(result["seconds"] / 0.05)
     (listed,) = json.loads(fishctl("runs", "--folder", str(tmp_path), "--json").stdout)
     assert (listed["name"], listed["kind"], listed["on"]) == ("first", "measure", "simulation")
-    assert (listed["thrust"], listed["thrust_ci95"]) == (result["thrust"], result["thrust_ci95"])
+    for key in ("thrust", "thrust_ci95", "total_ci95"):
+        assert listed[key] == result[key]
     assert listed["state"] == "finished"
     printed = fishctl("runs", "--folder", str(tmp_path)).stdout
-    assert f"{1e3 * result['thrust']:.2f} ± {1e3 * result['thrust_ci95']:.2f}" in printed
+    assert f"{1e3 * result['thrust']:.2f} ± {1e3 * result['total_ci95']:.2f}" in printed
     (folder / "experiment.json").write_text("{}")
     done = fishctl("runs", "--folder", str(tmp_path))
     assert done.returncode == 1
