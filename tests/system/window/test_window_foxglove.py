@@ -2,14 +2,15 @@
 
 import json
 import struct
+import sys
 from collections.abc import Iterator
 from typing import Any
 from xml.etree import ElementTree
 
 import aiohttp
 import pytest
-from rigs.documents import ROOT
-from rigs.processes import Daemon
+from rigs.documents import FENCE, ROOT
+from rigs.processes import Daemon, Process
 from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, run, running_window
 
 from fishd.core.schema import fields_of
@@ -72,6 +73,15 @@ def test_a_viewer_can_only_read(window: WindowProcess, message: str) -> None:
             assert (await read_text(sock))["level"] == 1
 
     run(test())
+
+
+def test_the_program_of_the_page_pairs_and_prints_forces(window: WindowProcess) -> None:
+    page = (ROOT / "docs" / "how-to" / "window.md").read_text(encoding="utf-8")
+    (example,) = [code for _, code in FENCE.findall(page) if "/api/pair" in code]
+    token = window.invite("watch").partition("#pair=")[2]
+    with Process(sys.executable, "-u", "-c", example, window.url, token) as program:
+        assert program.process.stdout
+        assert abs(float(program.process.stdout.readline())) < 1.0
 
 
 def test_only_origins_of_the_settings_and_paired_devices_read(
