@@ -251,15 +251,16 @@ async function act(op, args, take = false) {
   }
 }
 
-/** Take the driver's role, or change whether the fish swims on without this page. */
-async function becomeDriver(take = false) {
-  state.driver = (await request(state.name, "drive", { take, keep: state.keep })).driver;
-}
+/**
+ * Take the driver's role, or change whether the fish swims on without this page.
+ * The stream says who drives: the answer may come after a later change.
+ */
+const becomeDriver = (take = false) => request(state.name, "drive", { take, keep: state.keep });
 
 async function changeRole(drives, take) {
   try {
     if (drives) await becomeDriver(take);
-    else state.driver = (await request(state.name, "release", {})).driver;
+    else await request(state.name, "release", {});
   } catch (error) {
     notice("error", error.message, error.remedy);
   }

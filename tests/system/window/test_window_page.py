@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
 from rigs.processes import PATIENCE, Daemon, running, wait_until
 from rigs.virtual_pi_process import Pi
@@ -173,6 +173,27 @@ def test_a_page_that_loses_the_fish_to_one_of_the_same_device_says_another_page(
         expect(other.locator("#notices")).to_be_empty()
         other.get_by_role("button", name="Take over").click()
         expect(page.locator("#notices")).to_contain_text("Another page drives now.")
+
+
+def test_a_late_answer_does_not_hide_that_another_page_has_taken_over(
+    window: WindowProcess,
+) -> None:
+    with live_page(window.url) as (page, _):
+        assert page.context.browser
+        other = page.context.browser.new_page()
+        other.goto(window.url)
+        held: list[tuple[Route, APIResponse]] = []
+        page.route("**/drive", lambda route: held.append((route, route.fetch())))
+        page.get_by_role("button", name="Drive", exact=True).click()
+        expect(page.locator("#driver")).to_have_text("you drive")
+        other.get_by_role("button", name="Take over").dispatch_event("click")
+        expect(page.locator("#driver")).to_have_text("another page drives")
+        ((route, answer),) = held
+        with page.expect_response("**/drive"):
+            route.fulfill(response=answer)
+        page.evaluate("new Promise((done) => setTimeout(() => requestAnimationFrame(done)))")
+        expect(page.locator("#driver")).to_have_text("another page drives")
+        expect(other.locator("#driver")).to_have_text("you drive")
 
 
 def test_an_emergency_stop_ends_the_pulses_and_shows_its_time_and_the_way_out(
