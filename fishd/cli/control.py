@@ -17,7 +17,7 @@ from fishd.core.schema import Field
 
 @click.group(cls=ControllerGroup, options=daemon_options, remote=True)
 def set_controller() -> None:
-    """Let another controller swim; parameters left out take their defaults."""
+    """Set the controller of the fish; parameters left out take their defaults."""
 
 
 @set_controller.action

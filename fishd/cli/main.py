@@ -20,7 +20,7 @@ VERBS = {
         "mark": Verb("control", "mark", "Put a mark in the event stream."),
     },
     "Swim and stop": {
-        "set-controller": Verb("control", "set_controller", "Let another controller swim."),
+        "set-controller": Verb("control", "set_controller", "Set the controller of the fish."),
         "set-parameter": Verb("control", "set_parameter", "Change parameters while it swims."),
         "stop": Verb("control", "stop", "Fade to neutral and stay there."),
         "estop": Verb("estop", "estop", "Emergency stop: no more pulses, at once."),

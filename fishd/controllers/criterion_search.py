@@ -50,7 +50,7 @@ change from before to after: the unsteady part of the drift [1]."""
 MAX_MOVES = 8
 """Number of latest trials whose changes of the zero are kept."""
 INITIAL_DRIFT = 0.03
-"""Additional such deviation for the first trials, as a fraction of the ripple [1]."""
+"""Additional deviation of the zero in the first trials, as a fraction of the ripple [1]."""
 MIN_STANDARD_ERRORS = 1.0
 """Number of standard errors by which a gain must differ from `MIN_GAIN`; else repeat the trial."""
 MAX_ROUNDS = 3
@@ -67,9 +67,9 @@ rung is tried."""
 RETRY_INTERVAL_S = 40.0
 """Time until the next trial, once all neighbours are worse [s]."""
 MIN_CHANGE = 0.25
-"""Relative change of the ripple that restarts the search, as for another fish,"""
+"""Relative change of the ripple above which the fish counts as changed: the search restarts [1]."""
 MIN_CHANGE_STANDARD_ERRORS = 3.0
-"""Number of standard errors that this change must exceed, too."""
+"""Number of standard errors that such a change of the ripple must exceed, too."""
 MAX_STEP = 8
 """Largest step of a trial on the ladder [half steps]."""
 NEIGHBOUR_STEPS = (2, -2, 4, -4, 1, -1)
