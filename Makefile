@@ -117,25 +117,22 @@ DEB_MACHINE ?= $(shell dpkg --print-architecture 2>/dev/null || echo amd64)
 DEB_PYTHON ?= 3.11
 deb: docs $(VENV)/installed-dev  ## Build the Debian package: DEB_MACHINE=amd64|arm64 DEB_PYTHON=3.11|3.13
 	$(BIN)/python tools/deb --machine $(DEB_MACHINE) --python $(DEB_PYTHON)
-	@command -v lintian >/dev/null || { echo "lintian is missing: sudo apt install lintian"; exit 1; }
+	@command -v lintian >/dev/null || { echo "not run here: lintian is missing: sudo apt install lintian"; exit 1; }
 	lintian --fail-on error,warning,info --display-info --tag-display-limit 0 dist/fishd_*_$(DEB_MACHINE).deb
 
 trial-deb: docs $(VENV)/installed-dev  ## Install, upgrade, remove and purge it under a real systemd; needs root
 	$(BIN)/python tools/reliability deb --write
 
-.PHONY: install-pi uninstall-pi trial-systemd trial-arm64 release-check
+.PHONY: install-pi trial-systemd trial-arm64 release-check
 
-install-pi:  ## Install fishd on this Raspberry Pi, or renew it; needs sudo
+install-pi:  ## Install the package in dist/ on this Raspberry Pi, with its bus and pigpiod; needs sudo
 	tools/install_pi.sh
 
-uninstall-pi:  ## Remove it; an edited configuration and calibrations stay unless PURGE=1
-	tools/uninstall_pi.sh
-
-trial-systemd: $(VENV)/installed-dev  ## Start, hang and kill fishd under a real systemd; needs root
+trial-systemd: docs $(VENV)/installed-dev  ## Start, hang and kill fishd under a real systemd; needs root
 	$(BIN)/python tools/reliability systemd --write
 
-trial-arm64: $(VENV)/installed-dev  ## Install on arm64 Debian 12 and 13 under qemu; needs root, an hour
-	FISHCTL=$(CURDIR)/$(BIN)/fishctl tools/arm64_trial.sh
+trial-arm64: docs $(VENV)/installed-dev  ## Install on arm64 Debian 12 and 13 under qemu; needs root
+	BIN=$(CURDIR)/$(BIN) tools/arm64_trial.sh
 
 release-check: $(VENV)/installed-dev  ## Run every check once before a release, and print one table; needs root
 	$(BIN)/python tools/release_check.py

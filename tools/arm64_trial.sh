@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Installs fishd as docs/how-to/installing.md says on arm64 Debian 12 and 13, in chroots under qemu-user, and
-# compares a simulation there with the same on this machine. Needs root, and an hour.
+# Installs the Debian package on arm64 Debian 12 and 13, in chroots under qemu-user, and compares a simulation
+# there with the same on this machine. Needs root, and build/docs of `make docs`.
 #
 #   sudo tools/arm64_trial.sh [SUITE ...]     bookworm and trixie, where none is named
 #
@@ -10,9 +10,9 @@
 set -euo pipefail
 checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
 WORK=${WORK:-/var/tmp/fishd-arm64-trial}
-FISHCTL=${FISHCTL:-$checkout/.venv/bin/fishctl}
+BIN=${BIN:-$checkout/.venv/bin}
 SIMULATION=(simulate swing --seconds 60 --json)
-MOST_SPACE=250 # MB of /opt/fishd
+MOST_SPACE=400 # MB of /usr/lib/fishd
 LONGEST=2700   # s that a step may take
 # That of a Pi 4. No Pi has SVE, which qemu offers from itself and, in 7.2, computes NaN with.
 PROCESSOR=cortex-a72
@@ -23,17 +23,17 @@ fail() {
 }
 
 check_machine() {
-  ((EUID == 0)) || fail "needs root"
+  ((EUID == 0)) || fail "not run here: needs root"
   local tool
   for tool in debootstrap qemu-aarch64-static update-binfmts unshare; do
     command -v "$tool" >/dev/null ||
-      fail "$tool is missing: apt install debootstrap qemu-user-static binfmt-support util-linux"
+      fail "not run here: $tool is missing: apt install debootstrap qemu-user-static binfmt-support util-linux"
   done
-  [[ -x $FISHCTL ]] || fail "$FISHCTL is missing, to compare with: make test; or name it with FISHCTL"
+  [[ -x $BIN/fishctl ]] || fail "$BIN/fishctl is missing, to compare with: make test; or name its folder with BIN"
   [[ $(uname -m) == aarch64 || -e /proc/sys/fs/binfmt_misc/qemu-aarch64 ]] && return
   [[ -e /proc/sys/fs/binfmt_misc/register ]] ||
     mount -t binfmt_misc binfmt_misc /proc/sys/fs/binfmt_misc ||
-    fail "this kernel has no binfmt_misc, so it does not start programs for arm64"
+    fail "not run here: this kernel has no binfmt_misc, so it does not start programs for arm64"
   update-binfmts --enable qemu-aarch64
 }
 
@@ -73,36 +73,26 @@ inside() {
     LANG=C.UTF-8 DEBIAN_FRONTEND=noninteractive "${variables[@]}" "$@"
 }
 
-# The packages of the first step in docs/how-to/installing.md.
-documented_packages() {
-  sed -n 's/^\$ sudo apt install \(.*\)/\1/p' "$checkout/docs/how-to/installing.md" | head -n 1
-}
-
-# A Debian with these packages; kept for the next time.
+# A bare Debian; kept for the next time.
 make_base() {
-  local suite=$1 base=$WORK/$1.base packages
-  shift
-  packages=$base/packages-of-the-trial
-  [[ $(cat "$packages" 2>/dev/null) == "$*" ]] && return
+  local suite=$1 base=$WORK/$1.base
+  [[ ! -e $base.made ]] || return 0
   rm -rf "$base"
   timeout "$LONGEST" debootstrap --arch=arm64 --variant=minbase --include=ca-certificates \
     "$suite" "$base" ${DEBIAN:+"$DEBIAN"} &&
-    connect "$base" &&
-    inside "$base" sh -c 'apt-get update && apt-get install --yes --no-install-recommends "$@"' \
-      sh "$@" &&
-    echo "$*" >"$packages"
+    connect "$base" && inside "$base" apt-get update && touch "$base.made"
 }
 
-# A copy of it with the checkout.
+# A copy of it with the package.
 make_root() {
-  local suite=$1 root=$2
-  rm -rf "$root"
+  local suite=$1 root=$2 python
+  python=$([[ $suite == bookworm ]] && echo 3.11 || echo 3.13)
+  rm -rf "$root" "$WORK"/*"~deb"*.deb
   cp --archive "$WORK/$suite.base" "$root"
   connect "$root"
-  mkdir "$root/root/fishd"
-  git -C "$checkout" ls-files --cached --others --exclude-standard -z |
-    (cd "$checkout" && xargs -0 ls -d -- 2>/dev/null) |
-    tar -C "$checkout" -cf - -T - | tar -C "$root/root/fishd" -xf -
+  "$BIN/python" "$checkout/tools/deb" --fast --machine arm64 --python "$python" --to "$WORK"
+  mv "$WORK"/fishd_*.deb "$root/root/fishd.deb"
+  cp "$checkout/tools/install_pi.sh" "$root/root"
 }
 
 # Whether two reports of `fishctl simulate` agree; how fast the machines were does not count.
@@ -134,20 +124,19 @@ PYTHON
 }
 
 try_suite() {
-  local suite=$1 root=$WORK/$1 status=0 size packages
-  read -ra packages < <(documented_packages)
-  make_base "$suite" "${packages[@]}" >"$WORK/$suite.log" 2>&1 ||
+  local suite=$1 root=$WORK/$1 status=0 size
+  make_base "$suite" >"$WORK/$suite.log" 2>&1 ||
     fail "$suite: no Debian could be made; see $WORK/$suite.log"
   make_root "$suite" "$root"
-  inside "$root" make -C /root/fishd install-pi >"$WORK/$suite.install.log" 2>&1 || status=$?
+  inside "$root" env FISHD_DEB=/root/fishd.deb /root/install_pi.sh >"$WORK/$suite.install.log" 2>&1 || status=$?
   sed "s/^/$suite: /" "$WORK/$suite.install.log"
-  echo "$suite: make install-pi: exit status $status"
+  echo "$suite: install_pi.sh: exit status $status"
   ((status == 0)) || return 1
-  size=$(du --summarize --block-size=1MB "$root/opt/fishd" | cut -f 1)
-  echo "$suite: /opt/fishd: $size MB"
+  size=$(du --summarize --block-size=1MB "$root/usr/lib/fishd" | cut -f 1)
+  echo "$suite: /usr/lib/fishd: $size MB"
   ((size <= MOST_SPACE)) || { echo "$suite: more than $MOST_SPACE MB" && return 1; }
-  inside "$root" /usr/local/bin/fishctl "${SIMULATION[@]}" >"$WORK/$suite.json"
-  "$FISHCTL" "${SIMULATION[@]}" >"$WORK/host.json"
+  inside "$root" fishctl "${SIMULATION[@]}" >"$WORK/$suite.json"
+  "$BIN/fishctl" "${SIMULATION[@]}" >"$WORK/host.json"
   compare "$WORK/host.json" "$WORK/$suite.json" >"$WORK/$suite.comparison" || status=$?
   echo "$suite: fishctl ${SIMULATION[*]}: $(cat "$WORK/$suite.comparison")"
   return "$status"

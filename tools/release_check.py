@@ -1,9 +1,12 @@
 """Runs every check of a release and prints one table; a failed one does not stop the others.
 
+A check that this machine cannot run is neither passed nor failed: the table says why.
+
 `make release-check` needs root and the tools that each check names. `--only NAME ...` runs some.
 """
 
 import argparse
+import re
 import subprocess
 import sys
 import time
@@ -25,10 +28,13 @@ CHECKS: dict[str, list[str]] = {
     "packages": ["make", "packages"],
     "Debian package": ["make", "deb"],
     "trial of the Debian package": ["make", "trial-deb"],
+    "container": ["tools/try_container.sh"],
     "systemd trial": ["make", "trial-systemd"],
     "arm64 trial": ["make", "trial-arm64"],
 }
 """Command of each check, by its name in the table."""
+REFUSAL = re.compile(r"^(?:\w+: )?(not run here: .+)$", re.MULTILINE)
+"""Line by which a check says that this machine cannot run it, and why."""
 
 
 def run(name: str, command: list[str]) -> tuple[str, str, str]:
@@ -40,6 +46,8 @@ def run(name: str, command: list[str]) -> tuple[str, str, str]:
             command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, check=False
         ).returncode
     result = f"FAILED with exit status {code}: {log.relative_to(ROOT)}" if code else "passed"
+    if code and (refusals := REFUSAL.findall(log.read_text(errors="replace"))):
+        result = refusals[-1]
     progress(name, result)
     return name, f"{time.monotonic() - started:.0f}", result
 

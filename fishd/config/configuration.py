@@ -73,7 +73,7 @@ from fishd.virtual.swimmer.settings import SwimmerSettings
 log = logging.getLogger(__name__)
 
 SERVICE_FILE = Path("/etc/fishd/fishd.yaml")
-"""Configuration file of the service, installed by 'make install-pi'."""
+"""Configuration file of the service, installed by the Debian package."""
 FILE_VARIABLE = "FISHD_CONFIG"
 """Environment variable with the path of the configuration file."""
 

@@ -145,7 +145,7 @@ def _bus(machine: Machine, number: int, section: str) -> Result:
         if status.st_gid == 0 or not status.st_mode & stat.S_IWGRP:
             return fail(
                 f"/dev/i2c-{number} may be used by user {user_name(status.st_uid)} only",
-                "sudo make install-pi, then restart: its udev rule gives the bus to group i2c",
+                "install the Debian package of fishd, then restart: it gives the bus to group i2c",
             )
         group = device.group()
         return fail(

@@ -19,7 +19,7 @@ from fishd.hardware.driver import Claim
 log = logging.getLogger(__name__)
 
 FOLDER = Path("/run/fishd-locks")
-"""Folder of the lock files, which `make install-pi` makes: only root and the group fishd may enter.
+"""Folder of the lock files, by the Debian package: only root and the group fishd may enter.
 
 In another folder any user could hold a lock, or create its file, and so keep fishd from starting.
 """

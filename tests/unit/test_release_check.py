@@ -9,10 +9,11 @@ import pytest
 import release_check
 
 
-def test_a_failed_check_stops_no_other_and_fails_the_whole(
+def test_a_failed_check_stops_no_other_and_a_refused_one_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     commands = {"first": ["sh", "-c", "echo broken; exit 3"], "second": ["true"]}
+    commands["third"] = ["sh", "-c", "echo 'trial: not run here: no root' >&2; exit 1"]
     monkeypatch.setattr(release_check, "ROOT", tmp_path)
     monkeypatch.setattr(release_check, "LOGS", tmp_path / "logs")
     monkeypatch.setattr(release_check, "CHECKS", commands)
@@ -20,10 +21,11 @@ def test_a_failed_check_stops_no_other_and_fails_the_whole(
     with pytest.raises(SystemExit) as ended:
         release_check.main()
     assert ended.value.code
-    *_, failed, passed = capsys.readouterr().out.splitlines()
+    *_, failed, passed, refused = capsys.readouterr().out.splitlines()
     failure = r"\| first \| \d+ \| FAILED with exit status 3: logs/first.log \|"
     assert re.fullmatch(failure, failed)
     assert re.fullmatch(r"\| second \| \d+ \| passed \|", passed)
+    assert re.fullmatch(r"\| third \| \d+ \| not run here: no root \|", refused)
     assert (tmp_path / "logs" / "first.log").read_text() == "broken\n"
 
 

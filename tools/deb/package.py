@@ -143,9 +143,7 @@ def install_system_files(root: Path) -> None:
     """Install what systemd and udev read, and the configuration."""
     for pattern, folder in SYSTEM_FILES.items():
         for source in sorted((ROOT / "systemd").glob(pattern)):
-            text = source.read_text().replace("/opt/fishd", f"/{HOME}")
-            text = text.replace("'make install-pi'", "the package fishd")
-            write(root / folder / source.name, text)
+            write(root / folder / source.name, source.read_text())
     for source, target in CONFIGS.items():
         text = (ROOT / "config" / f"{source}.yaml").read_text()
         write(root / "etc" / "fishd" / f"{target}.yaml", text)

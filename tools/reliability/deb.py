@@ -1,52 +1,58 @@
-"""Trial of the Debian package under a real systemd in a container: install, upgrade, remove, purge.
+"""Trials of the Debian package under a real systemd: install, upgrade, remove, purge.
 
-Needs root and Debian's packages debootstrap and systemd-container, and no network but for these.
+Needs root, a network and Debian's packages debootstrap and systemd-container; some minutes.
 """
 
 import shutil
 import subprocess
-import sys
 from argparse import Namespace
 from collections.abc import Callable
 from pathlib import Path
 
-from common.report import BrokenPromise, Options, Report, progress, table
+from common.report import BrokenPromise, Report, progress, table
 from reliability.systemd import work_folder
 from reliability.systemd.container import Container, wait_for
-from reliability.systemd.root import CHECKOUT, check_machine, make_debian
+from reliability.systemd.root import (
+    CHECKOUT,
+    HOME,
+    OPTIONS,
+    PYTHONS,
+    build_package,
+    check_machine,
+    make_debian,
+)
 
 _UNITS = ("fishd", "fishd-recorder", "fishd-camera", "fishd-window")
 _FISHD = "fishd.service"
 
-OPTIONS: Options = {
-    "--package": {"type": Path, "help": "package to try; by default one is built"},
-    "--base": {"type": Path, "help": "folder that keeps the bare Debian for next time"},
-    "--keep": {"action": "store_true", "help": "keep the root folder and say where"},
+OPTIONS = OPTIONS | {
+    "--suite": {"nargs": "+", "choices": PYTHONS, "default": [*PYTHONS], "help": "Debians to try"},
 }
 
 
 def measure(options: Namespace) -> Report:
     """Run every trial; raises `BrokenPromise`, and SystemExit where trials are not possible."""
-    check_machine(options.base)
+    check_machine()
+    for suite in options.suite:
+        rows = _try_on(suite, options)
+    text = f"On {' and '.join(options.suite)}:\n\n{table('action | outcome', rows)}"
+    return Report({"reliability deb": text}, rows)
+
+
+def _try_on(suite: str, options: Namespace) -> list[tuple[str, str]]:
+    """Run every trial on a release of Debian, and return actions and outcomes."""
+    rows = []
     with work_folder(options.keep) as work:
-        root = make_debian(work, options.base)
-        package = options.package or _build(work)
-        packages = root / "root"
-        shutil.copy(package, packages / "old.deb")
-        _renumber(package, packages / "new.deb", work)
+        root = make_debian(work, suite, options)
+        package = build_package(work, suite)
+        shutil.copy(package, root / "root" / "old.deb")
+        shutil.copy(CHECKOUT / "tools" / "install_pi.sh", root / "root")
+        _renumber(package, root / "root" / "new.deb", work)
         with Container(root) as container:
-            rows = []
             for trial in TRIALS:
                 rows.append((trial.__name__.strip("_").replace("_", " "), trial(container)))
-                progress(*rows[-1])
-    return Report({"reliability deb": table("action | outcome", rows)}, rows)
-
-
-def _build(work: Path) -> Path:
-    python = f"{sys.version_info[0]}.{sys.version_info[1]}"
-    command = [sys.executable, CHECKOUT / "tools/deb", "--fast", "--python", python]
-    subprocess.run([*command, "--to", work], check=True)
-    return next(work.glob("*.deb"))
+                progress(suite, *rows[-1])
+    return rows
 
 
 def _renumber(package: Path, new: Path, work: Path) -> None:
@@ -88,30 +94,29 @@ def _upgrade_to(container: Container, package: str, *, restarts: bool) -> str:
     return said
 
 
-def _installing_beside_make_install_pi(container: Container) -> str:
+def _installing_beside_an_older_installation(container: Container) -> str:
     other = container.root / "opt/fishd/bin/fishd"
     other.parent.mkdir(parents=True)
     other.touch()
     said = container.run("sh", "-c", "dpkg --install /root/old.deb 2>&1 || true")
     shutil.rmtree(container.root / "opt/fishd")
     _require("sudo make uninstall-pi" in said, f"no remedy: {said}")
-    _require(not (container.root / "usr/lib/fishd/bin").exists(), "it is installed all the same")
+    _require(not (container.root / f"{HOME}/bin").exists(), "it is installed all the same")
     return "refused, with the remedy"
 
 
 def _installing(container: Container) -> str:
-    said = _dpkg(container, "--install", "/root/old.deb")
+    said = container.run("env", "FISHD_DEB=/root/old.deb", "/root/install_pi.sh")
+    _require("step 2b of docs" in said, "it does not say that a Debian has no pigpiod")
     _require("systemctl enable --now fishd" in said, "it does not say how to start fishd")
     for unit in _UNITS:
         _require(_state(container, unit) == ("inactive", "disabled"), f"{unit} is started")
     container.run("fishctl", "--version")
-    container.run("test", "-d", "/usr/lib/fishd/lib")
+    container.run("test", "-d", f"/{HOME}/lib")
     container.run("getent", "passwd", "fishd")
     camera = container.run("stat", "--format=%a %U %G", "/etc/fishd/camera.yaml")
     _require(camera == "640 root fishd", f"/etc/fishd/camera.yaml is {camera}")
-    compiled = (container.root / "usr/lib/fishd/lib").glob(
-        "python*/site-packages/fishd/__pycache__"
-    )
+    compiled = (container.root / HOME / "lib").glob("python*/site-packages/fishd/__pycache__")
     _require(any(compiled), "nothing is compiled")
     return "no service starts or is enabled"
 
@@ -160,9 +165,7 @@ def _removing(container: Container) -> str:
     _dpkg(container, "--remove", "fishd")
     for unit in _UNITS:
         _require(container.show(unit, "ActiveState") == "inactive", f"{unit} still runs")
-    left = [
-        path for path in ("usr/lib/fishd", "usr/bin/fishctl") if (container.root / path).exists()
-    ]
+    left = [path for path in (HOME, "usr/bin/fishctl") if (container.root / path).exists()]
     _require(not left, f"{', '.join(left)} stay")
     _require(calibration.exists(), "calibrations are gone")
     _require((container.root / "etc/fishd/fishd.yaml").exists(), "the configuration is gone")
@@ -188,7 +191,7 @@ def _purging(container: Container) -> str:
 
 
 TRIALS: tuple[Callable[[Container], str], ...] = (
-    _installing_beside_make_install_pi,
+    _installing_beside_an_older_installation,
     _installing,
     _starting,
     _upgrading_while_the_fish_swims,

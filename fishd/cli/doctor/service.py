@@ -68,7 +68,8 @@ def unit(context: Context) -> Result:
     folders = [folder for folder in _UNIT_FOLDERS if context.path(f"{folder}/{UNIT}").exists()]
     if not folders:
         return warning(
-            f"{UNIT} is not installed: fishd does not start by itself", "make install-pi"
+            f"{UNIT} is not installed: fishd does not start by itself",
+            "install the Debian package of fishd",
         )
     wants = context.path(_UNIT_FOLDERS[0]).glob(f"*.wants/{UNIT}")
     if not any(True for _ in wants):

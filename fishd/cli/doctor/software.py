@@ -88,7 +88,6 @@ def gpio_package(context: Context) -> Result | None:
     if not installed:
         return fail(
             "neither RPi.GPIO nor rpi-lgpio is installed, but the configuration uses GPIO pins",
-            "sudo make install-pi, which says what it takes; without the service "
             f"{install_command('rpi-lgpio')} (Pi 5, Debian 13); on others, rpi-gpio instead",
         )
     if "RPi.GPIO" in installed and "Raspberry Pi 5" in context.model:

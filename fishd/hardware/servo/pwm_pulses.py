@@ -299,7 +299,7 @@ def _explain(path: str, error: OSError) -> ServoError:
     if isinstance(error, PermissionError):
         hint = (
             "may not be used by this user: join group gpio, and let fishd's udev rule "
-            "give it the files of PWM chips (make install-pi)"
+            "give it the files of PWM chips (in its Debian package)"
         )
     elif error.errno in (errno.ENOENT, errno.ENODEV):
         hint = "is gone: was the PWM chip's driver unloaded, or the channel unexported?"

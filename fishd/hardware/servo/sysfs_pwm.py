@@ -190,7 +190,7 @@ def _channel(machine: Machine, settings: SysfsPwmSettings) -> Result:
     except ServoError as error:
         return fail(
             str(error),
-            "follow this line, then restart; 'make install-pi' gives group gpio the chip's files",
+            "follow this line, then restart",
         )
     if is_on:
         return warning(f"{channel.path}: pulses are on, but no fishd is running", "fishctl release")

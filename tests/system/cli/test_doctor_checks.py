@@ -117,7 +117,7 @@ CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
     ("amplifier", "ok", "", {}, ["force_sensor.channel_x=A0", "force_sensor.channel_y=A1",
      "force_sensor.saturation_low=0.1"]),
     ("systemd", "skipped", "", {}, []),
-    ("systemd", "warning", "make install-pi", SYSTEMD, []),
+    ("systemd", "warning", "install the Debian package", SYSTEMD, []),
     ("systemd", "warning", "enable --now", SYSTEMD | UNIT, []),
     ("systemd", "ok", "", SYSTEMD | UNIT | WANTED, []),
     ("state folder", "ok", "", {}, []),
@@ -162,8 +162,8 @@ def skip_unless_root() -> None:
     ("group", "mode", "remedy"),
     [
         ("daemon", 0o660, "usermod -aG daemon"),
-        ("daemon", 0o600, "make install-pi"),  # to join the group would not help
-        ("root", 0o660, "make install-pi"),
+        ("daemon", 0o600, "install the Debian package"),  # to join the group would not help
+        ("root", 0o660, "install the Debian package"),
     ],
 )
 def test_the_i2c_bus_must_be_accessible_to_this_user(
@@ -246,7 +246,7 @@ def test_a_button_none_can_read_is_told(examine: Examine, monkeypatch: pytest.Mo
     assert examine("gpio package") == ("", "", "")
     level, message, mend = examine("gpio package", "panel.estop_gpio=17")
     assert (level, message.startswith("neither RPi.GPIO nor rpi-lgpio is")) == ("FAIL", True)
-    assert "make install-pi" in mend
+    assert "[rpi-lgpio]" in mend
 
 
 @pytest.mark.slow

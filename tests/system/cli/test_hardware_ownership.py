@@ -94,7 +94,7 @@ main()
 
 @pytest.fixture
 def locks(tmp_path: Path) -> Iterator[Path]:
-    """Folder of lock files as made by `make install-pi`, with the group of user 65534."""
+    """Folder of lock files as made by the Debian package, with the group of user 65534."""
     if os.geteuid() != 0:
         pytest.skip("needs root: one fishd runs as another user")
     parent = Path(tempfile.mkdtemp())

@@ -46,8 +46,8 @@ def root(tmp_path: Path) -> Path:
     shutil.copytree(SYSTEMD, own)
     shutil.copytree(SHIPPED_UNITS, tmp_path / "usr/lib/systemd/system", symlinks=True)
     (tmp_path / "usr/lib/systemd/system/pigpiod.service").write_text(PIGPIOD)
-    fishd = "opt/fishd/bin/fishd"
-    fishctl = "opt/fishd/bin/fishctl"
+    fishd = "usr/lib/fishd/bin/fishd"
+    fishctl = "usr/lib/fishd/bin/fishctl"
     own_programs = (fishd, f"{fishd}-release", fishctl, f"{fishd}-camera", f"{fishd}-window")
     for program in (*own_programs, "usr/bin/pigpiod", "bin/sh", "bin/systemctl"):
         (tmp_path / program).parent.mkdir(parents=True, exist_ok=True)
@@ -126,10 +126,10 @@ def test_a_wrong_config_is_not_tried_again() -> None:
 def test_the_servo_is_released_however_the_daemon_ends() -> None:
     (release,) = setting("fishd.service", "ExecStopPost")
     (start,) = setting("fishd.service", "ExecStart")
-    assert release.startswith("/opt/fishd/bin/fishd-release --config ")
+    assert release.startswith("/usr/lib/fishd/bin/fishd-release --config ")
     assert release.rpartition(" ")[2] == start.rpartition(" ")[2]
     (last_resort,) = (
-        line for line in setting("fishd-failure.service", "ExecStart") if "opt" in line
+        line for line in setting("fishd-failure.service", "ExecStart") if "fishd-release" in line
     )
     assert last_resort == f"-{release}"
 

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rigs.documents import ROOT
 
+from deb.package import CONFIGS
 from fishd.config import SERVICE_FILE, Config, load, mistakes, to_yaml
 from fishd.core.errors import ConfigError
 from fishd.core.strict_yaml import YamlProblem, dump, parse
@@ -293,8 +294,7 @@ def test_the_longest_path_that_a_unix_socket_takes_is_good() -> None:
 
 
 def test_what_is_installed_on_a_pi_is_the_file_that_the_verbs_look_for() -> None:
-    layout = (ROOT / "tools" / "pi_layout.sh").read_text()
-    assert f"\nCONFIG={SERVICE_FILE}\n" in layout
+    assert str(SERVICE_FILE) == f"/etc/fishd/{CONFIGS['pi']}.yaml"
 
 
 @pytest.mark.parametrize("name", ["", " tank", "tank\n", "a\x1bb", "x" * 41])

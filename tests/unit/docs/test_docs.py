@@ -10,6 +10,7 @@ import pytest
 import yaml
 from rigs.documents import DOCS, FENCE, ROOT, code_of, first_cells, prose_of, text_of
 
+from deb.package import COMMANDS, CONFIGS, HOME, SYSTEM_FILES
 from fishd.camera.main import camera
 from fishd.cli.doctor import checks
 from fishd.cli.doctor.base import Context
@@ -233,13 +234,12 @@ def test_each_permitted_operator_is_listed() -> None:
 
 
 def test_installing_lists_all_files_and_groups_that_come_onto_a_pi() -> None:
-    layout = (ROOT / "tools/pi_layout.sh").read_text()
     users = (ROOT / "systemd/sysusers.d/fishd.conf").read_text()
     table = text_of(ROOT / "docs/how-to/installing.md").split("It installs:")[1].split("\n\n")[1]
-    files = re.findall(r"(?m)^\w*CONFIG=(\S+)|^ +\"\S+ (/\S+)\"$", layout)
-    wanted = {f"`{name or path}`" for name, path in files}
-    assert len(wanted) > 10
-    programs = ("fishd", "fishctl", "fishd-camera", "fishd-window")
-    wanted |= {f"`/usr/local/bin/{name}`" for name in programs}
+    wanted = {f"`/{HOME}`", *(f"`/usr/bin/{name}`" for name in COMMANDS)}
+    wanted |= {f"`/etc/fishd/{name}.yaml`" for name in CONFIGS.values()}
+    for pattern, folder in SYSTEM_FILES.items():
+        wanted |= {f"`/{folder}/{file.name}`" for file in (ROOT / "systemd").glob(pattern)}
+    assert len(wanted) > 16
     wanted |= set(re.findall(r"(?m)^m fishd (\w+)$", users))
     assert {name for name in wanted if name not in table} == set()

@@ -12,33 +12,39 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from common.report import BrokenPromise, Options, Report, progress, table
+from common.report import Report, progress, table
 from reliability.systemd.container import Container, wait_for
-from reliability.systemd.root import build, check_machine
+from reliability.systemd.root import (
+    CHECKOUT,
+    HOME,
+    OPTIONS,
+    build_package,
+    check_machine,
+    make_debian,
+)
 from reliability.systemd.trials import CONFIG, TRIALS, Rig, Row
 
+__all__ = ["OPTIONS", "measure"]
 HERE = Path(__file__).resolve().parent
-UNIT = "etc/systemd/system/fishd.service"
+SUITE = "bookworm"
+"""Release of Debian with the systemd of a Raspberry Pi OS 12."""
 SOCKET = "/run/fishd-virtual-pi/socket"
 _MAY = "CAP_SYS_NICE CAP_IPC_LOCK"
 
 
-OPTIONS: Options = {
-    "--base": {"type": Path, "help": "folder that keeps the bare Debian for next time"},
-    "--keep": {"action": "store_true", "help": "keep the root folder and say where"},
-}
-
-
 def measure(options: Namespace) -> Report:
     """Run every trial; raises `BrokenPromise`, and SystemExit where trials are not possible."""
-    check_machine(options.base)
-    with work_folder(options.keep) as work, Container(build(work, options.base)) as container:
-        return _try_all(container)
+    check_machine()
+    with work_folder(options.keep) as work:
+        root = make_debian(work, SUITE, options)
+        shutil.copy(build_package(work, SUITE), root / "root" / "fishd.deb")
+        with Container(root) as container:
+            return _try_all(container)
 
 
 def _try_all(container: Container) -> Report:
     limits = _may_raise_limits()
-    _install(container)
+    container.run("dpkg", "--install", "/root/fishd.deb")
     _configure(container, limits)
     pulses = container.root.parent / "pulses.log"
     with _watching(container, pulses):
@@ -48,32 +54,11 @@ def _try_all(container: Container) -> Report:
             rig.swim()
             rows.append(trial(rig))
             progress(rows[-1].what, rows[-1].outcome)
-    _uninstall(container)
     return Report({"reliability systemd": _text(container, rows, limits)}, rows)
 
 
-def _install(container: Container) -> None:
-    """Install fishd as on a Pi, without a network."""
-    progress("installing fishd")
-    pip = ["PIP_NO_INDEX=1", "PIP_FIND_LINKS=/root/wheels", "FISHD_GPIO=none"]
-    for _ in range(2):  # the second run finds everything installed
-        container.run("env", *pip, "make", "-C", "/root/fishd", "install-pi")
-
-
-def _uninstall(container: Container) -> None:
-    """Uninstall fishd, which stops a swimming fish and keeps the edited configuration."""
-    container.run("systemctl", "start", "fishd")
-    container.run("make", "-C", "/root/fishd", "uninstall-pi")
-    left = [path for path in ("opt/fishd", UNIT) if (container.root / path).exists()]
-    if left or container.show("fishd.service", "ActiveState") != "inactive":
-        raise BrokenPromise(f"uninstalling leaves {', '.join(left) or 'the daemon running'}")
-    if not (container.root / CONFIG).exists():
-        raise BrokenPromise("uninstalling takes away an edited configuration")
-    progress("uninstalled")
-
-
 def _configure(container: Container, limits: bool) -> None:
-    virtual_pi = (container.root / "root/fishd/config/virtual-pi.yaml").read_text()
+    virtual_pi = (CHECKOUT / "config/virtual-pi.yaml").read_text()
     virtual_pi = virtual_pi.replace("virtual_pi:\n", f"virtual_pi:\n  socket: {SOCKET}\n")
     (container.root / CONFIG).write_text(f"{virtual_pi}\nstate_folder: /var/lib/fishd\n")
     units = container.root / "etc/systemd/system"
@@ -99,7 +84,7 @@ def _may_raise_limits() -> bool:
 
 @contextmanager
 def _watching(container: Container, pulses: Path) -> Iterator[None]:
-    python = ["/opt/fishd/bin/python", "/root/watch_pulses.py", SOCKET]
+    python = [f"/{HOME}/bin/python", "/root/watch_pulses.py", SOCKET]
     wait_for(
         lambda: bool(container.run("sh", "-c", f"test -S {SOCKET} && echo yes", check=False)),
         "the virtual Pi does not start",
@@ -135,7 +120,7 @@ def _text(container: Container, rows: list[Row], limits: bool) -> str:
         for row in rows
     )
     text = (
-        f"systemd {version}, {python}, fishd from `make install-pi` with "
+        f"systemd {version}, {python}, fishd from its Debian package with "
         "the virtual Pi; times in seconds from the action.\n\n"
         + table("action | servo neutral | pulses off | ready (again) | outcome", cells)
     )
