@@ -217,7 +217,7 @@ def test_a_fish_that_cannot_go_on_says_why_and_where_its_last_checkpoint_is(tmp_
     kept = tmp_path / "kept.npz"
     keeps = ("--to", str(kept), "--checkpoint-every", "0.1")
     narrow = sets("swimmer.numerics.fine_width=0.5", "swimmer.steering=0")
-    done = simulate("square", "--frequency", "2.5", *narrow, *keeps)
+    done = simulate("square", "--frequency", "1.5", *narrow, *keeps)
     line = one_line(done)
     assert done.returncode == 1
     assert "the swimmer cannot go on at" in line
@@ -262,8 +262,9 @@ def test_a_folder_that_goes_away_costs_its_file_and_not_the_swim(
         gone.rename(tmp_path / "elsewhere")
 
     monkeypatch.setattr(checkpoint, "save", save_and_go)
-    files = ("--to", gone / "kept.npz", "--checkpoint-every", "0.5")
-    done = simulate("swing", "--seconds", "2", "--settle", "0.5", *files)
+    files = ("--to", gone / "kept.npz", "--checkpoint-every", "0.3")
+    wave = ("square", "--frequency", "5", "--seconds", "0.8", "--settle", "0.2")
+    done = simulate(*wave, *files)
     assert (tmp_path / "elsewhere" / "kept.npz").exists()
     assert done.returncode == 1
     assert "\nspeed " in done.stdout

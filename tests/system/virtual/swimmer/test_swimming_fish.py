@@ -27,9 +27,8 @@ def compute_friction(fish: Fish, speed: float) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steering", [0, 1])
-def test_a_fish_that_stops_beating_is_slowed_by_friction_alone(steering: int) -> None:
-    fish = Fish(coarse(f"swimmer.steering={steering}").swimmer)
+def test_a_fish_that_stops_beating_is_slowed_by_friction_alone() -> None:
+    fish = Fish(coarse().swimmer)
     swim(fish, 2.0, 2.5)
     speeds, left = [fish.motion().speed], [kinetic_energy(fish)]
     for _ in range(6):
