@@ -47,7 +47,7 @@ def sections() -> list[tuple[str, str, str]]:
 def section(name: str) -> str:
     """Return the text between the markers of this name."""
     if name == REFINEMENT:
-        cells = " | ".join(f"{cell:g} mm" for cell in figure_6.choose_table().cells)
+        cells = " | ".join(f"{cell:g} mm" for cell in figure_6.TABLE.cells)
         return table(f"speed ± averaging ± grid (mm/s), cells of | {cells}", refinement())
     words = {True: "yes", False: "**no**", None: "–"}
     return table(
@@ -317,7 +317,7 @@ def swimming() -> Iterator[Claim]:
 
 def refinement() -> Iterator[tuple[str, str, str, str]]:
     """Return the table of swims, with their speeds on cells of each size."""
-    stored = figure_6.choose_table()
+    stored = figure_6.TABLE
     for controller, setting in figure_6.REFINED:
         what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
         rows = [stored.row(figure_6.Case(controller, setting, cell)) for cell in stored.cells]
@@ -331,12 +331,12 @@ def _speed(row: dict[str, Any]) -> str:
     """Return speed ± averaging, and ± grid where that is known."""
     text = f"{row['speed_mm_per_s']:.2f} ± {row['ci95_mm_per_s']:.2f}"
     case = figure_6.Case(row["controller"], row["setting"], row["cell_mm"])
-    error = figure_6.choose_table().grid_error(*case)
+    error = figure_6.TABLE.grid_error(*case)
     return text if error is None else f"{text} ± {error:.0f}"
 
 
 def _swum(controller: str) -> list[dict[str, Any]]:
-    stored = figure_6.choose_table()
+    stored = figure_6.TABLE
     return read(stored.name, controller=controller, cell_mm=stored.cell)
 
 
