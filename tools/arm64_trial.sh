@@ -102,6 +102,7 @@ import json, math, sys
 
 first, second = (json.load(open(path)) for path in sys.argv[1:])
 for report in (first, second):
+    report.update(report.pop("quantities"))
     for name in ("microseconds_per_tick", "real_time_factor"):
         del report[name]
 numbers = [name for name, value in first.items() if isinstance(value, float)]
