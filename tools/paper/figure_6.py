@@ -14,17 +14,15 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import joblib
-import msgspec
 
 from common.report import progress
 from fishd.config import Config, load
-from fishd.controllers import registry
 from fishd.lab import drawing
 from fishd.lab.drawing import BLACK, BLUE, GREEN, ORANGE, PURPLE
 from fishd.lab.sweep.grid import Point
 from fishd.lab.sweep.measuring import Lengths, swim_freely
 from fishd.lab.sweep.results import SpeedResult
-from fishd.lab.swimmer.refinement import GridSpeed, estimate, find_grid_error
+from fishd.lab.swimmer.refinement import GridSpeed, estimate
 from paper.runs import FOLDER, Row, column, read, write
 
 NAME = "figure-6"
@@ -57,9 +55,7 @@ class Case(NamedTuple):
 
 REFINED = (("square", 3.0), ("sine", 2.0), ("swing", 0.6))
 """Controllers and settings that swim on all grids."""
-
-
-LOST = (Case("square", 6.0, 0.5),)
+LOST_SWIMS = (Case("square", 6.0, 0.5),)
 """Swims in which the fish turns and leaves the part with small cells before its speed is steady."""
 
 
@@ -76,7 +72,7 @@ class Table(NamedTuple):
         """Return the swims of the left panel."""
         waves = [Case(wave, frequency, self.cell) for wave in WAVES for frequency in FREQUENCIES]
         swings = [Case("swing", criterion, self.cell) for criterion in CRITERIA]
-        return [case for case in waves + swings if case not in LOST]
+        return [case for case in waves + swings if case not in LOST_SWIMS]
 
     def cases(self) -> list[Case]:
         """Return every swim of the table."""
@@ -91,23 +87,13 @@ class Table(NamedTuple):
         return next(iter(read(self.name, **having)), None)
 
     def grid_error(self, controller: str, setting: float, cell: float) -> float | None:
-        """Return the half-width of a speed's error by the grid [mm/s]; None if not known.
-
-        Without all grids in the table, it is that of the shipped refinement, where there is one.
-        """
+        """Return the half-width of a speed's error by the grid [mm/s]; None if not known."""
         rows = [self.row(Case(controller, setting, size)) for size in self.cells]
         grids = [
             GridSpeed(cell=row["cell_mm"], step=math.nan, speed=row["speed_mm_per_s"])
             for row in rows
             if row
         ]
-        if len(grids) < len(self.cells):
-            fish, start = config(cell), Case(controller, setting, cell).point()
-            parameters = registry.create(controller, start.parameters, fish.limits).parameters
-            values = msgspec.structs.asdict(parameters)
-            error = find_grid_error(fish, controller, values, shipped_only=True)
-            if error is not None:
-                return 1e3 * error
         return estimate(grids).error(cell) if len(grids) > 1 else None
 
 
@@ -138,7 +124,7 @@ def compute(jobs: int) -> None:
     """
     cases = TABLE.cases()
     rows = {case: row for case in cases if (row := TABLE.row(case))}
-    missing = sorted((case for case in cases if case not in rows), key=_turn)
+    missing = sorted((case for case in cases if case not in rows), key=_order)
     problems = []
     parallel = joblib.Parallel(jobs, batch_size=1, return_as="generator_unordered")
     for case, result in parallel(joblib.delayed(swim)(case) for case in missing):
@@ -152,7 +138,7 @@ def compute(jobs: int) -> None:
         raise SystemExit("\n".join(problems))
 
 
-def _turn(case: Case) -> tuple[Any, ...]:
+def _order(case: Case) -> tuple[Any, ...]:
     """Return a key that puts the swims of the left panel first, and the longest last."""
     last = case.controller == "triangle"
     return case.cell != TABLE.cell, -case.cell, last, case.controller == "swing", case.setting

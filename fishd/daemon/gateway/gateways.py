@@ -302,7 +302,7 @@ class Gateway(_Peer):
         self._notice = ""
         """Limit that the process says it has exceeded."""
         self._mistake = ""
-        """What the process found wrong with the file of known keys when it started."""
+        """Mistake in the file of known keys when the process started; empty without one."""
         self._started_at = 0.0
         """Time of the latest start [s]."""
         self._report_timer: asyncio.TimerHandle | None = None

@@ -35,7 +35,7 @@ class KnownKeys:
             self._update()
             time.sleep(SETTLE_TIME_S / 10)
         self.mistake: str = self._change
-        """What was wrong with the file at the start, or ""."""
+        """Mistake in the file at the start; empty without one."""
         self._change = ""
 
     def find(self, key: str) -> keys.KnownKey | None:

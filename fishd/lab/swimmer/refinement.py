@@ -129,18 +129,14 @@ def describe_fish(config: Config) -> dict[str, Any]:
     return {"amplitude_limit": config.amplitude_limit, **swimmer}
 
 
-def find_grid_error(
-    config: Config, controller: str, parameters: Mapping[str, Any], shipped_only: bool = False
-) -> float | None:
+def find_grid_error(config: Config, controller: str, parameters: Mapping[str, Any]) -> float | None:
     """Return the half-width of the error of a speed on this grid [m/s]; None if not known.
 
     parameters: all parameters of the controller
-    shipped_only: whether to leave out the refinements of this user
     It is known after `fishctl swimmer refine` of this fish with this controller.
     """
     fish, values = describe_fish(config), msgspec.to_builtins(dict(parameters))
-    folders = _folders()[:1] if shipped_only else _folders()
-    for stored in reversed([each for folder in folders for each in _read(folder / FILE)]):
+    for stored in reversed([each for folder in _folders() for each in _read(folder / FILE)]):
         if (stored.fish, stored.controller, stored.parameters) == (fish, controller, values):
             return estimate(stored.grids).error(config.swimmer.numerics.cell)
     return None

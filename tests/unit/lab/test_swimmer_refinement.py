@@ -76,7 +76,6 @@ def test_an_error_is_found_for_the_same_fish_and_gait_on_any_grid(
         )
     assert refinement.find_grid_error(finer, "square", PARAMETERS) == pytest.approx(0.03)
     assert refinement.find_grid_error(config, "square", PARAMETERS) == pytest.approx(0.12)
-    assert refinement.find_grid_error(config, "square", PARAMETERS, shipped_only=True) is None
     assert refinement.find_grid_error(config, "sine", PARAMETERS) is None
     other = coarse("swimmer.muscle.strain=0.9")
     assert refinement.find_grid_error(other, "square", PARAMETERS) is None
