@@ -16,7 +16,8 @@ from _pytest.runner import runtestprotocol
 from hypothesis import HealthCheck, settings
 
 # Each process computes with one thread; set before numpy or torch is loaded, here or in a child.
-for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+LIBRARIES = "OMP", "OPENBLAS", "MKL", "NUMBA"
+for variable in (f"{library}_NUM_THREADS" for library in LIBRARIES):
     os.environ.setdefault(variable, "1")
 for variable in ("COLUMNS", "LINES"):  # which workers set; a terminal reports its size itself
     os.environ.pop(variable, None)

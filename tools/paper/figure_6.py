@@ -1,11 +1,11 @@
 """Figure 6: the speed of the free swimmer against frequency, also on finer grids.
 
 Each swim is stored when it ends, and stored swims are not computed again: `make figures` resumes
-after an interruption. On one core that does nothing else, the swims of the left panel take 50
-minutes, the three on cells of 0.25 mm another 40.
+after an interruption. On one core that does nothing else, the swims on cells of 0.5 mm take 50
+minutes, the eight on cells of 0.25 mm another 100.
 
-Pale bars are the error by the grid, of the three refined swims on the left and of their finest grid
-on the right. For the other points it is not known.
+Pale bars are the error by the grid, where a gait swims on several: on the left that of both grids,
+on the right that of the finest. For the other points it is not known.
 """
 
 import math
@@ -55,6 +55,8 @@ class Case(NamedTuple):
 
 REFINED = (("square", 3.0), ("sine", 2.0), ("swing", 0.6))
 """Controllers and settings that swim on all grids."""
+FINE = (("square", 4.0), ("sine", 3.0), ("swing", 0.0), ("square", 1.5), ("sine", 1.5))
+"""Controllers and settings that swim on the grid of the figure and the finest."""
 LOST_SWIMS = (Case("square", 6.0, 0.5),)
 """Swims in which the fish turns and leaves the part with small cells before its speed is steady."""
 
@@ -77,7 +79,8 @@ class Table(NamedTuple):
     def cases(self) -> list[Case]:
         """Return every swim of the table."""
         others = [cell for cell in self.cells if cell != self.cell]
-        return self.curves() + [Case(*swim, cell) for cell in others for swim in REFINED]
+        refined = [Case(*swim, cell) for cell in others for swim in REFINED]
+        return self.curves() + refined + [Case(*swim, min(self.cells)) for swim in FINE]
 
     def row(self, case: Case) -> dict[str, Any] | None:
         """Return the row of a swim; None before it is stored."""
@@ -183,10 +186,16 @@ def draw() -> None:
             what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
             colour, marker = colours[controller]
             _bars(right, rows, "cell_mm", colour, marker, f"{controller}, {what}", line)
-            case = Case(controller, setting, TABLE.cell)
-            _draw_grid_error(left, case, "frequency_Hz", colour)
-            finest = case._replace(cell=rows[0]["cell_mm"])
+            finest = Case(controller, setting, rows[0]["cell_mm"])
             _draw_grid_error(right, finest, "cell_mm", colour)
+        for controller, setting in REFINED + FINE:
+            for cell in (TABLE.cell, min(TABLE.cells)):
+                case = Case(controller, setting, cell)
+                _draw_grid_error(left, case, "frequency_Hz", colours[controller][0])
+            if row := TABLE.row(case):
+                place = row["frequency_Hz"], row["speed_mm_per_s"]
+                left.plot(*place, ls="", marker="x", color=colours[controller][0], zorder=6)
+        left.plot([], [], ls="", marker="x", color="0.4", label=f"cells of {min(TABLE.cells)} mm")
         for axes in (left, right):
             axes.axhline(0.0, color="0.85", linewidth=0.6, zorder=0)
             axes.legend()

@@ -109,7 +109,7 @@ class Painter:
         return covered
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _paint(  # pragma: no cover
     places: Array,
     angle: Array,
@@ -262,7 +262,7 @@ def gather(  # pragma: no cover
         momentum[s, 2] += lever * carried
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def impose(  # pragma: no cover
     k: int,
     covered: Covered,
@@ -292,17 +292,14 @@ def impose(  # pragma: no cover
     return total
 
 
-@njit(cache=True)
-def update_chi(  # pragma: no cover
-    covered: Covered, chi: Field, fixed_chi: Field, sign: float
-) -> None:
-    """Write χ of covered faces: that of the fixed bodies, plus `sign` times that of this body."""
+@njit(cache=True, nogil=True)
+def add_chi(covered: Covered, chi: Field) -> None:  # pragma: no cover
+    """Add the coverage by a body to χ of the faces."""
     for m in range(covered.i.size):
-        i, j = covered.i[m], covered.j[m]
-        chi[i, j] = fixed_chi[i, j] + chi.dtype.type(sign * covered.chi[m])
+        chi[covered.i[m], covered.j[m]] += chi.dtype.type(covered.chi[m])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def weigh_cells(  # pragma: no cover
     k: int, covered: Covered, chi_u: Field, chi_v: Field, weight: Field
 ) -> None:
@@ -316,3 +313,16 @@ def weigh_cells(  # pragma: no cover
             i, j = covered.i[m] + (side if k == 0 else 0), covered.j[m] + (side if k else 0)
             inside = chi_u[i, j] * chi_u[i + 1, j] * chi_v[i, j] * chi_v[i, j + 1]
             weight[i, j] = weight.dtype.type(1.0) - inside
+
+
+@njit(cache=True, nogil=True)
+def uncover(  # pragma: no cover
+    k: int, covered: Covered, chi: Field, fixed_chi: Field, weight: Field, fixed_weight: Field
+) -> None:
+    """Restore χ of covered faces and the weights beside them to those of the fixed body alone."""
+    for m in range(covered.i.size):
+        i, j = covered.i[m], covered.j[m]
+        before_i, before_j = i - (k == 0), j - (k == 1)
+        chi[i, j] = fixed_chi[i, j]
+        weight[i, j] = fixed_weight[i, j]
+        weight[before_i, before_j] = fixed_weight[before_i, before_j]

@@ -83,6 +83,7 @@ class Flow:
         at rest then passes."""
         self._slip = walls == "slip"
         self._poisson = Poisson(grid, dtype)
+        self.pairs = self._poisson.pairs
         self._u = np.zeros((grid.nx + 1 + 2 * PAD, grid.ny + 2 * PAD), dtype)
         self._v = np.zeros((grid.nx + 2 * PAD, grid.ny + 1 + 2 * PAD), dtype)
         self.u, self.v = self._u[PAD:-PAD, PAD:-PAD], self._v[PAD:-PAD, PAD:-PAD]
@@ -125,15 +126,15 @@ class Flow:
         _fill_ghosts(self._u, self._v, 1.0 if self._slip else -1.0)
         weights = ADAMS_BASHFORTH[self._past_steps]
         scalars = *self.grid_velocity, self.viscosity, dt, *weights
-        crossed = []
-        for k, rates, predicted in (
-            (0, self._rates_u, self.predicted_u),
-            (1, self._rates_v, self.predicted_v),
-        ):
-            rates.insert(0, rates.pop())
-            fields = (self._u, self._v)[k], self._u, self._v, self.p
-            crossed.append(_advance(k, *fields, *rates, predicted, self._stencils[k], *scalars))
-        self._crossed = np.array([crossed[0], *self._crossed[:2]])
+        rates_u, rates_v = self._rates_u, self._rates_v
+        rates_u.insert(0, rates_u.pop())
+        rates_v.insert(0, rates_v.pop())
+        fields, (on_u, on_v) = (self._u, self._v, self.p), self._stencils
+        crossed, _ = self.pairs.run(
+            lambda: _advance(0, self._u, *fields, *rates_u, self.predicted_u, on_u, *scalars),
+            lambda: _advance(1, self._v, *fields, *rates_v, self.predicted_v, on_v, *scalars),
+        )
+        self._crossed = np.array([crossed, *self._crossed[:2]])
         self._past_steps = min(2, self._past_steps + 1)
         self.boundary_impulse = dt * float(weights @ self._crossed)
         self.predicted_u[0] = self.inlet
@@ -165,8 +166,10 @@ class Flow:
         _divergence(*predicted, *sizes, 1.0 / dt, weight, source)
         change = self._poisson.solve(source)
         before = grid.dy @ (self.p[-1] - self.p[0])
-        _correct_u(self.predicted_u, change, on_u.inverse_size_x, dt, self._u)
-        _correct_v(self.predicted_v, change, on_v.inverse_size_y, dt, self._v)
+        self.pairs.run(
+            lambda: _correct_u(self.predicted_u, change, on_u.inverse_size_x, dt, self._u),
+            lambda: _correct_v(self.predicted_v, change, on_v.inverse_size_y, dt, self._v),
+        )
         self.u[0] = self.predicted_u[0]
         beyond = self.u.dtype.type(2.0 * dt / self._between_x[-1])
         self.u[-1] = self.predicted_u[-1] + beyond * change[-1]
@@ -277,7 +280,7 @@ def flux_weights(real: Any) -> Any:  # pragma: no cover
     return real(7.0 / 12.0), real(1.0 / 12.0), real(DISSIPATION / 12.0)
 
 
-@njit(cache=True, fastmath={"contract", "nsz", "arcp"})
+@njit(cache=True, nogil=True, fastmath={"contract", "nsz", "arcp"})
 def _advance(  # pragma: no cover
     k: int,
     q: Field,
@@ -379,7 +382,7 @@ def _divergence(  # pragma: no cover
             out[i, j] = ((right[j] - left[j]) * along + across) * weight[i, j]
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _correct_u(  # pragma: no cover
     predicted: Field, change: Field, inverse_size: Field, dt: float, u: Field
 ) -> None:
@@ -395,7 +398,7 @@ def _correct_u(  # pragma: no cover
             out[j] = predicted[i, j] - scale * (change[i, j] - change[i - 1, j])
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _correct_v(  # pragma: no cover
     predicted: Field, change: Field, inverse_size: Field, dt: float, v: Field
 ) -> None:

@@ -15,10 +15,11 @@ from fishd.virtual.swimmer.beam import Beam
 from fishd.virtual.swimmer.covers import (
     Covered,
     Painter,
+    add_chi,
     circle,
     gather,
     impose,
-    update_chi,
+    uncover,
     weigh_cells,
 )
 from fishd.virtual.swimmer.flow import Flow
@@ -47,7 +48,8 @@ class Immersed:
         self._fixed: tuple[Covered, Covered] | None = None
         self._fixed_chi = np.zeros_like(flow.u), np.zeros_like(flow.v)
         self._chi = np.zeros_like(flow.u), np.zeros_like(flow.v)
-        self._divergence_weight = np.ones_like(flow.p)
+        self._weight, self._fixed_weight = np.ones_like(flow.p), np.ones_like(flow.p)
+        """Fraction of its divergence that each cell loses, with all bodies and with the circle."""
         self._covered: tuple[Covered, Covered] | None = None
         """Coverage by the beam in the latest step."""
         self._cell_mass = density * grid.h**2
@@ -69,9 +71,10 @@ class Immersed:
         on_u = circle(grid.x - x, grid.yc - y, radius, grid.h)
         on_v = circle(grid.xc - x, grid.y - y, radius, grid.h)
         self._fixed = on_u, on_v
-        for covered, fixed in zip(self._fixed, self._fixed_chi, strict=True):
-            fixed[covered.i, covered.j] = covered.chi
-        self._update_coverage(self._fixed, 0.0)
+        self._cover(self._fixed)
+        for fixed, chi in zip(self._fixed_chi, self._chi, strict=True):
+            fixed[:] = chi
+        self._fixed_weight[:] = self._weight
 
     def step(self, dt: float, forces: Array | None = None) -> None:
         """Advance by `dt` [s]; forces: those on the beam's unknowns in the middle of the step."""
@@ -80,7 +83,7 @@ class Immersed:
             self._hold(self._fixed)
         if self.beam:
             self._move(self.beam, dt, forces)
-        self.flow.project(dt, self._divergence_weight)
+        self.flow.project(dt, self._weight)
 
     def _hold(self, fixed: tuple[Covered, Covered]) -> None:
         """Bring the water inside the circle to rest."""
@@ -94,20 +97,29 @@ class Immersed:
         flow, h = self.flow, self.flow.grid.h
         on_u, on_v = covered
         at_u, at_v = self._positions
-        return (
-            impose(0, on_u, flow.predicted_u, motion, places, at_u, h),
-            impose(1, on_v, flow.predicted_v, motion, places, at_v, h),
+        return flow.pairs.run(
+            lambda: impose(0, on_u, flow.predicted_u, motion, places, at_u, h),
+            lambda: impose(1, on_v, flow.predicted_v, motion, places, at_v, h),
         )
 
-    def _update_coverage(self, covered: tuple[Covered, Covered], sign: float) -> None:
-        """Update χ of these faces and the weights of the divergence of the cells beside them.
+    def _cover(self, covered: tuple[Covered, Covered]) -> None:
+        """Add a body to χ of these faces, and weigh the divergence of the cells beside them."""
+        (on_u, on_v), (chi_u, chi_v), weight = covered, self._chi, self._weight
+        run = self.flow.pairs.run
+        run(lambda: add_chi(on_u, chi_u), lambda: add_chi(on_v, chi_v))
+        run(
+            lambda: weigh_cells(0, on_u, chi_u, chi_v, weight),
+            lambda: weigh_cells(1, on_v, chi_u, chi_v, weight),
+        )
 
-        sign: 1 to add this body to the fixed one, 0 to remove it
-        """
-        for on_faces, chi, fixed in zip(covered, self._chi, self._fixed_chi, strict=True):
-            update_chi(on_faces, chi, fixed, sign)
-        for k in (0, 1):
-            weigh_cells(k, covered[k], *self._chi, self._divergence_weight)
+    def _uncover(self, covered: tuple[Covered, Covered]) -> None:
+        """Remove the beam from χ of these faces and the weights of the cells beside them."""
+        weights = self._weight, self._fixed_weight
+        (on_u, on_v), (chi_u, chi_v), (fixed_u, fixed_v) = covered, self._chi, self._fixed_chi
+        self.flow.pairs.run(
+            lambda: uncover(0, on_u, chi_u, fixed_u, *weights),
+            lambda: uncover(1, on_v, chi_v, fixed_v, *weights),
+        )
 
     def _move(self, beam: Beam, dt: float, forces: Array | None) -> None:
         """Compute the new motion of the beam, and impose it on the water inside the beam."""
@@ -117,7 +129,8 @@ class Immersed:
         places, angle = beam.shape(beam.q + dt * (1.5 * beam.rate - 0.5 * self._before - travel))
         self._check_place(places, float(beam.half_thickness.max()))
         body = places, angle, beam.half_thickness, beam.taper, beam.spacing, beam.clamped
-        on_u, on_v = (painter.paint(*body) for painter in self._painters)
+        paint_u, paint_v = (painter.paint for painter in self._painters)
+        on_u, on_v = flow.pairs.run(lambda: paint_u(*body), lambda: paint_v(*body))
         if self._fixed:
             _exclude_fixed(on_u, self._fixed_chi[0])
             _exclude_fixed(on_v, self._fixed_chi[1])
@@ -133,9 +146,9 @@ class Immersed:
         beam.q = beam.q + dt * (0.5 * (rate + beam.rate) - travel)
         self._before, beam.rate = beam.rate, rate
         if self._covered:
-            self._update_coverage(self._covered, 0.0)
+            self._uncover(self._covered)
         self._covered = on_u, on_v
-        self._update_coverage(self._covered, 1.0)
+        self._cover(self._covered)
 
     def _solve(
         self, beam: Beam, dt: float, jacobian: Array, momentum: Array, forces: Array | None

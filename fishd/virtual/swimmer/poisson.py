@@ -12,6 +12,7 @@ from scipy.linalg import eigh_tridiagonal
 from threadpoolctl import threadpool_limits
 
 from fishd.virtual.swimmer.grid import Array, Field, Grid
+from fishd.virtual.swimmer.threads import Pairs
 
 
 class Poisson:
@@ -20,8 +21,10 @@ class Poisson:
     def __init__(self, grid: Grid, dtype: DTypeLike = np.float64) -> None:
         """dtype: precision of the fields"""
         # Applies to the whole process, intentionally: these matrices are too small for several
-        # threads, which wait for each other on a busy machine; a step took ten times as long.
+        # threads of BLAS, which wait for each other on a busy machine; a step took ten times as
+        # long.
         threadpool_limits(1, "blas")
+        self.pairs = Pairs(grid.nx * grid.ny)
         across = np.diff(grid.yc)
         upper = 1.0 / across
         diagonal = np.zeros(grid.ny)
@@ -30,85 +33,108 @@ class Poisson:
         # The matrix is symmetric after a scaling with the root of the cells' widths.
         root = np.sqrt(grid.dy)
         values, vectors = eigh_tridiagonal(diagonal / grid.dy, upper / (root[1:] * root[:-1]))
-        to_modes, from_modes = root[:, None] * vectors, vectors.T / root[None, :]
-        order = np.arange(grid.ny - 1, -1, -1)  # the first mode is constant across
-        self._half = 0
+        to_modes, from_modes = root[:, None] * vectors, vectors.T / root
+        # The first mode is constant across.
+        values, to_modes, from_modes = values[::-1], to_modes[:, ::-1], from_modes[::-1]
+        self._dx = np.asarray(grid.dx, dtype)
+        self._solution = np.empty((grid.nx, grid.ny), dtype)
         if np.allclose(grid.dy, grid.dy[::-1], rtol=1e-9, atol=0.0):
             # The modes of an even grid alternate between even and odd: the products are halved.
-            self._half = (grid.ny + 1) // 2
-            order = np.concatenate([order[::2], order[1::2]])
-        half = self._half
-        values, to_modes, from_modes = values[order], to_modes[:, order], from_modes[order]
-        if half:
+            half = (grid.ny + 1) // 2
             # The fold adds the middle row, where there is one, to itself.
             to_modes[half - 1] *= 1.0 if grid.ny % 2 == 0 else 0.5
-            to_modes, from_modes = to_modes[:half], from_modes[:, :half]
+            self._parts = [
+                _Modes(grid, values[k::2], to_modes[:half, k::2], from_modes[k::2, :half], dtype)
+                for k in (0, 1)
+            ]
+        else:
+            self._parts = [_Modes(grid, values, to_modes, from_modes, dtype)]
+        self._parts[0].has_constant = True
 
-        def prepared(matrix: Array) -> Field:
-            return np.ascontiguousarray(matrix, dtype)
+    def solve(self, f: Field) -> Field:
+        """Return φ [m² times the unit of f], overwritten by the next call; f: shape (nx, ny)."""
+        if len(self._parts) == 1:
+            part = self._parts[0]
+            np.multiply(f, self._dx[:, None], out=part.values)
+            part.solve()
+            return part.values
+        even, odd = self._parts
 
-        self._to_modes = prepared(to_modes[:, : half or None])
-        self._from_modes = prepared(from_modes[: half or None])
-        self._to_odd, self._from_odd = prepared(to_modes[:, half:]), prepared(from_modes[half:])
-        self._dx = prepared(grid.dx)
+        def solve(part: _Modes, sign: float) -> None:
+            _fold(f, self._dx, sign, part.values)
+            part.solve()
+
+        def unfold(rows: slice) -> None:
+            _unfold(even.values[rows], odd.values[rows], self._solution[rows])
+
+        self.pairs.run(lambda: solve(even, 1.0), lambda: solve(odd, -1.0))
+        middle = len(f) // 2
+        self.pairs.run(lambda: unfold(slice(middle)), lambda: unfold(slice(middle, None)))
+        return self._solution
+
+
+class _Modes:
+    """Modes across, with the solution of their equations along."""
+
+    def __init__(
+        self, grid: Grid, values: Array, to_modes: Array, from_modes: Array, dtype: DTypeLike
+    ) -> None:
+        """values: eigenvalues [1/m²]; to_modes, from_modes: matrices of the products"""
+        self._to_modes = np.ascontiguousarray(to_modes, dtype)
+        self._from_modes = np.ascontiguousarray(from_modes, dtype)
         # Reused, because a new allocation costs as much as one of the products.
-        self._even, self._odd = (np.empty((grid.nx, half), dtype) for _ in range(2))
-        self._modes, self._solution = (np.empty((grid.nx, grid.ny), dtype) for _ in range(2))
+        self.values = np.empty((grid.nx, to_modes.shape[0]), dtype)
+        """f times the width of the cells before `solve`, and φ after it."""
+        self.has_constant = False
+        """Whether the first mode is constant across."""
+        self._modes = np.empty((grid.nx, values.size), dtype)
         self._gaps = np.append(np.diff(grid.xc), 0.5 * grid.dx[-1])
         coupling = 1.0 / self._gaps  # φ = 0 half a cell beyond the last centre
         middle = -(coupling + np.append(0.0, coupling[:-1]))
         # Factorisation for each mode of the matrix, which is symmetric before the division by dx.
-        pivots = np.empty((grid.nx, grid.ny))
+        pivots = np.empty((grid.nx, values.size))
         pivots[0] = middle[0] + values * grid.dx[0]
         for i in range(1, grid.nx):
             pivots[i] = middle[i] + values * grid.dx[i] - coupling[i - 1] ** 2 / pivots[i - 1]
-        self._inverse_pivots = prepared(1.0 / pivots)
-        self._coupling = prepared(np.append(0.0, coupling[:-1]))
+        self._inverse_pivots = np.asarray(1.0 / pivots, dtype)
+        self._coupling = np.append(0.0, coupling[:-1]).astype(dtype)
 
-    def solve(self, f: Field) -> Field:
-        """Return φ [m² times the unit of f], overwritten by the next call; f: shape (nx, ny)."""
-        half = self._half
-        modes = self._modes
-        if half:
-            even, odd = self._even, self._odd
-            _fold(f, self._dx, even, odd)
-            np.matmul(even, self._to_modes, out=modes[:, :half])
-            np.matmul(odd, self._to_odd, out=modes[:, half:])
-        else:
-            np.matmul(f * self._dx[:, None], self._to_modes, out=modes)
+    def solve(self) -> None:
+        """Replace f in `values` by φ."""
+        modes = np.matmul(self.values, self._to_modes, out=self._modes)
         # In single precision, the recurrence of the constant mode would lose all digits.
         slope = np.cumsum(modes[:, 0], dtype=np.float64) * self._gaps
         constant = -np.cumsum(slope[::-1])[::-1]
         _sweep(modes, self._coupling, self._inverse_pivots)
-        modes[:, 0] = constant
-        if not half:
-            return np.matmul(modes, self._from_modes, out=self._solution)
-        np.matmul(modes[:, :half], self._from_modes, out=even)
-        np.matmul(modes[:, half:], self._from_odd, out=odd)
-        _unfold(even, odd, self._solution)
-        return self._solution
+        if self.has_constant:
+            modes[:, 0] = constant
+        np.matmul(modes, self._from_modes, out=self.values)
 
 
-@njit(cache=True)
-def _fold(f: Field, dx: Field, even: Field, odd: Field) -> None:  # pragma: no cover
-    """Compute the even and the odd part across, times the width of the cells."""
+@njit(cache=True, fastmath=True, nogil=True)
+def _fold(f: Field, dx: Field, sign: float, out: Field) -> None:  # pragma: no cover
+    """Compute the even part across, or with the sign −1 the odd part, times the cells' widths."""
     nx, ny = f.shape
     for i in range(nx):
-        for j in range(even.shape[1]):
-            even[i, j] = dx[i] * (f[i, j] + f[i, ny - 1 - j])
-            odd[i, j] = dx[i] * (f[i, j] - f[i, ny - 1 - j])
+        row, width = f[i], dx[i]
+        other = width * f.dtype.type(sign)
+        for j in range(out.shape[1]):
+            out[i, j] = width * row[j] + other * row[ny - 1 - j]
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def _unfold(even: Field, odd: Field, solution: Field) -> None:  # pragma: no cover
     nx, ny = solution.shape
+    n = even.shape[1]
     for i in range(nx):
-        for j in range(even.shape[1]):
+        # First the far half, because both write the middle row, where there is one.
+        for j in range(n):
             solution[i, ny - 1 - j] = even[i, j] - odd[i, j]
+        for j in range(n):
             solution[i, j] = even[i, j] + odd[i, j]
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, nogil=True)
 def _sweep(values: Field, coupling: Field, inverse_pivots: Field) -> None:  # pragma: no cover
     nx, ny = values.shape
     for i in range(1, nx):

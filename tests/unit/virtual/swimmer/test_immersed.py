@@ -1,9 +1,14 @@
 """Bodies in the water: conservation of momentum, light bodies, and bending without locking."""
 
+import gc
+import threading
+
 import numpy as np
 import pytest
 from numpy.typing import DTypeLike
+from rigs.processes import wait_until
 
+from fishd.virtual.swimmer import threads
 from fishd.virtual.swimmer.beam import Beam
 from fishd.virtual.swimmer.flow import Flow
 from fishd.virtual.swimmer.grid import Array, Grid, edges
@@ -166,3 +171,23 @@ def test_a_cylinder_that_starts_at_once_has_the_published_drag() -> None:
         drag.append(2.0 * float(body.fixed_impulse[0]) / dt)
     times = 2.0 * dt * (np.arange(len(drag)) + 0.5)
     assert np.interp([0.794, 2.893], times, drag) == pytest.approx([0.703, 1.287], rel=0.05)
+
+
+def test_a_second_thread_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    def swim(cells: int) -> Immersed:
+        monkeypatch.setattr(threads, "MIN_CELLS", cells)
+        monkeypatch.setattr(threads.config, "NUMBA_NUM_THREADS", 2)
+        body = swimmer()
+        body.add_circle(0.08, 0.06, 0.005)
+        for _ in range(20):
+            body.step(2e-3, bend(body, 5.0))
+        return body
+
+    running = threading.active_count()
+    alone, together = swim(10**9), swim(1)
+    assert threading.active_count() == running + 1
+    for name, values in alone.state().items():
+        assert np.array_equal(together.state()[name], values), name
+    del together
+    gc.collect()
+    wait_until(lambda: threading.active_count() == running)
