@@ -3,7 +3,7 @@ PYTHON ?= python3
 # What `make test` and `make lint` install; without `learn`, its tests are skipped.
 EXTRAS ?= dev,learn,cluster
 # How many tests run at a time: many only wait.
-JOBS ?= $(shell expr $$(nproc) + 4)
+JOBS ?= $(shell expr $$(nproc) + 6)
 VENV ?= .venv
 BIN := $(VENV)/bin
 # Each of the hundreds of processes that tests start would compile fishd again.

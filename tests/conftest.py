@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from _pytest.runner import runtestprotocol
 from hypothesis import HealthCheck, settings
+from rigs import forked_workers
 
 # Each process computes with one thread; set before numpy or torch is loaded, here or in a child.
 LIBRARIES = "OMP", "OPENBLAS", "MKL", "NUMBA"
@@ -137,6 +138,7 @@ class LostTime:
 
 
 LOST_TIME = pytest.StashKey[LostTime]()
+WORKERS = pytest.StashKey[forked_workers.Server]()
 
 
 def read_stolen_time() -> float:
@@ -176,7 +178,19 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         session.config.stash[LOST_TIME] = LostTime()
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config, specs: list[Any]) -> None:
+    """Fork the test processes of the whole suite from one that has loaded large libraries."""
+    is_whole = config.args_source is config.ArgsSource.TESTPATHS and not config.option.fast
+    if len(specs) > 1 and is_whole:
+        server = config.stash[WORKERS] = forked_workers.Server()
+        for spec in specs:
+            spec.python = server.python
+
+
 def pytest_unconfigure(config: pytest.Config) -> None:
+    if server := config.stash.get(WORKERS, None):
+        server.close()
     if lost_time := config.stash.get(LOST_TIME, None):
         lost_time.close()
 

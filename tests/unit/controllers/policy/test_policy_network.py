@@ -4,12 +4,12 @@ from typing import Literal
 
 import numpy as np
 import onnx
-import onnxruntime
 import pytest
 from rigs.policy_files import answer, card, linear, random_layers
 
 from fishd.controllers.policy import file
 from fishd.controllers.policy.network import to_onnx
+from fishd.controllers.policy.runtime import load
 from fishd.core.errors import PolicyError
 
 FEATURES = (("fy", 0.02), ("fy_rate", 0.3), ("instruction_angle", 0.42), ("fin_velocity", 0.002))
@@ -19,7 +19,7 @@ FEATURES = (("fy", 0.02), ("fy_rate", 0.3), ("instruction_angle", 0.42), ("fin_v
 @pytest.mark.parametrize("hidden", [(), (64, 64)])
 def test_onnx_equals_numpy(activation: Literal["tanh", "relu"], hidden: tuple[int, ...]) -> None:
     layers = random_layers(4, *hidden, 1)
-    session = onnxruntime.InferenceSession(to_onnx(layers, activation, card(*FEATURES)))
+    session = load().InferenceSession(to_onnx(layers, activation, card(*FEATURES)))
     for inputs in np.random.default_rng(1).normal(0.0, 1.5, (200, 4)).astype(np.float32):
         (output,) = session.run(["action"], {"observation": inputs[np.newaxis]})
         assert output.item() == pytest.approx(answer(layers, activation, inputs), abs=1e-6)
