@@ -24,6 +24,7 @@ from common.report import progress, table
 from fishd.config import load
 from fishd.core import files
 from fishd.virtual.swimmer import flow as flow_module
+from fishd.virtual.swimmer import threads
 from fishd.virtual.swimmer.beam import Beam
 from fishd.virtual.swimmer.body import build_beam
 from fishd.virtual.swimmer.fish import FOLLOW_TIME, RECENTRE_RATE, Fish
@@ -40,6 +41,8 @@ PERIODS = 8
 UNDULATION_VISCOSITY = 1.4e-4
 """Kinematic viscosity in lengths² per period."""
 SWIMMER = files.shipped_folder("config") / "swimmer.yaml"
+OPERATIONS = 62
+"""Operations of `flow._advance` for each value."""
 STREAM = 0.1
 """Speed of the stream past the rigid fish [m/s]."""
 
@@ -212,23 +215,28 @@ def cost(finest: float) -> str:
     """Return the table of the time of a step beside its floor.
 
     The floor of the fluxes is one pass over each of their 14 fields at the bandwidth of fields of
-    this size; that of the pressure is its matrix products at the speed of a large product, and
-    eight passes. Both speeds are measured in this run, on one core. On a busy machine, the shortest
-    step shows the cost on a quiet one.
+    this size, or their operations at the speed of a large matrix product, whichever is longer; that
+    of the pressure is its matrix products at that speed, and eight passes. Both speeds are measured
+    in this run, on one core. On a busy machine, the shortest step shows the cost on a quiet one.
     """
     rows = []
     for cell, step in ((5e-4, 4e-4), (2.5e-4, 2e-4)):
         rows.append(measure_cost(finest * cell, finest * step))
         progress(*rows[-1])
     heads = (
-        "cells | grid | CPU time of a simulated second | from the shortest step | parts of a step"
+        "cells | grid | CPU time of a simulated second | from the shortest step | time with two "
+        "threads | parts of a step"
     )
     return table(heads, rows)
 
 
 def measure_cost(cell: float, step: float) -> list[str]:
     """Return the row of one grid."""
-    fish = Fish(load(SWIMMER, numerics(cell, step)).swimmer)
+    settings = load(SWIMMER, numerics(cell, step)).swimmer
+    with_threads = Fish(settings)
+    together = time_of_second(with_threads) if with_threads.flow.pairs.has_two_threads else None
+    threads.config.NUMBA_NUM_THREADS = 1
+    fish = Fish(settings)
     flow, grid = fish.flow, fish.flow.grid
     swim = partial(beat, fish)
     for _ in range(40):
@@ -242,7 +250,11 @@ def measure_cost(cell: float, step: float) -> list[str]:
     fastest = shortest(swim, 200)
     mean = (time.process_time() - start) / (fish.time - begin)
     solver, source = flow._poisson, flow.p.copy()
-    floors = 14.0 * a_pass, 2.0 * grid.nx * grid.ny**2 * per_operation + 8.0 * a_pass
+    operations = OPERATIONS * 2.0 * grid.nx * grid.ny
+    floors = (
+        max(14.0 * a_pass, operations * per_operation),
+        2.0 * grid.nx * grid.ny**2 * per_operation + 8.0 * a_pass,
+    )
     took = shortest(partial(advance, flow, step)), shortest(lambda: solver.solve(source))
     parts = ", ".join(
         f"{name} {1e3 * time:.2f} ms, {time / floor:.1f} × the floor"
@@ -250,7 +262,18 @@ def measure_cost(cell: float, step: float) -> list[str]:
     )
     speeds = f"{4e-9 * grid.cells / a_pass:.0f} GB/s, {1e-9 / per_operation:.0f} Gflop/s"
     sizes = [f"{1e3 * cell:g} mm", f"{grid.nx} × {grid.ny}"]
-    return [*sizes, f"{mean:.1f} s", f"{fastest / step:.1f} s", f"{parts}; {speeds}"]
+    two = "–" if together is None else f"{together:.1f} s"
+    return [*sizes, f"{mean:.1f} s", f"{fastest / step:.1f} s", two, f"{parts}; {speeds}"]
+
+
+def time_of_second(fish: Fish) -> float:
+    """Return how long a simulated second takes on the clock, from 200 steps [s]."""
+    for _ in range(40):
+        beat(fish)
+    begin, start = fish.time, time.perf_counter()
+    for _ in range(200):
+        beat(fish)
+    return (time.perf_counter() - start) / (fish.time - begin)
 
 
 def beat(fish: Fish) -> None:
