@@ -10,6 +10,14 @@ import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+UNUSED_FEATURES = (
+    # Further processes of each new page, with half of the processor time of all pages.
+    "SpareRendererForSitePerProcess", "WebUIOmniboxAimPopup", "WebUIOmniboxPopup",
+    # Of the ones that playwright disables, those that matter here; the last option alone counts.
+    "DestroyProfileOnBrowserClose", "HttpsFirstBalancedModeAutoEnable", "HttpsUpgrades",
+    "MediaRouter", "OptimizationHints", "PaintHolding",
+)  # fmt: skip
+"""Features of Chromium that are switched off."""
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 
 
@@ -23,7 +31,8 @@ def shared_browser(*options: str) -> Iterator[Browser]:
     options: further ones of Chromium's command line
     """
     with sync_playwright() as playwright:
-        arguments = ["--no-sandbox", "--disable-gpu", *options]
+        without = f"--disable-features={','.join(UNUSED_FEATURES)}"
+        arguments = ["--no-sandbox", "--disable-gpu", without, *options]
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
         _SHARED.append(browser)
         try:

@@ -1,4 +1,4 @@
-"""Forks fishd, fishctl and fishd-camera from a process that has loaded them.
+"""Forks the programs of fishd from a process that has loaded them.
 
 Loading takes most of the processor time of a process that a test starts. Each test process has one
 such server. A program whose environment Python reads while it starts is started as usual, and so is
@@ -25,10 +25,16 @@ PROGRAMS = {
     (str(BIN / "fishd"),): ("fishd", False),
     (str(BIN / "fishctl"),): ("fishctl", False),
     (str(BIN / "fishd-camera"),): ("fishd_camera", False),
+    (str(BIN / "fishd-window"),): ("fishd_window", False),
     (*UNHURRIED_COMMAND, "fishd"): ("fishd", True),
     (*UNHURRIED_COMMAND, "fishctl"): ("fishctl", True),
 }
 """Function and patience of each program, by the beginning of its command."""
+LOADED_LATER = {
+    "fishd_camera": ["fishd.camera.main"],
+    "fishd_window": ["fishd.window.main", "fishd.window.window_server"],
+}
+"""Modules that the server loads when a program is started for the first time."""
 READ_AT_START = ("PYTHON", "LC_", "LANG", "LD_", "MALLOC_", "OMP_", "OPENBLAS_")
 """Beginnings of the names of variables that take effect while a process starts."""
 PR_SET_CHILD_SUBREAPER = 36
@@ -127,8 +133,8 @@ def serve(connection: socket.socket) -> Callable[[], None]:
         if not message:
             sys.exit()
         (name, unhurried, arguments), folder, variables = pickle.loads(message)
-        if name == "fishd_camera":
-            import_module("fishd.camera.main")
+        for module in LOADED_LATER.get(name, ()):
+            import_module(module)
         if child := os.fork():
             os.waitpid(child, 0)
             connection.send(b"done")

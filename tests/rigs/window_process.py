@@ -12,11 +12,11 @@ from urllib.parse import urlsplit
 import aiohttp
 import msgspec
 
-from rigs.processes import PATIENCE, Process, fishctl
+from rigs.processes import FISHD, PATIENCE, Process, fishctl
 
 NETWORK_HOST = "fish.example"
 """Name by which devices of the network reach a window."""
-START = "from fishd.__main__ import fishd_window; fishd_window()"
+FISHD_WINDOW = f"{FISHD}-window"
 
 
 class WindowProcess(Process):
@@ -36,8 +36,9 @@ class WindowProcess(Process):
         config.write_text(f"runs: {folder}/runs\nnames: [{NETWORK_HOST}]\n{settings}\n")
         options = ("--config", str(config), "--state", str(self.state), "--listen", "127.0.0.1:0")
         pairs = [word for name, where in fish.items() for word in ("--fish", f"{name}={where}")]
-        code = f"{changes}\n{START}"
-        super().__init__(sys.executable, "-P", "-c", code, *options, *pairs, *arguments)
+        code = f"{changes}\nfrom fishd.__main__ import fishd_window; fishd_window()"
+        start = (sys.executable, "-P", "-c", code) if changes else (FISHD_WINDOW,)
+        super().__init__(*start, *options, *pairs, *arguments)
 
     def wait_until_up(self) -> Self:
         assert self.process.stderr
