@@ -5,6 +5,7 @@ import contextlib
 import re
 import sys
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Self
 from urllib.parse import urlsplit
@@ -187,10 +188,11 @@ async def open_page(browser: Browser, fish: str = "fish", client: str = "") -> A
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
-    """Run a test within a generous time."""
+    """Run a test within a generous time, in a thread: this one may run playwright's loop."""
 
     async def run_in_time() -> None:
         async with asyncio.timeout(PATIENCE):
             await test
 
-    asyncio.run(run_in_time())
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(asyncio.run, run_in_time()).result()

@@ -14,7 +14,8 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
 from rigs.processes import PATIENCE, Daemon, running, wait_until
 from rigs.virtual_pi_process import Pi
-from rigs.window_process import NETWORK_HOST, WindowProcess
+from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, run
+from rigs.window_process import open_page as open_socket
 
 pytestmark = needs_browser
 
@@ -65,9 +66,17 @@ def browser() -> Iterator[None]:
 
 
 @pytest.fixture
-def window(new_window: WindowProcess) -> WindowProcess:
-    """Return a window that no page drives yet."""
-    return new_window
+def window(shared_window: WindowProcess, shared_daemon: Daemon) -> WindowProcess:
+    """Return the window of the module, which no page drives, and whose fish is at rest."""
+
+    async def release() -> None:
+        async with Browser(shared_window.url) as browser, open_socket(browser) as page:
+            await page.drive()
+            await page.post("release")
+
+    run(release())
+    shared_daemon.at_rest()
+    return shared_window
 
 
 @contextmanager
@@ -284,8 +293,8 @@ def test_a_page_whose_connection_is_dead_opens_another_one(window: WindowProcess
         expect(page.locator("#connection")).to_contain_text("live")
 
 
-def test_a_page_works_in_a_browser_that_keeps_nothing(window: WindowProcess) -> None:
-    with live_page(window.url) as (page, complaints):
+def test_a_page_works_in_a_browser_that_keeps_nothing(new_window: WindowProcess) -> None:
+    with live_page(new_window.url) as (page, complaints):
         page.add_init_script("""for (const name of ["localStorage", "sessionStorage"])
             Object.defineProperty(globalThis, name, { get() { throw new Error("forbidden"); } });
         """)
@@ -366,17 +375,17 @@ def test_a_device_of_the_network_pairs_with_a_link_that_leaves_its_address(
         assert complaints == []
 
 
-def test_a_device_that_is_revoked_says_so(window: WindowProcess) -> None:
-    with open_page(window.invite()) as (page, _):
+def test_a_device_that_is_revoked_says_so(new_window: WindowProcess) -> None:
+    with open_page(new_window.invite()) as (page, _):
         expect(page.locator("#connection")).to_contain_text("live")
-        (device,) = json.loads(window.ask("devices", "--json"))
-        window.ask("revoke", device["id"])
+        (device,) = json.loads(new_window.ask("devices", "--json"))
+        new_window.ask("revoke", device["id"])
         expect(page.locator("#banner")).to_contain_text("This device is no longer paired")
         expect(page.locator(".pairing")).to_be_visible()
 
 
-def test_a_run_in_simulation_is_drawn_beside_the_live_force(window: WindowProcess) -> None:
-    with live_page(window.url) as (page, complaints):
+def test_a_run_in_simulation_is_drawn_beside_the_live_force(new_window: WindowProcess) -> None:
+    with live_page(new_window.url) as (page, complaints):
         page.click("#tab-simulate")
         page.click("#experiment .primary")
         expect(page.locator(".job.done")).to_contain_text("True thrust")
@@ -395,8 +404,10 @@ def test_without_pulses_no_command_is_drawn(window: WindowProcess) -> None:
         expect(command).to_have_text("–")
 
 
-def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(window: WindowProcess) -> None:
-    with live_page(window.url) as (page, complaints):
+def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
+    new_window: WindowProcess,
+) -> None:
+    with live_page(new_window.url) as (page, complaints):
         swim(page)
         page.click("#tab-record")
         page.get_by_label("Seconds").fill("1")
