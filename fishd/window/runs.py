@@ -61,13 +61,18 @@ class Runs:
             read, runs = self._list
             if time.monotonic() - read >= RUNS_AGE_S:
                 self.folder.mkdir(parents=True, exist_ok=True)
-                output = await call(["runs", f"--folder={self.folder}", "--json"], self.folder)
-                try:
-                    runs = msgspec.json.decode(output)
-                except msgspec.DecodeError:
-                    raise JobError(f"the runs in {self.folder} could not be listed") from None
+                runs = []
+                if not _is_empty(self.folder):  # saves a process for each page of a new window
+                    runs = await self._list_folder()
                 self._list = (time.monotonic(), runs)
             return runs
+
+    async def _list_folder(self) -> Any:
+        output = await call(["runs", f"--folder={self.folder}", "--json"], self.folder)
+        try:
+            return msgspec.json.decode(output)
+        except msgspec.DecodeError:
+            raise JobError(f"the runs in {self.folder} could not be listed") from None
 
     async def plot(self, name: str) -> bytes:
         """Return the picture of a recording, or of an experiment; raise `JobError`."""
@@ -94,6 +99,13 @@ class Runs:
             raise JobError(f"{name} could not be drawn") from None
         finally:
             self._waiting_plots -= 1
+
+
+def _is_empty(folder: Path) -> bool:
+    try:
+        return next(folder.iterdir(), None) is None
+    except OSError:
+        return False
 
 
 def _is_newer(file: Path, other: Path) -> bool:

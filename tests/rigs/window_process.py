@@ -188,11 +188,16 @@ async def open_page(browser: Browser, fish: str = "fish", client: str = "") -> A
 
 
 def run(test: Coroutine[Any, Any, None]) -> None:
-    """Run a test within a generous time, in a thread: this one may run playwright's loop."""
+    """Run a test within a generous time."""
+    asyncio.run(_end_in_time(test))
 
-    async def run_in_time() -> None:
-        async with asyncio.timeout(PATIENCE):
-            await test
 
+def run_apart(task: Coroutine[Any, Any, None]) -> None:
+    """Run a task in another thread, as the loop of playwright may run in this one."""
     with ThreadPoolExecutor(1) as thread:
-        thread.submit(asyncio.run, run_in_time()).result()
+        thread.submit(asyncio.run, _end_in_time(task)).result()
+
+
+async def _end_in_time(task: Coroutine[Any, Any, None]) -> None:
+    async with asyncio.timeout(PATIENCE):
+        await task

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from rigs.processes import Daemon, running
 from rigs.virtual_pi_process import Pi, virtual_pi
-from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
+from rigs.window_process import Browser, WindowProcess, open_page, run_apart, running_window
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def shared_window(
             async with Browser(window.url) as browser, open_page(browser) as page:
                 await page.until("ticks")
 
-        run(wait_until_live())
+        run_apart(wait_until_live())
         yield window
 
 

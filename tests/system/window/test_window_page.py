@@ -14,7 +14,7 @@ from playwright.sync_api import APIResponse, Page, Route, expect
 from rigs.browser import needs_browser, open_page, shared_browser
 from rigs.processes import PATIENCE, Daemon, running, wait_until
 from rigs.virtual_pi_process import Pi
-from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, run
+from rigs.window_process import NETWORK_HOST, Browser, WindowProcess, run_apart
 from rigs.window_process import open_page as open_socket
 
 pytestmark = needs_browser
@@ -74,7 +74,7 @@ def window(shared_window: WindowProcess, shared_daemon: Daemon) -> WindowProcess
             await page.drive()
             await page.post("release")
 
-    run(release())
+    run_apart(release())
     shared_daemon.at_rest()
     return shared_window
 
