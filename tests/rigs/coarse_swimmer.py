@@ -9,7 +9,7 @@ from rigs.processes import sets
 FILE = ROOT / "config" / "swimmer.yaml"
 COARSE = (
     "swimmer.numerics.cell=0.002",
-    "swimmer.numerics.step=0.001",
+    f"swimmer.numerics.step={0.01 / 6}",
     "swimmer.numerics.fine_length=1.4",
     "swimmer.numerics.fine_width=0.8",
     "swimmer.numerics.stretch_along=1.2",

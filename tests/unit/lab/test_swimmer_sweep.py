@@ -81,7 +81,7 @@ def test_a_fish_that_is_lost_is_a_point_without_a_speed(
     result = swim_freely(WAVE, config, Lengths(settle=0.3, periods=2), None)
     assert result
     assert result.speed is None
-    assert "the swimmer cannot go on at 0.02" in result.failure
+    assert "the swimmer cannot go on at 0.033 s: the water passes" in result.failure
 
 
 def test_a_swim_is_stopped_before_its_end(config: Config) -> None:

@@ -25,9 +25,9 @@ def swum(fish: Swimmer, ticks: int, first: int = 1) -> None:
 
 def test_it_swims_until_the_time_at_which_it_is_read() -> None:
     fish = swimmer()
-    assert fish.read(7.0).samples == 10
+    assert fish.read(7.0).samples == 6
     assert fish.fish.time == pytest.approx(TICK)
-    assert fish.read(7.03).samples == 30  # two slots were missed
+    assert fish.read(7.03).samples == 18  # two slots were missed
     assert fish.fish.time == pytest.approx(4 * TICK)
 
 
