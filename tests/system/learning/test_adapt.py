@@ -42,6 +42,7 @@ from fishd.virtual.plant.optimum import square_wave
 from fishd.virtual.plant.parameters import PlantParameters
 
 PHI = 0.42
+FITTED_IN_BRIEF = ("omega0", "xi", "rotation")
 
 
 def identification() -> Identification:
@@ -286,8 +287,9 @@ class Stopped(BaseException):
 @pytest.mark.slow
 def test_a_resume_repeats_no_measurement(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adaptation, "train_policy", no_policy)
-    # Each fish takes long to compute
+    # Each fish, and each fitted parameter, takes long to compute
     monkeypatch.setattr(steps, "draw_cloud", partial(draw_cloud, count=2))
+    monkeypatch.setattr(steps, "FITTED", FITTED_IN_BRIEF)
     path, config = tmp_path / "run", load("config/simulated.yaml")
     daemon, show = VirtualDaemon(config), StoringDisplay()
 
@@ -348,7 +350,10 @@ def test_no_policy_is_trained_on_a_fish_that_explains_too_little(tmp_path: Path)
     assert not (run.path / TRAINING).exists()
 
 
-def test_a_fish_that_is_only_noise_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_fish_that_is_only_noise_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(steps, "FITTED", FITTED_IN_BRIEF)
     fish = ["plant.thrust_coefficient=1e-6", "plant.lateral_drag=1e-6", "simulation.noise=0.01"]
     config = load(None, fish)
     run = folder(tmp_path / "run")
