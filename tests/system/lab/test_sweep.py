@@ -120,21 +120,6 @@ def test_a_point_that_is_refused_is_trouble_and_the_next_is_measured(tmp_path: P
     assert len(list((tmp_path / "sweep" / "ticks").iterdir())) == 4
 
 
-@pytest.mark.parametrize("key", ["estimator.zero_drift", "a_key_of_then"])
-def test_a_folder_of_an_older_fishd_is_refused_with_what_differs(tmp_path: Path, key: str) -> None:
-    open_folder(tmp_path)
-    header = tmp_path / "experiment.json"
-    data = msgspec.json.decode(header.read_bytes())
-    if key == "a_key_of_then":
-        data["config"][key] = 1
-    else:
-        del data["config"]["estimator"]["zero_drift"]
-    header.write_bytes(msgspec.json.encode(data | {"version": "0.0.1"}))
-    has = "has" if key == "a_key_of_then" else "has no"
-    with pytest.raises(ConfigError, match=f"fishd 0.0.1, whose configuration {has} config.{key}"):
-        open_folder(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("head", "named"),
     [
@@ -159,17 +144,6 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
     table.write_bytes(table.read_bytes()[:-30])
     assert len(open_folder(tmp_path).results) == 2
     assert table.read_text().count("\n") == 3
-
-
-def test_a_row_that_is_cut_in_its_last_column_is_measured_again(tmp_path: Path) -> None:
-    folder = open_folder(tmp_path)
-    for point in SQUARES:
-        folder.add_result(point, Result(thrust=0.02, thrust_ci95=1e-4), b"a recording")
-    table = tmp_path / "rows.csv"
-    whole = table.read_bytes()
-    table.write_bytes(whole[:-1])
-    assert len(open_folder(tmp_path).results) == 2
-    assert table.read_bytes() == b"".join(whole.splitlines(keepends=True)[:-1])
 
 
 def test_a_table_as_long_as_that_of_as_many_points_as_are_permitted_is_resumed(
@@ -206,20 +180,6 @@ def test_a_table_that_cannot_be_read_says_why(tmp_path: Path) -> None:
     (tmp_path / "rows.csv").mkdir()
     with pytest.raises(ConfigError, match="is a folder; a regular file is needed"):
         open_folder(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("settings", "seconds", "named"),
-    [(["plant.xi=0.9"], 21.0, "plant.xi = 1.2, now it is 0.9"), ([], 30.0, "lengths.seconds")],
-)
-def test_a_folder_is_not_gone_on_with_by_another_fish_or_for_another_time(
-    tmp_path: Path, settings: Sequence[str], seconds: float, named: str
-) -> None:
-    open_folder(tmp_path)
-    # Makes no difference
-    open_folder(tmp_path, load(None, ["telemetry.address=tcp://127.0.0.1:1"]))
-    with pytest.raises(ConfigError, match=named):
-        open_folder(tmp_path, load(None, settings), seconds)
 
 
 def test_a_curve_tells_the_best_frequency_in_ticks_or_that_it_lacks_one(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 import pytest
 from rich.progress import Progress
-from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line
-from rigs.swimming import brief_job, rows, wait_for, while_it_trains
+from rigs.processes import Daemon, fishctl, one_line
+from rigs.swimming import brief_job, rows, while_it_trains
 
 from fishd.cli.learn.ppo import print_outcome
 from fishd.cli.main import fishctl as commands
@@ -131,26 +131,6 @@ def test_a_signal_leaves_a_checkpoint_to_resume_from(tmp_path: Path, settings: s
     assert int(rows(folder / "progress.csv")[-1]["steps"]) == done
     result = learn("ppo", "--resume", str(folder), "--steps", str(done + 64))
     assert result.returncode == 0, result.stderr
-
-
-def test_after_a_kill_all_checkpoints_are_complete(tmp_path: Path, settings: str) -> None:
-    text = SETTINGS.replace("steps: 128", "steps: 128\ncheckpoint_every: 64")
-    Path(settings).write_text(text, encoding="utf-8")
-    folder = tmp_path / "run"
-    words = ("--folder", str(folder), *ENDLESS, "--settings", settings)
-    training = Process(FISHCTL, "learn", "ppo", *words)
-    try:
-        wait_for(lambda: updates(folder) >= 3)
-    finally:
-        training.end(signal.SIGKILL)
-    for checkpoint in folder.glob("step-*"):
-        checkpoints.load_policy(checkpoint)
-        checkpoints.read_state(checkpoint)
-    done = checkpoints.read_state(checkpoints.newest(folder)).steps
-    assert done >= 128
-    assert learn("ppo", "--resume", str(folder), "--steps", str(done + 64)).returncode == 0
-    steps = [int(row["steps"]) for row in rows(folder / "progress.csv")]
-    assert steps == list(range(64, done + 65, 64))
 
 
 def test_on_a_terminal_a_training_shows_a_bar(

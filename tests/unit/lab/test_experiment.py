@@ -16,7 +16,9 @@ from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.session import VirtualSession
 from fishd.recording import open_run
 
-HEADER = Header(kind="sweep", on="live", settings={"seed": 1}, config={"plant": {"xi": 1.2}})
+HEADER = Header(
+    kind="sweep", on="live", settings={"seed": 1}, config={"plant": {"xi": 1.2}}, version="0.1"
+)
 
 
 def begin(path: Path, header: Header = HEADER) -> None:
@@ -64,7 +66,8 @@ def test_a_table_with_columns_of_an_older_fishd_is_read_and_renamed(
     [
         ({"settings": {"seed": 2}}, "began with seed = 1, now it is 2"),
         ({"config": {"plant": {"xi": 0.9}}}, "config.plant.xi = 1.2, now it is 0.9"),
-        ({"config": {"plant": {"xi": 1.2, "mass": 1}}}, "configuration has no config.plant.mass"),
+        ({"config": {"plant": {"xi": 1.2, "mass": 1}}}, "fishd 0.1, whose configuration has no co"),
+        ({"config": {"plant": {}}}, "configuration has config.plant.xi"),
         ({"on": "simulation"}, "on = live, now it is simulation"),
         ({"kind": "optimise"}, "kind = sweep, now it is optimise"),
     ],
@@ -74,7 +77,7 @@ def test_it_is_resumed_only_as_begun(tmp_path: Path, changes: dict[str, Any], na
     header = {"kind": "sweep", "on": "live", "settings": HEADER.settings, "config": HEADER.config}
     with pytest.raises(ConfigError, match=named):
         resume(tmp_path, Header(**(header | changes)))
-    config = {"plant": {"xi": 1.2}, "name": "x"}
+    config = {"plant": {"xi": 1.2}, "name": "x", "telemetry": {"address": "y"}}
     other_version = {"version": "0", "command": ["--json"], "config": config}
     assert resume(tmp_path, Header(**(header | other_version)))  # these may differ
 

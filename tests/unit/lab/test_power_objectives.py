@@ -42,7 +42,7 @@ def test_a_measurement_tells_power_and_thrust_per_watt_with_their_intervals() ->
 def test_without_a_power_meter_a_measurement_tells_the_thrust_alone() -> None:
     config = load("config/virtual-pi.yaml", ["power_meter=null"])
     with VirtualSession(config) as rig:
-        report = summarise(measure(rig, "square", {"frequency": 2.0}, 25.0), rig.tick)
+        report = summarise(measure(rig, "square", {"frequency": 2.0}, 20.5), rig.tick)
     assert report.thrust > 0.0
     assert (report.power, report.power_ci95, report.thrust_per_watt) == (None, None, None)
 
