@@ -31,7 +31,6 @@ OPERATORS = [path for path in DOCS if path.stem in (
 )]  # fmt: skip
 ADDED_BY_EXAMPLES = {"beat", "estimator.fy_offset", "estimator.fy_offset=0.02"}
 """Verb and key that the examples of contributing.md add, which test_contributing.py applies."""
-each_document = pytest.mark.parametrize("document", DOCS, ids=lambda path: path.name)
 
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
@@ -46,16 +45,16 @@ def anchors_of(document: Path) -> frozenset[str]:
     return frozenset(anchors)
 
 
-@each_document
-def test_every_relative_link_leads_somewhere(document: Path) -> None:
+def test_every_relative_link_leads_somewhere() -> None:
     broken = []
-    for link in _LINK.findall(prose_of(document)):
-        path, _, anchor = link.partition("#")
-        target = (document.parent / path).resolve() if path else document
-        if ":" in path or (target.exists() and not anchor):
-            continue
-        if not target.exists() or anchor not in anchors_of(target):
-            broken.append(link)
+    for document in DOCS:
+        for link in _LINK.findall(prose_of(document)):
+            path, _, anchor = link.partition("#")
+            target = (document.parent / path).resolve() if path else document
+            if ":" in path or (target.exists() and not anchor):
+                continue
+            if not target.exists() or anchor not in anchors_of(target):
+                broken.append((document.name, link))
     assert not broken
 
 
@@ -117,17 +116,12 @@ def command_lines(document: Path, program: str) -> Iterator[list[str]]:
                 yield [word.strip("\"'`,.") for word in words[1:]]
 
 
-@each_document
-@pytest.mark.parametrize(
-    "program", [fishctl, fishd, camera, window], ids=lambda command: command.name
-)
-def test_each_verb_and_option_of_a_command_exists_and_none_is_missing(
-    document: Path, program: click.Command
-) -> None:
-    lines = command_lines(document, program.name or "")
+def test_each_verb_and_option_of_a_command_exists_and_none_is_missing() -> None:
     problems = [
-        mistake
-        for words in lines
+        (document.name, mistake)
+        for document in DOCS
+        for program in (fishctl, fishd, camera, window)
+        for words in command_lines(document, program.name or "")
         if not ADDED_BY_EXAMPLES & set(words) and (mistake := find_mistake(program, words))
     ]
     assert not problems
@@ -148,27 +142,23 @@ def options_of(command: click.Command, context: click.Context) -> Iterator[str]:
             yield from options_of(subcommand, click.Context(subcommand, parent=context))
 
 
-@pytest.mark.parametrize("document", OPERATORS, ids=lambda path: path.name)
-def test_every_option_that_is_named_alone_belongs_to_some_verb(document: Path) -> None:
+def test_every_option_that_is_named_alone_belongs_to_some_verb() -> None:
     known = {o for program in (fishctl, fishd) for o in options_of(program, click.Context(program))}
-    named = re.findall(r"`(--[a-z-]+)", prose_of(document))
-    assert not set(named) - known - {"--"}
+    for document in OPERATORS:
+        named = re.findall(r"`(--[a-z-]+)", prose_of(document))
+        assert not set(named) - known - {"--"}, document.name
 
 
-@each_document
-def test_every_configuration_key_that_is_named_exists(document: Path) -> None:
-    known = set(keys())
+def test_every_configuration_key_that_is_named_exists() -> None:
     sections = "|".join(field.name for field in fields_of(Config) if field.kind == "section")
     key = re.compile(rf"(?<![\w./-])(?:{sections})(?:\.[a-z_0-9]+)+(?![\w/(])")
-    named = {key_path for code in code_of(document) for key_path in key.findall(code)}
-    modules = {f"{field.name}.py" for field in fields_of(Config)}
-    unknown = named - known - modules - ADDED_BY_EXAMPLES
-    wrong = {name for name in unknown if not name.startswith("start.parameters.")}
-    if document.name == "configuration.md":
-        wrong -= {"plant.omega"}  # an example of a mistake
-    if document.name == "troubleshooting.md":
-        wrong -= {"servo.gpoi"}
-    assert not wrong
+    known = {*keys(), *(f"{field.name}.py" for field in fields_of(Config)), *ADDED_BY_EXAMPLES}
+    mistakes = {"configuration.md": {"plant.omega"}, "troubleshooting.md": {"servo.gpoi"}}
+    for document in DOCS:
+        named = {key_path for code in code_of(document) for key_path in key.findall(code)}
+        unknown = named - known - mistakes.get(document.name, set())
+        wrong = {name for name in unknown if not name.startswith("start.parameters.")}
+        assert not wrong, document.name
 
 
 def configurations() -> Iterator[tuple[str, str]]:
