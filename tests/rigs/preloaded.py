@@ -35,8 +35,11 @@ LOADED_LATER = {
     "fishd_window": ["fishd.window.main", "fishd.window.window_server"],
 }
 """Modules that the server loads when a program is started for the first time."""
-READ_AT_START = ("PYTHON", "LC_", "LANG", "LD_", "MALLOC_", "OMP_", "OPENBLAS_")
-"""Beginnings of the names of variables that take effect while a process starts."""
+READ_AT_START = ("PYTHON", "LC_", "LANG", "MALLOC_", "OMP_", "OPENBLAS_")
+"""Beginnings of the names of variables that take effect while a process starts.
+
+The path of libraries is not one of them: cv2 changes it where it is loaded, and no test does.
+"""
 PR_SET_CHILD_SUBREAPER = 36
 
 
