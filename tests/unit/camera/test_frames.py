@@ -52,13 +52,6 @@ def test_nothing_is_shown_where_a_frame_is_missing_for_too_long(missing: int) ->
     assert levels_at(history_of(*times), 0.95) is None
 
 
-@pytest.mark.parametrize("rate", [20, 100, 1000])
-def test_a_stack_is_found_however_many_frames_there_are_a_second(rate: int) -> None:
-    history = history_of(*(k / rate for k in range(10 * rate)), delay=0.1, oldest=0.06)
-    expected = [round((9.8 - 0.05 * k) * rate) % 256 for k in range(4)]
-    assert levels_at(history, 9.9) == expected
-
-
 def test_frames_that_no_tick_can_want_any_more_are_forgotten() -> None:
     history = history_of(*(k * 1e-3 for k in range(20_000)))
     assert levels_at(history, 19.99) is not None

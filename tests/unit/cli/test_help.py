@@ -73,13 +73,6 @@ def test_no_option_with_bounds_accepts_nan() -> None:
             print(name, parameter.name, parameter.type.convert("nan", parameter, None))
 
 
-@pytest.mark.parametrize("verb", ["tare", "watch --json"])
-def test_a_time_that_is_no_number_is_a_wrong_use(verb: str) -> None:
-    done = CliRunner().invoke(fishctl, [*verb.split(), "--seconds", "nan"])
-    assert done.exit_code == 2
-    assert "'nan' is not valid: a finite number is needed" in done.stderr
-
-
 WITHOUT_JSON = {
     *("calibrate force", "calibrate servo", "completion", "config example"),
     *("virtual-pi clear", "virtual-pi inject", "virtual-pi press", "virtual-pi run"),

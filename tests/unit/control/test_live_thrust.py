@@ -57,18 +57,6 @@ def test_the_interval_shrinks_with_each_change_and_grows_with_time() -> None:
         assert later > 1.3 * second
 
 
-def test_another_wave_is_known_at_once() -> None:
-    with rig() as fish:
-        fish.rest(3.0)
-        fish.swim("swing", {}, 8.0)
-        fish.rest(3.0)
-        fish.swim("swing", {}, 8.0)
-        thrust, error = thrust_and_ci95(fish.swim("sine", {"frequency": 5.0 / 3.0}, 8.0))
-        assert abs(thrust - 17.6e-3) < error
-        thrust, error = thrust_and_ci95(fish.rest(3.0))
-        assert abs(thrust) < error < 2e-3
-
-
 def test_a_tail_that_does_not_move_rests_whichever_controller_is_active() -> None:
     with rig() as fish:
         _, error = thrust_and_ci95(fish.swim("hold", {}, 6.0))

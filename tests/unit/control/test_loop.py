@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -190,20 +189,6 @@ def test_a_suspect_force_that_a_slow_sensor_repeats_reaches_no_estimator() -> No
     tick = rig.run(1)[-1]
     assert (tick.fx, tick.fy, tick.samples) == (good.fx, good.fy, 0)
     assert tick.sample_age_ms < 10.0
-
-
-@pytest.mark.parametrize("tick", range(0, 12, 3))
-def test_one_suspect_force_costs_swing_no_beat(tick: int) -> None:
-    rig, robot = fragile_rig()
-    rig.start("swing")
-    rig.run_for(10.0)
-    rig.run(tick)
-    robot.fy, robot.suspect = 5.0, "F_y is clipped"
-    rig.run(1)
-    robot.fy, robot.suspect = None, ""
-    angles = [tick.phi_c for tick in rig.recorder.ticks[-30:] + rig.run_for(5.0)]
-    reversals = [k for k, (a, b) in enumerate(pairwise(angles)) if a * b < 0.0]
-    assert {b - a for a, b in pairwise(reversals)} <= {5, 6, 7}
 
 
 def test_a_release_that_fails_is_tried_again_until_it_works() -> None:

@@ -6,7 +6,6 @@ from rigs.harness import Rig, fragile_rig
 
 from fishd.control.estimators.observer import Observer, _exponential
 from fishd.core.errors import SensorError
-from fishd.lab.simulation import simulate
 
 OBSERVER = "estimator.kind=observer"
 REAL = ("simulation.offset_y=0.02", "simulation.drift=0.005")
@@ -63,15 +62,6 @@ def test_a_strongly_damped_fin_is_observed_as_well() -> None:
     rig.run_for(1)
     assert rig.mode == "running"
     assert error(rig, 10) < 0.1
-
-
-@pytest.mark.parametrize(("kind", "least", "most"), [("observer", 0.97, 1.0),
-                                                     ("lateral_force", 0.6, 0.9)])  # fmt: skip
-def test_swing_with_the_observer_bears_a_slow_servo(kind: str, least: float, most: float) -> None:
-    from fishd.config import load
-
-    config = load(None, [f"estimator.kind={kind}", "plant.servo_delay=0.1", *REAL])
-    assert least < simulate(config, "swing", {}, seconds=60).relative_thrust <= most
 
 
 def test_a_reversed_lateral_force_leaves_the_motion_unknown_and_the_offset_reversed() -> None:

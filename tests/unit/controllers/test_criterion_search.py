@@ -111,10 +111,11 @@ def test_a_number_that_is_set_ends_the_search_and_auto_begins_a_new_one() -> Non
 
 
 def test_it_is_refused_where_the_force_does_not_tell_the_thrust() -> None:
-    with pytest.raises(ParameterError, match="which is the thrust of a tethered fish only"):
-        registry.create("swing", {"C": "auto"}, replace(LIMITS, tethered=False))
-    with pytest.raises(ParameterError, match=r"needs ticks of 0\.15 s at most, not 0\.2 s"):
-        registry.create("swing", {"C": "auto"}, replace(LIMITS, tick=0.2))
+    for name, parameters in (("swing", {"C": "auto"}), ("thrust", {"target": 0.01})):
+        with pytest.raises(ParameterError, match="which is the thrust of a tethered fish only"):
+            registry.create(name, parameters, replace(LIMITS, tethered=False))
+        with pytest.raises(ParameterError, match=r"needs ticks of 0\.15 s at most, not 0\.2 s"):
+            registry.create(name, parameters, replace(LIMITS, tick=0.2))
     with pytest.raises(ParameterError, match=r"lead: 0.1 s is not valid with C auto"):
         registry.create("swing", {"C": "auto", "lead": 0.1}, LIMITS)
 

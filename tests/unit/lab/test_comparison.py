@@ -28,6 +28,8 @@ def test_square_beats_sine_beats_triangle_and_each_is_as_square_as_it_is() -> No
     assert relative_thrusts == sorted(relative_thrusts, reverse=True)
     factors = [standing.form_factor for standing in standings]
     assert factors == pytest.approx([1.0, 0.900, 0.866], abs=0.003)
+    fullness = [standing.fullness for standing in standings]
+    assert fullness == pytest.approx([1.0, 0.637, 0.5], abs=0.01)
     assert standings[0].frequency == pytest.approx(1.7, abs=0.02)
 
 

@@ -95,19 +95,6 @@ def test_only_whole_beats_are_counted() -> None:
     assert beats.means().thrust_deviation > 0.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("waveform", "fullness", "form_factor"),
-    [("square", 1.0, 1.0), ("sine", 2.0 / math.pi, 0.9003), ("triangle", 0.5, 0.8660)],
-)
-def test_fullness_and_form_of_waves(waveform: str, fullness: float, form_factor: float) -> None:
-    amplitude = 0.3
-    wave = {"frequency": 1.0, "amplitude": amplitude}
-    report = simulate(load(None, ["tick=0.005"]), waveform, wave, 14)
-    assert report.fullness == pytest.approx(fullness, abs=1e-3)
-    assert report.form_factor == pytest.approx(form_factor, abs=1e-3)
-
-
 run = partial(fishctl, "simulate")
 
 

@@ -41,52 +41,36 @@ def test_the_force_sensor_loses_few_samples_to_the_power_meter() -> None:
     assert counts[0] > 0.94 * counts[1]
 
 
-class Steady(PowerMeterDriver[PowerMeterSettings]):
-    """Meter that always works and measures a constant power."""
+def test_a_thread_reads_a_meter_in_real_time_and_a_read_does_not_wait_for_it() -> None:
+    entered, go = threading.Event(), threading.Event()
 
-    Settings = PowerMeterSettings
-    place = "a meter"
+    class Stuck(PowerMeterDriver[PowerMeterSettings]):
+        """Meter that hangs until it may go on, and measures a constant power."""
 
-    def open(self) -> None:
-        """Do nothing."""
+        Settings = PowerMeterSettings
+        place = "a meter"
 
-    def sample(self) -> PowerSample:
-        """Return a constant power."""
-        return PowerSample(self.clock.monotonic(), 2.5)
+        def open(self) -> None:
+            """Do nothing."""
 
-    def close(self) -> None:
-        """Do nothing."""
-
-
-def test_a_meter_that_hangs_does_not_delay_a_read() -> None:
-    entered, go, left = threading.Event(), threading.Event(), threading.Event()
-
-    class Stuck(Steady):
         def sample(self) -> PowerSample:
             entered.set()
             go.wait(PATIENCE)
-            left.set()
-            return super().sample()
+            return PowerSample(self.clock.monotonic(), 2.5)
 
-    clock = SystemClock()
+        def close(self) -> None:
+            """Do nothing."""
+
+    clock, powers = SystemClock(), list[float]()
     driver = Stuck(PowerMeterSettings(driver="stuck"), clock, 0.0125)
+    meter = SampledPower(driver, clock, threaded=True, tick=0.05)
     with ExitStack() as stack:
-        meter = SampledPower(driver, clock, threaded=True, tick=0.05)
         stack.callback(meter.close)
         stack.callback(go.set)
         assert entered.wait(PATIENCE)
         with pytest.raises(SensorError, match="a meter has not delivered"):
             meter.read(clock.monotonic())
-        assert not left.is_set()
-
-
-def test_a_thread_reads_the_meter_of_a_robot_in_real_time() -> None:
-    clock = SystemClock()
-    driver = Steady(PowerMeterSettings(driver="steady"), clock, 0.0125)
-    with ExitStack() as stack:
-        meter = SampledPower(driver, clock, threaded=True, tick=0.05)
-        stack.callback(meter.close)
-        powers: list[float] = []
+        go.set()
 
         def read() -> bool:
             with suppress(SensorError):  # none yet

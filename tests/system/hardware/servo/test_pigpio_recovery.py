@@ -66,12 +66,6 @@ def test_without_pigpiod_it_asks_at_most_twice_a_second_in_virtual_time(bench: B
     assert servo.driver.counters() == {"servo_reconnects": 0, "servo_late_answers": 0}
 
 
-def test_killed_fishds_never_fill_pigpiod_with_scripts(bench: Bench) -> None:
-    for _ in range(40):
-        bench.servo().write(0.1)
-    assert bench.scripts() == 1
-
-
 def test_scripts_of_others_and_of_other_pins_stay(bench: Bench) -> None:
     with bench.client() as client:
         script = client.store_script(b"tag 0 mils 10 jmp 0")

@@ -137,11 +137,3 @@ def test_the_shipped_policy_does_not_shake_the_servo_of_a_harsh_fish(fish: tuple
     assert longest_chatter(publisher.ticks) <= 1.0
     assert report.relative_thrust > 0.95
     assert report.fallback is None
-
-
-def test_the_shipped_policy_loses_nothing_on_its_own_fish() -> None:
-    policy = {"policy": "default-fish"}
-    fish = [load(None, [*NOISY, f"chatter.dwell={dwell}"]) for dwell in (0.0, 0.2)]
-    reports = [simulate(config, "ppo", policy) for config in fish]
-    assert reports[0].mean_thrust == reports[1].mean_thrust
-    assert reports[1].fallback is None

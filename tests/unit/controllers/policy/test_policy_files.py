@@ -245,8 +245,3 @@ def test_a_file_that_is_far_too_large_is_refused_before_it_is_read(tmp_path: Pat
     os.truncate(path, 2**40)  # a hole: reading it would take the memory of the machine
     with pytest.raises(PolicyError, match="is longer than 16 MB, far more than a policy needs"):
         file.read(path)
-
-
-def test_a_good_file_is_read_whole(tmp_path: Path) -> None:
-    policy = file.read(write(tmp_path))
-    assert (policy.content, policy.card) == (FLIP, card())

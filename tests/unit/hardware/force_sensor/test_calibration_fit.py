@@ -120,15 +120,6 @@ def test_a_fit_that_leaves_a_fifth_of_the_loads_is_refused_by_the_name_of_the_wo
         check(fit(loads), loads, "abcdefghij")
 
 
-@given(st.integers(0, 2**32 - 1))
-def test_voltages_that_have_nothing_to_do_with_the_loads_are_no_fit(seed: int) -> None:
-    random = np.random.default_rng(seed)
-    voltages = random.standard_normal((3 * len(PLAN), 2)).tolist()
-    loads = [Load(*force, *v) for force, v in zip(PLAN * 3, voltages, strict=True)]
-    with pytest.raises(PoorLoads, match="do not follow the loads"):
-        check(fit(loads), loads, [""] * len(loads))
-
-
 def test_the_condition_number_is_one_for_a_symmetric_sensor_and_the_ratio_of_gains_else() -> None:
     cross = [(0.0, 0.0), (0.2, 0.0), (-0.2, 0.0), (0.0, 0.2), (0.0, -0.2)]
     assert fit(measured_loads(cross, sensor(2, 2))).calibration.condition == pytest.approx(1.0)

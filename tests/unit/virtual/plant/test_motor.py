@@ -23,30 +23,6 @@ def test_a_servo_without_pulses_draws_its_idle_current_only() -> None:
     assert mean_power(fish, [None] * 10) == pytest.approx(6.0 * 0.01, rel=1e-12)
 
 
-def test_the_tail_costs_what_the_water_takes_from_it() -> None:
-    # A motor without losses, whose voltage is its torque: k_e = k_t. Its power is τ φ̇; on a slow
-    # ramp, where no power returns, that is the power of the damping and of the spring.
-    motor = MotorSettings(
-        voltage=6.0,
-        stall_current=1e6,
-        stall_torque=1e6 * 6.0 / PLANT.servo_speed,
-        no_load_current=0.0,
-        idle_current=0.0,
-        rotor_inertia=0.0,
-    )
-    fish = TetheredFish(PLANT, motor=motor)
-    window, spent, damped = 0.001, 0.0, 0.0
-    for step in range(400):
-        before = fish.state
-        spent += fish.advance(step * 1e-3, window, 1).power * window
-        rate = 0.5 * (before.alpha_rate + fish.state.alpha_rate)
-        damped += motor.tail_inertia * PLANT.xi * PLANT.omega0 * rate**2 * window
-    state = fish.state
-    bent = PLANT.omega0**2 * (PLANT.coupling * state.phi - state.alpha) ** 2
-    kept = 0.5 * motor.tail_inertia * (state.alpha_rate**2 + bent)
-    assert spent == pytest.approx(damped + kept, rel=1e-4)
-
-
 def test_a_beat_costs_what_the_equations_say_integrated_on_their_own() -> None:
     plant, motor, dt = PLANT, MOTOR, 1e-5
     fish = TetheredFish(plant, motor=motor)
