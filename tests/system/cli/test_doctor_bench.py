@@ -9,7 +9,17 @@ import pytest
 from rigs.processes import FISHCTL, Daemon, Process, fishctl, one_line, running, sets, wait_until
 from rigs.virtual_pi_process import Pi, virtual_pi
 
+from fishd.cli.doctor.bench import analog
+
 WIRED = ("virtual_pi.loop_gpio=23", "virtual_pi.filter_time=0.1")
+
+
+@pytest.fixture(autouse=True)
+def _brief_averages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shorten the measurement of the filter where its accuracy is not tested."""
+    if not request.node.get_closest_marker("realtime"):
+        monkeypatch.setattr(analog, "SETTLING_S", 0.6)
+        monkeypatch.setattr(analog, "AVERAGING_S", 0.3)
 
 
 def bench(pi: Pi, *options: str) -> tuple[int, dict[str, tuple[str, str]], dict[str, Any]]:
