@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from fishd.client import Fish
 from fishd.config import load
 from fishd.core.signals import Observation
-from fishd.lab.links.link import StepResult
 from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
@@ -48,9 +47,9 @@ def chatter(seen: Observation) -> float:
     return -0.42 if round(seen.time / 0.05) % 2 else 0.42
 
 
-def env_on(*settings: str, kind: type[SimulatedLink] = SimulatedLink) -> SwimEnv:
+def env_on(*settings: str) -> SwimEnv:
     config = load(None, [f"simulation.{setting}" for setting in settings])
-    env = SwimEnv(kind(config), config, EnvironmentSettings())
+    env = SwimEnv(SimulatedLink(config), config, EnvironmentSettings())
     env.reset(seed=1)
     return env
 
@@ -98,13 +97,8 @@ class Tank:
     parameters of its candidate.
     """
 
-    def __init__(
-        self,
-        monkeypatch: pytest.MonkeyPatch,
-        *settings: str,
-        kind: type[SimulatedLink] = SimulatedLink,
-    ) -> None:
-        self.env = env_on(*settings, kind=kind)
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *settings: str) -> None:
+        self.env = env_on(*settings)
         self.model = make_learner(TrainingSettings(), DummyVecEnv([lambda: self.env]))
         self.policies: list[Policy] = []
         self.asked: list[int] = []
@@ -144,33 +138,6 @@ def test_with_a_drifting_sensor_the_better_of_two_policies_is_chosen(
     for ticks in order:
         tank.evaluate(square(ticks))
     assert tank.best == order.index(6)
-
-
-class Pushed(SimulatedLink):
-    """A fish that is pushed while it swims."""
-
-    push = 0.0
-
-    def step(self, angle: float) -> StepResult:
-        step = super().step(angle)
-        pushed = replace(step.observation, fx=step.observation.fx + (self.push if angle else 0.0))
-        return step._replace(observation=pushed)
-
-
-def test_a_policy_pushed_once_does_not_stay_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
-    tank = Tank(monkeypatch, "noise=0.001", kind=Pushed)
-    link = tank.env.link
-    assert isinstance(link, Pushed)
-
-    tank.evaluate(square(6))
-    link.push = 0.003
-    (pushed,) = tank.evaluate(square(5), 8.0)
-    link.push = 0.0
-    assert tank.best == 1
-    assert pushed.relative_thrust > 1.02
-    for _ in range(3):
-        tank.evaluate(square(5))
-    assert tank.best == 0
 
 
 def test_a_policy_that_stalls_costs_little_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:

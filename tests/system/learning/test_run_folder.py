@@ -165,13 +165,6 @@ def test_a_table_of_another_kind_is_one_line(run: Path) -> None:
     assert complaint(read_evaluations, run) == f"{file}: not a table of evaluations"
 
 
-def test_a_resume_with_a_pipe_for_a_state_advises_what_to_do(run: Path) -> None:
-    (run / STEP / "state.json").unlink()
-    pipe(run / STEP / "state.json")
-    with pytest.raises(CheckpointError, match=r"is a named pipe; .* move this checkpoint away"):
-        resumed(run)
-
-
 def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> None:
     """After an abrupt end of a run, its newest checkpoint is not newer than its tables."""
     job = brief_job(tmp_path / "run", steps=256)
