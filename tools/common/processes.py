@@ -11,7 +11,7 @@ from typing import Any, Self
 BIN = Path(sys.executable).parent
 FISHD = str(BIN / "fishd")
 FISHCTL = str(BIN / "fishctl")
-PATIENCE = 60.0
+PATIENCE = 180.0
 """Timeout of the waits of tests and tools [s]."""
 
 
