@@ -96,22 +96,19 @@ def test_another_start_of_their_machine_begins_anew(boot: str) -> None:
     assert abs(offset.seconds + 50.0) <= offset.uncertainty <= 0.05
 
 
-def test_only_the_first_answer_is_waited_for() -> None:
-    network = Network(shortest=1e-3, longest=2e-3)
+@pytest.mark.parametrize(
+    ("shortest", "longest", "timeout"),
+    [(1e-3, 2e-3, MIN_UPDATE_TIMEOUT_S), (0.1, 0.11, pytest.approx(0.8, rel=0.1))],
+)
+def test_after_the_first_answer_a_network_is_given_the_time_that_it_takes(
+    shortest: float, longest: float, timeout: float
+) -> None:
+    network = Network(shortest=shortest, longest=longest)
     clock = ClockOffset(network.ask, lambda: network.now)
     clock.update()
     network.now += UPDATE_PERIOD_S + 1.0
     clock.update()
-    assert network.patience == MIN_UPDATE_TIMEOUT_S
-
-
-def test_a_slow_network_is_given_the_time_that_it_takes() -> None:
-    network = Network(shortest=0.1, longest=0.11)
-    clock = ClockOffset(network.ask, lambda: network.now)
-    clock.update()
-    network.now += UPDATE_PERIOD_S + 1.0
-    clock.update()
-    assert network.patience == pytest.approx(0.8, rel=0.1)
+    assert network.patience == timeout
 
 
 def test_beginning_anew_is_tried_in_pauses() -> None:

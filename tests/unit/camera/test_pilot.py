@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from rigs.harness import observe
-from rigs.policy_files import FLIP, of_pixels, seeing_card, velocity_follower, write
+from rigs.policy_files import FLIP, of_pixels, seeing_card, write
 
 from fishd.controllers.base import Limits
 from fishd.controllers.policy.pilot import HOLD_TIME_S, Pilot
@@ -80,11 +80,3 @@ def test_it_reverses_no_sooner_than_ppo_would(tmp_path: Path) -> None:
 def test_frames_of_another_size_are_refused(brightness: str) -> None:
     with pytest.raises(PolicyError, match=r"needs 2 frames of 32 x 32 pixels, but got .*\[\(84"):
         Pilot(brightness, LIMITS).angle(observe(), stack(50, size=84))
-
-
-def test_another_tick_or_amplitude_is_refused(tmp_path: Path) -> None:
-    path = str(write(tmp_path, velocity_follower()))
-    with pytest.raises(PolicyError, match="trained at a tick of 50 ms, this robot's is 20 ms"):
-        Pilot(path, replace(LIMITS, tick=0.02))
-    with pytest.raises(PolicyError, match=r"beyond the robot's amplitude_limit, 0\.3 rad"):
-        Pilot(path, replace(LIMITS, amplitude=0.3))

@@ -73,12 +73,13 @@ def error_message(folder: Path, kind: type[ForceCalibration | ServoCalibration],
     return line
 
 
-def test_a_file_of_an_older_fishd_is_read_with_its_old_names(tmp_path: Path) -> None:
+def test_a_file_of_an_older_fishd_is_read_and_its_uncertainty_is_unknown(tmp_path: Path) -> None:
     old = {**FORCE, "load_error": 0.02, "tared": "2026-11-20"}
     (tmp_path / "force-2027-01-01T000000.000000Z.yaml").write_text(yaml.safe_dump(old))
     newest = CalibrationFolder(tmp_path).newest(ForceCalibration)
     assert newest is not None
     assert (newest[0].load_ci95, newest[0].tare_date) == (0.02, "2026-11-20")
+    assert newest[0].thrust_ci95(0.025) is None
 
 
 @pytest.mark.parametrize("key", ["xy", "date", "scale"])
@@ -147,13 +148,6 @@ def bounds(struct: type[Struct], name: str) -> object:
 def test_a_servo_calibration_has_the_bounds_of_the_same_keys_of_the_configuration() -> None:
     for key in SERVO:
         assert bounds(ServoCalibration, key) == bounds(ServoSettings, key), key
-
-
-def test_a_file_from_before_uncertainties_is_used_and_they_are_unknown(tmp_path: Path) -> None:
-    (tmp_path / "force-2026-11-21T120000.000000Z.yaml").write_text(yaml.safe_dump(FORCE))
-    newest = CalibrationFolder(tmp_path).newest(ForceCalibration)
-    assert newest is not None
-    assert newest[0].thrust_ci95(0.025) is None
 
 
 def test_an_uncertainty_is_kept_with_its_calibration(tmp_path: Path) -> None:

@@ -20,9 +20,8 @@ from rigs.scripted_agent import (
     wait_for_message,
 )
 
-from fishd.config import load
 from fishd.controllers import registry
-from fishd.core.errors import ConfigError, ParameterError
+from fishd.core.errors import ParameterError
 
 
 def test_an_action_is_applied_in_the_tick_it_answers(still: Rig, agent: ScriptedAgent) -> None:
@@ -248,8 +247,3 @@ def test_deadlines_change_while_it_swims_the_agent_stays(rig: Rig, agent: Script
     assert rig.loop.active.controller.parameters.misses == 7
     with pytest.raises(ParameterError, match=r"set-controller remote --agent tcp://"):
         rig.retune(agent="tcp://127.0.0.1:9873")
-
-
-def test_lockstep_is_for_a_simulated_fish_only() -> None:
-    with pytest.raises(ConfigError, match="lockstep: true is not valid with robot: pi"):
-        load(None, ["robot=pi", "lockstep=true"])

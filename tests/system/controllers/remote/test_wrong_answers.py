@@ -99,6 +99,16 @@ def raw(tmp_path: Path) -> Iterator[RawAgent]:
     agent.close()
 
 
+@pytest.fixture
+def connection(rig: Rig, raw: RawAgent) -> socket.socket:
+    """Return the connection of the controller `remote` to the agent."""
+    rig.start("remote", agent=raw.address)
+    connection = raw.accept()
+    connection.sendall(raw.GREETING + raw.READY)
+    wait_for_connection(rig)
+    return connection
+
+
 @pytest.mark.parametrize(
     ("sent", "complaint"),
     [
@@ -108,12 +118,8 @@ def raw(tmp_path: Path) -> Iterator[RawAgent]:
     ],
 )
 def test_frames_without_end_are_a_fault_and_nothing_of_them_is_kept(
-    rig: Rig, raw: RawAgent, sent: bytes, complaint: str
+    rig: Rig, connection: socket.socket, sent: bytes, complaint: str
 ) -> None:
-    rig.start("remote", agent=raw.address)
-    connection = raw.accept()
-    connection.sendall(raw.GREETING + raw.READY)
-    wait_for_connection(rig)
     connection.sendall(sent)
     wait_for_message(rig)
     assert len(remote(rig)._wire._received) <= 2 * 65536
@@ -136,11 +142,7 @@ def test_what_speaks_no_zeromq_is_no_agent(rig: Rig, raw: RawAgent, greeting: by
     assert remote(rig)._wire.connections == 0
 
 
-def test_a_heartbeat_of_the_agent_is_answered(rig: Rig, raw: RawAgent) -> None:
-    rig.start("remote", agent=raw.address)
-    connection = raw.accept()
-    connection.sendall(raw.GREETING + raw.READY)
-    wait_for_connection(rig)
+def test_a_heartbeat_of_the_agent_is_answered(rig: Rig, connection: socket.socket) -> None:
     connection.sendall(b"\x04\x09\x04PING\x00\x10ab")
     received = b""
     while not received.endswith(b"\x04\x07\x04PONGab"):
@@ -148,11 +150,9 @@ def test_a_heartbeat_of_the_agent_is_answered(rig: Rig, raw: RawAgent) -> None:
         received += connection.recv(4096)
 
 
-def test_heartbeats_of_an_agent_that_never_reads_take_no_memory(rig: Rig, raw: RawAgent) -> None:
-    rig.start("remote", agent=raw.address)
-    connection = raw.accept()
-    connection.sendall(raw.GREETING + raw.READY)
-    wait_for_connection(rig)
+def test_heartbeats_of_an_agent_that_never_reads_take_no_memory(
+    rig: Rig, connection: socket.socket
+) -> None:
     wire, heartbeats = remote(rig)._wire, 1000 * b"\x04\x09\x04PING\x00\x10ab"
     for _ in range(300):  # their answers are more than the kernel keeps
         connection.sendall(heartbeats)
@@ -198,20 +198,19 @@ def test_an_action_for_nothing_sent_is_a_fault(rig: Rig, agent: ScriptedAgent, s
     assert f"an action for observation {seq}, which was never sent; the latest is 1" in reason(rig)
 
 
-def test_answers_of_another_session_are_told_from_late_ones(rig: Rig, agent: ScriptedAgent) -> None:
-    connect(rig, agent)
-    swim(rig, agent)
-    assert {run_answered_tick(rig, agent, 0.3, session="0123").phi_c for _ in range(5)} == {0.0}
-    assert rig.reason == "remote-silent"
-    assert "5 ticks in a row (5 were for another session)" in reason(rig)
-
-
-def test_late_answers_are_counted_in_the_reason(rig: Rig, agent: ScriptedAgent) -> None:
+@pytest.mark.parametrize(
+    ("is_late", "count"), [(True, "5 answers were late"), (False, "5 were for another session")]
+)
+def test_answers_of_another_session_are_told_from_late_ones(
+    rig: Rig, agent: ScriptedAgent, is_late: bool, count: str
+) -> None:
     connect(rig, agent)
     swim(rig, agent)
     for _ in range(5):
-        assert run_answered_tick(rig, agent, 0.3, seq=remote(rig)._seq).phi_c == 0.0
-    assert "5 ticks in a row (5 answers were late)" in reason(rig)
+        wrong = {"seq": remote(rig)._seq} if is_late else {"session": "0123"}
+        assert run_answered_tick(rig, agent, 0.3, **wrong).phi_c == 0.0
+    assert rig.reason == "remote-silent"
+    assert f"5 ticks in a row ({count})" in reason(rig)
 
 
 def test_before_the_first_action_wrong_answers_count_too(rig: Rig, agent: ScriptedAgent) -> None:

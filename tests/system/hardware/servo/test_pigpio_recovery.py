@@ -159,12 +159,6 @@ def test_the_last_resort_stops_the_pulses_though_the_user_is_impatient(bench: Be
     assert bench.width == 0
 
 
-def test_the_last_resort_says_in_one_line_that_pigpiod_is_gone(bench: Bench) -> None:
-    bench.faults.inject("pigpiod-gone")
-    with pytest.raises(ServoError, match=r"^pigpiod at 127\.0\.0\.1:\d+: Connection refused$"):
-        bench.last_resort()
-
-
 def test_a_living_fishd_learns_from_an_error_that_the_last_resort_was_taken(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)

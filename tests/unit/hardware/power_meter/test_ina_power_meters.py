@@ -55,19 +55,16 @@ def rig(request: pytest.FixtureRequest) -> Iterator[MeterRig]:
         yield rig
 
 
-def test_it_tells_the_power_into_the_servo_to_a_step_of_its_own(rig: MeterRig) -> None:
+@pytest.mark.parametrize("watts", [1.5, -0.3])
+def test_it_tells_the_power_to_a_step_of_its_own_and_what_flows_back_as_negative(
+    rig: MeterRig, watts: float
+) -> None:
+    rig.watts = lambda time: watts
     meter = rig.meter()
     rig.tick(meter)
     step = 6.0 * rig.meter_chip.shunt_step / rig.shunt
-    assert rig.tick(meter) == pytest.approx(1.5, abs=step)
+    assert rig.tick(meter) == pytest.approx(watts, abs=step)
     meter.close()
-
-
-def test_it_tells_what_flows_back_as_negative(rig: MeterRig) -> None:
-    rig.watts = lambda time: -0.3
-    meter = rig.meter()
-    rig.tick(meter)
-    assert rig.tick(meter) == pytest.approx(-0.3, rel=0.01)
 
 
 def test_short_bursts_go_unseen_in_no_part_of_a_tick(rig: MeterRig) -> None:

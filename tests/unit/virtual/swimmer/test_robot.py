@@ -32,18 +32,14 @@ def test_it_swims_until_the_time_at_which_it_is_read() -> None:
 
 
 @pytest.mark.parametrize(("angle", "activation"), [(PHI, 1.0), (-PHI / 2, -0.5), (2 * PHI, 1.0)])
-def test_the_muscles_do_what_the_command_is_of_its_limit(angle: float, activation: float) -> None:
+def test_the_muscles_do_what_the_command_is_of_its_limit_and_relax_when_it_is_released(
+    angle: float, activation: float
+) -> None:
     fish = swimmer()
     fish.write(angle)
     fish.read(TICK)
     assert fish.fish.activation == pytest.approx(activation)
     assert fish.truth().phi == pytest.approx(activation * PHI)
-
-
-def test_muscles_relax_when_the_servo_is_released() -> None:
-    fish = swimmer()
-    fish.write(PHI)
-    fish.read(TICK)
     fish.release()
     fish.read(2 * TICK)
     assert fish.fish.activation == 0.0
