@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 
 import pytest
-from rigs.harness import Rig
+from rigs.harness import LIMITS, Rig
 
+from fishd.controllers import registry
 from fishd.controllers.thrust import MIN_AMPLITUDE_FRACTION
 from fishd.controllers.thrust_gauge import mean_of_ripple
+from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 
 K = 12.9e-3
@@ -133,3 +135,10 @@ def test_the_mean_is_told_from_the_ripple_alone() -> None:
     f4 = 0.5 * cross * turn**4
     assert mean_of_ripple(f2, f4) == pytest.approx(0.5 * (1.0 + 9.0 * third**2), rel=1e-3)
     assert mean_of_ripple(0j, 0j) is None
+
+
+@pytest.mark.parametrize("target", [0, -0.01, float("nan"), float("inf")])
+def test_a_target_that_is_no_thrust_is_refused_in_a_line(target: float) -> None:
+    problem = r"thrust: target: \S+ is not valid: a number in \(0, 10\] N is needed$"
+    with pytest.raises(ParameterError, match=problem):
+        registry.create("thrust", {"target": target}, LIMITS)

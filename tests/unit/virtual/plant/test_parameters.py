@@ -1,6 +1,7 @@
 import sys
 from typing import get_type_hints
 
+import msgspec
 import pytest
 from rigs.processes import call
 
@@ -23,3 +24,11 @@ def test_every_parameter_has_bounds_a_unit_and_a_description() -> None:
         assert meta.extra_json_schema["unit"], name
         assert meta.le is not None, name
         assert meta.ge is not None or meta.gt is not None, name
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"xi": -0.1}, {"servo_lag": 0.0}, {"omega0": "fast"}, {"xi": 21.0}, {"damping": 1.0}]
+)
+def test_a_fish_that_cannot_exist_is_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(msgspec.ValidationError):
+        msgspec.convert(wrong, PlantParameters)
