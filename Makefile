@@ -82,8 +82,8 @@ $(VENV)/installed-dev: pyproject.toml $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --constraint tools/constraints.txt --editable '.[$(EXTRAS)]'
 	@# Tests run it on a stand-in for lgpio, which has no wheel for every Python.
 	$(BIN)/python -m pip install --quiet --no-deps 'rpi-lgpio>=0.6,<1'
-	@# Compiled here once, the tests need not be compiled by each of those that run at a time.
-	@$(BIN)/python -m pytest --collect-only -qq >/dev/null 2>&1 || true
+	@# Compiled here once, tests and the swimmer's kernels need not be compiled by each of those that run at a time.
+	@$(BIN)/python -m pytest -qq -k test_a_view_shows_the_water >/dev/null 2>&1 || true
 	@touch $@ $(VENV)/installed $(VENV)/installed-docs
 
 $(VENV)/installed-docs: pyproject.toml $(VENV)/bin/python

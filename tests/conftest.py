@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,8 @@ settings.register_profile(
 settings.load_profile("fishd")
 
 UNIT = Path(__file__).parent / "unit"
+LONG = {"test_unknown_keys", "test_site", "test_measure", "test_reliability", "test_doctor_bench"}
+"""Modules with a test that takes longer than ten others; these begin first."""
 
 MAX_LOST_S = 0.03
 """Lost time of the machine [s] above which a failed test of real time is repeated."""
@@ -101,8 +104,26 @@ def refuse_processes(event: str, what: tuple[Any, ...]) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Run slow modules first: the many short tests then spread evenly over the workers."""
-    items.sort(key=lambda item: item.path.is_relative_to(UNIT))
+    """Give each test process its part of the slow modules first, and then of the fast ones.
+
+    A process gets the tests of a piece of the list, and those that others have left. Slow tests
+    mostly wait, so they run beside one another, and the fast ones at the end leave no gaps.
+    """
+    count = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    slow, fast = (
+        _deal([item for item in items if item.path.is_relative_to(UNIT) == is_fast], count)
+        for is_fast in (False, True)
+    )
+    items[:] = [item for part in zip(slow, fast, strict=True) for tests in part for item in tests]
+
+
+def _deal(items: list[pytest.Item], count: int) -> list[list[pytest.Item]]:
+    """Return equal parts, each of modules from all folders."""
+    modules = sorted({item.path for item in items}, key=lambda path: (path.stem not in LONG, path))
+    place = {path: number % count for number, path in enumerate(modules)}
+    items = sorted(items, key=lambda item: place[item.path])
+    bounds = [len(items) * k // count for k in range(count + 1)]
+    return [items[first:end] for first, end in pairwise(bounds)]
 
 
 def pytest_collection_finish() -> None:

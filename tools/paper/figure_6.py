@@ -189,12 +189,13 @@ def draw() -> None:
             finest = Case(controller, setting, rows[0]["cell_mm"])
             _draw_grid_error(right, finest, "cell_mm", colour)
         for controller, setting in REFINED + FINE:
+            colour = PURPLE if (controller, setting) == ("swing", 0.0) else colours[controller][0]
             for cell in (TABLE.cell, min(TABLE.cells)):
                 case = Case(controller, setting, cell)
-                _draw_grid_error(left, case, "frequency_Hz", colours[controller][0])
+                _draw_grid_error(left, case, "frequency_Hz", colour)
             if row := TABLE.row(case):
                 place = row["frequency_Hz"], row["speed_mm_per_s"]
-                left.plot(*place, ls="", marker="x", color=colours[controller][0], zorder=6)
+                left.plot(*place, ls="", marker="x", color=colour, zorder=6)
         left.plot([], [], ls="", marker="x", color="0.4", label=f"cells of {min(TABLE.cells)} mm")
         for axes in (left, right):
             axes.axhline(0.0, color="0.85", linewidth=0.6, zorder=0)
