@@ -120,17 +120,9 @@ class Attempt(Generic[T]):
                 return False
             if not self._given_up:
                 self._given_up = True
-                self._raise_in_thread(GivenUp)
+                if self._interrupt and self._begun:
+                    _raise_in(self._thread)
         return True
-
-    def _raise_in_thread(self, error: Any) -> None:
-        """Raise an error in the thread at its next Python code; None cancels a pending error."""
-        if not (self._interrupt and self._begun):
-            return
-        import ctypes  # slow to import, and only needed when a call is given up
-
-        error = ctypes.py_object(error) if error else None
-        ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(self._thread.ident or 0), error)
 
     def _run(self) -> None:
         try:
@@ -156,7 +148,28 @@ class Attempt(Generic[T]):
         with self._settling:
             if self._given_up:
                 self._error = None  # no caller will read it
-                self._raise_in_thread(None)
+                if self._interrupt:
+                    _receive_pending()
             else:
                 self._settled.set()
             return not self._given_up
+
+
+def _raise_in(thread: threading.Thread) -> None:
+    """Raise `GivenUp` in a thread at its next Python code."""
+    import ctypes  # slow to import, and only needed when a call is given up
+
+    ident = ctypes.c_ulong(thread.ident or 0)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, ctypes.py_object(GivenUp))
+
+
+def _receive_pending() -> None:
+    """Receive a `GivenUp` that may still be pending in this thread, or one like it.
+
+    A pending error that is only cancelled leaves Python in a state in which each call of a function
+    takes longer, and one that is traced never ends (Python 3.11).
+    """
+    with suppress(GivenUp):
+        _raise_in(threading.current_thread())
+        while True:
+            pass

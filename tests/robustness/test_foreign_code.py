@@ -10,7 +10,7 @@ from contextlib import suppress
 
 import pytest
 from fishd_zoo import RAISED
-from rigs.processes import PATIENCE, wait_until
+from rigs.processes import PATIENCE, call, wait_until
 
 from fishd.core.errors import Escaped
 from fishd.core.foreign_code import Attempt, call_foreign
@@ -109,6 +109,28 @@ def test_what_comes_too_late_is_handed_to_whoever_takes_it_away() -> None:
     assert taken.wait(PATIENCE)
     assert results == ["late"]
     assert not attempt.wait(0.0)
+
+
+TRACED = """
+import sys, threading
+from fishd.core.foreign_code import Attempt
+
+begun, go = threading.Event(), threading.Event()
+attempt = Attempt(lambda: (begun.set(), go.wait()), late=lambda result: print("late"))
+begun.wait()
+attempt.give_up()
+go.set()
+while attempt.alive:
+    pass
+sys.setprofile(lambda *event: None)
+(lambda: None)()
+print("traced", flush=True)
+"""
+"""Program that traces a function after a call that returned too late."""
+
+
+def test_a_function_can_be_traced_after_a_call_that_came_too_late() -> None:
+    assert call(sys.executable, "-c", TRACED, check=True).stdout.endswith("traced\n")
 
 
 def test_many_that_are_given_up_just_when_they_are_done_are_either_taken_or_thrown_away() -> None:
