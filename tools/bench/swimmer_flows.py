@@ -235,8 +235,9 @@ def measure_cost(cell: float, step: float) -> list[str]:
     settings = load(SWIMMER, numerics(cell, step)).swimmer
     with_threads = Fish(settings)
     together = time_of_second(with_threads) if with_threads.flow.pairs.has_two_threads else None
-    threads.config.NUMBA_NUM_THREADS = 1
+    available, threads.config.NUMBA_NUM_THREADS = threads.config.NUMBA_NUM_THREADS, 1
     fish = Fish(settings)
+    threads.config.NUMBA_NUM_THREADS = available
     flow, grid = fish.flow, fish.flow.grid
     swim = partial(beat, fish)
     for _ in range(40):
