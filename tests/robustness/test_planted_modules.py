@@ -61,6 +61,29 @@ def test_no_verb_executes_files_of_the_working_directory(words: str, trap: Trap)
     assert done.returncode in ((0, 1) if words.startswith("doctor") else (0,)), done.stderr
 
 
+START_WITH_CV2 = """
+import subprocess, sys
+import cv2
+from fishd.core.process.safe_path import SafeChildren
+
+child = [sys.executable, "-c", ""]
+assert subprocess.run(child, stderr=subprocess.DEVNULL).returncode != 0
+with SafeChildren():
+    subprocess.run(child, check=True)
+"""
+"""Program that starts Python without protection, which takes the library from the folder, and with
+it."""
+
+
+def test_a_child_of_a_process_that_has_loaded_cv2_takes_no_library_from_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("cv2", reason="install the extra 'camera'")
+    monkeypatch.delenv("LD_LIBRARY_PATH", raising=False)
+    (tmp_path / "libc.so.6").touch()
+    call(sys.executable, "-c", START_WITH_CV2, cwd=tmp_path, check=True)
+
+
 def test_fishd_and_its_gateways_do_not_execute_them(trap: Trap) -> None:
     with Process(FISHD, *addresses(trap.folder.parent), cwd=trap.folder) as process:
         endpoint = f"ipc://{trap.folder.parent}/control"

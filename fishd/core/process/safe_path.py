@@ -1,13 +1,13 @@
-"""Protection of Python processes that fishd starts against modules in the working directory.
+"""Protection of Python processes that fishd starts against code in the working directory.
 
-In a folder that others can write to, such as /tmp, another user may have put a `joblib.py`.
-`fishd.__main__` does the same for fishd itself.
+In a folder that others can write to, such as /tmp, another user may have put a `joblib.py` or a
+`libc.so.6`. `fishd.__main__` does the same for fishd itself.
 """
 
 import os
 import sys
 
-_VARIABLE = "PYTHONSAFEPATH"
+_SAFE_PATH, _LIBRARIES = "PYTHONSAFEPATH", "LD_LIBRARY_PATH"
 
 
 def python_command(*arguments: str) -> list[str]:
@@ -22,11 +22,15 @@ class SafeChildren:
     """
 
     def __enter__(self) -> None:
-        self._before = os.environ.get(_VARIABLE)
-        os.environ[_VARIABLE] = "1"
+        self._before = {name: os.environ.get(name) for name in (_SAFE_PATH, _LIBRARIES)}
+        os.environ[_SAFE_PATH] = "1"
+        if folders := self._before[_LIBRARIES]:
+            # An empty one is the working directory; cv2 adds one as it is loaded.
+            os.environ[_LIBRARIES] = ":".join(filter(None, folders.split(":")))
 
     def __exit__(self, *_: object) -> None:
-        if self._before is None:
-            del os.environ[_VARIABLE]
-        else:
-            os.environ[_VARIABLE] = self._before
+        for name, value in self._before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
