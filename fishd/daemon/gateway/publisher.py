@@ -21,6 +21,8 @@ MAX_CONNECTIONS = 200
 
 MAX_QUEUED_MESSAGES = 100
 """Messages kept for a slow subscriber, five seconds of ticks; it misses the later ones."""
+MAX_TELEMETRY_BYTES = 2**20
+"""Largest message from the link [bytes]."""
 MAX_RECEIVED_BYTES = 512
 """Largest message from a subscriber, a topic or a handshake [bytes]."""
 HANDSHAKE_TIMEOUT_MS = 2000
@@ -36,13 +38,15 @@ def run(
     known: "KnownKeys | None",
 ) -> str:
     """Publish until fishd ends; return the exceeded limit, if any, or which key was removed."""
+    # Kept, because `recv` would ask the system for as much memory for each message.
+    buffer = memoryview(bytearray(MAX_TELEMETRY_BYTES))
     poller = select.poll()
     poller.register(link, select.POLLIN)
     while not (why := limits.exceeded() or (known.find_change() if known else "")):
         if not poller.poll(_CHECK_PERIOD_MS):
             continue
         try:
-            message = link.recv(2**20)
+            message = bytes(buffer[: link.recv_into(buffer)])
         except ConnectionResetError:  # fishd was killed
             return ""
         if message in (b"", END):
