@@ -41,7 +41,13 @@ settings.register_profile(
 settings.load_profile("fishd")
 
 UNIT = Path(__file__).parent / "unit"
-LONG = {"test_unknown_keys", "test_site", "test_measure", "test_reliability", "test_doctor_bench"}
+LONG_MODULES = {
+    "test_unknown_keys",
+    "test_site",
+    "test_measure",
+    "test_reliability",
+    "test_doctor_bench",
+}
 """Modules with a test that takes longer than ten others; these begin first."""
 
 MAX_LOST_S = 0.03
@@ -119,7 +125,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def _deal(items: list[pytest.Item], count: int) -> list[list[pytest.Item]]:
     """Return equal parts, each of modules from all folders."""
-    modules = sorted({item.path for item in items}, key=lambda path: (path.stem not in LONG, path))
+    modules = sorted(
+        {item.path for item in items}, key=lambda path: (path.stem not in LONG_MODULES, path)
+    )
     place = {path: number % count for number, path in enumerate(modules)}
     items = sorted(items, key=lambda item: place[item.path])
     bounds = [len(items) * k // count for k in range(count + 1)]

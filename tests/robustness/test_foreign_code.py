@@ -122,14 +122,21 @@ attempt.give_up()
 go.set()
 while attempt.alive:
     pass
+for count in range(300):
+    attempt = Attempt(lambda: 1)
+    for _ in range(count):
+        pass
+    attempt.give_up()
+    while attempt.alive:
+        pass
 sys.setprofile(lambda *event: None)
 (lambda: None)()
 print("traced", flush=True)
 """
-"""Program that traces a function after a call that returned too late."""
+"""Program that traces a function after calls that were given up too late, or at any moment."""
 
 
-def test_a_function_can_be_traced_after_a_call_that_came_too_late() -> None:
+def test_a_function_can_be_traced_after_calls_that_were_given_up() -> None:
     assert call(sys.executable, "-c", TRACED, check=True).stdout.endswith("traced\n")
 
 

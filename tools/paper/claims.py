@@ -318,7 +318,7 @@ def swimming() -> Iterator[Claim]:
 def refinement() -> Iterator[tuple[str, str, str, str]]:
     """Return the table of swims, with their speeds on cells of each size."""
     stored = figure_6.TABLE
-    for controller, setting in figure_6.REFINED + figure_6.FINE:
+    for controller, setting in figure_6.REFINED + figure_6.FINE_SWIMS:
         what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
         rows = [stored.row(figure_6.Case(controller, setting, cell)) for cell in stored.cells]
         yield (

@@ -55,7 +55,7 @@ class Case(NamedTuple):
 
 REFINED = (("square", 3.0), ("sine", 2.0), ("swing", 0.6))
 """Controllers and settings that swim on all grids."""
-FINE = (("square", 4.0), ("sine", 3.0), ("swing", 0.0), ("square", 1.5), ("sine", 1.5))
+FINE_SWIMS = (("square", 4.0), ("sine", 3.0), ("swing", 0.0), ("square", 1.5), ("sine", 1.5))
 """Controllers and settings that swim on the grid of the figure and the finest."""
 LOST_SWIMS = (Case("square", 6.0, 0.5),)
 """Swims in which the fish turns and leaves the part with small cells before its speed is steady."""
@@ -80,7 +80,7 @@ class Table(NamedTuple):
         """Return every swim of the table."""
         others = [cell for cell in self.cells if cell != self.cell]
         refined = [Case(*swim, cell) for cell in others for swim in REFINED]
-        return self.curves() + refined + [Case(*swim, min(self.cells)) for swim in FINE]
+        return self.curves() + refined + [Case(*swim, min(self.cells)) for swim in FINE_SWIMS]
 
     def row(self, case: Case) -> dict[str, Any] | None:
         """Return the row of a swim; None before it is stored."""
@@ -188,12 +188,14 @@ def draw() -> None:
             _bars(right, rows, "cell_mm", colour, marker, f"{controller}, {what}", line)
             finest = Case(controller, setting, rows[0]["cell_mm"])
             _draw_grid_error(right, finest, "cell_mm", colour)
-        for controller, setting in REFINED + FINE:
+        for controller, setting in REFINED + FINE_SWIMS:
             colour = PURPLE if (controller, setting) == ("swing", 0.0) else colours[controller][0]
-            for cell in (TABLE.cell, min(TABLE.cells)):
-                case = Case(controller, setting, cell)
-                _draw_grid_error(left, case, "frequency_Hz", colour)
-            if row := TABLE.row(case):
+            case, finest = (
+                Case(controller, setting, cell) for cell in (TABLE.cell, min(TABLE.cells))
+            )
+            _draw_grid_error(left, case, "frequency_Hz", colour)
+            _draw_grid_error(left, finest, "frequency_Hz", colour)
+            if row := TABLE.row(finest):
                 place = row["frequency_Hz"], row["speed_mm_per_s"]
                 left.plot(*place, ls="", marker="x", color=colour, zorder=6)
         left.plot([], [], ls="", marker="x", color="0.4", label=f"cells of {min(TABLE.cells)} mm")

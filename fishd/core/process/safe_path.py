@@ -25,7 +25,7 @@ class SafeChildren:
         self._before = {name: os.environ.get(name) for name in (_SAFE_PATH, _LIBRARIES)}
         os.environ[_SAFE_PATH] = "1"
         if folders := self._before[_LIBRARIES]:
-            # An empty one is the working directory; cv2 adds one as it is loaded.
+            # An empty folder stands for the working directory; cv2 adds one when it is loaded.
             os.environ[_LIBRARIES] = ":".join(filter(None, folders.split(":")))
 
     def __exit__(self, *_: object) -> None:

@@ -1,5 +1,6 @@
 """Gateway of telemetry: a PUB socket that publishes the messages from the link."""
 
+import mmap
 import select
 import socket
 from contextlib import suppress
@@ -39,7 +40,7 @@ def run(
 ) -> str:
     """Publish until fishd ends; return the exceeded limit, if any, or which key was removed."""
     # Kept, because `recv` would ask the system for as much memory for each message.
-    buffer = memoryview(bytearray(MAX_TELEMETRY_BYTES))
+    buffer = memoryview(mmap.mmap(-1, MAX_TELEMETRY_BYTES))
     poller = select.poll()
     poller.register(link, select.POLLIN)
     while not (why := limits.exceeded() or (known.find_change() if known else "")):

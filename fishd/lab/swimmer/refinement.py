@@ -19,8 +19,8 @@ from fishd.core import files
 from fishd.core.errors import FishdError
 
 MIN_ORDER = 1.0
-"""Order for two grids, and the smallest one with which errors are computed: swims of the default
-fish have shown observed orders from 0.4 to 1.5."""
+"""Order for two grids, and the smallest one with which errors are computed: settled speeds of
+the default fish have shown orders from 0.4 to 1.5."""
 ORDERS = MIN_ORDER, 3.0
 """Range of observed orders in which the speed counts as converging."""
 MAX_ORDER = 2.0

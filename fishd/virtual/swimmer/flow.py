@@ -84,6 +84,7 @@ class Flow:
         self._slip = walls == "slip"
         self._poisson = Poisson(grid, dtype)
         self.pairs = self._poisson.pairs
+        """Threads for the two halves of a step."""
         self._u = np.zeros((grid.nx + 1 + 2 * PAD, grid.ny + 2 * PAD), dtype)
         self._v = np.zeros((grid.nx + 2 * PAD, grid.ny + 1 + 2 * PAD), dtype)
         self.u, self.v = self._u[PAD:-PAD, PAD:-PAD], self._v[PAD:-PAD, PAD:-PAD]

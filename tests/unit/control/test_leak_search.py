@@ -63,6 +63,19 @@ def test_with_the_leak_swing_thrusts_as_well_as_on_the_default_fish() -> None:
     assert share["auto"].relative_thrust > 0.98
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("amplitude", [0.1, 0.8])
+def test_on_the_default_fish_it_costs_no_thrust(amplitude: float) -> None:
+    limit = f"amplitude_limit={amplitude}"
+    shares = [
+        simulate(
+            load(None, [f"estimator.leak={leak}", limit]), "swing", {}, 60.0, 10.0
+        ).relative_thrust
+        for leak in ("0.3", "auto")
+    ]
+    assert shares[1] > shares[0] - 0.01
+
+
 def test_the_thrust_is_known_again_after_the_scale_of_the_velocity_has_changed() -> None:
     rig = Rig("estimator.leak=auto", f"plant.lateral_drag={3.0 * DRAG}", "simulation.offset_x=0.01")
     rig.run_for(3.0)

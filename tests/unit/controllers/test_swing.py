@@ -105,3 +105,9 @@ def relative_thrust(ratio: float, seed: int) -> float:
 def test_on_an_imperfect_rig_it_gets_most_of_the_best_thrust(ratio: float, least: float) -> None:
     """ratio: ω₀Φ/Ω; the median over five seeds of noise and drift."""
     assert statistics.median(relative_thrust(ratio, seed) for seed in range(5)) >= least
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("change", ["omega0=5", "omega0=25", "xi=2.4", "coupling=1"])
+def test_fishes_that_have_little_in_common_swim_with_the_same_settings(change: str) -> None:
+    assert simulate(load(None, [f"plant.{change}"]), "swing", {"C": 0.6}).relative_thrust > 0.9

@@ -1,5 +1,8 @@
 """Search of the best parameters: few ticks of swimming, and intervals that hold."""
 
+import os
+import signal
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -7,15 +10,20 @@ import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import load
+from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
+    Trial,
     measure_trials,
+    read_trials,
     restrict_to_whole_ticks,
+    write_trial,
 )
 from fishd.lab.rerun import rerun
 from fishd.lab.session import VirtualSession
-from fishd.lab.simulation import simulate
+from fishd.lab.simulation import VirtualRun, simulate
 from fishd.recording import open_run, read
+from fishd.virtual.plant.base import TrueWindow
 
 BEST = 25.736e-3
 """Best thrust of the default fish by a square wave of whole ticks, at 1.667 Hz [N]."""
@@ -98,6 +106,61 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     refused = one_line(fishctl(*words, "--resume", str(folder), "--amplitude", "0.3"))
     assert "began with parameters.amplitude = None, now it is 0.3" in refused
     assert "--resume" in one_line(fishctl(*words, "--folder", str(folder)))
+
+
+@pytest.mark.slow
+def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    generator = np.random.default_rng(5)
+    tick = VirtualRun.tick
+    left = 0
+
+    def interrupted(run: VirtualRun) -> TrueWindow:
+        nonlocal left
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+        return tick(run)
+
+    monkeypatch.setattr(VirtualRun, "tick", interrupted)
+    folder = tmp_path / "run"
+    table = folder / "rows.csv"
+    words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
+    kept, stops = "", 0
+    while True:
+        left = int(generator.integers(1, 300)) if stops < 3 else 0
+        done = fishctl(*words)
+        words = ["optimise", "--resume", str(folder)]
+        content = table.read_text()
+        assert content.startswith(kept)
+        kept = content
+        if done.returncode == 0:
+            break
+        stops += 1
+        assert done.returncode == 130
+        assert done.stderr.startswith("fishctl: interrupted, ")
+        assert done.stderr.endswith(f"; resume with: fishctl {' '.join(words)}\n")
+    assert stops == 3
+    assert "best frequency of square: 1.667 Hz" in done.stdout
+    rows = [row.split(",") for row in kept.splitlines()[1:]]
+    seconds = sum(len(read(path)) for path in folder.glob("search*.mcap")) * 0.05
+    swims = sum(float(b[3]) - float(a[3]) for a, b in pairwise([[0.0] * 5, *rows])) * 0.05
+    assert seconds > swims + 2.75 * len(rows)
+
+
+def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
+    header = Header(kind="optimise", on="simulation")
+    table = tmp_path / "run" / "rows.csv"
+    with open_experiment(tmp_path / "run", header) as search:
+        assert read_trials(search, ["frequency"]) == []
+        trial = Trial({"frequency": 1.25}, 0.02, 0.001, 0.5, 0.01, 40, 12.5)
+        write_trial(search, trial)
+    whole = table.read_text()
+    table.write_text(whole + "2.0,0.023,0.001,0.7,0.01,80,24.7")  # of 24.75
+    with open_experiment(tmp_path / "run", header, resume=True) as search:
+        assert read_trials(search, ["frequency"]) == [trial]
+    assert table.read_text() == whole
 
 
 @pytest.mark.parametrize(

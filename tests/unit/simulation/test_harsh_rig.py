@@ -6,6 +6,7 @@ from rigs.documents import ROOT
 
 from fishd.config import load
 from fishd.lab.simulation import simulate
+from fishd.lab.simulation.virtual_run import KeepingPublisher
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -28,6 +29,18 @@ def test_it_has_every_imperfection_that_there_is(section: str, defaults: msgspec
     names = harsh.__struct_fields__
     same = {name for name in names if getattr(harsh, name) == getattr(defaults, name)}
     assert same == KEYS_AS_DEFAULT[section]
+
+
+@pytest.mark.slow
+def test_the_same_seed_swims_the_same_to_the_last_bit_and_another_one_does_not() -> None:
+    def ticks(*overrides: str) -> list[tuple[float, ...]]:
+        publisher = KeepingPublisher()
+        simulate(load(FILE, overrides), "swing", {"C": 0.6}, 3.0, 1.0, publisher)
+        return [(t.fx, t.fy, t.phi_c, t.alpha, t.alpha_rate) for t in publisher.ticks]
+
+    first = ticks()
+    assert ticks() == first
+    assert ticks("simulation.seed=1") != first
 
 
 @pytest.mark.slow

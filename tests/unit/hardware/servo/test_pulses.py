@@ -116,6 +116,16 @@ calibrations = st.builds(
 )
 
 
+@given(servos, st.floats(allow_nan=True, allow_infinity=True))
+def test_an_angle_is_a_permitted_pulse_or_refused(servo: ServoSettings, angle: float) -> None:
+    try:
+        width = pulse_width(servo, angle)
+    except ServoError:
+        return
+    assert 500 <= width <= 2500
+    assert servo.lowest - 1e-9 <= angle <= servo.highest + 1e-9
+
+
 @given(servos, st.floats(0, 1), st.floats(0, 1))
 def test_a_larger_angle_turns_further(servo: ServoSettings, share_1: float, share_2: float) -> None:
     lowest, highest = reach(servo)

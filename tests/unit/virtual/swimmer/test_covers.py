@@ -112,3 +112,36 @@ def test_faces_at_unequal_distances_are_refused() -> None:
         Painter(stretched, PY, H).paint(
             places, np.zeros(2), np.full(2, 4e-3), np.zeros(2), 0.01, clamped=False
         )
+
+
+def find_wall(surface: float, diffusion: float) -> float:
+    """Return where the water of a steady shear beside a body at rest appears to stand still.
+
+    It is relative to the surface, positive outside [cells].
+
+    surface: place of the surface above a face [cells]; diffusion: ν Δt/h²
+    """
+    y = np.arange(-6.0, 40.0)
+    size = len(y)
+    chi = np.array([kernel_integral(surface - face) for face in y])
+    mu1 = np.array([kernel_moment(surface - face) for face in y])
+    above, below = np.eye(size, k=1), np.eye(size, k=-1)
+    diffuse = np.eye(size) + diffusion * (above + below - 2.0 * np.eye(size))
+    mix = np.diag(1.0 - chi) + 0.5 * mu1[:, None] * (above - below)
+    system = np.eye(size) - mix @ diffuse
+    system[[0, -1]] = np.eye(size)[[0, -1]]
+    u = np.linalg.solve(system, np.eye(size)[-1])
+    return float(y[-1] - u[-1] / (u[-1] - u[-2]) - surface)
+
+
+@pytest.mark.parametrize(
+    ("diffusion", "wander", "mean"),
+    [(0.0005, 0.26, 0.02), (0.0016, 0.23, 0.05), (0.0032, 0.21, 0.07), (0.0064, 0.21, 0.09)],
+)
+def test_the_wall_that_water_feels_stays_near_the_surface_as_that_sweeps_a_cell(
+    diffusion: float, wander: float, mean: float
+) -> None:
+    """A kernel without a slope, one cell wide, has 0.56 and 0.20."""
+    offsets = [find_wall(surface, diffusion) for surface in np.arange(0.0, 1.0, 0.125)]
+    assert max(offsets) - min(offsets) < wander
+    assert abs(float(np.mean(offsets))) < mean
