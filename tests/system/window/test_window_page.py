@@ -89,7 +89,9 @@ def live_page(url: str, **settings: Any) -> Iterator[tuple[Page, list[str]]]:
 
 def swim(page: Page, controller: str = "swing") -> None:
     page.select_option("#controller", controller)
-    page.click("#start")
+    with page.expect_response("**/request", timeout=PATIENCE * 1e3) as response:
+        page.click("#start")
+    assert response.value.ok
     expect(page.locator("#mode")).to_have_text("running")
 
 
