@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rigs.processes import FISHD, Daemon, call
+from rigs.processes import FISHD, PATIENCE, Daemon, call
 
 from common.daemon import Fishd
 from fishd.client import Fish
@@ -56,7 +56,10 @@ def test_a_version_that_cannot_be_written_is_one_line(stream: str) -> None:
 
 
 def test_bytes_that_are_no_text_do_not_keep_an_emergency_stop_from_passing(tmp_path: Path) -> None:
-    with Daemon(tmp_path).wait_until_up() as daemon, Fish(daemon.endpoint) as fish:
+    with (
+        Daemon(tmp_path).wait_until_up() as daemon,
+        Fish(daemon.endpoint, timeout=PATIENCE) as fish,
+    ):
         assert fish.estop(os.fsdecode(b"fin \xff")).mode == "estop"
         reason = fish.status().reason
     assert reason

@@ -67,7 +67,7 @@ def runs(tmp_path: Path) -> Path:
 
 
 def test_what_lets_a_fish_in_estop_swim_is_named(daemon: Daemon, runs: Path) -> None:
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.estop()
         done = daemon.fishctl("record", "run", "--folder", str(runs), "--for", "0.5")
         fish.clear_fault()
@@ -82,7 +82,7 @@ def test_a_signal_finishes_the_file(daemon: Daemon, runs: Path, number: signal.S
     words = ("run", "--subject", "fish 3", "--operator", "Ada", "--note", "stiff fin")
     recording = Recording(daemon, runs, *words)
     recording.wait_for_ticks()
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("swing")
         fish.set_parameters(C=0.3)
         fish.mark("a push")
@@ -111,7 +111,7 @@ def test_a_kill_of_fishd_loses_nothing_and_the_next_is_recorded(tmp_path: Path, 
     with running(tmp_path, "--set", "start.controller=swing") as first:
         recording = Recording(first, runs, "run")
         recording.wait_for_ticks()
-        with Fish(first.endpoint) as fish:
+        with Fish(first.endpoint, timeout=PATIENCE) as fish:
             ticks = (tick.seq for tick in fish.ticks())
             heard = [seq for _, seq in zip(range(15), ticks, strict=False)]
         # The next fishd is received at a lower tick number, even on a busy machine.

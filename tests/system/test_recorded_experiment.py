@@ -3,7 +3,7 @@
 import signal
 from pathlib import Path
 
-from rigs.processes import EXPERIMENT, Daemon, Process, wait_until
+from rigs.processes import EXPERIMENT, PATIENCE, Daemon, Process, wait_until
 
 from fishd.client import Fish
 from fishd.core.errors import RecordingError
@@ -14,7 +14,11 @@ from fishd.recording import open_run
 
 def test_what_a_live_rig_does_is_rerun_to_the_last_bit(daemon: Daemon, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    with Fish(daemon.endpoint) as fish, LiveSession(fish) as rig, rig.recorded(path, "live"):
+    with (
+        Fish(daemon.endpoint, timeout=PATIENCE) as fish,
+        LiveSession(fish) as rig,
+        rig.recorded(path, "live"),
+    ):
         rig.rest(0.5)
         rig.swim("swing", {"C": 0.4}, 1.5)
         rig.rest(0.5)

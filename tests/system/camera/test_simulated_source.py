@@ -49,7 +49,10 @@ def test_from_another_machine_the_offset_is_estimated(
     tmp_path: Path, daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("fishd.camera.clock_offset.read_boot_id", lambda: "of another machine")
-    with running_camera(tmp_path, *settings(daemon)) as camera, Fish(daemon.endpoint) as fish:
+    with (
+        running_camera(tmp_path, *settings(daemon)) as camera,
+        Fish(daemon.endpoint, timeout=PATIENCE) as fish,
+    ):
         camera.is_in("streaming")
         with camera.client(fish=fish) as client:
             received: list[tuple[FrameHeader, Frame]] = []
@@ -91,11 +94,11 @@ class Lockstep:
     """An agent that waits for its camera in each tick."""
 
     def __init__(self, daemon: Daemon, camera: CameraProcess, stack: StackSettings) -> None:
-        self.fish = Fish(daemon.endpoint)
-        self.agent = Agent(f"{daemon.endpoint}-agent")
+        self.fish = Fish(daemon.endpoint, timeout=PATIENCE)
+        self.agent = Agent(f"{daemon.endpoint}-agent", timeout=PATIENCE)
         self.fish.set_controller("remote", agent=self.agent.address)
         # From here on no tick ends before the agent has acted.
-        self.client = camera.client(fish=self.fish, stack=stack, timeout=4.0)
+        self.client = camera.client(fish=self.fish, stack=stack, timeout=PATIENCE)
 
     def __enter__(self) -> "Lockstep":
         return self

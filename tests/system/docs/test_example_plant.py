@@ -6,7 +6,7 @@ import pytest
 from rigs import processes
 from rigs.documents import ROOT
 from rigs.example_packages import fishctl
-from rigs.processes import running, sets, wait_until
+from rigs.processes import PATIENCE, running, sets, wait_until
 
 from fishd.client import Fish
 from fishd.config import load, to_yaml
@@ -75,7 +75,7 @@ def test_an_agent_learns_on_it_and_on_fish_like_it() -> None:
 @pytest.mark.parametrize("lockstep", ["false", "true"])
 def test_it_swims_in_a_true_fishd_which_reports_its_keys(tmp_path: Path, lockstep: str) -> None:
     mine = sets(MODEL, "plant.tip_xi=0.8", f"lockstep={lockstep}", "start.controller=swing")
-    with running(tmp_path, *mine) as daemon, Fish(daemon.endpoint) as fish:
+    with running(tmp_path, *mine) as daemon, Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         assert fish.config()["plant"]["tip_xi"] == 0.8
         wait_until(lambda: fish.status().seq > 20)
         assert fish.status().mode == "running"

@@ -9,7 +9,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RenderCollection
 from msgspec.structs import replace
-from rigs.processes import Daemon, running, sets
+from rigs.processes import PATIENCE, Daemon, running, sets
 from rigs.swimming import BRIEF, Resting, brief_job
 from stable_baselines3.common.env_checker import check_env as check_for_baselines
 
@@ -241,7 +241,8 @@ def test_the_requested_pause_follows_the_longest_before(monkeypatch: pytest.Monk
 
 def test_the_environment_on_a_fishd_passes_both_checkers(daemon: Daemon, tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/agent"
-    with Fish(daemon.endpoint) as fish:  # a busy machine may delay the checkers by many ticks
+    # A busy machine may delay the checkers by many ticks.
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("remote", agent=address, misses=100)
     env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, agent=address).unwrapped
     try:
@@ -257,7 +258,7 @@ def test_the_environment_on_a_running_fishd_listens_at_the_given_address(tmp_pat
         env = gymnasium.make("fishd/SwimOnDaemon-v0", endpoint=daemon.endpoint, agent=address)
         try:
             env.reset()
-            with Fish(daemon.endpoint) as fish:
+            with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
                 assert fish.status().parameters["agent"] == address
         finally:
             env.close()

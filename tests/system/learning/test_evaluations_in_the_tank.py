@@ -9,7 +9,7 @@ import msgspec
 import pytest
 import torch
 from msgspec.structs import replace
-from rigs.processes import running, sets
+from rigs.processes import PATIENCE, running, sets
 from rigs.swimming import NOISY, Failing, Resting, brief_job, rows
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -342,7 +342,7 @@ def test_a_fishd_in_lockstep_gives_the_same_evaluations_as_a_simulation(tmp_path
     with running(tmp_path, *started) as daemon:
         there = on_robot(tmp_path / "there", **changes)
         train(replace(there, endpoint=daemon.endpoint))
-        with Fish(daemon.endpoint) as fish:
+        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
             assert fish.status().mode == "idle"
     assert any(row["thrust_ci95"] for row in rows(here.folder / "evaluations.csv"))
     for name in ("progress.csv", "evaluations.csv"):

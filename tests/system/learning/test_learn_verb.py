@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 from rich.progress import Progress
-from rigs.processes import Daemon, fishctl, one_line
+from rigs.processes import PATIENCE, Daemon, fishctl, one_line
 from rigs.swimming import brief_job, rows, while_it_trains
 
 from fishd.cli.learn.ppo import print_outcome
@@ -184,7 +184,7 @@ def test_a_training_on_a_running_fishd_uses_its_tick_and_leaves_the_fish_at_rest
     assert [row["steps"] for row in rows(folder / "progress.csv")] == ["16", "32"]
     card = checkpoints.read_card(checkpoints.newest(folder))
     assert (card.provenance.on, card.tick) == ("live", 0.05)
-    with Fish(daemon.endpoint) as fish:
+    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         assert fish.status().mode == "idle"
 
 
@@ -195,7 +195,7 @@ def test_an_estop_ends_a_training_with_the_reason_and_a_checkpoint_and_no_other_
     folder = tmp_path / "run"
 
     def press() -> None:
-        with Fish(daemon.endpoint) as fish:
+        with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
             fish.estop("the tail hit the glass")
 
     on = ("ppo", "--on", "live", "--endpoint", daemon.endpoint)
