@@ -98,7 +98,7 @@ class Lockstep:
         self.agent = Agent(f"{daemon.endpoint}-agent", timeout=PATIENCE)
         self.fish.set_controller("remote", agent=self.agent.address)
         # From here on no tick ends before the agent has acted.
-        self.client = camera.client(fish=self.fish, stack=stack, timeout=PATIENCE)
+        self.client = camera.client(fish=self.fish, stack=stack, timeout=4.0)
 
     def __enter__(self) -> "Lockstep":
         return self
