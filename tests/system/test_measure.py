@@ -113,7 +113,7 @@ def test_an_emergency_stop_ends_it_and_says_so(daemon: Daemon) -> None:
     daemon.fishctl("estop")
     status, _, err = measuring.finish()
     assert status == 1
-    # As the mode of a tick, or as the reason why its next request is refused, whichever is earlier.
+    # The message names the mode of a tick or the refusal of a request, whichever comes first.
     assert "estop" in err
     assert "requested with fishctl" in err
     assert daemon.status().mode == "estop"
