@@ -24,11 +24,18 @@ def gateways(daemon: Daemon) -> dict[str, int]:
     """Return the processes of the gateways by their purpose."""
     pids = {}
     for server in children(daemon.process.pid):
-        for pid in children(server):
-            with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-                name = Path(f"/proc/{pid}/comm").read_text().strip()
-                if not gone(pid) and name != "fishd-gateways":  # a process that is being forked
-                    pids[name.removeprefix("fishd-")] = pid
+        pids |= gateways_of(server)
+    return pids
+
+
+def gateways_of(server: int) -> dict[str, int]:
+    """Return the processes that a fork server has forked, by their purpose."""
+    pids = {}
+    for pid in children(server):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            name = Path(f"/proc/{pid}/comm").read_text().strip()
+            if not gone(pid) and name != "fishd-gateways":  # a process that is being forked
+                pids[name.removeprefix("fishd-")] = pid
     return pids
 
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from rigs.documents import ROOT
-from rigs.gateway_processes import both_gateways, children, fork_server, gateways, gone
+from rigs.gateway_processes import both_gateways, fork_server, gateways, gateways_of, gone
 from rigs.processes import PATIENCE, Daemon, Process, Subscriber, call, running, wait_until
 
 from fishd.client import AsyncFish, Fish
@@ -504,10 +504,10 @@ def test_hanging_gateways_end_in_parallel(tmp_path: Path, monkeypatch: pytest.Mo
         with contextlib.ExitStack() as stack:
             addresses = (f"ipc://{tmp_path}/control", f"ipc://{tmp_path}/telemetry")
             both = Gateways(*addresses, stack)
-            while not (both.telemetry._serves and both._server.serves):
-                await asyncio.sleep(0.01)
             server = both._server._process.pid
-            hung.extend([server, *children(server)])
+            while not (both.telemetry._serves and len(gateways_of(server)) == 2):
+                await asyncio.sleep(0.01)  # one that is stopped while it is forked outlives fishd
+            hung.extend([server, *gateways_of(server).values()])
             for pid in hung[1:]:
                 os.kill(pid, signal.SIGSTOP)
             monkeypatch.setattr("fishd.daemon.gateway.gateways.select.select", wait)
