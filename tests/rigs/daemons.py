@@ -5,14 +5,17 @@ from pathlib import Path
 
 import pytest
 
+from fishd.client import AsyncFish, Fish
 from fishd.lab import session
 from rigs.processes import Daemon, running
 
 
 @pytest.fixture(autouse=True)
 def unhurried_rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a measurement miss any of its ticks where real time is not tested."""
+    """Let clients wait for answers, and measurements miss ticks, where real time is not tested."""
     if not request.node.get_closest_marker("realtime"):
+        for client in (Fish, AsyncFish):
+            monkeypatch.setitem(client.__init__.__kwdefaults__, "timeout", 30.0)
         monkeypatch.setattr(session, "MAX_LOST_FRACTION", 1.0)
         monkeypatch.setattr(session, "IDLE_LIMIT", 60.0)
 

@@ -171,7 +171,7 @@ def test_without_a_yes_nothing_changes(talk: Talk, rig: Bench, daemon: Daemon, h
     dialogue.expect("save it?")
     if how == "ctrl-c":
         dialogue.process.send_signal(signal.SIGINT)
-        dialogue.process.wait(20)
+        dialogue.process.wait(PATIENCE)
     elif how == "no":
         dialogue.answer("", "n")
     assert dialogue.finish() == (1 if how == "no" else 130)

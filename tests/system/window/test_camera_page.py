@@ -10,6 +10,7 @@ from typing import Any
 import aiohttp
 import msgspec
 import pytest
+from rigs.processes import PATIENCE
 
 from fishd.core.errors import StartupError
 from fishd.window import web_server
@@ -28,7 +29,7 @@ async def run_server() -> AsyncIterator[tuple[PageServer, aiohttp.ClientSession]
 
 def run(test: Test) -> None:
     async def run_all() -> None:
-        async with asyncio.timeout(20.0), run_server() as (server, session):
+        async with asyncio.timeout(PATIENCE), run_server() as (server, session):
             await test(server, session)
 
     asyncio.run(run_all())
