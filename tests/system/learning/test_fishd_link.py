@@ -266,7 +266,10 @@ def test_a_reset_ends_a_pause(env: SwimEnv) -> None:
     assert swims(env)
 
 
-def test_a_fishd_that_is_gone_or_was_restarted_ends_control(tmp_path: Path) -> None:
+def test_a_fishd_that_is_gone_or_was_restarted_ends_control(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(Fish.__init__.__kwdefaults__, "timeout", 5.0)  # waits for one that is gone
     with running(tmp_path, *sets("tick=0.1")) as first:
         env = env_on(first)
         env.reset()
