@@ -230,8 +230,7 @@ class V4l2Camera:
         index, size, sequence, stamp, flags = self._done.popleft()
         argument.index, argument.bytesused = index, size
         argument.sequence, argument.flags = sequence, flags
-        argument.timestamp.secs = int(stamp)
-        argument.timestamp.usecs = round(stamp % 1.0 * 1e6) % 10**6
+        argument.timestamp.secs, argument.timestamp.usecs = divmod(round(stamp * 1e6), 10**6)
 
     def _streamon(self, _: Any) -> None:
         self._streaming, self._sequence = True, -1

@@ -136,6 +136,11 @@ def test_an_answer_that_comes_before_its_frame_does_not_leave_that_out(
             holding.clear()
             return state
 
+        def is_in_lockstep() -> bool:
+            client.poll()
+            return client.state.virtual
+
+        wait_until(is_in_lockstep)
         source.lets.release()
         wait_until(lambda: ask().until == TICK)
         first = client.stack_at(TICK)

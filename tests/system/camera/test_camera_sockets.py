@@ -191,6 +191,7 @@ def test_the_doctor_says_how_the_camera_is(
     camera: CameraProcess, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     context = Context(Config())
+    camera.until(lambda state: state.rate > 0.0)  # a single frame has no rate
     monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
     check = service.camera(context)
     assert check

@@ -25,9 +25,13 @@ def checkout(tmp_path: Path) -> Path:
     """A copy of what the packages are made of, without the history of git."""
     folder = tmp_path / "checkout"
     (folder / "tools").mkdir(parents=True)
+    # Other test processes write bytecode at the same time.
+    without = shutil.ignore_patterns("__pycache__")
     for part in PARTS:
-        copy = shutil.copytree if (ROOT / part).is_dir() else shutil.copy
-        copy(ROOT / part, folder / part)
+        if (ROOT / part).is_dir():
+            shutil.copytree(ROOT / part, folder / part, ignore=without)
+        else:
+            shutil.copy(ROOT / part, folder / part)
     shutil.copy(ROOT / ".gitignore", folder)
     return folder
 
