@@ -21,7 +21,7 @@ from rigs.processes import PATIENCE, Daemon, Process, Subscriber, call, running,
 from fishd.client import AsyncFish, Fish
 from fishd.daemon.gateway import link
 from fishd.daemon.gateway.gateways import (
-    END_TIMEOUT_S,
+    BEAT_S,
     MIN_FAILED_PERIOD_S,
     RECONNECT_TIME_S,
     Gateway,
@@ -117,8 +117,10 @@ def test_a_hanging_gateway_is_replaced_and_costs_no_tick(shared_daemon: Daemon, 
         os.kill(hung, signal.SIGSTOP)
         wait_until(lambda: gateways(shared_daemon).get(kind, hung) != hung)
         event = subscriber.until(kind="gateway")
+        while "status -9" in event["message"]:  # of the restart in a test before, reported late
+            event = subscriber.until(kind="gateway")
     assert re.search(r" was started again: it left \d+ heartbeats unanswered$", event["message"])
-    assert gone(hung)
+    wait_until(lambda: gone(hung))
     after = shared_daemon.status()
     assert (
         after.recovered_errors[f"{kind}_restarts"]
@@ -186,7 +188,7 @@ def test_a_fork_server_that_hangs_is_replaced_with_its_gateways(daemon: Daemon) 
     os.kill(hung, signal.SIGSTOP)
     wait_until(lambda: gone(hung))
     assert not set(former.values()) & set(both_gateways(daemon).values())
-    assert all(gone(pid) for pid in former.values())
+    wait_until(lambda: all(gone(pid) for pid in former.values()))
     wait_until(lambda: daemon.status().recovered_errors["control_restarts"] == 1)
 
 
@@ -512,10 +514,12 @@ def test_hanging_gateways_end_in_parallel(tmp_path: Path, monkeypatch: pytest.Mo
                 os.kill(pid, signal.SIGSTOP)
             monkeypatch.setattr("fishd.daemon.gateway.gateways.select.select", wait)
 
+    # Long, since a gateway whose time is over when this process gets to it is not waited for.
+    monkeypatch.setattr("fishd.daemon.gateway.gateways.END_TIMEOUT_S", PATIENCE)
     asyncio.run(begin_and_end())
     assert len(hung) == 3
     assert len(waited) == 2
-    assert max(waited) <= END_TIMEOUT_S
+    assert max(waited) <= PATIENCE
     wait_until(lambda: all(gone(pid) for pid in hung))
 
 
@@ -535,6 +539,8 @@ def test_only_heartbeats_that_a_process_could_answer_count(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.setattr("fishd.daemon.gateway.gateways.MAX_STARVED", 12)
+    # A minute, since garbage collection in this process may take longer than an answer.
+    monkeypatch.setattr("fishd.daemon.gateway.gateways.ANSWER_FRACTION", 60.0 / (4 * BEAT_S))
     lost = []
 
     class Peer(_Peer):
@@ -595,5 +601,5 @@ def test_a_gateway_that_ends_at_once_is_started_again_and_again_but_not_in_a_spi
         return duration, gateway.restarts
 
     duration, restarts = asyncio.run(watch())
-    assert duration >= 4 * MIN_FAILED_PERIOD_S - 0.01
-    assert restarts == 4
+    assert duration >= (starts - 1) * MIN_FAILED_PERIOD_S - 0.01
+    assert restarts == starts - 1
