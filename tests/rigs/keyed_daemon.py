@@ -2,9 +2,9 @@
 
 import contextlib
 import os
-import socket
 import subprocess
 import time
+import weakref
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import zmq
 
 from fishd.core import files, keys
 from fishd.daemon.gateway.keys import SETTLE_TIME_S
-from rigs.processes import FISHCTL, Daemon, call, running, sets, wait_until
+from rigs.processes import FISHCTL, Daemon, call, reserve_port, running, sets, wait_until
 
 
 class KeyedDaemon:
@@ -21,8 +21,9 @@ class KeyedDaemon:
     def __init__(self, folder: Path, **roles: str) -> None:
         """Make all keys; roles: role of each client; empty for one that fishd does not know"""
         self.folder = folder
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            self.endpoint = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+        reserved = reserve_port()
+        weakref.finalize(self, reserved.close)
+        self.endpoint = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
         self.known = folder / "fishd" / keys.KNOWN_FILE
         for name in ("fishd", *roles):
             public, secret = (key.decode() for key in zmq.curve_keypair())

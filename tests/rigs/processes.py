@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import signal
 import socket as sockets
 import subprocess
 import time
@@ -21,7 +22,8 @@ from rigs import preloaded
 
 __all__ = [
     "EXPERIMENT", "FISHCTL", "FISHD", "LEASE", "PATIENCE", "Daemon", "Process", "Subscriber",
-    "addresses", "call", "fishctl", "install", "one_line", "running", "sets", "wait_until",
+    "addresses", "call", "fishctl", "install", "is_stopped", "one_line", "reserve_port",
+    "running", "sets", "wait_until",
 ]  # fmt: skip
 
 
@@ -50,6 +52,27 @@ class Process(processes.Process):
     """A program that runs beside this one."""
 
     start = staticmethod(preloaded.start)
+
+    def stop(self) -> None:
+        """Send SIGSTOP, and wait until no thread runs."""
+        self.process.send_signal(signal.SIGSTOP)
+        wait_until(lambda: is_stopped(self.pid))
+
+
+def is_stopped(pid: int) -> bool:
+    """Return whether a process is stopped by a signal."""
+    return "\nState:\tT" in Path(f"/proc/{pid}/status").read_text()
+
+
+def reserve_port() -> sockets.socket:
+    """Return a socket that keeps a free TCP port for a fishd, until it is closed.
+
+    Only a program that names the port can listen at it meanwhile.
+    """
+    reserved = sockets.socket()
+    reserved.setsockopt(sockets.SOL_SOCKET, sockets.SO_REUSEADDR, 1)
+    reserved.bind(("127.0.0.1", 0))
+    return reserved
 
 
 def addresses(folder: Path) -> list[str]:

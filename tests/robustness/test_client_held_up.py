@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import zmq
-from rigs.processes import PATIENCE, wait_until
+from rigs.processes import PATIENCE, is_stopped, wait_until
 
 from fishd.camera.settings import CameraSettings, SimulatedSettings
 from fishd.core import protocol
@@ -50,11 +50,6 @@ IDLE = State(1, "idle", None, "hold", {"text": LONG_TEXT})
 CAMERA_SETTINGS = CameraSettings(simulated=SimulatedSettings(fishd=LONG_TEXT))
 
 
-def state_of(pid: int) -> str:
-    """Return the state of a process in /proc: T where it is stopped."""
-    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-
-
 CLIENTS = (
     (SYNCHRONOUS, IDLE, "idle"),
     (ASYNCHRONOUS, IDLE, "idle"),
@@ -81,7 +76,7 @@ def test_an_answer_that_nobody_has_read_yet_is_no_silence(tmp_path: Path) -> Non
             client, answer, _ = clients[server]
             *envelope, payload = server.recv_multipart()
             os.kill(client.pid, signal.SIGSTOP)
-            wait_until(lambda pid=client.pid: state_of(pid) == "T")
+            wait_until(lambda pid=client.pid: is_stopped(pid))
             request = protocol.decode_request(payload)
             server.send_multipart([*envelope, protocol.success(request.id, answer)])
         time.sleep(TIMEOUT + 0.2)  # longer than the timeout of a client

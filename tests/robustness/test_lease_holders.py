@@ -160,10 +160,15 @@ class Silent:
 
 
 def test_a_renewal_goes_on_after_silences_until_fishd_says_that_the_lease_has_ended() -> None:
-    fishd, lost = Silent(5), threading.Event()
-    connect: Any = lambda timeout: fishd  # noqa: E731
+    fishd, ready, lost = Silent(5), threading.Event(), threading.Event()
+
+    def connect(timeout: float) -> Any:
+        assert ready.wait(PATIENCE)
+        return fishd
+
     renewal = LeaseRenewal(connect, Grant("a lease", 0.05), None)
     renewal.when_lost = lost.set
+    ready.set()
     assert lost.wait(PATIENCE)
     renewal.join(PATIENCE)
     assert (fishd.asked, str(renewal.lost)) == (7, "over")

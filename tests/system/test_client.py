@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import zmq
-from rigs.processes import PATIENCE, Daemon, wait_until
+from rigs.processes import PATIENCE, Daemon
 
 from fishd.client import AsyncFish, Fish, FishError, NoDaemon, Refused
 from fishd.core.calibration import ServoCalibration
@@ -123,21 +123,24 @@ def test_a_command_whose_gateway_is_gone_fails_at_once_and_is_not_repeated(tmp_p
     """The first gateway takes the command and is gone; the next one gets only what follows."""
     endpoint = f"ipc://{tmp_path}/control"
     operations = []
+    gateways = threading.Semaphore(0)
 
     def serve_two_gateways() -> None:
         for _ in range(2):
             with zmq.Context() as context, context.socket(zmq.ROUTER) as gateway:
                 gateway.linger = 0
                 gateway.bind(endpoint)
+                gateways.release()
                 assert gateway.poll(PATIENCE * 1e3)
                 operations.append(json.loads(gateway.recv_multipart()[-1])["op"])
 
     server = threading.Thread(target=serve_two_gateways)
     server.start()
-    wait_until(lambda: (tmp_path / "control").exists())
+    assert gateways.acquire(timeout=PATIENCE)
     with Fish(endpoint, timeout=1e6) as fish:
         with pytest.raises(NoDaemon, match="before the answer to mark: it is not known whether"):
             fish.mark("once")
+        assert gateways.acquire(timeout=PATIENCE)
         fish.timeout = 1.0
         with pytest.raises(NoDaemon, match="no answer within 1 s"):
             fish.status()

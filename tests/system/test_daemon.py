@@ -20,6 +20,7 @@ from rigs.processes import (
     Subscriber,
     addresses,
     call,
+    reserve_port,
     running,
     sets,
     wait_until,
@@ -186,12 +187,13 @@ def test_after_a_kill_a_client_knows_at_once_that_nobody_is_there(tmp_path: Path
 
 
 def test_after_a_kill_the_next_daemon_takes_the_place_over_without_a_pause(tmp_path: Path) -> None:
-    telemetry = "tcp://127.0.0.1:0"
-    for _ in range(3):
-        with running(tmp_path, *sets(f"telemetry.address={telemetry}")) as daemon:
-            assert daemon.fishctl("status").returncode == 0
-            telemetry = daemon.telemetry
-            daemon.kill()
+    with reserve_port() as reserved:
+        telemetry = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
+        for _ in range(3):
+            with running(tmp_path, *sets(f"telemetry.address={telemetry}")) as daemon:
+                assert daemon.fishctl("status").returncode == 0
+                assert daemon.telemetry == telemetry
+                daemon.kill()
 
 
 def test_logs_can_be_json(tmp_path: Path) -> None:

@@ -150,7 +150,7 @@ def test_one_that_was_killed_leaves_nothing_in_the_way(tmp_path: Path) -> None:
 
 @contextlib.contextmanager
 def stopped(pi: Pi) -> Iterator[None]:
-    pi.process.send_signal(signal.SIGSTOP)
+    pi.stop()
     try:
         yield
     finally:
