@@ -1,6 +1,7 @@
 """Emulated pigpiod and servos on it, for tests of the pigpio servo."""
 
 import contextlib
+import inspect
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
@@ -11,10 +12,11 @@ import pytest
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import SystemClock, VirtualClock
 from fishd.core.errors import ServoError
+from fishd.hardware.servo import pigpio_client, pigpio_link, pigpio_pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio, PigpioSettings
-from fishd.hardware.servo.pigpio_client import ANSWER_TIMEOUT_S, MAX_SCRIPTS, Client, open_client
-from fishd.hardware.servo.pigpio_link import PigpioLink
+from fishd.hardware.servo.pigpio_client import MAX_SCRIPTS, Client, open_client
+from fishd.hardware.servo.pigpio_link import VIRTUAL_TIMEOUT_S, PigpioLink
 from fishd.hardware.servo.pigpio_pulses import neutralise
 from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.pigpiod.daemon import Pigpiod
@@ -89,7 +91,7 @@ class Bench:
         running = 0
         with self.client() as client:
             for script in range(MAX_SCRIPTS):
-                client.within(ANSWER_TIMEOUT_S)
+                client.within(VIRTUAL_TIMEOUT_S)
                 running += bool(client.script_status(script)[1])
         return running
 
@@ -147,6 +149,10 @@ def script_of(servo: CalibratedServo) -> int:
 
 
 @pytest.fixture
-def bench() -> Iterator[Bench]:
+def bench(monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    """Yield a bench in virtual time, whose clients have patience with a busy machine."""
+    for module in (pigpio_client, pigpio_link, pigpio_pulses):
+        monkeypatch.setattr(module, "ANSWER_TIMEOUT_S", VIRTUAL_TIMEOUT_S)
+    monkeypatch.setattr(inspect.unwrap(open_client), "__defaults__", (VIRTUAL_TIMEOUT_S,))
     with contextlib.ExitStack() as stack:
         yield Bench(stack)

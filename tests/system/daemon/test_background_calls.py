@@ -19,14 +19,16 @@ class Stuck:
 
     def __init__(self) -> None:
         self.entered = threading.Event()
+        """Event of the next call; an exception may let an earlier call set its own again."""
         self._go = threading.Event()
         self.threads: list[threading.Thread] = []
 
     def __call__(self) -> None:
+        entered = self.entered
         self.threads.append(threading.current_thread())
         while not self._go.is_set():
             try:
-                self.entered.set()  # from here on no exception ends it
+                entered.set()  # from here on no exception ends it
                 self._go.wait(TIMEOUT_S)
             except BaseException:
                 continue
@@ -85,7 +87,7 @@ def test_so_many_that_would_not_end_are_enough_until_one_ends() -> None:
         background = BackgroundCalls(TIMEOUT_S)
         for _ in range(MAX_ABANDONED_CALLS):
             background.check_busy()
-            stuck.entered.clear()
+            stuck.entered = threading.Event()
             call = asyncio.create_task(background.call("", stuck))
             await asyncio.to_thread(stuck.entered.wait, TIMEOUT_S)
             call.cancel()
