@@ -32,6 +32,7 @@ from rigs.window_process import Browser, open_page, run, running_window
 
 from fishd.client import Fish, Refused
 from fishd.client.zmq_sockets import connect_subscriber
+from fishd.core import files
 from fishd.core.errors import NoKey
 from fishd.daemon.gateway.keys import EMPTY_SETTLE_TIME_S
 
@@ -229,9 +230,11 @@ def test_a_malformed_line_from_a_restart_of_telemetry_is_named_once(
         wait_until(lambda: "keyed-tel" in gateways(keyed.daemon))
         os.kill(parent, signal.SIGSTOP)
         os.kill(gateways(keyed.daemon)["keyed-tel"], signal.SIGKILL)
-        keyed.write(f"{keyed.known.read_text()}nonsense\n")
-        os.kill(parent, signal.SIGCONT)
-        event = subscriber.until(kind="gateway", level="warning")
+        files.write_atomically(keyed.known, f"{keyed.known.read_text()}nonsense\n")
+        with contextlib.suppress(ProcessLookupError):  # it stood still for so long that it was lost
+            os.kill(parent, signal.SIGCONT)
+        event = subscriber.until(kind="gateway", data={"gateway": "keyed-telemetry"})
+    assert event["level"] == "warning"
     assert "fishd/known, line 3: 'drive KEY NAME'" in event["message"]
 
 

@@ -54,7 +54,7 @@ def test_a_replay_ends_by_a_signal_and_leaves_no_socket(tmp_path: Path, number: 
     socket = tmp_path / "control"
     words = ("--speed", "0.01", "--address", "tcp://127.0.0.1:0", "--control", f"ipc://{socket}")
     process = Process(FISHCTL, "replay", str(run), *words)
-    wait_until(socket.exists)
+    wait_until(lambda: bool(unix_sockets.find_listener(socket)))
     assert process.end(number)[::2] == (0, "")
     assert not socket.exists()
 
@@ -65,7 +65,7 @@ def test_a_client_sees_the_replay_and_cannot_steer_it(tmp_path: Path) -> None:
     words = ("--speed", "0.5", "--address", telemetry, "--control", control)
     player = Process(FISHCTL, "replay", str(run), *words)
     try:
-        wait_until((tmp_path / "control").exists)
+        wait_until(lambda: bool(unix_sockets.find_listener(tmp_path / "control")))
         with Fish(control, timeout=PATIENCE) as fish:
             status = fish.status()
             assert (status.name, status.telemetry) == ("replay of run", telemetry)
