@@ -212,11 +212,15 @@ class FishLink:
             self._tell("ticks", b"[" + b",".join(batch) + b"]")
 
     async def _take_status(self, status: Status) -> Status:
-        """Store a status; after a restart of fishd, begin again."""
-        before, self.status = self.status, status
+        """Store a status; after a restart of fishd, begin again.
+
+        Where a new fishd does not list its controllers, its next status counts as its first.
+        """
+        before = self.status
         restarted = before is not None and status.shows_restart_since(before)
         if before is None or restarted:
             self.controllers = await self._monitor.controllers()
+        self.status = status
         if restarted:
             self._forget()
             self._set_connection("restarted", f"fishd has restarted: it is process {status.pid}")

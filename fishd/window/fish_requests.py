@@ -113,7 +113,7 @@ class FishRequests:
         link = self._pages.find_link(request.match_info["fish"])
         await read_body(request, NoArguments)
         self._pages.require_driver(link.name, self._pages.find_page(request, access))
-        await self._pages.end_driving(link.name)
+        await self._pages.end_driving(link.name, self._pages.driver_of(link.name))
         return success({"driver": None})
 
     async def _request(self, request: web.Request) -> web.Response:

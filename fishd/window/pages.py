@@ -198,9 +198,13 @@ class Pages:
             what = f"{driver.page.device} drives" if driver else "no page drives"
             raise ApiError(409, "not-driver", f"{what} {name}", "take over to drive it")
 
-    async def end_driving(self, name: str) -> None:
-        """Let no page drive a fish, and return it unless its driver wanted otherwise."""
-        driver = self._drivers.get(name)
+    async def end_driving(self, name: str, driver: Driver | None) -> None:
+        """Let no page drive a fish, and return it unless its driver wanted otherwise.
+
+        driver: the driver that ends; if another page drives since, nothing changes
+        """
+        if self._drivers.get(name) is not driver:
+            return
         self.set_driver(name, None)
         if driver and not driver.keep:
             await self.links[name].give_back()
@@ -218,7 +222,7 @@ class Pages:
             for name, driver in list(self._drivers.items()):
                 if driver.is_gone:
                     log.warning("%s has left while it drove %s", driver.page.device, name)
-                    self._endings.add(asyncio.create_task(self.end_driving(name)))
+                    self._endings.add(asyncio.create_task(self.end_driving(name, driver)))
             if time.monotonic() >= next_connection:
                 next_connection = time.monotonic() + CONNECTION_PERIOD_S
                 for name, link in self.links.items():

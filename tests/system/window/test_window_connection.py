@@ -8,6 +8,16 @@ import pytest
 from rigs.processes import Daemon, running
 from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
 
+NO_ANSWER_ONCE = """
+from fishd.client import AsyncFish, NoDaemon
+list_controllers = AsyncFish.controllers
+async def fail(fish):
+    AsyncFish.controllers = list_controllers
+    raise NoDaemon("no answer")
+AsyncFish.controllers = fail
+"""
+"""Code of a window whose first request for the controllers is not answered."""
+
 
 def test_a_fishd_that_hangs_is_stale_then_lost_then_live(
     own_daemon: Daemon, own_window: WindowProcess
@@ -67,6 +77,19 @@ def test_a_window_shows_several_fish_by_name_and_waits_for_one_that_is_off(
                     assert page.hello["status"] is None
                 states = {fish["name"]: fish["state"] for fish in await browser.get("/api/fish")}
                 assert states == {"tuna": "live", "bream": "lost"}
+
+        run(test())
+
+
+def test_a_fishd_that_does_not_list_its_controllers_at_once_is_asked_again(
+    own_daemon: Daemon, tmp_path: Path
+) -> None:
+    with running_window(tmp_path, changes=NO_ANSWER_ONCE, fish=own_daemon.endpoint) as window:
+
+        async def test() -> None:
+            async with Browser(window.url) as browser, open_page(browser) as page:
+                while not page.hello["controllers"]:
+                    page.hello = await page.until("hello")
 
         run(test())
 

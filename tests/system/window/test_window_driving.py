@@ -12,15 +12,25 @@ from rigs.window_process import Browser, WindowProcess, open_page, run, running_
 
 from bench.window import MAX_STOP_S, measure_stops
 
-SOON = "from fishd.window import live; live.DRIVER_TIMEOUT_S = 1.0"
+HASTE = """
+import signal
+from fishd.window import live
+signal.signal(signal.SIGUSR1, lambda *_: setattr(live, "DRIVER_TIMEOUT_S", 0.5))
+"""
+"""Code of a window that does not wait long for a page that is gone, from SIGUSR1 on."""
 SINE = {"op": "set-controller", "args": {"name": "sine"}}
 
 
 @pytest.fixture
 def hasty_window(daemon: Daemon, tmp_path: Path) -> Iterator[WindowProcess]:
-    """Yield a window that does not wait long for a page that is gone."""
-    with running_window(tmp_path, changes=SOON, fish=daemon.endpoint) as process:
+    """Yield a window that does not wait long for a page that is gone, once `hurry` is called."""
+    with running_window(tmp_path, changes=HASTE, fish=daemon.endpoint) as process:
         yield process
+
+
+def hurry(window: WindowProcess) -> None:
+    """Let a `hasty_window` wait no longer; sooner, a slow start might count as an end."""
+    window.process.send_signal(signal.SIGUSR1)
 
 
 def test_a_second_page_takes_over_and_the_first_one_sees_it(window: WindowProcess) -> None:
@@ -61,6 +71,7 @@ def test_a_page_that_is_gone_stops_the_fish(hasty_window: WindowProcess) -> None
         async with Browser(hasty_window.url) as browser, open_page(browser) as watcher:
             async with open_page(browser) as page:
                 await page.swim()
+            hurry(hasty_window)
             await watcher.until("driver", lambda driver: driver is None)
             await watcher.until_at_rest()
 
@@ -73,6 +84,7 @@ def test_a_page_that_is_open_but_gives_no_sign_of_life_stops_the_fish(
     async def test() -> None:
         async with Browser(hasty_window.url) as browser, open_page(browser) as page:
             await page.swim()
+            hurry(hasty_window)
             await page.until("driver", lambda driver: driver is None)
             await page.until_at_rest()
 
@@ -87,6 +99,7 @@ def test_a_fish_swims_on_without_its_page_if_the_driver_has_said_so(
             async with open_page(browser) as page:
                 await page.swim()
                 await page.post("drive", {"keep": True})
+            hurry(hasty_window)
             await watcher.until("driver", lambda driver: driver is None)
             for _ in range(20):
                 ticks = await watcher.until("ticks")
