@@ -16,6 +16,7 @@ from fishd.core.clock import VirtualClock
 from fishd.core.errors import StartupError
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
 from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.pi import link as pi_link
 from fishd.virtual.pi.i2c import Read, Write, kernel_error
 from fishd.virtual.pi.lgpio import Pins
 from fishd.virtual.pi.link import RemotePi
@@ -33,6 +34,12 @@ def virtual_pi() -> VirtualPi:
     """Return a virtual Pi on a virtual clock, so that the bus takes no time."""
     settings = VirtualPiSettings(pigpio_port=0)
     return VirtualPi(settings, PlantParameters(), SimulationSettings(), 0.05, VirtualClock())
+
+
+@pytest.fixture(autouse=True)
+def patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let clients wait for an answer, so that a busy machine fails no test."""
+    monkeypatch.setattr(pi_link, "ANSWER_MARGIN_S", PATIENCE)
 
 
 @pytest.fixture
@@ -145,7 +152,10 @@ def test_a_second_virtual_pi_harms_no_first_one(pi: VirtualPi, path: Path, tmp_p
         assert remote.transfer(ADDRESS, CONFIG) == [b"\x85\x83"]
 
 
-def test_a_virtual_pi_that_hangs_is_not_taken_for_a_bus_that_does(path: Path) -> None:
+def test_a_virtual_pi_that_hangs_is_not_taken_for_a_bus_that_does(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pi_link, "ANSWER_MARGIN_S", 0.1)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
         listener.bind(str(path))
         listener.listen()  # and never answer, as a process that is stopped
