@@ -12,6 +12,7 @@ from rigs.processes import PATIENCE, Daemon, Subscriber, running
 from rigs.virtual_pi_process import virtual_pi
 
 from fishd.camera.client import CameraLost
+from fishd.camera.clock_offset import Offset
 from fishd.camera.messages import FrameHeader
 from fishd.camera.simulated import SimulatedCamera, SimulatedCameraSettings, Tail
 from fishd.client import Agent, Fish
@@ -55,10 +56,17 @@ def test_from_another_machine_the_offset_is_estimated(
     ):
         camera.is_in("streaming")
         with camera.client(fish=fish) as client:
+            estimate, offsets = client.offset, list[Offset]()
+
+            def estimate_and_store() -> Offset:
+                offsets.append(estimate())
+                return offsets[-1]
+
+            monkeypatch.setattr(client, "offset", estimate_and_store)
             received: list[tuple[FrameHeader, Frame]] = []
             while len(received) < 5:
                 received += client.poll_with_headers(PATIENCE)
-            offset = client.offset()
+    offset = offsets[-1]  # that of the last frame; later ones may differ
     assert 0.0 < offset.uncertainty < 1.0
     assert abs(offset.seconds) <= offset.uncertainty  # in truth both use one clock
     sent, frame = received[-1]
