@@ -211,7 +211,7 @@ def test_frames_of_another_size_or_rate_are_refused_before_anything_moves(
         r"camera is needed, or a training with camera.stack.interval: [\d.]+$",
         refusal(quick),
     )
-    young = StackSettings(size=32, frames=2, oldest=0.02)
+    young = StackSettings(size=32, frames=2, interval=0.5, oldest=0.02)
     assert re.search(
         r": frames no older than 20 ms are needed \(camera.stack.delay \+ oldest\); those of the "
         r"camera at \S+ are there \d+ ms after their exposure, \d+ ms apart: a camera with less "
