@@ -1,8 +1,8 @@
 """fishd and fishctl without limits of time, for tests on a busy machine of anything but time.
 
 A late tick, a delayed controller and an old sample are not faults, no answer of pigpiod is too
-late, and a measurement may miss any of its ticks. `make test-realtime` and the tests on the virtual
-clock check these limits.
+late, a measurement may miss any of its ticks, and fishd has a minute for an orderly end. `make
+test-realtime` and the tests on the virtual clock check these limits.
 """
 
 import math
@@ -14,6 +14,7 @@ from fishd.__main__ import fishctl, fishd
 from fishd.client import Fish
 from fishd.control import loop, supervisor
 from fishd.control.faults import FAULTS
+from fishd.core.process import shutdown
 from fishd.hardware.servo import pigpio_link
 from fishd.lab import session
 
@@ -23,6 +24,7 @@ def have_patience() -> None:
     supervisor.OVERRUN_SHARE = math.inf
     loop.MAX_SAMPLE_AGE_PERIODS = 100.0
     pigpio_link.MAX_LATE_ANSWERS = 1_000_000
+    shutdown.SHUTDOWN_TIMEOUT_S = 60.0
     FAULTS["controller-slow"] = replace(FAULTS["controller-slow"], in_a_row=1_000_000)
     session.MAX_LOST_FRACTION, session.IDLE_LIMIT = 1.0, 60.0
     Fish.__init__.__kwdefaults__["timeout"] = 30.0
