@@ -28,6 +28,7 @@ PROGRAMS = {
     (str(BIN / "fishd-window"),): ("fishd_window", False),
     (*UNHURRIED_COMMAND, "fishd"): ("fishd", True),
     (*UNHURRIED_COMMAND, "fishctl"): ("fishctl", True),
+    (*UNHURRIED_COMMAND, "fishd-window"): ("fishd_window", True),
 }
 """Function and patience of each program, by the beginning of its command."""
 LOADED_LATER = {

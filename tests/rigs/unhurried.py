@@ -1,4 +1,4 @@
-"""fishd and fishctl without limits of time, for tests on a busy machine of anything but time.
+"""fishd, fishctl and fishd-window without limits of time, for tests of anything but time.
 
 A late tick, a delayed controller and an old sample are not faults, no answer of pigpiod is too
 late, a measurement may miss any of its ticks, and fishd has a minute for an orderly end. `make
@@ -7,10 +7,11 @@ test-realtime` and the tests on the virtual clock check these limits.
 
 import math
 import sys
+from importlib import import_module
 
 from msgspec.structs import replace
 
-from fishd.__main__ import fishctl, fishd
+from fishd.__main__ import fishctl, fishd, fishd_window
 from fishd.client import Fish
 from fishd.control import loop, supervisor
 from fishd.control.faults import FAULTS
@@ -28,8 +29,14 @@ def have_patience() -> None:
     FAULTS["controller-slow"] = replace(FAULTS["controller-slow"], in_a_row=1_000_000)
     session.MAX_LOST_FRACTION, session.IDLE_LIMIT = 1.0, 60.0
     Fish.__init__.__kwdefaults__["timeout"] = 30.0
+    if link := sys.modules.get("fishd.window.fish_link"):
+        # Otherwise a last resort that begins while fishd stalls stops the fish again, later.
+        link.ESTOP_TIMEOUT_S = 30.0  # type: ignore[attr-defined]
 
 
 if __name__ == "__main__":
+    program = sys.argv.pop(1)
+    if program == "fishd-window":
+        import_module("fishd.window.fish_link")
     have_patience()
-    {"fishd": fishd, "fishctl": fishctl}[sys.argv.pop(1)]()
+    {"fishd": fishd, "fishctl": fishctl, "fishd-window": fishd_window}[program]()

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import re
 import sys
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
@@ -13,11 +14,15 @@ from urllib.parse import urlsplit
 import aiohttp
 import msgspec
 
+from rigs import preloaded
 from rigs.processes import FISHD, PATIENCE, Process, fishctl
 
 NETWORK_HOST = "fish.example"
 """Name by which devices of the network reach a window."""
-FISHD_WINDOW = f"{FISHD}-window"
+FISHD_WINDOW: tuple[str, ...] = (f"{FISHD}-window",)
+"""Command that starts a window."""
+if not os.environ.get("JUDGES_REAL_TIME"):
+    FISHD_WINDOW = (*preloaded.UNHURRIED_COMMAND, "fishd-window")
 
 
 class WindowProcess(Process):
@@ -38,7 +43,7 @@ class WindowProcess(Process):
         options = ("--config", str(config), "--state", str(self.state), "--listen", "127.0.0.1:0")
         pairs = [word for name, where in fish.items() for word in ("--fish", f"{name}={where}")]
         code = f"{changes}\nfrom fishd.__main__ import fishd_window; fishd_window()"
-        start = (sys.executable, "-P", "-c", code) if changes else (FISHD_WINDOW,)
+        start = (sys.executable, "-P", "-c", code) if changes else FISHD_WINDOW
         super().__init__(*start, *options, *pairs, *arguments)
 
     def wait_until_up(self) -> Self:
