@@ -8,6 +8,7 @@ import pytest
 from fishd.client import AsyncFish, Fish
 from fishd.lab import session
 from rigs.processes import Daemon, running
+from rigs.unhurried import ANSWER_TIMEOUT_S
 
 
 @pytest.fixture(autouse=True)
@@ -15,7 +16,7 @@ def unhurried_rig(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatc
     """Let clients wait for answers, and measurements miss ticks, where real time is not tested."""
     if not request.node.get_closest_marker("realtime"):
         for client in (Fish, AsyncFish):
-            monkeypatch.setitem(client.__init__.__kwdefaults__, "timeout", 30.0)
+            monkeypatch.setitem(client.__init__.__kwdefaults__, "timeout", ANSWER_TIMEOUT_S)
         monkeypatch.setattr(session, "MAX_LOST_FRACTION", 1.0)
         monkeypatch.setattr(session, "IDLE_LIMIT", 60.0)
 

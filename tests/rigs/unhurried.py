@@ -19,6 +19,9 @@ from fishd.core.process import shutdown
 from fishd.hardware.servo import pigpio_link
 from fishd.lab import session
 
+ANSWER_TIMEOUT_S = 30.0
+"""Timeout of clients for an answer of fishd [s]."""
+
 
 def have_patience() -> None:
     """Remove the limits of time in this process."""
@@ -28,10 +31,10 @@ def have_patience() -> None:
     shutdown.SHUTDOWN_TIMEOUT_S = 60.0
     FAULTS["controller-slow"] = replace(FAULTS["controller-slow"], in_a_row=1_000_000)
     session.MAX_LOST_FRACTION, session.IDLE_LIMIT = 1.0, 60.0
-    Fish.__init__.__kwdefaults__["timeout"] = 30.0
+    Fish.__init__.__kwdefaults__["timeout"] = ANSWER_TIMEOUT_S
     if link := sys.modules.get("fishd.window.fish_link"):
         # Otherwise a last resort that begins while fishd stalls stops the fish again, later.
-        link.ESTOP_TIMEOUT_S = 30.0  # type: ignore[attr-defined]
+        link.ESTOP_TIMEOUT_S = ANSWER_TIMEOUT_S  # type: ignore[attr-defined]
 
 
 if __name__ == "__main__":

@@ -98,7 +98,7 @@ def shoot(daemon: Daemon, seconds: float) -> None:
 
 
 def test_a_fishd_that_goes_on_after_a_hang_begins_nothing_of_before(own_daemon: Daemon) -> None:
-    own_daemon.process.send_signal(signal.SIGSTOP)
+    own_daemon.stop()
     with own_daemon.socket() as socket:
         swing = {"v": 2, "id": 1, "op": "set-controller", "args": {"name": "swing"}}
         socket.send(msgspec.json.encode(swing))

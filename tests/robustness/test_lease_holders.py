@@ -55,7 +55,7 @@ def test_a_program_that_is_killed_leaves_the_fish_at_rest(daemon: Daemon) -> Non
 
 def test_a_program_that_was_stopped_ends_in_one_line_and_does_not_drive_on(daemon: Daemon) -> None:
     with swimming(daemon) as program:
-        program.process.send_signal(signal.SIGSTOP)
+        program.stop()
         wait_until(lambda: rests(daemon))
         program.process.send_signal(signal.SIGCONT)
         _, _, err = program.finish()

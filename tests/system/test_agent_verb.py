@@ -147,7 +147,7 @@ def test_a_camera_that_pauses_is_waited_for(tmp_path: Path, daemon: Daemon, eye:
             Subscriber(daemon.telemetry, b"tick") as ticks,
         ):
             ticks.until(controller="remote", mode="running", phi_c=0.42)
-            camera.process.send_signal(signal.SIGSTOP)
+            camera.stop()
             agent.wait_for_line("no frames: the fish waits at neutral")
             ticks.until(controller="remote", mode="running", phi_c=0.0)
             camera.process.send_signal(signal.SIGCONT)

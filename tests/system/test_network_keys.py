@@ -71,8 +71,8 @@ class Client:
     def subscribe_to_reports(cls) -> Subscriber:
         """Return a subscriber of this machine, which no restart of a gateway with keys cuts off.
 
-        One with a key may miss the report of a restart: it comes a second later, to whoever has
-        connected again by then.
+        A subscriber with a key may miss the report of a restart: fishd sends it a second later, to
+        those that have connected again by then.
         """
         local = Subscriber(cls.keyed.daemon.telemetry, b"event")
         return cls.stack.enter_context(local).connected()
@@ -242,7 +242,7 @@ def test_a_malformed_line_from_a_restart_of_telemetry_is_named_once(
         os.kill(parent, signal.SIGSTOP)
         os.kill(gateways(keyed.daemon)["keyed-tel"], signal.SIGKILL)
         files.write_atomically(keyed.known, f"{keyed.known.read_text()}nonsense\n")
-        with contextlib.suppress(ProcessLookupError):  # it stood still for so long that it was lost
+        with contextlib.suppress(ProcessLookupError):  # after a long stop, fishd has killed it
             os.kill(parent, signal.SIGCONT)
         event = subscriber.until(kind="gateway", data={"gateway": "keyed-telemetry"})
     assert event["level"] == "warning"

@@ -204,7 +204,7 @@ def test_loads_outlive_a_fishd_without_an_answer(talk: Talk, rig: Bench, daemon:
     measure(dialogue, rig, 0.2, 0.0, "0.2")
     dialogue.answer("load [N]")
     rig.pi.load(-0.2, 0.0)
-    daemon.process.send_signal(signal.SIGSTOP)
+    daemon.stop()
     try:
         dialogue.answer("Enter when it is still")
         dialogue.expect("not measured: no answer within")

@@ -261,7 +261,7 @@ def test_a_swim_goes_on_after_the_program_was_itself_held_up(daemon: Daemon) -> 
         wait_until(lambda: fish.status().mode == "running")
         ticks = fish.ticks()
         first = next(ticks).seq
-        process.process.send_signal(signal.SIGSTOP)
+        process.stop()
         try:
             wait_until(lambda: next(ticks).seq > first + 3.0 / TICK)
         finally:

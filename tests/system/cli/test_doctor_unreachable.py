@@ -30,7 +30,7 @@ def run_checks(root: Path, endpoint: str, *overrides: str) -> dict[str, tuple[st
 @pytest.mark.usefixtures("hurried_doctor")
 def test_beside_a_fishd_that_hangs_no_hardware_is_touched(pi: Bench) -> None:
     with pi.daemon() as daemon:
-        daemon.process.send_signal(signal.SIGSTOP)
+        daemon.stop()
         try:
             status, findings = doctor(pi.folder, *pi.settings)
         finally:

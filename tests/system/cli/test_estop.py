@@ -70,7 +70,7 @@ def test_pulses_that_cannot_be_ended_are_no_success(pi: Bench) -> None:
 
 def test_a_simulated_fish_that_hangs_has_no_pulses(tmp_path: Path) -> None:
     with running(tmp_path) as daemon:
-        daemon.process.send_signal(signal.SIGSTOP)
+        daemon.stop()
         try:
             ended = daemon.fishctl("estop")
         finally:

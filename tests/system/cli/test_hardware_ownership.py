@@ -171,7 +171,7 @@ def test_one_virtual_pi_takes_one_fishd_by_any_name_of_its_socket_even_one_that_
     with pi.daemon() as first:
         taken = f"another fishd (pid {first.process.pid}) drives the virtual Pi on "
         assert taken in failed_start(tmp_path / "second", *pi.settings, *other_name)
-        first.process.send_signal(signal.SIGSTOP)
+        first.stop()
         try:
             assert taken in failed_start(tmp_path / "second", *pi.settings)
         finally:

@@ -80,7 +80,7 @@ def test_a_file_of_the_service_that_is_not_there_is_exit_status_78() -> None:
 def test_the_last_resort_works_while_a_fishd_hangs(pi: Bench) -> None:
     with pi.daemon() as daemon:
         daemon.fishctl("set-controller", "hold", "--angle", "0.2")
-        daemon.process.send_signal(signal.SIGSTOP)
+        daemon.stop()
         try:
             ended = release(*pi.settings)
         finally:

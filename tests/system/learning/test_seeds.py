@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from joblib.externals.loky import get_reusable_executor
-from rigs.processes import FISHCTL, fishctl, one_line
+from rigs.processes import FISHCTL, fishctl, is_stopped, one_line
 from rigs.swimming import LONG_ENOUGH, Done, brief_job, wait_for, while_it_trains
 
 from fishd.lab import parallel
@@ -172,10 +172,6 @@ if any("popen_loky" in word for word in sys.orig_argv):
     os.kill(os.getpid(), signal.SIGSTOP)
 """
 """Code run at the start of each Python process: a trainer waits for SIGCONT before it imports."""
-
-
-def is_stopped(process: int) -> bool:
-    return "\nState:\tT" in Path(f"/proc/{process}/status").read_text()
 
 
 def test_ctrl_c_before_any_training_has_begun_ends_all(

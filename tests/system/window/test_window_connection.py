@@ -25,7 +25,7 @@ def test_a_fishd_that_hangs_is_stale_then_lost_then_live(
     async def test() -> None:
         async with Browser(own_window.url) as browser, open_page(browser) as page:
             await page.until("ticks")
-            os.kill(own_daemon.pid, signal.SIGSTOP)
+            own_daemon.stop()
             try:
                 stale = await page.until("connection", lambda c: c["state"] == "stale")
                 assert stale["age"] > 0.0

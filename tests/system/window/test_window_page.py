@@ -287,7 +287,7 @@ def test_a_page_whose_server_hangs_says_so_by_its_own_clock_and_opens_another_co
     window: WindowProcess,
 ) -> None:
     with live_page(window.url) as (page, _):
-        window.process.send_signal(signal.SIGSTOP)
+        window.stop()
         try:
             with page.expect_websocket():
                 expect(page.locator("#connection")).to_contain_text("stale")

@@ -370,7 +370,7 @@ def test_an_estop_overtakes_the_requests_of_500_clients_that_never_read(daemon: 
 
 def test_a_client_that_asks_too_fast_is_told_so_and_others_are_not(shared_daemon: Daemon) -> None:
     with shared_daemon.socket() as hasty, Fish(shared_daemon.endpoint, timeout=PATIENCE) as calm:
-        shared_daemon.process.send_signal(signal.SIGSTOP)
+        shared_daemon.stop()
         try:
             for number in range(1500):
                 hasty.send(b'{"v":2,"id":%d,"op":"config"}' % number)
