@@ -11,7 +11,6 @@ from importlib import import_module
 
 from msgspec.structs import replace
 
-from fishd.__main__ import fishctl, fishd, fishd_window
 from fishd.client import Fish
 from fishd.control import loop, supervisor
 from fishd.control.faults import FAULTS
@@ -38,6 +37,9 @@ def have_patience() -> None:
 
 
 if __name__ == "__main__":
+    # Not loaded with this module: it changes PYTHONSAFEPATH, also for what a test starts.
+    from fishd.__main__ import fishctl, fishd, fishd_window
+
     program = sys.argv.pop(1)
     if program == "fishd-window":
         import_module("fishd.window.fish_link")
