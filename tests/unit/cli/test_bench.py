@@ -1,5 +1,6 @@
 """`fishctl doctor --bench`: its figures and verdicts, in virtual time."""
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -17,20 +18,36 @@ WIDTHS = [2220.0, 1860.0, 1500.0, 1140.0, 780.0]
 
 
 def measured(
-    tau: float | None = 0.1, change: Callable[[float], float] = lambda volts: volts
+    tau: float | None = 0.1,
+    change: Callable[[float], float] = lambda volts: volts,
+    stalls: tuple[float, float] = (0.0, 0.0),
 ) -> Filter | Result:
-    """Return the measurement through a filter; tau: None without a wire; change: the ADC's error"""
+    """Return the measurement through a filter; tau: None without a wire; change: the ADC's error
+
+    stalls: how long the program stands still before and after a conversion, once, soon after the
+        first pulse [s]
+    """
     clock, train = VirtualClock(), PulseTrain()
     rc = RcFilter(train.edges, tau or 0.0)
+    first_pulse = math.inf
+    naps = iter([stalls])
 
     def read_volts() -> float:
+        soon_after = clock.now > first_pulse + 0.03
+        before, after = next(naps, (0.0, 0.0)) if soon_after else (0.0, 0.0)
+        clock.sleep(before)
         start = clock.now
         clock.sleep(1 / 860)
-        return change(0.0 if tau is None else rc.mean(start, clock.now))
+        volts = 0.0 if tau is None else rc.mean(start, clock.now)
+        clock.sleep(after)
+        return change(volts)
 
-    return analog.measure_filter(
-        read_volts, lambda width: train.set(clock.now, width), WIDTHS, FRAME, 0.05, clock
-    )
+    def write(width: float) -> None:
+        nonlocal first_pulse
+        first_pulse = min(first_pulse, clock.now)
+        train.set(clock.now, width)
+
+    return analog.measure_filter(read_volts, write, WIDTHS, FRAME, 0.05, clock)
 
 
 def test_a_good_adc_follows_the_duty_of_the_pulses() -> None:
@@ -38,7 +55,16 @@ def test_a_good_adc_follows_the_duty_of_the_pulses() -> None:
     assert isinstance(good, Filter)
     assert good.high_level == pytest.approx(3.3, abs=0.005)
     assert abs(good.offset) < 1e-3
-    assert good.time_constant == pytest.approx(0.1, abs=FRAME)
+    assert good.time_constant == pytest.approx((0.1, 0.1), abs=FRAME)
+    assert analog.judge_filter(good).level == "ok"
+
+
+@pytest.mark.parametrize("stalls", [(0.3, 0.0), (0.0, 0.3), (2.0, 0.0), (0.0, 2.0)])
+def test_a_stall_during_the_rise_is_not_blamed_on_the_filter(stalls: tuple[float, float]) -> None:
+    good = measured(stalls=stalls)
+    assert isinstance(good, Filter)
+    low, high = good.time_constant
+    assert low < 0.1 < high
     assert analog.judge_filter(good).level == "ok"
 
 
@@ -48,11 +74,12 @@ def test_a_good_adc_follows_the_duty_of_the_pulses() -> None:
         (None, lambda volts: volts, "FAIL", "no wire leads to it"),
         (0.0, lambda volts: volts, "FAIL", "without the resistor and the capacitor"),
         (0.02, lambda volts: volts, "warning", "not 0.1 s"),
+        (0.3, lambda volts: volts, "warning", "not 0.1 s"),
         (0.1, lambda volts: 1.1 * volts, "FAIL", "+10.0%"),
         (0.1, lambda volts: volts + 0.03, "warning", "+30.0 mV without pulses"),
         (0.1, lambda volts: volts + 0.02 * (volts > 0.22), "warning", "mV off a line"),
     ],
-    ids=["no wire", "no filter", "small filter", "gain", "offset", "a step"],
+    ids=["no wire", "no filter", "small filter", "large filter", "gain", "offset", "a step"],
 )
 def test_a_fault_between_pulses_and_adc_is_named(
     tau: float | None, change: Callable[[float], float], level: str, words: str

@@ -18,7 +18,7 @@ REPORT = BenchReport(
     "2026-11-27",
     BOARD,
     killed=Ending(0.21, None),
-    filter=Filter(3.28, 0.01, 0.001, 0.001, 0.1, [0.0], [0.0]),
+    filter=Filter(3.28, 0.01, 0.001, 0.001, (0.1, 0.1), [0.0], [0.0]),
     lateness=Lateness(10.0, 0.05, 50, (20.0, 60.0, 90.0), (15.0, 40.0, 70.0)),
     findings=[Finding("kill", "FAIL", "the pulses go on", "report this")],
 )

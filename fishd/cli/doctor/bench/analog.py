@@ -5,7 +5,7 @@ import statistics
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,6 +40,14 @@ _RATE, _RATE_BITS = 128, 0b100 << 5
 _START_A0 = 0x8000 | 0x4000 | 0x0200 | 0x0100 | 0x0003
 """Config of one conversion of A0 at ±4.096 V: start, input, range, single-shot, comparator off."""
 _IDLE = 0x8000
+
+
+class Sample(NamedTuple):
+    """Voltage at A0 at a time between two bounds, counted from the first pulse [s]."""
+
+    earliest: float
+    latest: float
+    volts: float
 
 
 @contextmanager
@@ -138,24 +146,31 @@ def measure_filter(
     """
     clock = clock or SystemClock()
 
-    def samples(width: float, seconds: float) -> list[tuple[float, float]]:
+    def samples(width: float, seconds: float) -> list[Sample]:
         start = clock.monotonic()
-        pairs, next_write = [], start
-        while (now := clock.monotonic()) - start < seconds:
+        if width:
+            write(width)
+        written = now = clock.monotonic()
+        next_write = start + tick
+        taken: list[Sample] = []
+        while not taken or now - start < seconds:
             if width and now >= next_write:
                 write(width)
                 next_write = now + tick
-            pairs.append((clock.monotonic() - start, read_volts()))
-        return pairs
+            asked = clock.monotonic()
+            volts = read_volts()
+            now = clock.monotonic()
+            taken.append(Sample(asked - written, now - start, volts))
+        return taken
 
     samples(0.0, SETTLING_S)
     duties, volts = [0.0], [_mean(samples(0.0, AVERAGING_S))]
-    rise: list[tuple[float, float]] = []
+    rise: list[Sample] = []
     for width in widths:
         settling = samples(width, SETTLING_S)
         rise = rise or settling
         measured = samples(width, AVERAGING_S)
-        values = [value for _, value in measured]
+        values = [sample.volts for sample in measured]
         if max(values) - min(values) > BARE_WIRE_V:
             return fail(
                 f"A0 jumps by {max(values) - min(values):.1f} V within a second: the wire leads to "
@@ -194,10 +209,10 @@ def judge_filter(measured: Filter) -> Result:
         f"A0 follows the duty of the pulses with {level:.3f} ± {error:.3f} V (a pin at "
         f"{SUPPLY_V} V), {measured.residual * 1e3:.1f} mV off a line at most"
     )
-    low, high = FILTER_TIME_RANGE_S
-    if not low <= measured.time_constant <= high:
+    (low, high), (shortest, longest) = measured.time_constant, FILTER_TIME_RANGE_S
+    if high < shortest or low > longest:
         return warning(
-            f"{message}; the filter takes {measured.time_constant:.2f} s, not {FILTER_TIME_S} s",
+            f"{message}; the filter takes {low:.2f} to {high:.2f} s, not {FILTER_TIME_S} s",
             "check that it has 10 kΩ and 10 µF: with others the accuracy is unknown",
         )
     if abs(level - SUPPLY_V) - error > SUPPLY_TOLERANCE * SUPPLY_V:
@@ -216,11 +231,20 @@ def judge_filter(measured: Filter) -> Result:
     return ok(message)
 
 
-def _mean(samples: list[tuple[float, float]]) -> float:
-    return statistics.fmean(value for _, value in samples)
+def _mean(samples: list[Sample]) -> float:
+    return statistics.fmean(sample.volts for sample in samples)
 
 
-def _time_constant(rise: list[tuple[float, float]], before: float, after: float) -> float:
-    """Return the time in which the voltage has made 63 % of its change [s]."""
+def _time_constant(rise: list[Sample], before: float, after: float) -> tuple[float, float]:
+    """Return bounds of the time in which the voltage has made 63 % of its change [s].
+
+    However late this program reads the chip: the voltage was lower at the one time, and as high at
+    the other.
+    """
     threshold = before + (1.0 - math.exp(-1.0)) * (after - before)
-    return next((when for when, volts in rise if volts >= threshold), SETTLING_S)
+    low = 0.0
+    for sample in rise:
+        if sample.volts >= threshold:
+            return low, sample.latest
+        low = sample.earliest
+    return low, SETTLING_S + AVERAGING_S

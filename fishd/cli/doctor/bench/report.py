@@ -79,8 +79,9 @@ class Filter(Struct, frozen=True):
     """Voltage at duty 0, from the same line [V]."""
     residual: float
     """Largest distance of a mean voltage from the line [V]."""
-    time_constant: float
-    """Time in which the voltage reaches 63 % of its change, known to about 0.02 s [s]."""
+    time_constant: tuple[float, float]
+    """Bounds of the time in which the voltage makes 63 % of its change, ± a period of pulses [s].
+    """
     duties: list[float]
     volts: list[float]
     """Mean voltage at each duty [V]."""
