@@ -53,8 +53,6 @@ def train(
     `CheckpointError` where the run folder can no longer be written.
     """
     job.check()
-    torch.set_num_threads(1)
-    torch.distributions.Distribution.set_default_validate_args(False)
     link: Link
     if job.on == "live":
         stack = job.settings.camera.stack if job.settings.see != "force" else None
@@ -91,6 +89,9 @@ class Training:
 
     def __init__(self, job: Job, link: Link, display: Display, stop: Callable[[], bool]) -> None:
         """Create or open the run folder; nothing moves yet. Raises as `train` does."""
+        torch.set_num_threads(1)
+        # Where learning diverges, `_update` reports it, instead of a ValueError of torch.
+        torch.distributions.Distribution.set_default_validate_args(False)
         self._job, self._display, self._stop = job, display, stop
         self._extractor = extractors.make_extractor(job.settings)
         self._env = SwimEnv(link, job.config, job.settings.seen, self._extractor)
