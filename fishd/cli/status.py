@@ -68,7 +68,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         *([("shows", shown)] if (shown := _format_shown(status)) else []),
         *([("calibrating", "the servo, by a client")] if status.calibrating else []),
         *(("limitation", line) for line in status.limitations),
-        *([("recovered errors", format_values(errors, {}))] if errors else []),
+        *([("recovered", format_values(errors, {}))] if errors else []),
         *([("late", missed)] if status.missed_slots or status.overruns else []),
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
         ("telemetry", status.telemetry),
