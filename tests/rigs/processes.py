@@ -131,6 +131,12 @@ class Daemon(Process):
             wait_until(lambda: _rests(fish))
         return self
 
+    def wait_until_still(self) -> None:
+        """Wait until the fin of a simulated fish stands still, after any swim before the rest."""
+        with Fish(self.endpoint, timeout=PATIENCE) as fish:
+            ticks = fish.ticks()
+            wait_until(lambda: all(abs(float(next(ticks).alpha)) < 1e-4 for _ in range(3)))  # type: ignore[arg-type]
+
     def fishctl(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """Run fishctl for this daemon, and return the result."""
         return fishctl("--endpoint", self.endpoint, *arguments)

@@ -189,9 +189,7 @@ def test_a_view_is_written_with_the_axis_once_searched(swimming: Daemon, tmp_pat
 
 
 def test_no_axis_is_detected_while_the_fish_rests(daemon: Daemon) -> None:
-    with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
-        ticks = fish.ticks()
-        wait_until(lambda: abs(float(next(ticks).alpha)) < 1e-4)  # type: ignore[arg-type]
+    daemon.wait_until_still()
     complaint = one_line(fishctl("camera", "view", "--axis"))
     assert complaint.startswith("fishctl: no axis was detected, as no tail moves: let the fish")
 
@@ -225,6 +223,7 @@ def test_alignment_needs_a_fish_that_swims(daemon: Daemon) -> None:
 
 
 def test_a_fish_that_swims_without_moving_has_no_axis(daemon: Daemon) -> None:
+    daemon.wait_until_still()
     with Fish(daemon.endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("hold")
     complaint = one_line(fishctl("camera", "align", "--for", "3"))

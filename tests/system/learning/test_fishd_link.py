@@ -131,7 +131,8 @@ def test_a_link_swims_a_fishd_in_real_time_and_rests_it(daemon: Daemon, fish: Fi
             after, lost, _ = link.step(angle)
             if not lost:
                 sent[before.fx] = angle
-                assert after.time == pytest.approx(before.time + 0.1)
+                passed = after.time - before.time  # a tick, or several on a busy machine
+                assert passed == pytest.approx(0.1 * max(1, round(passed / 0.1)))
                 assert after.instruction_angle == pytest.approx(angle)
             before = after
         assert len(sent) > 10

@@ -13,9 +13,9 @@ from rigs.window_process import Browser, WindowProcess, open_page, run
 from fishd.core.signals import Tick
 
 
-def test_a_page_begins_with_all_that_it_needs(window: WindowProcess) -> None:
+def test_a_page_begins_with_all_that_it_needs(new_window: WindowProcess) -> None:
     async def test() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
+        async with Browser(new_window.url) as browser, open_page(browser) as page:
             hello = page.hello
             assert hello["fish"] == ["fish"]
             assert hello["session"]["scope"] == "drive"
@@ -54,7 +54,11 @@ def test_ticks_come_in_order_and_continue_the_history(window: WindowProcess) -> 
     run(test())
 
 
-def test_the_driver_swims_tunes_marks_tares_and_stops_the_fish(window: WindowProcess) -> None:
+def test_the_driver_swims_tunes_marks_tares_and_stops_the_fish(
+    window: WindowProcess, daemon: Daemon
+) -> None:
+    daemon.wait_until_still()
+
     async def test() -> None:
         async with Browser(window.url) as browser, open_page(browser) as page:
             await page.drive()
