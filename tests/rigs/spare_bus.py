@@ -11,7 +11,10 @@ ANOTHER = BEYOND - LOWEST
 
 @cache
 def spare_bus() -> int:
-    """Return a bus that no machine has, and that no other test process uses meanwhile."""
+    """Return a bus that no machine has, and that no other test process uses meanwhile.
+
+    Not for constants of a module: test processes are forks of one that has loaded all modules.
+    """
     for bus in range(LOWEST, BEYOND):
         held = socket.socket(socket.AF_UNIX)
         try:

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from rigs.doctor_process import doctor, free_telemetry
 from rigs.operator_rig import Bench
-from rigs.processes import FISHD, Daemon, running
+from rigs.processes import FISHD, Daemon, running, sets
 from rigs.spare_bus import ANOTHER, spare_bus
 
 from fishd.core.errors import StartupError
@@ -21,11 +21,6 @@ from fishd.core.process.lockfile import lock_path
 from fishd.hardware import ownership
 
 NOBODY = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
-BUS = spare_bus()
-PI = [
-    *("--set", "robot=pi", "--set", f"force_sensor.bus={BUS}"),
-    *("--set", "servo.host=127.0.0.2", "--set", f"servo.port={20000 + BUS}"),
-]
 
 
 @pytest.fixture
@@ -37,8 +32,9 @@ def folders() -> Iterator[tuple[Path, Path]]:
         folder.chmod(0o777)
     yield parent / "one", parent / "other"
     shutil.rmtree(parent)
+    bus = spare_bus()
     for lock in ownership.lock_folder().glob("fishd-*"):
-        if lock.name.startswith((f"fishd-i2c-{BUS}.", f"fishd-127.0.0.2:{20000 + BUS}-")):
+        if lock.name.startswith((f"fishd-i2c-{bus}.", f"fishd-127.0.0.2:{20000 + bus}-")):
             lock.unlink()
 
 
@@ -65,20 +61,22 @@ def failed_start(folder: Path, *arguments: str, **command: tuple[str, ...]) -> s
 
 
 def pi_settings(folder: Path) -> list[str]:
-    return [*PI, "--set", f"state_folder={folder}"]
+    bus = spare_bus()
+    hardware = f"force_sensor.bus={bus}", "servo.host=127.0.0.2", f"servo.port={20000 + bus}"
+    return sets("robot=pi", *hardware, f"state_folder={folder}")
 
 
 def test_a_second_fishd_on_the_same_bus_is_refused_with_a_pid(folders: tuple[Path, Path]) -> None:
     one, other = folders
     with running(one, *pi_settings(one)) as first:
         message = failed_start(other, *pi_settings(other))
-        assert f"another fishd (pid {first.process.pid}) drives /dev/i2c-{BUS}; " in message
+        assert f"another fishd (pid {first.process.pid}) drives /dev/i2c-{spare_bus()}; " in message
         assert "force_sensor.bus" in message
-        elsewhere = [*pi_settings(other), "--set", f"force_sensor.bus={BUS + ANOTHER}"]
+        elsewhere = [*pi_settings(other), "--set", f"force_sensor.bus={spare_bus() + ANOTHER}"]
         message = failed_start(other, *elsewhere)
         assert f"another fishd (pid {first.process.pid}) drives the servo on GPIO 18" in message
         assert first.fishctl("status").returncode == 0
-    (ownership.lock_folder() / f"fishd-i2c-{BUS + ANOTHER}.lock").unlink()
+    (ownership.lock_folder() / f"fishd-i2c-{spare_bus() + ANOTHER}.lock").unlink()
 
 
 GROUP = 65534
@@ -114,7 +112,8 @@ def test_fishd_of_another_user_counts_as_owner(folders: tuple[Path, Path], locks
     one, other = folders
     private = ("sh", "-c", 'umask 077; exec "$@"', "sh", *nobody)
     with running(one, *pi_settings(one), under=private, start=start) as killed:
-        assert f"drives /dev/i2c-{BUS}" in failed_start(other, *pi_settings(other), start=own_start)
+        message = failed_start(other, *pi_settings(other), start=own_start)
+        assert f"drives /dev/i2c-{spare_bus()}" in message
         assert {lock.stat().st_mode & 0o777 for lock in locks.iterdir()} == {0o660}
         killed.kill()
     with running(other, *pi_settings(other), start=own_start) as first:  # same lock files
