@@ -15,13 +15,14 @@ def shared_window(
 ) -> Iterator[WindowProcess]:
     folder = tmp_path_factory.mktemp("window")
     with running_window(folder, fish=shared_daemon.endpoint) as window:
-
-        async def wait_until_live() -> None:
-            async with Browser(window.url) as browser, open_page(browser) as page:
-                await page.until("ticks")
-
-        run_apart(wait_until_live())
+        run_apart(wait_until_live(window))
         yield window
+
+
+async def wait_until_live(window: WindowProcess) -> None:
+    """Wait until a window hears its fish."""
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.until("ticks")
 
 
 @pytest.fixture
@@ -32,8 +33,9 @@ def window(shared_window: WindowProcess, daemon: Daemon) -> WindowProcess:
 
 @pytest.fixture
 def new_window(daemon: Daemon, tmp_path: Path) -> Iterator[WindowProcess]:
-    """Yield a window of a single test, which no page drives yet."""
+    """Yield a window of a single test, which hears its fish, and which no page drives yet."""
     with running_window(tmp_path, fish=daemon.endpoint) as process:
+        run_apart(wait_until_live(process))
         yield process
 
 
