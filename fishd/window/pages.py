@@ -201,7 +201,7 @@ class Pages:
     async def end_driving(self, name: str, driver: Driver | None) -> None:
         """Let no page drive a fish, and return it unless its driver wanted otherwise.
 
-        driver: the driver that ends; if another page drives since, nothing changes
+        driver: the driver that ends; nothing changes if another page has taken over since
         """
         if self._drivers.get(name) is not driver:
             return

@@ -1,6 +1,7 @@
 """Numbers of unused I2C buses for tests."""
 
 import atexit
+import os
 import socket
 from functools import cache
 
@@ -13,8 +14,10 @@ ANOTHER = BEYOND - LOWEST
 def spare_bus() -> int:
     """Return a bus that no machine has, and that no other test process uses meanwhile.
 
-    Not for constants of a module: test processes are forks of one that has loaded all modules.
+    Raises AssertionError where it is called for a constant of a module: test processes are forks of
+    one that has loaded all modules, and would share the bus.
     """
+    assert "PYTEST_CURRENT_TEST" in os.environ, "this is no test, but a module that is loaded"
     for bus in range(LOWEST, BEYOND):
         held = socket.socket(socket.AF_UNIX)
         try:

@@ -37,7 +37,7 @@ def have_patience() -> None:
 
 
 if __name__ == "__main__":
-    # Not loaded with this module: it changes PYTHONSAFEPATH, also for what a test starts.
+    # Loading it sets PYTHONSAFEPATH, which programs that a test starts would inherit.
     from fishd.__main__ import fishctl, fishd, fishd_window
 
     program = sys.argv.pop(1)

@@ -90,7 +90,7 @@ class Training:
     def __init__(self, job: Job, link: Link, display: Display, stop: Callable[[], bool]) -> None:
         """Create or open the run folder; nothing moves yet. Raises as `train` does."""
         torch.set_num_threads(1)
-        # Where learning diverges, `_update` reports it, instead of a ValueError of torch.
+        # `_update` detects a policy that is not finite; torch would raise a ValueError before that.
         torch.distributions.Distribution.set_default_validate_args(False)
         self._job, self._display, self._stop = job, display, stop
         self._extractor = extractors.make_extractor(job.settings)

@@ -80,8 +80,7 @@ class Filter(Struct, frozen=True):
     residual: float
     """Largest distance of a mean voltage from the line [V]."""
     time_constant: tuple[float, float]
-    """Bounds of the time in which the voltage makes 63 % of its change, ± a period of pulses [s].
-    """
+    """Bounds of the time of 63 % of the voltage's change, ± a period of the pulses [s]."""
     duties: list[float]
     volts: list[float]
     """Mean voltage at each duty [V]."""
