@@ -2,6 +2,7 @@
 
 import math
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -57,6 +58,23 @@ def test_a_new_zero_of_the_sensor_is_no_motion_of_the_fin(samples: int) -> None:
     for _ in range(20):
         seen = estimator.update(Measurement(0.0, 0.0, 0.0, 10), 0.0, 0.0, DT)
         assert (seen.fin_velocity, seen.fy_rate) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("leak", ["auto", 0.2])
+def test_a_reversed_force_is_seen_as_if_it_had_always_been_reversed(
+    leak: float | Literal["auto"],
+) -> None:
+    settings = EstimatorSettings(leak=leak)
+    corrected, right = LateralForceEstimator(settings), LateralForceEstimator(settings)
+    for tick in range(400):
+        fx, fy = 0.1 * math.cos(0.6 * tick), 0.5 + 0.2 * math.sin(0.3 * tick)
+        if tick == 150:
+            corrected.reverse_fy()
+        seen = corrected.update(Measurement(DT * tick, fx, fy, 10), 0.0, DT * tick, DT)
+        wanted = right.update(Measurement(DT * tick, fx, -fy, 10), 0.0, DT * tick, DT)
+        if tick >= 150:
+            assert seen.fin_velocity == pytest.approx(wanted.fin_velocity)
+            assert seen.fy_rate == pytest.approx(wanted.fy_rate)
 
 
 def test_the_observation_has_the_previous_angle() -> None:

@@ -73,6 +73,13 @@ def test_a_measured_factor_is_used_at_once_and_without_a_zero() -> None:
         assert 0.01 * TRUTH < error < 0.6e-3  # no wave is known better
 
 
+def test_the_interval_of_a_measured_factor_is_the_measured_one() -> None:
+    with rig() as fish:
+        fish._run.loop.thrust.calibrate(68.4, 20.0)
+        fish.rest(1.0)
+        assert fish._run.loop.thrust.factor == pytest.approx((68.4, 20.0), rel=0.01)
+
+
 def test_a_new_zero_of_the_sensor_is_found_again_and_the_factor_stays() -> None:
     with rig() as fish:
         fish.rest(3.0)
@@ -202,3 +209,17 @@ def test_a_load_that_stays_is_the_zero_after_two_pieces_of_a_rest(load: float) -
     robot.fx = load
     thrust, error = thrust_and_ci95(rig.run_for(1.7))
     assert abs(thrust) < error < 4e-3
+
+
+@pytest.mark.parametrize("loads", [(0.05, -2.0), (5.0, 0.05), (0.05, 0.1)])
+def test_after_two_different_loads_in_a_rest_the_thrust_is_not_known(
+    loads: tuple[float, float],
+) -> None:
+    rig, robot = fragile_rig()
+    rig.run_for(3.0)
+    for load in loads:  # each for a piece of the rest
+        robot.fx = load
+        rig.run_for(0.6)
+    robot.fx = None
+    rig.start("square", frequency=5.0 / 3.0)
+    assert rig.run_for(10)[-1].thrust_ci95 is UNSET

@@ -8,6 +8,8 @@ from rigs.harness import LIMITS, Rig, commands, observe
 
 from fishd.config import load
 from fishd.controllers import registry
+from fishd.controllers.base import Limits
+from fishd.controllers.reversal import Reversal
 from fishd.lab.simulation import simulate
 
 IMPERFECT = ["simulation.noise=1e-3", "simulation.offset_y=0.02", "simulation.drift=0.02"]
@@ -44,6 +46,15 @@ def test_with_a_lead_it_reverses_before_the_fin_slows_down_once_two_beats_are_ov
     late = reversals(feed(speeds, C=0.6))
     assert early[:4] == late[:4]
     assert early[4] < late[4]
+
+
+def test_at_short_ticks_noise_does_not_lead_to_a_predicted_slowdown() -> None:
+    reversal = Reversal(Limits(amplitude=0.42, tick=0.01))
+    for k in range(100):
+        noise = 0.02 * (-1) ** k
+        seen = observe(fin_velocity=1.0 + 0.01 * k + noise, dt=0.01)
+        reversal.update(seen, C=0.6, lead=0.1, longest=10.0)
+        assert reversal.direction == 1.0
 
 
 def test_without_any_sign_of_slowing_down_it_reverses_after_the_longest_half_period() -> None:
