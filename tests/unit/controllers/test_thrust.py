@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 
 import pytest
-from rigs.harness import LIMITS, Rig
+from rigs.harness import LIMITS, Rig, observe
 
 from fishd.controllers import registry
 from fishd.controllers.thrust import MIN_AMPLITUDE_FRACTION
-from fishd.controllers.thrust_gauge import mean_of_ripple
+from fishd.controllers.thrust_gauge import ThrustGauge, mean_of_ripple
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Tick
 
@@ -137,6 +137,19 @@ def test_the_mean_is_told_from_the_ripple_alone() -> None:
     f4 = 0.5 * cross * turn**4
     assert mean_of_ripple(f2, f4) == pytest.approx(0.5 * (1.0 + 9.0 * third**2), rel=1e-3)
     assert mean_of_ripple(0j, 0j) is None
+
+
+def test_the_gauge_averages_the_thrust_of_the_last_four_seconds() -> None:
+    gauge = ThrustGauge(coefficient=1.0)
+    shown = []
+    for speed, half_beats in ((1.0, 60), (2.0, 18), (1.0, 8)):  # of 0.25 s
+        for tick in range(5 * half_beats):
+            side = 0.4 if tick // 5 % 2 else -0.4
+            gauge.update(observe(angle=side, fin_velocity=speed))
+        shown.append((gauge.thrust, gauge.latest))
+    assert shown[0] == pytest.approx((1.0, 1.0))
+    assert shown[1] == pytest.approx((4.0, 4.0))
+    assert shown[2] == pytest.approx((2.5, 1.0), rel=0.1)  # two seconds of each
 
 
 @pytest.mark.parametrize("target", [0, -0.01, float("nan"), float("inf")])
