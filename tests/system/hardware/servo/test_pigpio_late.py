@@ -97,6 +97,17 @@ def test_where_the_next_tick_would_come_after_the_countdown_the_first_ends_it(be
         late_tick(bench, servo, 0.5)
 
 
+def test_after_a_release_a_late_answer_is_no_error_however_long_the_release(bench: Bench) -> None:
+    servo = bench.servo()
+    servo.write(0.5)
+    servo.release()
+    bench.wait(2.0)
+    late_tick(bench, servo, -0.5)
+    servo.write(0.5)
+    assert bench.width == 1800
+    assert servo.driver.counters() == {"servo_reconnects": 0, "servo_late_answers": 1}
+
+
 def test_an_answer_that_came_after_the_countdown_is_not_trusted(bench: Bench) -> None:
     servo = bench.servo()
     servo.write(0.5)
