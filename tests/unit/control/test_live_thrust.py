@@ -217,8 +217,8 @@ def test_after_two_different_loads_in_a_rest_the_thrust_is_not_known(
 ) -> None:
     rig, robot = fragile_rig()
     rig.run_for(3.0)
-    for load in loads:  # each for a piece of the rest
-        robot.fx = load
+    for fx in loads:  # each for a piece of the rest
+        robot.fx = fx
         rig.run_for(0.6)
     robot.fx = None
     rig.start("square", frequency=5.0 / 3.0)
