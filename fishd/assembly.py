@@ -1,5 +1,6 @@
 """Construction of the robot and its control loop from a configuration, in real or virtual time."""
 
+import dataclasses
 import logging
 import os
 from collections.abc import Callable
@@ -31,6 +32,7 @@ from fishd.hardware.base import CalibratedParts, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.driver import ServoDriver, read_counters
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
+from fishd.hardware.recipes import Recipes
 from fishd.hardware.registry import FORCE_SENSORS, POWER_METERS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
@@ -65,30 +67,23 @@ def open_robot(
     when the hardware answers again. Raises `StartupError` when a package is missing, no virtual Pi
     is running or another fishd drives this robot, and `ConfigError` for a bad calibration file.
     """
-    if control:
-
-        def remove_recipe(kind: object, error: object, trace: object) -> None:
-            if error is None:  # otherwise there may be pulses
-                release_recipe.remove(str(control))
-
-        stack.push(remove_recipe)
-        if not config.kind.has_hardware:
-            release_recipe.write_without_servo(str(control))
+    recipes = Recipes(file, control)
+    stack.push(recipes.remove_at_end)
+    if not config.kind.has_hardware:
+        recipes.write_without_servo()
     if config.robot == "simulated":
         if file and not (release_recipe.read(str(file)) or {}).get("fresh"):
             release_recipe.remove(str(file))  # of an earlier content of the file
-        return simulated_fish(config).robot()
+        return dataclasses.replace(simulated_fish(config).robot(), write_recipes=recipes.write_for)
     if config.robot == "swimmer":
         swimmer = open_swimmer(config)
         swimmer.compile()
-        return swimmer.robot()
+        return dataclasses.replace(swimmer.robot(), write_recipes=recipes.write_for)
     stack.enter_context(ownership.claim_parts(parts_of(config)))
-    names = tuple(str(path) for path in (file, control) if path)
-    for name in names:
-        release_recipe.remove(name)  # of an earlier fishd
+    recipes.remove_former()
     if config.robot == "virtual-pi":
         plug_in_virtual_pi(config, stack)
-    return assemble(config, clock, stack, threaded=True, recipes=names)
+    return assemble(config, clock, stack, threaded=True, recipes=recipes)
 
 
 def simulated_fish(config: Config) -> SimulatedFish:
@@ -250,14 +245,14 @@ def assemble(
     stack: ExitStack,
     *,
     threaded: bool,
-    recipes: tuple[str, ...] = (),
+    recipes: Recipes | None = None,
     truth: Callable[[], Truth] | None = None,
     servo_driver: Callable[..., ServoDriver[Any]] | None = None,
 ) -> Robot:
     """Return the robot on the buses and pins of this process; do as `open_robot` without claims.
 
     threaded: False for a clock in virtual time
-    recipes: names for `release_recipe` with which other programs find this servo
+    recipes: recipes with which other programs end these pulses; None for none
     servo_driver: function that opens the servo, by default the class that the configuration names
     """
     panel = _open_panel(config, clock, stack)
@@ -283,8 +278,7 @@ def assemble(
     def write_recipes(calibration: ServoCalibration) -> None:
         """Write the recipes with which `fishd-release` can end these pulses quickly."""
         if recipes and (resort := servo.driver.last_resort(settings)):
-            for name in recipes:
-                release_recipe.write(name, resort.function, servo.driver.neutral, resort.arguments)
+            recipes.write(resort, servo.driver.neutral)
 
     write_recipes(servo.calibration)
     if threaded:
@@ -324,6 +318,7 @@ def assemble(
         },
         power=meter.read if meter else None,
         countdown=servo.driver.countdown,
+        write_recipes=recipes.write_for if recipes else lambda control: None,
     )
 
 

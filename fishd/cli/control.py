@@ -9,7 +9,7 @@ import click
 from fishd import client
 from fishd.cli.completion import active_parameters, complete_pair
 from fishd.cli.options import ControllerGroup, ParameterType, Utf8Text, daemon_options
-from fishd.cli.output import echo, format_state, make_printable, print_json
+from fishd.cli.output import echo, format_state, make_printable, print_json, report_detour
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.core.protocol import State
 from fishd.core.schema import Field
@@ -108,6 +108,7 @@ def _change(endpoint: str | None, as_json: bool, change: "Callable[[client.Fish]
     """Request a change, and print the state afterwards."""
     with client.Fish(endpoint) as fish:
         state = change(fish)
+    report_detour(fish)
     if as_json:
         print_json(state)
         return

@@ -33,9 +33,10 @@ _TIMEOUT_S = 0.3
 def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) -> int:
     """Emergency stop: no more pulses, at once, until 'fishctl clear-fault'.
 
-    It tries three ways, and prints which one worked: fishd's control socket; fishd's separate
-    socket for emergency stops, if the first does not answer within 0.1 s; and the last resort
-    without the daemon, as 'fishctl release'. Exit status 0 if there are no more pulses.
+    It tries four ways, and prints which one worked: fishd's control socket; fishd's separate
+    socket for emergency stops, if the first does not answer within 0.1 s; fishd's name in the
+    kernel, which needs no file; and the last resort without the daemon, as 'fishctl release'. Exit
+    status 0 if there are no more pulses.
     """
     with Fish(endpoint) as fish:
         path = socket_path(fish.endpoint)
@@ -59,7 +60,9 @@ def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) 
 
 def _describe_way(fish: Fish, path: Path | None) -> str:
     if fish.estop_taken_by == "control":
-        return "control socket"
+        return f"control socket; {fish.detour}" if fish.detour else "control socket"
+    if fish.estop_taken_by == "kernel":
+        return f"fishd's name in the kernel: {fish.detour}"
     return f"fishd's own socket, {path}.estop, as the control socket did not answer at once"
 
 

@@ -16,6 +16,7 @@ from fishd.core.schema import format_values
 from fishd.core.signals import Reason
 
 if TYPE_CHECKING:
+    from fishd.client import Fish
     from fishd.core.protocol import State
 
 T = TypeVar("T")
@@ -41,6 +42,12 @@ def output_may_fail(done: str) -> Iterator[None]:
         discard_output()
         with suppress(OSError):
             echo(f"fishctl: {done}; {describe_write_error(error)}", err=True)
+
+
+def report_detour(fish: "Fish") -> None:
+    """Print to standard error how a fishd was reached that is not where clients look for it."""
+    if fish.detour:
+        echo(f"fishctl: {fish.detour}", err=True)
 
 
 def echo_rows(rows: Sequence[tuple[str, str]]) -> None:

@@ -17,6 +17,7 @@ from fishd.core import text
 from fishd.core.addresses import find_control_address
 from fishd.core.errors import ConfigError, FishError, NoDaemon, ServoError, StartupError
 from fishd.core.process.interruption import SIGNALS, handle_signals
+from fishd.core.process.kernel_names import Holder
 from fishd.hardware.release_recipe import NOT_RELEASED, describe_outcome
 
 _NO_FOLDER = "/proc/self/no-calibrations"
@@ -86,41 +87,40 @@ def _release(config: Config) -> str:
     """Stop a fishd that drives the servo, or end the pulses; return what was done, in words."""
     try:
         with handle_signals(SIGNALS, signal.SIG_IGN):
-            driver_pid = _find_driver(config)
-            if driver_pid and (summary := _stop_fishd(config, driver_pid)):
+            driver = _find_driver(config)
+            if driver and (summary := _stop_fishd(config, driver)):
                 return summary
             done = describe_outcome(_end_pulses(config))
     except ServoError as error:
         raise ServoError(f"{error}; {NOT_RELEASED}") from None
-    if not driver_pid:
+    if not driver:
         return done
     return (
-        f"fishd (pid {driver_pid}) drives the servo and did not answer at "
-        f"{_endpoint(config)}: {done}"
+        f"fishd (pid {driver}) drives the servo and did not answer at {_endpoint(config)}: {done}"
     )
 
 
-def _find_driver(config: Config) -> str:
-    """Return the pid of a fishd that drives this servo; empty if there is none."""
+def _find_driver(config: Config) -> Holder | None:
+    """Return the fishd that drives this servo; None if there is none."""
     from fishd.assembly import parts_of
-    from fishd.hardware.ownership import find_owner_pid
+    from fishd.hardware.ownership import find_owner
 
     with suppress(StartupError):  # invalid place of a virtual Pi: the release reports it
-        return find_owner_pid(parts_of(config))
-    return ""
+        return find_owner(parts_of(config))
+    return None
 
 
 def _endpoint(config: Config) -> str:
     return config.control.address or find_control_address()
 
 
-def _stop_fishd(config: Config, driver_pid: str) -> str:
+def _stop_fishd(config: Config, driver: Holder) -> str:
     """Send a fishd an emergency stop, and read the pulses back; empty unless they have ended."""
     from fishd.assembly import read_pulses
 
     try:
         with Fish(_endpoint(config), timeout=_ANSWER_S) as fish:
-            if str(fish.status(_ANSWER_S).pid) != driver_pid:
+            if fish.status(_ANSWER_S).pid != driver.pid:
                 return ""
             state = fish.estop("fishctl release", timeout=_ANSWER_S)
         pulses = read_pulses(config)
@@ -131,7 +131,7 @@ def _stop_fishd(config: Config, driver_pid: str) -> str:
     pulse_state = (
         "there are no pulses" if pulses is False else "whether there are pulses is not known"
     )
-    return f"fishd (pid {driver_pid}) was asked: mode {state.mode}, {pulse_state}"
+    return f"fishd (pid {driver}) was asked: mode {state.mode}, {pulse_state}"
 
 
 def _load_without_bad_folder(

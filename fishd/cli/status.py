@@ -13,6 +13,7 @@ from fishd.cli.output import (
     format_reason,
     make_printable,
     print_json,
+    report_detour,
 )
 from fishd.client import Fish
 from fishd.core.console import format_power, format_thrust
@@ -31,6 +32,7 @@ def status(timing: bool, endpoint: str | None, as_json: bool) -> None:
     """Show what the fish and its daemon are doing."""
     with Fish(endpoint) as fish:
         fish_status = fish.status()
+    report_detour(fish)
     if as_json:
         print_json(fish_status)
         return
@@ -71,6 +73,7 @@ def _status_rows(status: Status) -> list[tuple[str, str]]:
         *([("recovered", format_values(errors, {}))] if errors else []),
         *([("late", missed)] if status.missed_slots or status.overruns else []),
         ("daemon", f"fishd {status.version}, pid {status.pid}, up {uptime}"),
+        ("control", status.control or "none: see limitation"),
         ("telemetry", status.telemetry),
     ]
 

@@ -13,8 +13,10 @@ import msgspec
 from fishd.core import protocol, text
 from fishd.core.addresses import (
     ENDPOINT_VARIABLE,
+    default_address,
     estop_path,
     find_control_address,
+    is_usual,
     socket_path,
 )
 from fishd.core.decoding import decoder
@@ -33,6 +35,7 @@ from fishd.core.signals import Status
 if TYPE_CHECKING:
     from fishd.client.lease import LeaseRenewal
     from fishd.core.keys import Access
+    from fishd.core.local_daemons import LocalDaemon
 
 T = TypeVar("T")
 
@@ -58,13 +61,19 @@ class Connection:
         self.access = _find_access(self.endpoint)
         """Keys of this client and of the fishd; None for a connection without keys."""
         self._was_named = bool(endpoint or os.environ.get(ENDPOINT_VARIABLE))
+        self.detour = ""
+        """How a fishd was reached that is not where clients look for it; empty if it is there."""
+        if not self._was_named and not is_usual(self.endpoint):
+            self.detour = (
+                f"no fishd at {default_address()}; the one of this user serves {self.endpoint}"
+            )
         self.timeout = timeout
         self.telemetry_address = telemetry
         self.held: LeaseRenewal | None = None
         """Lease of the fish, inside `with fish.lease(...)`."""
         self._ids = itertools.count(1)
         self.estop_taken_by = ""
-        """Socket that answered the latest emergency stop: `control` or `estop`."""
+        """Socket that answered the latest emergency stop: `control`, `estop` or `kernel`."""
 
     def check_endpoint(self) -> None:
         """Raise `NoDaemon` at once if it is certain that no fishd will answer.
@@ -89,10 +98,23 @@ class Connection:
             )
 
     def _no_daemon(self, why: str) -> NoDaemon:
+        if elsewhere := self._local_daemons():
+            found = ", ".join(daemon.describe() for daemon in elsewhere)
+            return NoDaemon(
+                f"no fishd at {self.endpoint}: {why}; {found}: name it with --endpoint or "
+                "$FISHD_ENDPOINT"
+            )
         return NoDaemon(
             f"no fishd at {self.endpoint}: {why}; start one with 'fishd', or a simulated fish "
             "that swims with 'make run'; or name another with --endpoint or $FISHD_ENDPOINT"
         )
+
+    def _local_daemons(self) -> "list[LocalDaemon]":
+        """Return the fishds of this machine that a client of this endpoint may mean."""
+        from fishd.core import local_daemons
+
+        same = local_daemons.find_own(self.endpoint)
+        return same if same or self._was_named else local_daemons.find_own()
 
     def no_answer_error(self, patience: float = 0.0) -> NoDaemon:
         """Return the error for a missing answer; patience: time beyond the timeout [s]."""
@@ -146,11 +168,11 @@ class Connection:
         return identity, payload
 
     def estop_without_gateway(self, message: str) -> State | None:
-        """Request an emergency stop at fishd's emergency socket; None if it does not answer."""
+        """Request an emergency stop at fishd's own sockets; None if none answers."""
         path = estop_path(self.endpoint)
         identity, request = self.request("estop", {"message": message})
         if path is None:
-            return None
+            return self._estop_all(message)
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
             client.settimeout(ESTOP_SOCKET_TIMEOUT_S)
             try:
@@ -159,9 +181,40 @@ class Connection:
                 client.send(request)
                 reply = client.recv(2**20)
             except OSError:
-                return None
+                return self._estop_all(message)
         self.estop_taken_by = "estop"
         return self.result((reply,), identity, State)
+
+    def _estop_all(self, message: str) -> State | None:
+        """Request an emergency stop of every fishd that this endpoint may mean, by its name."""
+        answers = [
+            self._ask(daemon, State, "estop", {"message": message})
+            for daemon in self._local_daemons()
+        ]
+        states = [state for state in answers if state]
+        self.estop_taken_by = "kernel" if states else ""
+        return states[0] if states else None
+
+    def ask_directly(self, kind: type[T], op: str, args: Mapping[str, Any]) -> T | None:
+        """Send a request to the name of a fishd in the kernel; None without an answer.
+
+        For a fishd whose control socket is gone. Return None also if it may be one of several.
+        """
+        daemons = self._local_daemons()
+        return self._ask(daemons[0], kind, op, args) if len(daemons) == 1 else None
+
+    def _ask(
+        self, daemon: "LocalDaemon", kind: type[T], op: str, args: Mapping[str, Any]
+    ) -> T | None:
+        identity, request = self.request(op, args)
+        reply = daemon.ask(request)
+        result = self.result((reply,), identity, kind) if reply else None
+        if result is not None:
+            self.detour = (
+                f"no answer from {self.endpoint}; process {daemon.pid} answered at its name in the "
+                "kernel"
+            )
+        return result
 
     def result(self, frames: Sequence[bytes], identity: int, kind: type[T]) -> T | None:
         """Return the result in a reply; None if it answers an earlier request that timed out."""

@@ -19,6 +19,7 @@ from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibrati
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost, NoDaemon, NoKey, Untrusted
 from fishd.core.protocol import (
+    DIRECT_OPERATIONS,
     LOADING_TIMEOUT_S,
     READ_OPERATIONS,
     Calibrations,
@@ -123,8 +124,7 @@ class Fish(Connection):
     ) -> State:
         """Stop the servo's pulses at once.
 
-        If the control socket does not answer at once, the request goes to the emergency socket,
-        too.
+        If the control socket does not answer at once, the request goes to fishd's own sockets, too.
 
         timeout: time to wait for an answer after these first attempts, which take up to 0.5 s [s];
             None for that of other requests
@@ -279,7 +279,16 @@ class Fish(Connection):
 
     def _exchange(self, kind: type[T], op: str, patience: float, args: dict[str, Any]) -> T:
         if self._socket is None:
-            self.check_endpoint()
+            try:
+                self.check_endpoint()
+            except Untrusted:
+                raise
+            except NoDaemon:
+                if op in DIRECT_OPERATIONS and op != "estop":
+                    result = self.ask_directly(kind, op, args)
+                    if result is not None:
+                        return result
+                raise
             self._socket = self._open_socket()
         connection = self._socket
         identity, request = self.request(op, args)

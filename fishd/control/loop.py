@@ -224,6 +224,11 @@ class ControlLoop:
             self.thrust.forget_zero()
             self.lateral_sign.rest()
 
+    @property
+    def has_pending(self) -> bool:
+        """Whether a controller is to start after a time at rest."""
+        return self._pending is not None
+
     def stop(self) -> None:
         """Fade to neutral and stay there; has no effect while a fault or estop is latched."""
         self._cancel_pending()

@@ -12,7 +12,7 @@ import socket
 import stat
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -130,6 +130,11 @@ def estop_path(control: str) -> Path | None:
     return path.with_name(f"{path.name}.estop") if path else None
 
 
+def default_address() -> str:
+    """Return the default address of a daemon of this user; its folder may not exist."""
+    return f"ipc://{_private_socket('control')}"
+
+
 def control_address() -> str:
     """Return the default address of a daemon; create its folder if that belongs to fishd.
 
@@ -153,7 +158,8 @@ def _ensure_private_folder(path: Path, key: str) -> Path:
     """Return the path of a socket after making sure that this user owns its folder."""
     folder = path.parent
     try:
-        folder.mkdir(mode=0o700, exist_ok=True)
+        with suppress(FileExistsError):  # raised for a file, which is found below
+            folder.mkdir(mode=0o700, exist_ok=True)
         status = folder.stat(follow_symlinks=False)
     except OSError as error:
         raise StartupError(
@@ -170,18 +176,30 @@ def find_control_address() -> str:
     """Return the address at which a client looks for the daemon of this machine.
 
     $FISHD_ENDPOINT, else a daemon of this user, else the system's service. A socket that another
-    user has created in the place of this user's does not hide the service.
+    user has created in the place of this user's does not hide the service. If both are certainly
+    not there, the only daemon that this user may ask, wherever its socket is.
     """
     endpoint = os.environ.get(ENDPOINT_VARIABLE)
     if endpoint:
         return endpoint
     own = _private_socket("control")
+    if not unix_sockets.is_deserted(own) and not unix_sockets.find_trust_problem(own):
+        return f"ipc://{own}"
     # A daemon that was killed leaves its socket behind.
-    if _may_exist(_SERVICE_SOCKET) and (
-        unix_sockets.is_deserted(own) or unix_sockets.find_trust_problem(own)
-    ):
+    if _may_exist(_SERVICE_SOCKET) and not unix_sockets.is_deserted(_SERVICE_SOCKET):
         return f"ipc://{_SERVICE_SOCKET}"
-    return f"ipc://{own}"
+    if unix_sockets.is_deserted(own):
+        from fishd.core import local_daemons
+
+        daemons = local_daemons.find_own()
+        if len(daemons) == 1 and (elsewhere := daemons[0].control_address()):
+            return elsewhere
+    return f"ipc://{_SERVICE_SOCKET if _may_exist(_SERVICE_SOCKET) else own}"
+
+
+def is_usual(endpoint: str) -> bool:
+    """Return whether a client looks for a daemon at this address first."""
+    return endpoint in (default_address(), f"ipc://{_SERVICE_SOCKET}")
 
 
 def _may_exist(path: Path) -> bool:

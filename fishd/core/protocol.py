@@ -33,6 +33,8 @@ LOADING_TIMEOUT_S = 10.0
 
 READ_OPERATIONS = {"status", "controllers", "policies", "config", "calibrations"}
 """Operations without an effect, which a client sends again after its connection was lost."""
+DIRECT_OPERATIONS = ("estop", "stop", "status")
+"""Operations that fishd also carries out without its gateways, at sockets of its own."""
 MOVING_OPERATIONS = {"set-controller", "clear-fault", "calibrate-servo"}
 """Operations that may move a fish at rest, or start the pulses of its servo."""
 MAX_WAIT_S = 5.0

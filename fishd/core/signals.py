@@ -241,6 +241,7 @@ EventKind = Literal[
     "power",
     "calibration",
     "gateway",
+    "sockets",
     "lease",
     "lease-expired",
     "mark",
@@ -300,6 +301,13 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
         "warning",
         "the process behind a socket was restarted; messages were lost",
         "`gateway`: `telemetry` or `control`",
+    ),
+    (
+        "sockets",
+        "warning; error if they cannot be created",
+        "files of sockets, or their folder, were gone: they were created again, or the fish fades "
+        "to neutral unless an experiment holds it",
+        "`control`: address of the control socket, empty without one",
     ),
     (
         "lease",
@@ -501,10 +509,16 @@ class Status(Struct, frozen=True):
     ] = None
     lease_expiry: Annotated[
         Reason | None,
-        note("Reason why the fish rests after a lease that was not renewed; null otherwise."),
+        note(
+            "Reason why the fish rests after a lease that was not renewed, or because no client "
+            "could connect; null otherwise."
+        ),
     ] = None
     keyed_telemetry: Annotated[
         str, note("Address of telemetry for [clients with a key](#keys); empty for none.")
+    ] = ""
+    control: Annotated[
+        str, note("Address of the control socket; empty while its file cannot be created.")
     ] = ""
 
     def shows_restart_since(self, earlier: "Status") -> bool:

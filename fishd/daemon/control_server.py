@@ -1,18 +1,14 @@
-"""Servers of requests: of those that the gateway passes on, and of those for an emergency stop."""
+"""Server of requests, which gateways pass on or which come directly."""
 
 import asyncio
 import logging
 import math
-import socket
 import time
-from collections.abc import Awaitable, Callable, Container
-from contextlib import ExitStack, suppress
-from pathlib import Path
+from collections.abc import Awaitable, Callable, Collection
 from typing import Any
 
 from fishd.core import protocol, text
 from fishd.core.errors import Refused
-from fishd.core.process import unix_sockets
 from fishd.daemon.gateway import link
 
 log = logging.getLogger(__name__)
@@ -65,19 +61,19 @@ class ControlServer:
             while not send(part):  # an incomplete reply keeps its request open
                 await asyncio.sleep(_SEND_RETRY_S)
 
-    async def reply_to_estop(self, payload: bytes) -> bytes:
-        """Carry out a request for an emergency stop, and refuse every other request."""
-        return await self._reply(time.monotonic(), payload, {"estop"})
+    async def reply_directly(self, payload: bytes) -> bytes:
+        """Carry out a request that came without a gateway, which only few operations may."""
+        return await self._reply(time.monotonic(), payload, protocol.DIRECT_OPERATIONS)
 
     async def _reply(
-        self, received: float, payload: bytes, permitted: Container[str] | None = None
+        self, received: float, payload: bytes, permitted: Collection[str] | None = None
     ) -> bytes:
         identity: protocol.RequestId = None
         try:
             request = protocol.decode_request(payload)
             identity = request.id
             if permitted is not None and request.op not in permitted:
-                raise Refused("unknown-op", "this socket accepts only estop")
+                raise Refused("unknown-op", f"this socket accepts only {', '.join(permitted)}")
             _check_age(request.op, time.monotonic() - received)
             return protocol.success(identity, await self._perform(request.op, request.args))
         except Refused as error:
@@ -96,65 +92,3 @@ def _check_age(operation: str, seconds: float) -> None:
             f"this {operation} waited for {seconds:.0f} s, as fishd stood still or was flooded;"
             " send it again",
         )
-
-
-class EstopSocket:
-    """Separate socket for an emergency stop, next to the control socket; it needs no gateway.
-
-    A client sends the request `estop` there as one datagram if the control socket does not answer.
-    The kernel queues only a few datagrams, each of a limited size, and fishd reads one per tick.
-    """
-
-    def __init__(
-        self, path: Path, perform: Callable[[bytes], Awaitable[bytes]], period: float
-    ) -> None:
-        """Listen at a path next to a socket that is `claimed`, or log why that is not possible.
-
-        perform: function that carries out or refuses a request and returns the reply
-        period: shortest time between two requests [s]
-        """
-        self._perform = perform
-        self._period = period
-        self._events = asyncio.get_running_loop()
-        self._task: asyncio.Task[None] | None = None
-        self._stack = ExitStack()
-        self._socket = self._stack.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
-        self._socket.setblocking(False)
-        try:
-            unix_sockets.check_length(str(path))
-            unix_sockets.bind(self._socket, path, unix_sockets.GROUP_MASK)
-        except (OSError, ValueError) as error:
-            log.warning(
-                "%s: not available, so an emergency stop needs the control socket: %s", path, error
-            )
-            self._stack.close()
-            return
-        self._stack.callback(path.unlink, missing_ok=True)
-        self._stack.callback(self._pause)
-        self._resume()
-
-    def close(self) -> None:
-        """Stop listening; may be called twice."""
-        self._stack.close()
-
-    def _resume(self) -> None:
-        if self._socket.fileno() >= 0:
-            self._events.add_reader(self._socket, self._take)
-
-    def _pause(self) -> None:
-        self._events.remove_reader(self._socket)
-
-    def _take(self) -> None:
-        try:
-            payload, sender = self._socket.recvfrom(protocol.MAX_MESSAGE)
-        except OSError:
-            return
-        self._pause()
-        self._task = self._events.create_task(self._answer(payload, sender))
-        self._events.call_later(self._period, self._resume)
-
-    async def _answer(self, payload: bytes, sender: str | bytes | None) -> None:
-        reply = await self._perform(payload)
-        if sender:
-            with suppress(OSError):  # the client has ended, or does not read
-                self._socket.sendto(reply, sender)

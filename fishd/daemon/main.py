@@ -21,7 +21,7 @@ from fishd.control.loop import SETTLE_TIME_S
 from fishd.control.supervisor import Mode
 from fishd.controllers import registry
 from fishd.controllers.policy.runtime import preload
-from fishd.core import addresses
+from fishd.core import addresses, local_daemons
 from fishd.core.clock import Clock, SlowClock, SystemClock, Ticker, VirtualClock
 from fishd.core.console import log_format_option, run, status_line
 from fishd.core.errors import ConfigError, FishdError, ServoError
@@ -30,9 +30,11 @@ from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
 from fishd.core.process.shutdown import Shutdown, exit_now
 from fishd.core.process.systemd_notify import SystemdNotifier
 from fishd.daemon.calibration_requests import CalibrationRequests
-from fishd.daemon.control_server import ControlServer, EstopSocket
+from fishd.daemon.control_server import ControlServer
+from fishd.daemon.direct_sockets import open_at_file, open_in_kernel
 from fishd.daemon.gateway.gateways import Gateways, Telemetry
-from fishd.daemon.requests import Operations
+from fishd.daemon.requests import Access, Operations
+from fishd.daemon.socket_files import SocketWatch
 from fishd.daemon.virtual_pace import Lockstep, SlowMotion
 from fishd.daemon.warm_up import mock_ticks
 from fishd.hardware.base import Robot
@@ -65,7 +67,9 @@ class Daemon:
         self._clock = SlowClock() if self._slow else _clock(config)
         self._virtual = isinstance(self._clock, VirtualClock)
         self._events = asyncio.get_running_loop()
-        self._housekeeping = itertools.cycle((self._report, self._collect_garbage))
+        self._housekeeping = itertools.cycle(
+            (self._report, self._check_sockets, self._collect_garbage, self._check_sockets)
+        )
         self._next_housekeeping = 0.0
         self._stack = ExitStack()
 
@@ -113,17 +117,22 @@ class Daemon:
                 calibration_requests,
                 config,
                 controllers,
-                self._gateways.telemetry.address,
                 self.is_realtime,
-                self._gateways.counters,
-                self._gateways.keyed_telemetry,
+                self._access,
             )
             self._server = ControlServer(self._operations.perform, config.tick)
             self._gateways.serve(self._server, self._loop.reporter)
             stack.callback(self._server.close)
-            if path := addresses.estop_path(address):
-                estop_socket = EstopSocket(path, self._server.reply_to_estop, config.tick)
-                stack.callback(estop_socket.close)
+            answer = self._server.reply_directly, config.tick
+            if direct := open_in_kernel(local_daemons.name_of_this(address), *answer):
+                stack.callback(direct.close)
+            self._sockets = SocketWatch(
+                self._loop,
+                self._gateways,
+                config.control.address,
+                lambda path: open_at_file(path, *answer),
+                stack,
+            )
             self._stack = stack.pop_all()
         return self
 
@@ -198,11 +207,24 @@ class Daemon:
             if self._loop.lease.active:
                 self._loop.expire_lease()
         if now >= self._next_housekeeping:
-            self._next_housekeeping = now + STATUS_PERIOD_S / 2
+            self._next_housekeeping = now + STATUS_PERIOD_S / 4
             next(self._housekeeping)()
 
     def _collect_garbage(self) -> None:
         realtime.collect_garbage(thorough=self._loop.supervisor.mode is not Mode.RUNNING)
+
+    def _check_sockets(self) -> None:
+        self._sockets.check()
+
+    def _access(self) -> Access:
+        gateways, sockets = self._gateways, self._sockets
+        return Access(
+            sockets.control,
+            gateways.telemetry.address,
+            gateways.keyed_telemetry,
+            sockets.limitation,
+            {**gateways.counters(), "sockets_restored": sockets.restored},
+        )
 
     def _ticked(self, now: float) -> None:
         """Notify systemd of a tick; `now` is its start on the loop's clock [s]."""

@@ -4,9 +4,9 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from msgspec import Struct
 
@@ -31,6 +31,20 @@ from fishd.daemon.calibration_requests import CalibrationRequests, Handlers
 log = logging.getLogger(__name__)
 
 
+class Access(NamedTuple):
+    """How clients reach fishd now."""
+
+    control: str = ""
+    """Address of the control socket; empty without one."""
+    telemetry: str = ""
+    keyed_telemetry: str = ""
+    """Address of telemetry for clients with a key; empty for none."""
+    limitation: str = ""
+    """Line about what is wrong with the sockets; empty if nothing is."""
+    counters: Mapping[str, int] = {}
+    """Numbers of recovered errors since start."""
+
+
 class Operations:
     """Handlers of the requests, which read the loop's state and change it between its ticks."""
 
@@ -41,26 +55,20 @@ class Operations:
         calibration_requests: CalibrationRequests,
         config: Config,
         controllers: list[ControllerInfo],
-        telemetry: str,
         realtime: bool,
-        counters: Callable[[], dict[str, int]] = dict,
-        keyed_telemetry: str = "",
+        access: Callable[[], "Access"] = Access,
     ) -> None:
         """Prepare to answer requests.
 
         config: configuration that fishd was started with
         controllers: controllers that can be made active
-        telemetry: address of telemetry for clients
         realtime: whether the loop runs under SCHED_FIFO
-        counters: function that returns the numbers of recovered errors outside of the robot
-        keyed_telemetry: address of telemetry for clients with a key; empty for none
+        access: function that returns how clients reach this fishd
         """
         self._loop = loop
         self._clock = clock
-        self._telemetry = telemetry
-        self._keyed_telemetry = keyed_telemetry
         self._realtime = realtime
-        self._counters = counters
+        self._access = access
         self._calibrations = calibration_requests
         self._config = config
         self._name = config.name or text.line(socket.gethostname(), 40) or "fish"
@@ -106,7 +114,7 @@ class Operations:
 
     def status(self) -> Status:
         """Return a snapshot of the daemon's state."""
-        loop = self._loop
+        loop, access = self._loop, self._access()
         observation = loop.observation
         thrust, error = loop.known_thrust
         return Status(
@@ -131,10 +139,10 @@ class Operations:
             overruns=loop.statistics.overruns,
             timing=loop.statistics.timing(),
             robot=loop.robot.name,
-            limitations=self._limitations(),
-            recovered_errors={**loop.robot.counters(), **self._counters()},
+            limitations=(*self._limitations(), *filter(None, [access.limitation])),
+            recovered_errors={**loop.robot.counters(), **access.counters},
             realtime=self._realtime,
-            telemetry=self._telemetry,
+            telemetry=access.telemetry,
             servo_lost=loop.servo.lost,
             fallback=loop.active.fallback,
             sensor_lost=loop.supervisor.sensor_lost,
@@ -152,7 +160,8 @@ class Operations:
             leak=loop.found_leak,
             lease=loop.lease.holder,
             lease_expiry=loop.lease.expired,
-            keyed_telemetry=self._keyed_telemetry,
+            keyed_telemetry=access.keyed_telemetry,
+            control=access.control,
         )
 
     def _limitations(self) -> tuple[str, ...]:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from fishd.core.calibration import ForceCalibration, ServoCalibration
@@ -92,6 +93,11 @@ class Robot:
     """Called between the ticks of a loop in real time, just before the next read."""
     countdown: float = math.inf
     """Time for which the servo continues without a write [s]; see `ServoDriver.countdown`."""
+    write_recipes: Callable[[Path], None] = lambda control: None
+    """Writes again how other programs end the pulses, after the runtime folder was gone.
+
+    Called with the file of the control socket.
+    """
 
     @property
     def force_unit(self) -> str:

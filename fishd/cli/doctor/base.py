@@ -15,6 +15,7 @@ from fishd.client import Fish
 from fishd.client.connection import DEFAULT_TIMEOUT_S
 from fishd.config import Config
 from fishd.config.drivers import CHOICES
+from fishd.core import local_daemons
 from fishd.core.addresses import find_control_address, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
 from fishd.core.plugins import Plugins
@@ -48,13 +49,14 @@ class Unreachable(NamedTuple):
 
 
 def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
-    """Return the state of the daemon at an endpoint; None if certainly no process listens there.
+    """Return the state of the daemon at an endpoint; None if there certainly is none.
 
-    A fishd at another control.address stays undetected, even if it owns the same bus.
+    Without an endpoint, a fishd of this user is found wherever its socket is. A fishd that serves
+    another endpoint than the given one stays undetected, even if it owns the same bus.
     """
     given_endpoint, endpoint = endpoint, endpoint or find_control_address()
     try:
-        if is_unused(endpoint):
+        if is_unused(endpoint) and not local_daemons.find_own(endpoint):
             return None
     except PermissionError:
         return Unreachable(f"there may be a fishd at {endpoint}, but this user may not ask", True)
@@ -108,7 +110,7 @@ def _latest_tick(fish: Fish) -> Tick | None:
 def _read_calibrations(fish: Fish) -> Calibrations | None:
     try:
         return fish.calibrations()
-    except Refused:
+    except (Refused, NoDaemon):  # without a control socket there is no answer
         return None
 
 

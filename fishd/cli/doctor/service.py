@@ -7,7 +7,7 @@ import msgspec
 import zmq
 
 from fishd.cli.doctor.base import ANSWER_TIMEOUT_S, Context, Running, Unreachable, is_unused
-from fishd.core import addresses
+from fishd.core import addresses, local_daemons
 from fishd.core.errors import FishError, StartupError
 from fishd.hardware.checks import Check, Result, fail, ok, skipped, warning
 
@@ -23,6 +23,12 @@ def daemon(context: Context) -> Result:
                 f"no fishd at {context.endpoint or addresses.find_control_address()}, but "
                 f"{context.owner}",
                 "name its control.address with --endpoint",
+            )
+        if others := local_daemons.find_all():
+            return warning(
+                f"no fishd at {context.endpoint or addresses.find_control_address()}, but "
+                f"{', '.join(other.describe() for other in others)}",
+                "name the one that you mean with --endpoint",
             )
         return ok("no fishd is running")
     if isinstance(context.daemon, Unreachable):
@@ -53,7 +59,11 @@ def telemetry(context: Context) -> Result:
 
 def control(context: Context) -> Result:
     """Check that the control address is free, or used by the daemon."""
-    served = context.daemon.endpoint if isinstance(context.daemon, Running) else None
+    served = None
+    if isinstance(context.daemon, Running):
+        served = context.daemon.endpoint
+        if not context.daemon.status.control:
+            return fail(f"{served} is gone, and fishd cannot create it", "see 'daemon'")
     try:
         address = context.config.control.address or served or addresses.control_address()
     except StartupError as error:

@@ -38,15 +38,14 @@ def lock_path(path: Path) -> Path:
 
 
 @contextmanager
-def locked(path: Path, *, shared: bool = False, remove: bool = False) -> Iterator[None]:
+def locked(path: Path, *, remove: bool = False) -> Iterator[None]:
     """Hold the lock of `path`, and create the lock file if it does not exist.
 
-    shared: the group of the file may lock it, too, and another user may have created it
     remove: remove the lock file at the end, if that is permitted
     Raise `LockHeld` if a process holds it, this one included, OSError if it cannot be created, and
     `NotALock`, an OSError, if the path is something else.
     """
-    lock = _acquire_lock(path, shared)
+    lock = _acquire_lock(path)
     try:
         os.ftruncate(lock, 0)
         os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
@@ -64,7 +63,7 @@ def find_lock_holder(path: Path) -> str:
     The check holds the lock for a moment.
     """
     try:
-        lock = _open_lock(lock_path(path), os.O_RDONLY, shared=True)
+        lock = _open_lock(lock_path(path), os.O_RDONLY)
     except OSError:  # it was never held, or this user may not read it
         return ""
     try:
@@ -76,10 +75,10 @@ def find_lock_holder(path: Path) -> str:
     return ""
 
 
-def _acquire_lock(path: Path, shared: bool) -> int:
+def _acquire_lock(path: Path) -> int:
     """Return the lock file, open and locked; retry if its holder has just removed it."""
     while True:
-        lock = _open_lock(lock_path(path), os.O_RDWR, shared=shared)
+        lock = _open_lock(lock_path(path), os.O_RDWR)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             with suppress(FileNotFoundError):
@@ -95,7 +94,7 @@ def _acquire_lock(path: Path, shared: bool) -> int:
         os.close(lock)
 
 
-def _open_lock(path: Path, flags: int, *, shared: bool) -> int:
+def _open_lock(path: Path, flags: int) -> int:
     flags |= _SAFE_OPEN_FLAGS
     try:
         # First without O_CREAT, which Linux may refuse for an existing file of another user.
@@ -109,24 +108,23 @@ def _open_lock(path: Path, flags: int, *, shared: bool) -> int:
             raise NotALock(path, "a symbolic link") from None
         raise
     status = os.fstat(lock)
-    if problem := _find_lock_problem(status, path.parent, shared):
+    if problem := _find_lock_problem(status, path.parent):
         os.close(lock)
         raise NotALock(path, problem)
     # Read permission is enough to lock a file.
-    mode = 0o660 if shared else 0o600
-    if status.st_uid == os.geteuid() and stat.S_IMODE(status.st_mode) != mode:
-        os.fchmod(lock, mode)
+    if status.st_uid == os.geteuid() and stat.S_IMODE(status.st_mode) != 0o600:
+        os.fchmod(lock, 0o600)
     return lock
 
 
-def _find_lock_problem(status: os.stat_result, folder: Path, shared: bool) -> str:
+def _find_lock_problem(status: os.stat_result, folder: Path) -> str:
     """Return why an open file is not a lock file of fishd; empty if it is one."""
     if not stat.S_ISREG(status.st_mode):
         return "not a regular file"
     if status.st_nlink > 1:
         return "a hard link to another file"
     owners = {os.geteuid(), 0, folder.stat().st_uid}
-    if not shared and status.st_uid not in owners:
+    if status.st_uid not in owners:
         return f"a file of user {status.st_uid}"
     return ""
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fishd.core.errors import StartupError
-from fishd.core.process.lockfile import LockHeld, NotALock, lock_path, locked
+from fishd.core.process.kernel_names import NameTaken, claimed
 
 MAX_PATH_BYTES = 107
 """Maximum length of the path of a Unix socket in Linux [bytes]."""
@@ -111,10 +111,10 @@ def _connect(probe: socket.socket, path: Path) -> int:
 
 @contextmanager
 def claim_socket(path: Path, name: str, rival: str, advice: str) -> Iterator[None]:
-    """Make sure that no other process serves this socket, and remove its files at the end.
+    """Make sure that no other process serves this socket, and remove its file at the end.
 
     Binding alone is not enough: ZeroMQ replaces the socket file of a running process, and leaves
-    its own behind.
+    its own behind. The claim is a name in the kernel, which stays when the folder is removed.
 
     name: name of the socket in messages
     Raise `StartupError` with `rival` and `advice` if a process, even this one, serves the socket.
@@ -123,28 +123,37 @@ def claim_socket(path: Path, name: str, rival: str, advice: str) -> Iterator[Non
         try:
             if path.exists() and not path.is_socket():
                 raise StartupError(f"{path} exists and is not a socket; choose another address")
-            stack.enter_context(locked(path.resolve(), remove=True))
-        except LockHeld as held:
+            stack.enter_context(claimed(_claim_name(path)))
+        except NameTaken as taken:
             raise StartupError(
-                f"{rival} (pid {held.pid}) already serves {name}; {advice}"
-            ) from None
-        except NotALock as error:
-            raise StartupError(
-                f"{error.filename} {error.strerror}; remove it, or choose an address in a folder "
-                "that you own"
+                f"{rival} (pid {taken.holder}) already serves {name}; {advice}"
             ) from None
         except OSError as error:
             raise StartupError(
-                f"{lock_path(path)} cannot be created: {error.strerror}; "
-                "choose an address in a folder that exists and that you may write to"
+                f"{path} cannot be used: {error.strerror}; choose an address in a folder that "
+                "exists and that you may write to"
             ) from None
         deadline = time.monotonic() + RELEASE_TIMEOUT_S
         while path.is_socket() and not is_deserted(path):
-            if time.monotonic() > deadline:  # a program without a lock file
+            if time.monotonic() > deadline:  # a program without such a name
                 raise StartupError(f"another program already serves {name}; {advice}")
             time.sleep(RETRY_INTERVAL_S)
-        stack.callback(path.unlink, missing_ok=True)
+        stack.callback(_remove_file, path)
         yield
+
+
+def _claim_name(path: Path) -> str:
+    """Return the name in the kernel for a path, the same for all links to it.
+
+    Processes in containers may have another folder of the same name.
+    """
+    file_systems = Path("/proc/self/ns/mnt").stat().st_ino
+    return f"serves/{file_systems}{path.resolve()}"
+
+
+def _remove_file(path: Path) -> None:
+    with suppress(OSError):  # its folder may be gone, or be another user's
+        path.unlink()
 
 
 def bind(server: socket.socket, path: Path, mask: int | None = None) -> None:

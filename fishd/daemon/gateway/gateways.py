@@ -31,6 +31,7 @@ from fishd.daemon.gateway.link import (
     END,
     KEYED_CONTROL,
     KEYED_TELEMETRY,
+    LISTEN,
     MAX_MESSAGE_BYTES,
     NOTICE,
     PING,
@@ -276,7 +277,8 @@ class Gateway(_Peer):
         """Start the process; must be called in a running asyncio loop.
 
         kind: TELEMETRY or CONTROL, or the same with keys
-        listener: socket that clients connect to; it stays open during restarts of the process
+        listener: socket that clients connect to; it stays open during restarts of the process,
+            and `close` closes it
         address: ZeroMQ address of the listener
         keys: secret key and folder of the keys, for a kind with keys
         """
@@ -329,6 +331,17 @@ class Gateway(_Peer):
             self.lost += 1
         return True
 
+    def listen_at(self, address: str, listener: socket.socket) -> None:
+        """Listen at another address, too; connections through the present one stay.
+
+        Raise OSError if the process could not be told; nothing has changed then.
+        """
+        if self._link is not None:  # else the next process gets the listener when it starts
+            socket.send_fds(self._link, [LISTEN + address.encode()], [listener.fileno()])
+        self._listener.close()
+        self._listener = listener.dup()
+        self.address = address
+
     def read(self, enabled: bool) -> None:
         """Read messages, or let them wait in the link."""
         self._enabled = enabled
@@ -361,6 +374,7 @@ class Gateway(_Peer):
             if ended:
                 break
         self._drop_link()
+        self._listener.close()
 
     def beat(self) -> None:
         """Send a heartbeat, unless the gateway still waits for the fork server."""
@@ -512,11 +526,11 @@ class Gateways:
 def _open(kind: str, address: str, server: ForkServer, stack: ExitStack, keys: str = "") -> Gateway:
     key = kind.replace("keyed-", "network.") if keys else f"{kind}.address"
     listener = addresses.listen(address, key, group=kind == CONTROL)
-    stack.callback(listener.close)
     where = addresses.reachable_address(address, listener)
     try:
         gateway = Gateway(kind, listener, where, server, keys)
     except OSError as error:
+        listener.close()
         raise StartupError(f"the gateway of {kind} cannot be started: {error.strerror}") from None
     stack.callback(gateway.close)
     return gateway

@@ -2,6 +2,10 @@
 
 import socket
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import zmq
 
 MAX_MESSAGE_BYTES = 65536
 """Largest size of a message on a link [bytes]; longer replies are sent in parts."""
@@ -15,6 +19,8 @@ REQUEST, READY, NOTICE, END = b"?", b"^", b"!", b"."
 start may name a mistake in the file of known keys."""
 PING, PONG = b"~", b"-"
 """First bytes of a heartbeat and of the answer to it."""
+LISTEN = b"@"
+"""First byte of a further address to listen at; its listener is sent with it."""
 START, STARTED = b"*", b"/"
 """First bytes of a request to the fork server for a gateway, and of the answer to it."""
 _PART, _LAST = b"+", b"="
@@ -39,6 +45,14 @@ def kind_and_address(message: bytes) -> tuple[str, str]:
     """Return the kind and the address in a request for a gateway."""
     kind, _, address = message[1:].decode().partition(" ")
     return kind, address
+
+
+def listen(server: "zmq.Socket[bytes]", message: bytes, listener: int) -> None:
+    """Let a gateway's socket listen at the address in a message, too; `listener` is its socket."""
+    import zmq
+
+    server.set(zmq.USE_FD, listener)
+    server.bind(message[1:].decode())
 
 
 def started(kind: str, pid: int, outcome: str) -> bytes:

@@ -3,13 +3,14 @@
 import mmap
 import select
 import socket
+import struct
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import zmq
 
 from fishd.daemon.gateway.limits import ResourceLimits
-from fishd.daemon.gateway.link import END, PING, PONG, split_frames
+from fishd.daemon.gateway.link import END, LISTEN, PING, PONG, listen, split_frames
 
 if TYPE_CHECKING:
     from fishd.daemon.gateway.keys import KnownKeys
@@ -28,6 +29,8 @@ MAX_RECEIVED_BYTES = 512
 """Largest message from a subscriber, a topic or a handshake [bytes]."""
 HANDSHAKE_TIMEOUT_MS = 2000
 """Longest time for the handshake of a connection [ms]."""
+_LISTENER_BYTES = socket.CMSG_SPACE(struct.calcsize("i"))
+"""Size of the ancillary data with a file descriptor [bytes]."""
 _CHECK_PERIOD_MS = 100
 """Longest time between two checks of the limits [ms]."""
 
@@ -47,7 +50,8 @@ def run(
         if not poller.poll(_CHECK_PERIOD_MS):
             continue
         try:
-            message = bytes(buffer[: link.recv_into(buffer)])
+            size, ancillary, _, _ = link.recvmsg_into([buffer], _LISTENER_BYTES)
+            message = bytes(buffer[:size])
         except ConnectionResetError:  # fishd was killed
             return ""
         if message in (b"", END):
@@ -55,6 +59,9 @@ def run(
         if message == PING:
             with suppress(OSError):  # the next `recv` notices that fishd was killed
                 link.send(PONG)
+            continue
+        if message.startswith(LISTEN):
+            listen(server, message, *struct.unpack("i", ancillary[0][2]))
             continue
         server.send_multipart(split_frames(message), zmq.DONTWAIT)
     return why

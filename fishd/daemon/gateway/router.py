@@ -11,7 +11,16 @@ import zmq
 from fishd.core import protocol
 from fishd.core.errors import Refused
 from fishd.daemon.gateway.limits import ResourceLimits
-from fishd.daemon.gateway.link import END, MAX_MESSAGE_BYTES, PING, PONG, Replies, request
+from fishd.daemon.gateway.link import (
+    END,
+    LISTEN,
+    MAX_MESSAGE_BYTES,
+    PING,
+    PONG,
+    Replies,
+    listen,
+    request,
+)
 
 if TYPE_CHECKING:
     from fishd.daemon.gateway.keys import KnownKeys
@@ -110,7 +119,7 @@ class Router:
     def _take_replies(self) -> None:
         while not self._ended:
             try:
-                message = self._link.recv(2 * MAX_MESSAGE_BYTES)
+                message, listeners, _, _ = socket.recv_fds(self._link, 2 * MAX_MESSAGE_BYTES, 1)
             except BlockingIOError:
                 return
             except ConnectionResetError:  # fishd was killed
@@ -121,6 +130,9 @@ class Router:
             if message == PING:
                 with suppress(OSError):  # the next `recv` notices that fishd was killed
                     self._link.send(PONG)
+                continue
+            if message.startswith(LISTEN):
+                listen(self._server, message, *listeners)
                 continue
             reply = self._replies.take(message)
             if reply:

@@ -79,7 +79,11 @@ def test_the_socket_of_a_killed_daemon_is_not_a_daemon(tmp_path: Path, scheme: s
             port.bind(("127.0.0.1", 0))
             endpoint = f"tcp://127.0.0.1:{port.getsockname()[1]}"
             _, findings = doctor(tmp_path, "--endpoint", endpoint, *free_telemetry())
-    assert findings["daemon"] == ("ok", "no fishd is running")
+    level, message = findings["daemon"]
+    # Other tests may run a fishd now.
+    assert (level, message) == ("ok", "no fishd is running") or message.startswith(
+        f"no fishd at {endpoint}, but the fishd of process "
+    )
 
 
 @pytest.mark.usefixtures("hurried_doctor")

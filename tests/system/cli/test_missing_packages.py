@@ -48,14 +48,12 @@ def test_fishd_on_a_pi_does_not_start_without_what_it_needs(
     env = environment_without(tmp_path, *modules)
     with (tmp_path / "sitecustomize.py").open("a") as file:  # another fishd may hold these pins
         file.write(
-            "from pathlib import Path\n"
-            "from fishd.hardware import ownership\n"
-            f"ownership.FOLDER = Path({str(tmp_path)!r})\n"
+            "from fishd.core.process import kernel_names\n"
+            f"kernel_names._PREFIX = 'test-{os.getpid()}'\n"
         )
     pi = sets("robot=pi", "force_sensor.bus=255", *settings)  # no machine has this bus
     paths = [*sets(f"state_folder={tmp_path}"), *addresses(tmp_path)]
     ended = call(FISHD, *pi, *paths, env=env)
-    assert (tmp_path / "fishd-i2c-255.lock").exists()
     assert ended.returncode == 1
     assert re.fullmatch(complaint, ended.stderr)
 

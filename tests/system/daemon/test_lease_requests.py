@@ -19,7 +19,7 @@ class Client:
     def __init__(self, rig: Rig, folder: Path) -> None:
         self.rig = rig
         requests = CalibrationRequests(rig.loop, rig.clock, rig.config, folder)
-        self._operations = Operations(rig.loop, rig.clock, requests, rig.config, [], "", False)
+        self._operations = Operations(rig.loop, rig.clock, requests, rig.config, [], False)
 
     async def ask(self, op: str, **args: Any) -> Any:
         return await self._operations.perform(op, args)

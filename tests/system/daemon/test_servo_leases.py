@@ -32,7 +32,7 @@ class Client:
     def __init__(self, rig: LockstepRig) -> None:
         self.rig = rig
         requests = CalibrationRequests(rig.loop, rig.clock, rig.config, state_folder(rig.config))
-        self._operations = Operations(rig.loop, rig.clock, requests, rig.config, [], "", False)
+        self._operations = Operations(rig.loop, rig.clock, requests, rig.config, [], False)
 
     async def ask(self, op: str, **args: Any) -> Any:
         return await self._operations.perform(op, args)

@@ -1,6 +1,7 @@
 """The packages in docs/example-drivers, installed and used as their reader would."""
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -22,6 +23,7 @@ from fishd.config import load
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import ConfigError, ServoError, StartupError
+from fishd.core.process import kernel_names
 from fishd.hardware import ownership
 from fishd.hardware.driver import Pair
 from fishd.hardware.sampler import Sampler
@@ -196,7 +198,7 @@ PCA9685 = ["servo.driver=pca9685", "servo.bus=177", "force_sensor.bus=178"]
 def test_a_second_fishd_on_the_same_chip_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: list[str], part: int, complaint: str
 ) -> None:
-    monkeypatch.setattr(ownership, "FOLDER", tmp_path)
+    monkeypatch.setattr(kernel_names, "_PREFIX", f"test-{os.getpid()}")
     config = load(None, ["robot=pi", *settings, f"state_folder={tmp_path}"])
     with (
         ownership.claim_parts(assembly.parts_of(config)[part : part + 1]),

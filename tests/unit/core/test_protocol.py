@@ -90,5 +90,5 @@ def test_the_id_of_a_broken_request_is_found_where_there_is_one() -> None:
 def test_what_the_protocol_lists_is_what_fishd_answers(tmp_path: Path) -> None:
     rig = Rig()
     bench = CalibrationRequests(rig.loop, rig.clock, rig.config, tmp_path)
-    operations = Operations(rig.loop, rig.clock, bench, rig.config, [], "", realtime=False)
+    operations = Operations(rig.loop, rig.clock, bench, rig.config, [], realtime=False)
     assert [*operations._handlers] == [*protocol.OPERATIONS]

@@ -592,7 +592,7 @@ def test_a_gateway_that_ends_at_once_is_started_again_and_again_but_not_in_a_spi
 
     async def watch() -> tuple[float, int]:
         started = asyncio.get_running_loop().time()
-        gateway = Gateway(link.TELEMETRY, None, "", FailingServer())  # type: ignore[arg-type]
+        gateway = Gateway(link.TELEMETRY, socket.socket(), "", FailingServer())  # type: ignore[arg-type]
         while starts < 5:
             await asyncio.sleep(0.01)
         duration = asyncio.get_running_loop().time() - started

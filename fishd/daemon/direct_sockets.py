@@ -1,0 +1,142 @@
+"""fishd's own sockets for an emergency stop and few other requests, which need no gateway.
+
+A client sends a request there as one datagram if the control socket does not answer. One socket is
+a file beside the control socket. The other is a name in the kernel, which no change of a folder
+takes away. The kernel queues only a few datagrams, each of a limited size.
+"""
+
+import asyncio
+import grp
+import logging
+import os
+import pwd
+import socket
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from pathlib import Path
+
+from fishd.core import protocol
+from fishd.core.process import kernel_names, unix_sockets
+from fishd.core.process.kernel_names import Holder
+
+log = logging.getLogger(__name__)
+
+_MAX_REFUSED = 32
+"""Largest number of datagrams of other users that are read, and dropped, for one that is not."""
+
+Perform = Callable[[bytes], Awaitable[bytes]]
+
+
+class DirectSocket:
+    """Socket that receives requests as datagrams, at most one in each period."""
+
+    def __init__(self, server: socket.socket, perform: Perform, period: float) -> None:
+        """Begin to read a bound socket; must be called in a running asyncio loop.
+
+        perform: function that carries out or refuses a request and returns the reply
+        period: shortest time between two requests [s]
+        """
+        self._socket = server
+        self._perform = perform
+        self._period = period
+        self._events = asyncio.get_running_loop()
+        self._task: asyncio.Task[None] | None = None
+        self._events.add_reader(server, self._take)
+
+    def close(self) -> None:
+        """Stop listening; may be called twice."""
+        if self._socket.fileno() >= 0:
+            self._events.remove_reader(self._socket)
+            self._socket.close()
+
+    def _resume(self) -> None:
+        if self._socket.fileno() >= 0:
+            self._events.add_reader(self._socket, self._take)
+
+    def _take(self) -> None:
+        received = self._receive()
+        if received:
+            self._events.remove_reader(self._socket)
+            self._task = self._events.create_task(self._answer(*received))
+            self._events.call_later(self._period, self._resume)
+
+    def _receive(self) -> tuple[bytes, str | bytes | None] | None:
+        """Return a request and the address of its client; None without a permitted one."""
+        try:
+            return self._socket.recvfrom(protocol.MAX_MESSAGE)
+        except OSError:
+            return None
+
+    async def _answer(self, payload: bytes, sender: str | bytes | None) -> None:
+        reply = await self._perform(payload)
+        if sender:
+            with suppress(OSError):  # the client has ended, or does not read
+                self._socket.sendto(reply, sender)
+
+
+class KernelSocket(DirectSocket):
+    """Socket with a name in the kernel, for this user, root and the members of this group.
+
+    Datagrams of other users are dropped without an answer.
+    """
+
+    def __init__(self, name: str, perform: Perform, period: float) -> None:
+        """Listen at a name; raise OSError."""
+        self._permitted = {0, os.geteuid(), *_members_of_group()}
+        super().__init__(kernel_names.bind_datagrams(name), perform, period)
+
+    def _receive(self) -> tuple[bytes, str | bytes | None] | None:
+        for _ in range(_MAX_REFUSED):
+            try:
+                payload, client, sender = kernel_names.receive_datagram(
+                    self._socket, protocol.MAX_MESSAGE
+                )
+            except OSError:
+                return None
+            if self._is_permitted(client):
+                return payload, sender
+        return None
+
+    def _is_permitted(self, client: Holder) -> bool:
+        return client.user in self._permitted
+
+
+def open_at_file(path: Path, perform: Perform, period: float) -> DirectSocket | None:
+    """Return a socket at a path next to a socket that is `claimed`; None if it cannot be made.
+
+    The reason is logged. Only this user and the group of this process may connect.
+    """
+    server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    server.setblocking(False)
+    try:
+        unix_sockets.check_length(str(path))
+        unix_sockets.bind(server, path, unix_sockets.GROUP_MASK)
+    except (OSError, ValueError) as error:
+        log.warning(
+            "%s: not available, so an emergency stop needs the control socket: %s", path, error
+        )
+        server.close()
+        return None
+    return DirectSocket(server, perform, period)
+
+
+def open_in_kernel(name: str, perform: Perform, period: float) -> KernelSocket | None:
+    """Return a socket at a name in the kernel; None if it cannot be made, which is logged."""
+    try:
+        return KernelSocket(name, perform, period)
+    except OSError as error:
+        log.warning(
+            "no name in the kernel (%s), so this fishd is found only by the files of its sockets",
+            error.strerror,
+        )
+        return None
+
+
+def _members_of_group() -> set[int]:
+    """Return the users that belong to the group of this process by the system's list of groups."""
+    members = set()
+    with suppress(KeyError, OSError):
+        for name in grp.getgrgid(os.getegid()).gr_mem:
+            with suppress(KeyError):
+                members.add(pwd.getpwnam(name).pw_uid)
+    return members

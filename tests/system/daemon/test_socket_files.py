@@ -1,0 +1,301 @@
+"""A fishd whose sockets, or their folder, are gone can be found, seen and stopped."""
+
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from rigs.doctor_process import doctor, free_telemetry
+from rigs.other_user import command_as_user, spare_user
+from rigs.processes import (
+    FISHCTL,
+    FISHD,
+    Daemon,
+    Process,
+    Subscriber,
+    call,
+    one_line,
+    running,
+    sets,
+    wait_until,
+)
+
+from fishd.client import Fish, NoDaemon
+from fishd.core import local_daemons
+from fishd.core.process import kernel_names
+
+SWIM = ("set-controller", "hold", "--angle", "0.2")
+
+
+def break_folder(folder: Path) -> Path:
+    """Put a file in the place of a folder, which then cannot be created; return the folder."""
+    kept = folder.with_name("kept")
+    folder.rename(kept)
+    folder.touch()
+    return kept
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Folder of the sockets of a fishd."""
+    made = tmp_path / "sockets"
+    made.mkdir()
+    return made
+
+
+def test_sockets_are_created_again_when_their_folder_was_removed(folder: Path) -> None:
+    with running(folder, *sets(f"telemetry.address=ipc://{folder}/telemetry")) as daemon:
+        with Fish(daemon.endpoint) as earlier, earlier.lease("experiment"):
+            earlier.set_controller("hold", angle=0.2)
+            shutil.rmtree(folder)
+            wait_until((folder / "control.estop").exists)
+            assert folder.stat().st_mode & 0o777 == 0o755  # as it was
+            with Fish(daemon.endpoint) as fish:
+                ticks = fish.ticks()
+                assert next(ticks).mode == "running"
+                status = fish.status()
+            assert earlier.status().lease  # its connection has survived, and so has its lease
+        assert status.recovered_errors["sockets_restored"] == 1
+        assert status.limitations == ()
+        assert status.control == daemon.endpoint
+        (folder / "control.estop").unlink()  # one file alone
+        wait_until((folder / "control.estop").exists)
+        assert daemon.fishctl("status").returncode == 0
+    assert list(folder.iterdir()) == []
+
+
+def test_the_loss_of_sockets_is_an_event_and_a_line_in_the_log(folder: Path) -> None:
+    with Daemon(folder) as daemon:
+        events = Subscriber(daemon.wait_until_up().telemetry, b"event").connected()
+        (folder / "control").unlink()
+        _, event = events.socket.recv_multipart()
+        message = "the files of fishd's sockets were gone and have been created again; control "
+        assert json.loads(event)["kind"] == "sockets"
+        assert json.loads(event)["message"] == f"{message}{daemon.endpoint}"
+        events.close()
+        assert message in daemon.end()[2]
+
+
+@pytest.mark.realtime
+def test_a_gone_folder_is_noticed_within_a_second(folder: Path) -> None:
+    with running(folder) as daemon, Fish(daemon.endpoint) as fish:
+        for _ in range(5):
+            shutil.rmtree(folder)
+            gone = time.monotonic()
+            while not (folder / "control.estop").exists():
+                time.sleep(0.01)
+            assert time.monotonic() - gone < 1.0
+        assert fish.status().missed_slots == 0
+
+
+def test_a_fish_that_no_client_can_reach_rests_and_can_still_be_stopped(folder: Path) -> None:
+    with running(folder) as daemon:
+        assert daemon.fishctl(*SWIM).returncode == 0
+        kept = break_folder(folder)
+        wait_until(lambda: daemon.status().mode == "idle")  # by its name in the kernel
+        status = daemon.fishctl("status")
+        assert status.returncode == 0
+        assert f"process {daemon.pid} answered at its name in the kernel" in status.stderr
+        assert "rests, as   no client can connect to this fishd" in status.stdout
+        assert "are gone and cannot be created: " in status.stdout
+        assert daemon.fishctl("stop").stdout.startswith("idle")
+        refused = one_line(daemon.fishctl("set-controller", "swing"))
+        assert f"no fishd at {daemon.endpoint}" in refused
+        assert f"process {daemon.pid}" in refused
+        _, findings = doctor(folder.parent, "--endpoint", daemon.endpoint, *free_telemetry())
+        assert findings["daemon"][0] == "warning"
+        assert f"(pid {daemon.pid})" in findings["daemon"][1]
+        assert findings["control"][0] == "FAIL"
+        ended = daemon.fishctl("estop")
+        assert ended.stdout.startswith("estop")
+        assert "stopped through: fishd's name in the kernel: " in ended.stdout
+        folder.unlink()
+        kept.rename(folder)
+        wait_until((folder / "control").exists)
+        wait_until(lambda: daemon.status().control == daemon.endpoint)
+        assert daemon.status().mode == "estop"
+
+
+def test_an_experiment_goes_on_while_no_other_client_can_connect(folder: Path) -> None:
+    with running(folder) as daemon, Fish(daemon.endpoint) as fish:
+        with fish.lease("experiment"):
+            fish.set_controller("hold", angle=0.2)
+            kept = break_folder(folder)
+            wait_until(
+                lambda: any("cannot be created" in line for line in fish.status().limitations)
+            )
+            assert fish.status().mode == "running"
+        folder.unlink()
+        kept.rename(folder)
+
+
+def test_a_controller_that_is_to_start_later_does_not_start_unreachable(folder: Path) -> None:
+    with running(folder, *sets("start.controller=swing", "start.rest=3600")) as daemon:
+        kept = break_folder(folder)
+        wait_until(lambda: daemon.status().lease_expiry is not None)
+        folder.unlink()
+        kept.rename(folder)
+
+
+def test_a_file_of_another_program_is_not_replaced(folder: Path) -> None:
+    with running(folder) as daemon:
+        with socket.socket(socket.AF_UNIX) as other:
+            (folder / "control").unlink()
+            other.bind(f"{folder}/control")
+            other.listen()
+            (folder / "control.estop").unlink()
+            found = (folder / "control").stat().st_ino
+            complaint = "another program has put something else at "
+
+            def is_reported() -> bool:
+                (own,) = local_daemons.find_own(daemon.endpoint)
+                return complaint in str(own.ask(b'{"v": 2, "op": "status"}'))
+
+            if (folder / "control").stat().st_ino == found:  # bound before fishd looked
+                wait_until(is_reported)
+                assert (folder / "control").stat().st_ino == found
+        (folder / "control").unlink()
+        wait_until((folder / "control").exists)
+
+
+class User(NamedTuple):
+    """Another user with folders of its own, whose fishds only its programs meet."""
+
+    number: int
+    command: tuple[str, ...]
+    home: Path
+
+    def in_session(self, session: Path | None) -> list[str]:
+        """Return the beginning of a command in a login session, or without one, as in cron."""
+        login = f"XDG_RUNTIME_DIR={session}" if session else "--unset=XDG_RUNTIME_DIR"
+        *become, env, path, python = self.command
+        return [*become, env, login, f"HOME={self.home}", path, python]
+
+    def fishd(self, session: Path | None) -> Process:
+        """Start a fishd with its default control address."""
+        return Process(
+            *self.in_session(session), FISHD, *sets("telemetry.address=tcp://127.0.0.1:0")
+        )
+
+    def fishctl(self, session: Path | None, *arguments: str) -> "subprocess.CompletedProcess[str]":
+        return call(*self.in_session(session), FISHCTL, *arguments)
+
+    def daemons(self) -> list[local_daemons.LocalDaemon]:
+        return [daemon for daemon in local_daemons.find_all() if daemon.user == self.number]
+
+
+@pytest.fixture
+def user() -> Iterator[User]:
+    number = spare_user()
+    command = command_as_user(number)
+    home = Path(tempfile.mkdtemp())
+    home.chmod(0o755)
+    os.chown(home, number, number)
+    yield User(number, command, home)
+    shutil.rmtree(home)
+    shutil.rmtree(f"/tmp/fishd-{number}", ignore_errors=True)
+
+
+def open_session(user: User, name: str = "session") -> Path:
+    """Create the folder of a login session."""
+    session = user.home / name
+    session.mkdir()
+    os.chown(session, user.number, user.number)
+    return session
+
+
+def test_after_a_logout_the_socket_is_elsewhere_until_the_next_login(user: User) -> None:
+    session = open_session(user)
+    os.chown(user.home, 0, 0)  # like /run/user, where only root makes folders
+    with user.fishd(session):
+        wait_until((session / "fishd" / "control.estop").exists)
+        shutil.rmtree(session)
+        elsewhere = Path(f"/tmp/fishd-{user.number}/control")
+        wait_until((elsewhere.parent / "control.estop").exists)
+        for place in (session, None):
+            status = user.fishctl(place, "status")
+            assert "limitation  the folder of ipc://" not in status.stderr
+            assert f"control     ipc://{elsewhere}" in status.stdout
+        open_session(user)
+        wait_until((session / "fishd" / "control.estop").exists)
+        assert (
+            f"control     ipc://{session}/fishd/control" in user.fishctl(session, "status").stdout
+        )
+        assert not elsewhere.exists()
+
+
+def test_verbs_from_cron_find_the_fishd_of_a_login_session_and_say_so(user: User) -> None:
+    session = open_session(user)
+    with user.fishd(session):
+        wait_until((session / "fishd" / "control.estop").exists)
+        told = f"the one of this user serves ipc://{session}/fishd/control"
+        for verb in (["status"], list(SWIM), ["stop"], ["estop"]):
+            done = user.fishctl(None, *verb)
+            assert done.returncode == 0, done.stderr
+            assert told in done.stderr + done.stdout
+        assert user.fishctl(session, "status").stderr == ""
+
+
+def test_estop_stops_every_fishd_that_may_be_meant_and_stop_asks_which(user: User) -> None:
+    one, other = open_session(user, "one"), open_session(user, "other")
+    with user.fishd(one), user.fishd(other):
+        for session in (one, other):
+            wait_until((session / "fishd" / "control.estop").exists)
+        refused = user.fishctl(None, "stop")
+        assert refused.returncode == 1
+        for session in (one, other):
+            assert f"serves ipc://{session}/fishd/control" in refused.stderr
+        assert user.fishctl(None, "estop").returncode == 0
+        for session in (one, other):
+            assert "mode        estop" in user.fishctl(session, "status").stdout
+
+
+def test_a_fishd_answers_no_other_user_at_its_name_and_none_can_pretend_to_be_it(
+    user: User,
+) -> None:
+    session = open_session(user)
+    stranger = user.number + 1000
+    with user.fishd(session) as process:
+        wait_until((session / "fishd" / "control.estop").exists)
+        (own,) = user.daemons()
+        request = b'{"v": 2, "op": "estop"}'
+        ask = (
+            "import os, sys\n"
+            "from fishd.core.process.kernel_names import exchange_datagrams as ask\n"
+            "os.setgid(int(sys.argv[1])); os.setuid(int(sys.argv[1]))\n"
+            "print(ask(sys.argv[2], sys.argv[3].encode(), 1.0))"
+        )
+        arguments = [sys.executable, "-c", ask, str(stranger), own.name, request.decode()]
+        refused = subprocess.run(arguments, capture_output=True, text=True, check=True)
+        assert refused.stdout == "None\n"
+        assert "mode        idle" in user.fishctl(session, "status").stdout
+        assert own.ask(request)  # root may
+        assert process.pid == own.pid
+    forged = f"daemon/{user.number}/{os.getpid()}/00000000/forged"
+    with kernel_names.bind_datagrams(forged):
+        pretender = local_daemons.LocalDaemon(user.number, os.getpid(), "00000000", forged)
+        assert pretender not in local_daemons.find_all()
+
+
+def test_an_answer_of_another_process_is_not_believed(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/control"
+    name = local_daemons.name_of_this(endpoint)
+    answer = (
+        "import sys\nfrom fishd.core.process.kernel_names import bind_datagrams\n"
+        "server = bind_datagrams(sys.argv[1]); server.setblocking(True); print(flush=True)\n"
+        'while True: server.sendto(b\'{"v":2,"id":1,"ok":true}\', server.recvfrom(9999)[1])'
+    )
+    with subprocess.Popen([sys.executable, "-c", answer, name], stdout=subprocess.PIPE) as process:
+        assert process.stdout
+        process.stdout.readline()
+        with Fish(endpoint) as fish, pytest.raises(NoDaemon):
+            fish.estop()
+        process.kill()
