@@ -131,8 +131,8 @@ class Daemon:
                 self._gateways,
                 config.control.address,
                 lambda path: open_at_file(path, *answer),
-                stack,
             )
+            stack.callback(self._sockets.close)
             self._stack = stack.pop_all()
         return self
 

@@ -50,10 +50,10 @@ class SocketFile:
         """Whether the folder of the login session was gone, and the socket is in another one."""
         return not self._configured and self._gateway.address != addresses.default_address()
 
-    def restore(self, stack: ExitStack) -> None:
+    def restore(self, claims: ExitStack) -> None:
         """Create the file again, in the folder where clients now look for it.
 
-        stack: holds the claims of further addresses, and removes their files at its end
+        claims: holds the claims of further addresses, and removes their files at its end
         Raise `StartupError` or OSError.
         """
         address = self._configured or addresses.control_address()
@@ -63,7 +63,7 @@ class SocketFile:
         if self._configured:
             self._restore_folder(path.parent)
         if address not in self._claimed:
-            stack.enter_context(addresses.claim_address(address))
+            claims.enter_context(addresses.claim_address(address))
             self._claimed.add(address)
         elif path.exists() and not (path.is_socket() and unix_sockets.is_deserted(path)):
             raise StartupError(f"another program has put something else at {path}; remove that")
@@ -92,12 +92,10 @@ class SocketWatch:
         gateways: Gateways,
         configured: str | None,
         open_direct: Callable[[Path], DirectSocket | None],
-        stack: ExitStack,
     ) -> None:
         """
         configured: `control.address`
         open_direct: function that opens fishd's own socket at a path
-        stack: at its end, all files are removed
         """
         self._loop = loop
         self._control = gateways.control
@@ -108,7 +106,8 @@ class SocketWatch:
             ),
         ]
         self._open_direct = open_direct
-        self._stack = stack
+        self._claims = ExitStack()
+        self._claims.callback(self._close_direct_file)
         self._direct: DirectSocket | None = None
         self._direct_file: Path | None = None
         self._direct_identity: tuple[int, ...] = ()
@@ -116,7 +115,6 @@ class SocketWatch:
         self.restored = 0
         """Number of times that files were created again since start."""
         self._open_direct_file()
-        stack.callback(self._close_direct_file)
 
     @property
     def control(self) -> str:
@@ -135,6 +133,10 @@ class SocketWatch:
             )
         return ""
 
+    def close(self) -> None:
+        """Remove the files that this object has created; may be called twice."""
+        self._claims.close()
+
     def check(self) -> None:
         """Create files that are gone, and report that; let the fish rest if that fails."""
         missing = [file for file in self._files if not file.is_there]
@@ -146,7 +148,7 @@ class SocketWatch:
             return
         try:
             for file in missing:
-                file.restore(self._stack)
+                file.restore(self._claims)
         except (OSError, StartupError) as error:
             self._report_failure(str(error))
             self._let_fish_rest()
@@ -160,7 +162,7 @@ class SocketWatch:
         """Move the control socket to the folder of the login session, if that exists again."""
         before = self._control.address
         try:
-            self._files[0].restore(self._stack)
+            self._files[0].restore(self._claims)
         except (OSError, StartupError):
             return  # such as another fishd that has started there since
         if self._control.address != before:

@@ -14,6 +14,7 @@ NAMES = (
     "misbehaviour",
     "mutations",
     "odd_conditions",
+    "reach",
     "soak",
     "systemd",
     "window",

@@ -215,7 +215,7 @@ def open_session(user: User, name: str = "session") -> Path:
 def test_after_a_logout_the_socket_is_elsewhere_until_the_next_login(user: User) -> None:
     session = open_session(user)
     os.chown(user.home, 0, 0)  # like /run/user, where only root makes folders
-    with user.fishd(session):
+    with user.fishd(session) as process:
         wait_until((session / "fishd" / "control.estop").exists)
         shutil.rmtree(session)
         elsewhere = Path(f"/tmp/fishd-{user.number}/control")
@@ -230,6 +230,10 @@ def test_after_a_logout_the_socket_is_elsewhere_until_the_next_login(user: User)
             f"control     ipc://{session}/fishd/control" in user.fishctl(session, "status").stdout
         )
         assert not elsewhere.exists()
+        shutil.rmtree(session)
+        wait_until((elsewhere.parent / "control.estop").exists)
+        assert process.end()[0] == 0
+    assert not [path for path in elsewhere.parent.iterdir() if path.is_socket()]
 
 
 def test_verbs_from_cron_find_the_fishd_of_a_login_session_and_say_so(user: User) -> None:
