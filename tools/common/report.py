@@ -32,6 +32,9 @@ class Report(NamedTuple):
     """Results for programs, as data that msgspec can write as JSON."""
     broken: bool = False
     """Whether a promise of fishd was not kept; the exit status is 1 then."""
+    number: str = ""
+    """The result in one line, for a cell of a table in docs/; it is written instead of the only
+    section, which is for people."""
 
 
 class BrokenPromise(BaseException):
@@ -72,7 +75,7 @@ def run(package: str, names: Sequence[str]) -> int:
     print(msgspec.json.encode(report.figures).decode() if options.json else text)
     if options.write:
         for marker, section in report.sections.items():
-            put(_page_with(marker), marker, section)
+            put(_page_with(marker), marker, report.number or section, in_line=bool(report.number))
     return int(report.broken)
 
 
@@ -115,13 +118,15 @@ def table(head: str, rows: Iterable[Iterable[str]]) -> str:
     return "\n".join(f"| {line} |" for line in (head, rule, *map(" | ".join, rows)))
 
 
-def put(document: Path, name: str, text: str) -> None:
+def put(document: Path, name: str, text: str, *, in_line: bool = False) -> None:
     """Replace the text between the two markers of `name` in a document.
 
+    in_line: whether the markers are in a line, such as a row of a table
     Raises SystemExit where the markers are missing.
     """
     before, _, after = _parted(document, name)
-    document.write_text(f"{before}\n\n{text}\n\n{after}", encoding="utf-8")
+    gap = " " if in_line else "\n\n"
+    document.write_text(f"{before}{gap}{text}{gap}{after}", encoding="utf-8")
 
 
 def between(document: Path, name: str) -> str:

@@ -36,7 +36,8 @@ def measure(options: Namespace) -> Report:
     for suite in options.suite:
         rows = _try_on(suite, options)
     text = f"On {' and '.join(options.suite)}:\n\n{table('action | outcome', rows)}"
-    return Report({"reliability deb": text}, rows)
+    number = f"{len(rows)} actions as promised, on {' and '.join(options.suite)}"
+    return Report({"reliability deb": text}, rows, number=number)
 
 
 def _try_on(suite: str, options: Namespace) -> list[tuple[str, str]]:

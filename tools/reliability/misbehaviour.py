@@ -363,4 +363,10 @@ def measure(options: Namespace) -> Report:
     )
     rows = map(row, outcomes.values())
     ended = any(outcome.ended for outcome in outcomes.values())
-    return Report({"reliability misbehaviour": table(head, rows)}, outcomes, broken=ended)
+    number = (
+        f"{sum(outcome.ended for outcome in outcomes.values())} ends of fishd in "
+        f"{sum(outcome.cases for outcome in outcomes.values())} cases; from SIGTERM to the end at "
+        f"most {max(outcome.longest or 0.0 for outcome in outcomes.values()):.2f} s"
+    )
+    text = table(head, rows)
+    return Report({"reliability misbehaviour": text}, outcomes, broken=ended, number=number)

@@ -317,4 +317,10 @@ def measure(options: Namespace) -> Report:
     processor, cores = list(machine().values())[:2]
     words = f"Seed {options.seed}; seconds of processor time; {cores} cores of an {processor}."
     sections = {"reliability mutations": f"{table(head, rows)}\n\n{words}"}
-    return Report(sections, [*results, together], broken=broken)
+    number = (
+        f"{sum(result.mistakes for result in results)} wrong answers on "
+        f"{sum(result.files for result in results)} files; slowest verb "
+        f"{max(result.seconds for result in results):.2f} s, at most "
+        f"{max(result.megabytes for result in (*results, together)):.0f} MB"
+    )
+    return Report(sections, [*results, together], broken=broken, number=number)

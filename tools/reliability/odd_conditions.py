@@ -163,6 +163,9 @@ def measure(options: Namespace) -> Report:
         {"reliability odd-conditions": _table(cells, conditions, groups)},
         cells,
         broken=any(cell.wrong for cell in cells),
+        number=f"{sum(bool(cell.wrong) for cell in cells)} of "
+        f"{sum(cell.tried for cell in cells)} commands not right, "
+        f"under {len(conditions)} conditions",
     )
 
 

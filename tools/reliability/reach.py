@@ -199,4 +199,9 @@ def measure(options: Namespace) -> Report:
         )
     head = "what happens | stops confirmed | slowest [s] | sockets again after [s] | ways"
     text = f"{table(head, rows)}\n\nSeed {options.seed}."
-    return Report({"reliability reach": text}, attempts, broken=broken)
+    gone = [each.restored for each in attempts if each.restored and each.delay > MAX_GONE_S]
+    result = (
+        f"{sum(each.stopped for each in attempts)} of {len(attempts)} confirmed; sockets again "
+        f"within {max(gone):.2f} s"
+    )
+    return Report({"reliability reach": text}, attempts, broken=broken, number=result)

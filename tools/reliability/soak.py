@@ -236,4 +236,5 @@ def measure(options: Namespace) -> Report:
         progress(f"soak: {name}")
         begun = time.perf_counter()
         lines.append(f"- {soaks[name]()} ({time.perf_counter() - begun:.0f} s)")
-    return Report({"reliability soak": "\n".join(lines)}, lines)
+    number = "<br>".join(line.removeprefix("- ").partition(";")[0] for line in lines)
+    return Report({"reliability soak": "\n".join(lines)}, lines, number=number)

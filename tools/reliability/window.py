@@ -285,4 +285,10 @@ def measure(options: Namespace) -> Report:
         o.left_open or o.mistakes or not o.answers or o.megabytes > MAX_MEGABYTES for o in outcomes
     )
     text = f"{table(head, rows)}\n\nThe fish was {fish}. Seed {options.seed}."
-    return Report({"reliability window": text}, outcomes, broken=broken)
+    number = (
+        f"{sum(o.mistakes for o in outcomes)} errors of status 500 in "
+        f"{sum(o.messages for o in outcomes)} messages, {sum(o.left_open for o in outcomes)} "
+        f"connections left open; at most {max(o.megabytes for o in outcomes):.0f} MB; the fish was "
+        f"{fish}"
+    )
+    return Report({"reliability window": text}, outcomes, broken=broken, number=number)

@@ -221,4 +221,9 @@ def measure(options: Namespace) -> Report:
     words = f"Runs that could not be read: {unreadable}. Seed {options.seed}."
     broken = any(kill.is_broken for kill in kills)
     text = f"{table(head, rows)}\n\n{words}"
-    return Report({"reliability window_kills": text}, kills, broken=broken)
+    rests = [kill.rest for kill in kills if kill.rest is not None]
+    result = (
+        f"{sum(kill.is_broken for kill in kills)} promises broken in {len(kills)} kills; fish at "
+        f"rest within {max(rests, default=WATCH_S):.1f} s; {unreadable} runs not readable"
+    )
+    return Report({"reliability window_kills": text}, kills, broken=broken, number=result)
