@@ -39,7 +39,7 @@ _RESET_CONFIG = 0x8583
 _FISHD_CONFIG, _FISHD_CONFIG_MASK = 0x0113, 0x011F
 """Single-shot, window comparator, off: a configuration that no other program leaves."""
 _RESET_THRESHOLD = 0x7FFF
-LOW_BITS = 0x000F
+_LOW_BITS = 0x000F
 """Bits of codes and thresholds that an ADS1015 does not have: they are always 0."""
 
 
@@ -126,14 +126,14 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
             self._chip = self._single_shot(
                 bus, settings.address, settings.full_scale, settings.data_rate, self.clock
             )
-            is_coarse = self._chip.is_ads1015()
+            is_coarse = not self._chip.high_threshold() & _LOW_BITS
         except BaseException:
             i2c.close_bus(bus)
             raise
         self._x = self._chip.input(settings.channel_x)
         self._y = self._chip.input(settings.channel_y)
         self._bus = bus
-        self._largest = ADC_STEPS - 1 - (LOW_BITS if is_coarse else 0)
+        self._largest = ADC_STEPS - 1 - (_LOW_BITS if is_coarse else 0)
         self._highest = min(self._saturated, self._largest)
         self.limitations = (_describe_ads1015(settings),) if is_coarse else ()
 
@@ -293,10 +293,10 @@ def _identify(number: int, address: int) -> tuple[int, int, bool]:
     bus = i2c.open_bus(number)
     try:
         config, threshold = (_read(bus, address, register) for register in (_CONFIG, _THRESHOLD))
-        is_coarse = not threshold & LOW_BITS
+        is_coarse = not threshold & _LOW_BITS
         if is_coarse:  # or another program has cleared these bits: then they can be set
-            _write(bus, address, _THRESHOLD, threshold | LOW_BITS)
-            is_coarse = not _read(bus, address, _THRESHOLD) & LOW_BITS
+            _write(bus, address, _THRESHOLD, threshold | _LOW_BITS)
+            is_coarse = not _read(bus, address, _THRESHOLD) & _LOW_BITS
             _write(bus, address, _THRESHOLD, threshold)
         return config, threshold, is_coarse
     finally:

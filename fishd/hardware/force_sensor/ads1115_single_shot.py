@@ -6,7 +6,6 @@ from typing import Any
 from adafruit_ads1x15 import ADS1115, AnalogIn, ads1x15
 
 from fishd.core.clock import Clock
-from fishd.hardware.force_sensor.ads1115 import LOW_BITS
 
 MAX_CONVERSION_PERIODS, CONVERSION_TIMEOUT_PERIODS = 1.1, 1.25
 """Longest time of a conversion, and time after which it has failed, as multiples of 1/data rate."""
@@ -51,9 +50,9 @@ class SingleShot(ADS1115):  # type: ignore[misc]
                 raise
             raise OSError(number, os.strerror(number)) from None
 
-    def is_ads1015(self) -> bool:
-        """Return whether the high threshold lacks the low bits, all of which the driver has set."""
-        return not self._read_register(_HIGH_THRESHOLD) & LOW_BITS
+    def high_threshold(self) -> int:
+        """Return the high threshold of the chip, of which the driver has set all bits but one."""
+        return self._read_register(_HIGH_THRESHOLD)
 
     def input(self, channel: str) -> Any:
         """Return an input, such as `A0` or `A0-A1`; reading its `value` makes a conversion."""
