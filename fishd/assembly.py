@@ -290,7 +290,11 @@ def assemble(
         log.warning("%s", line)
 
     def limitations() -> tuple[str, ...]:
-        lines = tuple(servo.driver.limitations)
+        lines = (
+            *sensor.limitations,
+            *(meter.limitations if meter else ()),
+            *servo.driver.limitations,
+        )
         if sensor.calibration.is_unset:
             lines += (
                 f"the force is not calibrated, and shown in {sensor.unit}: fishctl calibrate force",

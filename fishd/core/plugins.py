@@ -6,9 +6,11 @@ which are read again after an installation: a running fishd finds new ones witho
 
 import importlib
 import os
+import signal
 import sys
-from collections.abc import Mapping
-from contextlib import suppress
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import reduce
 from importlib.machinery import PathFinder
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -102,8 +104,15 @@ class Plugins(Generic[T]):
             hint = suggest(name, self.names())
             raise self._unknown(f"no {self.kind} is named '{text.quoted(name)}'; {hint}")
         where = f"{self.kind} '{name}' ({value} in {self.package(name)})"
+        module = value.partition(":")[0].strip()
+        if name not in self._built_in and module not in sys.modules:
+            from fishd.core.trial_import import find_danger  # imports subprocess
+
+            if danger := find_danger(module):
+                raise self._unknown(f"{where} does not load: {danger}")
         try:
-            plugin = call_foreign(_load_class, value.partition(" [")[0])
+            with _kept_process_state():
+                plugin = call_foreign(_load_class, value.partition(" [")[0])
         except Exception as error:
             raise self._unknown(f"{where} does not load: {text.describe_error(error)}") from error
         base = self._base
@@ -131,6 +140,8 @@ class Plugins(Generic[T]):
         stamps = _stamps()
         if stamps != self._stamps:
             importlib.invalidate_caches()
+            if trials := sys.modules.get("fishd.core.trial_import"):
+                trials.find_danger.cache_clear()
             self._entries = self._read_entry_points()
             self._stamps = stamps
         return self._entries
@@ -156,6 +167,28 @@ class Plugins(Generic[T]):
 
                 logging.getLogger(__name__).warning("%s", problem)
         return entries
+
+
+@contextmanager
+def _kept_process_state() -> Iterator[None]:
+    """Restore the working directory, and in the main thread the handlers of signals, at the end.
+
+    A package may change them while it is imported.
+    """
+    folder = os.open(".", os.O_RDONLY | os.O_DIRECTORY)
+    in_main = threading.current_thread() is threading.main_thread()
+    handlers = {n: signal.getsignal(n) for n in _SIGNALS} if in_main else {}
+    try:
+        yield
+    finally:
+        os.fchdir(folder)
+        os.close(folder)
+        for number, handler in handlers.items():
+            if handler is not None:  # None was not set by Python
+                signal.signal(number, handler)
+
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGPIPE)
 
 
 def _load_class(name: str) -> Any:

@@ -387,6 +387,7 @@ def _explain(
         path,
         f"{format_excerpt(value)} is not valid: {describe_permitted(_describe(field))} is needed"
         + _ask_for_other_unit(value, field)
+        + _ask_for_hexadecimal(value, field)
         + _entry_hint(value, field),
     )
 
@@ -404,6 +405,19 @@ def _unknown_key(
     elif not hint.startswith("did") and (wider_hint := suggest(key, all_keys)).startswith("did"):
         hint = wider_hint
     return UnknownKey((*path, key), f"unknown key; {hint}")
+
+
+def _ask_for_hexadecimal(value: Any, field: inspect.Field) -> str:
+    """Return a hint if the digits of an I2C address are valid as hexadecimal ones, or empty."""
+    kind, _, _ = _unwrap(field.type)
+    if "address" not in field.encode_name or not isinstance(kind, inspect.IntType):
+        return ""
+    try:
+        address = int(str(value), 16)
+    except ValueError:
+        return ""
+    valid = kind.ge is not None and kind.le is not None and kind.ge <= address <= kind.le
+    return f"; {address:#04x} may be meant" if valid else ""
 
 
 def _ask_for_other_unit(value: Any, field: inspect.Field) -> str:

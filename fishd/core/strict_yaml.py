@@ -7,6 +7,7 @@ true, `1e2` is a text, `1:30` is ninety, `010` is eight, and the second of two e
 import os
 import pathlib
 import re
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import yaml
@@ -91,10 +92,14 @@ def parse(
     try:
         loader = _Loader(text)
         root = loader.get_single_node()
+        if not text.isascii():
+            _check_white_space(text, root)
     except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        line = mark.line + 1 if mark else 1
-        raise YamlProblem(line, f"not valid YAML: {error.problem}") from None
+        raise _explain(text, error) from None
+    except yaml.reader.ReaderError as error:
+        character = text[error.position]
+        line = text.count("\n", 0, error.position) + 1
+        raise YamlProblem(line, f"{_name(character)} is not permitted: remove it") from None
     except yaml.YAMLError as error:
         raise YamlProblem(1, f"not valid YAML: {' '.join(str(error).split())}") from None
     except (ValueError, OverflowError):  # an escape such as "\\U00110000"
@@ -120,7 +125,14 @@ class _Loader(yaml.SafeLoader):
 
 
 class _Dumper(yaml.SafeDumper):
-    """Dumper that quotes a text that would be another value in YAML 1.1 or 1.2."""
+    """Dumper that quotes a text that would be another value or be refused by `parse`."""
+
+    def analyze_scalar(self, scalar: str) -> Any:
+        """Do as the base class; odd white space needs quotes."""
+        analysis = super().analyze_scalar(scalar)
+        if not scalar.isascii() and any(map(_is_odd, scalar)):
+            analysis.allow_flow_plain = analysis.allow_block_plain = False
+        return analysis
 
 
 _Loader.yaml_implicit_resolvers = {}  # instead of those of YAML 1.1
@@ -208,3 +220,74 @@ def _check_characters(text: str, name: str, line: int) -> None:
         text.encode()
     except UnicodeEncodeError:
         raise ValueProblem(line, f"{name}: half of a character (\\ud800…\\udfff)") from None
+
+
+_CONTROL_CHARACTERS = {"\0": "NUL", "\x1a": "Ctrl-Z", "\x1b": "ESC", "\x7f": "DEL"}
+
+
+def _name(character: str) -> str:
+    """Return a name such as `a no-break space (U+00A0)`."""
+    import unicodedata  # only for what is refused
+
+    default = "a control character" if ord(character) < 0xA0 else "a character"
+    name = _CONTROL_CHARACTERS.get(character) or unicodedata.name(character, default).lower()
+    article = "" if character in _CONTROL_CHARACTERS or name == default else "a "
+    article = "an " if article and name[0] in "aeio" else article
+    return f"{article}{name} (U+{ord(character):04X})"
+
+
+def _is_odd(character: str) -> bool:
+    """Return whether a character looks like a space, or like none, but is not one for YAML."""
+    import unicodedata
+
+    return not character.isascii() and (
+        character.isspace() or unicodedata.category(character) == "Cf"
+    )
+
+
+def _check_white_space(text: str, root: yaml.Node | None) -> None:
+    """Refuse odd white space outside of quotes, comments and blocks of text."""
+    positions = [n for n, character in enumerate(text) if _is_odd(character)]
+    if not positions or root is None:
+        return
+    scalars = list(_scalars(root, set()))
+    for n in positions:
+        styles = [s.style for s in scalars if s.start_mark.index <= n < s.end_mark.index]
+        begins_text = n == 0 and text[n] == "\ufeff"  # a byte order mark
+        if not begins_text and (None in styles or (not styles and text[n] in _LINE_BREAKS)):
+            raise YamlProblem(text.count("\n", 0, n) + 1, _describe_odd(text[n]))
+
+
+_LINE_BREAKS = "\x85\u2028\u2029"
+"""Characters that end a line in YAML 1.1, but neither in YAML 1.2 nor in editors."""
+
+
+def _scalars(node: yaml.Node, seen: set[int]) -> Iterator[yaml.ScalarNode]:
+    """Yield each scalar of a document once."""
+    if id(node) in seen:
+        return
+    seen.add(id(node))
+    if isinstance(node, yaml.ScalarNode):
+        yield node
+    for item in node.value if isinstance(node, yaml.CollectionNode) else ():
+        for child in item if isinstance(item, tuple) else (item,):
+            yield from _scalars(child, seen)
+
+
+def _describe_odd(character: str) -> str:
+    return f"{_name(character)} is not a space for YAML: type a space, or put the text in quotes"
+
+
+def _explain(text: str, error: yaml.MarkedYAMLError) -> YamlProblem:
+    """Return the problem of an invalid document; white space that only looks right is named."""
+    mark = error.problem_mark or error.context_mark
+    if not mark:
+        return YamlProblem(1, f"not valid YAML: {error.problem}")
+    begin = (error.context_mark or mark).index
+    begin = text.rfind("\n", 0, begin) + 1
+    if odd := next(filter(_is_odd, reversed(text[begin : mark.index + 1])), ""):
+        line = text.count("\n", 0, text.rfind(odd, 0, mark.index + 1)) + 1
+        return YamlProblem(line, _describe_odd(odd))
+    if text[mark.index : mark.index + 1] == "\t":
+        return YamlProblem(mark.line + 1, "a tab is not permitted here: type spaces instead")
+    return YamlProblem(mark.line + 1, f"not valid YAML: {error.problem}")

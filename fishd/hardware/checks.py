@@ -38,6 +38,11 @@ class Machine(ABC):
         """Model name of this machine, such as Raspberry Pi 5 Model B; empty if unknown."""
         return self.text("/proc/device-tree/model")
 
+    @property
+    def limitations(self) -> tuple[str, ...]:
+        """Limitations that a running fishd of this robot reports; empty if none runs."""
+        return ()
+
     def path(self, absolute: str) -> Path:
         """Return a path of this machine, below `root`."""
         return self.root / absolute.lstrip("/")

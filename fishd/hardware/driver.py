@@ -124,6 +124,8 @@ class SampledDriver(Driver[T]):
     """Prefix of the counters of errors: `i2c` makes `i2c_errors`."""
     settling: float = 0.0
     """Time for which the hardware is left alone after an error [s]."""
+    limitations: tuple[str, ...] = ()
+    """Reasons why its samples are not as good as they could be, a line each."""
 
     def __init__(self, settings: T, clock: Clock) -> None:
         """Import what is needed; open nothing yet.

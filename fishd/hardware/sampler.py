@@ -109,6 +109,11 @@ class SampledPart(ABC, Generic[X]):
             **read_counters(self._driver),
         }
 
+    @property
+    def limitations(self) -> tuple[str, ...]:
+        """Reasons why the samples are not as good as they could be, a line each."""
+        return self._driver.limitations
+
     def close(self) -> None:
         """Stop sampling and release the hardware; may be called twice, and never hangs.
 

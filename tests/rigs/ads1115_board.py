@@ -29,14 +29,19 @@ class Board:
     """
 
     def __init__(
-        self, speed: float = 400e3, noise: float = 0.0, seed: int = 0, clock: Any = None
+        self,
+        speed: float = 400e3,
+        noise: float = 0.0,
+        seed: int = 0,
+        clock: Any = None,
+        bits: int = 16,
     ) -> None:
         self.clock = clock or VirtualClock()
         self.faults = Faults(self.clock, seed)
         self.bus = I2cBus(self.clock, speed, self.faults)
         self.volts: Any = list(VOLTS)
         self.measured: list[tuple[int, float, float]] = []
-        self.chip = Ads1115Chip(self.clock, self.input, self.faults, noise, seed)
+        self.chip = Ads1115Chip(self.clock, self.input, self.faults, noise, seed, bits)
         self.bus.attach(0x48, self.chip)
         self.device = LinuxI2c(self.transfer, {1, ABSENT_BUS}, self.set_timeout)
 

@@ -39,7 +39,8 @@ _MUX_X, _MUX_Y = 0, 3  # A0-A1 and A2-A3
 class LoadedPi:
     """Virtual Pi whose fish can be loaded, in a separate process."""
 
-    def __init__(self, socket: str) -> None:
+    def __init__(self, socket: str, bits: int = 16) -> None:
+        """bits: 16 for an ADS1115, 12 for an ADS1015"""
         self._load = (0.0, 0.0)
         self._shaking = 0.0
         # Replace its chip by the one with the loads.
@@ -47,7 +48,7 @@ class LoadedPi:
         clock = SystemClock()
         simulation = SimulationSettings(noise=2e-4)
         self._pi = VirtualPi(settings, PlantParameters(), simulation, 0.05, clock)
-        self._pi.bus.attach(0x48, Ads1115Chip(clock, self._volts, self._pi.faults))
+        self._pi.bus.attach(0x48, Ads1115Chip(clock, self._volts, self._pi.faults, bits=bits))
         self._server = LinkServer(self._pi, Path(socket))
         self._server.start()
 
@@ -164,9 +165,9 @@ def pi_process() -> Iterator[Any]:
 
 
 @contextlib.contextmanager
-def bench(process: Any, folder: Path) -> Iterator[Bench]:
-    """Run a virtual Pi in a `pi_process`."""
-    pi = process.LoadedPi(str(folder / "virtual-pi"))
+def bench(process: Any, folder: Path, *options: Any) -> Iterator[Bench]:
+    """Run a virtual Pi in a `pi_process`; options: those of `LoadedPi`."""
+    pi = process.LoadedPi(str(folder / "virtual-pi"), *options)
     try:
         yield Bench(folder, pi)
     finally:

@@ -134,7 +134,7 @@ def die_at(
 def test_a_kill_between_any_two_commands_leaves_no_pulses(
     deed: Callable[[Bench], None], mortal: Callable[[int | None], None]
 ) -> None:
-    for n in range(100):
+    for n in range(150):
         with contextlib.ExitStack() as stack:
             bench = Bench(stack)
             died = die_at(n, bench, deed, mortal)

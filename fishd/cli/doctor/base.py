@@ -146,6 +146,11 @@ class Context(Machine):
             return daemon
         return None
 
+    @property
+    def limitations(self) -> tuple[str, ...]:
+        """Limitations that a running fishd of this robot reports; empty if none runs."""
+        return self.running.status.limitations if self.running else ()
+
     @cached_property
     def owner(self) -> str:
         """Description of the fishd that drives a part of this robot, at any endpoint, or empty."""

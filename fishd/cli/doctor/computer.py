@@ -16,7 +16,8 @@ from fishd.hardware.checks import Check, Result, fail, ok, skipped, user_name, w
 
 LOW_DISK_BYTES, FULL_DISK_BYTES = 1e9, 50e6
 """Free space below which there is a warning, and below which the check fails [bytes]."""
-_THROTTLED = "/sys/devices/platform/soc/soc:firmware/get_throttled"
+_THROTTLED = "soc*/soc*:firmware/get_throttled"
+"""File of the firmware in the tree of devices: below `soc`, or `soc@107c000000` on a Pi 5."""
 _HISTORY_SHIFT_BITS = 16
 """Distance of the flag for the time since start from the flag for now [bits]."""
 _TOO_SLOW_PROCESSOR = "brcm,bcm2835"
@@ -81,13 +82,20 @@ def _system_name(context: Context) -> str:
 
 def power(context: Context) -> Result:
     """Check the power supply, by the firmware or the under-voltage alarm of the kernel."""
-    if text := context.text(_THROTTLED):
-        return _judge_flags(int(text, 16))
+    if flags := read_throttled(context):
+        return _judge_flags(int(flags, 16))
     for monitor in sorted(context.path("/sys/class/hwmon").glob("hwmon*")):
         if context.text(f"/sys/class/hwmon/{monitor.name}/name") == "rpi_volt":
             alarm = context.text(f"/sys/class/hwmon/{monitor.name}/in0_lcrit_alarm") == "1"
             return _judge_flags(1) if alarm else ok("no under-voltage")
     return skipped("this machine does not report whether its power suffices")
+
+
+def read_throttled(context: Context) -> str:
+    """Return the firmware's flags of power and heat, hexadecimal; empty if there are none."""
+    devices = "/sys/devices/platform"
+    files = (path.relative_to(context.root) for path in context.path(devices).glob(_THROTTLED))
+    return next(filter(None, (context.text(str(file)) for file in files)), "")
 
 
 def _judge_flags(flags: int) -> Result:

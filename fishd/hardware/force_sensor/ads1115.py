@@ -34,11 +34,13 @@ MIN_PAIRS_PER_CONVERSION = 8 / 0.05 / 860
 SUPPLY_V = 3.3
 """Supply of the ADC and of the amplifiers in docs/how-to/wiring.md [V]."""
 
-_CONFIG, _HIGH_THRESHOLD = 1, 3
+_CONFIG, _THRESHOLD = 1, 3
 _RESET_CONFIG = 0x8583
 _FISHD_CONFIG, _FISHD_CONFIG_MASK = 0x0113, 0x011F
 """Single-shot, window comparator, off: a configuration that no other program leaves."""
-_ADS1115_THRESHOLD, _ADS1015_THRESHOLD = 0x7FFF, 0x7FF0
+_RESET_THRESHOLD = 0x7FFF
+_LOW_BITS = 0x000F
+"""Bits of codes and thresholds that an ADS1015 does not have: they are always 0."""
 
 
 class Ads1115Settings(ForceSensorSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -101,9 +103,8 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
         self._step = settings.full_scale / ADC_STEPS
         low, high = settings.saturation_low, settings.saturation_high
         self._lowest = -ADC_STEPS if low is None else max(-ADC_STEPS, math.floor(low / self._step))
-        self._highest = (
-            ADC_STEPS - 1 if high is None else min(ADC_STEPS - 1, math.ceil(high / self._step))
-        )
+        self._saturated = ADC_STEPS if high is None else math.ceil(high / self._step)
+        self._highest = self._largest = ADC_STEPS - 1
         self._in_doubt = True
         self._y_first = False
         self._first: tuple[float, int] | None = None
@@ -118,19 +119,23 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
         return f"the ADS1115 at {self.settings.address:#04x} on /dev/i2c-{self.settings.bus}"
 
     def open(self) -> None:
-        """Open the bus and find the chip; raise OSError if that fails."""
+        """Open the bus, find the chip and look which one it is; raise OSError if that fails."""
         settings = self.settings
         bus = i2c.open_bus(settings.bus)
         try:
             self._chip = self._single_shot(
                 bus, settings.address, settings.full_scale, settings.data_rate, self.clock
             )
+            is_coarse = not self._chip.high_threshold() & _LOW_BITS
         except BaseException:
             i2c.close_bus(bus)
             raise
         self._x = self._chip.input(settings.channel_x)
         self._y = self._chip.input(settings.channel_y)
         self._bus = bus
+        self._largest = ADC_STEPS - 1 - (_LOW_BITS if is_coarse else 0)
+        self._highest = min(self._saturated, self._largest)
+        self.limitations = (_describe_ads1015(settings),) if is_coarse else ()
 
     def sample(self) -> Pair | None:
         """Convert once; return a pair after every second conversion. Raises OSError."""
@@ -214,7 +219,7 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
         if self._lowest < code < self._highest:
             return ""
         name = self.names[channel]
-        if code in (-ADC_STEPS, ADC_STEPS - 1):
+        if code in (-ADC_STEPS, self._largest):
             return f"{name} is clipped at {math.copysign(self.settings.full_scale, code):+g} V"
         key = "saturation_high" if code >= self._highest else "saturation_low"
         volts = code * self._step
@@ -242,14 +247,25 @@ def _amplifier(settings: Ads1115Settings) -> Result:
     return ok(f"±{settings.full_scale:g} V{limits}")
 
 
+def _describe_ads1015(settings: Ads1115Settings) -> str:
+    """Return one line about an ADS1015 in the place of the ADS1115, with its step."""
+    return (
+        f"the chip at {settings.address:#04x} on /dev/i2c-{settings.bus} is an ADS1015, not an "
+        f"ADS1115: it has 12 bits, so its step is {settings.full_scale / 2.048:g} mV, 16 times as "
+        "coarse; replace it"
+    )
+
+
 def _chip(machine: Machine, settings: Ads1115Settings) -> Result:
-    """Check which chip answers: the threshold has 16 bits in an ADS1115, 12 in an ADS1015."""
+    """Check which chip answers: it needs the 16 bits of an ADS1115, not the 12 of an ADS1015."""
+    remedy = "fishd needs an ADS1115: it has 16 bits"
     if occupied := machine.occupied("owns the bus; see force"):
-        return occupied
+        coarse = _describe_ads1015(settings)
+        return fail(coarse, remedy) if coarse in machine.limitations else occupied
     place = f"{settings.address:#04x} on /dev/i2c-{settings.bus}"
     try:
         with machine.plugged_in():
-            config, threshold = _registers(settings.bus, settings.address)
+            config, threshold, is_coarse = _identify(settings.bus, settings.address)
     except MissingPackage:
         raise
     except StartupError as error:
@@ -259,11 +275,11 @@ def _chip(machine: Machine, settings: Ads1115Settings) -> Result:
             i2c.explain(error, settings.bus, settings.address, "ADS1115", "force_sensor"),
             f"'i2cdetect -y {settings.bus}' (package i2c-tools) lists which addresses answer",
         )
-    if threshold == _ADS1015_THRESHOLD:
-        return fail(f"an ADS1015 answers at {place}", "fishd needs an ADS1115: it has 16 bits")
-    if config == _RESET_CONFIG and threshold == _ADS1115_THRESHOLD:
+    if is_coarse:
+        return fail(_describe_ads1015(settings), remedy)
+    if config == _RESET_CONFIG and threshold == _RESET_THRESHOLD:
         return ok(f"an ADS1115 answers at {place}, as after power-on")
-    if config & _FISHD_CONFIG_MASK == _FISHD_CONFIG and threshold == _ADS1115_THRESHOLD:
+    if config & _FISHD_CONFIG_MASK == _FISHD_CONFIG and threshold == _RESET_THRESHOLD:
         return ok(f"an ADS1115 answers at {place}, as fishd left it")
     return warning(
         f"what answers at {place} has config {config:#06x} and threshold {threshold:#06x}: another "
@@ -272,16 +288,26 @@ def _chip(machine: Machine, settings: Ads1115Settings) -> Result:
     )
 
 
-def _registers(number: int, address: int) -> tuple[int, int]:
-    """Return the chip's config and high threshold without changing them; raise OSError."""
+def _identify(number: int, address: int) -> tuple[int, int, bool]:
+    """Return the chip's config and high threshold, and whether it is an ADS1015; raise OSError."""
     bus = i2c.open_bus(number)
     try:
-        bus.try_lock()
-        values = []
-        for register in (_CONFIG, _HIGH_THRESHOLD):
-            word = bytearray(2)
-            bus.writeto_then_readfrom(address, bytes([register]), word)
-            values.append(int.from_bytes(word, "big"))
+        config, threshold = (_read(bus, address, register) for register in (_CONFIG, _THRESHOLD))
+        is_coarse = not threshold & _LOW_BITS
+        if is_coarse:  # or another program has cleared these bits: then they can be set
+            _write(bus, address, _THRESHOLD, threshold | _LOW_BITS)
+            is_coarse = not _read(bus, address, _THRESHOLD) & _LOW_BITS
+            _write(bus, address, _THRESHOLD, threshold)
+        return config, threshold, is_coarse
     finally:
         i2c.close_bus(bus)
-    return values[0], values[1]
+
+
+def _read(bus: Any, address: int, register: int) -> int:
+    word = bytearray(2)
+    bus.writeto_then_readfrom(address, bytes([register]), word)
+    return int.from_bytes(word, "big")
+
+
+def _write(bus: Any, address: int, register: int, word: int) -> None:
+    bus.writeto(address, bytes([register, *word.to_bytes(2, "big")]))

@@ -10,7 +10,7 @@ from fishd.core.clock import Clock
 MAX_CONVERSION_PERIODS, CONVERSION_TIMEOUT_PERIODS = 1.1, 1.25
 """Longest time of a conversion, and time after which it has failed, as multiples of 1/data rate."""
 
-_CONFIG = 1
+_CONFIG, _HIGH_THRESHOLD = 1, 3
 _IDLE_BIT = 0x8000
 _WAKE_UP_S = 25e-6
 """Time that the chip needs before a conversion [s]."""
@@ -49,6 +49,10 @@ class SingleShot(ADS1115):  # type: ignore[misc]
             if number is None:
                 raise
             raise OSError(number, os.strerror(number)) from None
+
+    def high_threshold(self) -> int:
+        """Return the high threshold of the chip, of which the driver has set all bits but one."""
+        return self._read_register(_HIGH_THRESHOLD)
 
     def input(self, channel: str) -> Any:
         """Return an input, such as `A0` or `A0-A1`; reading its `value` makes a conversion."""

@@ -21,6 +21,13 @@ COMMAND_ERRORS = (OSError, pigpio.error, UnicodeError)
 MAX_SCRIPTS, SCRIPT_PARAMETERS = 32, 10
 """Number of scripts that pigpiod stores, and of the parameters of each."""
 
+_MAX_VERSION = 9999
+"""Largest version that a pigpiod may have; it is 79 since 2021."""
+_PROVOCATION_S = 0.3
+"""Time that a silent server has for an answer to an empty line [s]."""
+_SHOWN_BYTES = 24
+"""Number of bytes of another server's answer that are shown."""
+
 _STANDSTILL_POLL_S = 5e-3
 """Period at which a wait in virtual time checks whether pigpiod stands still [s]."""
 
@@ -28,6 +35,24 @@ UNKNOWN_SCRIPT = pigpio.error_text(pigpio.PI_BAD_SCRIPT_ID)
 _SCRIPT_DELETED = "another program deleted fishd's script, as 'fishctl release' does"
 _SCRIPT_STATUS = 45
 _ANSWER = struct.Struct("<3Ii")
+_ECHO = struct.pack("<3I", pigpio._PI_CMD_PIGPV, 0, 0)
+"""First bytes of the answer to a request for the version."""
+
+
+class UnsuitableServer(ServoError):
+    """A server that cannot drive the servo; the text names its address."""
+
+
+class NotPigpiod(UnsuitableServer):
+    """Another server answers on the port of pigpiod."""
+
+
+class MissingCommands(UnsuitableServer):
+    """A pigpiod that is too old for the countdown."""
+
+
+class SilentServer(TimeoutError):
+    """A server has not answered the first request."""
 
 
 class TimedSocket:
@@ -87,6 +112,24 @@ class TimedSocket:
         """Wait for the answers to all commands."""
         while self.unanswered:
             self._answer()
+
+    def provoke(self) -> bytes:
+        """Send an empty line to a silent server; return all that has arrived then.
+
+        Servers of texts, such as HTTP, answer at the end of a line. A pigpiod ignores one when the
+        connection closes after it.
+        """
+        with contextlib.suppress(OSError):
+            self.deadline = time.monotonic() + _PROVOCATION_S
+            self._socket.settimeout(_PROVOCATION_S)
+            self._socket.sendall(b"\r\n\r\n")
+            self._fill(_ANSWER.size)
+        return self.received
+
+    @property
+    def received(self) -> bytes:
+        """Bytes that have arrived and belong to no complete answer."""
+        return bytes(self._received)
 
     def interrupt(self) -> None:
         """End the wait of another thread."""
@@ -154,11 +197,38 @@ class Client(pigpio.pi):  # type: ignore[misc]
     ) -> None:
         """Connect within `limit` [s]; raise OSError. `standstill` is that of `TimedSocket`."""
         self._host, self._port = host, port
+        self.place = pigpiod_at(host, port)
+        """Name of this pigpiod in messages."""
         self._notify = None
         self._socket = TimedSocket(host, port, limit, standstill)
         self.sl = pigpio._socklock()
         self.sl.s = self._socket
         self.connected = True
+
+    def identify(self) -> int:
+        """Return the version of pigpiod; raise OSError, or `NotPigpiod` for another server."""
+        try:
+            version = int(self.get_pigpio_version())
+        except OSError as error:
+            is_silent = isinstance(error, TimeoutError)
+            answer = self._socket.provoke() if is_silent else self._socket.received
+            if not _ECHO.startswith(answer[: len(_ECHO)]):
+                shown = repr(answer[:_SHOWN_BYTES])[1:]
+                raise self._not_pigpiod(f"it sends {shown}") from None
+            if is_silent:
+                raise SilentServer from None
+            if isinstance(error, ConnectionError) and not answer:
+                raise ConnectionError(
+                    "it closed the connection at once: it is not pigpiod, or its option -n does "
+                    "not permit this address"
+                ) from None
+            raise
+        if not 0 < version <= _MAX_VERSION:  # 0 is sent by a server that returns what it receives
+            raise self._not_pigpiod(f"it says that its version is {version}")
+        return version
+
+    def _not_pigpiod(self, why: str) -> NotPigpiod:
+        return NotPigpiod(f"what answers at {self._host}:{self._port} is not pigpiod: {why}")
 
     @property
     def unanswered(self) -> int:
@@ -191,7 +261,9 @@ def pigpiod_at(host: str, port: int) -> str:
 def describe_error(error: BaseException, limit: float) -> str:
     """Return what went wrong as a short text; `limit` is the time that pigpiod had [s]."""
     if isinstance(error, TimeoutError):
-        return f"no answer within {limit * 1e3:g} ms"
+        silence = f"no answer within {limit * 1e3:g} ms"
+        is_first = isinstance(error, SilentServer)
+        return f"{silence}: it is not pigpiod, or it hangs" if is_first else silence
     if isinstance(error, pigpio.error):
         return _SCRIPT_DELETED if error.value == UNKNOWN_SCRIPT else str(error.value)
     return str(getattr(error, "strerror", None) or error or type(error).__name__)
@@ -206,7 +278,11 @@ def open_client(host: str, port: int, limit: float = ANSWER_TIMEOUT_S) -> Iterat
     client = None
     try:
         client = Client(host, port, limit)
+        client.identify()
+        client.within(limit)
         yield client
+    except UnsuitableServer:
+        raise
     except COMMAND_ERRORS as error:
         raise ServoError(f"{pigpiod_at(host, port)}: {describe_error(error, limit)}") from None
     finally:

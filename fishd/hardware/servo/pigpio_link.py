@@ -11,6 +11,7 @@ from fishd.hardware.servo.pigpio_client import (
     ANSWER_TIMEOUT_S,
     COMMAND_ERRORS,
     Client,
+    UnsuitableServer,
     describe_error,
     pigpiod_at,
 )
@@ -74,7 +75,7 @@ class PigpioLink:
         self._standstill = standstill
         self._client: Client | None = None
         self._opening: Client | None = None
-        self._reason = "no answer yet"
+        self._trouble = f"{self._where}: not connected: no answer yet"
         self._connections = 0
         self._late = 0  # number of late sessions in a row
         self._next_attempt = float("-inf")
@@ -131,10 +132,11 @@ class PigpioLink:
                     suffix = "; waiting for it"
                 raise ServoError(f"{self._where}: {why}{suffix}") from None
             except BaseException as error:
-                self._drop(client, describe_error(error, limit))
+                why = describe_error(error, limit)
+                self._drop(client, why)
                 if not isinstance(error, COMMAND_ERRORS):
                     raise
-                raise ServoError(f"{self._where}: {self._reason}{suffix}") from None
+                raise ServoError(f"{self._where}: {why}{suffix}") from None
         finally:
             self._lock.release()
 
@@ -163,12 +165,12 @@ class PigpioLink:
             self._next_attempt = now + VIRTUAL_PAUSE_S
             self._connect()
         if not self._client:
-            raise ServoError(f"{self._where}: not connected: {self._reason}{suffix}")
+            raise ServoError(f"{self._trouble}{suffix}")
         return self._client
 
     def _drop(self, client: Client, why: str) -> None:
         self._client = None
-        self._reason = why
+        self._trouble = f"{self._where}: not connected: {why}"
         client.close()
         self._needed.set()
 
@@ -179,12 +181,14 @@ class PigpioLink:
             client = self._opening = Client(*self._address, real_limit, self._standstill)
             if self._closed.is_set():  # `close` may have run before `_opening` was set
                 raise ConnectionError("closed")
-            client.get_pigpio_version()
+            client.identify()
             limit = PREPARATION_TIMEOUT_S
             client.within(self._real_limit(limit))
             self._prepare(client)
         except BaseException as error:
-            self._reason = describe_error(error, limit)
+            why = describe_error(error, limit)
+            is_named = isinstance(error, UnsuitableServer)
+            self._trouble = why if is_named else f"{self._where}: not connected: {why}"
             if client:
                 client.close()
             if isinstance(error, Exception):  # the next attempt may succeed

@@ -19,6 +19,7 @@ from fishd.hardware.servo.pigpio_client import (
     SCRIPT_PARAMETERS,
     UNKNOWN_SCRIPT,
     Client,
+    MissingCommands,
     open_client,
 )
 from fishd.hardware.servo.pulses import NEUTRAL_TIME_S
@@ -52,7 +53,45 @@ _READ_BACKS, _READ_BACK_S = 10, 0.1
 _LEVEL_READS, _LEVEL_READ_S = 130, 4e-4
 """Number of reads of a pin's level, and time between them [s]; together they cover two frames."""
 
+_SCRIPT_COMMANDS = {
+    "PROC": pigpio._PI_CMD_PROC,
+    "PROCD": pigpio._PI_CMD_PROCD,
+    "PROCP": pigpio._PI_CMD_PROCP,
+    "PROCR": pigpio._PI_CMD_PROCR,
+    "PROCU": pigpio._PI_CMD_PROCU,
+}
+_PIN_COMMANDS = {
+    "SERVO": pigpio._PI_CMD_SERVO,
+    "GPW": pigpio._PI_CMD_GPW,
+    "GDC": pigpio._PI_CMD_GDC,
+    "MODEG": pigpio._PI_CMD_MODEG,
+    "READ": pigpio._PI_CMD_READ,
+}
+"""Commands of pigpiod that fishd needs, by the names of `pigs`."""
+_NOTHING = 99
+"""Number that neither a script nor a GPIO has."""
+
 Sleep = Callable[[float], None]
+
+
+def check_commands(client: Client) -> None:
+    """Raise `MissingCommands` unless pigpiod knows all commands that fishd needs."""
+    if missing := missing_commands(client, _SCRIPT_COMMANDS | _PIN_COMMANDS):
+        raise MissingCommands(
+            f"{client.place} is version {client.get_pigpio_version()}, too old: it does not know "
+            f"{', '.join(missing)}, which the countdown needs"
+        )
+
+
+def missing_commands(client: Client, commands: dict[str, int]) -> list[str]:
+    """Return those commands that pigpiod does not know; none of them has an effect here."""
+    missing = []
+    for name, number in commands.items():
+        text = b"?" if name == "PROC" else b""  # not a script, so it is refused
+        result = pigpio._pigpio_command_ext(client.sl, number, _NOTHING, 0, len(text), [text])
+        if pigpio.u2i(result) == pigpio.PI_UNKNOWN_COMMAND:
+            missing.append(name)
+    return missing
 
 
 def countdown_counts(countdown: float, tick: float) -> int:
@@ -164,17 +203,19 @@ def neutralise(
 
 
 def _neutralise(client: Client, gpio: int, neutral: float, sleep: Sleep) -> bool:
-    scripts = find_countdowns(client, gpio, ANSWER_TIMEOUT_S)
+    has_scripts = not missing_commands(client, _SCRIPT_COMMANDS)
+    scripts = find_countdowns(client, gpio, ANSWER_TIMEOUT_S) if has_scripts else []
     energised = _pulses_on(client, gpio, sleep)
     if energised:
         client.within(ANSWER_TIMEOUT_S)
-        # First a new script guards the pulses: this process may be killed too.
-        guard = install(client, gpio, _GUARD_COUNTS, OFF, sleep)
-        remove(client, scripts)
-        scripts = [guard]
-        client.within(ANSWER_TIMEOUT_S)
-        with _ignore_missing_script():
-            client.update_script(guard, armed_parameters(gpio, _GUARD_COUNTS, OFF))
+        if has_scripts:
+            # First a new script guards the pulses: this process may be killed too.
+            guard = install(client, gpio, _GUARD_COUNTS, OFF, sleep)
+            remove(client, scripts)
+            scripts = [guard]
+            client.within(ANSWER_TIMEOUT_S)
+            with _ignore_missing_script():
+                client.update_script(guard, armed_parameters(gpio, _GUARD_COUNTS, OFF))
         # This also takes the pin from the PWM peripheral.
         client.set_servo_pulsewidth(gpio, round(neutral))
         sleep(NEUTRAL_TIME_S)

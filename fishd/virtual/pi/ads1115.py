@@ -1,4 +1,4 @@
-"""ADS1115 emulated at the level of its registers, on which the real driver runs unchanged.
+"""ADS1115 or ADS1015 emulated at the level of its registers; the real driver runs unchanged on it.
 
 The chip has no thread: at each access it computes the conversions since the previous one. Only the
 single-shot mode is emulated. The comparator is not: the ALERT pin is not connected.
@@ -26,8 +26,11 @@ RESET_CONFIG = 0x0583
 FULL_SCALE = (6.144, 4.096, 2.048, 1.024, 0.512, 0.256, 0.256, 0.256)
 """Full scale for each value of the gain bits [V]."""
 
-DATA_RATES = (8, 16, 32, 64, 128, 250, 475, 860)
-"""Nominal data rate for each value of the rate bits [1/s]."""
+DATA_RATES = {
+    16: (8, 16, 32, 64, 128, 250, 475, 860),
+    12: (128, 250, 490, 920, 1600, 2400, 3300, 3300),
+}
+"""Nominal data rate for each value of the rate bits [1/s], by the number of bits of the chip."""
 
 POWER_UP = 25e-6
 """Time to wake up before a conversion [s]."""
@@ -53,17 +56,21 @@ class Ads1115Chip:
         faults: Faults,
         noise: float = 1.0,
         seed: int = 0,
+        bits: int = 16,
     ) -> None:
         """
         volts: returns the mean voltage [V] of an input, given its mux bits (0 to 7), start and
             end [s]
-        noise: rms noise of a conversion, in steps of the ADC
+        noise: rms noise of a conversion, in steps of an ADS1115
         seed: seed of the noise, and of the error of the data rate, within ±10 %
+        bits: 16 for an ADS1115; 12 for an ADS1015, whose codes and thresholds end with four zeros
         """
         self._clock = clock
         self._volts = volts
         self._faults = faults
         self._noise = noise
+        self._step = 1 << 16 - bits
+        self._rates = DATA_RATES[bits]
         self._random = random.Random(seed)
         self.rate_factor = self._random.uniform(0.9, 1.1)
         self._lock = threading.RLock()
@@ -77,7 +84,7 @@ class Ads1115Chip:
         """Return to the state after power-up; a running conversion is lost."""
         with self._lock:
             self._pointer = CONVERSION
-            self._registers = [0, RESET_CONFIG, 0x8000, 0x7FFF]
+            self._registers = [0, RESET_CONFIG, 0x8000, self._rounded_down(0x7FFF)]
             self._conversion: _Conversion | None = None
 
     def write(self, data: bytes) -> None:
@@ -108,7 +115,7 @@ class Ads1115Chip:
 
     def _store(self, word: int, now: float) -> None:
         if self._pointer != CONFIG:
-            self._registers[self._pointer] = word
+            self._registers[self._pointer] = self._rounded_down(word)
             return
         self._registers[CONFIG] = config = word & ~_IDLE_BIT
         if not config & _SINGLE_SHOT:
@@ -119,7 +126,7 @@ class Ads1115Chip:
         idle = self._conversion is None and not self._faults.active("stuck-busy")
         if word & _IDLE_BIT and config & _SINGLE_SHOT and idle:
             start = now + POWER_UP
-            rate = DATA_RATES[config >> 5 & 7] * self.rate_factor
+            rate = self._rates[config >> 5 & 7] * self.rate_factor
             self._conversion = _Conversion(start, start + 1.0 / rate, config)
 
     def _warn_once(self, message: str) -> None:
@@ -140,13 +147,18 @@ class Ads1115Chip:
         """Return the result of a conversion."""
         start, end, config = conversion
         mux = config >> 12 & 7
+        largest = self._rounded_down(0x7FFF)
         if self._faults.active("clipped"):
-            code = 0x7FFF
+            code = largest
         elif self._faults.active("frozen-code"):
             code = self._last_codes.get(mux, self._registers[CONVERSION])
         else:
             steps = self._volts(mux, start, end) / FULL_SCALE[config >> 9 & 7] * 0x8000
             noisy = self._random.gauss(steps, self._noise) if self._noise else steps
-            code = round(min(max(noisy, -0x8000), 0x7FFF))
+            code = min(max(round(noisy / self._step) * self._step, -0x8000), largest)
         self._last_codes[mux] = code
         return code
+
+    def _rounded_down(self, word: int) -> int:
+        """Return a register's value without the bits that the chip does not have."""
+        return word & -self._step

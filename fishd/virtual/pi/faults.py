@@ -26,6 +26,7 @@ FAULTS: dict[str, str] = {
     "meter-brown-out": "INA219, INA226: registers reset; happens at once",
     "pigpiod-gone": "pigpiod: not running; connections closed, pulses stopped, scripts lost",
     "pigpiod-frozen": "pigpiod: stopped; no answers, scripts pause, pulses continue",
+    "pigpiod-old": "pigpiod: of a version that does not know PROCU, which a countdown needs",
     "pulse-jitter": "pigpiod: each edge of its pulses comes up to 100 µs late",
     "pigpiod-restart": "pigpiod: killed and started again; happens at once",
 }

@@ -32,8 +32,12 @@ class VirtualPiSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     ] = 0.0
     zero_x: Annotated[float, unit("V", "Voltage of channel_x at zero force.", ge=-5, le=5)] = 0.0
     zero_y: Annotated[float, unit("V", "Voltage of channel_y at zero force.", ge=-5, le=5)] = 0.0
+    adc: Annotated[
+        Literal["ads1115", "ads1015"],
+        note("ADC: an ADS1115, or an ADS1015 as some shops sell it under that name, with 12 bits."),
+    ] = "ads1115"
     adc_noise: Annotated[
-        float, unit("1", "RMS noise of a conversion, in steps of the ADC.", ge=0, le=100)
+        float, unit("1", "RMS noise of a conversion, in steps of an ADS1115.", ge=0, le=100)
     ] = 1.0
     adc_gain: Annotated[
         float, unit("1", "Ratio of the ADC's codes to those of a perfect one.", ge=0.5, le=2)

@@ -24,6 +24,8 @@ from fishd.virtual.plant.parameters import PlantParameters
 
 POWER_METER_ADDRESS = 0x40
 """I2C address of the power meter."""
+ADC_BITS = {"ads1115": 16, "ads1015": 12}
+"""Number of bits of each ADC."""
 _MUX_OF_A0 = (0, 1, 4)
 """Mux bits of the inputs A0-A1, A0-A3 and A0; the other two pins are at ground beside a filter."""
 _MAX_CONVERSION_S = 0.2
@@ -95,7 +97,9 @@ class VirtualPi:
             self.pigpiod.connect(settings.loop_gpio, settings.servo_gpio)
         is_plain = self._filter is None and settings.adc_gain == 1.0
         volts = self.tank.volts if is_plain else self._volts
-        self.chip = Ads1115Chip(clock, volts, self.faults, settings.adc_noise, seed=seed + 2)
+        self.chip = Ads1115Chip(
+            clock, volts, self.faults, settings.adc_noise, seed + 2, ADC_BITS[settings.adc]
+        )
         self.bus.attach(settings.address, self.chip)
         if settings.power_meter:
             supply = imperfections.motor.voltage

@@ -4,10 +4,11 @@ import datetime
 import os
 import socket
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rigs.doctor_process import doctor, free_telemetry
-from rigs.operator_rig import Bench
+from rigs.operator_rig import Bench, bench
 from rigs.processes import fishctl
 
 from fishd.core.calibration import ForceCalibration
@@ -104,7 +105,7 @@ def test_a_fault_of_the_hardware_fails_the_check_that_is_about_it(
 
 @pytest.mark.parametrize(
     ("register", "value", "level", "complaint"),
-    [(1, 0x0483, "warning", "another program uses it"), (3, 0x7FF0, "FAIL", "an ADS1015 answers")],
+    [(1, 0x0483, "warning", "another program uses it"), (3, 0x7FF0, "warning", "threshold 0x7ff0")],
 )
 def test_a_chip_that_is_not_as_fishd_left_it_is_pointed_out(
     pi: Bench, register: int, value: int, level: str, complaint: str
@@ -113,6 +114,21 @@ def test_a_chip_that_is_not_as_fishd_left_it_is_pointed_out(
     _, findings = doctor(pi.folder, *pi.settings, *free_telemetry())
     assert findings["adc"][0] == level
     assert complaint in findings["adc"][1]
+
+
+def test_an_ads1015_sold_as_ads1115_fails_whether_fishd_runs_or_not(
+    process: Any, tmp_path: Path
+) -> None:
+    with bench(process, tmp_path, 12) as pi:
+        findings = [doctor(tmp_path, *pi.settings, *free_telemetry())[1]["adc"]]
+        pi.pi.write_register(3, 0x123F)  # by another program, which believes the label too
+        findings.append(doctor(tmp_path, *pi.settings, *free_telemetry())[1]["adc"])
+        with pi.daemon("--set", "force_sensor.frozen_after=null") as daemon:
+            _, asked = doctor(tmp_path, *pi.settings, *free_telemetry())
+            (limitation,) = (line for line in daemon.status().limitations if "ADS1015" in line)
+            assert limitation in daemon.fishctl("status").stdout
+    assert [*findings, asked["adc"]] == 3 * [("FAIL", limitation)]
+    assert limitation in asked["daemon"][1]
 
 
 def test_without_a_virtual_pi_the_sensor_fails_in_one_line(tmp_path: Path) -> None:

@@ -10,6 +10,9 @@ from rigs.doctor_tree import Examine, put, unprivileged
 from rigs.processes import call
 
 from fishd.cli.doctor import timing
+from fishd.cli.doctor.base import Context
+from fishd.cli.doctor.bench.measurement import describe_board
+from fishd.config import load
 
 MODEL, BUS = "proc/device-tree/model", "of_node/clock-frequency"
 PI_4 = {MODEL: "Raspberry Pi 4 Model B Rev 1.5\0"}
@@ -35,6 +38,7 @@ OWN_KERNEL = (
 FAST, SLOW = (speed.to_bytes(4, "big") for speed in (400_000, 100_000))
 SPEED, SPEED_BEFORE = f"sys/bus/i2c/devices/i2c-1/{BUS}", f"sys/class/i2c-adapter/i2c-1/{BUS}"
 FLAGS = "sys/devices/platform/soc/soc:firmware/get_throttled"
+FLAGS_PI_5 = "sys/devices/platform/soc@107c000000/soc@107c000000:firmware/get_throttled"
 HWMON = "sys/class/hwmon/hwmon"
 MONITOR = {f"{HWMON}0/name": "cpu_thermal\n", f"{HWMON}1/name": "rpi_volt\n"}
 ALARM = "sys/class/hwmon/hwmon1/in0_lcrit_alarm"
@@ -90,6 +94,8 @@ CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
     ("power", "warning", "the Pi is throttled", {FLAGS: "4\n"}, []),
     ("power", "warning", "too hot", {FLAGS: "8\n"}, []),
     ("power", "warning", "has been under-voltage and throttled", {FLAGS: "50000\n"}, []),
+    ("power", "ok", "no under-voltage", {FLAGS_PI_5: "0\n"}, []),
+    ("power", "FAIL", "under-voltage", {FLAGS_PI_5: "50005\n"}, []),
     ("power", "skipped", "does not report", {}, []),
     ("power", "ok", "no under-voltage", MONITOR | {ALARM: "0\n"}, []),
     ("power", "FAIL", "under-voltage", MONITOR | {ALARM: "1\n"}, []),
@@ -151,6 +157,23 @@ def test_a_check_reports_the_state_of_a_pi(
         put(root, path, content)
     actual_level, message, mend = examine(check, *settings)
     assert (actual_level, words in f"{message}; {mend}") == (level, True), message
+
+
+@pytest.mark.parametrize("flags", [FLAGS, FLAGS_PI_5])
+def test_a_report_of_the_bench_has_the_power_and_heat_of_each_board(root: Path, flags: str) -> None:
+    zone = "sys/class/thermal/thermal_zone"
+    files = {
+        flags: "50005\n",
+        f"{zone}0/type": "nvme\n",
+        f"{zone}0/temp": "31000\n",
+        f"{zone}1/type": "cpu-thermal\n",
+        f"{zone}1/temp": "48312\n",
+    }
+    for path, content in files.items():
+        put(root, path, content)
+    config = load(None, ["robot=pi", f"state_folder={root}/state"])
+    board = describe_board(Context(config, None, f"ipc://{root}/nobody", root))
+    assert (board.throttled, board.temperature) == ("50005", 48.312)
 
 
 def skip_unless_root() -> None:

@@ -17,6 +17,7 @@ from fishd.cli.doctor.base import Context
 from fishd.cli.doctor.bench import analog, pulses, swim
 from fishd.cli.doctor.bench.report import BenchReport, Board, Finding, page
 from fishd.cli.doctor.bench.swim import Bench
+from fishd.cli.doctor.computer import read_throttled
 from fishd.cli.output import echo, print_json
 from fishd.core.clock import SystemClock
 from fishd.core.errors import ConfigError, FishError, ServoError, StartupError
@@ -64,6 +65,8 @@ BUSY_PINS = (0, 1, 2, 3, 14, 15)
 """GPIOs of buses, which change for other reasons."""
 WIDTHS = 5
 """Number of duties of the filter."""
+_PROCESSOR_ZONES = ("cpu-thermal", "x86_pkg_temp")
+"""Types of the kernel's thermal zones that measure a processor; their numbers change."""
 _PACKAGES = (
     *("msgspec", "numpy", "pyzmq", "pigpio", "rpi-lgpio", "RPi.GPIO", "Adafruit-Blinka"),
     *("adafruit-circuitpython-ads1x15", "adafruit-extended-bus"),
@@ -283,7 +286,7 @@ def describe_board(context: Context) -> Board:
         kernel=kernel.release,
         preempt_rt="PREEMPT_RT" in kernel.version or context.text("/sys/kernel/realtime") == "1",
         governor=", ".join(sorted(governors)),
-        throttled=context.text("/sys/devices/platform/soc/soc:firmware/get_throttled"),
+        throttled=read_throttled(context),
         temperature=_temperature(context),
         python=platform.python_version(),
         fishd=__version__,
@@ -293,8 +296,13 @@ def describe_board(context: Context) -> Board:
 
 
 def _temperature(context: Context) -> float | None:
-    text = context.text("/sys/class/thermal/thermal_zone0/temp")
-    return int(text) / 1000.0 if text.lstrip("-").isdigit() else None
+    """Return the temperature of the processor [°C], by the name of its sensor."""
+    zones = "/sys/class/thermal"
+    for zone in sorted(context.path(zones).glob("thermal_zone*")):
+        if context.text(f"{zones}/{zone.name}/type") in _PROCESSOR_ZONES:
+            text = context.text(f"{zones}/{zone.name}/temp")
+            return int(text) / 1000.0 if text.lstrip("-").isdigit() else None
+    return None
 
 
 def confirm(context: Context, loop_gpio: int) -> None:

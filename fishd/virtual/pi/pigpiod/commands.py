@@ -20,6 +20,8 @@ log = logging.getLogger(__name__)
 
 VERSION = 79
 """Version of the library in Raspberry Pi OS, whose Python module is 1.78."""
+OLD_VERSION, UNKNOWN_TO_OLD = 60, frozenset({"PROCU"})
+"""Version of an older pigpiod, and the commands that it does not know."""
 HARDWARE_REVISION = 0xC03112
 """Revision of a Raspberry Pi 4B with 4 GB."""
 MAX_SCRIPTS = 32
@@ -244,6 +246,8 @@ class Commands:
         self.notifications: dict[int, Notification] = {}
         """Notifications by handle."""
         self._random = random.Random(0)
+        self.unknown: frozenset[str] = frozenset()
+        """Names of the commands that it does not know, as an older version."""
         self._logged: set[int] = set()
         """Unknown commands that were logged."""
         self._handlers: dict[str, Callable[[float, int, int, bytes], int]] = {
@@ -253,7 +257,7 @@ class Commands:
             "WRITE": lambda time, gpio, level, _: pins.write(time, gpio, level),
             "PWM": lambda time, gpio, duty, _: pins.pwm(time, gpio, duty),
             "SERVO": lambda time, gpio, width, _: pins.servo(time, gpio, width),
-            "PIGPV": lambda _, __, ___, ____: VERSION,
+            "PIGPV": lambda _, __, ___, ____: OLD_VERSION if self.unknown else VERSION,
             "GDC": lambda time, gpio, _, __: pins.duty(gpio),
             "GPW": lambda time, gpio, _, __: pins.servo_width(gpio),
             "HP": lambda time, gpio, frequency, extension: pins.hardware_pwm(
@@ -342,6 +346,8 @@ class Commands:
         Return the result, negative for an error, and the bytes that follow it.
         """
         name = NAMES[number] if number < len(NAMES) else "?"
+        if name in self.unknown:
+            return errors.UNKNOWN_COMMAND, b""
         try:
             if name == "PROCP":
                 script = self._script(p1)

@@ -16,7 +16,7 @@ import time
 from fishd.core.clock import Clock
 from fishd.virtual.pi.faults import Faults
 from fishd.virtual.pi.pigpiod import errors
-from fishd.virtual.pi.pigpiod.commands import NAMES, Commands
+from fishd.virtual.pi.pigpiod.commands import NAMES, UNKNOWN_TO_OLD, Commands
 from fishd.virtual.pi.pigpiod.script import MAX_DELAY_MS
 from fishd.virtual.pi.pulse_train import Edge
 
@@ -206,6 +206,8 @@ class Pigpiod:
         gone = frozen = False
         if not faults.none:
             gone, frozen = faults.active("pigpiod-gone"), faults.active("pigpiod-frozen")
+            is_old = faults.active("pigpiod-old")
+            self._commands.unknown = UNKNOWN_TO_OLD if is_old else frozenset()
         if gone != self._gone:
             self._gone = gone
             if gone:

@@ -18,7 +18,7 @@ from fishd.hardware.servo.pigpio_client import Client, open_client
 
 
 class Server:
-    """Pigpiod that gives one prepared answer and then ends, or does not answer."""
+    """Pigpiod that says its version, gives a prepared answer, and then ends or is silent."""
 
     def __init__(self, answer: bytes, *, dies: bool) -> None:
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -32,6 +32,8 @@ class Server:
         connection, _ = self._listener.accept()
         with connection:
             connection.recv(16)
+            connection.sendall(VERSION)
+            connection.recv(16)
             connection.sendall(self._answer)
             if not self._dies:
                 self._done.wait(10.0)
@@ -42,6 +44,7 @@ class Server:
         self._listener.close()
 
 
+VERSION = struct.pack("<IIII", 26, 0, 0, 79)
 HEADER = struct.pack("<IIII", 45, 0, 0, 44)
 
 

@@ -8,6 +8,7 @@ from rigs.force_rig import STEP, TICK, ForceRig, Ticks, measurements
 from fishd.core.calibration import ForceCalibration
 from fishd.core.errors import SensorError
 from fishd.core.signals import Measurement
+from fishd.virtual.pi.i2c import Write
 
 CALIBRATION = ForceCalibration(xx=2.0, xy=0.1, x0=-0.3, yx=-0.2, yy=3.0, y0=0.4)
 
@@ -41,7 +42,7 @@ def test_a_window_of_50_ms_holds_at_least_eight_pairs() -> None:
         windows = measurements(Ticks(rig.sensor()).run(5.0))
     assert min(measured.samples for measured in windows) >= 12
     with ForceRig(speed=100e3) as rig:
-        windows = measurements(Ticks(rig.sensor()).run(5.0))
+        windows = measurements(Ticks(rig.sensor()).run(5.0))[1:]  # the first also opens the chip
     assert min(measured.samples for measured in windows) >= 8
 
 
@@ -140,3 +141,37 @@ def test_a_closed_sensor_can_be_closed_again_and_not_be_read(rig: ForceRig) -> N
     sensor.close()
     with pytest.raises(SensorError, match="is closed"):
         sensor.read(2 * TICK)
+
+
+COARSE = (
+    "the chip at 0x48 on /dev/i2c-1 is an ADS1015, not an ADS1115: it has 12 bits, so its step is "
+    "1 mV, 16 times as coarse; replace it"
+)
+
+
+@pytest.mark.parametrize("threshold", [None, 0x7FF0, 0x1230, 0x8000])
+@pytest.mark.parametrize(("bits", "limitations"), [(16, ()), (12, (COARSE,))])
+def test_an_ads1015_is_a_limitation_whatever_another_program_wrote(
+    bits: int, limitations: tuple[str, ...], threshold: int | None
+) -> None:
+    with ForceRig(bits=bits) as rig:
+        if threshold is not None:
+            rig.bus.transfer(0x48, [Write(bytes([3, *threshold.to_bytes(2, "big")]))])
+        sensor = rig.sensor()
+        measured = Ticks(sensor).next()
+        assert sensor.limitations == limitations
+    assert (measured.fx, measured.fy) == pytest.approx((0.5, -0.25), abs=1e-3)
+
+
+def test_an_ads1115_in_the_place_of_an_ads1015_ends_the_limitation() -> None:
+    with ForceRig(bits=12) as coarse:
+        fine = ForceRig(clock=coarse.clock)
+        sensor = coarse.sensor()
+        ticks = Ticks(sensor)
+        ticks.next()
+        assert sensor.limitations == (COARSE,)
+        coarse.faults.inject("unplugged")
+        ticks.run(0.5)
+        coarse.bus = fine.bus
+        ticks.run(1.5)
+        assert sensor.limitations == ()

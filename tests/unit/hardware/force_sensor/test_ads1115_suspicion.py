@@ -37,6 +37,14 @@ def test_a_clipped_channel_is_named_with_its_limit(rig: ForceRig, volts: float, 
     assert measured.suspect == f"F_y (channel A2-A3) is clipped at {end} V"
 
 
+@pytest.mark.parametrize(("volts", "end"), [(3.0, "+2.048"), (-3.0, "-2.048")])
+def test_the_largest_code_of_an_ads1015_is_clipped_too(volts: float, end: str) -> None:
+    with ForceRig(bits=12) as rig:
+        rig.volts["A2-A3"] = volts
+        measured = Ticks(rig.sensor()).next()
+    assert measured.suspect == f"F_y (channel A2-A3) is clipped at {end} V"
+
+
 @pytest.mark.parametrize(("volts", "key"), [(3.28, "saturation_high"), (-3.28, "saturation_low")])
 def test_an_amplifier_at_its_supply_is_suspected(rig: ForceRig, volts: float, key: str) -> None:
     rig.volts["A2-A3"] = volts

@@ -46,15 +46,20 @@ def test_noise_is_as_large_as_asked_for_and_the_same_for_the_same_seed() -> None
     assert readings(1) == noisy_codes != readings(2)
 
 
-@pytest.mark.parametrize(("bits", "rate"), list(enumerate(DATA_RATES)))
-def test_a_conversion_lasts_a_period_of_a_rate_that_is_off_by_a_tenth(bits: int, rate: int) -> None:
+@pytest.mark.parametrize(
+    ("chip", "bits", "rate"),
+    [(chip, bits, rate) for chip, rates in DATA_RATES.items() for bits, rate in enumerate(rates)],
+)
+def test_a_conversion_lasts_a_period_of_a_rate_that_is_off_by_a_tenth(
+    chip: int, bits: int, rate: int
+) -> None:
     lengths = []
     for seed in range(20):
-        board = Board(seed=seed)
+        board = Board(seed=seed, bits=chip)
         board.configure(config(X, rate=bits))
         begun = board.clock.now
         board.clock.sleep(1.2 / rate)
-        assert board.register(0) == codes(VOLTS[X])
+        assert board.register(0) == pytest.approx(codes(VOLTS[X]), abs=0 if chip == 16 else 8)
         (_, start, end) = board.measured[0]
         assert start == pytest.approx(begun + POWER_UP)
         lengths.append((end - start) * rate)
@@ -68,6 +73,16 @@ def test_registers_are_read_and_written_by_their_pointer(board: Board) -> None:
     assert answers == [[b"\x12"], [b"\x12\x34"], [b"\x12\x34\xff"]]
     board.bus.transfer(0x48, [Write(b"\x03\x12")])  # half a word
     assert board.register(3) == 0x7FFF
+
+
+def test_an_ads1015_has_neither_codes_nor_thresholds_between_its_steps() -> None:
+    with Board(bits=12) as board:
+        board.volts[:3] = [0.2, 5.0, -5.0]
+        ads = board.driver(gain=2)
+        assert [ads.read(mux) for mux in range(3)] == [3200, 0x7FF0, -0x8000]
+        assert board.register(3) == 0x7FF0
+        board.bus.transfer(0x48, [Write(b"\x03\x12\x3f")])
+        assert board.register(3) == 0x1230
 
 
 def test_a_busy_chip_tells_so_and_ignores_a_start(board: Board) -> None:

@@ -1,10 +1,13 @@
 """Pulses to forces and a button to a pin, with the real drivers on the virtual Pi."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import pytest
 from rigs.processes import PATIENCE
 
+from fishd.assembly import open_in_virtual_time
+from fishd.config import load
 from fishd.core.clock import VirtualClock
 from fishd.hardware.servo.pigpio_client import Client
 from fishd.virtual.imperfections import SimulationSettings
@@ -81,3 +84,12 @@ def test_a_button_is_seen_by_the_true_gpio_library(pi: VirtualPi) -> None:
         gpio.cleanup()
     with pytest.raises(ValueError, match="GPIO 40 is not valid: 0 to 27 is needed"):
         pi.set_level(40, 1)
+
+
+@pytest.mark.parametrize("adc", ["ads1115", "ads1015"])
+def test_the_real_driver_finds_out_which_adc_it_has(adc: str) -> None:
+    config = load(None, ["robot=virtual-pi", f"virtual_pi.adc={adc}"])
+    with ExitStack() as stack:
+        robot, _ = open_in_virtual_time(config, stack)
+        robot.sensor.read(config.tick)
+        assert any("ADS1015" in line for line in robot.limitations()) == (adc == "ads1015")

@@ -1,0 +1,92 @@
+"""Packages that end, crash or change the process that imports them: fishd survives
+and names them.
+"""
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from rigs.processes import START, call, install, one_line, running
+
+from fishd.core import trial_import
+
+DANGERS = {
+    "exiting": ("import os\nos._exit(0)\n", "its import ends its process with exit status 0"),
+    "crashing": (
+        "import os, signal\nos.kill(os.getpid(), signal.SIGSEGV)\n",
+        "its import ends its process with SIGSEGV",
+    ),
+    "closing": (
+        "import os\nfor number in range(1024):\n"
+        "    try:\n        os.close(number)\n    except OSError:\n        pass\n",
+        "its import closes files of its process",
+    ),
+    "endless": ("while True:\n    pass\n", "its import does not end within 8 s"),
+    "quitting": ("import sys\nsys.exit(3)\n", "SystemExit: 3"),
+}
+CHANGING = """
+import os, signal
+os.chdir("/")
+try:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+except ValueError:
+    pass  # not in the main thread
+
+from fishd.controllers.hold import Hold
+
+
+class Harmless(Hold):
+    \"\"\"Changes its process.\"\"\"
+"""
+
+
+def packages(folder: Path, *names: str, group: str = "fishd.controllers") -> Path:
+    site = folder / "site"
+    modules = {f"{name}_module": DANGERS[name][0] for name in names} | {"changing": CHANGING}
+    classes = {name: f"{name}_module:Any" for name in names}
+    install(site, modules, group=group, **classes, harmless="changing:Harmless")
+    return site
+
+
+@pytest.mark.parametrize("name", sorted(DANGERS))
+def test_a_package_that_no_configuration_names_does_not_stop_fishd(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = packages(tmp_path, name)
+    monkeypatch.setenv("PYTHONPATH", str(site), prepend=os.pathsep)
+    with running(tmp_path) as daemon:
+        assert daemon.status().mode == "idle"
+        refused = daemon.fishctl_apart("set-controller", name)
+        line = f"controller '{name}' ({name}_module:Any in {name} 1.0) does not load: "
+        assert f"{line}{DANGERS[name][1]}" in one_line(refused)
+        assert daemon.fishctl("set-controller", "harmless").returncode == 0
+        assert Path(f"/proc/{daemon.process.pid}/cwd").resolve() == Path.cwd()
+        daemon.process.send_signal(signal.SIGTERM)
+        assert daemon.process.wait() == 0
+
+
+@pytest.mark.parametrize("name", sorted(DANGERS.keys() - {"endless"}))
+def test_one_that_the_configuration_names_is_named_in_its_refusal(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = packages(tmp_path, name, group="fishd.plants")
+    monkeypatch.setenv("PYTHONPATH", str(site), prepend=os.pathsep)
+    control = f"control.address=ipc://{tmp_path}/control"
+    ended = call(*START, "--set", f"plant.model={name}", "--set", control)
+    assert ended.returncode == os.EX_CONFIG
+    assert f"in {name} 1.0) does not load: {DANGERS[name][1]}" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_a_package_that_is_repaired_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    file = tmp_path / "repaired.py"
+    file.write_text(DANGERS["exiting"][0])
+    assert trial_import.find_danger("repaired") == DANGERS["exiting"][1]
+    file.write_text("repaired = True\n")
+    trial_import.find_danger.cache_clear()  # as an installation does
+    assert trial_import.find_danger("repaired") == ""
