@@ -175,13 +175,14 @@ def _kept_process_state() -> Iterator[None]:
 
     A package may change them while it is imported.
     """
-    folder = os.open(".", os.O_RDONLY | os.O_DIRECTORY)
+    folder = os.open(".", os.O_PATH | os.O_DIRECTORY)  # this user may lack the right to read it
     in_main = threading.current_thread() is threading.main_thread()
     handlers = {n: signal.getsignal(n) for n in _SIGNALS} if in_main else {}
     try:
         yield
     finally:
-        os.fchdir(folder)
+        with suppress(PermissionError):  # this user may not enter the folder again
+            os.fchdir(folder)
         os.close(folder)
         for number, handler in handlers.items():
             if handler is not None:  # None was not set by Python
