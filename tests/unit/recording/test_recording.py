@@ -22,7 +22,7 @@ from fishd.core.signals import Tick
 from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording import recorder as recorder_module
 from fishd.recording.folder import find_recording, list_recordings, read_overview, read_overviews
-from fishd.recording.recorder import Description, NewFrames, Recorder
+from fishd.recording.recorder import TAKEOVER_MESSAGE, Description, NewFrames, Recorder
 from fishd.recording.recover import recover
 from fishd.recording.summary import Tally
 
@@ -263,9 +263,7 @@ def test_it_is_told_once_that_another_fishd_has_taken_over(
     for tick in ticks[seq:]:
         hear(recorder, tick, pid=2)
     recorder.__exit__(None, None, None)
-    assert [line for line in lines if "another fishd" in line] == [
-        "another fishd has taken over: the recording continues with it"
-    ]
+    assert [line for line in lines if "another fishd" in line] == [TAKEOVER_MESSAGE]
     run = open_run(tmp_path / "run.mcap")
     assert run.summary.restarts == 1
     assert [daemon["pid"] for daemon in run.daemons] == ["1", "2"]
