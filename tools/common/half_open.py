@@ -13,12 +13,14 @@ _CHUNK = 65536
 class Path:
     """Path to the TCP ports of programs on this machine; a context manager.
 
-    It leads from the same ports of `PATH_HOST`, also in the addresses that the programs send. Each
+    It leads from the same ports of another host, also in the addresses that the programs send. Each
     port can be cut off: its connections forward nothing any more, in neither direction, and are not
     closed; the kernel accepts new ones, which get no answer.
     """
 
-    def __init__(self, *ports: int) -> None:
+    def __init__(self, *ports: int, host: str = PATH_HOST) -> None:
+        """host: where it begins, of the length of `PATH_HOST`"""
+        self._host = host
         self._open = {port: threading.Event() for port in ports}
         self._connections: list[tuple[int, threading.Event, socket.socket]] = []
         """Port, whether it still forwards, and one of its two sockets."""
@@ -27,7 +29,7 @@ class Path:
         self._listeners, self._threads = [], []
         for port, is_open in self._open.items():
             is_open.set()
-            listener = socket.create_server((PATH_HOST, port), backlog=100)
+            listener = socket.create_server((host, port), backlog=100)
             thread = threading.Thread(target=self._accept, args=(port, listener), daemon=True)
             thread.start()
             self._listeners.append(listener)
@@ -91,12 +93,15 @@ class Path:
                 forwards.set()
             self._connections += [(port, forwards, client), (port, forwards, program)]
         for ends in ((client, program), (program, client)):
-            threading.Thread(target=_forward, args=(*ends, forwards), daemon=True).start()
+            arguments = (*ends, self._host, forwards)
+            threading.Thread(target=_forward, args=arguments, daemon=True).start()
 
 
-def _forward(source: socket.socket, target: socket.socket, forwards: threading.Event) -> None:
+def _forward(
+    source: socket.socket, target: socket.socket, host: str, forwards: threading.Event
+) -> None:
     """Forward until an end closes; nothing, and no end, once the connection is forgotten."""
-    here, there = f"tcp://{HOST}:".encode(), f"tcp://{PATH_HOST}:".encode()
+    here, there = f"tcp://{HOST}:".encode(), f"tcp://{host}:".encode()
     with suppress(OSError):
         while (data := source.recv(_CHUNK)) and forwards.is_set():
             target.sendall(data.replace(here, there))
