@@ -16,6 +16,7 @@ from fishd.client.zmq_sockets import milliseconds_until
 from fishd.core import addresses, protocol, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, Refused
+from fishd.core.names import find_name_problem
 
 ENDPOINT_VARIABLE = "FISHD_CAMERA"
 MAX_MESSAGE_BYTES = 16 * 2**20
@@ -92,7 +93,7 @@ class CameraRequests:
             self._socket.close()  # a router may have forgotten its connection
             self._connect()
             self._asked = 0.0
-        if not single_attempt and (problem := addresses.find_name_problem(self.endpoint)):
+        if not single_attempt and (problem := find_name_problem(self.endpoint)):
             raise CameraLost(f"no camera at {self.endpoint}: {problem}")
         if not single_attempt and self._publishes():
             raise CameraLost(

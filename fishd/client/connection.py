@@ -15,7 +15,6 @@ from fishd.core.addresses import (
     ENDPOINT_VARIABLE,
     estop_path,
     find_control_address,
-    find_name_problem,
     socket_path,
 )
 from fishd.core.decoding import decoder
@@ -105,6 +104,8 @@ class Connection:
             listener = self._listener()
         except PermissionError:
             listener = None
+        from fishd.core.names import find_name_problem  # only needed for this message
+
         if problem := find_name_problem(self.endpoint):
             return NoDaemon(f"no fishd at {self.endpoint}: {problem}")
         if listener is None:
@@ -203,22 +204,9 @@ class Connection:
         host, port = self.endpoint.rpartition(":")[0], status.keyed_telemetry.rpartition(":")[2]
         return msgspec.structs.replace(status, telemetry=f"{host}:{port}")
 
-    def no_telemetry_error(self, timeout: float, address: str) -> NoDaemon:
-        """Return the error for missing telemetry; address: as fishd answers, empty if it does not.
-
-        timeout: time for which nothing has come [s]
-        """
-        if not address:
-            return self._no_daemon(f"no telemetry within {timeout:g} s")
-        why = find_name_problem(address) or "can this machine reach that address?"
-        return NoDaemon(
-            f"the fishd at {self.endpoint} answers, but nothing arrives from its telemetry at "
-            f"{address}: {why}"
-        )
-
-    def no_ticks_error(self, timeout: float) -> NoDaemon:
-        """Return the error for a fishd that publishes no ticks."""
-        return NoDaemon(f"the fishd at {self.endpoint} has not ticked for {timeout:g} s")
+    def no_telemetry_error(self, timeout: float) -> NoDaemon:
+        """Return the error for missing telemetry of a fishd that does not answer; timeout: [s]."""
+        return self._no_daemon(f"no telemetry within {timeout:g} s")
 
 
 def _find_access(endpoint: str) -> "Access | None":

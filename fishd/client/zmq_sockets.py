@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import zmq
 
-from fishd.core.addresses import find_name_problem, is_ipv6
+from fishd.core.addresses import is_ipv6
 from fishd.core.errors import NoDaemon
+from fishd.core.names import find_name_problem
 
 if TYPE_CHECKING:
     from fishd.client.connection import Connection
@@ -83,7 +84,7 @@ class Subscription(Generic[S]):
         if address == self.address:
             if not self.was_replaced:
                 self._report(
-                    f"{self._source} answers, but nothing arrives from its telemetry at {address}: "
+                    f"{self._source} answers, but nothing arrives from its telemetry at {address}; "
                     "connecting again"
                 )
             self.was_replaced = True
@@ -119,7 +120,7 @@ class TelemetryReader(Subscription[S]):
     def check_ticks(self) -> None:
         """Raise `NoDaemon` where only other messages have come in time."""
         if time.monotonic() > self._deadline:
-            raise self._fish.no_ticks_error(self._timeout)
+            raise NoDaemon(f"{self._source} has not ticked for {self._timeout:g} s")
 
     def handle_silence(self, address: str) -> None:
         """Connect again if fishd answers; raise `NoDaemon` if that has not helped in time.
@@ -128,8 +129,14 @@ class TelemetryReader(Subscription[S]):
         """
         now = time.monotonic()
         is_overdue = now > self._deadline
-        if is_overdue and (self.was_replaced or not address):
-            raise self._fish.no_telemetry_error(self._timeout, address)
+        if is_overdue and not address:
+            raise self._fish.no_telemetry_error(self._timeout)
+        if is_overdue and self.was_replaced:
+            why = find_name_problem(address) or "can this machine reach that address?"
+            raise NoDaemon(
+                f"{self._source} answers, but nothing arrives from its telemetry at {address}: "
+                f"{why}"
+            )
         if address:
             if not self.was_replaced:  # one attempt, whatever the timeout
                 self._deadline = max(self._deadline, now + min(self._timeout, TELEMETRY_TIMEOUT_S))

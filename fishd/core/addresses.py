@@ -25,8 +25,6 @@ ADDRESS_FORM = "tcp://HOST:PORT or ipc://PATH is needed"
 ENDPOINT_VARIABLE = "FISHD_ENDPOINT"
 KEYS_VARIABLE = "FISHD_KEYS"
 ADDRESS_IN_USE = "it is in use, by another fishd perhaps; end that, or choose another address"
-NAME_TIMEOUT_S = 1.0
-"""Longest wait for a name server, to explain why a host does not answer [s]."""
 _SERVICE_SOCKET = Path("/run/fishd/control")
 _MAX_PENDING_CONNECTIONS = 128
 """Maximum number of connections that wait to be accepted."""
@@ -118,44 +116,6 @@ def find_connect_problem(text: str) -> str:
             "was given"
         )
     return ""
-
-
-def find_name_problem(address: str) -> str:
-    """Return that the name in an address is not known; empty if it is, or may be.
-
-    This waits for the answer of a name server, for `NAME_TIMEOUT_S` at most.
-    """
-    import threading  # only needed for this message
-
-    try:
-        where = parse(address)
-    except ValueError:
-        return ""
-    if isinstance(where, Ipc) or (_parse_ip(where.host) and "%" not in where.host):
-        return ""
-    problems: list[str] = []
-
-    def look_up() -> None:
-        try:
-            socket.getaddrinfo(where.host, None, type=socket.SOCK_STREAM)
-        except socket.gaierror as error:
-            is_unsure = error.errno == socket.EAI_AGAIN
-            problems.append("no name server answers" if is_unsure else "")
-        except UnicodeError:
-            problems.append("")
-
-    thread = threading.Thread(target=look_up, name="name", daemon=True)
-    thread.start()
-    thread.join(NAME_TIMEOUT_S)
-    if not problems:
-        return ""
-    zone = where.host.partition("%")[2]
-    why = f"this machine has no network interface {zone}" if zone else problems[0]
-    reason = f" ({why})" if why else ""
-    return (
-        f"the name {where.host} is not known{reason}; check its spelling, or write the address "
-        "in numbers"
-    )
 
 
 def socket_path(address: str) -> Path | None:

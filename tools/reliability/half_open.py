@@ -207,12 +207,13 @@ class Run:
     def watch(self) -> None:
         """Watch all ticks, as JSON."""
         trial = self._trial
-        with Process(FISHCTL, "--endpoint", self._endpoint, "watch", "--json") as process:
-            assert process.process.stdout
-            first = process.process.stdout.readline()
+        path = Path(tempfile.mkdtemp(dir=self._rig.folder)) / "ticks"
+        command = (FISHCTL, "--endpoint", self._endpoint, "watch", "--json")
+        with path.open("wb") as file, Process(*command, stdout=file) as process:
+            wait_until(lambda: path.stat().st_size > 0)
             self._disturb()
-            status, out, lines = self._end(process)
-        seqs = [json.loads(line)["seq"] for line in (first + out).splitlines()]
+            status, _, lines = self._end(process)
+        seqs = [json.loads(line)["seq"] for line in path.read_text().splitlines()]
         trial.lost = seqs[-1] - seqs[0] + 1 - len(seqs)
         trial.counted = sum(int(number) for number in re.findall(r"were lost: (\d+)", lines))
         if trial.kind == "for ever":
