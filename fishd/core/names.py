@@ -1,4 +1,4 @@
-"""Names of machines: why an address cannot be found."""
+"""Explanation why the name in an address is not known."""
 
 import socket
 import threading

@@ -214,14 +214,17 @@ class Recorder:
                 progressed = now
                 self._progress(self.writer)
                 if self._due(self.writer):
-                    self.writer.close("continued in the next file")
-                    self._open()
-                    self.writer.tally.expect(self._seq)
+                    self._continue_in_next_file()
             if now - max(looked, telemetry.heard) >= FISHD_TIMEOUT_S:
                 looked = now
                 self._look_for_fishd(telemetry)
         self._count_last_ticks(telemetry)
         self._count_last_frames()
+
+    def _continue_in_next_file(self) -> None:
+        self.writer.close("continued in the next file")
+        self._open()
+        self.writer.tally.expect(self._seq)
 
     def _take_all(self, telemetry: "Telemetry") -> None:
         for topic, payload in telemetry.messages():

@@ -18,7 +18,7 @@ IMAGE_BYTES = 64 * 2**20
 
 
 class Disk:
-    """Small disk of its own; `folder` is in it."""
+    """Small disk, mounted at `folder`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -35,7 +35,7 @@ from fishd.core.errors import RecordingError
 from fishd.recording import open_run
 
 KINDS = ("forgotten", "for some seconds", "for ever")
-"""What happens to the connections."""
+"""Ways in which connections die."""
 MAX_BEGIN_S = 3.0
 """Largest time from the start of a program to the silence [s]."""
 MAX_SILENCE_S = 8.0
@@ -116,7 +116,7 @@ def _reserve() -> socket.socket:
 
 
 class Run:
-    """One program at the other end of a path of its own."""
+    """One program at the other end of a separate path."""
 
     def __init__(self, rig: Rig, host: str, trial: Trial, chance: random.Random) -> None:
         self._rig, self._trial, self._chance = rig, trial, chance
