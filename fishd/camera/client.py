@@ -26,7 +26,7 @@ from fishd.camera.requests import (
 )
 from fishd.camera.settings import CameraSettings
 from fishd.client import Fish
-from fishd.client.zmq_sockets import milliseconds_until
+from fishd.client.zmq_sockets import Subscription, milliseconds_until
 from fishd.core import text
 from fishd.core.camera_frames import TIME_TOLERANCE_S, Frame, FrameHistory, Stack, StackSettings
 from fishd.core.errors import FishError
@@ -142,10 +142,13 @@ class CameraClient:
         """Return the frames as `poll` does, each with its header."""
         deadline = time.monotonic() + seconds
         frames: list[tuple[FrameHeader, Frame]] = []
-        while not frames and self._socket.poll(milliseconds_until(deadline)):
+        subscription = self._subscription
+        while not frames and subscription.socket.poll(milliseconds_until(deadline)):
             frames = self._receive_all()
             if self._until_moved:
                 break
+        if not frames and subscription.is_dead():
+            subscription.replace(subscription.address)
         return frames
 
     def frames(self) -> Iterator[Frame]:
@@ -249,19 +252,26 @@ class CameraClient:
         return f": {text.line(problem)}" if problem else ""
 
     def _subscribe(self, address: str, views: bool) -> None:
-        self._socket = self._context.socket(zmq.SUB)
-        self._socket.set(zmq.RCVHWM, MAX_QUEUED_MESSAGES)
-        self._socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        self._socket.set(zmq.RECONNECT_IVL, 20)
-        self._socket.set(zmq.RECONNECT_IVL_MAX, 500)
-        topics = [messages.FRAME, messages.STATE, messages.UNTIL]
-        for topic in [*topics, messages.VIEW] if views else topics:
-            self._socket.subscribe(topic)
-        connect(self._socket, address)
+        topics = [messages.FRAME, messages.UNTIL, messages.STATE]
+
+        def open_socket(address: str) -> "zmq.Socket[bytes]":
+            socket = self._context.socket(zmq.SUB)
+            socket.set(zmq.RCVHWM, MAX_QUEUED_MESSAGES)
+            socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
+            socket.set(zmq.RECONNECT_IVL, 20)
+            socket.set(zmq.RECONNECT_IVL_MAX, 500)
+            for topic in [*topics, messages.VIEW] if views else topics:
+                socket.subscribe(topic)
+            connect(socket, address)
+            return socket
+
+        source = f"the camera at {self.endpoint}"
+        # `check` says that no frames arrive.
+        self._subscription = Subscription(open_socket, address, source, lambda line: None)
 
     def _await_subscription(self) -> None:
         """Wait for the state that the camera sends to a new subscriber; raises `CameraLost`."""
-        if not self._socket.poll(int(self._timeout * 1e3)):
+        if not self._subscription.socket.poll(int(self._timeout * 1e3)):
             raise CameraLost(
                 f"the camera at {self.endpoint} answers, but nothing comes from its frames at "
                 f"{self.state.frames}; can this machine reach that address?"
@@ -272,7 +282,9 @@ class CameraClient:
         self._until_moved = False
         for _ in range(MAX_QUEUED_MESSAGES):
             try:
-                message = messages.decode(self._socket.recv_multipart(zmq.NOBLOCK))
+                parts = self._subscription.socket.recv_multipart(zmq.NOBLOCK)
+                self._subscription.hear()
+                message = messages.decode(parts)
             except zmq.Again:
                 break
             except BadMessage as error:

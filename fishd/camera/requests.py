@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import time
 from contextlib import suppress
 from typing import TypeVar, cast
 
@@ -10,11 +11,12 @@ import zmq
 
 from fishd.camera.messages import STATE, CameraState
 from fishd.camera.settings import CameraSettings, PublishSettings
-from fishd.client.connection import answer_deadlines
+from fishd.client.connection import MAX_UNANSWERED_S, answer_deadlines
 from fishd.client.zmq_sockets import milliseconds_until
 from fishd.core import addresses, protocol, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, Refused
+from fishd.core.names import find_name_problem
 
 ENDPOINT_VARIABLE = "FISHD_CAMERA"
 MAX_MESSAGE_BYTES = 16 * 2**20
@@ -45,11 +47,16 @@ class CameraRequests:
         self.timeout = timeout
         self._context = context
         self._ids = itertools.count(1)
-        self._socket = context.socket(zmq.DEALER)
+        self._asked = 0.0
+        """Time of the first request since the latest answer [s, monotonic]; 0 without one."""
+        self._connect()
+
+    def _connect(self) -> None:
+        self._socket = self._context.socket(zmq.DEALER)
         self._socket.set(zmq.LINGER, 0)
         self._socket.set(zmq.IMMEDIATE, 1)
         self._socket.set(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
-        connect(self._socket, endpoint)
+        connect(self._socket, self.endpoint)
 
     def status(self, timeout: float | None = None) -> CameraState:
         """Return the camera's state; timeout: longest wait [s], None: that of the object."""
@@ -65,6 +72,7 @@ class CameraRequests:
         request = protocol.Request(v=protocol.VERSION, id=identity, op=op)
         timeout_s = self.timeout if timeout is None else timeout
         event = zmq.POLLOUT
+        self._asked = self._asked or time.monotonic()
         single_attempt = timeout is not None  # a call within a tick has no time for retries
         for deadline in answer_deadlines(timeout_s, again=not single_attempt):
             while self._socket.poll(milliseconds_until(deadline), event):
@@ -74,12 +82,19 @@ class CameraRequests:
                     continue
                 with suppress(msgspec.DecodeError):
                     reply = protocol.decode_reply(self._socket.recv_multipart()[-1])
+                    self._asked = 0.0
                     if reply.id != identity:
                         continue
                     if reply.error:
                         raise Refused(text.quoted(reply.error.code), text.line(reply.error.message))
                     if reply.result:
                         return cast(T, decoder(kind)(reply.result))
+        if time.monotonic() - self._asked >= MAX_UNANSWERED_S:
+            self._socket.close()  # a router may have forgotten its connection
+            self._connect()
+            self._asked = 0.0
+        if not single_attempt and (problem := find_name_problem(self.endpoint)):
+            raise CameraLost(f"no camera at {self.endpoint}: {problem}")
         if not single_attempt and self._publishes():
             raise CameraLost(
                 f"{self.endpoint} is the address of a camera's frames; use the address of its "

@@ -31,7 +31,7 @@ def watch(endpoint: str | None, as_json: bool, seconds: float | None) -> None:
     'late' is the largest delay of a tick in the last 5 s, 'compute' the longest computing time.
     'skipped' counts the ticks that the daemon left out, 'lost' those that did not arrive here. If
     standard output is not a terminal, a line is printed every second instead; with --json, every
-    tick as one line.
+    tick as one line, and a line on standard error where ticks were lost.
     """
     can_draw = sys.stdout.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
     show = _print_ticks if as_json else _draw if can_draw else _print_lines
@@ -48,7 +48,12 @@ async def _run(
 
 
 async def _print_ticks(fish: AsyncFish) -> None:
+    seq = 0
     async for tick in fish.ticks():
+        if 0 < seq < tick.seq - 1:
+            lost = tick.seq - seq - 1
+            echo(f"fishctl: just before tick {tick.seq}, ticks were lost: {lost}", err=True)
+        seq = tick.seq
         print_json_line(tick)
 
 

@@ -2,10 +2,11 @@
 
 import asyncio
 import functools
+import math
 import sys
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager, closing, suppress
+from contextlib import asynccontextmanager, closing
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, Self, TypeVar
 
 import zmq.asyncio
@@ -13,9 +14,9 @@ import zmq.asyncio
 from fishd.client.connection import DEFAULT_IDLE_LIMIT_S, DEFAULT_TIMEOUT_S, LATE_ANSWER_WAIT_MS
 from fishd.client.lease import LeaseRenewal, report_unreturned
 from fishd.client.synchronous import Fish
-from fishd.client.zmq_sockets import connect_subscriber
+from fishd.client.zmq_sockets import TelemetryReader, connect_subscriber
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishError, LeaseLost, NoDaemon
+from fishd.core.errors import FishError, LeaseLost
 from fishd.core.protocol import State
 from fishd.core.signals import Event, Status, Tick
 
@@ -99,6 +100,7 @@ class AsyncFish:
     calibrate_servo = _run_in_thread(Fish.calibrate_servo)
     _take_lease = _run_in_thread(Fish.take_lease)
     _end_lease = _run_in_thread(Fish.end_lease)
+    _find_telemetry = _run_in_thread(Fish.find_telemetry)
 
     async def estop(self, message: str = "requested by a client") -> State:
         """Stop the servo's pulses at once, like `Fish.estop`, before requests that wait."""
@@ -145,18 +147,27 @@ class AsyncFish:
 
     async def _subscribe(self, topic: bytes, kind: type[T]) -> AsyncIterator[T]:
         fish = self._fish
+
+        def connect(address: str) -> zmq.asyncio.Socket:
+            return connect_subscriber(self._context, address, topic, access=fish.access)
+
         address = fish.telemetry_address or (await self.status()).telemetry
-        forever = kind is Event
-        patience = -1 if forever and not fish.access else int(fish.timeout * 1e3)
+        reader = TelemetryReader(
+            fish, connect, address, math.inf if kind is Event else fish.timeout
+        )
         decode: Callable[[bytes], T] = decoder(kind)
-        socket = connect_subscriber(self._context, address, topic, access=fish.access)
-        with closing(socket):
+        with closing(reader):
             while True:
-                while await socket.poll(patience) or await socket.poll(LATE_ANSWER_WAIT_MS):
-                    fish.check_lease()
-                    yield fish.read(decode, await socket.recv_multipart())
-                if fish.access:
-                    with suppress(NoDaemon):
-                        await self.status()  # raises an error if the key is no longer known
-                if not forever:
-                    raise fish.no_telemetry_error()
+                if not await reader.socket.poll(reader.wait_ms):
+                    address = await self._find_telemetry()
+                    if not await reader.socket.poll(LATE_ANSWER_WAIT_MS):
+                        reader.handle_silence(address)
+                    continue
+                fish.check_lease()
+                frames = await reader.socket.recv_multipart()
+                reader.hear()
+                if frames[0] == topic:
+                    yield fish.read(decode, frames)
+                    reader.expect_next()
+                else:
+                    reader.check_ticks()

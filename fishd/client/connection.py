@@ -46,6 +46,9 @@ DEFAULT_IDLE_LIMIT_S = 30.0
 LATE_ANSWER_WAIT_MS = 500
 """Additional time to read an answer that is late: if this process was itself suspended, such as by
 SIGSTOP, the answer has arrived, but no thread has read it yet [ms]."""
+MAX_UNANSWERED_S = 1.0
+"""Time from a request to the end of its TCP connection if nothing is answered: a router may have
+forgotten it, and the next request connects again [s]."""
 ESTOP_FALLBACK_DELAY_S = 0.1
 """Time after which an emergency stop is also sent to fishd's emergency socket [s]."""
 ESTOP_SOCKET_TIMEOUT_S = 0.4
@@ -123,6 +126,10 @@ class Connection:
             listener = self._listener()
         except PermissionError:
             listener = None
+        from fishd.core.names import find_name_problem  # only needed for this message
+
+        if problem := find_name_problem(self.endpoint):
+            return NoDaemon(f"no fishd at {self.endpoint}: {problem}")
         if listener is None:
             return self._no_daemon(why)
         return NoDaemon(
@@ -250,9 +257,9 @@ class Connection:
         host, port = self.endpoint.rpartition(":")[0], status.keyed_telemetry.rpartition(":")[2]
         return msgspec.structs.replace(status, telemetry=f"{host}:{port}")
 
-    def no_telemetry_error(self) -> NoDaemon:
-        """Return the error for missing telemetry."""
-        return self._no_daemon(f"no telemetry within {self.timeout:g} s")
+    def no_telemetry_error(self, timeout: float) -> NoDaemon:
+        """Return the error for missing telemetry of a fishd that does not answer; timeout: [s]."""
+        return self._no_daemon(f"no telemetry within {timeout:g} s")
 
 
 def _find_access(endpoint: str) -> "Access | None":

@@ -1,8 +1,10 @@
 """`Fish`: the client for synchronous programs."""
 
+import math
 import sys
+import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -11,6 +13,7 @@ from fishd.client.connection import (
     DEFAULT_TIMEOUT_S,
     ESTOP_FALLBACK_DELAY_S,
     LATE_ANSWER_WAIT_MS,
+    MAX_UNANSWERED_S,
     Connection,
     answer_deadlines,
 )
@@ -58,6 +61,8 @@ class Fish(Connection):
         """
         super().__init__(endpoint, timeout, telemetry)
         self._socket: Requests | None = None
+        self._asked = 0.0
+        """Time of the first request since the latest answer [s, monotonic]; 0 without one."""
         self._context: zmq.Context[zmq.Socket[bytes]] | None = None
         """ZeroMQ context of telemetry, created by the first subscription."""
 
@@ -76,11 +81,15 @@ class Fish(Connection):
         """Disconnect; may be called twice."""
         if self.held:
             self.held.stop()
-        if self._socket:
-            self._socket.close()
-            self._socket = None
+        self._disconnect()
         if self._context:
             self._context.destroy(linger=0)
+
+    def _disconnect(self) -> None:
+        """Close the connection of requests; the next request opens another one."""
+        if self._socket:
+            self._socket.close()
+        self._socket, self._asked = None, 0.0
 
     def status(self, timeout: float | None = None) -> Status:
         """Return a snapshot of the daemon.
@@ -272,9 +281,7 @@ class Fish(Connection):
         try:
             return self._exchange(kind, op, patience, args)
         except NoKey:  # the next request connects again
-            if self._socket:
-                self._socket.close()
-                self._socket = None
+            self._disconnect()
             raise
 
     def _exchange(self, kind: type[T], op: str, patience: float, args: dict[str, Any]) -> T:
@@ -293,11 +300,13 @@ class Fish(Connection):
         connection = self._socket
         identity, request = self.request(op, args)
         sent_on = None
+        self._asked = self._asked or time.monotonic()
         for deadline in answer_deadlines(self.timeout + patience, again=patience >= 0.0):
             while sent_on is not None or connection.send_by(deadline, request):
                 sent_on = sent_on or connection.connections
                 reply = connection.receive_by(deadline, sent_on)
                 if reply:
+                    self._asked = 0.0
                     result = self.result((reply,), identity, kind)
                     if result is not None:
                         return result
@@ -306,7 +315,10 @@ class Fish(Connection):
                 elif op in READ_OPERATIONS:
                     sent_on = None
                 else:
+                    self._asked = 0.0
                     raise self.lost_command_error(op)
+        if not self._path and time.monotonic() - self._asked >= MAX_UNANSWERED_S:
+            self._disconnect()  # a router may have forgotten it
         raise self.no_answer_error(patience)
 
     def _open_socket(self) -> Requests:
@@ -318,28 +330,51 @@ class Fish(Connection):
 
     def _subscribe(self, kinds: dict[bytes, type[T]], *, forever: bool = False) -> Iterator[T]:
         """Return an iterator of the messages of these topics; forever: wait without limit."""
-        address = self.telemetry_address or self.status().telemetry
-        patience = -1 if forever and not self.access else int(self.timeout * 1e3)
-        decoders = {topic: decoder(kind) for topic, kind in kinds.items()}
         import zmq
 
-        from fishd.client.zmq_sockets import connect_subscriber
+        from fishd.client.zmq_sockets import TelemetryReader, connect_subscriber
 
-        self._context = self._context or zmq.Context()
-        socket = connect_subscriber(self._context, address, *kinds, access=self.access)
+        self._context = context = self._context or zmq.Context()
+
+        def connect(address: str) -> "zmq.Socket[bytes]":
+            return connect_subscriber(context, address, *kinds, access=self.access)
+
+        address = self.telemetry_address or self.status().telemetry
+        reader = TelemetryReader(self, connect, address, math.inf if forever else self.timeout)
+        decoders = {topic: decoder(kind) for topic, kind in kinds.items()}
 
         def messages() -> Iterator[T]:
-            with closing(socket):
+            with closing(reader):
+                reader.expect_next()
                 while True:
-                    while socket.poll(patience) or socket.poll(LATE_ANSWER_WAIT_MS):
-                        self.check_lease()
-                        frames = socket.recv_multipart()
-                        if decode := decoders.get(frames[0]):
-                            yield self.read(decode, frames)
-                    if self.access:
-                        with suppress(NoDaemon):
-                            self.status()  # raises an error if the key is no longer known
-                    if not forever:
-                        raise self.no_telemetry_error()
+                    if not reader.socket.poll(reader.wait_ms):
+                        address = self.find_telemetry()
+                        if not reader.socket.poll(LATE_ANSWER_WAIT_MS):
+                            reader.handle_silence(address)
+                        continue
+                    self.check_lease()
+                    frames = reader.socket.recv_multipart()
+                    reader.hear()
+                    if decode := decoders.get(frames[0]):
+                        yield self.read(decode, frames)
+                        reader.expect_next()
+                    else:
+                        reader.check_ticks()
 
         return messages()
+
+    def find_telemetry(self) -> str:
+        """Return the present address of telemetry; empty without an answer.
+
+        Raise an error if the key of this client is no longer known.
+        """
+        for _ in range(2):
+            try:
+                status = self.status(min(self.timeout, MAX_UNANSWERED_S))
+            except NoDaemon:
+                if self._path:
+                    break
+                self._disconnect()  # a router may have forgotten this connection, too
+            else:
+                return self.telemetry_address or status.telemetry
+        return ""

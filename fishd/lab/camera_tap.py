@@ -10,10 +10,12 @@ from fishd.core import text
 from fishd.core.camera_frames import Frame
 from fishd.core.errors import FishError
 from fishd.recording.images import FrameHead
-from fishd.recording.recorder import NewFrames
+from fishd.recording.recorder import POLL_INTERVAL_S, NewFrames
 
 CAMERA_TIMEOUT_S = 2.0
 """Time without a frame after which the camera counts as lost [s]."""
+LAST_FRAMES_TIMEOUT_S = 1.0
+"""Longest wait for the last frames of a recording [s]."""
 _MAX_WAITING_FRAMES = 1000
 """Maximum number of frames that wait for the first tick; older ones are dropped."""
 
@@ -34,6 +36,8 @@ class CameraTap:
         except BaseException:
             self._fish.close()
             raise
+        self._expected = self._client.state.session, self._client.state.seq
+        """Session and number of the latest frame that is not to be recorded, or that has come."""
         self._heard = time.monotonic()
         self._lost = False
         self._session = ""
@@ -76,6 +80,28 @@ class CameraTap:
             return NewFrames(news, [])
         waiting, self._waiting = self._waiting, []
         return NewFrames(news, [(self._head(*pair), pair[1].pixels) for pair in waiting])
+
+    def count_missing(self) -> int | None:
+        """Return how many published frames have not arrived; None if the camera does not say.
+
+        Those that arrive meanwhile are in the result of the next `take`.
+        """
+        try:
+            state = self._client.status()
+        except FishError:
+            return None
+        deadline = time.monotonic() + LAST_FRAMES_TIMEOUT_S
+        while True:
+            self._waiting += self._poll()
+            session, seq = self._expected
+            if self._client.latest:
+                header = self._client.latest.header
+                session, seq = header.session, header.seq
+            if session != state.session:
+                return None
+            if seq >= state.seq or time.monotonic() > deadline:
+                return max(0, state.seq - seq)
+            time.sleep(POLL_INTERVAL_S)
 
     def _poll(self) -> list[tuple[FrameHeader, Frame]]:
         try:

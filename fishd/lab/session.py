@@ -1,5 +1,6 @@
 """A session of an experiment on the fish of a running fishd, or on a simulated fish."""
 
+import logging
 import os
 import time
 from abc import ABC, abstractmethod
@@ -29,6 +30,8 @@ from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:
     from fishd.recording.writer import RunWriter, Source
+
+log = logging.getLogger(__name__)
 
 IDLE_LIMIT = 5.0
 """Time after which an experiment that reads no tick while the fish swims counts as hung [s]."""
@@ -374,6 +377,8 @@ class LiveSession(Session):
                 break
         if not ticks:
             refuse_lost(ticks, (seconds,), self.tick)
+        if lost := end - first - len(ticks):
+            log.warning("ticks of this experiment lost on their way from fishd: %d", lost)
         return ticks
 
     def _check_same_fishd(self, tick: Tick) -> None:

@@ -10,8 +10,8 @@ import msgspec
 import zmq
 
 from fishd.client import Fish
-from fishd.client.zmq_sockets import set_keys
-from fishd.core import addresses, text
+from fishd.client.zmq_sockets import Subscription, connect_subscriber
+from fishd.core import text
 from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishError, NoDaemon, RecordingError, Refused
 from fishd.core.protocol import Calibrations
@@ -29,6 +29,8 @@ FLUSH_INTERVAL_S = 0.5
 """Interval of writes to the kernel: a kill loses at most this time and `DRAIN_INTERVAL_S` [s]."""
 SYNC_INTERVAL_S = 10.0
 """Interval of writes to the disk: a power cut loses at most this time [s]."""
+POLL_INTERVAL_S = 0.02
+"""Interval at which messages are read at the end of a recording [s]."""
 FISHD_TIMEOUT_S = 1.0
 """Time without a message after which the recorder looks for fishd again [s]."""
 MIN_FREE_BYTES = 16 * 2**20
@@ -50,7 +52,12 @@ MAX_UNSENT_LINES = 100
 """Maximum number of lines that wait to be sent to fishd; older ones are dropped."""
 MAX_WAITING_MESSAGES = 20000
 """Maximum number of messages that wait for a delayed recorder: a quarter of an hour."""
-TAKEOVER_MESSAGE = "another fishd has taken over: the recording continues with it"
+MAX_STALL_S = 1.0
+"""Time of a write to the disk above which the recorder reports it [s]."""
+TAKEOVER_MESSAGE = (
+    "another fishd has taken over: the recording continues with it; whether ticks of the former "
+    "one were lost is not known"
+)
 
 
 class NewFrames(NamedTuple):
@@ -70,8 +77,20 @@ class FrameSource(Protocol):
     def take(self) -> NewFrames:
         """Return the news and frames since the previous call."""
 
+    def count_missing(self) -> int | None:
+        """Return how many published frames have not arrived; None if the camera does not say."""
+
     def close(self) -> None:
         """Disconnect; may be called twice."""
+
+
+class Position(NamedTuple):
+    """Position of a recorder in the ticks of a fishd."""
+
+    pid: int
+    """Process of the fishd."""
+    seq: int
+    """Number of its latest stored tick."""
 
 
 class Recorder:
@@ -83,6 +102,7 @@ class Recorder:
         open_writer: Callable[[], RunWriter],
         *,
         tell: Callable[[str], None],
+        after: Position | None = None,
         progress: Callable[[RunWriter], None] = lambda writer: None,
         due: Callable[[RunWriter], bool] = lambda writer: False,
         camera: FrameSource | None = None,
@@ -91,6 +111,7 @@ class Recorder:
         endpoint: control socket of fishd; None for that of this machine
         open_writer: begins a recording
         tell: called with a line for the user about an incident
+        after: position of a recording that this one continues
         progress: called once a second
         due: returns whether to close this recording and begin the next one
         camera: source of the frames of a camera; it is closed with the recorder
@@ -98,16 +119,19 @@ class Recorder:
         self._endpoint = endpoint
         self._open_writer = open_writer
         self._tell, self._progress, self._due = tell, progress, due
-        self._telemetry = Telemetry()
+        self._telemetry: Telemetry | None = None
         self._camera = camera
         self._writer: RunWriter | None = None
         self._described: Description | None = None
+        self._after = after
         self._seq = 0
         self._unsent: deque[str] = deque(maxlen=MAX_UNSENT_LINES)
         """Lines that could not be sent to fishd yet, since it did not answer in time."""
         self._gone = False
         self._refused = 0
         """Number of messages that are not fishd's."""
+        self.is_complete = True
+        """Whether the files hold every tick and frame since the beginning, as far as is known."""
         self.reason = "stopped"
         """Reason of the end, for the file."""
 
@@ -116,8 +140,9 @@ class Recorder:
         try:
             with Fish(self._endpoint) as fish:
                 self._described = describe_daemon(fish)
-                self._telemetry.connect(self._described.status.telemetry, fish.access)
+                self._telemetry = Telemetry(fish, self.status.telemetry, self._tell)
             self._open()
+            self._begin(self._telemetry)
         except BaseException:
             self._close()
             raise
@@ -129,6 +154,22 @@ class Recorder:
         if self._refused > 1:
             self._tell(f"messages that are not fishd's, ignored: {self._refused}")
         self.writer.close(self.reason if error is None else text.describe_error(error))
+
+    def _begin(self, telemetry: "Telemetry") -> None:
+        """Wait until telemetry arrives; if it does not, ticks count as lost from now on."""
+        if self._after and self._after.pid == self.status.pid:
+            self.writer.tally.expect(self._after.seq)
+        elif self._after:
+            self._lose("fishd was restarted meanwhile: how many ticks were lost is not known")
+        elif not telemetry.wait(FISHD_TIMEOUT_S):
+            self.writer.status(self.status)
+
+    @property
+    def position(self) -> Position | None:
+        """Position of the latest tick that is stored, by this recorder or the one before it."""
+        if not self.began or not self.writer.stored_seq:
+            return self._after
+        return Position(self.status.pid, self.writer.stored_seq)
 
     @property
     def began(self) -> bool:
@@ -149,16 +190,16 @@ class Recorder:
 
     def run(self, stopping: Callable[[], bool], seconds: float | None = None) -> None:
         """Record until `stopping`, or for this time [s]; raise `RecordingError`."""
-        received = flushed = synced = progressed = start = time.monotonic()
+        telemetry = self._telemetry
+        assert telemetry
+        looked = flushed = synced = progressed = start = time.monotonic()
         while not stopping():
             now = time.monotonic()
             if seconds is not None and now - start >= seconds:
                 self.reason = f"after {seconds:g} s, as requested"
                 break
             time.sleep(DRAIN_INTERVAL_S)
-            for topic, payload in self._telemetry.messages():
-                self._take(topic, payload)
-                received = now
+            self._take_all(telemetry)
             if self._camera:
                 self._take_frames(self._camera)
             if now - flushed >= FLUSH_INTERVAL_S - DRAIN_INTERVAL_S / 2:
@@ -166,16 +207,79 @@ class Recorder:
                 sync = now - synced >= SYNC_INTERVAL_S
                 synced = now if sync else synced
                 self.writer.flush(sync=sync)
+                if (stall := time.monotonic() - now) > MAX_STALL_S:
+                    self._tell(f"a write to the disk took {stall:.1f} s; ticks wait meanwhile")
                 self._check_room()
             if now - progressed >= 1.0:
                 progressed = now
                 self._progress(self.writer)
                 if self._due(self.writer):
-                    self.writer.close("continued in the next file")
-                    self._open()
-            if now - received >= FISHD_TIMEOUT_S:
-                received = now
-                self._look_for_fishd()
+                    self._continue_in_next_file()
+            if now - max(looked, telemetry.heard) >= FISHD_TIMEOUT_S:
+                looked = now
+                self._look_for_fishd(telemetry)
+        self._count_last_ticks(telemetry)
+        self._count_last_frames()
+
+    def _continue_in_next_file(self) -> None:
+        self.writer.close("continued in the next file")
+        self._open()
+        self.writer.tally.expect(self._seq)
+
+    def _take_all(self, telemetry: "Telemetry") -> None:
+        for topic, payload in telemetry.messages():
+            self._take(topic, payload)
+
+    def _count_last_ticks(self, telemetry: "Telemetry") -> None:
+        """Take the ticks that fishd has published until now; count those that do not arrive."""
+        try:
+            with Fish(self._endpoint, timeout=FISHD_TIMEOUT_S) as fish:
+                status = fish.status()
+        except FishError:
+            self._doubt_end(
+                f"fishd does not answer: whether ticks after tick {self._seq} were lost is not "
+                "known"
+            )
+            return
+        deadline = time.monotonic() + FISHD_TIMEOUT_S
+        while self._seq < status.seq and time.monotonic() < deadline:
+            self._take_all(telemetry)
+            time.sleep(POLL_INTERVAL_S)
+        restarts = self.writer.tally.restarts
+        known = len(self.writer.gaps)
+        self.writer.status(status)
+        self._report_gaps(known, f"up to tick {status.seq}, at the end")
+        if self._seq > status.seq or self.writer.tally.restarts > restarts:
+            self._doubt_end("at the end another fishd runs, whose ticks are not recorded")
+
+    def _count_last_frames(self) -> None:
+        """Count the frames that the camera has published and that have not arrived."""
+        if not self._camera:
+            return
+        missing = self._camera.count_missing()
+        self._take_frames(self._camera)
+        if missing is None:
+            self._doubt_end(
+                "the camera does not answer: whether its last frames were lost is not known"
+            )
+        elif missing:
+            self.writer.tally.lose_frames(missing)
+            self._lose(f"at the end, frames were lost: {missing}")
+
+    def _report_gaps(self, known: int, where: str) -> None:
+        """Report the gaps of the recording after the first `known` ones."""
+        for gap in self.writer.gaps[known:]:
+            self._lose(f"{where}, ticks were lost: {gap.lost}")
+
+    def _lose(self, line: str) -> None:
+        """Report a loss."""
+        self.is_complete = False
+        self._tell(line)
+
+    def _doubt_end(self, line: str) -> None:
+        """Report that it is not known what was lost at the end; the file says so, too."""
+        self._lose(line)
+        self.reason = f"{self.reason}; {line}"
 
     def _take_frames(self, camera: FrameSource) -> None:
         news, frames = camera.take()
@@ -186,7 +290,7 @@ class Recorder:
             self._send_lines()
         for head, pixels in frames:
             if lost := self.writer.frame(head, pixels):
-                self._tell(f"just before frame {head.seq}, frames were lost: {lost}")
+                self._lose(f"just before frame {head.seq}, frames were lost: {lost}")
 
     def _send_lines(self) -> None:
         """Send waiting lines to fishd as events; keep those that it does not answer for later."""
@@ -197,7 +301,8 @@ class Recorder:
                 self._unsent.popleft()
 
     def _close(self) -> None:
-        self._telemetry.close()
+        if self._telemetry:
+            self._telemetry.close()
         if self._camera:
             self._camera.close()
 
@@ -217,18 +322,18 @@ class Recorder:
             return
         if isinstance(message, TickHead):
             if message.seq <= self._seq:
-                self._tell(TAKEOVER_MESSAGE)
+                self._lose(TAKEOVER_MESSAGE)
             elif self._gone:
                 self._tell("fishd sends again: the recording continues")
             self._gone = False
             self._seq = message.seq
             if self._camera:
                 self._camera.set_time(message.t, message.time)
-            for gap in self.writer.gaps[known:]:
-                self._tell(f"just before tick {message.seq}, ticks were lost: {gap.lost}")
+            self._report_gaps(known, f"just before tick {message.seq}")
         elif isinstance(message, Status):
+            self._report_gaps(known, f"up to tick {message.seq}")
             if self.writer.tally.restarts > restarts:  # its ticks had higher numbers
-                self._tell(TAKEOVER_MESSAGE)
+                self._lose(TAKEOVER_MESSAGE)
             # After its first ticks, so that the file assigns the ticks to the right fishd.
             if message.pid != self.status.pid and self._seq <= message.seq:
                 self._ask_again()
@@ -246,11 +351,14 @@ class Recorder:
             self._described = self._ask()
             self._described.write(self.writer)
 
-    def _look_for_fishd(self) -> None:
-        """Reconnect telemetry if fishd has another address now; otherwise it reconnects itself."""
+    def _look_for_fishd(self, telemetry: "Telemetry") -> None:
+        """Connect telemetry again if fishd has another address now, or if the connection is dead.
+
+        Otherwise it connects again itself.
+        """
         try:
             with Fish(self._endpoint, timeout=0.5) as fish:
-                self._telemetry.connect(fish.status().telemetry, fish.access)
+                telemetry.renew(fish.status().telemetry, fish.access)
         except FishError as error:
             if not self._gone:
                 is_silent = isinstance(error, NoDaemon)
@@ -298,32 +406,46 @@ class OutOfRoom(RecordingError):
 class Telemetry:
     """Subscription to all topics of telemetry, with a long queue."""
 
-    def __init__(self) -> None:
+    def __init__(self, fish: Fish, address: str, tell: Callable[[str], None]) -> None:
+        """Raises `NoDaemon` if the address is invalid."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-        self._socket = self._context.socket(zmq.SUB)
-        self._socket.set(zmq.RCVHWM, MAX_WAITING_MESSAGES)
-        self._socket.set(zmq.RECONNECT_IVL, 10)
-        for topic in CHANNELS:
-            self._socket.subscribe(topic.encode())
-        self._address = ""
+        topics = [topic.encode() for topic in CHANNELS]
+        options = {zmq.RCVHWM: MAX_WAITING_MESSAGES, zmq.RECONNECT_IVL: 10}
 
-    def connect(self, address: str, access: "Access | None") -> None:
-        """Subscribe to this address only; with keys, connect again."""
-        if address != self._address or access:  # ZeroMQ does not retry with a key that was refused
-            if self._address:
-                self._socket.disconnect(self._address)
-            set_keys(self._socket, access)
-            self._socket.set(zmq.IPV6, addresses.is_ipv6(address))
-            self._socket.connect(address)
-            self._address = address
+        self._access = fish.access
+
+        def connect(address: str) -> "zmq.Socket[bytes]":
+            return connect_subscriber(
+                self._context, address, *topics, access=self._access, options=options
+            )
+
+        source = f"the fishd at {fish.endpoint}"
+        self._subscription = Subscription(connect, address, source, tell)
+
+    @property
+    def heard(self) -> float:
+        """Time of the latest message [s, monotonic]."""
+        return self._subscription.heard
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for the next message, and return whether there is one."""
+        return bool(self._subscription.socket.poll(int(seconds * 1e3)))
+
+    def renew(self, address: str, access: "Access | None") -> None:
+        """Connect again if the address is another one, or if the connection is dead."""
+        subscription, self._access = self._subscription, access
+        is_useless = address != subscription.address or subscription.is_dead()
+        if is_useless and not self.wait(0.0):
+            subscription.replace(address)
 
     def messages(self) -> Iterator[tuple[str, bytes]]:
         """Yield topic and payload of each waiting message."""
         for _ in range(MAX_WAITING_MESSAGES):
             try:
-                frames = self._socket.recv_multipart(zmq.NOBLOCK)
+                frames = self._subscription.socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
                 return
+            self._subscription.hear()
             topic = frames[0].decode("ascii", "replace")
             if len(frames) == 2 and topic in CHANNELS:
                 yield topic, frames[1]

@@ -90,6 +90,8 @@ class Tally:
     def __init__(self) -> None:
         self.gaps: list[Gap] = []
         self._last: TickHead | Tick | None = None
+        self._sent = 0
+        """Number of the latest tick that the present fishd is known to have published; 0 if no."""
         self._first_t = 0.0
         self._ticks = self._events = self._marks = self._missed = self._restarts = 0
         self._pid = self._known = 0
@@ -130,13 +132,15 @@ class Tally:
                 self._energy += tick.power
                 self._metered += 1
             self._swimming[tick.controller] = self._swimming.get(tick.controller, 0) + 1
+        is_same_fishd = last is None or tick.seq > last.seq
+        if not is_same_fishd:  # it counts from 1
+            self._sent = 0
+        if self._sent or last:
+            self._expect(tick.seq - 1, last.t if last else tick.t)
+        self._sent = max(self._sent, tick.seq)
         if last is None:
             self._first_t = tick.t
             return True
-        is_same_fishd = tick.seq > last.seq
-        before = last.seq if is_same_fishd else 0  # another fishd counts from 1
-        if tick.seq > before + 1:
-            self.gaps.append(Gap(last.t, before + 1, tick.seq - before - 1))
         if is_same_fishd:
             self._missed += max(0, tick.missed_slots - last.missed_slots)
         else:
@@ -144,12 +148,24 @@ class Tally:
         return is_same_fishd
 
     def status(self, status: Status) -> None:
-        """Add a status, which also reveals another fishd whose ticks have higher numbers."""
+        """Add a status, which reveals lost ticks, and another fishd with higher tick numbers."""
         if self._last and status.seq < self._last.seq:  # its next tick will reveal it
             return
         if self._pid not in (0, status.pid) and self._known == self._restarts:
             self._restarts += 1
+        elif self._sent:
+            self._expect(status.seq, self._last.t if self._last else status.t)
+        self._sent = max(self._sent, status.seq)
         self._pid, self._known = status.pid, self._restarts
+
+    def expect(self, seq: int) -> None:
+        """Count the ticks that follow this number as lost if they are not added."""
+        self._sent = seq
+
+    def _expect(self, seq: int, after: float) -> None:
+        """Add a gap if ticks up to this number, which the present fishd has sent, are missing."""
+        if seq > self._sent:
+            self.gaps.append(Gap(after, self._sent + 1, seq - self._sent))
 
     def event(self, event: Event) -> None:
         """Add an event."""
@@ -172,6 +188,16 @@ class Tally:
         self._frames_lost += lost
         self._frame_gaps += lost > 0
         return lost
+
+    def lose_frames(self, count: int) -> None:
+        """Count frames that were published after the latest one that was added."""
+        self._frames_lost += count
+        self._frame_gaps += count > 0
+
+    @property
+    def seq(self) -> int:
+        """Number of the latest tick; 0 before the first."""
+        return self._last.seq if self._last else 0
 
     @property
     def restarts(self) -> int:

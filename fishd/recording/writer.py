@@ -3,6 +3,7 @@
 docs/how-to/recording.md describes its layout.
 """
 
+import errno
 import getpass
 import platform
 import socket
@@ -18,6 +19,7 @@ import msgspec
 import numpy as np
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fishd import __version__
@@ -82,6 +84,11 @@ class RunWriter:
         path = Path(path)
         self.path = path if path.name.endswith(SUFFIX) else path.with_name(path.name + SUFFIX)
         self.tally = Tally()
+        self._stored = self.tally.summary
+        """Summary of what was written to the kernel."""
+        self.stored_seq = 0
+        """Number of the latest tick that was written to the kernel; 0 before the first."""
+        self._has_failed = False
         run = self.path.name.removesuffix(SUFFIX)
         about = provenance(run, source, operator, subject, note, extra or {})
         self._file = PartFile(self.path)
@@ -129,8 +136,8 @@ class RunWriter:
 
     @property
     def summary(self) -> Summary:
-        """Summary of the recording until now."""
-        return self.tally.summary
+        """Summary of the recording until now; after a failed write, of what is in the file."""
+        return self._stored if self._has_failed else self.tally.summary
 
     def free(self) -> int:
         """Return the free space on its disk [bytes]."""
@@ -204,6 +211,7 @@ class RunWriter:
         """
         try:
             self._writer.flush()  # type: ignore[no-untyped-call]
+            self._note_stored()
             if sync:
                 self._file.sync()
         except OSError as error:
@@ -222,12 +230,16 @@ class RunWriter:
                 "fishd.end", to_metadata(self.tally.summary) | {"reason": reason}
             )
             self._writer.flush()  # type: ignore[no-untyped-call]
+            self._note_stored()
             self._writer.finish()  # type: ignore[no-untyped-call]
             self._file.flush()
             self._file.finish()
         except OSError as error:
             raise self._failed(error) from None
         self._give_up()
+
+    def _note_stored(self) -> None:
+        self._stored, self.stored_seq = self.tally.summary, self.tally.seq
 
     def _give_up(self) -> None:
         """Close the file, and write nothing more."""
@@ -255,12 +267,23 @@ class RunWriter:
             raise self._failed(error) from None
 
     def _failed(self, error: OSError) -> RecordingError:
+        """Close the file after a failed write, and return the error, with what was lost."""
         self._give_up()
-        what = f"{self.part}: the recording ends after {self.tally.seconds:.0f} s"
+        self._has_failed = True
+        stored, seen = self._stored, self.tally.summary
+        unwritten = seen.ticks - stored.ticks
+        self._stored = replace(stored, lost_ticks=seen.lost_ticks + unwritten)
+        lost = f", and its last {unwritten} ticks are lost" if unwritten else ""
         remedy = (
-            f"the written part is readable; free some space, then run fishctl recover {self.part}"
+            "free some space"
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+            else "make the disk writable"
         )
-        return RecordingError(f"{what}: {error.strerror or error}; {remedy}")
+        return RecordingError(
+            f"{self.part}: the recording ends after {stored.duration:.0f} s{lost}: "
+            f"{error.strerror or error}; the written part is readable; {remedy}, then run fishctl "
+            f"recover {self.part}"
+        )
 
 
 _DECODERS: dict[str, Callable[[bytes], TickHead | Event | Status]] = {

@@ -17,7 +17,7 @@ import zmq.asyncio
 from msgspec import UNSET, Struct
 
 from fishd.client import AsyncFish, Fish
-from fishd.client.zmq_sockets import connect_subscriber
+from fishd.client.zmq_sockets import Subscription, connect_subscriber
 from fishd.core import text
 from fishd.core.addresses import find_control_address
 from fishd.core.decoding import decoder
@@ -151,12 +151,20 @@ class FishLink:
         if self._state != "restarted":
             self._set_connection("stale", "no tick has come yet")
         address = status.telemetry
-        topics, access = (b"tick", b"event", b"status"), self._fish.access
-        socket = connect_subscriber(self._context, address, *topics, access=access)
-        with closing(socket):
+
+        def connect(address: str) -> zmq.asyncio.Socket:
+            topics, access = (b"tick", b"event"), self._fish.access
+            return connect_subscriber(self._context, address, *topics, access=access)
+
+        telemetry = Subscription(connect, address, f"the fishd at {self.address}")
+        with closing(telemetry):
             while self.status and self.status.telemetry == address:
-                if await socket.poll(int(STALE_AFTER_S * 1e3)):
-                    await self._receive(await socket.recv_multipart())
+                if await telemetry.socket.poll(int(STALE_AFTER_S * 1e3)):
+                    frames = await telemetry.socket.recv_multipart()
+                    telemetry.hear()
+                    await self._receive(frames)
+                elif telemetry.is_dead():
+                    telemetry.replace(address)
                 if time.monotonic() - self._last_tick > STALE_AFTER_S:
                     await self._probe()
 

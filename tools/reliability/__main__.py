@@ -10,6 +10,7 @@ from common.report import run  # noqa: E402
 NAMES = (
     "deaths",
     "deb",
+    "half_open",
     "kills",
     "misbehaviour",
     "mutations",

@@ -9,6 +9,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import msgspec
@@ -21,7 +22,7 @@ from fishd.camera.simulated import SimulatedCamera, Tail
 from fishd.camera.sources.base import Shot, Sink, Timeline, Trouble
 from fishd.client import Fish
 from fishd.client.connection import LATE_ANSWER_WAIT_MS
-from fishd.client.zmq_sockets import connect_subscriber
+from fishd.client.zmq_sockets import Subscription, connect_subscriber
 from fishd.core.addresses import find_control_address
 from fishd.core.camera_frames import TIME_TOLERANCE_S
 from fishd.core.decoding import decoder
@@ -139,14 +140,20 @@ class SimulatedSource:
         view = _View(self._settings, self._size, description, sink)
         context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         try:
-            socket = connect_subscriber(context, status.telemetry, b"tick", access=fish.access)
+            connect = partial(connect_subscriber, context, access=fish.access)
+            telemetry = Subscription(
+                lambda address: connect(address, b"tick"),
+                status.telemetry,
+                f"the fishd at {fish.endpoint}",
+            )
             offset = ClockOffset(clock_reader(fish))
             view.ahead = offset.update().seconds
             last_tick_time, last_seq = time.monotonic(), 0
             while not stopping(0.0):
                 sink.alive()
-                if socket.poll(view.poll_timeout()):
-                    topic, payload = (*socket.recv_multipart(), b"")[:2]
+                if telemetry.socket.poll(view.poll_timeout()):
+                    topic, payload = (*telemetry.socket.recv_multipart(), b"")[:2]
+                    telemetry.hear()
                     tick = self._decoded(payload) if topic == b"tick" else None
                     if tick is not None:
                         if tick.seq <= last_seq:
@@ -159,8 +166,10 @@ class SimulatedSource:
                     if fish.status().pid != status.pid:
                         return
                     # With a waiting tick, it was this process that was delayed.
-                    if not socket.poll(LATE_ANSWER_WAIT_MS):
+                    if not telemetry.socket.poll(LATE_ANSWER_WAIT_MS):
                         view.report_idle()
+                        if telemetry.is_dead():
+                            telemetry.replace(status.telemetry)
                 view.ahead = offset.update().seconds
         finally:
             context.destroy(linger=0)

@@ -1,6 +1,7 @@
 """The verbs that record a running fish, also with its camera, and the always-on black box."""
 
 import re
+import shutil
 import signal
 import sys
 from collections.abc import Callable
@@ -23,13 +24,17 @@ from fishd.core.errors import FishError, NoDaemon, RecordingError
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
 from fishd.recording.folder import ensure_folder, new_path, recording_path, runs_folder
-from fishd.recording.recorder import Recorder
+from fishd.recording.recorder import MIN_FREE_BYTES, Position, Recorder
 
 if TYPE_CHECKING:
     from fishd.lab.camera_tap import CameraTap
 
 F = TypeVar("F", bound=Callable[..., Any])
 UNIT_BYTES = {"MB": 10**6, "GB": 10**9}
+INCOMPLETE = 3
+"""Exit status of a recorder that lost ticks or frames, or may have."""
+DISK_RETRY_S = 10.0
+"""Time until a black box tries again to write to its disk [s]."""
 MIN_BLACK_BOX_BYTES = 10**7
 """Smallest size of a black box [bytes]."""
 MAX_BLACK_BOX_BYTES = 10**15
@@ -127,6 +132,10 @@ def record(
 
     RUN is a name in the folder of recordings or a path; by default the date and time. The
     recording survives a restart of fishd. No older recording is ever overwritten.
+
+    Exit status: 0 if every tick is in the file; 3 if ticks or frames were lost, or may have been,
+    as a line then says; 1 if the recording could not begin or the disk failed. A black box reports
+    losses, and ends with 0.
     """
     if black_box and run:
         raise click.UsageError("--black-box names its files itself: leave RUN out")
@@ -134,9 +143,16 @@ def record(
         raise click.UsageError("a black box keeps no frames: they would fill it within hours")
     begin = partial(RunWriter, operator=operator, subject=subject, note=note)
     if black_box:
-        box = BlackBox(ensure_folder(folder or runs_folder()), keep, begin)
-        open_recorder = partial(Recorder, endpoint, box.open, tell=_print_line, due=box.due)
-        _record_endlessly(open_recorder, _StopSignals(), seconds, as_json)
+        place = ensure_folder(folder or runs_folder())
+        box = BlackBox(place, keep, begin)
+
+        def has_room() -> bool:
+            return shutil.disk_usage(place).free > 2 * MIN_FREE_BYTES
+
+        def open_recorder(after: Position | None) -> Recorder:
+            return Recorder(endpoint, box.open, tell=_print_line, after=after, due=box.due)
+
+        _record_endlessly(open_recorder, has_room, _StopSignals(), seconds, as_json)
         return
     if camera is None:
         _record_one(run, endpoint, folder, begin, seconds, as_json)
@@ -165,7 +181,7 @@ def record_camera(
 
     RUN is a name in the folder of recordings or a path; by default the date and time. As `fishctl
     record --camera`. If the camera is lost, the recording goes on; the loss is reported and
-    counted.
+    counted, and the exit status is 3.
     """
     from fishd.lab.camera_tap import CameraTap
 
@@ -211,21 +227,30 @@ def _record_one(
     finally:
         if recorder.began:
             _end_line()
-            _print_summary(recorder.writer, as_json)
+            _print_summary(recorder.writer, recorder.is_complete, as_json)
+    if not recorder.is_complete:
+        sys.exit(INCOMPLETE)
 
 
 def _record_endlessly(
-    open_recorder: Callable[[], Recorder],
+    open_recorder: Callable[[Position | None], Recorder],
+    has_room: Callable[[], bool],
     stopping: "_StopSignals",
     seconds: float | None,
     as_json: bool,
 ) -> None:
-    """Wait for a fishd, record it, and continue after its restarts."""
-    waiting = False
+    """Wait for a fishd, record it, and continue after its restarts and failures of the disk.
+
+    Raise `RecordingError` if the first file cannot be written, or if none can at the end.
+    """
+    waiting, failure = False, None
+    position: Position | None = None
     while not stopping():
+        recorder = open_recorder(position)
         try:
-            with open_recorder() as recorder:
+            with recorder:
                 echo(f"recording to {recorder.writer.path}", err=as_json)
+                failure = None
                 recorder.run(stopping, seconds)
                 return
         except NoDaemon as error:
@@ -233,6 +258,18 @@ def _record_endlessly(
                 _print_line(f"waiting: {error}")
             waiting = True
             stopping.wait(1.0)
+        except RecordingError as error:
+            position = recorder.position
+            if position is None:
+                raise
+            if failure is None:
+                _print_line(f"{error}; the black box tries again every {DISK_RETRY_S:.0f} s")
+            failure = error
+            stopping.wait(DISK_RETRY_S)
+            while not (has_room() or stopping()):
+                stopping.wait(DISK_RETRY_S)
+    if failure:
+        raise failure
 
 
 class _StopSignals:
@@ -270,12 +307,15 @@ def _end_line() -> None:
         click.echo("\r\x1b[K", nl=False)
 
 
-def _print_summary(writer: RunWriter, as_json: bool) -> None:
+def _print_summary(writer: RunWriter, is_complete: bool, as_json: bool) -> None:
     """Print the contents of a recording that has ended."""
+    summary = writer.summary
     if as_json:
-        print_json({"path": str(writer.path), "bytes": writer.size, **asdict(writer.summary)})
-    else:
-        echo(f"{writer.path.name}: {_format_amount(writer)}")
+        facts = {"path": str(writer.path), "bytes": writer.size, "complete": is_complete}
+        print_json({**facts, **asdict(summary)})
+        return
+    unknown = "" if is_complete or summary.lost_ticks else "; perhaps more are lost, see above"
+    echo(f"{writer.path.name}: {_format_amount(writer)}{unknown}")
 
 
 def _format_amount(writer: RunWriter) -> str:

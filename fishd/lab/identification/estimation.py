@@ -30,7 +30,7 @@ from fishd.lab.identification.misfit import all_white, find_missing_parameters
 from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifiable, passages
 from fishd.lab.identification.result import Identification
 from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, summarise
-from fishd.lab.session import Session
+from fishd.lab.session import Session, refuse_lost
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -268,4 +268,5 @@ def continue_experiment(
 def _swim_excitation(session: Session, seconds: float) -> "DataFrame":
     ticks = session.rest(REST_S)
     ticks += session.swim("excitation", {}, seconds - REST_S)
+    refuse_lost(ticks, (REST_S, seconds - REST_S), session.tick)
     return ticks_to_frame(ticks)

@@ -22,7 +22,7 @@ from fishd.core.signals import Tick
 from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording import recorder as recorder_module
 from fishd.recording.folder import find_recording, list_recordings, read_overview, read_overviews
-from fishd.recording.recorder import Description, NewFrames, Recorder
+from fishd.recording.recorder import TAKEOVER_MESSAGE, Description, NewFrames, Recorder
 from fishd.recording.recover import recover
 from fishd.recording.summary import Tally
 
@@ -263,9 +263,7 @@ def test_it_is_told_once_that_another_fishd_has_taken_over(
     for tick in ticks[seq:]:
         hear(recorder, tick, pid=2)
     recorder.__exit__(None, None, None)
-    assert [line for line in lines if "another fishd" in line] == [
-        "another fishd has taken over: the recording continues with it"
-    ]
+    assert [line for line in lines if "another fishd" in line] == [TAKEOVER_MESSAGE]
     run = open_run(tmp_path / "run.mcap")
     assert run.summary.restarts == 1
     assert [daemon["pid"] for daemon in run.daemons] == ["1", "2"]
@@ -350,3 +348,31 @@ def test_a_name_means_a_recording_of_the_folder(tmp_path: Path) -> None:
         find_recording("mornin", tmp_path)
     with pytest.raises(RecordingError, match="contains no recording"):
         find_recording("latest", tmp_path / "nowhere")
+
+
+def test_ticks_that_only_a_status_reveals_count_as_lost(tmp_path: Path) -> None:
+    ticks = swum().recorder.ticks
+    with RunWriter(tmp_path / "run") as writer:
+        writer.status(status(ticks[4], pid=1))  # the recorder hears nothing of the ticks after it
+        for tick in ticks[7:20]:
+            writer.tick(tick)
+        writer.status(status(ticks[24], pid=1))
+        writer.status(status(ticks[29], pid=1))
+    run = open_run(tmp_path / "run.mcap")
+    assert [gap.lost for gap in run.gaps] == [2, 5, 5]
+    assert run.gaps[0].seq == ticks[5].seq
+    assert run.summary.lost_ticks == 12
+    assert run.summary == read_overview(run.path).summary
+
+
+def test_ticks_that_are_lost_between_two_files_of_a_black_box_are_reported(tmp_path: Path) -> None:
+    ticks, lines, paths = swum().recorder.ticks, list[str](), iter(["first", "second"])
+    recorder = Recorder(None, lambda: RunWriter(tmp_path / next(paths)), tell=lines.append)
+    recorder._described = description_of(ticks[0], pid=1)
+    recorder._open()
+    hear(recorder, ticks[0], pid=1)
+    recorder._continue_in_next_file()
+    hear(recorder, ticks[5], pid=1)
+    recorder.__exit__(None, None, None)
+    assert lines == [f"just before tick {ticks[5].seq}, ticks were lost: 4"]
+    assert not recorder.is_complete

@@ -1,0 +1,129 @@
+"""A disk that becomes full, read-only or stalls while a fish is recorded: no silent loss."""
+
+import contextlib
+import json
+import re
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from rigs.processes import FISHCTL, Daemon, Process, call, running, wait_until
+
+from fishd.core.errors import RecordingError
+from fishd.recording import open_run
+
+IMAGE_BYTES = 64 * 2**20
+"""Size of the disk [bytes]; a recording ends where 16 MB are left."""
+
+
+class Disk:
+    """Small disk, mounted at `folder`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def make_read_only(self) -> None:
+        """Let writes fail, as the kernel does after an error of the disk."""
+        device = call("findmnt", "-no", "SOURCE", str(self.folder)).stdout.strip()
+        Path(f"/sys/fs/ext4/{Path(device).name}/trigger_fs_error").write_text("a test")
+
+    def fill(self) -> None:
+        """Leave no room."""
+        with contextlib.suppress(OSError), (self.folder / "filler").open("wb") as filler:
+            while True:
+                filler.write(bytes(2**20))
+
+    def empty(self) -> None:
+        """Make room again."""
+        (self.folder / "filler").unlink()
+
+    @contextlib.contextmanager
+    def stalled(self) -> Iterator[None]:
+        """Let all writes wait."""
+        subprocess.run(["fsfreeze", "-f", str(self.folder)], check=True)
+        try:
+            yield
+        finally:
+            subprocess.run(["fsfreeze", "-u", str(self.folder)], check=True)
+
+
+@pytest.fixture
+def disk(tmp_path: Path) -> Iterator[Disk]:
+    folder, image = tmp_path / "disk", tmp_path / "image"
+    folder.mkdir()
+    with image.open("wb") as file:
+        file.truncate(IMAGE_BYTES)
+    made = call("mkfs.ext4", "-q", "-F", str(image))
+    if (
+        made.returncode
+        or call("mount", "-o", "loop,errors=remount-ro", str(image), str(folder)).returncode
+    ):
+        pytest.skip("no file system may be mounted here")
+    assert folder.is_mount()
+    try:
+        yield Disk(folder)
+    finally:
+        call("umount", "--lazy", str(folder))
+
+
+def last_tick(folder: Path) -> int:
+    """Return the number of the last tick in the newest unfinished recording; 0 without one."""
+    try:
+        return open_run(max(folder.glob("*.part"))).ticks[-1].seq
+    except (ValueError, IndexError, RecordingError):
+        return 0
+
+
+def record(daemon: Daemon, disk: Disk, *words: str) -> Process:
+    """Start a recorder on a disk."""
+    command = (FISHCTL, "--endpoint", daemon.endpoint, "record", *words)
+    return Process(*command, "--folder", str(disk.folder), "--json")
+
+
+def test_a_disk_that_becomes_read_only_ends_a_recording_which_says_what_is_stored(
+    tmp_path: Path, disk: Disk
+) -> None:
+    with running(tmp_path) as daemon, record(daemon, disk, "run") as recording:
+        wait_until(lambda: last_tick(disk.folder) > 0)
+        disk.make_read_only()
+        status, out, lines = recording.finish()
+    said = json.loads(out)
+    stored = open_run(disk.folder / "run.mcap.part").ticks
+    assert status == 1
+    assert said["ticks"] == len(stored)
+    (lost,) = re.findall(r"its last (\d+) ticks are lost", lines)
+    assert said["lost_ticks"] == int(lost) > 0
+    assert "make the disk writable, then run fishctl recover" in lines
+
+
+def test_a_disk_that_stalls_loses_no_tick_and_the_stall_is_said(tmp_path: Path, disk: Disk) -> None:
+    with running(tmp_path) as daemon, record(daemon, disk, "run") as recording:
+        wait_until(lambda: last_tick(disk.folder) > 0)
+        with disk.stalled():
+            seq = daemon.status().seq + 60
+            wait_until(lambda: daemon.status().seq > seq)
+        wait_until(lambda: last_tick(disk.folder) > seq)
+        status, out, lines = recording.end()
+    said = json.loads(out)
+    assert (status, said["lost_ticks"]) == (0, 0)
+    ticks = [tick.seq for tick in open_run(disk.folder / "run.mcap").ticks]
+    assert ticks == list(range(ticks[0], ticks[-1] + 1))
+    assert "a write to the disk took" in lines
+
+
+def test_a_black_box_goes_on_when_the_disk_has_room_again_and_counts_what_it_lost(
+    tmp_path: Path, disk: Disk
+) -> None:
+    with running(tmp_path) as daemon, record(daemon, disk, "--black-box", "--keep", "10MB") as box:
+        wait_until(lambda: last_tick(disk.folder) > 0)
+        disk.fill()
+        wait_until(lambda: bool(list(disk.folder.glob("blackbox-*.mcap"))))  # it has ended
+        before = open_run(min(disk.folder.glob("blackbox-*.mcap"))).ticks[-1].seq
+        disk.empty()
+        wait_until(lambda: last_tick(disk.folder) > before)
+        status, _, lines = box.end()
+    first = open_run(max(disk.folder.glob("blackbox-*.mcap"))).ticks[0].seq
+    assert status == 0
+    assert "the black box tries again" in lines
+    assert f"just before tick {first}, ticks were lost: {first - before - 1}\n" in lines
