@@ -65,7 +65,7 @@ BUSY_PINS = (0, 1, 2, 3, 14, 15)
 WIDTHS = 5
 """Number of duties of the filter."""
 _PACKAGES = (
-    *("msgspec", "numpy", "pyzmq", "pigpio", "rpi-lgpio", "RPi.GPIO", "Adafruit-Blinka"),
+    *("msgspec", "numpy", "pyzmq", "pigpio", "gpiod", "rpi-lgpio", "RPi.GPIO", "Adafruit-Blinka"),
     *("adafruit-circuitpython-ads1x15", "adafruit-extended-bus"),
 )
 Print = Callable[[str, Result], None]
