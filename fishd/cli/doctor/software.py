@@ -7,7 +7,7 @@ import sys
 from importlib import metadata
 
 from fishd.cli.doctor.base import Context, sudo_unless
-from fishd.core.errors import StartupError, install_command
+from fishd.core.errors import MissingPackage, StartupError, install_command
 from fishd.hardware import header
 from fishd.hardware.checks import Check, Result, fail, ok, warning
 from fishd.hardware.panel_pins import ChipPins, find_chip, find_pins
@@ -70,10 +70,7 @@ def packages(context: Context) -> Result:
 
 
 def gpio_package(context: Context) -> Result | None:
-    """Check the packages for pins of the header: gpiod for the panel, RPi.GPIO for drivers.
-
-    Raises `MissingPackage` if the panel has none.
-    """
+    """Check the packages for pins of the header: gpiod for the panel, RPi.GPIO for drivers."""
     drivers = [
         settings.driver
         for _, plugins, settings in context.drivers
@@ -94,7 +91,10 @@ def gpio_package(context: Context) -> Result | None:
         )
     used = installed if drivers else []
     if context.config.panel.has_pins:
-        used = sorted({*used, *(["gpiod"] if find_pins() is ChipPins else installed)})
+        try:
+            used = sorted({*used, *(["gpiod"] if find_pins() is ChipPins else installed)})
+        except MissingPackage as error:
+            return fail(str(error), install_command("pi"))
     if "RPi.GPIO" in used and "Raspberry Pi 5" in context.model:
         return fail(
             "RPi.GPIO does not work on a Pi 5",
@@ -105,10 +105,12 @@ def gpio_package(context: Context) -> Result | None:
 
 def gpio_chip(context: Context) -> Result | None:
     """Check that this user may use the GPIO chip that the panel needs."""
-    if not context.config.panel.has_pins or find_pins() is not ChipPins:
+    if not context.config.panel.has_pins:
         return None
     try:
-        return ok(find_chip())
+        return ok(find_chip()) if find_pins() is ChipPins else None
+    except MissingPackage:  # `gpio_package` reports it
+        return None
     except StartupError as error:
         problem, _, remedy = str(error).partition("; ")
         return fail(problem, remedy)
