@@ -108,7 +108,7 @@ class ChipPins:
                         raise
                     infos = [chip.get_line_info(pin) for pin in lines]
                     users = [
-                        f"GPIO {i.offset} is used by {i.consumer or 'the kernel'}"
+                        f"GPIO {i.offset} is held by {i.consumer or 'the kernel'}"
                         for i in infos
                         if i.used
                     ]

@@ -371,7 +371,7 @@ class TestPinsThatCannotBeUsed:
     ) -> None:
         chip.lines[pin].consumer = consumer
         assert self.start() == (
-            f"the panel cannot use its pins: GPIO {pin} is used by {user}; "
+            f"the panel cannot use its pins: GPIO {pin} is held by {user}; "
             "stop that program, remove its dtoverlay, or choose another pin"
         )
         chip.lines[pin].consumer = None
