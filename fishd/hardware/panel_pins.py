@@ -3,16 +3,18 @@
 gpiod is libgpiod's own package. Where it is not installed, RPi.GPIO or rpi-lgpio does the same.
 """
 
-import errno
 import logging
 import os
 import select
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fishd.core.errors import MissingPackage, StartupError
 from fishd.hardware import header
+
+if TYPE_CHECKING:
+    from gpiod import LineRequest, LineSettings
 
 log = logging.getLogger(__name__)
 
@@ -66,9 +68,9 @@ def find_chip() -> str:
             f"{denied} may not be opened by this user; "
             "'sudo usermod -aG gpio USER', log in again, then try again"
         )
-    found = f"there is only {', '.join(others)}" if others else "there is no /dev/gpiochipN"
+    chips = f"there is only {', '.join(others)}" if others else "there is no /dev/gpiochipN"
     raise StartupError(
-        f"the GPIO chip of the header is missing, {found}; "
+        f"the GPIO chip of the header is missing, {chips}; "
         "button and light need a Pi with Raspberry Pi OS"
     )
 
@@ -81,46 +83,24 @@ class ChipPins:
 
     def __init__(self, button: int | None, light: int | None) -> None:
         """Claim the pins; raise `StartupError` if that is not possible."""
-        import gpiod
         from gpiod.line import Bias, Direction, Edge, Value
+        from gpiod.line_settings import LineSettings
 
         self._button: Any = button
         self._light: Any = light
         self._levels = (Value.INACTIVE, Value.ACTIVE)
         self._lock = threading.Lock()  # a request must not be used by two threads at a time
         self._thread: threading.Thread | None = None
-        lines: dict[Any, gpiod.LineSettings | None] = {}
+        lines: dict[Any, LineSettings | None] = {}
         if button is not None:
             # Not debounced by the kernel: it would report the old level, also to polls, for as
             # long as a loose contact chatters.
-            lines[button] = gpiod.LineSettings(
+            lines[button] = LineSettings(
                 direction=Direction.INPUT, bias=Bias.PULL_UP, edge_detection=Edge.BOTH
             )
         if light is not None:
-            lines[light] = gpiod.LineSettings(direction=Direction.OUTPUT)
-        path = find_chip()
-        try:
-            with gpiod.Chip(path) as chip:
-                try:
-                    self._request = chip.request_lines(lines, consumer=CONSUMER)
-                except OSError as error:
-                    if error.errno != errno.EBUSY:
-                        raise
-                    infos = [chip.get_line_info(pin) for pin in lines]
-                    users = [
-                        f"GPIO {i.offset} is held by {i.consumer or 'the kernel'}"
-                        for i in infos
-                        if i.used
-                    ]
-                    raise StartupError(
-                        f"the panel cannot use its pins: {', '.join(users) or 'in use'}; "
-                        "stop that program, remove its dtoverlay, or choose another pin"
-                    ) from None
-        except OSError as error:
-            names = " and ".join(f"GPIO {pin}" for pin in lines)
-            raise StartupError(
-                f"the panel cannot use {names} of {path}: {error.strerror or error}"
-            ) from None
+            lines[light] = LineSettings(direction=Direction.OUTPUT)
+        self._request = _claim(find_chip(), lines)
 
     def listen(self, on_edge: Callable[[], None]) -> None:
         """Call a function, from another thread, after each edge of the button."""
@@ -165,6 +145,31 @@ class ChipPins:
                 return
             on_edge()
             end.poll(BOUNCE_MS)  # edges of this time are waiting together, and are reported then
+
+
+def _claim(path: str, lines: "dict[Any, LineSettings | None]") -> "LineRequest":
+    """Claim lines of a chip; raise `StartupError` if that is not possible."""
+    import gpiod
+
+    try:
+        with gpiod.Chip(path) as chip:
+            try:
+                return chip.request_lines(lines, consumer=CONSUMER)
+            except OSError:
+                infos = [chip.get_line_info(pin) for pin in lines]
+                users = [(i.offset, i.consumer or "the kernel") for i in infos if i.used]
+                if not users:
+                    raise
+    except OSError as error:
+        names = " and ".join(f"GPIO {pin}" for pin in lines)
+        raise StartupError(
+            f"the panel cannot use {names} of {path}: {error.strerror or error}"
+        ) from None
+    raise StartupError(
+        "the panel cannot use its pins: "
+        + ", ".join(f"GPIO {pin} is held by {user}" for pin, user in users)
+        + "; stop that program, remove its dtoverlay, or choose another pin"
+    )
 
 
 class RpiGpioPins:

@@ -4,6 +4,7 @@ import errno
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from itertools import chain, repeat
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -382,7 +383,7 @@ class TestPinsThatCannotBeUsed:
     ) -> None:
         for name, true in TRUE.items():  # which refuse settings that they do not know
             monkeypatch.setattr(_ext, name, true)
-        calls = iter((0, 0, 0, errno.EIO))  # it is opened, named, opened, and asked for the pins
+        calls = chain((0, 0, 0), repeat(errno.EIO))  # after it was opened, named and opened again
         monkeypatch.setattr(chip, "check", lambda: fail(next(calls)))
         assert self.start() == (
             "the panel cannot use GPIO 17 and GPIO 27 of /dev/gpiochip0: Input/output error"
