@@ -41,7 +41,7 @@ from fishd.virtual.fish import SimulatedFish
 from fishd.virtual.plant.base import TrueWindow
 
 if TYPE_CHECKING:  # most runs need neither drivers nor emulation, so they are loaded on demand
-    from fishd.hardware.panel import RpiGpioPanel
+    from fishd.hardware.panel import Panel
     from fishd.hardware.power_meter.sampled_power import SampledPower
     from fishd.virtual.pi.virtual_pi import VirtualPi
     from fishd.virtual.swimmer.robot import Swimmer
@@ -122,7 +122,7 @@ def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
 
     The clock of the virtual Pi is ahead of the loop's by the remainder of a conversion.
     """
-    from fishd.virtual.pi.lgpio import EmulatedLgpio
+    from fishd.virtual.pi.gpiochip import EmulatedGpiod
     from fishd.virtual.pi.linux_i2c import LinuxI2c
     from fishd.virtual.pi.virtual_pi import VirtualPi
 
@@ -135,8 +135,8 @@ def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
     set_timeout = partial(setattr, pi.bus, "timeout")
     with driver_packages():
         stack.enter_context(LinuxI2c(pi.bus.transfer, {settings.bus}, set_timeout))
-    if _has_panel(config):
-        stack.enter_context(EmulatedLgpio(pi.pins))
+        if config.panel.has_pins:
+            stack.enter_context(EmulatedGpiod(pi.pins))
     servo = replace(config.servo, host="127.0.0.1", port=pi.pigpiod.port)
     robot = assemble(
         replace(config, servo=servo),
@@ -179,7 +179,7 @@ def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
 
     Raises `StartupError` if none is running, or a package is missing.
     """
-    from fishd.virtual.pi.lgpio import EmulatedLgpio, Pins
+    from fishd.virtual.pi.gpiochip import EmulatedGpiod, Pins
     from fishd.virtual.pi.link import RemotePi
     from fishd.virtual.pi.linux_i2c import LinuxI2c
     from fishd.virtual.pi.wires import Wires
@@ -190,10 +190,10 @@ def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
     buses = {config.virtual_pi.bus}
     with driver_packages():
         stack.enter_context(LinuxI2c(remote.transfer, buses, remote.set_timeout))
-    if _has_panel(config):
-        pins = Pins()
-        stack.enter_context(EmulatedLgpio(pins))
-        stack.callback(Wires(path, pins.set_level).close)
+        if config.panel.has_pins:
+            pins = Pins()
+            stack.enter_context(EmulatedGpiod(pins))
+            stack.callback(Wires(path, pins.set_level).close)
 
 
 def state_folder(config: Config) -> Path:
@@ -384,18 +384,14 @@ def _calibration_warning(config: Config, servo: CalibratedServo) -> str:
     )
 
 
-def _open_panel(config: Config, clock: Clock, stack: ExitStack) -> "RpiGpioPanel | None":
-    if not _has_panel(config):
+def _open_panel(config: Config, clock: Clock, stack: ExitStack) -> "Panel | None":
+    if not config.panel.has_pins:
         return None
-    from fishd.hardware.panel import RpiGpioPanel
+    from fishd.hardware.panel import Panel
 
-    panel = RpiGpioPanel(config.panel, clock)
+    panel = Panel(config.panel, clock)
     stack.callback(panel.close)
     return panel
-
-
-def _has_panel(config: Config) -> bool:
-    return config.panel.estop_gpio is not None or config.panel.led_gpio is not None
 
 
 def _await_first_sample(read: Callable[[float], object], clock: Clock) -> None:

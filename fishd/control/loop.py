@@ -33,7 +33,7 @@ from fishd.core.signals import Measurement, Observation, Publisher, Tick
 from fishd.hardware.base import Robot
 
 if TYPE_CHECKING:
-    from fishd.hardware.panel import RpiGpioPanel
+    from fishd.hardware.panel import Panel
 
 UPDATE_BUDGET = 0.5
 """Largest fraction of the period that an update of the controller may take."""
@@ -301,7 +301,7 @@ class ControlLoop:
         """Latch a fault, and log its error once, also while another fault is latched."""
         self.supervisor.fail(code, self.reporter.problem(what, error))
 
-    def _attend_panel(self, panel: "RpiGpioPanel", slot: Slot) -> None:
+    def _attend_panel(self, panel: "Panel", slot: Slot) -> None:
         """Show the mode on the operator's panel, and stop at once while its button is pressed."""
         try:
             if panel.update(self.supervisor.mode.value, slot.now):

@@ -11,7 +11,7 @@ from fishd.core.signals import Measurement, Truth
 
 if TYPE_CHECKING:
     from fishd.hardware.force_sensor.window import VoltageWatch
-    from fishd.hardware.panel import RpiGpioPanel
+    from fishd.hardware.panel import Panel
     from fishd.hardware.servo.calibrated_servo import CalibratedServo
 
 
@@ -74,7 +74,7 @@ class Robot:
     servo: Servo
     truth: Callable[[], Truth] | None = None
     """Function that returns the true state at the latest read, if the fish is simulated."""
-    panel: "RpiGpioPanel | None" = None
+    panel: "Panel | None" = None
     tared: TaredSensor | None = None
     """The force sensor, if it can be tared."""
     calibrated: "CalibratedParts | None" = None

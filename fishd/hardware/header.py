@@ -12,7 +12,7 @@ log = logging.getLogger(__name__)
 PACKAGE = "RPi.GPIO"
 """Package that a driver lists in its `packages` if it calls `load`."""
 _PROVIDERS = ("RPi.GPIO", "rpi-lgpio")
-_EXTRAS = "fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio] (Pi 4 and older)"
+_EXTRAS = "fishd[rpi-lgpio], or fishd[rpi-gpio] (Pi 4 and older)"
 
 
 def installed_packages() -> list[str]:

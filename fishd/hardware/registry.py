@@ -49,6 +49,7 @@ PACKAGES = {
     "Adafruit_PureIO": "Adafruit-PureIO",
     "board": "Adafruit-Blinka",
     "busio": "Adafruit-Blinka",
+    "gpiod": "gpiod",
     "pigpio": "pigpio",
 }
 """Package of each module that a driver of fishd imports."""

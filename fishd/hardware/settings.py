@@ -88,6 +88,11 @@ class PanelSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     ] = "high"
     led_gpio: Annotated[Gpio | None, note("Pin of the status light; null for none.")] = None
 
+    @property
+    def has_pins(self) -> bool:
+        """Whether there is a button or a light."""
+        return self.estop_gpio is not None or self.led_gpio is not None
+
 
 def _calibration_values(source: ServoSettings | ServoCalibration) -> dict[str, Any]:
     return {

@@ -7,9 +7,10 @@ import sys
 from importlib import metadata
 
 from fishd.cli.doctor.base import Context, sudo_unless
-from fishd.core.errors import install_command
+from fishd.core.errors import MissingPackage, StartupError, install_command
 from fishd.hardware import header
 from fishd.hardware.checks import Check, Result, fail, ok, warning
+from fishd.hardware.panel_pins import ChipPins, find_chip, find_pins
 from fishd.hardware.registry import PACKAGES
 
 _MODULES = {package: module for module, package in PACKAGES.items()} | {
@@ -69,12 +70,12 @@ def packages(context: Context) -> Result:
 
 
 def gpio_package(context: Context) -> Result | None:
-    """Check that only one of RPi.GPIO and rpi-lgpio is installed: they overwrite each other."""
-    panel = context.config.panel
-    pins = {panel.estop_gpio, panel.led_gpio} != {None} or any(
-        header.PACKAGE in plugins.find(settings.driver).packages
+    """Check the packages for pins of the header: gpiod for the panel, RPi.GPIO for drivers."""
+    drivers = [
+        settings.driver
         for _, plugins, settings in context.drivers
-    )
+        if header.PACKAGE in plugins.find(settings.driver).packages
+    ]
     installed = header.installed_packages()
     pip = f"{sys.executable} -m pip"
     if len(installed) > 1:
@@ -83,19 +84,36 @@ def gpio_package(context: Context) -> Result | None:
             "RPi.GPIO and rpi-lgpio are both installed, and overwrite each other",
             f"{pip} uninstall RPi.GPIO rpi-lgpio; then install {right}",
         )
-    if not pins:
-        return None
-    if not installed:
+    if drivers and not installed:
         return fail(
-            "neither RPi.GPIO nor rpi-lgpio is installed, but the configuration uses GPIO pins",
-            f"{install_command('rpi-lgpio')} (Pi 5, Debian 13); on others, rpi-gpio instead",
+            f"neither RPi.GPIO nor rpi-lgpio is installed, but driver {drivers[0]} needs one",
+            f"{install_command('rpi-lgpio')}; or rpi-gpio, on a Pi 4 and older",
         )
-    if "RPi.GPIO" in installed and "Raspberry Pi 5" in context.model:
+    used = installed if drivers else []
+    if context.config.panel.has_pins:
+        try:
+            used = sorted({*used, *(["gpiod"] if find_pins() is ChipPins else installed)})
+        except MissingPackage as error:
+            return fail(str(error), install_command("pi"))
+    if "RPi.GPIO" in used and "Raspberry Pi 5" in context.model:
         return fail(
             "RPi.GPIO does not work on a Pi 5",
-            f"{pip} uninstall RPi.GPIO; {install_command('rpi-lgpio')}",
+            f"{pip} uninstall RPi.GPIO; {install_command('rpi-lgpio' if drivers else 'pi')}",
         )
-    return ok(installed[0])
+    return ok(", ".join(used)) if used else None
+
+
+def gpio_chip(context: Context) -> Result | None:
+    """Check that this user may use the GPIO chip that the panel needs."""
+    if not context.config.panel.has_pins:
+        return None
+    try:
+        return ok(find_chip()) if find_pins() is ChipPins else None
+    except MissingPackage:  # `gpio_package` reports it
+        return None
+    except StartupError as error:
+        problem, _, remedy = str(error).partition("; ")
+        return fail(problem, remedy)
 
 
 def _find_problem(name: str, bounds: str) -> str:
@@ -125,4 +143,5 @@ CHECKS = (
     Check("configuration", configuration),
     Check("packages", packages),
     Check("gpio package", gpio_package, ("pi",)),
+    Check("gpio chip", gpio_chip, ("pi",)),
 )

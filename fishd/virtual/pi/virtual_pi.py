@@ -13,9 +13,9 @@ from fishd.core.signals import Truth
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.ads1115 import Ads1115Chip
 from fishd.virtual.pi.faults import Faults
+from fishd.virtual.pi.gpiochip import Pins
 from fishd.virtual.pi.i2c import I2cBus
 from fishd.virtual.pi.ina import CHIPS
-from fishd.virtual.pi.lgpio import Pins
 from fishd.virtual.pi.pigpiod.daemon import Pigpiod
 from fishd.virtual.pi.rc_filter import RcFilter
 from fishd.virtual.pi.settings import VirtualPiSettings
@@ -109,7 +109,7 @@ class VirtualPi:
                 meter(clock, self.tank.power, self.faults, supply, settings.shunt),
             )
         self.pins = Pins()
-        """Pins of the header, as used by rpi-lgpio."""
+        """Pins of the header, as used by gpiod."""
         self._clock = clock
         self._levels: dict[int, int] = {}
         self._levels_changed = threading.Condition()

@@ -1,7 +1,9 @@
 """Checks of `fishctl doctor` that look at a Raspberry Pi's own files, on a tree of such files."""
 
+import errno
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from fishd.cli.doctor import timing
 from fishd.cli.doctor.base import Context
 from fishd.cli.doctor.bench.measurement import describe_board
 from fishd.config import load
+from fishd.virtual.pi.gpiochip import EmulatedGpiod, Pins
 
 MODEL, BUS = "proc/device-tree/model", "of_node/clock-frequency"
 PI_4 = {MODEL: "Raspberry Pi 4 Model B Rev 1.5\0"}
@@ -113,7 +116,10 @@ CASES: list[tuple[str, str, str, dict[str, str | bytes], list[str]]] = [
     ("gpio pins", "ok", "", PINS, ["servo.gpio=17"]),
     ("gpio pins", "warning", "GPIO27", PINS, ["servo.gpio=17", "panel.led_gpio=27"]),
     ("gpio package", "", "", {}, []),
-    ("gpio package", "ok", "rpi-lgpio", {}, ["panel.estop_gpio=4"]),
+    ("gpio package", "ok", "gpiod", {}, ["panel.estop_gpio=4"]),
+    ("gpio package", "ok", "rpi-lgpio", PI_5, ["servo.driver=rpi-gpio"]),
+    ("gpio package", "ok", "gpiod, rpi-lgpio", {}, ["servo.driver=rpi-gpio", "panel.led_gpio=4"]),
+    ("gpio chip", "", "", {}, []),
     ("amplifier", "ok", "", {}, ["force_sensor.full_scale=2.048"]),
     ("amplifier", "ok", "", {}, ["force_sensor.full_scale=4.096"]),
     ("amplifier", "warning", "would count as a force", {},
@@ -263,13 +269,50 @@ def test_the_pwm_channel_must_be_there_and_silent(root: Path, examine: Examine) 
     assert duty.read_text() == "1500000\n"
 
 
-def test_a_button_none_can_read_is_told(examine: Examine, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pins_that_no_package_reaches_fail(
+    examine: Examine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An installation without the package works, but doctor must report it."""
     monkeypatch.setattr("fishd.hardware.header._PROVIDERS", ())
+    level, message, mend = examine("gpio package", "servo.driver=rpi-gpio")
+    assert level == "FAIL"
+    assert message == "neither RPi.GPIO nor rpi-lgpio is installed, but driver rpi-gpio needs one"
+    assert "[rpi-lgpio]" in mend
+    monkeypatch.setitem(sys.modules, "gpiod", None)
     assert examine("gpio package") == ("", "", "")
     level, message, mend = examine("gpio package", "panel.estop_gpio=17")
-    assert (level, message.startswith("neither RPi.GPIO nor rpi-lgpio is")) == ("FAIL", True)
-    assert "[rpi-lgpio]" in mend
+    assert (level, "need the package gpiod, 2.3 or later" in message) == ("FAIL", True)
+    assert mend.endswith("[pi]'")
+
+
+def test_a_panel_without_gpiod_uses_the_package_that_is_there(
+    root: Path, examine: Examine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "gpiod", None)
+    assert examine("gpio package", "panel.estop_gpio=17")[:2] == ("ok", "rpi-lgpio")
+    monkeypatch.setattr("fishd.hardware.header._PROVIDERS", ("RPi.GPIO",))
+    info = tmp_path / "RPi_GPIO-0.7.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: RPi.GPIO\nVersion: 0.7.1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert examine("gpio package", "panel.estop_gpio=17")[:2] == ("ok", "RPi.GPIO")
+    for path, content in PI_5.items():
+        put(root, path, content)
+    level, message, mend = examine("gpio package", "panel.estop_gpio=17")
+    assert (level, message) == ("FAIL", "RPi.GPIO does not work on a Pi 5")
+    assert mend.endswith("[pi]'")
+
+
+def test_the_chip_of_the_pins_must_be_accessible_to_this_user(examine: Examine) -> None:
+    chip = Pins()
+    with EmulatedGpiod(None, chip):
+        assert examine("gpio chip", "panel.estop_gpio=17") == ("ok", "/dev/gpiochip1", "")
+        chip.error = errno.EACCES
+        assert examine("gpio chip", "panel.estop_gpio=17") == (
+            "FAIL",
+            "/dev/gpiochip1 may not be opened by this user",
+            "'sudo usermod -aG gpio USER', log in again, then try again",
+        )
 
 
 @pytest.mark.slow

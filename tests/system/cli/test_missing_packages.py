@@ -29,17 +29,27 @@ def env(tmp_path: Path) -> dict[str, str]:
     return environment_without(tmp_path, *MODULES)
 
 
-def test_fishd_on_a_virtual_pi_names_the_package(pi: Bench, env: dict[str, str]) -> None:
-    ended = call(FISHD, *pi.settings, *addresses(pi.folder), env=env)
+@pytest.mark.parametrize(
+    ("modules", "settings", "package"),
+    [
+        (MODULES, [], "adafruit-extended-bus"),
+        (["gpiod"], ["panel.estop_gpio=17"], "gpiod"),
+    ],
+)
+def test_fishd_on_a_virtual_pi_names_the_package(
+    pi: Bench, tmp_path: Path, modules: list[str], settings: list[str], package: str
+) -> None:
+    env = environment_without(tmp_path, *modules)
+    ended = call(FISHD, *pi.settings, *sets(*settings), *addresses(pi.folder), env=env)
     assert ended.returncode == 1
-    assert re.fullmatch(ONE_LINE % "adafruit-extended-bus", ended.stderr)
+    assert re.fullmatch(ONE_LINE % package, ended.stderr)
 
 
 @pytest.mark.parametrize(
     ("modules", "settings", "complaint"),
     [
         (MODULES, [], ONE_LINE % "adafruit-circuitpython-ads1x15"),
-        (["RPi"], ["panel.estop_gpio=9"], r"[^\n]*the pins of the header need[^\n]*\n"),
+        (["gpiod", "RPi"], ["panel.estop_gpio=9"], r"[^\n]*the pins of the header need[^\n]*\n"),
     ],
 )
 def test_fishd_on_a_pi_does_not_start_without_what_it_needs(

@@ -1,15 +1,26 @@
-"""The E-stop button and the status light: the real rpi-lgpio on emulated pins."""
+"""The E-stop button and the status light: the real gpiod and rpi-lgpio on emulated pins."""
 
+import errno
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from itertools import chain, repeat
+from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
+from gpiod import _ext
+from rigs import lgpio_module
+from rigs.processes import PATIENCE, wait_until
 
 from fishd.core.clock import VirtualClock
-from fishd.hardware.panel import RpiGpioPanel
+from fishd.core.errors import StartupError
+from fishd.hardware.panel import Panel
+from fishd.hardware.panel_pins import find_chip
 from fishd.hardware.settings import PanelSettings
-from fishd.virtual.pi.lgpio import PULL_NONE, PULL_UP, EmulatedLgpio, Pins
+from fishd.virtual.pi import gpiochip
+from fishd.virtual.pi.i2c import kernel_error
 
 BUTTON, LIGHT = 17, 27
 OPENS = PanelSettings(estop_gpio=BUTTON, estop_pressed="high", led_gpio=LIGHT)
@@ -17,23 +28,43 @@ CLOSES = PanelSettings(estop_gpio=BUTTON, estop_pressed="low")
 GROUND = 0
 OPEN = None  # a contact that is open, or a broken wire
 
-Make = Callable[[PanelSettings], RpiGpioPanel]
+TRUE = {name: getattr(_ext, name) for name in ("LineConfig", "LineSettings")}
+"""Classes of gpiod's C module that the emulation replaces, and that need no chip."""
+
+Make = Callable[[PanelSettings], Panel]
+Pins = Any  # of either module: they have the same functions
 
 
 @pytest.fixture
-def pins() -> Iterator[Pins]:
-    pins = Pins()
-    with EmulatedLgpio(pins):
+def chip() -> Iterator[gpiochip.Pins]:
+    """GPIO chip of a Pi 4, which gpiod finds."""
+    chip = gpiochip.Pins()
+    with gpiochip.EmulatedGpiod(chip):
+        yield chip
+
+
+@pytest.fixture
+def without_gpiod(monkeypatch: pytest.MonkeyPatch) -> Iterator[lgpio_module.Pins]:
+    """Pins of a Pi on which rpi-lgpio is installed, and gpiod is not."""
+    monkeypatch.setitem(sys.modules, "gpiod", None)
+    pins = lgpio_module.Pins()
+    with lgpio_module.EmulatedLgpio(pins):
         yield pins
 
 
+@pytest.fixture(params=["chip", "without_gpiod"])
+def pins(request: pytest.FixtureRequest) -> Pins:
+    """Pins through each library."""
+    return request.getfixturevalue(request.param)
+
+
 @pytest.fixture
-def make(pins: Pins) -> Iterator[Make]:
+def make() -> Iterator[Make]:
     """Return a function that makes panels, which are closed after the test."""
     panels = []
 
-    def make_panel(settings: PanelSettings) -> RpiGpioPanel:
-        panels.append(RpiGpioPanel(settings, VirtualClock()))
+    def make_panel(settings: PanelSettings) -> Panel:
+        panels.append(Panel(settings, VirtualClock()))
         return panels[-1]
 
     yield make_panel
@@ -42,40 +73,50 @@ def make(pins: Pins) -> Iterator[Make]:
 
 
 @pytest.fixture
-def panel(pins: Pins, make: Make) -> RpiGpioPanel:
+def panel(pins: Pins, make: Make) -> Panel:
     """Panel whose button is released: its contact is closed."""
     pins.set_level(BUTTON, GROUND)
     return make(OPENS)
 
 
-def test_a_press_is_reported_at_once_by_a_library_thread(pins: Pins, panel: RpiGpioPanel) -> None:
+def is_pulled_up(pins: Pins, pin: int) -> bool:
+    module = gpiochip if isinstance(pins, gpiochip.Pins) else lgpio_module
+    return bool(pins.lines[pin].pull == module.PULL_UP)
+
+
+def test_a_press_is_reported_at_once_by_another_thread(pins: Pins, panel: Panel) -> None:
     threads = []
     panel.on_press = lambda: threads.append(threading.current_thread())
     pins.set_level(BUTTON, OPEN)
-    assert len(threads) == 1
-    assert threads[0] is not threading.current_thread()
+    wait_until(lambda: threads)
+    assert threads != [threading.current_thread()]
 
 
-def test_a_press_is_reported_once_however_it_bounces(pins: Pins, panel: RpiGpioPanel) -> None:
+def test_a_press_is_reported_once_however_it_bounces(pins: Pins, panel: Panel) -> None:
     presses = []
     panel.on_press = lambda: presses.append(1)
     for level in (OPEN, GROUND, OPEN, GROUND, OPEN):
         pins.set_level(BUTTON, level)
-    assert presses == [1]
+    wait_until(lambda: presses)
     for time in range(3):
         assert panel.update("estop", 0.05 * time) is True
+    panel.close()  # its thread has ended: no edge is reported any more
+    assert presses == [1]
 
 
-def test_a_press_between_two_ticks_is_seen(pins: Pins, panel: RpiGpioPanel) -> None:
+def test_a_press_between_two_ticks_is_seen(pins: Pins, panel: Panel) -> None:
+    presses = []
+    panel.on_press = lambda: presses.append(1)
     panel.update("running", 0.0)
     pins.set_level(BUTTON, OPEN)
+    wait_until(lambda: presses)
     pins.set_level(BUTTON, GROUND)
     assert panel.update("running", 0.05) is True
     assert panel.update("running", 0.10) is False
 
 
-def test_a_release_takes_two_polls(pins: Pins, panel: RpiGpioPanel) -> None:
-    pins.set_level(BUTTON, OPEN)
+def test_a_release_takes_two_polls(without_gpiod: lgpio_module.Pins, make: Make) -> None:
+    pins, panel = without_gpiod, make(OPENS)  # here an edge is reported before the next line
     assert panel.update("estop", 0.0) is True
     pins.set_level(BUTTON, GROUND)
     assert panel.update("estop", 0.05) is True
@@ -86,31 +127,81 @@ def test_a_release_takes_two_polls(pins: Pins, panel: RpiGpioPanel) -> None:
     assert panel.update("estop", 0.20) is False
 
 
-def test_a_spike_that_is_gone_when_looked_at_is_no_press(pins: Pins, panel: RpiGpioPanel) -> None:
-    presses = []
+def test_a_button_that_is_pressed_at_the_start_is_seen_by_the_first_tick(
+    pins: Pins, make: Make
+) -> None:
+    pins.set_level(BUTTON, OPEN)
+    assert make(OPENS).update("idle", 0.0) is True
+
+
+def test_a_spike_that_is_gone_when_looked_at_is_no_press(
+    chip: gpiochip.Pins, make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chip.set_level(BUTTON, GROUND)
+    panel, presses, calls = make(OPENS), list[int](), list[int]()
     panel.on_press = lambda: presses.append(1)
-    (callback,) = pins.callbacks
-    callback.function(0, BUTTON, 1, 0)  # an edge, and the level is low again
+    monkeypatch.setattr(chip, "check", lambda: calls.append(1))
+    (spike,) = chip.lines[BUTTON].watchers
+    for number in (1, 2):
+        spike(1)  # an edge, and the level is low again
+        wait_until(lambda count=2 * number: len(calls) >= count)  # it read the edge and the level
+    assert presses == []  # the second spike is read after the first was judged
+    assert panel.update("running", 0.0) is False
+
+
+def test_a_spike_that_is_gone_is_no_press_with_rpi_lgpio(
+    without_gpiod: lgpio_module.Pins, make: Make
+) -> None:
+    without_gpiod.set_level(BUTTON, GROUND)
+    panel, presses = make(OPENS), list[int]()
+    panel.on_press = lambda: presses.append(1)
+    (callback,) = without_gpiod.callbacks
+    callback.function(0, BUTTON, 1, 0)
     assert presses == []
     assert panel.update("running", 0.0) is False
 
 
+def test_a_contact_that_chatters_without_end_is_a_press(chip: gpiochip.Pins, make: Make) -> None:
+    """A loose wire beside that of the servo; the kernel's debounce would never report it."""
+    chip.set_level(BUTTON, GROUND)
+    panel, pressed, stopped = make(OPENS), threading.Event(), threading.Event()
+    panel.on_press = pressed.set
+
+    def chatter() -> None:
+        while not stopped.wait(1e-3):
+            chip.set_level(BUTTON, GROUND)
+            chip.set_level(BUTTON, OPEN)
+
+    thread = threading.Thread(target=chatter)
+    thread.start()
+    try:
+        assert pressed.wait(PATIENCE)
+    finally:
+        stopped.set()
+        thread.join()
+
+
 def test_a_broken_wire_is_a_press_where_the_button_opens_a_contact(pins: Pins, make: Make) -> None:
-    pins.set_level(BUTTON, OPEN)
+    pins.set_level(BUTTON, GROUND)
     panel = make(OPENS)
-    assert pins.lines[BUTTON].pull == PULL_UP
-    assert panel.update("idle", 0.0) is True
+    assert is_pulled_up(pins, BUTTON)
+    assert panel.update("idle", 0.0) is False
+    pins.set_level(BUTTON, OPEN)
+    assert panel.update("idle", 0.05) is True
 
 
 def test_a_button_that_closes_a_contact_is_pressed_when_low(pins: Pins, make: Make) -> None:
     panel = make(CLOSES)
-    assert pins.lines[BUTTON].pull == PULL_UP
+    assert is_pulled_up(pins, BUTTON)
     assert panel.update("running", 0.0) is False
     pins.set_level(BUTTON, GROUND)
     assert panel.update("running", 0.05) is True
 
 
-def test_without_edges_polls_do(pins: Pins, make: Make, caplog: pytest.LogCaptureFixture) -> None:
+def test_without_edges_polls_do(
+    without_gpiod: lgpio_module.Pins, make: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    pins = without_gpiod
     pins.reports_edges = False
     pins.set_level(BUTTON, GROUND)
     panel = make(OPENS)
@@ -123,9 +214,7 @@ def test_without_edges_polls_do(pins: Pins, make: Make, caplog: pytest.LogCaptur
     assert len(caplog.messages) == 1
 
 
-def record_light(
-    pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, seconds: float
-) -> list[int]:
+def record_light(pins: Pins, panel: Panel, mode: str, tick: float, seconds: float) -> list[int]:
     """Return the level of the light after each tick."""
     levels = []
     for index in range(round(seconds / tick)):
@@ -140,7 +229,7 @@ def count_flashes(levels: list[int]) -> int:
 
 
 @pytest.mark.parametrize("tick", [0.01, 0.2])
-def test_the_light_flashes_each_second_idle(pins: Pins, panel: RpiGpioPanel, tick: float) -> None:
+def test_the_light_flashes_each_second_idle(pins: Pins, panel: Panel, tick: float) -> None:
     levels = record_light(pins, panel, "idle", tick, 10.0)
     assert count_flashes(levels) == 10
     assert sum(levels) == pytest.approx(0.2 * len(levels), abs=0.05 * len(levels))
@@ -149,41 +238,176 @@ def test_the_light_flashes_each_second_idle(pins: Pins, panel: RpiGpioPanel, tic
 @pytest.mark.parametrize("mode", ["fault", "estop"])
 @pytest.mark.parametrize(("tick", "rate"), [(0.05, 5.0), (0.2, 2.5)])
 def test_the_light_flickers_after_a_fault(
-    pins: Pins, panel: RpiGpioPanel, mode: str, tick: float, rate: float
+    pins: Pins, panel: Panel, mode: str, tick: float, rate: float
 ) -> None:
     levels = record_light(pins, panel, mode, tick, 10.0)
     assert count_flashes(levels) == pytest.approx(10.0 * rate, rel=0.15)
 
 
-def test_close_ends_the_light_and_gives_back_only_its_pins(pins: Pins, panel: RpiGpioPanel) -> None:
-    from RPi import GPIO
-
-    GPIO.setup(22, GPIO.OUT, initial=GPIO.HIGH)
+def test_close_ends_the_light_and_the_reports(pins: Pins, panel: Panel) -> None:
     presses = []
     panel.on_press = lambda: presses.append(1)
     panel.update("running", 0.0)
+    assert pins.lines[LIGHT].level() == 1
     panel.close()
     panel.close()
     assert pins.lines[LIGHT].driven == 0
-    assert not pins.lines[LIGHT].is_output
-    assert pins.lines[22].level() == 1
     pins.set_level(BUTTON, OPEN)
     assert presses == []
+    assert "estop-button" not in [thread.name for thread in threading.enumerate()]
+
+
+def test_closed_pins_are_free_for_other_programs(chip: gpiochip.Pins, make: Make) -> None:
+    panel = make(OPENS)
+    assert {chip.lines[pin].consumer for pin in (BUTTON, LIGHT)} == {"fishd"}
+    panel.close()
+    assert {chip.lines[pin].consumer for pin in (BUTTON, LIGHT)} == {None}
+    make(OPENS)
+
+
+def test_close_gives_back_only_its_pins(without_gpiod: lgpio_module.Pins, make: Make) -> None:
+    pins, panel = without_gpiod, make(OPENS)
+    from RPi import GPIO
+
+    GPIO.setup(22, GPIO.OUT, initial=GPIO.HIGH)
+    panel.close()
+    assert not pins.lines[LIGHT].is_output
+    assert pins.lines[22].level() == 1
 
 
 def test_close_goes_on_when_a_step_fails(
-    pins: Pins, panel: RpiGpioPanel, caplog: pytest.LogCaptureFixture
+    without_gpiod: lgpio_module.Pins, make: Make, caplog: pytest.LogCaptureFixture
 ) -> None:
+    pins, panel = without_gpiod, make(OPENS)
     from RPi import GPIO
 
     GPIO.cleanup(LIGHT)  # by another part of the program
     panel.close()
-    assert caplog.messages[0].startswith("cannot switch off GPIO 27: ")
-    assert pins.lines[BUTTON].pull == PULL_NONE
+    assert caplog.messages[0].startswith("the status light on GPIO 27 cannot be switched any more")
+    assert pins.lines[BUTTON].pull == lgpio_module.PULL_NONE
+
+
+def test_a_chip_that_is_gone_is_one_error_of_the_button(
+    chip: gpiochip.Pins, make: Make, caplog: pytest.LogCaptureFixture
+) -> None:
+    chip.set_level(BUTTON, GROUND)
+    panel = make(OPENS)
+    chip.error = errno.ENODEV
+    chip.set_level(BUTTON, OPEN)  # as the kernel wakes all that wait for a chip that is gone
+    wait_until(lambda: caplog.messages)
+    for tick in range(3):
+        with pytest.raises(OSError, match=r"^E-stop button on GPIO 17: No such device$"):
+            panel.update("running", 0.05 * tick)
+    assert sorted(caplog.messages) == [
+        "E-stop button: its edges are not reported any more: No such device",
+        "the status light on GPIO 27 cannot be switched any more: No such device",
+    ]
+    panel.close()
+
+
+@pytest.mark.parametrize(
+    "chips",
+    [
+        ("pinctrl-bcm2835", "raspberrypi-exp-gpio"),  # Pi 3, Zero 2
+        ("pinctrl-bcm2711", "raspberrypi-exp-gpio"),  # Pi 4
+        ("pinctrl-rp1", "gpio-brcmstb@107d508500"),  # Pi 5, kernel 6.12
+        ("gpio-brcmstb@107d508500", None, None, "gpio-brcmstb@107d517c00", "pinctrl-rp1"),  # 6.6
+    ],
+    ids=str,
+)
+def test_the_chip_of_the_header_is_found_by_its_label(
+    make: Make, chips: tuple[str | None, ...]
+) -> None:
+    pins = [label and gpiochip.Pins(label) for label in chips]
+    with gpiochip.EmulatedGpiod(*pins):
+        panel = make(OPENS)
+        claimed = [chip.label for chip in pins if chip and chip.lines[LIGHT].consumer]
+        panel.close()
+    assert len(claimed) == 1
+    assert claimed[0].startswith("pinctrl-")
+
+
+def fail(number: int) -> None:
+    if number:
+        raise kernel_error(number)
+
+
+class TestPinsThatCannotBeUsed:
+    """Pins that cannot be used: each case gives one line with the remedy."""
+
+    def start(self) -> str:
+        with pytest.raises(StartupError) as caught:
+            Panel(OPENS, VirtualClock())
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    def test_of_no_pi(self) -> None:
+        with gpiochip.EmulatedGpiod(gpiochip.Pins("INT33FC:00")):
+            assert self.start() == (
+                "the GPIO chip of the header is missing, there is only /dev/gpiochip0 "
+                "(INT33FC:00); button and light need a Pi with Raspberry Pi OS"
+            )
+        with gpiochip.EmulatedGpiod():
+            assert "is missing, there is no /dev/gpiochipN; " in self.start()
+
+    def test_of_another_group(self, chip: gpiochip.Pins) -> None:
+        chip.error = errno.EACCES
+        assert self.start() == (
+            "/dev/gpiochip0 may not be opened by this user; "
+            "'sudo usermod -aG gpio USER', log in again, then try again"
+        )
+
+    def test_with_another_chip_that_is_forbidden(self, make: Make) -> None:
+        forbidden, header = gpiochip.Pins("other"), gpiochip.Pins()
+        forbidden.error = errno.EACCES
+        with gpiochip.EmulatedGpiod(forbidden, header):
+            make(OPENS).close()
+
+    @pytest.mark.parametrize(
+        ("pin", "consumer", "user"),
+        [(BUTTON, "gpiomon", "gpiomon"), (LIGHT, "", "the kernel")],
+    )
+    def test_held_by_another_program(
+        self, chip: gpiochip.Pins, make: Make, pin: int, consumer: str, user: str
+    ) -> None:
+        chip.lines[pin].consumer = consumer
+        assert self.start() == (
+            f"the panel cannot use its pins: GPIO {pin} is held by {user}; "
+            "stop that program, remove its dtoverlay, or choose another pin"
+        )
+        chip.lines[pin].consumer = None
+        make(OPENS)
+
+    def test_of_a_chip_that_fails_when_it_is_asked_for_them(
+        self, chip: gpiochip.Pins, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        for name, true in TRUE.items():  # which refuse settings that they do not know
+            monkeypatch.setattr(_ext, name, true)
+        calls = chain((0, 0, 0), repeat(errno.EIO))  # after it was opened, named and opened again
+        monkeypatch.setattr(chip, "check", lambda: fail(next(calls)))
+        assert self.start() == (
+            "the panel cannot use GPIO 17 and GPIO 27 of /dev/gpiochip0: Input/output error"
+        )
+
+    def test_with_a_gpiod_of_version_1(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Debian 12 has one as python3-libgpiod."""
+        monkeypatch.setitem(sys.modules, "gpiod", ModuleType("gpiod"))
+        monkeypatch.setitem(sys.modules, "gpiod.line_settings", None)
+        monkeypatch.setattr("fishd.hardware.header._PROVIDERS", ())
+        assert self.start() == (
+            "E-stop button and status light need the package gpiod, 2.3 or later; install fishd[pi]"
+        )
 
 
 def test_without_pins_no_library_is_needed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "RPi", None)
-    panel = RpiGpioPanel(PanelSettings(), VirtualClock())
+    for name in ("gpiod", "RPi"):
+        monkeypatch.setitem(sys.modules, name, None)
+    panel = Panel(PanelSettings(), VirtualClock())
     assert panel.update("running", 0.0) is False
     panel.close()
+
+
+@pytest.mark.skipif(any(Path("/dev").glob("gpiochip*")), reason="this machine has GPIO chips")
+def test_the_true_library_finds_no_chip_on_a_computer_without() -> None:
+    with pytest.raises(StartupError, match=r"missing, there is no /dev/gpiochipN; "):
+        find_chip()

@@ -68,7 +68,7 @@ WIDTHS = 5
 _PROCESSOR_ZONES = ("cpu-thermal", "x86_pkg_temp")
 """Types of the kernel's thermal zones that measure a processor; their numbers change."""
 _PACKAGES = (
-    *("msgspec", "numpy", "pyzmq", "pigpio", "rpi-lgpio", "RPi.GPIO", "Adafruit-Blinka"),
+    *("msgspec", "numpy", "pyzmq", "pigpio", "gpiod", "rpi-lgpio", "RPi.GPIO", "Adafruit-Blinka"),
     *("adafruit-circuitpython-ads1x15", "adafruit-extended-bus"),
 )
 Print = Callable[[str, Result], None]

@@ -17,8 +17,8 @@ from fishd.core.errors import StartupError
 from fishd.hardware.force_sensor.ads1115 import Ads1115, Ads1115Settings
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi import link as pi_link
+from fishd.virtual.pi.gpiochip import Pins
 from fishd.virtual.pi.i2c import Read, Write, kernel_error
-from fishd.virtual.pi.lgpio import Pins
 from fishd.virtual.pi.link import RemotePi
 from fishd.virtual.pi.link_server import LinkServer
 from fishd.virtual.pi.settings import VirtualPiSettings

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rigs.lgpio_module import EmulatedLgpio, Pins
 
 from fishd.core.calibration import ServoCalibration
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import ServoError, StartupError
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.rpi_gpio import RpiGpio, RpiGpioSettings, pull_low
-from fishd.virtual.pi.lgpio import EmulatedLgpio, Pins
 
 SETTINGS = RpiGpioSettings(gpio=18)
 
@@ -150,7 +150,7 @@ class TestALibraryThatCannotBeUsed:
 
     def test_missing(self, pins: Pins, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(sys.modules, "RPi", None)
-        assert "install fishd[rpi-lgpio] (Pi 5, Debian 13) or fishd[rpi-gpio]" in self.start()
+        assert "install fishd[rpi-lgpio], or fishd[rpi-gpio] (Pi 4" in self.start()
 
     def test_twice(self, pins: Pins, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         info = tmp_path / "RPi_GPIO-0.7.1.dist-info"

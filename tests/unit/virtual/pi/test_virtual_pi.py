@@ -3,7 +3,9 @@
 from collections.abc import Iterator
 from contextlib import ExitStack
 
+import gpiod
 import pytest
+from gpiod.line import Bias, Direction
 from rigs.processes import PATIENCE
 
 from fishd.assembly import open_in_virtual_time
@@ -11,8 +13,8 @@ from fishd.config import load
 from fishd.core.clock import VirtualClock
 from fishd.hardware.servo.pigpio_client import Client
 from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.pi.gpiochip import EmulatedGpiod
 from fishd.virtual.pi.i2c import Read
-from fishd.virtual.pi.lgpio import EmulatedLgpio
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.virtual_pi import VirtualPi
 from fishd.virtual.plant.parameters import PlantParameters
@@ -71,17 +73,16 @@ def test_the_fish_swims_on_with_an_unread_sensor(pi: VirtualPi, clock: VirtualCl
 
 
 def test_a_button_is_seen_by_the_true_gpio_library(pi: VirtualPi) -> None:
-    with EmulatedLgpio(pi.pins):
-        from RPi import GPIO as gpio  # noqa: N811
-
-        gpio.setmode(gpio.BCM)
-        gpio.setup(17, gpio.IN, pull_up_down=gpio.PUD_UP)
-        for level, read in ((None, 1), (0, 0), (None, 1)):
+    pull_up = gpiod.LineSettings(direction=Direction.INPUT, bias=Bias.PULL_UP)
+    with (
+        EmulatedGpiod(pi.pins),
+        gpiod.request_lines("/dev/gpiochip0", {17: pull_up}) as request,
+    ):
+        for level, read in ((None, True), (0, False), (None, True)):
             pi.set_level(17, level)
-            assert gpio.input(17) == read
+            assert bool(request.get_value(17)) is read
         pi.set_level(17, 0)
         assert pi.state().levels == {17: 0}
-        gpio.cleanup()
     with pytest.raises(ValueError, match="GPIO 40 is not valid: 0 to 27 is needed"):
         pi.set_level(40, 1)
 
