@@ -208,6 +208,7 @@ class Recorder:
 
     def _take(self, topic: str, payload: bytes) -> None:
         known, restarts = len(self.writer.gaps), self.writer.tally.restarts
+        known_steps = len(self.writer.tally.clock_steps)
         try:
             message = self.writer.message(topic, payload)
         except msgspec.DecodeError:
@@ -226,6 +227,8 @@ class Recorder:
                 self._camera.set_time(message.t, message.time)
             for gap in self.writer.gaps[known:]:
                 self._tell(f"just before tick {message.seq}, ticks were lost: {gap.lost}")
+            for step in self.writer.tally.clock_steps[known_steps:]:
+                self._tell(str(step))
         elif isinstance(message, Status):
             if self.writer.tally.restarts > restarts:  # its ticks had higher numbers
                 self._tell(TAKEOVER_MESSAGE)

@@ -29,12 +29,12 @@ expect.set_options(timeout=PATIENCE * 1e3)
 APP = "const app = await import('/app.js');"
 FEED = """
 const day = 24 * 3600 * 20;
-let seq = app.state.tick.seq, t = app.state.tick.t;
+let seq = app.state.tick.seq, { t, time } = app.state.tick;
 globalThis.feed = (count, drawn) => {
   for (let i = 0; i < count; i++) {
     const phase = i / 12;
     app.receive.ticks([{
-      t: t += 0.05, seq: ++seq, mode: "running", controller: "swing", servo_on: true, samples: 2,
+      t: t += 0.05, time: time += 0.05, seq: ++seq, mode: "running", controller: "swing", servo_on: true, samples: 2,
       fx: Math.sin(phase), fy: Math.cos(phase), fy_rate: 0, fin_velocity: phase % 1, phi_c: 0.4,
       thrust: 0.02, thrust_ci95: 0.001, frequency: 1.7, sample_age_ms: 2, lateness_us: 50,
       busy_time_us: 90, missed_slots: 0, alpha: 0.1, phi: 0.3, power: 0.6,
@@ -434,7 +434,7 @@ def test_lost_ticks_are_drawn_as_a_gap_and_suspect_samples_are_marked(
             (await import("/app.js")).stream.socket.onmessage = null;
             for (let seq = 1; seq <= 300; seq++) {
                 if (seq > 100 && seq <= 200) continue;
-                const tick = { t: 1000 + seq * 0.05, seq, fx: 0.01, fy: 0, thrust: 0.01, phi_c: 0 };
+                const tick = { time: 1000 + seq * 0.05, seq, fx: 0.01, fy: 0, thrust: 0.01, phi_c: 0 };
                 if (seq === 250) tick.suspect = "clipped";
                 ring.push(tick);
             }
