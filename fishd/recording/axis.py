@@ -143,5 +143,6 @@ class ClockSteps:
         suspected, self._suspected = self._suspected, (position, offset)
         if suspected and abs(offset - suspected[1]) <= MIN_STEP_S:
             if len(self.steps) < MAX_STEPS:
-                self.steps.append(ClockStep(suspected[0], suspected[1] - self._offset))
+                by = suspected[1] - self._offset
+                self.steps.append(ClockStep(round(suspected[0], 3), round(by, 3)))
             self._offset, self._suspected = offset, None

@@ -8,7 +8,7 @@ import os
 import struct
 from pathlib import Path
 
-_CODE = '''
+_CODE = """
 import ctypes, datetime, gc, mmap, os, struct, time
 
 with open(os.environ["STEPPED_CLOCK"], "rb") as _file:
@@ -23,7 +23,7 @@ gc.get_referents(_type.__dict__)[0]["now"] = classmethod(
     lambda cls, tz=None: cls.fromtimestamp(time.time(), tz)
 )
 ctypes.pythonapi.PyType_Modified(ctypes.py_object(_type))
-'''
+"""
 
 
 class WallClock:
