@@ -51,6 +51,7 @@ def test_a_recording_during_a_step_of_the_clock_is_as_long_as_its_ticks(
     tmp_path: Path, step: float
 ) -> None:
     rig = Rig(tmp_path)
+    rig.fishd.next_tick()
     with rig.fishd, Process(*rig.words("record", "run"), env=rig.environment) as recorder:
         wait_until(lambda: rig.count_ticks("run") > 30)
         rig.clock.set(step)
