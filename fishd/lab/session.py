@@ -28,7 +28,8 @@ from fishd.core.signals import Event, Publisher, Reason, Tick
 from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:
-    from fishd.recording.writer import RunWriter, Source
+    from fishd.recording.provenance import Source
+    from fishd.recording.writer import RunWriter
 
 IDLE_LIMIT = 5.0
 """Time after which an experiment that reads no tick while the fish swims counts as hung [s]."""

@@ -1,17 +1,9 @@
 """Time axis of a recording, from fishd's monotonic clock, and the steps of its unix clock."""
 
 import math
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple
 
 from msgspec import Struct
-
-from fishd.core.signals import Event, Status, Tick
-from fishd.recording.images import FrameHead
-
-if TYPE_CHECKING:
-    from fishd.recording.summary import TickHead
-
-    Message: TypeAlias = TickHead | Tick | Event | Status | FrameHead
 
 MIN_STEP_S = 0.1
 """Smallest change of the unix clock that counts as a step; the daemons of NTP make smaller ones
@@ -66,24 +58,26 @@ class Axis:
         self._latest: _Moment | None = None
         """The latest tick, or the first message before it."""
 
-    def place(self, message: "Message", arrival: float | None = None) -> float:
+    def place(
+        self, t: float, time: float, seq: int | None = None, arrival: float | None = None
+    ) -> float:
         """Return the time of a message since the first message [s].
 
+        t, time: its time on the unix clock, and on fishd's monotonic clock [s]; 0 if unknown
+        seq: number of a tick; None for another message
         arrival: when it arrived, on the monotonic clock of this machine [s]; None if unknown
         """
-        seq = None if isinstance(message, Event | Status | FrameHead) else message.seq
-        time = message.clock if isinstance(message, Status) else message.time
         position, latest = 0.0, self._latest
         if latest is not None:
             position = latest.position + _choose_interval(
                 latest,
                 time - latest.time if time or (seq and latest.time) else None,
-                message.t - latest.t,
+                t - latest.t,
                 None if arrival is None or latest.arrival is None else arrival - latest.arrival,
                 seq,
             )
         if seq is not None or latest is None:
-            self._latest = _Moment(position, time, message.t, arrival, seq or 0)
+            self._latest = _Moment(position, time, t, arrival, seq or 0)
         return position
 
 

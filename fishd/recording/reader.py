@@ -24,7 +24,7 @@ from fishd.recording.axis import Axis
 from fishd.recording.images import IMAGE_TOPIC, FrameHead, RecordedFrame, decode_frame, decode_head
 from fishd.recording.mcap_file import Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
-from fishd.recording.summary import Gap, Summary, Tally, from_metadata
+from fishd.recording.summary import Gap, Summary, Tally, from_metadata, place
 from fishd.recording.writer import (
     AXIS_FORMAT,
     CALIBRATIONS_ATTACHMENT,
@@ -186,7 +186,7 @@ class Run:
         """
         if self._format < AXIS_FORMAT:
             axis = Axis()
-            times = [axis.place(message) for message in self.messages()]
+            times = [place(axis, message) for message in self.messages()]
         else:
             begin = self.entries[0].log_time if self.entries else 0
             times = [(entry.log_time - begin) * 1e-9 for entry in self.entries]

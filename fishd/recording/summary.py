@@ -1,7 +1,7 @@
 """Summary of a recording: duration, controllers, thrust, and missing data."""
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
@@ -10,7 +10,7 @@ from fishd.core.decoding import decoder
 from fishd.core.old_names import rename_keys
 from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Status, Tick
-from fishd.recording.axis import ClockStep, ClockSteps
+from fishd.recording.axis import Axis, ClockStep, ClockSteps
 from fishd.recording.images import FrameHead
 
 
@@ -85,6 +85,20 @@ class TickHead(Struct, frozen=True, gc=False):
     power: float | UnsetType = UNSET
     time: float = 0.0
     busy_time_us: float = 0.0
+
+
+Message: TypeAlias = TickHead | Tick | Event | Status | FrameHead
+
+
+def times_of(message: Message) -> tuple[float, float]:
+    """Return the time of a message on the unix clock, and on fishd's monotonic clock [s]."""
+    return message.t, message.clock if isinstance(message, Status) else message.time
+
+
+def place(axis: Axis, message: Message, arrival: float | None = None) -> float:
+    """Return the time of a message as `Axis.place` does."""
+    seq = None if isinstance(message, Event | Status | FrameHead) else message.seq
+    return axis.place(*times_of(message), seq, arrival)
 
 
 class Tally:

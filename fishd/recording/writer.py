@@ -3,16 +3,10 @@
 docs/how-to/recording.md describes its layout.
 """
 
-import getpass
-import platform
-import socket
-import subprocess
 from collections.abc import Callable, Mapping
-from datetime import datetime
-from functools import cache
 from pathlib import Path
 from time import monotonic, time_ns
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import msgspec
 import numpy as np
@@ -20,7 +14,6 @@ from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from fishd import __version__
 from fishd.config import Config, to_yaml
 from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
@@ -37,7 +30,17 @@ from fishd.recording.images import (
 )
 from fishd.recording.numbering import next_recording_number
 from fishd.recording.part_file import SUFFIX, PartFile
-from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
+from fishd.recording.provenance import Source, provenance
+from fishd.recording.summary import (
+    Gap,
+    Message,
+    Summary,
+    Tally,
+    TickHead,
+    place,
+    times_of,
+    to_metadata,
+)
 
 CHANNELS: dict[str, type[Struct]] = {"tick": Tick, "event": Event, "status": Status}
 """Recorded topics of telemetry, and the types of their messages."""
@@ -48,15 +51,10 @@ MAX_TIME_S = 1e10
 """Largest time of a message, before or after 1970: MCAP counts nanoseconds in 64 bits [s]."""
 CONFIG_ATTACHMENT, CALIBRATIONS_ATTACHMENT = "config.yaml", "calibrations.json"
 """Names of attachments."""
-FORMAT = 3
-"""Version of the layout of a recording."""
 AXIS_FORMAT = 3
 """First version in which log times follow fishd's monotonic clock; before, the unix clock."""
 PRESENT_NAMES_FORMAT = 2
 """First version with the present names of fields; before, they have those of `OLD_NAMES`."""
-
-Source = Literal["fishd", "simulation"]
-"""Origin of the ticks: a running fishd, whatever its robot, or a run in virtual time."""
 
 
 class RunWriter:
@@ -199,7 +197,7 @@ class RunWriter:
         Raise `msgspec.DecodeError` if it is invalid, for example if a time of it is not possible.
         """
         head = _DECODERS[topic](payload)
-        for time in _times_of(head):
+        for time in times_of(head):
             if not abs(time) <= MAX_TIME_S:
                 raise msgspec.ValidationError(f"{time:g} s is not a valid time")
         self.tally.add(head, self._add(topic, head, payload, monotonic()))
@@ -254,7 +252,7 @@ class RunWriter:
     def _add(
         self,
         topic: str,
-        message: TickHead | Tick | Event | Status | FrameHead,
+        message: Message,
         payload: bytes,
         arrival: float | None = None,
     ) -> float:
@@ -264,10 +262,10 @@ class RunWriter:
         """
         if self._closed:
             raise RecordingError(f"{self.path}: the recording has ended")
-        for time in _times_of(message):
+        for time in times_of(message):
             if not abs(time) <= MAX_TIME_S:
                 raise RecordingError(f"{self.path}: {time:g} s is not a valid time")
-        position = self._axis.place(message, arrival)
+        position = place(self._axis, message, arrival)
         published = max(0, round(message.t * 1e9))
         if self._origin_ns is None:
             self._origin_ns = published
@@ -290,55 +288,8 @@ class RunWriter:
         return RecordingError(f"{what}: {error.strerror or error}; {remedy}")
 
 
-def _times_of(message: TickHead | Tick | Event | Status | FrameHead) -> tuple[float, float]:
-    """Return unix and monotonic time of a message [s]."""
-    return message.t, message.clock if isinstance(message, Status) else message.time
-
-
 _DECODERS: dict[str, Callable[[bytes], TickHead | Event | Status]] = {
     "tick": decoder(TickHead),
     "event": decoder(Event),
     "status": decoder(Status),
 }
-
-
-def provenance(
-    run: str, source: Source, operator: str, subject: str, note: str, extra: Mapping[str, str]
-) -> dict[str, str]:
-    """Return the metadata `fishd.run` of a recording that begins now."""
-    return {
-        **extra,
-        "run": run,
-        "format": str(FORMAT),
-        "source": source,
-        "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
-        "operator": operator or _user(),
-        "subject": subject,
-        "note": note,
-        "version": __version__,
-        "git_commit": git_commit(),
-        "host": socket.gethostname(),
-        "system": platform.platform(),
-        "python": platform.python_version(),
-    }
-
-
-@cache
-def git_commit() -> str:
-    """Return the commit of fishd's sources, with `-dirty` for changed ones; empty without git."""
-    folder = Path(__file__).resolve().parents[2]
-    if not (folder / ".git").exists():
-        return ""
-    command = ("git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--dirty")
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip()
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a user without a name
-        return ""

@@ -18,6 +18,7 @@ from fishd.lab.run_traces import traces
 from fishd.recording import RunWriter, open_run
 from fishd.recording.axis import Axis, ClockSteps
 from fishd.recording.folder import read_overview
+from fishd.recording.summary import place
 
 UNIX = 1.8e9
 """Unix time at the monotonic time 0 of these recordings [s]."""
@@ -141,11 +142,11 @@ def test_another_fishd_continues_where_its_first_message_arrives(
 ) -> None:
     last = replace(swum(0.1).recorder.ticks[-1], seq=900, time=100.0, t=UNIX + 100.0)
     axis = Axis()
-    assert axis.place(last, 7.0) == 0.0
+    assert place(axis, last, 7.0) == 0.0
     first = replace(last, seq=1, time=time, t=t)
-    assert axis.place(first, 67.2) == pytest.approx(expected)
+    assert place(axis, first, 67.2) == pytest.approx(expected)
     following = replace(first, seq=2, time=time + 0.05, t=t + 0.05)
-    assert axis.place(following, 67.2) == pytest.approx(expected + 0.05)
+    assert place(axis, following, 67.2) == pytest.approx(expected + 0.05)
 
 
 def test_events_and_statuses_are_placed_beside_the_ticks(tmp_path: Path) -> None:
