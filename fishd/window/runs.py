@@ -113,7 +113,7 @@ def _is_empty(folder: Path) -> bool:
 
 
 def _read_stamp(file: Path) -> tuple[int, ...] | None:
-    """Return what differs between two files or contents of a name; None if there is no file."""
+    """Return a stamp that changes with the file and its content; None without a file."""
     try:
         status = file.stat()
     except OSError:

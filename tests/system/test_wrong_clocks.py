@@ -64,15 +64,15 @@ def test_a_recording_during_a_step_of_the_clock_is_as_long_as_its_ticks(
     run = open_run(rig.runs / "run.mcap")
     first, last = run.ticks[0], run.ticks[-1]
     assert run.summary.duration == pytest.approx(last.time - first.time, abs=1e-6)
-    (found,) = run.summary.clock_steps
-    assert found.by == pytest.approx(step, abs=0.05)
-    assert f"fishctl: {found}" in err
+    (clock_step,) = run.summary.clock_steps
+    assert clock_step.by == pytest.approx(step, abs=0.05)
+    assert f"fishctl: {clock_step}" in err
     assert f", {len(run.ticks)} ticks" in out
     (mark,) = run.events
     (at,) = run.times_of("event")
     assert at == pytest.approx(mark.time - first.time, abs=1e-6)
-    assert found.at - 0.2 <= at <= run.summary.duration
-    assert str(found) in rig.fishctl("runs").stdout
+    assert clock_step.at - 0.2 <= at <= run.summary.duration
+    assert str(clock_step) in rig.fishctl("runs").stdout
 
 
 def test_fishd_and_its_recordings_work_before_1970(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ OPTIONS: Options = {
 
 
 class Outcome(Struct):
-    """What became of a verb."""
+    """Result of the trial of a verb."""
 
     verb: str
     steps: int = 0

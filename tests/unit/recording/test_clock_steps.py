@@ -44,11 +44,11 @@ def test_a_step_of_the_clock_changes_no_length_and_is_listed(tmp_path: Path, ste
     path = write(tmp_path / "run", stepped(step, 10.0 if step > 0 else UNIX))
     for summary in (open_run(path).summary, read_overview(path).summary):
         assert summary.duration == pytest.approx(2.95)
-        (found,) = summary.clock_steps
-        assert (found.at, found.by) == pytest.approx((2.0, step), abs=1e-3)
+        (clock_step,) = summary.clock_steps
+        assert (clock_step.at, clock_step.by) == pytest.approx((2.0, step), abs=1e-3)
     listed = fishctl("runs", "--folder", str(tmp_path)).stdout
     assert "  3.0 s  " in listed
-    assert f"the clock was set by {found.by:+.1f} s at 2.0 s".replace("-", "−") in listed
+    assert f"the clock was set by {clock_step.by:+.1f} s at 2.0 s".replace("-", "−") in listed
 
 
 def test_the_figures_and_tables_after_a_step_have_the_axis_of_the_ticks(tmp_path: Path) -> None:
