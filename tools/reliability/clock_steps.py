@@ -23,7 +23,7 @@ from pathlib import Path
 from msgspec import Struct
 
 from common.daemon import Fishd
-from common.processes import FISHCTL, Process, call
+from common.processes import FISHCTL, Process, call, wait_until
 from common.report import JOBS, Options, Report, progress, run_cases, table
 from common.wall_clock import WallClock
 from fishd.core.errors import RecordingError
@@ -34,18 +34,21 @@ evaluation: {every: 0}
 ppo: {n_steps: 64, batch_size: 64}
 """
 VERBS: dict[str, tuple[str, float]] = {
-    "record": ("record --for 15 run", 14.0),
-    "black box": ("record --black-box --for 15", 14.0),
-    "watch": ("watch --for 15", 14.0),
-    "measure": ("measure swing --on live --for 21", 20.0),
-    "sweep": ("sweep square --frequency 1,1.5 --on live --for 21", 40.0),
-    "optimise": ("optimise square --over frequency --on live --budget 90", 60.0),
-    "compare": ("compare swing sine --on live --for 21 --runs 1", 40.0),
-    "identify": ("identify --experiment --on live --for 40", 36.0),
+    "record": ("record --for 15 run", 11.0),
+    "black box": ("record --black-box --for 15", 11.0),
+    "watch": ("watch --for 20", 14.0),
+    "measure": ("measure swing --on live --for 21", 17.0),
+    "sweep": ("sweep square --frequency 1,1.5 --on live --for 21", 36.0),
+    "optimise": ("optimise square --over frequency --on live --budget 90", 26.0),
+    "compare": ("compare swing sine --on live --for 21 --runs 1", 36.0),
+    "identify": ("identify --experiment --on live --for 40", 34.0),
     "adapt": ("adapt --on live --budget 150 --steps 640", 130.0),
     "learn": ("learn ppo --on live --steps 256 --settings training.yaml", 14.0),
 }
 """Command line of each verb, and the time during which the clock is set [s]."""
+RECORDING_VERBS = tuple(verb for verb in VERBS if verb not in ("watch", "learn"))
+START_S = 2.0
+"""Time from the start of a verb, or of its recording, to the first step of the clock [s]."""
 INSTANTS = 20
 """Number of steps of the clock during each verb, and of recordings in the trial of the order."""
 MIN_PAUSE_S = 0.3
@@ -133,6 +136,9 @@ def _try_verb(outcome: Outcome, chance: random.Random, folder: Path) -> None:
                 cwd=folder,
             ) as verb,
         ):
+            if outcome.verb in RECORDING_VERBS:
+                wait_until(lambda: any((folder / "runs").rglob("*.part")) or not verb.runs)
+            time.sleep(START_S)
             outcome.steps = _set_at_random(clock, chance, seconds, verb)
             status, _, _ = verb.finish(TIMEOUT_S)
     lines = (folder / "errors").read_text(encoding="utf-8")
@@ -145,9 +151,9 @@ def _try_verb(outcome: Outcome, chance: random.Random, folder: Path) -> None:
             _check(open_run(path), outcome)
         except RecordingError as error:
             outcome.mistakes.append(str(error))
-    if not paths and outcome.verb not in ("watch", "learn"):
+    if not paths and outcome.verb in RECORDING_VERBS:
         outcome.mistakes.append("it left no recording")
-    if outcome.verb in ("record", "black box") and outcome.listed != outcome.steps:
+    if outcome.verb in ("record", "black box", "measure") and outcome.listed != outcome.steps:
         outcome.mistakes.append("a step is not listed")
     for path in paths[:1]:
         drawn = call(FISHCTL, "plot", path, "--png", "--to", folder, env=environment)
@@ -176,11 +182,11 @@ def _terminal() -> Iterator[int]:
 
 def _set_at_random(clock: WallClock, chance: random.Random, seconds: float, verb: Process) -> int:
     """Set the clock at random instants, forward and back, while a verb runs; return how often."""
-    span = seconds - 3.0 - INSTANTS * MIN_PAUSE_S
-    begin, count, ahead = time.monotonic() + 3.0, 0, 0.0
+    span = seconds - INSTANTS * MIN_PAUSE_S
+    begin, count, ahead = time.monotonic(), 0, 0.0
     for index, instant in enumerate(sorted(chance.uniform(0.0, span) for _ in range(INSTANTS))):
         time.sleep(max(0.0, begin + instant + index * MIN_PAUSE_S - time.monotonic()))
-        if verb.process.poll() is not None:
+        if not verb.runs:
             break
         size = chance.choice((0.3, 30.0, 3600.0, YEARS_S)) * chance.uniform(0.6, 1.0)
         ahead = (-1.0) ** index * size - (time.time() + size) * (index == INSTANTS // 2)
