@@ -45,7 +45,8 @@ class Monitor:
         self._exposure: float | None = None
         self._picture = (0, 0)
         self.condition: Condition = "starting"
-        self.since = time.time()
+        self._entered = self._start
+        """Time at which the condition began, on the clock of `now` [s]."""
         self.timeline = Timeline(False, "", None)
         self.limitations: tuple[str, ...] = ()
         self.session = ""
@@ -87,7 +88,7 @@ class Monitor:
     def _enter(self, condition: Condition, trouble: Trouble | None) -> bool:
         changed = condition != self.condition or str(trouble) != str(self._trouble)
         if condition != self.condition:
-            self.condition, self.since = condition, time.time()
+            self.condition, self._entered = condition, self._now()
         self._trouble = trouble
         return changed
 
@@ -95,17 +96,17 @@ class Monitor:
         """Return the current state."""
         self._forget_old()
         size = self._settings.picture.size
-        timeline = self.timeline
+        timeline, wall, now = self.timeline, time.time(), self._now()
         return CameraState(
-            t=time.time(),
+            t=wall,
             version=__version__,
             pid=os.getpid(),
-            uptime=self._now() - self._start,
+            uptime=now - self._start,
             session=self.session,
             source=self._settings.source,
             device=self._device,
             state=self.condition,
-            since=self.since,
+            since=wall - (now - self._entered),
             problem=str(self._trouble) if self._trouble else "",
             remedy=self._trouble.remedy if self._trouble else "",
             limitations=self.limitations,

@@ -62,7 +62,7 @@ class View:
             # After a restart of the daemon, ticks are numbered from 1 again.
             self._lost += max(0, tick.seq - ticks[-1].seq - 1)
         ticks.append(tick)
-        while abs(tick.t - ticks[0].t) > TRACE_SPAN_S:
+        while abs(tick.time - ticks[0].time) > TRACE_SPAN_S:
             ticks.popleft()
 
     async def collect(self, events: AsyncIterator[Event]) -> None:
@@ -75,7 +75,7 @@ class View:
         """Whether the status is a second old, or does not match the latest tick."""
         tick, status = self._ticks[-1], self.status
         is_current = (status.mode, status.controller) == (tick.mode, tick.controller)
-        return not is_current or abs(tick.t - status.t) >= 1.0
+        return not is_current or abs(tick.time - status.clock) >= 1.0
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Yield the header, as many traces as fit, and events below them on a tall screen."""
@@ -164,12 +164,12 @@ class View:
         """Return a trace with its name and scale to the left; lost ticks leave a gap."""
         values = [trace.value(tick) for tick in self._ticks]
         low, high = _choose_scale(values, trace.min_end)
-        now = self._ticks[-1].t
+        now = self._ticks[-1].time
         points = [(now - TRACE_SPAN_S, math.nan)]
         for previous, tick, value in zip((None, *self._ticks), self._ticks, values, strict=False):
             if previous and tick.seq - previous.seq != 1:
-                points.append((previous.t, math.nan))
-            points.append((tick.t, (value - low) / (high - low)))
+                points.append((previous.time, math.nan))
+            points.append((tick.time, (value - low) / (high - low)))
         labels = [""] * rows
         labels[round(high / (high - low) * (rows - 1))] = "0"
         labels[-1] = f"{low:g}"

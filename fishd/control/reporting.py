@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 
 class Reporter:
-    """Logs the events of the loop, and passes them to the publisher with the wall-clock time."""
+    """Logs the events of the loop, and passes them to the publisher with their times."""
 
     def __init__(self, clock: Clock, publisher: Publisher | None) -> None:
         """publisher: None where events have no reader; they are logged nevertheless"""
@@ -30,7 +30,8 @@ class Reporter:
         if self._publisher is None:
             return
         try:
-            self._publisher.event(Event(self._clock.wall(), level, kind, message, data))
+            wall, now = self._clock.wall(), self._clock.monotonic()
+            self._publisher.event(Event(wall, level, kind, message, data, now))
         except Exception:
             log.exception("the event could not be published")
 

@@ -334,6 +334,9 @@ class Event(Struct, frozen=True):
     kind: Annotated[str, note(f"One of {', '.join(get_args(EventKind))}.")]
     message: Annotated[str, note("Description in one line.")]
     data: Annotated[dict[str, Any], note("Details for programs.")] = {}
+    time: Annotated[
+        float, unit("s", "Time of the event, on fishd's monotonic clock, as `time` of a tick.")
+    ] = 0.0
 
 
 class QuantityInfo(Struct, frozen=True):

@@ -160,6 +160,6 @@ def _settled_phases(ticks: Iterable[Tick], settle: float, *, swims: bool) -> Ite
     """Yield the ticks of each settled swim or rest, without suspect forces."""
     for running, group in groupby(ticks, lambda tick: tick.mode == "running"):
         phase = list(group)
-        start = phase[0].t + settle
+        start = phase[0].time + settle
         if running is swims:
-            yield [tick for tick in phase if tick.t >= start and tick.suspect is UNSET]
+            yield [tick for tick in phase if tick.time >= start and tick.suspect is UNSET]

@@ -5,10 +5,12 @@ the same header. Files are written atomically, and each row immediately.
 """
 
 import math
+import os
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -24,6 +26,7 @@ from fishd.core.process.lockfile import LockHeld, NotALock, find_lock_holder, lo
 from fishd.lab import tables
 from fishd.lab.tables import Table
 from fishd.recording.folder import runs_folder
+from fishd.recording.numbering import next_number
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 
 HEADER, ROWS, RESULT = "experiment.json", "rows.csv", "result.json"
@@ -33,7 +36,7 @@ MAX_TABLE_BYTES = 256 * 2**20
 """Size of the largest table [bytes]: 2.6 kB for each of the points that a sweep may have."""
 IRRELEVANT_KEYS = ("control", "name", "panel", "realtime", "start", "state_folder", "telemetry")
 """Sections and keys of a configuration that do not affect the thrust."""
-_NOT_COMPARED = ("began", "command", "ended", "version")
+_NOT_COMPARED = ("began", "command", "ended", "number", "version")
 
 On = Literal["live", "simulation"]
 T = TypeVar("T", bound=Struct)
@@ -70,6 +73,8 @@ class Header(Struct, frozen=True, kw_only=True):
     ended: str | None = None
     """Local time at which it was complete, in ISO 8601; empty before, None where it is unknown."""
     version: str = __version__
+    number: int = 0
+    """Running number among the experiments of a folder, which gives their order; 0 without one."""
 
 
 class Experiment:
@@ -170,7 +175,12 @@ class Experiment:
 
 def default_folder(kind: str) -> Path:
     """Return a path in the folder of all runs, with date and time in its name."""
-    return runs_folder() / f"{kind.split()[-1]}-{datetime.now():%Y%m%d-%H%M%S}"
+    name = f"{kind.split()[-1]}-{datetime.now():%Y%m%d-%H%M%S}"
+    path, number = runs_folder() / name, 1
+    while os.path.lexists(path):  # the clock was set back
+        number += 1
+        path = path.with_name(f"{name}-{number}")
+    return path
 
 
 @contextmanager
@@ -189,7 +199,7 @@ def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iter
             experiment = Experiment(path, header)
             if not resume:
                 check_free(path)
-                started = _with_start_time(header)
+                started = _with_start(path, header)
                 experiment.write_struct(HEADER, msgspec.structs.replace(started, ended=""))
             yield experiment
             if not experiment.is_interrupted:
@@ -208,7 +218,7 @@ def mark_folder(path: Path, kind: str, on: On) -> None:
     """
     check_free(path)
     _make_folder(path)
-    write_atomically(path / HEADER, _as_json(_with_start_time(Header(kind=kind, on=on))))
+    write_atomically(path / HEADER, _as_json(_with_start(path, Header(kind=kind, on=on))))
 
 
 def _make_folder(path: Path) -> None:
@@ -218,9 +228,11 @@ def _make_folder(path: Path) -> None:
         raise ConfigError(f"{path}: the folder cannot be created: {error.strerror}") from None
 
 
-def _with_start_time(header: Header) -> Header:
-    """Return the header with the current time as its start."""
-    return msgspec.structs.replace(header, began=_now())
+def _with_start(path: Path, header: Header) -> Header:
+    """Return the header of an experiment that begins now: with its time and running number."""
+    root = path.absolute().parent
+    known = (entry.number for _, entry in list_experiments(root) if isinstance(entry, Header))
+    return msgspec.structs.replace(header, began=_now(), number=next_number(root, known))
 
 
 def _now() -> str:
@@ -248,13 +260,19 @@ def read_header(path: Path) -> Header:
 
 
 def list_experiments(root: Path) -> Iterator[tuple[Path, Header | ConfigError]]:
-    """Yield the experiments of a folder, each with its header or the error of reading it."""
-    folders = sorted(root.glob(f"*/{HEADER}"), key=lambda path: path.stat().st_mtime)
-    for path in folders:
+    """Yield the experiments of a folder, each with its header or the error of reading it.
+
+    They are in the order of their numbers. Those without one come first, by name.
+    """
+    entries: list[tuple[int, Path, Header | ConfigError]] = []
+    for path in sorted(root.glob(f"*/{HEADER}")):
         try:
-            yield path.parent, read_header(path.parent)
+            header = read_header(path.parent)
+            entries.append((header.number, path.parent, header))
         except ConfigError as error:
-            yield path.parent, error
+            entries.append((0, path.parent, error))
+    for _, path, entry in sorted(entries, key=itemgetter(0)):
+        yield path, entry
 
 
 def count_rows(path: Path) -> int | None:

@@ -97,7 +97,7 @@ def rerun(
     messages = list(run.messages())
     tally = Tally()
     for index, message in enumerate(messages):
-        tally.add(message)
+        tally.add(message, run.times[index])
         if isinstance(message, Event):
             comparison.event(message)
         elif isinstance(message, Tick):
@@ -212,7 +212,7 @@ class _Rerun:
     def _observe(self, tick: Tick, applied: float, dt: float) -> Observation:
         """Return the observation of the controller in this tick."""
         measurement = Measurement(
-            tick.t - 1e-3 * tick.sample_age_ms,
+            tick.time - 1e-3 * tick.sample_age_ms,
             tick.fx,
             tick.fy,
             tick.samples,
@@ -225,7 +225,7 @@ class _Rerun:
         corrected = tick.fy_corrected is True
         if corrected is not self._estimator.fy_corrected:
             self._estimator.reverse_fy()
-        estimated = self._estimator.update(measurement, applied, tick.t, dt)
+        estimated = self._estimator.update(measurement, applied, tick.time, dt)
         recorded = {name: getattr(tick, name) for name in ESTIMATES}
         if corrected:
             recorded["fy_rate"] = -tick.fy_rate

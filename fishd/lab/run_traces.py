@@ -14,7 +14,7 @@ from fishd.controllers import registry
 from fishd.core import text
 from fishd.core.errors import RecordingError, UnknownController
 from fishd.core.schema import format_values
-from fishd.core.signals import Event, Tick
+from fishd.core.signals import Tick
 from fishd.recording import Run
 
 PORTRAIT_S = 20.0
@@ -84,16 +84,17 @@ class Traces(NamedTuple):
 
 def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
     """Return the part from `begin` to `end` [s]; raises `RecordingError` where it is empty."""
-    first = run.ticks[0].t if run.ticks else 0.0
-    chosen = [tick for tick in run.ticks if begin <= tick.t - first <= end]
-    if not chosen:
+    pairs = zip(run.ticks, run.times_of("tick"), strict=True)
+    kept = [(tick, time) for tick, time in pairs if begin <= time <= end]
+    if not kept:
         length = f"the recording is {run.summary.duration:.1f} s long"
         raise RecordingError(f"{run.path}: no tick between these times; {length}")
-    rows = _with_breaks(chosen)
+    chosen = [tick for tick, _ in kept]
+    rows, times = zip(*_with_breaks(kept), strict=True)
 
     def column(name: str, value: Callable[[Tick], object] | None = None) -> Array:
         get = value or attrgetter(name)
-        raw_values = (get(row) if isinstance(row, Tick) else math.nan for row in rows)
+        raw_values = (math.nan if row is None else get(row) for row in rows)
         values = np.array([math.nan if v is UNSET else v for v in raw_values], dtype=float)
         return _checked(run, name, values)
 
@@ -101,12 +102,11 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
         return column(name, lambda tick: _quantities(tick).get(name, math.nan))
 
     simulated = chosen[0].alpha is not UNSET
-    times = [(row.t if isinstance(row, Tick) else row) - first for row in rows]
     time = _checked(run, "the time of a tick", np.array(times))
-    swims = [index for index, row in enumerate(rows) if isinstance(row, Tick) and _swims(row)]
+    swims = [index for index, row in enumerate(rows) if row is not None and _swims(row)]
     units = _units({tick.controller for tick in chosen})
     names = dict.fromkeys(name for tick in chosen for name in _quantities(tick))
-    events = [event for event in _label_events(run.events, first) if begin <= event.time <= end]
+    events = [event for event in _label_events(run) if begin <= event.time <= end]
     _checked(run, "the time of an event", np.array([event.time for event in events]))
     left_out = [
         f"{len(items) - maximum} {kind} not drawn"
@@ -243,9 +243,9 @@ def _units(controllers: Iterable[str]) -> dict[str, str]:
     return units
 
 
-def _label_events(events: Iterable[Event], first: float) -> Iterator[EventLabel]:
+def _label_events(run: Run) -> Iterator[EventLabel]:
     last_parameters: dict[str, Any] = {}
-    for event in events:
+    for event, time in zip(run.events, run.times_of("event"), strict=True):
         if event.kind not in SHOWN_EVENTS:
             continue
         label, parameters = event.kind, event.data.get("parameters")
@@ -264,17 +264,17 @@ def _label_events(events: Iterable[Event], first: float) -> Iterator[EventLabel]
             label = event.message
         elif event.kind == "fault":
             label = f"fault {event.data.get('code', '')}".strip()
-        yield EventLabel(event.t - first, event.kind, text.line(label, MAX_TEXT_CHARS))
+        yield EventLabel(time, event.kind, text.line(label, MAX_TEXT_CHARS))
 
 
-def _with_breaks(ticks: list[Tick]) -> list[Tick | float]:
-    """Return the ticks, with the time of a break at each gap between two of them."""
-    rows: list[Tick | float] = []
-    for previous, tick in zip((None, *ticks), ticks, strict=False):
+def _with_breaks(ticks: list[tuple[Tick, float]]) -> Iterator[tuple[Tick | None, float]]:
+    """Yield ticks and their times, with None and the time of a break at each gap between two."""
+    previous, before = None, 0.0
+    for tick, time in ticks:
         if previous is not None and tick.seq != previous.seq + 1:
-            rows.append(previous.t)
-        rows.append(tick)
-    return rows
+            yield None, before
+        yield tick, time
+        previous, before = tick, time
 
 
 def _quantities(tick: Tick) -> dict[str, float]:

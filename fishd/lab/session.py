@@ -29,7 +29,8 @@ from fishd.core.signals import Event, Publisher, Reason, Tick
 from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:
-    from fishd.recording.writer import RunWriter, Source
+    from fishd.recording.provenance import Source
+    from fishd.recording.writer import RunWriter
 
 log = logging.getLogger(__name__)
 

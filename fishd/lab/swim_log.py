@@ -103,7 +103,7 @@ class SwimLog:
     def _in_order(self, ticks: list[Tick]) -> list[Tick]:
         """Return the ticks with numbers above the last one, also those of a restarted fishd."""
         if self._last and ticks[0].seq + self._offset <= self._last.seq:
-            pause = round((ticks[0].t - self._last.t) / self._period)
+            pause = round((ticks[0].time - self._last.time) / self._period)
             self._offset = self._last.seq + max(2, pause) - ticks[0].seq
         if self._offset:
             ticks = [replace(tick, seq=tick.seq + self._offset) for tick in ticks]

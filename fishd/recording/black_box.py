@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from fishd.core.errors import RecordingError
-from fishd.recording.folder import list_recordings, new_path
+from fishd.recording.folder import list_recordings, open_new
 from fishd.recording.part_file import PART_SUFFIX, is_being_written
 from fishd.recording.recorder import MIN_FREE_BYTES
 from fishd.recording.recover import RECOVERING_SUFFIX, recover
@@ -44,7 +44,7 @@ class BlackBox:
                 with suppress(RecordingError):
                     recover(path)
         self._opened = time.monotonic()
-        return self._open_writer(new_path(self._folder, FILE_PREFIX))
+        return open_new(self._folder, self._open_writer, FILE_PREFIX)
 
     def due(self, writer: RunWriter) -> bool:
         """Return whether to begin the next file."""
@@ -71,4 +71,4 @@ class BlackBox:
                     excess -= size
 
     def _list_own_files(self) -> list[Path]:
-        return [path for path in list_recordings(self._folder) if path.name.startswith(FILE_PREFIX)]
+        return list_recordings(self._folder, FILE_PREFIX)

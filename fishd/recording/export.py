@@ -78,10 +78,19 @@ def _escape_texts(table: pandas.DataFrame) -> pandas.DataFrame:
 
 def _event_table(run: Run) -> pandas.DataFrame:
     rows = [
-        (event.t, event.level, event.kind, event.message, msgspec.json.encode(event.data).decode())
-        for event in run.events
+        (
+            event.t,
+            event.level,
+            event.kind,
+            event.message,
+            msgspec.json.encode(event.data).decode(),
+            event.time,
+            elapsed,
+        )
+        for event, elapsed in zip(run.events, run.times_of("event"), strict=True)
     ]
-    return pandas.DataFrame(rows, columns=["t", "level", "kind", "message", "data"])
+    columns = ["t", "level", "kind", "message", "data", "time", "elapsed"]
+    return pandas.DataFrame(rows, columns=columns)
 
 
 def _frame_table(run: Run) -> pandas.DataFrame:

@@ -1,7 +1,7 @@
 """The folder of recordings: its place, its content, and the recordings that names refer to."""
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
@@ -10,13 +10,15 @@ from fishd.core import files
 from fishd.core.errors import RecordingError
 from fishd.core.schema import suggest
 from fishd.recording.mcap_file import read_metadata
+from fishd.recording.numbering import list_files, read_number
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX, is_being_written
 from fishd.recording.reader import open_run
 from fishd.recording.summary import Summary, from_metadata
+from fishd.recording.writer import RunWriter
 
 FOLDER_VARIABLE = "FISHD_RUNS"
 LATEST = "latest"
-"""Name that refers to the newest recording."""
+"""Name that refers to the recording with the largest number, the newest one."""
 
 
 class Overview(NamedTuple):
@@ -61,6 +63,20 @@ def check_new_files(paths: Iterable[Path], *, replace: bool) -> None:
             raise RecordingError(f"{path} already exists; use --force to replace it")
 
 
+def open_new(folder: Path, open_writer: Callable[[Path], RunWriter], prefix: str = "") -> RunWriter:
+    """Begin a recording with an unused name, also if another process begins one in this moment.
+
+    open_writer: begins a recording with this path
+    """
+    while True:
+        path = new_path(folder, prefix)
+        try:
+            return open_writer(path)
+        except RecordingError:
+            if not (path.exists() or path.with_name(path.name + PART_SUFFIX).exists()):
+                raise
+
+
 def new_path(folder: Path, prefix: str = "") -> Path:
     """Return a path for a recording that begins now, named after the local date and time."""
     name = f"{prefix}{datetime.now():%Y-%m-%d-%H%M%S}"
@@ -82,18 +98,15 @@ def recording_path(run: str, folder: Path | None = None) -> Path:
     return path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
 
 
-def list_recordings(folder: Path) -> list[Path]:
-    """Return all recordings of a folder, finished or not, the oldest first."""
-    try:
-        ending = (
-            path for path in folder.iterdir() if path.name.endswith((SUFFIX, SUFFIX + PART_SUFFIX))
-        )
-        files_found = [path for path in ending if path.is_file()]  # reading a pipe would never end
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise RecordingError(f"{folder} cannot be read: {error.strerror}") from None
-    return [path for _, path in sorted((_modified(path), path) for path in files_found)]
+def list_recordings(folder: Path, prefix: str = "") -> list[Path]:
+    """Return all recordings of a folder, finished or not, in the order of their numbers.
+
+    Older recordings without a number, and those whose beginning is damaged, come first, by name.
+
+    prefix: beginning of their names
+    """
+    paths = list_files(folder, prefix)
+    return sorted(paths, key=lambda path: (read_number(path), run_name(path), path.name))
 
 
 def find_recording(run: str, folder: Path | None = None) -> Path:
@@ -142,17 +155,11 @@ def read_overview(path: Path) -> Overview:
     Raise `RecordingError`.
     """
     entries = read_metadata(path) or {}
-    summary = from_metadata(entries.get("fishd.end", {}))
-    if summary is not None and "fishd.run" in entries:
+    end = entries.get("fishd.end", {})
+    summary = from_metadata(end)
+    if summary is not None and "duration" in end and "fishd.run" in entries:
         return Overview(run_name(path), path, entries["fishd.run"], summary, True, False)
     run = open_run(path)
     writing = is_being_written(path)
     damaged = run.damaged if run.is_damaged else None
     return Overview(run.name, path, run.about, run.summary, run.finished, writing, damaged)
-
-
-def _modified(path: Path) -> float:
-    try:
-        return path.stat().st_mtime
-    except OSError:
-        return 0.0

@@ -107,6 +107,15 @@ def read_metadata(path: Path) -> dict[str, dict[str, str]] | None:
     return entries if isinstance(last, Footer) else None
 
 
+def read_first_metadata(path: Path) -> dict[str, str]:
+    """Return the metadata at the beginning of a file; none if another record precedes them.
+
+    Raise `RecordingError` if the file cannot be read, or is not an MCAP file.
+    """
+    _, record = next(_read_outer_records(path), (0, None))
+    return record.metadata if isinstance(record, Metadata) else {}
+
+
 class _Expander:
     """Function that returns the content of chunks, with a limit on the memory that it allocates."""
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
 from mcap.records import Attachment, Channel, Footer, Message, Metadata
+from msgspec.structs import replace
 
 from fishd.config import Config, adopt
 from fishd.core import strict_yaml, text
@@ -19,11 +20,18 @@ from fishd.core.errors import FishdError, RecordingError
 from fishd.core.old_names import rename_keys, rename_message
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
+from fishd.recording.axis import Axis
 from fishd.recording.images import IMAGE_TOPIC, FrameHead, RecordedFrame, decode_frame, decode_head
 from fishd.recording.mcap_file import Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
-from fishd.recording.summary import Gap, Summary, Tally, from_metadata
-from fishd.recording.writer import CALIBRATIONS_ATTACHMENT, CHANNELS, CONFIG_ATTACHMENT, FORMAT
+from fishd.recording.summary import Gap, Summary, Tally, from_metadata, place
+from fishd.recording.writer import (
+    AXIS_FORMAT,
+    CALIBRATIONS_ATTACHMENT,
+    CHANNELS,
+    CONFIG_ATTACHMENT,
+    PRESENT_NAMES_FORMAT,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -46,6 +54,8 @@ class Entry(NamedTuple):
     """`tick`, `event` or `status`."""
     payload: bytes
     """JSON, exactly as fishd sent it; that of an older fishd has the present names."""
+    log_time: int
+    """Time of the message in the file [ns]."""
 
 
 class Run:
@@ -76,6 +86,8 @@ class Run:
         """Description of the first damage; empty if unknown."""
         self.entries: list[Entry] = []
         """All messages of fishd, in the order of arrival."""
+        self.is_timed = True
+        """Whether ticks that have been read have monotonic times; else its times are unix times."""
         self.frame_heads: list[FrameHead] = []
         """Metadata of the frames of a camera, in the order of arrival."""
         self._scan()
@@ -137,8 +149,13 @@ class Run:
 
     @cached_property
     def ticks(self) -> list[Tick]:
-        """All ticks, in the order of arrival; raises `RecordingError`."""
-        return self._decoded("tick", Tick)
+        """All ticks, in the order of arrival; raises `RecordingError`.
+
+        If an older fishd gave them no monotonic time, their `time` is their unix time.
+        """
+        ticks = self._decoded("tick", Tick)
+        self.is_timed = len(ticks) < 2 or any(tick.time for tick in ticks)
+        return ticks if self.is_timed else [replace(tick, time=tick.t) for tick in ticks]
 
     @cached_property
     def events(self) -> list[Event]:
@@ -159,6 +176,28 @@ class Run:
         }
         for entry in self.entries:
             yield next(iterators[entry.topic])
+
+    @cached_property
+    def times(self) -> list[float]:
+        """Time of each message, in the order of arrival, since the first tick [s].
+
+        It is that of fishd's monotonic clock, which no step of the unix clock moves. Raises
+        `RecordingError`.
+        """
+        if self._format < AXIS_FORMAT:
+            axis = Axis()
+            times = [place(axis, message) for message in self.messages()]
+        else:
+            begin = self.entries[0].log_time if self.entries else 0
+            times = [(entry.log_time - begin) * 1e-9 for entry in self.entries]
+        topics = [entry.topic for entry in self.entries]
+        first = times[topics.index("tick")] if "tick" in topics else 0.0
+        return [time - first for time in times]
+
+    def times_of(self, topic: str) -> list[float]:
+        """Return the time of each message of a topic, such as `tick`, as in `times` [s]."""
+        pairs = zip(self.entries, self.times, strict=True)
+        return [time for entry, time in pairs if entry.topic == topic]
 
     @property
     def gaps(self) -> list[Gap]:
@@ -192,9 +231,9 @@ class Run:
     def _tally(self) -> Tally:
         tally = Tally()
         for about in self.daemons:
-            tally.set_force_unit(about.get("force_unit", "N"))
-        for message in self.messages():
-            tally.add(message)
+            tally.set_daemon(about)
+        for message, time in zip(self.messages(), self.times, strict=True):
+            tally.add(message, time)
         for head in self.frame_heads:
             tally.frame(head)
         return tally
@@ -220,7 +259,10 @@ class Run:
                 yield record.data
 
     def frame(self) -> "DataFrame":
-        """Return the ticks as a table: see `ticks_to_frame`; raise `RecordingError`."""
+        """Return the ticks as a table: see `ticks_to_frame`; raise `RecordingError`.
+
+        The additional column `elapsed` is the time since the first tick, as in `times` [s].
+        """
         names: set[str] = set()
         for tick in self.ticks:
             names.update(tick.quantities or ())
@@ -229,7 +271,7 @@ class Run:
                     f"{self.path}: its controllers have more than {MAX_COLUMNS} quantities, too "
                     "many for a table"
                 )
-        return ticks_to_frame(self.ticks)
+        return ticks_to_frame(self.ticks).assign(elapsed=self.times_of("tick"))
 
     def _scan(self) -> None:
         topics = dict(TOPICS)
@@ -242,7 +284,7 @@ class Run:
                     self._take_frame(self._with_present_names("frame", record.data))
                 elif topic in CHANNELS:
                     payload = self._with_present_names(topic, record.data)
-                    self.entries.append(Entry(topic, payload))
+                    self.entries.append(Entry(topic, payload, record.log_time))
                     ticks += topic == "tick"
             elif isinstance(record, Damaged):
                 self._damages.append(ticks)
@@ -264,7 +306,13 @@ class Run:
 
     def _with_present_names(self, kind: str, payload: bytes) -> bytes:
         """Return a message; one with old names gets the present ones."""
-        return payload if self.about.get("format") == FORMAT else rename_message(kind, payload)
+        return payload if self._format >= PRESENT_NAMES_FORMAT else rename_message(kind, payload)
+
+    @property
+    def _format(self) -> int:
+        """Version of the layout; 0 if it is not known."""
+        number = self.about.get("format", "")
+        return int(number) if number.isdecimal() and len(number) <= MAX_DIGITS else 0
 
     def _take_frame(self, payload: bytes) -> None:
         try:
@@ -295,9 +343,7 @@ class Run:
     def _decoded(self, topic: str, kind: type[T]) -> list[T]:
         decode = decoder(kind)
         try:
-            return [
-                decode(payload) for entry_topic, payload in self.entries if entry_topic == topic
-            ]
+            return [decode(entry.payload) for entry in self.entries if entry.topic == topic]
         except msgspec.DecodeError as error:
             version = self.about.get("version", "unknown")
             raise RecordingError(

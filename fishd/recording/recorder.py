@@ -313,6 +313,7 @@ class Recorder:
 
     def _take(self, topic: str, payload: bytes) -> None:
         known, restarts = len(self.writer.gaps), self.writer.tally.restarts
+        known_steps = len(self.writer.tally.clock_steps)
         try:
             message = self.writer.message(topic, payload)
         except msgspec.DecodeError:
@@ -330,6 +331,8 @@ class Recorder:
             if self._camera:
                 self._camera.set_time(message.t, message.time)
             self._report_gaps(known, f"just before tick {message.seq}")
+            for step in self.writer.tally.clock_steps[known_steps:]:
+                self._tell(str(step))
         elif isinstance(message, Status):
             self._report_gaps(known, f"up to tick {message.seq}")
             if self.writer.tally.restarts > restarts:  # its ticks had higher numbers

@@ -44,6 +44,8 @@ class Replay:
         if first is None:
             raise RecordingError(f"{run.path} contains no tick to replay")
         self._tick = first
+        self._seconds = 0.0
+        """Time of that tick since the first one [s]."""
         self._recorded: Status | None = next(iter(run.statuses), None)
         self._parameters: dict[str, Any] = self._recorded.parameters if self._recorded else {}
         with ExitStack() as stack:
@@ -74,13 +76,16 @@ class Replay:
         speed: seconds of the recording per second
         """
         self._answer_until(time.monotonic() + SUBSCRIBER_WAIT_S)
-        due, before = time.monotonic(), self._tick.t
-        for entry, message in zip(self._run.entries, self._messages, strict=True):
-            due += min(MAX_PAUSE_S, max(0.0, message.t - before)) / speed
-            before = message.t
+        due, before = time.monotonic(), self._run.times[0]
+        messages = zip(self._run.entries, self._messages, self._run.times, strict=True)
+        for entry, message, at in messages:
+            due += min(MAX_PAUSE_S, max(0.0, at - before)) / speed
+            before = at
             self._answer_until(due)
             self._update_state(message)
             self._publisher.send_multipart([entry.topic.encode(), entry.payload])
+            if isinstance(message, Tick):
+                self._seconds = at
             if isinstance(message, Tick) and self._recorded is None and self._whole_second():
                 status = protocol.encode(self.status())
                 self._publisher.send_multipart([b"status", status])
@@ -92,7 +97,8 @@ class Replay:
         return replace(
             status,
             t=tick.t,
-            uptime=status.uptime if self._recorded else tick.t - self._run.ticks[0].t,
+            clock=tick.time,
+            uptime=status.uptime if self._recorded else self._seconds,
             mode=tick.mode,
             controller=tick.controller,
             parameters=self._parameters,

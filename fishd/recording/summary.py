@@ -1,13 +1,16 @@
 """Summary of a recording: duration, controllers, thrust, and missing data."""
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
 from fishd.core.decoding import decoder
 from fishd.core.old_names import rename_keys
+from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Status, Tick
+from fishd.recording.axis import Axis, ClockStep, ClockSteps
 from fishd.recording.images import FrameHead
 
 
@@ -15,7 +18,7 @@ class Gap(NamedTuple):
     """Gap: consecutive ticks of fishd that are missing in the recording."""
 
     after: float
-    """Time of the last tick before the gap, or else of the first tick after it [s, unix]."""
+    """Time of the last tick before the gap, since the first tick of the recording [s]."""
     seq: int
     """Number of the first missing tick."""
     lost: int
@@ -29,6 +32,8 @@ class Summary(Struct, frozen=True):
     """Time of the first tick [s, unix]."""
     ends: float = 0.0
     """Time of the last tick [s, unix]."""
+    duration: float = 0.0
+    """Time from the first tick to the last on the monotonic clock [s]."""
     ticks: int = 0
     events: int = 0
     marks: int = 0
@@ -61,11 +66,8 @@ class Summary(Struct, frozen=True):
     """Number of places with missing frames, or with a restart of the camera."""
     lost_frames: int = 0
     """Known number of missing frames: not delivered by the camera, or lost on the way."""
-
-    @property
-    def duration(self) -> float:
-        """Time from the first tick to the last [s]."""
-        return self.ends - self.begins
+    clock_steps: tuple[ClockStep, ...] = ()
+    """Steps of the unix clock of fishd's machine."""
 
 
 class TickHead(Struct, frozen=True, gc=False):
@@ -82,6 +84,21 @@ class TickHead(Struct, frozen=True, gc=False):
     thrust_ci95: float | UnsetType = UNSET
     power: float | UnsetType = UNSET
     time: float = 0.0
+    busy_time_us: float = 0.0
+
+
+Message: TypeAlias = TickHead | Tick | Event | Status | FrameHead
+
+
+def times_of(message: Message) -> tuple[float, float]:
+    """Return the time of a message on the unix clock, and on fishd's monotonic clock [s]."""
+    return message.t, message.clock if isinstance(message, Status) else message.time
+
+
+def place(axis: Axis, message: Message, arrival: float | None = None) -> float:
+    """Return the time of a message as `Axis.place` does."""
+    seq = None if isinstance(message, Event | Status | FrameHead) else message.seq
+    return axis.place(*times_of(message), seq, arrival)
 
 
 class Tally:
@@ -92,7 +109,9 @@ class Tally:
         self._last: TickHead | Tick | None = None
         self._sent = 0
         """Number of the latest tick that the present fishd is known to have published; 0 if no."""
-        self._first_t = 0.0
+        self._first_t = self._first = self._position = 0.0
+        self._clock_steps = ClockSteps()
+        self._is_real_time = True
         self._ticks = self._events = self._marks = self._missed = self._restarts = 0
         self._pid = self._known = 0
         self._impulse = 0.0
@@ -104,23 +123,34 @@ class Tally:
         self._frames = self._frame_gaps = self._frames_lost = 0
         self._last_frame: FrameHead | None = None
 
-    def set_force_unit(self, force_unit: str) -> None:
-        """Set the unit of the following forces."""
+    def set_daemon(self, daemon: Mapping[str, str]) -> None:
+        """Set the metadata of the fishd of the following ticks."""
         if self._force_unit == "N":
-            self._force_unit = force_unit
+            self._force_unit = daemon.get("force_unit", "N")
+        self._is_real_time = find_kind(daemon.get("robot", "")).is_real_time
 
-    def add(self, message: TickHead | Tick | Event | Status) -> None:
-        """Add a message of any kind."""
+    def add(self, message: TickHead | Tick | Event | Status, position: float) -> None:
+        """Add a message of any kind; position: its time on the axis of the recording [s]."""
         if isinstance(message, Event):
             self.event(message)
         elif isinstance(message, Status):
             self.status(message)
         else:
-            self.tick(message)
+            self.tick(message, position)
 
-    def tick(self, tick: TickHead | Tick) -> bool:
-        """Add a tick; return False if it is the first of another fishd."""
+    def tick(self, tick: TickHead | Tick, position: float) -> bool:
+        """Add a tick; return False if it is the first of another fishd.
+
+        position: its time on the axis of the recording [s]
+        """
         last, self._last = self._last, tick
+        before_gap, self._position = self._position - self._first, position
+        if self._is_real_time:
+            self._clock_steps.add(
+                position - (self._first if last else position),
+                tick.t,
+                tick.time + 1e-6 * tick.busy_time_us,
+            )
         self._ticks += 1
         if tick.mode == "running":
             self._impulse += tick.fx
@@ -136,10 +166,10 @@ class Tally:
         if not is_same_fishd:  # it counts from 1
             self._sent = 0
         if self._sent or last:
-            self._expect(tick.seq - 1, last.t if last else tick.t)
+            self._expect(tick.seq - 1, before_gap)
         self._sent = max(self._sent, tick.seq)
         if last is None:
-            self._first_t = tick.t
+            self._first_t, self._first = tick.t, position
             return True
         if is_same_fishd:
             self._missed += max(0, tick.missed_slots - last.missed_slots)
@@ -154,7 +184,7 @@ class Tally:
         if self._pid not in (0, status.pid) and self._known == self._restarts:
             self._restarts += 1
         elif self._sent:
-            self._expect(status.seq, self._last.t if self._last else status.t)
+            self._expect(status.seq, self.seconds)
         self._sent = max(self._sent, status.seq)
         self._pid, self._known = status.pid, self._restarts
 
@@ -207,7 +237,12 @@ class Tally:
     @property
     def seconds(self) -> float:
         """Time from the first tick to the last [s]."""
-        return self._last.t - self._first_t if self._last else 0.0
+        return self._position - self._first
+
+    @property
+    def clock_steps(self) -> list[ClockStep]:
+        """Steps of the unix clock until now."""
+        return self._clock_steps.steps
 
     @property
     def summary(self) -> Summary:
@@ -220,6 +255,7 @@ class Tally:
         return Summary(
             begins=self._first_t,
             ends=self._last.t if self._last else 0.0,
+            duration=self.seconds,
             ticks=self._ticks,
             events=self._events,
             marks=self._marks,
@@ -235,6 +271,7 @@ class Tally:
             frames=self._frames,
             frame_gaps=self._frame_gaps,
             lost_frames=self._frames_lost,
+            clock_steps=tuple(self.clock_steps),
         )
 
 

@@ -4,16 +4,10 @@ docs/how-to/recording.md describes its layout.
 """
 
 import errno
-import getpass
-import platform
-import socket
-import subprocess
-import time
 from collections.abc import Callable, Mapping
-from datetime import datetime
-from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Self
+from time import monotonic, time_ns
+from typing import Any, Self
 
 import msgspec
 import numpy as np
@@ -22,13 +16,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from fishd import __version__
 from fishd.config import Config, to_yaml
 from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.schema import json_schema, schema_name
 from fishd.core.signals import Event, Status, Tick
+from fishd.recording.axis import Axis
 from fishd.recording.images import (
     IMAGE_SCHEMA,
     IMAGE_TOPIC,
@@ -36,8 +30,19 @@ from fishd.recording.images import (
     encode_frame,
     image_json_schema,
 )
+from fishd.recording.numbering import next_recording_number
 from fishd.recording.part_file import SUFFIX, PartFile
-from fishd.recording.summary import Gap, Summary, Tally, TickHead, to_metadata
+from fishd.recording.provenance import Source, provenance
+from fishd.recording.summary import (
+    Gap,
+    Message,
+    Summary,
+    Tally,
+    TickHead,
+    place,
+    times_of,
+    to_metadata,
+)
 
 CHANNELS: dict[str, type[Struct]] = {"tick": Tick, "event": Event, "status": Status}
 """Recorded topics of telemetry, and the types of their messages."""
@@ -45,14 +50,13 @@ CHANNELS: dict[str, type[Struct]] = {"tick": Tick, "event": Event, "status": Sta
 CHUNK_BYTES = 32 * 2**10
 """Size at which a chunk is closed, which blocks the writer for 0.5 ms [bytes]."""
 MAX_TIME_S = 1e10
-"""Largest time of a message: MCAP counts nanoseconds in 64 bits [s, unix]."""
+"""Largest time of a message, before or after 1970: MCAP counts nanoseconds in 64 bits [s]."""
 CONFIG_ATTACHMENT, CALIBRATIONS_ATTACHMENT = "config.yaml", "calibrations.json"
 """Names of attachments."""
-FORMAT = "2"
-"""Version of the layout of a recording; before 2, fields have the names of `OLD_NAMES`."""
-
-Source = Literal["fishd", "simulation"]
-"""Origin of the ticks: a running fishd, whatever its robot, or a run in virtual time."""
+AXIS_FORMAT = 3
+"""First version in which log times follow fishd's monotonic clock; before, the unix clock."""
+PRESENT_NAMES_FORMAT = 2
+"""First version with the present names of fields; before, they have those of `OLD_NAMES`."""
 
 
 class RunWriter:
@@ -89,9 +93,13 @@ class RunWriter:
         self.stored_seq = 0
         """Number of the latest tick that was written to the kernel; 0 before the first."""
         self._has_failed = False
+        self._axis = Axis()
+        self._origin_ns: int | None = None
+        """Log time of the first message [ns, unix]."""
+        self._file = PartFile(self.path)
         run = self.path.name.removesuffix(SUFFIX)
         about = provenance(run, source, operator, subject, note, extra or {})
-        self._file = PartFile(self.path)
+        about["number"] = str(next_recording_number(self.path.parent))
         self._closed = False
         self._encode = msgspec.json.Encoder().encode
         self._writer = Writer(self._file, CHUNK_BYTES, CompressionType.ZSTD)  # type: ignore[arg-type]
@@ -155,7 +163,7 @@ class RunWriter:
         """
         number = str(self.tally.restarts)
         self._writer.add_metadata("fishd.daemon", {"number": number, **(daemon or {})})
-        self.tally.set_force_unit((daemon or {}).get("force_unit", "N"))
+        self.tally.set_daemon(daemon or {})
         yaml = to_yaml(config if isinstance(config, Config) else dict(config))
         self._attach(CONFIG_ATTACHMENT, "application/yaml", yaml.encode())
 
@@ -165,17 +173,16 @@ class RunWriter:
 
     def tick(self, tick: Tick) -> None:
         """Record a tick."""
-        self._add("tick", tick.t, tick.seq, self._encode(tick))
-        self.tally.tick(tick)
+        self.tally.tick(tick, self._add("tick", tick, self._encode(tick)))
 
     def event(self, event: Event) -> None:
         """Record an event."""
-        self._add("event", event.t, 0, self._encode(event))
+        self._add("event", event, self._encode(event))
         self.tally.event(event)
 
     def status(self, status: Status) -> None:
         """Record a status."""
-        self._add("status", status.t, status.seq, self._encode(status))
+        self._add("status", status, self._encode(status))
         self.tally.status(status)
 
     def frame(self, head: FrameHead, pixels: NDArray[np.uint8]) -> int:
@@ -188,19 +195,19 @@ class RunWriter:
         if IMAGE_TOPIC not in self._channels:
             schema = self._writer.register_schema(IMAGE_SCHEMA, "jsonschema", image_json_schema())
             self._channels[IMAGE_TOPIC] = self._writer.register_channel(IMAGE_TOPIC, "json", schema)
-        self._add(IMAGE_TOPIC, head.t, head.seq, payload)
+        self._add(IMAGE_TOPIC, head, payload)
         return self.tally.frame(head)
 
     def message(self, topic: str, payload: bytes) -> TickHead | Event | Status:
         """Record the bytes of a message of telemetry, and return its content.
 
-        Raise `msgspec.DecodeError` if it is invalid, for example if `t` is not in 0…`MAX_TIME_S`.
+        Raise `msgspec.DecodeError` if it is invalid, for example if a time of it is not possible.
         """
         head = _DECODERS[topic](payload)
-        if not 0.0 <= head.t <= MAX_TIME_S:
-            raise msgspec.ValidationError(f"t = {head.t:g} is not a valid time")
-        self._add(topic, head.t, 0 if isinstance(head, Event) else head.seq, payload)
-        self.tally.add(head)
+        for time in times_of(head):
+            if not abs(time) <= MAX_TIME_S:
+                raise msgspec.ValidationError(f"{time:g} s is not a valid time")
+        self.tally.add(head, self._add(topic, head, payload, monotonic()))
         return head
 
     def flush(self, *, sync: bool = False) -> None:
@@ -247,24 +254,42 @@ class RunWriter:
         self._file.close()
 
     def _attach(self, name: str, media_type: str, content: bytes) -> None:
-        now = time.time_ns()
+        now = max(0, time_ns())
         try:
             self._writer.add_attachment(now, now, name, media_type, content)
         except OSError as error:
             raise self._failed(error) from None
         self.flush()
 
-    def _add(self, topic: str, t: float, seq: int, payload: bytes) -> None:
+    def _add(
+        self,
+        topic: str,
+        message: Message,
+        payload: bytes,
+        arrival: float | None = None,
+    ) -> float:
+        """Write a message; return its time since the first message, as `Axis.place` does [s].
+
+        Its log time grows with the monotonic clock; its publish time is the unix time.
+        """
         if self._closed:
             raise RecordingError(f"{self.path}: the recording has ended")
-        if not t <= MAX_TIME_S:
-            raise RecordingError(f"{self.path}: t = {t:g} is not a valid time")
-        nanoseconds = max(0, round(t * 1e9))
-        channel = self._channels[topic]
+        for time in times_of(message):
+            if not abs(time) <= MAX_TIME_S:
+                raise RecordingError(f"{self.path}: {time:g} s is not a valid time")
+        position = place(self._axis, message, arrival)
+        published = max(0, round(message.t * 1e9))
+        if self._origin_ns is None:
+            self._origin_ns = published
+        logged = max(0, self._origin_ns + round(position * 1e9))
+        seq = 0 if isinstance(message, Event) else message.seq
         try:
-            self._writer.add_message(channel, nanoseconds, payload, nanoseconds, seq & 0xFFFFFFFF)
+            self._writer.add_message(
+                self._channels[topic], logged, payload, published, seq & 0xFFFFFFFF
+            )
         except OSError as error:
             raise self._failed(error) from None
+        return position
 
     def _failed(self, error: OSError) -> RecordingError:
         """Close the file after a failed write, and return the error, with what was lost."""
@@ -291,45 +316,3 @@ _DECODERS: dict[str, Callable[[bytes], TickHead | Event | Status]] = {
     "event": decoder(Event),
     "status": decoder(Status),
 }
-
-
-def provenance(
-    run: str, source: Source, operator: str, subject: str, note: str, extra: Mapping[str, str]
-) -> dict[str, str]:
-    """Return the metadata `fishd.run` of a recording that begins now."""
-    return {
-        **extra,
-        "run": run,
-        "format": FORMAT,
-        "source": source,
-        "started": datetime.now().astimezone().isoformat(timespec="milliseconds"),
-        "operator": operator or _user(),
-        "subject": subject,
-        "note": note,
-        "version": __version__,
-        "git_commit": git_commit(),
-        "host": socket.gethostname(),
-        "system": platform.platform(),
-        "python": platform.python_version(),
-    }
-
-
-@cache
-def git_commit() -> str:
-    """Return the commit of fishd's sources, with `-dirty` for changed ones; empty without git."""
-    folder = Path(__file__).resolve().parents[2]
-    if not (folder / ".git").exists():
-        return ""
-    command = ("git", "-C", str(folder), "describe", "--always", "--abbrev=40", "--dirty")
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5)
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip()
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a user without a name
-        return ""

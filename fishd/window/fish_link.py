@@ -89,7 +89,12 @@ class FishLink:
         self._history = (-HISTORY_AGE_S, 0, b"{}")
         """When the history was encoded [s, monotonic], its last tick, and its payload."""
         self.listeners: set[Callable[[str, float, bytes], None]] = set()
-        """Functions that receive topic, time [s, unix] and payload of each message."""
+        """Functions that receive topic, time [s] and payload of each message.
+
+        The time begins as unix time; no later step of the unix clock moves it.
+        """
+        self._ahead: float | None = None
+        """Unix time minus monotonic time of the first message of this fishd [s]."""
         self._tell = tell
         self._fish = AsyncFish(endpoint)
         self._stopper = AsyncFish(endpoint)
@@ -173,26 +178,29 @@ class FishLink:
             if frames[0] == b"tick":
                 tick = _decode_tick(frames[-1])
                 self._receive_tick(tick, frames[-1])
-                self._pass_on("tick", tick.t, frames[-1])
+                self._pass_on("tick", tick.t, tick.time, frames[-1])
             elif frames[0] == b"event":
                 event = _decode_event(frames[-1])
                 self.events.append(frames[-1])
                 self._tell("event", frames[-1])
-                self._pass_on("event", event.t, frames[-1])
+                self._pass_on("event", event.t, event.time, frames[-1])
             elif frames[0] == b"status":
                 status = await self._take_status(
                     self._fish.with_telemetry(_decode_status(frames[-1]))
                 )
-                self._pass_on("status", status.t, frames[-1])
+                self._pass_on("status", status.t, status.clock, frames[-1])
         except msgspec.DecodeError as error:
             raise FishError(
                 f"the program at {self.address} is not a fishd of this version: "
                 f"{text.error_message(error)}"
             ) from None
 
-    def _pass_on(self, topic: str, t: float, payload: bytes) -> None:
+    def _pass_on(self, topic: str, t: float, time: float, payload: bytes) -> None:
+        """Give a message to the listeners; t, time: its unix and monotonic time [s]."""
+        if self._ahead is None:
+            self._ahead = t - time
         for listener in self.listeners:
-            listener(topic, t, payload)
+            listener(topic, time + self._ahead if time else t, payload)
 
     def _receive_tick(self, tick: Tick, payload: bytes) -> None:
         now = self._last_tick = time.monotonic()
@@ -246,6 +254,7 @@ class FishLink:
         self._history = (-HISTORY_AGE_S, 0, b"{}")
         self._batch.clear()
         self._seq = 0
+        self._ahead = None
 
     async def _probe(self) -> None:
         """Find out why no ticks come; raise `NoDaemon` if fishd does not answer."""

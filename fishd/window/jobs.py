@@ -52,13 +52,12 @@ class Job(Struct):
     """Words that a person would type."""
     state: Literal["running", "done", "failed", "stopped", "lost"]
     """`lost`: its window was killed."""
-    started: float
-    """Time of the start [s, unix]."""
+    elapsed: float
+    """Time since its start, until its end at most [s]."""
     run: str = ""
     """Name of the folder of an experiment."""
     lines: list[str] = []
     result: Any = None
-    ended: float | None = None
     exit: int | None = None
     resumable: bool = False
     """Whether it ended before it was complete, and can be resumed."""
@@ -83,8 +82,10 @@ class Jobs:
         keep: receives the jobs that run, where one begins or ends
         show_folder: whether the commands that pages show name the folder
         """
-        self._tell, self._keep, self._show_folder = tell, keep, show_folder
+        self._tell_pages, self._keep, self._show_folder = tell, keep, show_folder
         self._jobs: dict[str, Job] = {}
+        self._starts: dict[str, float] = {}
+        """Start of each job that runs [s, monotonic]."""
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
         self._stopping: set[str] = set()
@@ -104,7 +105,15 @@ class Jobs:
 
     def all(self) -> list[Job]:
         """Return all jobs, the oldest first."""
-        return list(self._jobs.values())
+        return [self._with_elapsed_time(job) for job in self._jobs.values()]
+
+    def _with_elapsed_time(self, job: Job) -> Job:
+        if job.id in self._starts:
+            job.elapsed = time.monotonic() - self._starts[job.id]
+        return job
+
+    def _tell(self, job: Job) -> None:
+        self._tell_pages(self._with_elapsed_time(job))
 
     def take_lost(self, lost: Iterable[msgspec.Raw]) -> None:
         """List the jobs of a window that was killed, each with what is left of it."""
@@ -171,8 +180,8 @@ class Jobs:
             words += endpoint
         shown = [f"--folder={self._folder}"] if self._show_folder and kind in _FOLDER_KINDS else []
         name = self._new_id()
-        job = Job(name, kind, fish, ["fishctl", *words, *shown], "running", time.time(), run)
-        self._jobs[name] = job
+        job = Job(name, kind, fish, ["fishctl", *words, *shown], "running", 0.0, run)
+        self._jobs[name], self._starts[name] = job, time.monotonic()
         while len(self._jobs) > MAX_REMEMBERED_JOBS:
             ended = next((j.id for j in self._jobs.values() if j.state != "running"), None)
             if ended is None:
@@ -243,7 +252,8 @@ class Jobs:
             job.lines.append(text.describe_error(error))
             job.state = "failed"
         finally:
-            job.ended = time.time()
+            self._with_elapsed_time(job)
+            self._starts.pop(job.id, None)
             self._tasks.pop(job.id, None)
             self._stopping.discard(job.id)
             self.runs.forget()

@@ -42,6 +42,8 @@ class Runs:
         self._list: tuple[float, Any] = (-RUNS_AGE_S, [])
         self._listing, self._plotting = asyncio.Lock(), asyncio.Lock()
         self._waiting_plots = 0
+        self._drawn: dict[str, tuple[int, ...] | None] = {}
+        """Stamp of each recording when its picture was drawn."""
 
     def forget(self) -> None:
         """Read the folder again when it is listed next."""
@@ -90,10 +92,12 @@ class Runs:
         try:
             async with self._plotting:
                 picture = self._cache / f"{name}.png"
-                if not _is_newer(picture, experiment.with_name(f"{name}.mcap")):
+                stamp = _read_stamp(experiment.with_name(f"{name}.mcap"))
+                if stamp is None or stamp != self._drawn.get(name):
                     where = (f"--folder={self.folder}", f"--to={self._cache}")
                     words = ["plot", name, "--png", "--force", *where, "--json"]
                     await call(words, self.folder)
+                    self._drawn[name] = stamp
                 return await asyncio.to_thread(picture.read_bytes)
         except FileNotFoundError:
             raise JobError(f"{name} could not be drawn") from None
@@ -108,8 +112,10 @@ def _is_empty(folder: Path) -> bool:
         return False
 
 
-def _is_newer(file: Path, other: Path) -> bool:
+def _read_stamp(file: Path) -> tuple[int, ...] | None:
+    """Return a stamp that changes with the file and its content; None without a file."""
     try:
-        return file.stat().st_mtime > other.stat().st_mtime
+        status = file.stat()
     except OSError:
-        return False
+        return None
+    return status.st_ino, status.st_size, status.st_mtime_ns

@@ -123,7 +123,7 @@ def measure_latency(stressed: bool, priority: int, runs: int) -> Latency:
                 fishd.next_tick()
             )  # the very first tick may have been published before the subscription
             before = (tick.seq - 1 + tick.missed_slots) * fishd.status().tick
-            first_ticks.append(tick.t - before - fishd.started)
+            first_ticks.append(tick.time - before - fishd.started)
             for _ in range(3):
                 began = time.monotonic()
                 command = [FISHCTL, "status", "--endpoint", fishd.endpoint]

@@ -59,7 +59,7 @@ class Fishd(Process):
         }
         pairs = [*(f"{key}={value}" for key, value in own.items()), *settings]
         with self.log.open("wb") as log:
-            self.started = time.time()
+            self.started = time.monotonic()
             super().__init__(
                 *command,
                 *sets(*pairs),

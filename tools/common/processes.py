@@ -55,6 +55,11 @@ class Process:
         """Number of the process."""
         return self.process.pid
 
+    @property
+    def runs(self) -> bool:
+        """Whether the process has not ended yet."""
+        return self.process.poll() is None
+
     def __enter__(self) -> Self:
         return self
 

@@ -8,6 +8,7 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 from common.report import run  # noqa: E402
 
 NAMES = (
+    "clock_steps",
     "deaths",
     "deb",
     "half_open",

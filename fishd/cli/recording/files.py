@@ -27,13 +27,21 @@ DEFAULT_ADDRESS = "tcp://127.0.0.1:9872"
 
 
 def open_recording(name: str, folder: Path | None) -> Run:
-    """Open the recording of a name; print on standard error if it is damaged.
+    """Open the recording of a name; print on standard error what is wrong with its data or times.
 
     Raises `RecordingError`.
     """
     run = open_run(find_recording(name, folder))
     if run.is_damaged:
         echo(f"fishctl: {run.path}: {format_damage(run.damaged, run.damage_reason)}", err=True)
+    for step in run.summary.clock_steps:
+        echo(f"fishctl: {run.path}: {step}", err=True)
+    if not run.is_timed:
+        echo(
+            f"fishctl: {run.path}: its fishd recorded no monotonic time: lengths follow the unix "
+            "clock",
+            err=True,
+        )
     return run
 
 

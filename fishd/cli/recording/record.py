@@ -23,7 +23,7 @@ from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
-from fishd.recording.folder import ensure_folder, new_path, recording_path, runs_folder
+from fishd.recording.folder import ensure_folder, open_new, recording_path, runs_folder
 from fishd.recording.recorder import MIN_FREE_BYTES, Position, Recorder
 
 if TYPE_CHECKING:
@@ -206,10 +206,10 @@ def _record_one(
     stopping = _StopSignals()
     place = ensure_folder(folder or runs_folder())
     progress = _draw if sys.stdout.isatty() and not as_json else lambda writer: None
-    path = recording_path(run, place) if run else new_path(place)
-    recorder = Recorder(
-        endpoint, partial(begin, path), tell=_print_line, progress=progress, camera=camera
+    open_writer = (
+        partial(begin, recording_path(run, place)) if run else partial(open_new, place, begin)
     )
+    recorder = Recorder(endpoint, open_writer, tell=_print_line, progress=progress, camera=camera)
     try:
         with recorder:
             echo(f"recording to {recorder.writer.path}; Ctrl-C ends it", err=as_json)

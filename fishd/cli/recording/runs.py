@@ -34,7 +34,7 @@ MAX_DURATION_S = 1e9
 @folder_option
 @json_option
 def runs(folder: Path | None, as_json: bool) -> int:
-    """List recordings and experiments, each the oldest first.
+    """List recordings and experiments, each the oldest first, by their running numbers.
 
     'thrust' is the mean while the fish swam, in mN unless another unit is shown, with its 95 %
     confidence interval, which includes the calibration where that is known. If the zero of the
@@ -83,6 +83,8 @@ class _ExperimentSummary(Struct):
     force_unit: str = "N"
     problem: str = ""
     """Reason why it cannot be read; empty if it can."""
+    number: int = 0
+    """Running number, which gives the order; 0 without one."""
 
     @classmethod
     def read(cls, path: Path, header: "Header | ConfigError") -> "_ExperimentSummary":
@@ -102,6 +104,7 @@ class _ExperimentSummary(Struct):
             statistical,
             total,
             header.force_unit,
+            number=header.number,
         )
 
 
@@ -142,7 +145,6 @@ def _to_json(glance: Overview) -> dict[str, Any]:
         "path": str(glance.path),
         "state": _format_state(glance),
         "damaged": glance.damaged,
-        "duration": glance.summary.duration,
         **msgspec.structs.asdict(glance.summary),
         "about": glance.about,
     }
@@ -202,6 +204,7 @@ def _format_remarks(glance: Overview) -> list[str]:
         *([format_damage(glance.damaged)] if glance.damaged is not None else []),
         *([format_count(restarts, "restart")] if restarts else []),
         *([_format_frames(glance.summary)] if glance.summary.frames else []),
+        *map(str, glance.summary.clock_steps),
         *(glance.about[key] for key in ("subject", "note") if glance.about.get(key)),
     ]
 

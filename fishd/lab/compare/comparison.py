@@ -159,10 +159,10 @@ def _do_nothing(_: VirtualRun) -> None:
 
 def trace(ticks: Sequence[Tick]) -> Trace:
     """Return the end of a run as a trace for figures."""
-    end = ticks[-1].t
-    kept = [tick for tick in ticks if tick.t >= end - TRACE_S - _MARGIN_S - 1e-6]
+    end = ticks[-1].time
+    kept = [tick for tick in ticks if tick.time >= end - TRACE_S - _MARGIN_S - 1e-6]
     return Trace(
-        [tick.t - end for tick in kept],
+        [tick.time - end for tick in kept],
         [tick.phi_c for tick in kept],
         [tick.fx for tick in kept],
         [tick.alpha if isinstance(tick.alpha, float) else math.nan for tick in kept],

@@ -150,8 +150,8 @@ def _budget(
 
 def _trace(run: ThrustMeasurement) -> Trace:
     swim = _last_swim(run)
-    start = run.ticks[0].t
-    drift = np.interp([tick.t - start for tick in swim], run.blocks.time, run.drift)
+    start = run.ticks[0].time
+    drift = np.interp([tick.time - start for tick in swim], run.blocks.time, run.drift)
     corrected = [replace(t, fx=t.fx - float(d)) for t, d in zip(swim, drift, strict=True)]
     return trace(corrected)
 

@@ -153,7 +153,7 @@ class ContestantSurvey(Struct, frozen=True, kw_only=True):
 def longest_chatter(ticks: Iterable[Tick], apart: float) -> float:
     """Return the length of the longest series of reversals less than `apart` apart [s]."""
     reversals = Reversals()
-    times = [tick.t for tick in ticks if reversals.add(tick.phi_c)]
+    times = [tick.time for tick in ticks if reversals.add(tick.phi_c)]
     longest = start = 0.0
     for previous, current in pairwise(times):
         start = start or previous

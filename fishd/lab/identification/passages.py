@@ -14,7 +14,7 @@ from fishd.lab.identification.response import Array
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-COLUMNS = ("t", "seq", "missed_slots", "fx", "fy", "phi_c", "servo_on", "samples")
+COLUMNS = ("time", "seq", "missed_slots", "fx", "fy", "phi_c", "servo_on", "samples")
 """Columns of a table of ticks that an identification reads."""
 MIN_PASSAGE_S = 5.0
 """Length of the shortest passage that is used [s]."""
@@ -66,6 +66,8 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
         if len(table) < 2:
             continue
         columns = {name: table[name].to_numpy() for name in COLUMNS}
+        if "elapsed" in table:  # of a recording: it increases across restarts of fishd, too
+            columns["time"] = table["elapsed"].to_numpy()
         if "suspect" in table:  # a suspect force counts as missing
             columns["samples"] = np.where(table["suspect"].fillna("") == "", columns["samples"], 0)
         tick = _period(columns)
@@ -73,7 +75,7 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
             passage = _passage(columns, rows, tick, begin)
             if passage.duration >= MIN_PASSAGE_S:
                 usable.append(passage)
-        begin += float(columns["t"][-1] - columns["t"][0])
+        begin += float(columns["time"][-1] - columns["time"][0])
     if not usable:
         raise Unidentifiable(
             f"there is no passage of {MIN_PASSAGE_S:g} s without a gap in which the servo has "
@@ -86,7 +88,7 @@ def _period(columns: dict[str, Array]) -> float:
     """Return the period of the loop [s], from times of ticks, some of which are late."""
     slots = np.diff(columns["seq"]) + np.diff(columns["missed_slots"])
     good = slots > 0
-    intervals = np.diff(columns["t"])[good] / slots[good]
+    intervals = np.diff(columns["time"])[good] / slots[good]
     if not len(intervals) or not (median := float(np.median(intervals))) > 0.0:
         raise Unidentifiable("the times of the ticks do not increase: use a recording of a fish")
     # A late tick shortens the next interval: the mean is right where clocks do not jump.
@@ -118,7 +120,7 @@ def _passage(columns: dict[str, Array], rows: slice, tick: float, begin: float) 
     # The command of a tick applies until the next one; its forces are means since the last one.
     commands = np.repeat(phi_c[:-1], slots)
     forces = np.stack((columns["fx"][rows], columns["fy"][rows])).astype(float)[:, 1:]
-    times = begin + (columns["t"][rows][1:] - columns["t"][0]).astype(float)
+    times = begin + (columns["time"][rows][1:] - columns["time"][0]).astype(float)
     return Passage(
         tick=tick,
         samples=max(1, round(float(np.median(columns["samples"][rows][1:] / slots)))),

@@ -70,6 +70,8 @@ class State(Struct, frozen=True):
     """Whether imitation is finished, in this run or in the one that it began with."""
     swims: int = 0
     """Number of measured swims of the best policy in a tank."""
+    number: int = 0
+    """Running number of a `best` checkpoint in its run, which grows with each."""
 
     def is_finished(self, steps: int) -> bool:
         """Return True if a training of `steps` control steps is complete."""
@@ -93,6 +95,9 @@ def save(
     extractor: FeatureExtractor | None = None,
 ) -> Path:
     """Write a checkpoint; kind: step or best, of which only the newest is kept."""
+    if kind == "best":
+        number = 1 + max(map(_read_number, folder.glob("best-*")), default=0)
+        state = msgspec.structs.replace(state, number=number)
     name = f"{kind}-{state.steps:06d}"
     final, part = folder / name, folder / f".{name}.part"
     shutil.rmtree(part, ignore_errors=True)
@@ -145,8 +150,8 @@ def newest(folder: Path) -> Path:
 def best(folder: Path) -> Path | None:
     """Return the checkpoint that swam best; None where no policy of the run has swum."""
     checkpoints = [path for path in list_all(folder) if path.name.startswith("best")]
-    # After a kill, the previous best may remain.
-    return max(checkpoints, key=_write_time, default=None)
+    # After a kill, the previous best may remain; the later one may have fewer steps.
+    return max(checkpoints, key=_read_number, default=None)
 
 
 def find(path: Path, *, latest: bool = False) -> Path:
@@ -304,11 +309,11 @@ def _discard(checkpoint: Path) -> None:
     shutil.rmtree(old)
 
 
-def _write_time(checkpoint: Path) -> float:
+def _read_number(checkpoint: Path) -> int:
     try:
-        return (checkpoint / STATE).stat().st_mtime
-    except OSError:
-        return 0.0
+        return read_state(checkpoint).number
+    except CheckpointError:
+        return 0
 
 
 def _read_text(path: Path) -> str:

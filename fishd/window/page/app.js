@@ -156,7 +156,7 @@ function markEvent(event) {
     mark: () => event.message, fault: () => "fault",
     mode: () => (event.data.mode === "estop" ? "E-stop" : event.data.mode === "idle" ? "idle" : null),
   }[event.kind]?.();
-  if (text) charts.mark(event.t, text);
+  if (text) charts.mark(event.time, text);
 }
 
 function noticeOther(event) {

@@ -247,8 +247,8 @@ class Chart {
     ctx.textBaseline = "alphabetic";
     let free = -Infinity;
     for (const mark of this.owner.marks) {
-      if (mark.t < min || mark.t > max) continue;
-      const x = plot.valToPos(mark.t, "x", true);
+      if (mark.time < min || mark.time > max) continue;
+      const x = plot.valToPos(mark.time, "x", true);
       ctx.beginPath();
       ctx.moveTo(x, bbox.top);
       ctx.lineTo(x, bbox.top + bbox.height);
@@ -346,8 +346,8 @@ export class Charts {
   }
 
   /** Note a change; its tick is looked up once. */
-  mark(t, text) {
-    this.marks.push({ t, text, seq: this.ring?.seqAt(t) ?? null });
+  mark(time, text) {
+    this.marks.push({ time, text, seq: this.ring?.seqAt(time) ?? null });
     if (this.marks.length > 64) this.marks.shift();
     this.dirty = true;
   }
@@ -362,7 +362,7 @@ export class Charts {
     ring.copyTimes(this.times);
     this.#findGaps();
     const high = this.times[this.length - 1], low = high - this.seconds;
-    for (const mark of this.marks) if (mark.seq === null && mark.t >= low) mark.seq = ring.seqAt(mark.t);
+    for (const mark of this.marks) if (mark.seq === null && mark.time >= low) mark.seq = ring.seqAt(mark.time);
     for (const chart of this.charts) {
       chart.showKeys(ring);
       if (!chart.definition.truth) continue;

@@ -76,7 +76,7 @@ export function Experiments(page) {
     event.preventDefault();
     startJob(page, form.kind, given(options()));
   };
-  const jobs = [...state.jobs.values()].filter(({ fish }) => !fish || fish === state.name).sort((a, b) => b.started - a.started).slice(0, 8);
+  const jobs = [...state.jobs.values()].filter(({ fish }) => !fish || fish === state.name).sort((a, b) => b.id - a.id).slice(0, 8);
   const uses = ["measure", "sweep", "simulate"].includes(form.kind);
 
   return html`
@@ -141,6 +141,15 @@ export const plain = (line) => line.replace(/^fishctl: /, "");
 /** Quote a word as a shell needs it. */
 const quote = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
 
+const received = new WeakMap();
+
+/** Return the time since this state of a job arrived; the clock of the server may be another one [s]. */
+function secondsSinceReceived(job) {
+  const now = performance.now();
+  if (!received.has(job)) received.set(job, now);
+  return (now - received.get(job)) / 1000;
+}
+
 function Job({ job, state, notice, mayDrive, resume }) {
   const [, tick] = useState(0);
   const runs = job.state === "running";
@@ -149,7 +158,7 @@ function Job({ job, state, notice, mayDrive, resume }) {
     const timer = setInterval(() => tick((n) => n + 1), 500);
     return () => clearInterval(timer);
   }, [runs]);
-  const elapsed = (job.ended ?? Date.now() / 1000) - job.started;
+  const elapsed = job.elapsed + (runs ? secondsSinceReceived(job) : 0);
   const total = expected(job.command), ends = runs && total && elapsed > total;
   const stop = () => call("POST", `/api/jobs/${job.id}/stop`).catch((error) => notice("error", error.message, error.remedy));
   return html`<li class=${`job ${job.state}`}>
@@ -217,7 +226,8 @@ export function Runs(page) {
     if (state.session?.paired) load();
   }, [finished, state.session?.paired]);
   const begin = (run) => run.began ?? run.about?.started ?? "";
-  const list = (runs ?? []).slice().sort((a, b) => begin(b).localeCompare(begin(a))).slice(0, MAX_RUNS);
+  const order = (run) => Number(run.number ?? run.about?.number ?? 0);
+  const list = (runs ?? []).slice().sort((a, b) => order(b) - order(a)).slice(0, MAX_RUNS);
   return html`
     <div class="head-row"><h2 id="runs-title">Runs</h2><button type="button" onClick=${load}>Refresh</button></div>
     ${failure && html`<p class="note">The runs cannot be listed. ${sentence(failure.message)} ${sentence(failure.remedy)}</p>`}

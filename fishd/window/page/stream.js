@@ -17,7 +17,7 @@ export class Ring {
     this.capacity = Math.min(MAX_ROWS, Math.max(2400, Math.ceil(KEPT_S / period))) + 256;
     this.columns = new Map();
     this.clear();
-    for (const name of ["t", "seq"]) this.#add(name);
+    for (const name of ["time", "seq"]) this.#add(name);
   }
 
   clear() {
@@ -32,18 +32,18 @@ export class Ring {
   push(tick) {
     const before = this.latest;
     if (before) {
-      if (tick.t < before.t - CLOCK_JUMP_S) this.clear();
-      else if (tick.t <= before.t) return;
-      else if (tick.seq !== before.seq + 1 || tick.t - before.t > Math.max(1, 4 * this.period)) {
+      if (tick.time < before.time - CLOCK_JUMP_S) this.clear();
+      else if (tick.time <= before.time) return;
+      else if (tick.seq !== before.seq + 1 || tick.time - before.time > Math.max(1, 4 * this.period)) {
         if (tick.seq > before.seq + 1) {
           this.lost += tick.seq - before.seq - 1;
-          this.lostAt = tick.t;
+          this.lostAt = tick.time;
         }
         this.#row();
-        this.#write("t", 0.5 * (tick.t + before.t));
+        this.#write("time", 0.5 * (tick.time + before.time));
       }
     }
-    if (this.lost && tick.t - this.lostAt > KEPT_S) this.lost = 0;
+    if (this.lost && tick.time - this.lostAt > KEPT_S) this.lost = 0;
     this.#row();
     for (const name in tick) {
       if (typeof tick[name] === "number" && (name !== "phi_c" || tick.servo_on !== false)) this.#write(name, tick[name]);
@@ -61,11 +61,11 @@ export class Ring {
   }
 
   /** Return the number of the first tick at or after a time; null if it is not in the ring. */
-  seqAt(t) {
-    const times = this.columns.get("t"), numbers = this.columns.get("seq");
+  seqAt(time) {
+    const times = this.columns.get("time"), numbers = this.columns.get("seq");
     for (let age = this.rows; age >= 1; age--) {
       const row = (this.next - age + this.capacity) % this.capacity;
-      if (times[row] >= t - 0.5 * this.period && !Number.isNaN(numbers[row])) return numbers[row];
+      if (times[row] >= time - 0.5 * this.period && !Number.isNaN(numbers[row])) return numbers[row];
     }
     return null;
   }
@@ -89,7 +89,7 @@ export class Ring {
 
   /** Copy the latest times; rows that are not filled yet continue the time backwards. */
   copyTimes(target) {
-    this.copy("t", target);
+    this.copy("time", target);
     const first = target.length - Math.min(this.rows, target.length);
     for (let i = first - 1; i >= 0; i--) target[i] = (target[i + 1] ?? 0) - this.period;
   }

@@ -201,13 +201,13 @@ def test_it_follows_the_terminal_through_any_size_without_colour_if_asked(daemon
     assert not COLOUR.search(terminal.text)
 
 
-def tick(seq: int, t: float | None = None, **fields: Any) -> Tick:
+def tick(seq: int, time: float | None = None, **fields: Any) -> Tick:
     """Return a tick of a loop of 50 ms, with a wave on both forces."""
     numbers = {name: 0.0 for name in Tick.__struct_fields__ if name not in ("alpha", "phi")}
     wave = {"fx": 0.02 + 0.02 * math.sin(0.5 * seq), "fy": 0.2 * math.sin(0.25 * seq)}
     what = {"seq": seq, "mode": "running", "controller": "swing", "servo_on": True}
     what["missed_slots"] = 0
-    return Tick(**numbers | what | wave | {"t": 0.05 * seq if t is None else t} | fields)
+    return Tick(**numbers | what | wave | {"time": 0.05 * seq if time is None else time} | fields)
 
 
 def status(**fields: Any) -> Status:
@@ -256,8 +256,17 @@ def test_it_shows_which_experiment_holds_the_fish() -> None:
     assert held not in render(view_of(map(tick, range(1, 101))))
 
 
+def test_a_step_of_the_unix_clock_leaves_the_traces_as_they_are() -> None:
+    steps = (0.0, -30.0, 1.7e9)
+    screens = [
+        render(view_of(tick(seq, t=1e9 + 0.05 * seq + step * (seq > 50)) for seq in range(1, 101)))
+        for step in steps
+    ]
+    assert screens[0] == screens[1] == screens[2]
+
+
 def test_a_daemon_that_was_restarted_is_not_a_loss() -> None:
-    after = [tick(seq, t=60.0 + 0.05 * seq) for seq in range(1, 50)]
+    after = [tick(seq, time=60.0 + 0.05 * seq) for seq in range(1, 50)]
     assert render(view_of([*map(tick, range(1000, 1050)), *after]))[2].split()[-1] == "0"
 
 
@@ -301,10 +310,10 @@ def test_quantities_of_the_controller_are_on_the_screen_with_their_units() -> No
 
 
 def test_the_status_is_requested_every_second_and_when_mode_or_controller_change() -> None:
-    assert not view_of([tick(1, t=100.5)], t=100.0).outdated
-    assert view_of([tick(1, t=101.0)], t=100.0).outdated
-    assert view_of([tick(1, t=100.5, mode="estop")], t=100.0).outdated
-    assert view_of([tick(1, t=100.5, controller="sine")], t=100.0).outdated
+    assert not view_of([tick(1, time=100.5)], clock=100.0).outdated
+    assert view_of([tick(1, time=101.0)], clock=100.0).outdated
+    assert view_of([tick(1, time=100.5, mode="estop")], clock=100.0).outdated
+    assert view_of([tick(1, time=100.5, controller="sine")], clock=100.0).outdated
 
 
 def test_any_size_of_screen_is_filled_and_never_overflows() -> None:
@@ -318,5 +327,5 @@ def test_any_size_of_screen_is_filled_and_never_overflows() -> None:
 
 @pytest.mark.parametrize("period", [0.002, 0.05, 0.2])
 def test_traces_are_whole_lines_at_any_period_of_the_loop(period: float) -> None:
-    ticks = (tick(seq, t=period * seq) for seq in range(1, round(6.0 / period)))
+    ticks = (tick(seq, time=period * seq) for seq in range(1, round(6.0 / period)))
     assert re.search("[\u2801-\u28ff]{60}", still_trace(render(view_of(ticks, tick=period))))

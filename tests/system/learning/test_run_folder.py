@@ -159,6 +159,19 @@ def test_after_a_kill_at_any_call_of_a_save_the_best_is_the_new_or_the_old_one(
             break
 
 
+def test_the_best_is_the_one_that_was_saved_last_whatever_the_clock_was(
+    finished: Path, tmp_path: Path
+) -> None:
+    run = Path(shutil.copytree(finished, tmp_path / "run"))
+    state = checkpoints.read_state(run / STEP)
+    save_best(run, state)
+    shutil.copytree(run / "best-000064", tmp_path / "before")
+    save_best(run, replace(state, steps=32))
+    (tmp_path / "before").rename(run / "best-000064")  # left by a kill before it was removed
+    os.utime(run / "best-000032" / "state.json", (0.0, 0.0))
+    assert checkpoints.best(run) == run / "best-000032"
+
+
 def test_a_table_of_another_kind_is_one_line(run: Path) -> None:
     (run / "evaluations.csv").write_text("a,b\n1,2\n", encoding="utf-8")
     file = run / "evaluations.csv"
@@ -298,7 +311,7 @@ def test_a_full_disk_loses_nothing_and_advises_how_to_resume(tmp_path: Path) -> 
         assert steps == list(range(64, before + 65, 64))
 
 
-@pytest.mark.parametrize("size", ["16k", "28k", "48k"])
+@pytest.mark.parametrize("size", ["16k", "32k", "48k"])
 def test_a_full_disk_before_a_checkpoint_advises_to_restart(tmp_path: Path, size: str) -> None:
     with small_disk(tmp_path / "disk", size) as enlarge:
         job = brief_job(tmp_path / "disk" / "run", steps=64)

@@ -41,6 +41,25 @@ def test_a_recording_is_made_listed_and_drawn(window: WindowProcess) -> None:
     run(test())
 
 
+def test_the_duration_of_a_job_does_not_follow_the_unix_clock(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    changes = "import time; begin = time.monotonic()\n"
+    changes += "time.time = lambda: 1e9 - 100 * (time.monotonic() - begin)"  # set back all the time
+
+    async def test() -> None:
+        async with Browser(process.url) as browser, open_page(browser) as page:
+            job = await start(page, "record", name="backwards", seconds=1.0)
+            ended = await end_of(page, job)
+            assert ended["elapsed"] >= 1.0
+            assert ended["elapsed"] in [
+                entry["elapsed"] for entry in await browser.get("/api/jobs")
+            ]
+
+    with running_window(tmp_path, changes=changes, fish=daemon.endpoint) as process:
+        run(test())
+
+
 def test_a_recording_is_stopped_and_kept(window: WindowProcess) -> None:
     async def test() -> None:
         async with Browser(window.url) as browser, open_page(browser) as page:

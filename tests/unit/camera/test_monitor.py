@@ -1,5 +1,7 @@
 """Rate of a camera and age of its frames in its state."""
 
+import time
+
 import pytest
 
 from fishd.camera.monitor import Monitor
@@ -51,3 +53,15 @@ def test_in_lockstep_nothing_grows_old_while_time_stands_still() -> None:
     monitor = streaming(clock, virtual=True)
     clock.now += 60.0
     assert monitor.state().rate == pytest.approx(25.0)
+
+
+def test_the_age_of_a_condition_does_not_follow_the_unix_clock(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clock = Clock()
+    monitor = streaming(clock)
+    before = time.time()
+    clock.now += 5.0
+    monkeypatch.setattr("time.time", lambda: before - 3600.0)
+    state = monitor.state()
+    assert state.t - state.since == pytest.approx(5.36)

@@ -36,7 +36,7 @@ def test_times_and_forces_that_cannot_be_are_listed_in_few_digits(tmp_path: Path
     (tick, *_) = swum(0.2).recorder.ticks
     with RunWriter(tmp_path / "run") as writer:
         writer.tick(tick)
-        writer.tally.tick(replace(tick, seq=tick.seq + 1, t=1e300, thrust=-1e300))
+        writer.tally.tick(replace(tick, seq=tick.seq + 1, thrust=-1e300), 1e300)
     listed = fishctl("runs", "--folder", str(tmp_path)).stdout
     assert "1e+300 s" in listed
     assert max(map(len, listed.splitlines())) < 120

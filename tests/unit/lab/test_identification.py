@@ -297,7 +297,7 @@ def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
         (lambda t: t.iloc[:0], "there is no passage of 5 s without a gap"),
         (lambda t: t.iloc[:90], "there is no passage of 5 s without a gap"),
         (lambda t: t.assign(phi_c=0.0), "φ_c is zero all the time"),
-        (lambda t: t.assign(t=1.0), "the times of the ticks do not increase"),
+        (lambda t: t.assign(time=1.0), "the times of the ticks do not increase"),
         (lambda t: t.assign(servo_on=False), "there is no passage of 5 s without a gap"),
     ],
 )

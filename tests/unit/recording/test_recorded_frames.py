@@ -96,7 +96,7 @@ def test_viewers_find_the_schema_that_they_know(path: Path, frames: list[Frame])
         types = [described["properties"][name]["type"] for name in ("time", "seq", "session")]
         assert types == ["number", "integer", "string"]
         stamp = content["timestamp"]
-        assert stamp["sec"] * 10**9 + stamp["nsec"] == message.log_time
+        assert stamp["sec"] * 10**9 + stamp["nsec"] == message.publish_time
         assert message.log_time * 1e-9 == pytest.approx(UNIX + sent.time, abs=1e-6)
         assert content["format"] == "png"
         png = np.frombuffer(base64.b64decode(content["data"]), np.uint8)

@@ -52,7 +52,7 @@ def test_its_thrust_is_the_mean_over_all_its_swimming() -> None:
             fish.run()
             impulse += fish.fish.take_window().thrust
     for tick in fish.recorder.ticks:
-        tally.tick(tick)
+        tally.tick(tick, tick.time)
     thrust, error = tally.summary.thrust, tally.summary.thrust_ci95
     assert thrust is not None
     assert error is not None
@@ -236,7 +236,11 @@ def test_messages_from_no_time_are_left_out_and_counted(tmp_path: Path) -> None:
     ticks = swum(0.4).recorder.ticks
     recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=lines.append)
     recorder._writer = recorder._open_writer()
-    wrong = [replace(ticks[1], t=t) for t in (1e300, -1.0, 1.1e10)]
+    wrong = [
+        replace(ticks[1], t=1e300),
+        replace(ticks[1], t=-1.1e10),
+        replace(ticks[1], time=1e300),
+    ]
     for tick in (ticks[0], *wrong, ticks[1]):
         recorder._take("tick", msgspec.json.encode(tick))
     recorder.__exit__(None, None, None)

@@ -177,7 +177,7 @@ def _swim_for(fish: Fish, seconds: float) -> list[Tick]:
             reason = fish.status().reason
             raise StartupError(f"fishd swims no more: {reason.message if reason else tick.mode}")
         ticks.append(tick)
-        if tick.t - ticks[0].t >= seconds:
+        if tick.time - ticks[0].time >= seconds:
             break
     return ticks
 
