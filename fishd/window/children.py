@@ -4,10 +4,14 @@ import asyncio
 import os
 import shlex
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fishd.core import text
 from fishd.core.errors import FishdError
 from fishd.core.process.safe_path import python_command
+
+if TYPE_CHECKING:
+    from fishd.window.scratch import Scratch
 
 _CHILD = """\
 import ctypes, os, signal, sys
@@ -24,8 +28,14 @@ class JobError(FishdError):
     """A job cannot be started, or there is none."""
 
 
-async def spawn(words: list[str], runs: Path) -> asyncio.subprocess.Process:
-    """Start fishctl; runs: folder of recordings and experiments."""
+async def spawn(
+    words: list[str], runs: Path, scratch: "Scratch | None" = None
+) -> asyncio.subprocess.Process:
+    """Start fishctl.
+
+    runs: folder of recordings and experiments
+    scratch: the folder in which it writes, which exists for as long as it runs
+    """
     return await asyncio.create_subprocess_exec(
         *python_command("-c", _CHILD, str(os.getpid()), *words),
         stdin=asyncio.subprocess.DEVNULL,
@@ -33,12 +43,13 @@ async def spawn(words: list[str], runs: Path) -> asyncio.subprocess.Process:
         stderr=asyncio.subprocess.PIPE,
         env={**os.environ, "FISHD_RUNS": str(runs), "PYTHONUNBUFFERED": "1"},
         start_new_session=True,  # Ctrl-C in this terminal is for the window
+        pass_fds=(scratch.descriptor,) if scratch else (),
     )
 
 
-async def call(words: list[str], runs: Path) -> bytes:
+async def call(words: list[str], runs: Path, scratch: "Scratch | None" = None) -> bytes:
     """Run fishctl, and return its output; raise `JobError`."""
-    process = await spawn(words, runs)
+    process = await spawn(words, runs, scratch)
     output, errors = await process.communicate()
     if process.returncode and not output:
         message = text.line(errors.decode("utf-8", "replace"))

@@ -8,7 +8,6 @@ import asyncio
 import csv
 import shutil
 import signal
-import tempfile
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -25,6 +24,7 @@ from fishd.core.errors import FishdError
 from fishd.window.children import JobError, call, spawn
 from fishd.window.job_options import DRIVING_KINDS, ResumeOptions, list_words
 from fishd.window.runs import Runs
+from fishd.window.scratch import Scratch
 
 MAX_RUNNING_JOBS = 4
 MAX_REMEMBERED_JOBS = 20
@@ -90,8 +90,8 @@ class Jobs:
         self._stopping: set[str] = set()
         self._pending: set[str] = set()
         self._count = 0
-        self._cache = tempfile.TemporaryDirectory(prefix="fishd-window-")
-        self.runs = Runs(runs, Path(self._cache.name))
+        self._scratch = Scratch("fishd-window-")
+        self.runs = Runs(runs, self._scratch)
         self._folder = runs
 
     async def close(self) -> None:
@@ -100,7 +100,7 @@ class Jobs:
             self.stop(name)
         if self._tasks:
             await asyncio.wait(self._tasks.values())
-        self._cache.cleanup()
+        self._scratch.close()
 
     def all(self) -> list[Job]:
         """Return all jobs, the oldest first."""
@@ -172,6 +172,7 @@ class Jobs:
         shown = [f"--folder={self._folder}"] if self._show_folder and kind in _FOLDER_KINDS else []
         name = self._new_id()
         job = Job(name, kind, fish, ["fishctl", *words, *shown], "running", time.time(), run)
+        words += self._list_hidden_words(job, is_resumed=isinstance(options, ResumeOptions))
         self._jobs[name] = job
         while len(self._jobs) > MAX_REMEMBERED_JOBS:
             ended = next((j.id for j in self._jobs.values() if j.state != "running"), None)
@@ -179,7 +180,6 @@ class Jobs:
                 break
             del self._jobs[ended]
         self._keep_running()
-        words += self._list_hidden_words(job, is_resumed=isinstance(options, ResumeOptions))
         self._tasks[name] = asyncio.create_task(self._run(job, words))
         return job
 
@@ -203,9 +203,9 @@ class Jobs:
         if job.kind in _FOLDER_KINDS:
             return [f"--folder={self._folder}", "--json"]
         if job.kind == "simulate":
-            return [f"--record={self._cache.name}/simulate-{job.id}.mcap", "--json"]
+            return [f"--record={self._scratch.folder}/simulate-{job.id}.mcap", "--json"]
         place = [] if is_resumed else ["--on=live", f"--folder={self._folder / job.run}"]
-        return [*place, f"--plot={self._cache.name}/{job.id}.png", "--json"]
+        return [*place, f"--plot={self._scratch.folder}/{job.id}.png", "--json"]
 
     def _keep_running(self) -> None:
         self._keep([job for job in self._jobs.values() if job.state == "running"])
@@ -252,13 +252,15 @@ class Jobs:
 
     def _keep_picture(self, job: Job) -> None:
         """Move the picture of an experiment into its folder."""
-        picture, folder = Path(self._cache.name, f"{job.id}.png"), self._folder / job.run
-        if job.run and picture.exists() and folder.is_dir():
+        if not job.run:
+            return
+        picture, folder = self._scratch.folder / f"{job.id}.png", self._folder / job.run
+        if picture.exists() and folder.is_dir():
             shutil.move(picture, folder / f"{job.kind}.png")
 
     async def _run_child(self, job: Job, words: list[str]) -> bytes:
         """Run fishctl; return its output."""
-        process = self._processes[job.id] = await spawn(words, self._folder)
+        process = self._processes[job.id] = await spawn(words, self._folder, self._scratch)
         if job.id in self._stopping:
             self._signal(job.id, signal.SIGINT)
         assert process.stdout
@@ -293,10 +295,11 @@ class Jobs:
 
     async def _read_curve(self, name: str) -> dict[str, list[float | None]]:
         """Return columns of a simulated run."""
-        run, folder = Path(self._cache.name, f"simulate-{name}.mcap"), Path(self._cache.name, name)
+        scratch = self._scratch.folder
+        run, folder = scratch / f"simulate-{name}.mcap", scratch / name
         folder.mkdir()
         words = ["export", str(run), "--csv", f"--to={folder}", "--force"]
-        await call(words, self._folder)
+        await call(words, self._folder, self._scratch)
         try:
             return await asyncio.to_thread(_read_columns, next(folder.glob("*[!s].csv")))
         finally:
