@@ -11,13 +11,12 @@ from msgspec import Meta, Struct
 
 from fishd import __version__
 from fishd.window.answers import ApiError, NoArguments, read_body, success
-from fishd.window.devices import Device, Devices, Scope
+from fishd.window.devices import DEVICE_S, Device, Devices, Scope
 from fishd.window.web_server import host_name, parse_ip
 
 log = logging.getLogger(__name__)
 
 COOKIE = "fishd_window"
-COOKIE_S = 365 * 86400
 FORWARDED = ("Forwarded", "X-Forwarded-For", "X-Forwarded-Host", "X-Real-IP", "Via")
 """Headers by which a reverse proxy shows that the browser is elsewhere."""
 
@@ -121,7 +120,7 @@ class AccessControl:
         response.set_cookie(
             COOKIE,
             secret,
-            max_age=COOKIE_S,
+            max_age=int(DEVICE_S),
             path="/",
             httponly=True,
             samesite="Strict",

@@ -10,7 +10,7 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -21,12 +21,17 @@ from msgspec.structs import replace
 from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
+from fishd.window.expiry import SteadyClock, boot_id, boot_time
 
 Scope = Literal["watch", "drive"]
 T = TypeVar("T")
 
 INVITATION_S = 600.0
 """Time within which a token pairs a device [s]."""
+DEVICE_S = 365 * 86400.0
+"""Time for which a device stays paired [s]."""
+DROP_RETRY_S = 60.0
+"""Time between two attempts to remove what has expired from the file [s]."""
 MAX_INVITATIONS = 20
 MAX_DEVICES = 200
 MAX_NAME_CHARACTERS = 40
@@ -60,7 +65,14 @@ class Invitation(Struct, frozen=True):
     """SHA-256 of the token, in hexadecimal."""
     scope: Scope
     until: float
-    """Time at which it expires [s, unix]."""
+    """Time at which it expires, since the start of the machine [s]."""
+    boot: str = ""
+    """Name of that run of the machine, with which it expires, too."""
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether it pairs a device."""
+        return self.boot == boot_id() and boot_time() < self.until
 
 
 class _Content(Struct, frozen=True):
@@ -86,14 +98,23 @@ class Devices:
                 f"{folder} cannot be created: {error.strerror}; set state in the settings"
             ) from None
         self._content, self._version = _Content(), (0, 0, 0)
+        self._clock: SteadyClock | None = None
+        self._next_drop = 0.0
         self._read()
+
+    def now(self) -> float:
+        """Return the time by which devices expire [s, unix]."""
+        if self._clock is None:
+            seen = (device.seen for device in self._content.devices)
+            self._clock = SteadyClock(max(seen, default=0.0))
+        return self._clock.now()
 
     def invite(self, scope: Scope, seconds: float = INVITATION_S) -> str:
         """Return a new token that pairs one device within this time."""
         token = secrets.token_urlsafe(16)
-        invitation = Invitation(_hash(token), scope, time.time() + seconds)
+        invitation = Invitation(_hash(token), scope, boot_time() + seconds, boot_id())
         with self._changing() as content:
-            valid = [entry for entry in content.invitations if entry.until > time.time()]
+            valid = [entry for entry in content.invitations if entry.is_valid]
             kept = (*valid[1 - MAX_INVITATIONS :], invitation)
             self._write(replace(content, invitations=kept))
         return token
@@ -103,7 +124,7 @@ class Devices:
         digest, secret = _hash(token), secrets.token_urlsafe(32)
         with self._changing() as content:
             match = next((entry for entry in content.invitations if entry.token == digest), None)
-            if match is None or match.until < time.time():
+            if match is None or not match.is_valid:
                 raise DeviceError(
                     "this link was used already, or has expired: run 'fishctl window pair' again"
                 )
@@ -112,14 +133,14 @@ class Devices:
                     f"{MAX_DEVICES} devices are paired: revoke some with 'fishctl window revoke'"
                 )
             taken = {device.name for device in content.devices}
-            now = time.time()
+            now = self.now()
             wanted = text.line(name, MAX_NAME_CHARACTERS) or "device"
             device = Device(
                 id=secrets.token_hex(4),
                 name=_unused_name(wanted, taken),
                 scope=match.scope,
                 token=_hash(secret),
-                paired=now,
+                paired=max(now, time.time()),  # which may have been set since
                 seen=now,
             )
             others = tuple(entry for entry in content.invitations if entry is not match)
@@ -132,12 +153,34 @@ class Devices:
             return None
         digest = _hash(secret)
         device = next((entry for entry in self.all() if entry.token == digest), None)
-        if device and time.time() - device.seen > SEEN_PERIOD_S:
-            self._replace(device, replace(device, seen=time.time()))
+        if device and self.now() - device.seen > SEEN_PERIOD_S:
+            self._replace(device, replace(device, seen=self.now()))
         return device
 
     def all(self) -> tuple[Device, ...]:
-        """Return all devices."""
+        """Return all devices whose access has not expired; remove from the file what has."""
+        self.list_stored()
+        valid = self._keep_valid(self._content)
+        if valid != self._content and time.monotonic() >= self._next_drop:
+            self._next_drop = time.monotonic() + DROP_RETRY_S
+            with suppress(DeviceError, OSError), self._changing() as content:
+                self._write(self._keep_valid(content))
+                self._next_drop = 0.0
+        return valid.devices
+
+    def _keep_valid(self, content: _Content) -> _Content:
+        """Return the content without what has expired."""
+        now = self.now()
+        return _Content(
+            tuple(device for device in content.devices if now - device.paired < DEVICE_S),
+            tuple(entry for entry in content.invitations if entry.is_valid),
+        )
+
+    def list_stored(self) -> tuple[Device, ...]:
+        """Return the devices in the file.
+
+        A command that runs while the wall clock is wrong must not decide what has expired.
+        """
         if self._version_now() != self._version:
             self._read()
         return self._content.devices
@@ -151,9 +194,10 @@ class Devices:
 
     def revoke(self, name: str) -> Device:
         """Remove the device with this name or id; raise `DeviceError` if there is none."""
-        match = next((entry for entry in self.all() if name in (entry.name, entry.id)), None)
+        stored = self.list_stored()
+        match = next((entry for entry in stored if name in (entry.name, entry.id)), None)
         if match is None:
-            known = ", ".join(entry.name for entry in self.all()) or "there is none"
+            known = ", ".join(entry.name for entry in stored) or "there is none"
             raise DeviceError(f"no device is named '{text.quoted(name)}'; paired: {known}")
         self._replace(match, None)
         return match
