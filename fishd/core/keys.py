@@ -143,7 +143,7 @@ def _read(path: Path, forbidden: int, may: str) -> str:
 
 
 def _check_folder(folder: Path) -> None:
-    """Raise `ConfigError` if other users may put keys of their own into a folder."""
+    """Raise `ConfigError` if other users may put keys into a folder."""
     if problem := find_folder_problem(folder):
         raise ConfigError(problem)
 

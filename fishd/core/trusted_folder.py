@@ -1,4 +1,4 @@
-"""Whether other users may change or replace a folder whose files decide who has access."""
+"""Search for other users that may change or replace a folder, such as one with keys."""
 
 import os
 import stat

@@ -8,6 +8,7 @@ import fcntl
 import hashlib
 import os
 import secrets
+import stat
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -97,6 +98,12 @@ class Devices:
             raise DeviceError(
                 f"{folder} cannot be created: {error.strerror}; set state in the settings"
             ) from None
+        mode = stat.S_IMODE(folder.stat().st_mode)
+        if mode & 0o022:
+            raise DeviceError(
+                f"{folder}: other users may change it (mode {mode:o}), and so pair devices; run "
+                f"'chmod go-w {folder}'"
+            )
         self._content, self._version = _Content(), (0, 0, 0)
         self._clock: SteadyClock | None = None
         self._next_drop = 0.0

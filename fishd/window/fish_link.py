@@ -10,13 +10,14 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, closing, suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import zmq.asyncio
 from msgspec import UNSET, Struct
 
 from fishd.client import AsyncFish, Fish
+from fishd.client.lease import LeaseRenewal
 from fishd.client.zmq_sockets import connect_subscriber
 from fishd.core import text
 from fishd.core.addresses import find_control_address
@@ -104,7 +105,7 @@ class FishLink:
         self._state, self._message = "lost", "connecting"
         self._waiting = 0
         self._taking = asyncio.Lock()
-        self._lease: AsyncExitStack | None = None
+        self._lease: _HeldLease | None = None
 
     async def close(self) -> None:
         """Return the fish, and disconnect."""
@@ -316,12 +317,18 @@ class FishLink:
         return str(answer.get("pulses", answer.get("mode", "")))
 
     async def request(
-        self, op: str, arguments: dict[str, Any], holder: str, take: bool
+        self,
+        op: str,
+        arguments: dict[str, Any],
+        holder: str,
+        take: bool,
+        check: Callable[[], None],
     ) -> dict[str, Any]:
         """Carry out a request, and return its result; raise `FishdError`.
 
         holder: name of the lease under which the fish swims
         take: whether to take the fish from an experiment
+        check: raises `FishdError` if the sender no longer drives; a request may have to wait
         """
         if op == "stop":  # must not wait for a controller that loads
             return _builtins(await self._stopper.stop())
@@ -330,20 +337,28 @@ class FishLink:
         self._waiting += 1
         try:
             async with self._taking:
-                return await self._perform(op, arguments, holder, take)
+                return await self._perform(op, arguments, holder, take, check)
         finally:
             self._waiting -= 1
 
     async def _perform(
-        self, op: str, arguments: dict[str, Any], holder: str, take: bool
+        self,
+        op: str,
+        arguments: dict[str, Any],
+        holder: str,
+        take: bool,
+        check: Callable[[], None],
     ) -> dict[str, Any]:
         fish = self._fish
+        check()
         if op == "clear-fault":
             return _builtins(await fish.clear_fault())
         if op == "mark":
             return _builtins(await fish.mark(arguments["text"]))
         for is_last in (False, True):
+            check()
             await self._hold(holder, take)
+            check()
             try:
                 if op == "set-controller":
                     name, parameters = arguments["name"], arguments["parameters"]
@@ -362,21 +377,38 @@ class FishLink:
         if self._lease:
             return
         stack = AsyncExitStack()
-        await stack.enter_async_context(
+        renewal = await stack.enter_async_context(
             self._fish.lease(text.line(holder, 60), take, idle_limit=None)
         )
-        self._lease = stack
+        self._lease = _HeldLease(renewal, stack)
 
-    async def give_back(self) -> None:
-        """End the lease: the fish comes to rest, if it swims under it."""
+    async def give_back(self, is_driven: Callable[[], bool] = lambda: False) -> None:
+        """End the lease: the fish comes to rest, if it swims under it.
+
+        It does so at once, also while a controller is loaded, which then does not start.
+
+        is_driven: returns whether another page has begun to drive, which then keeps the lease
+        """
+        if self._lease and self._taking.locked():
+            with suppress(FishError):
+                await self._stopper.end_lease(self._lease.renewal.token)
         async with self._taking:
-            await self._drop_lease()
+            if not is_driven():
+                await self._drop_lease()
 
     async def _drop_lease(self) -> None:
-        stack, self._lease = self._lease, None
-        if stack:
+        lease, self._lease = self._lease, None
+        if lease:
             with suppress(FishError):
-                await stack.aclose()
+                await lease.stack.aclose()
+
+
+class _HeldLease(NamedTuple):
+    """Lease of the fish."""
+
+    renewal: LeaseRenewal
+    stack: AsyncExitStack
+    """Ends the lease when it is closed."""
 
 
 def fishctl_command(*arguments: str) -> list[str]:

@@ -4,6 +4,7 @@ Only the page that drives changes how a fish swims.
 """
 
 import logging
+from functools import partial
 from typing import Annotated, Any
 
 import msgspec
@@ -128,12 +129,13 @@ class FishRequests:
                 400, "unknown-op", f"no such op '{text.quoted(body.op)}'; valid: {known}"
             )
         arguments = msgspec.structs.asdict(convert(body.args, kind, f"{body.op}: "))
+        check = partial(self._pages.require_driver, link.name, page)
         if body.op != "stop":
-            self._pages.require_driver(link.name, page)
+            check()
         elif self._pages.driver_of(link.name) is None:
             self._pages.set_driver(link.name, Driver(page, False))
         holder = f"window: {access.name}"
-        return success(await link.request(body.op, arguments, holder, body.take))
+        return success(await link.request(body.op, arguments, holder, body.take, check))
 
     async def _get_history(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")

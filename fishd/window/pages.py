@@ -4,7 +4,7 @@ import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from typing import Any
 
@@ -39,19 +39,24 @@ class Pages:
         access: AccessControl,
         list_jobs: Callable[[], list[Job]],
         list_viewers: Callable[[], Iterable[Viewer]],
+        stop_jobs: Callable[[Set[str]], None],
     ) -> None:
         """
         endpoints: control socket of each fish, by its name
         list_jobs, list_viewers: return all jobs, and the open WebSockets of all kinds
+        stop_jobs: ends those of devices without access; gets the identifiers of those with it
         """
         self.links = {
             name: FishLink(name, endpoint, self._teller(name))
             for name, endpoint in endpoints.items()
         }
         self._access, self._list_jobs, self._list_viewers = access, list_jobs, list_viewers
+        self._stop_jobs = stop_jobs
         self._pages: set[LivePage] = set()
         self._session = secrets.token_hex(4)
         self._drivers: dict[str, Driver] = {}
+        self._absent: dict[str, Driver] = {}
+        """Driver of each fish that swims on without its page."""
         self._endings: set[asyncio.Task[None]] = set()
         """Ends of the role of drivers that are gone; fishd may be slow to answer."""
 
@@ -182,6 +187,7 @@ class Pages:
 
     def set_driver(self, name: str, driver: Driver | None) -> None:
         """Let a page drive a fish, or none."""
+        self._absent.pop(name, None)
         if driver:
             self._drivers[name] = driver
         else:
@@ -206,8 +212,14 @@ class Pages:
         if self._drivers.get(name) is not driver:
             return
         self.set_driver(name, None)
-        if driver and not driver.keep:
-            await self.links[name].give_back()
+        if driver and driver.keep:
+            self._absent[name] = driver
+        elif driver:
+            await self._return(name)
+
+    async def _return(self, name: str) -> None:
+        """Let a fish come to rest, unless another page drives it by then."""
+        await self.links[name].give_back(is_driven=lambda: name in self._drivers)
 
     async def _watch(self) -> None:
         """Close pages of revoked devices, and end the role of drivers that are gone."""
@@ -234,7 +246,9 @@ class Pages:
         for viewer in self._list_viewers():
             if viewer.device_id not in paired:
                 viewer.end()
-        for name, driver in list(self._drivers.items()):
+        for name, driver in [*self._drivers.items(), *self._absent.items()]:
             if driver.page.device_id not in paired:
-                driver.page.seen = -1e9
                 log.warning("%s drives %s and was revoked", driver.page.device, name)
+                self.set_driver(name, None)
+                self._endings.add(asyncio.create_task(self._return(name)))
+        self._stop_jobs(paired)

@@ -23,7 +23,7 @@ exec rm -rf -- "$1"
 class Scratch:
     """A folder in /tmp for this process and its children, made when it is first used.
 
-    A shell of its own removes it once this process and those children have ended that keep
+    A shell in the background removes it once this process and those children have ended that keep
     `descriptor` open. A child that outlives a killed parent can so leave nothing behind.
     """
 
@@ -34,15 +34,15 @@ class Scratch:
     @property
     def folder(self) -> Path:
         """The folder; raises `JobError` if it cannot be made."""
-        return self._made[0]
+        return self._content[0]
 
     @property
     def descriptor(self) -> int:
         """Descriptor that keeps the folder as long as a process has it open."""
-        return self._made[1]
+        return self._content[1]
 
     @cached_property
-    def _made(self) -> tuple[Path, int, "subprocess.Popen[bytes]"]:
+    def _content(self) -> tuple[Path, int, "subprocess.Popen[bytes]"]:
         folder = Path(tempfile.gettempdir(), f"{self._prefix}{secrets.token_hex(8)}")
         read_end, write_end = os.pipe()
         with os.fdopen(read_end, "rb") as end:
@@ -64,8 +64,8 @@ class Scratch:
 
     def close(self) -> None:
         """Remove the folder."""
-        if "_made" in vars(self):
-            folder, write_end, remover = self._made
+        if "_content" in vars(self):
+            folder, write_end, remover = self._content
             shutil.rmtree(folder, ignore_errors=True)
             remover.kill()
             remover.wait()

@@ -37,7 +37,13 @@ class WindowServer(WebServer):
             keep=lambda jobs: self._register.change(jobs=[Raw(encode(job)) for job in jobs]),
             show_folder=settings.runs is not None,
         )
-        self._pages = Pages(settings.endpoints, access, self._jobs.all, lambda: self.viewers)
+        self._pages = Pages(
+            settings.endpoints,
+            access,
+            self._jobs.all,
+            lambda: self.viewers,
+            self._jobs.stop_without_access,
+        )
         host, port = settings.address
         routes = [
             *file_routes(resources.files(__package__).joinpath("page"), "index.html"),

@@ -31,7 +31,7 @@ real = time.time
 signal.signal(signal.SIGUSR1, lambda *_: setattr(time, "time", lambda: real() - 86400.0))
 signal.signal(signal.SIGUSR2, lambda *_: setattr(devices, "DEVICE_S", 0.0))
 """
-"""Code of a window whose clock SIGUSR1 sets back by a day, and whose devices SIGUSR2 lets expire."""
+"""Code of a window: SIGUSR1 sets its clock back by a day, SIGUSR2 lets its devices expire."""
 Step = Callable[[float], None]
 
 

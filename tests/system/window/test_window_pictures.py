@@ -117,6 +117,6 @@ def test_a_picture_of_the_largest_size_is_served_whole_to_each_who_asks_at_once(
 
 
 def peak_memory(window: WindowProcess) -> int:
-    """Return the largest resident size of a window so far [bytes]."""
+    """Return the largest resident size that a window has had [bytes]."""
     status = Path(f"/proc/{window.pid}/status").read_text()
     return 1024 * int(status.partition("VmHWM:")[2].split()[0])

@@ -14,7 +14,7 @@ START = {
     "simulate": {"controller": "swing", "seconds": 600},
     "measure": {"controller": "square", "seconds": 60},
 }
-"""What a window does when it is killed: nothing, or a job with these options."""
+"""Options of the job that a window runs when it is killed, by its kind; none for no job."""
 
 
 @pytest.fixture

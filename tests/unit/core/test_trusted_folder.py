@@ -1,4 +1,4 @@
-"""A folder that decides who has access: others may neither change nor replace it."""
+"""A folder with keys: other users may neither change nor replace it."""
 
 import os
 import re
