@@ -7,6 +7,7 @@ it is needed.
 import asyncio
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 import msgspec
@@ -48,7 +49,7 @@ class EstopPath:
         self._prober = ThreadPoolExecutor(1, thread_name_prefix=f"probe {name}")
         self._attempt = _Attempt(is_sent=True)
         self._last_resort: asyncio.Future[str] | None = None
-        self._answered, self._problem = time.monotonic(), ""
+        self._answered = time.monotonic()
 
     def close(self) -> None:
         """End the threads, without waiting for their requests."""
@@ -90,7 +91,7 @@ class EstopPath:
         while True:
             try:
                 await loop.run_in_executor(self._prober, self._probe)
-                self._answered, self._problem = time.monotonic(), ""
+                self._answered = time.monotonic()
             except Exception as error:
                 self._problem = text.error_message(error)
             await asyncio.sleep(PROBE_PERIOD_S)
@@ -105,8 +106,7 @@ class EstopPath:
         silence = time.monotonic() - self._answered
         if silence < MAX_SILENCE_S:
             return ""
-        why = f": {self._problem}" if self._problem else ""
-        return text.line(f"fishd has not answered at its control socket for {silence:.0f} s{why}")
+        return f"fishd has not answered at its control socket for {silence:.0f} s"
 
 
 async def _run_last_resort(endpoint: str | None, error: NoDaemon) -> str:
