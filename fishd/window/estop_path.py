@@ -89,11 +89,9 @@ class EstopPath:
         """Try the way again and again, until this task is cancelled."""
         loop = asyncio.get_running_loop()
         while True:
-            try:
+            with suppress(FishError, OSError):
                 await loop.run_in_executor(self._prober, self._probe)
                 self._answered = time.monotonic()
-            except Exception as error:
-                self._problem = text.error_message(error)
             await asyncio.sleep(PROBE_PERIOD_S)
 
     def _probe(self) -> None:
