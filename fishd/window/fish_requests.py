@@ -4,6 +4,7 @@ Only the page that drives changes how a fish swims.
 """
 
 import logging
+from collections.abc import AsyncIterator
 from functools import partial
 from typing import Annotated, Any
 
@@ -16,9 +17,12 @@ from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
 from fishd.window.live import Driver
 from fishd.window.pages import Pages
+from fishd.window.web_server import ESTOP
 
 log = logging.getLogger(__name__)
 
+PART_BYTES = 2**15
+"""Size of the parts in which a long answer is sent [bytes]."""
 Text = Annotated[str, Meta(max_length=1000)]
 
 
@@ -72,7 +76,7 @@ class FishRequests:
         self._access, self._pages = access, pages
         self.routes = [
             web.get("/api/fish", self._list_fish),
-            web.post("/api/fish/{fish}/estop", self._estop),
+            web.post("/api/fish/{fish}/estop", self._estop, name=ESTOP),
             web.post("/api/fish/{fish}/drive", self._drive),
             web.post("/api/fish/{fish}/release", self._release),
             web.post("/api/fish/{fish}/request", self._request),
@@ -91,7 +95,7 @@ class FishRequests:
     async def _estop(self, request: web.Request) -> web.Response:
         access = self._access.require(request, "watch")
         link = self._pages.find_link(request.match_info["fish"])
-        result = await link.estop(f"requested in the window by {access.name}")
+        result = await link.estop_path.stop(f"requested in the window by {access.name}")
         log.warning("emergency stop of %s by %s: %s", link.name, access.name, result["outcome"])
         return success(result)
 
@@ -139,8 +143,16 @@ class FishRequests:
 
     async def _get_history(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")
-        since = request.query.get("since", "0")
-        if not (since.isascii() and since.isdigit() and len(since) < 16):
-            raise ApiError(400, "bad-request", "since: the number of a tick is needed")
         link = self._pages.find_link(request.match_info["fish"])
-        return success(link.columns(int(since)))
+        return web.Response(
+            body=_split(link.history()[0]),
+            content_type="application/json",
+        )
+
+
+async def _split(result: bytes) -> AsyncIterator[bytes]:
+    """Yield a successful answer in parts; of the whole, each client that is slow kept a copy."""
+    yield b'{"ok":true,"result":'
+    for begin in range(0, len(result), PART_BYTES):
+        yield result[begin : begin + PART_BYTES]
+    yield b"}"

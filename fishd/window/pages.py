@@ -12,7 +12,6 @@ import msgspec
 from aiohttp import web
 
 from fishd.core import text
-from fishd.core.errors import FishdError
 from fishd.window.access import Access, AccessControl
 from fishd.window.answers import ApiError
 from fishd.window.devices import DeviceError
@@ -20,7 +19,7 @@ from fishd.window.fish_link import FishLink
 from fishd.window.foxglove import FoxglovePage
 from fishd.window.jobs import Job
 from fishd.window.live import Driver, LivePage, encode, encode_message
-from fishd.window.web_server import Viewer
+from fishd.window.viewer import Viewer
 
 log = logging.getLogger(__name__)
 
@@ -140,7 +139,7 @@ class Pages:
                 for page in pages:
                     try:
                         self._greet(page)
-                    except DeviceError:  # it was revoked, or the file is damaged
+                    except DeviceError:  # it was revoked
                         page.end()
                 return
             message = encode_message(kind, payload)
@@ -223,23 +222,25 @@ class Pages:
 
     async def _watch(self) -> None:
         """Close pages of revoked devices, and end the role of drivers that are gone."""
-        next_connection = 0.0
+        next_connection, warned = 0.0, dict.fromkeys(self.links, False)
         while True:
             await asyncio.sleep(WATCH_PERIOD_S)
             self._endings = {ending for ending in self._endings if not ending.done()}
-            try:
-                self._close_revoked()
-            except FishdError as error:
-                log.error("%s", error)
+            self._access.refresh()
+            self._close_revoked()
             for name, driver in list(self._drivers.items()):
                 if driver.is_gone:
                     log.warning("%s has left while it drove %s", driver.page.device, name)
                     self._endings.add(asyncio.create_task(self.end_driving(name, driver)))
-            if time.monotonic() >= next_connection:
+            is_due = time.monotonic() >= next_connection
+            if is_due:
                 next_connection = time.monotonic() + CONNECTION_PERIOD_S
-                for name, link in self.links.items():
-                    if link.connection.state in ("stale", "lost"):
-                        self._teller(name)("connection", encode(link.connection))
+            for name, link in self.links.items():
+                warns = bool(link.connection.warning)
+                is_bad = warns or link.connection.state in ("stale", "lost")
+                if warns != warned[name] or (is_due and is_bad):
+                    warned[name] = warns
+                    self._teller(name)("connection", encode(link.connection))
 
     def _close_revoked(self) -> None:
         paired = self._access.paired_ids()

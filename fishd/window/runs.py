@@ -21,7 +21,7 @@ RUNS_AGE_S = 1.0
 """Longest age of a list of runs [s]."""
 MAX_WAITING_PLOTS = 8
 MAX_HEADER_BYTES = 2**20
-_RUN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]*", re.A)
+_RUN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,199}", re.A)
 
 
 class Header(Struct):

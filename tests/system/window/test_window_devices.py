@@ -187,13 +187,15 @@ def test_devices_of_one_name_are_told_apart_and_names_are_printable(tmp_path: Pa
     assert names == ["a", "a 2", "?[2J", "device"]
 
 
-def test_a_damaged_file_pairs_nothing_and_says_so(tmp_path: Path) -> None:
+def test_a_damaged_file_pairs_nothing_and_says_what_to_do(tmp_path: Path) -> None:
     paired = Devices(tmp_path)
-    _, secret = paired.pair(paired.invite("drive"), "tablet")
-    assert paired.find(secret)
+    paired.pair(paired.invite("drive"), "tablet")
     (tmp_path / "devices.json").write_text("{")
-    with pytest.raises(DeviceError, match=r"devices\.json: .*; remove it, and pair"):
-        paired.find(secret)
+    for change in (paired.all, lambda: paired.invite("watch"), lambda: paired.revoke("tablet")):
+        with pytest.raises(DeviceError, match=r"devices\.json: .*; replace it by"):
+            change()
+    (tmp_path / "devices.copy.json").replace(tmp_path / "devices.json")
+    assert [device.name for device in paired.all()] == ["tablet"]
 
 
 def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:
