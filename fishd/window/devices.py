@@ -175,11 +175,14 @@ class Devices:
                 self._next_drop = 0.0
         return valid.devices
 
+    def is_paired(self, device: Device) -> bool:
+        """Return whether the access of a device has not expired; reads no disk."""
+        return self.now() - device.paired < DEVICE_S
+
     def _keep_valid(self, content: _Content) -> _Content:
         """Return the content without what has expired."""
-        now = self.now()
         return _Content(
-            tuple(device for device in content.devices if now - device.paired < DEVICE_S),
+            tuple(device for device in content.devices if self.is_paired(device)),
             tuple(entry for entry in content.invitations if entry.is_valid),
         )
 
