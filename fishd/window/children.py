@@ -4,14 +4,10 @@ import asyncio
 import os
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fishd.core import text
 from fishd.core.errors import FishdError
 from fishd.core.process.safe_path import python_command
-
-if TYPE_CHECKING:
-    from fishd.window.scratch import Scratch
 
 _CHILD = """\
 import ctypes, os, signal, sys
@@ -28,13 +24,11 @@ class JobError(FishdError):
     """A job cannot be started, or there is none."""
 
 
-async def spawn(
-    words: list[str], runs: Path, scratch: "Scratch | None" = None
-) -> asyncio.subprocess.Process:
+async def spawn(words: list[str], runs: Path, *held: int) -> asyncio.subprocess.Process:
     """Start fishctl.
 
     runs: folder of recordings and experiments
-    scratch: the folder in which it writes, which exists for as long as it runs
+    held: descriptors that it keeps open as long as it runs
     """
     return await asyncio.create_subprocess_exec(
         *python_command("-c", _CHILD, str(os.getpid()), *words),
@@ -43,13 +37,13 @@ async def spawn(
         stderr=asyncio.subprocess.PIPE,
         env={**os.environ, "FISHD_RUNS": str(runs), "PYTHONUNBUFFERED": "1"},
         start_new_session=True,  # Ctrl-C in this terminal is for the window
-        pass_fds=(scratch.descriptor,) if scratch else (),
+        pass_fds=held,
     )
 
 
-async def call(words: list[str], runs: Path, scratch: "Scratch | None" = None) -> bytes:
-    """Run fishctl, and return its output; raise `JobError`."""
-    process = await spawn(words, runs, scratch)
+async def call(words: list[str], runs: Path, *held: int) -> bytes:
+    """Run fishctl like `spawn`, and return its output; raise `JobError`."""
+    process = await spawn(words, runs, *held)
     output, errors = await process.communicate()
     if process.returncode and not output:
         message = text.line(errors.decode("utf-8", "replace"))

@@ -20,7 +20,7 @@ async def read_curve(
     folder.mkdir()
     try:
         words = ["export", str(recording), "--csv", f"--to={folder}", "--force"]
-        await call(words, runs, scratch)
+        await call(words, runs, scratch.descriptor)
         return await asyncio.to_thread(_read_columns, next(folder.glob("*[!s].csv")))
     finally:
         recording.unlink(missing_ok=True)

@@ -277,7 +277,8 @@ class Jobs:
 
     async def _run_child(self, job: Job, words: list[str]) -> bytes:
         """Run fishctl; return its output."""
-        process = self._processes[job.id] = await spawn(words, self._folder, self._scratch)
+        process = await spawn(words, self._folder, self._scratch.descriptor)
+        self._processes[job.id] = process
         if job.id in self._stopping:
             self._signal(job.id, signal.SIGINT)
         assert process.stdout

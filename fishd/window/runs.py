@@ -100,7 +100,7 @@ class Runs:
                 if not _is_newer(picture, self.folder / f"{name}.mcap"):
                     where = (f"--folder={self.folder}", f"--to={cache}")
                     words = ["plot", name, "--png", "--force", *where, "--json"]
-                    await call(words, self.folder, self._scratch)
+                    await call(words, self.folder, self._scratch.descriptor)
                 return await asyncio.to_thread(open_picture, picture, f"the picture of {name}")
         except files.NoFile:
             raise JobError(f"{name} could not be drawn") from None
