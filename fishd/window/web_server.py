@@ -29,6 +29,8 @@ MAX_VIEWERS = 16
 """Largest number of WebSockets that are served at a time."""
 MAX_VIEWERS_PER_ADDRESS = 12
 """Largest number of WebSockets of one address."""
+REFUSAL_DELAY_S = 1.0
+"""Time until a page that is one too many is refused: it may come again at once [s]."""
 REQUEST_TIMEOUT_S = 3.0
 """Longest time until a connection has sent its request, to the end of the headers [s]."""
 HEARTBEAT_PERIOD_S = 10.0
@@ -153,6 +155,7 @@ class WebServer:
         viewer.address = request.remote or ""
         own = sum(other.address == viewer.address for other in self.viewers)
         if len(self.viewers) >= MAX_VIEWERS or own >= MAX_VIEWERS_PER_ADDRESS:
+            await asyncio.sleep(REFUSAL_DELAY_S)
             raise web.HTTPServiceUnavailable(
                 text=f"{len(self.viewers)} pages are open already, {own} of them from "
                 f"{viewer.address}; close one of them\n"
