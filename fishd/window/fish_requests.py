@@ -3,6 +3,7 @@
 Only the page that drives changes how a fish swims.
 """
 
+import asyncio
 import logging
 from collections.abc import AsyncIterator
 from functools import partial
@@ -15,12 +16,15 @@ from msgspec import Meta, Struct
 from fishd.core import text
 from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
+from fishd.window.fish_link import FishLink
 from fishd.window.live import Driver
 from fishd.window.pages import Pages
 from fishd.window.web_server import ESTOP
 
 log = logging.getLogger(__name__)
 
+MAX_SENT_HISTORIES = 2
+"""Number of answers with the history that are sent at a time."""
 PART_BYTES = 2**15
 """Size of the parts in which a long answer is sent [bytes]."""
 Text = Annotated[str, Meta(max_length=1000)]
@@ -74,6 +78,7 @@ class FishRequests:
 
     def __init__(self, access: AccessControl, pages: Pages) -> None:
         self._access, self._pages = access, pages
+        self._sending = asyncio.Semaphore(MAX_SENT_HISTORIES)
         self.routes = [
             web.get("/api/fish", self._list_fish),
             web.post("/api/fish/{fish}/estop", self._estop, name=ESTOP),
@@ -145,14 +150,18 @@ class FishRequests:
         self._access.require(request, "watch")
         link = self._pages.find_link(request.match_info["fish"])
         return web.Response(
-            body=_split(link.history()[0]),
+            body=self._send_history(link),
             content_type="application/json",
         )
 
+    async def _send_history(self, link: FishLink) -> AsyncIterator[bytes]:
+        """Yield an answer in parts: of the whole, each client that is slow kept a copy.
 
-async def _split(result: bytes) -> AsyncIterator[bytes]:
-    """Yield a successful answer in parts; of the whole, each client that is slow kept a copy."""
-    yield b'{"ok":true,"result":'
-    for begin in range(0, len(result), PART_BYTES):
-        yield result[begin : begin + PART_BYTES]
-    yield b"}"
+        Others wait, as an emergency stop must find the processor free.
+        """
+        async with self._sending:
+            history, _ = link.history()
+            yield b'{"ok":true,"result":'
+            for begin in range(0, len(history), PART_BYTES):
+                yield history[begin : begin + PART_BYTES]
+            yield b"}"

@@ -29,10 +29,14 @@ MAX_VIEWERS = 16
 """Largest number of WebSockets that are served at a time."""
 MAX_VIEWERS_PER_ADDRESS = 12
 """Largest number of WebSockets of one address."""
+REFUSAL_DELAY_S = 1.0
+"""Time until a page that is one too many is refused: it may come again at once [s]."""
 REQUEST_TIMEOUT_S = 3.0
 """Longest time until a connection has sent its request, to the end of the headers [s]."""
 HEARTBEAT_PERIOD_S = 10.0
 """Period of pings to a page, which must answer within half of it [s]."""
+RECEIVE_BYTES = 16 * 2**10
+"""Size of what a connection may send before it is read [bytes]: little is read at a time."""
 MAX_MESSAGE_BYTES = 1024
 """Largest size of a message from a page [bytes]."""
 ESTOP = "estop"
@@ -115,6 +119,8 @@ class WebServer:
             self._server = await loop.create_server(
                 lambda: self._places.protocol(server), self._host, self._port
             )
+            for listener in self._server.sockets:  # its connections have the same size
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
         except OSError as error:
             await self._runner.cleanup()
             number = error.errno or 0  # negative for errors of the resolver
@@ -149,6 +155,7 @@ class WebServer:
         viewer.address = request.remote or ""
         own = sum(other.address == viewer.address for other in self.viewers)
         if len(self.viewers) >= MAX_VIEWERS or own >= MAX_VIEWERS_PER_ADDRESS:
+            await asyncio.sleep(REFUSAL_DELAY_S)
             raise web.HTTPServiceUnavailable(
                 text=f"{len(self.viewers)} pages are open already, {own} of them from "
                 f"{viewer.address}; close one of them\n"

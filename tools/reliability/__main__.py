@@ -17,6 +17,7 @@ NAMES = (
     "soak",
     "systemd",
     "window",
+    "window_estop",
     "window_kills",
 )
 
