@@ -121,7 +121,7 @@ def pair(scope: "Scope", url: str | None, as_json: bool, **values: Any) -> None:
 @json_option
 def devices(as_json: bool, **values: Any) -> None:
     """List the paired devices."""
-    paired = _open_devices(_load_running(**values)).all()
+    paired = _open_devices(_load_running(**values)).list_stored()
     if as_json:
         keys = ("id", "name", "scope", "paired", "seen")
         print_json([{key: getattr(device, key) for key in keys} for device in paired])
@@ -137,15 +137,16 @@ def devices(as_json: bool, **values: Any) -> None:
 @click.argument("device")
 @json_option
 def revoke(device: str, as_json: bool, **values: Any) -> None:
-    """Remove a device, and close its pages.
+    """Remove a device, close its pages, and end what it does: its driving and its jobs.
 
-    DEVICE is its name or id, as `fishctl window devices` shows it.
+    The fish comes to rest, also where it would keep swimming without the page. DEVICE is its name
+    or id, as `fishctl window devices` shows it.
     """
     removed = _open_devices(_load_running(**values)).revoke(device)
     if as_json:
         print_json({"id": removed.id, "name": removed.name})
     else:
-        echo(f"{text.line(removed.name)} is no longer paired")
+        echo(f"{text.line(removed.name)} is no longer paired; what it drives and its jobs end")
 
 
 def _open_devices(settings: WindowSettings) -> "Devices":

@@ -99,7 +99,7 @@ class AsyncFish:
     calibrate_thrust = _run_in_thread(Fish.calibrate_thrust)
     calibrate_servo = _run_in_thread(Fish.calibrate_servo)
     _take_lease = _run_in_thread(Fish.take_lease)
-    _end_lease = _run_in_thread(Fish.end_lease)
+    end_lease = _run_in_thread(Fish.end_lease)
     _find_telemetry = _run_in_thread(Fish.find_telemetry)
 
     async def estop(self, message: str = "requested by a client") -> State:
@@ -131,7 +131,7 @@ class AsyncFish:
             await asyncio.to_thread(renewal.stop)
             try:
                 if not renewal.returned:
-                    await self._end_lease(renewal.token)
+                    await self.end_lease(renewal.token)
             except LeaseLost:
                 pass
             except FishError as error:

@@ -14,6 +14,8 @@ MAX_TABLE_BYTES = 16 * 2**20
 """Maximum size of a table of numbers [bytes]."""
 
 _KINDS = {
+    stat.S_IFREG: "a file",
+    stat.S_IFLNK: "a symbolic link",
     stat.S_IFDIR: "a folder",
     stat.S_IFIFO: "a named pipe",
     stat.S_IFSOCK: "a socket",
@@ -67,8 +69,12 @@ def read_text(path: Path, longest: int, reader: str, encoding: str = "utf-8") ->
 
 def _check_kind(status: os.stat_result) -> None:
     if not stat.S_ISREG(status.st_mode):
-        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
-        raise FileProblem(f"is {kind}; a regular file is needed")
+        raise FileProblem(f"is {describe_kind(status)}; a regular file is needed")
+
+
+def describe_kind(status: os.stat_result) -> str:
+    """Return what a path belongs to, such as `a folder`."""
+    return _KINDS.get(stat.S_IFMT(status.st_mode), "something else")
 
 
 def expand_user(path: str | os.PathLike[str]) -> Path:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 from fishd.core import files
 from fishd.core.addresses import KEYS_VARIABLE
 from fishd.core.errors import ConfigError, NoKey
+from fishd.core.trusted_folder import find_folder_problem
 
 SECRET_FILE, PUBLIC_FILE, KNOWN_FILE = "key", "key.pub", "known"
 ROLES = ("watch", "drive")
@@ -103,7 +104,10 @@ def make_keys(folder: Path, public: str, secret: str) -> None:
     """
     notes = "# A line for each key, as 'fishctl keygen' prints it.\n"
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        for parent in reversed(folder.parents):  # pathlib would leave their modes to the umask
+            parent.mkdir(mode=0o755, exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
+        _check_folder(folder)
         for name, content, mode in (
             (SECRET_FILE, f"{secret}\n", 0o600),
             (PUBLIC_FILE, f"{public}\n", 0o644),
@@ -134,7 +138,14 @@ def _read(path: Path, forbidden: int, may: str) -> str:
         )
     if status.st_uid not in (os.getuid(), 0):
         raise ConfigError(f"{path}: it belongs to another user; it must belong to this one or root")
+    _check_folder(path.parent)
     return text
+
+
+def _check_folder(folder: Path) -> None:
+    """Raise `ConfigError` if other users may put keys into a folder."""
+    if problem := find_folder_problem(folder):
+        raise ConfigError(problem)
 
 
 def _make_key(folder: Path) -> str:

@@ -4,20 +4,26 @@ A request from the network needs a paired device; an emergency stop is open to e
 """
 
 import logging
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from aiohttp import web
 from msgspec import Meta, Struct
 
 from fishd import __version__
 from fishd.window.answers import ApiError, NoArguments, read_body, success
-from fishd.window.devices import Device, Devices, Scope
-from fishd.window.web_server import host_name, parse_ip
+from fishd.window.devices import DEVICE_S, Device, Scope
+from fishd.window.paired_devices import PairedDevices
+from fishd.window.places import is_loopback as is_loopback_address
+from fishd.window.web_server import check_body, host_name
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 COOKIE = "fishd_window"
-COOKIE_S = 365 * 86400
+MAX_PAIRING_BYTES = 512
+"""Largest size of a request of a device that may not be paired [bytes]."""
+PAIRING_TIMEOUT_S = 1.0
+"""Longest time until the body of such a request has come [s]."""
 FORWARDED = ("Forwarded", "X-Forwarded-For", "X-Forwarded-Host", "X-Real-IP", "Via")
 """Headers by which a reverse proxy shows that the browser is elsewhere."""
 
@@ -62,7 +68,7 @@ class Pairing(Struct, forbid_unknown_fields=True):
 class AccessControl:
     """The permissions of each request, and the requests that pair a device."""
 
-    def __init__(self, devices: Devices, pair_all: bool) -> None:
+    def __init__(self, devices: PairedDevices, pair_all: bool) -> None:
         """pair_all: whether browsers on this machine need pairing, too"""
         self._devices, self._pair_all = devices, pair_all
         self.routes = [
@@ -110,18 +116,26 @@ class AccessControl:
             )
         return access
 
+    def is_paired(self, request: web.Request) -> bool:
+        """Return whether a request is from a paired device."""
+        return self._devices.find(request.cookies.get(COOKIE)) is not None
+
+    def refresh(self) -> None:
+        """Read the paired devices soon if they have changed."""
+        self._devices.refresh()
+
     async def _get_session(self, request: web.Request) -> web.Response:
         return success(self.find(request).describe())
 
     async def _pair(self, request: web.Request) -> web.Response:
-        pairing = await read_body(request, Pairing)
-        device, secret = self._devices.pair(pairing.token, pairing.name)
+        pairing = await _read_small_body(request, Pairing)
+        device, secret = await self._devices.pair(pairing.token, pairing.name)
         log.info("%s is paired, to %s", device.name, device.scope)
         response = success(Access(device.scope, device, False).describe())
         response.set_cookie(
             COOKIE,
             secret,
-            max_age=COOKIE_S,
+            max_age=int(DEVICE_S),
             path="/",
             httponly=True,
             samesite="Strict",
@@ -130,9 +144,9 @@ class AccessControl:
         return response
 
     async def _unpair(self, request: web.Request) -> web.Response:
-        await read_body(request, NoArguments)
+        await _read_small_body(request, NoArguments)
         if device := self._devices.find(request.cookies.get(COOKIE)):
-            self._devices.revoke(device.id)
+            await self._devices.revoke(device.id)
         response = success(None)
         response.del_cookie(COOKIE, path="/", httponly=True, samesite="Strict")
         return response
@@ -143,10 +157,11 @@ def is_loopback(request: web.Request) -> bool:
     name = host_name(request.host)
     if any(header in request.headers for header in FORWARDED):
         return False
-    return _is_loopback(request.remote or "") and (name == "localhost" or _is_loopback(name))
+    is_name_local = name == "localhost" or is_loopback_address(name)
+    return is_name_local and is_loopback_address(request.remote or "")
 
 
-def _is_loopback(name: str) -> bool:
-    address = parse_ip(name)
-    mapped = getattr(address, "ipv4_mapped", None)
-    return address is not None and (mapped or address).is_loopback
+async def _read_small_body(request: web.Request, kind: type[T]) -> T:
+    """Return the body of a request that needs no pairing; raise `ApiError`."""
+    check_body(request, MAX_PAIRING_BYTES)
+    return await read_body(request, kind, PAIRING_TIMEOUT_S)

@@ -14,7 +14,7 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, NoDaemon, ParameterError, Refused
 from fishd.window import web_server
 from fishd.window.children import JobError
-from fishd.window.devices import DeviceError
+from fishd.window.devices import DeviceError, DevicesBusy
 from fishd.window.fish_link import Busy
 from fishd.window.live import encode
 
@@ -36,12 +36,14 @@ class NoArguments(Struct, forbid_unknown_fields=True):
     """Body of a request without arguments."""
 
 
-async def read_body(request: web.Request, kind: type[T]) -> T:
-    """Return the body of a request; raise `ApiError`."""
+async def read_body(
+    request: web.Request, kind: type[T], seconds: float = web_server.REQUEST_TIMEOUT_S
+) -> T:
+    """Return the body of a request, which must come within this time [s]; raise `ApiError`."""
     if request.content_type != "application/json":
         raise ApiError(415, "bad-request", "Content-Type: application/json is needed")
     try:
-        async with asyncio.timeout(web_server.REQUEST_TIMEOUT_S):
+        async with asyncio.timeout(seconds):
             body = await request.read()
     except TimeoutError:
         raise ApiError(408, "bad-request", "the body of the request has not come") from None
@@ -82,6 +84,8 @@ async def answer_in_json(request: web.Request, handler: Handler) -> web.StreamRe
         refusal = _refusal(error)
     except ConnectionError:  # the page has gone
         raise
+    except OSError as error:
+        refusal = ApiError(503, "system", text.describe_error(error))
     except Exception as error:
         log.error("%s failed: %s", request.path, text.describe_error(error), exc_info=True)
         refusal = ApiError(500, "internal", f"a mistake in fishd: {text.describe_error(error)}")
@@ -106,7 +110,7 @@ def _refusal(error: FishdError) -> ApiError:
         return ApiError(409, text.quoted(error.code), message)
     if isinstance(error, NoDaemon):
         return ApiError(503, "no-daemon", message)
-    if isinstance(error, Busy):
+    if isinstance(error, Busy | DevicesBusy):
         return ApiError(503, "busy", message)
     if isinstance(error, JobError):
         return ApiError(409, "job", message)

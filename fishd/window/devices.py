@@ -8,11 +8,12 @@ import fcntl
 import hashlib
 import os
 import secrets
+import stat
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 import msgspec
 from msgspec import Struct
@@ -21,22 +22,31 @@ from msgspec.structs import replace
 from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
+from fishd.window.expiry import SteadyClock, boot_id, boot_time
 
 Scope = Literal["watch", "drive"]
-T = TypeVar("T")
-
 INVITATION_S = 600.0
 """Time within which a token pairs a device [s]."""
+DEVICE_S = 365 * 86400.0
+"""Time for which a device stays paired [s]."""
+DROP_RETRY_S = 60.0
+"""Time between two attempts to remove what has expired from the file [s]."""
 MAX_INVITATIONS = 20
 MAX_DEVICES = 200
 MAX_NAME_CHARACTERS = 40
 MAX_FILE_BYTES = 2**20
-SEEN_PERIOD_S = 3600.0
-"""Shortest time between two updates of the time at which a device was seen [s]."""
+LOCK_TIMEOUT_S = 2.0
+"""Longest wait for another process that changes the file [s]."""
+LOCK_PERIOD_S = 0.05
+"""Time between two attempts to lock the file [s]."""
 
 
 class DeviceError(FishdError):
     """A device cannot be paired or revoked."""
+
+
+class DevicesBusy(DeviceError):
+    """The file of the devices cannot be changed now, maybe later."""
 
 
 class Device(Struct, frozen=True):
@@ -60,7 +70,14 @@ class Invitation(Struct, frozen=True):
     """SHA-256 of the token, in hexadecimal."""
     scope: Scope
     until: float
-    """Time at which it expires [s, unix]."""
+    """Time at which it expires, since the start of the machine [s]."""
+    boot: str = ""
+    """Name of that run of the machine, with which it expires, too."""
+
+    @property
+    def is_valid(self) -> bool:
+        """Whether it pairs a device."""
+        return self.boot == boot_id() and boot_time() < self.until
 
 
 class _Content(Struct, frozen=True):
@@ -74,36 +91,54 @@ _decode: Callable[[bytes], _Content] = decoder(_Content)
 
 
 class Devices:
-    """The paired devices in the state folder; it follows changes that other processes make."""
+    """The paired devices in the state folder; it follows changes that other processes make.
+
+    Each method reads the disk, and raises `DeviceError` if that is damaged or does not answer.
+    """
 
     def __init__(self, folder: Path) -> None:
         """folder: is created if missing; raises `DeviceError`"""
         self._folder, self._path = folder, folder / "devices.json"
+        self._copy = folder / "devices.copy.json"
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError as error:
             raise DeviceError(
                 f"{folder} cannot be created: {error.strerror}; set state in the settings"
             ) from None
+        mode = stat.S_IMODE(folder.stat().st_mode)
+        if mode & 0o022:
+            raise DeviceError(
+                f"{folder}: other users may change it (mode {mode:o}), and so pair devices; run "
+                f"'chmod go-w {folder}'"
+            )
         self._content, self._version = _Content(), (0, 0, 0)
-        self._read()
+        self._clock: SteadyClock | None = None
+        self._next_drop = 0.0
+
+    def now(self) -> float:
+        """Return the time by which devices expire [s, unix]."""
+        if self._clock is None:
+            seen = (device.seen for device in self._content.devices)
+            self._clock = SteadyClock(max(seen, default=0.0))
+        return self._clock.now()
 
     def invite(self, scope: Scope, seconds: float = INVITATION_S) -> str:
         """Return a new token that pairs one device within this time."""
         token = secrets.token_urlsafe(16)
-        invitation = Invitation(_hash(token), scope, time.time() + seconds)
+        invitation = Invitation(hash_token(token), scope, boot_time() + seconds, boot_id())
         with self._changing() as content:
-            valid = [entry for entry in content.invitations if entry.until > time.time()]
+            valid = [entry for entry in content.invitations if entry.is_valid]
             kept = (*valid[1 - MAX_INVITATIONS :], invitation)
             self._write(replace(content, invitations=kept))
         return token
 
     def pair(self, token: str, name: str) -> tuple[Device, str]:
         """Use up a token; return the new device, and the token for its cookie."""
-        digest, secret = _hash(token), secrets.token_urlsafe(32)
+        digest, secret = hash_token(token), secrets.token_urlsafe(32)
         with self._changing() as content:
             match = next((entry for entry in content.invitations if entry.token == digest), None)
-            if match is None or match.until < time.time():
+            if match is None or not match.is_valid:
                 raise DeviceError(
                     "this link was used already, or has expired: run 'fishctl window pair' again"
                 )
@@ -112,90 +147,130 @@ class Devices:
                     f"{MAX_DEVICES} devices are paired: revoke some with 'fishctl window revoke'"
                 )
             taken = {device.name for device in content.devices}
-            now = time.time()
+            now = self.now()
             wanted = text.line(name, MAX_NAME_CHARACTERS) or "device"
             device = Device(
                 id=secrets.token_hex(4),
                 name=_unused_name(wanted, taken),
                 scope=match.scope,
-                token=_hash(secret),
-                paired=now,
+                token=hash_token(secret),
+                paired=max(now, time.time()),  # which may have been set since
                 seen=now,
             )
             others = tuple(entry for entry in content.invitations if entry is not match)
             self._write(_Content((*content.devices, device), others))
         return device, secret
 
-    def find(self, secret: str | None) -> Device | None:
-        """Return the device with this token in its cookie."""
-        if not secret or len(secret) > 200:
-            return None
-        digest = _hash(secret)
-        device = next((entry for entry in self.all() if entry.token == digest), None)
-        if device and time.time() - device.seen > SEEN_PERIOD_S:
-            self._replace(device, replace(device, seen=time.time()))
-        return device
-
     def all(self) -> tuple[Device, ...]:
-        """Return all devices."""
+        """Return all devices whose access has not expired; remove from the file what has."""
+        self.list_stored()
+        valid = self._keep_valid(self._content)
+        if valid != self._content and time.monotonic() >= self._next_drop:
+            self._next_drop = time.monotonic() + DROP_RETRY_S
+            with suppress(DeviceError, OSError), self._changing(timeout=0.0) as content:
+                self._write(self._keep_valid(content))
+                self._next_drop = 0.0
+        return valid.devices
+
+    def is_paired(self, device: Device) -> bool:
+        """Return whether the access of a device has not expired; reads no disk."""
+        return self.now() - device.paired < DEVICE_S
+
+    def _keep_valid(self, content: _Content) -> _Content:
+        """Return the content without what has expired."""
+        return _Content(
+            tuple(device for device in content.devices if self.is_paired(device)),
+            tuple(entry for entry in content.invitations if entry.is_valid),
+        )
+
+    def list_stored(self) -> tuple[Device, ...]:
+        """Return the devices in the file.
+
+        A command that runs while the wall clock is wrong must not decide what has expired.
+        """
         if self._version_now() != self._version:
             self._read()
         return self._content.devices
 
-    def get(self, identity: str) -> Device:
-        """Return the device with this id; raise `DeviceError` if there is none."""
-        for device in self.all():
-            if device.id == identity:
-                return device
-        raise DeviceError("this device is no longer paired")
+    def read_copy(self) -> tuple[Device, ...]:
+        """Return the devices in the copy of the file; none if it cannot be read, either."""
+        try:
+            return self._decode_file(self._copy).devices
+        except DeviceError:
+            return ()
+
+    def note_seen(self, times: Mapping[str, float]) -> None:
+        """Store when devices were seen [s, unix], by their ids; raise `DevicesBusy`."""
+        with self._changing(timeout=0.0) as content:
+            devices = (replace(d, seen=times.get(d.id, d.seen)) for d in content.devices)
+            self._write(replace(content, devices=tuple(devices)))
 
     def revoke(self, name: str) -> Device:
         """Remove the device with this name or id; raise `DeviceError` if there is none."""
-        match = next((entry for entry in self.all() if name in (entry.name, entry.id)), None)
+        stored = self.list_stored()
+        match = next((entry for entry in stored if name in (entry.name, entry.id)), None)
         if match is None:
-            known = ", ".join(entry.name for entry in self.all()) or "there is none"
+            known = ", ".join(entry.name for entry in stored) or "there is none"
             raise DeviceError(f"no device is named '{text.quoted(name)}'; paired: {known}")
-        self._replace(match, None)
+        with self._changing() as content:
+            others = tuple(entry for entry in content.devices if entry.id != match.id)
+            self._write(replace(content, devices=others))
         return match
 
-    def _replace(self, device: Device, successor: Device | None) -> None:
-        with self._changing() as content:
-            devices = (successor if entry.id == device.id else entry for entry in content.devices)
-            self._write(replace(content, devices=tuple(entry for entry in devices if entry)))
-
     @contextmanager
-    def _changing(self) -> Iterator[_Content]:
-        """Yield the newest content, while no other process changes it."""
+    def _changing(self, timeout: float = LOCK_TIMEOUT_S) -> Iterator[_Content]:
+        """Yield the newest content, while no other process changes it; raise `DevicesBusy`.
+
+        timeout: longest wait for another process [s]
+        """
+        deadline = time.monotonic() + timeout
         descriptor = os.open(self._folder / "lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             _give_to_owner(self._folder, descriptor)
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            while not _try_to_lock(descriptor):
+                if time.monotonic() >= deadline:
+                    raise DevicesBusy(f"{self._folder}/lock is held by another process; end that")
+                time.sleep(LOCK_PERIOD_S)
             self._read()
             yield self._content
         finally:
             os.close(descriptor)
 
     def _write(self, content: _Content) -> None:
-        new = self._path.with_suffix(".new")
+        """Write the file, and a copy by which the devices are known where the file is damaged."""
+        payload = msgspec.json.format(msgspec.json.encode(content))
+        self._write_file(self._path, payload)
+        self._content, self._version = content, self._version_now()
+        with suppress(OSError):
+            self._write_file(self._copy, payload)
+
+    def _write_file(self, path: Path, payload: bytes) -> None:
+        new = path.with_suffix(".new")
         new.unlink(missing_ok=True)
         descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         with os.fdopen(descriptor, "wb") as file:
-            file.write(msgspec.json.format(msgspec.json.encode(content)))
+            file.write(payload)
             file.flush()
             os.fsync(descriptor)
             _give_to_owner(self._folder, descriptor)
-        new.replace(self._path)
-        self._content, self._version = content, self._version_now()
+        new.replace(path)
 
     def _read(self) -> None:
-        self._version = self._version_now()
+        version = self._version_now()
+        self._content = self._decode_file(self._path)
+        self._version = version
+
+    def _decode_file(self, path: Path) -> _Content:
         try:
-            self._content = _decode(files.read(self._path, MAX_FILE_BYTES, "the paired devices"))
+            return _decode(files.read(path, MAX_FILE_BYTES, "the paired devices"))
         except files.NoFile:
-            self._content = _Content()
+            if self._content.devices and not (self._folder / "lock").exists():
+                raise DeviceError(f"{path} is gone with its folder; restore that") from None
+            return _Content()
         except (files.FileProblem, msgspec.DecodeError) as error:
             raise DeviceError(
-                f"{self._path}: {text.error_message(error)}; remove it, and pair the devices again"
+                f"{path}: {text.error_message(error)}; replace it by {self._copy.name}, which is a "
+                "copy of it, or remove it and pair the devices again"
             ) from None
 
     def _version_now(self) -> tuple[int, int, int]:
@@ -205,6 +280,14 @@ class Devices:
         except FileNotFoundError:
             return 0, 0, 0
         return status.st_ino, status.st_mtime_ns, status.st_size
+
+
+def _try_to_lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _give_to_owner(folder: Path, descriptor: int) -> None:
@@ -221,5 +304,6 @@ def _unused_name(name: str, taken: set[str]) -> str:
     return name
 
 
-def _hash(token: str) -> str:
+def hash_token(token: str) -> str:
+    """Return the SHA-256 of a token, in hexadecimal."""
     return hashlib.sha256(token.encode("utf-8", "replace")).hexdigest()

@@ -1,30 +1,26 @@
-"""Link to one fish: its telemetry, the state of the connection, and requests.
-
-An emergency stop has its own threads and connections, so that it waits for nothing else.
-"""
+"""Link to one fish: its telemetry, the state of the connection, and requests."""
 
 import asyncio
 import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import AsyncExitStack, closing, suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import zmq.asyncio
 from msgspec import UNSET, Struct
 
-from fishd.client import AsyncFish, Fish
+from fishd.client import AsyncFish
+from fishd.client.lease import LeaseRenewal
 from fishd.client.zmq_sockets import Subscription, connect_subscriber
 from fishd.core import text
 from fishd.core.addresses import find_control_address
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishError, LeaseLost, NoDaemon
-from fishd.core.process.safe_path import python_command
-from fishd.core.protocol import State
+from fishd.core.errors import FishError, LeaseLost
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
+from fishd.window.estop_path import EstopPath
 
 log = logging.getLogger(__name__)
 
@@ -43,12 +39,6 @@ BATCH_PERIOD_S = 0.05
 """Shortest time between two messages with ticks [s]."""
 MAX_WAITING_REQUESTS = 8
 """Number of requests above which a further one is refused."""
-ESTOP_THREADS = 4
-ESTOP_TIMEOUT_S = 0.5
-"""Time to wait for the answer to an emergency stop, before the last resort [s]."""
-LAST_RESORT_TIMEOUT_S = 10.0
-"""Time to wait for the end of the last resort [s]."""
-
 _decode_tick: Callable[[bytes], Tick] = decoder(Tick)
 _decode_event: Callable[[bytes], Event] = decoder(Event)
 _decode_status: Callable[[bytes], Status] = decoder(Status)
@@ -65,6 +55,8 @@ class Connection(Struct, frozen=True):
     age: float
     """Time since the last tick [s]."""
     message: str
+    warning: str
+    """Why an emergency stop may not reach the fish; empty if its way answers."""
 
 
 class Busy(FishError):
@@ -99,7 +91,7 @@ class FishLink:
         self._fish = AsyncFish(endpoint)
         self._stopper = AsyncFish(endpoint)
         self._monitor = AsyncFish(endpoint, timeout=PROBE_TIMEOUT_S)
-        self._estops = ThreadPoolExecutor(ESTOP_THREADS, thread_name_prefix=f"estop {name}")
+        self.estop_path = EstopPath(name, endpoint)
         self._context = zmq.asyncio.Context()
         self._batch: list[bytes] = []
         self._flush: asyncio.TimerHandle | None = None
@@ -109,7 +101,7 @@ class FishLink:
         self._state, self._message = "lost", "connecting"
         self._waiting = 0
         self._taking = asyncio.Lock()
-        self._lease: AsyncExitStack | None = None
+        self._lease: _HeldLease | None = None
 
     async def close(self) -> None:
         """Return the fish, and disconnect."""
@@ -117,13 +109,13 @@ class FishLink:
         for fish in (self._fish, self._stopper, self._monitor):
             fish.close()
         self._context.destroy(linger=0)
-        self._estops.shutdown(wait=False, cancel_futures=True)
+        self.estop_path.close()
 
     @property
     def connection(self) -> Connection:
         """State of the connection."""
         age = time.monotonic() - (self._last_tick or self._started)
-        return Connection(self._state, round(age, 2), self._message)
+        return Connection(self._state, round(age, 2), self._message, self.estop_path.warning)
 
     @property
     def endpoint_options(self) -> list[str]:
@@ -139,6 +131,9 @@ class FishLink:
 
     async def run(self) -> None:
         """Follow the fish, also after it restarts, until this task is cancelled."""
+        await asyncio.gather(self.estop_path.watch(), self._follow_on())
+
+    async def _follow_on(self) -> None:
         while True:
             try:
                 await self._follow()
@@ -268,12 +263,9 @@ class FishLink:
         self._state, self._message = state, text.line(message)
         self._tell("connection", _RAW(self.connection))
 
-    def columns(self, since: int = 0) -> dict[str, Any]:
-        """Return the history as columns by field; those of the quantities are in a mapping.
-
-        since: number of the last tick that is not returned
-        """
-        ticks = [_decode_tick(payload) for seq, payload in self._ticks if seq > since]
+    def _columns(self) -> dict[str, Any]:
+        """Return the history as columns by field; those of the quantities are in a mapping."""
+        ticks = [_decode_tick(payload) for _, payload in self._ticks]
         columns: dict[str, Any] = {}
         for name in Tick.__struct_fields__:
             column = [getattr(tick, name) for tick in ticks]
@@ -284,61 +276,32 @@ class FishLink:
         return columns
 
     def history(self) -> tuple[bytes, bytes]:
-        """Return the columns as JSON, shared by pages that open within a second, and later ticks.
+        """Return the columns as JSON, shared by all who ask within a second, and later ticks.
 
-        A page that opens again and again must not take the processor from an emergency stop.
+        Many who ask must not take the processor from an emergency stop.
         """
         encoded, last, payload = self._history
         if time.monotonic() - encoded > HISTORY_AGE_S:
-            payload, last = _RAW(self.columns()), self._seq
+            payload, last = _RAW(self._columns()), self._seq
             self._history = time.monotonic(), last, payload
         later = b",".join(payload for seq, payload in self._ticks if seq > last)
         return payload, b"[%s]" % later
 
     # Requests
 
-    async def estop(self, message: str) -> dict[str, Any]:
-        """Stop the pulses; raise `FishError` if neither fishd nor the last resort does so."""
-
-        def stop() -> tuple[State, str]:
-            with Fish(self.endpoint, timeout=ESTOP_TIMEOUT_S) as fish:
-                return fish.estop(message), fish.estop_taken_by
-
-        start = time.monotonic()
-        loop = asyncio.get_running_loop()
-        try:
-            state, way = await loop.run_in_executor(self._estops, stop)
-        except NoDaemon as error:
-            way, outcome = "last resort", await self._stop_without_daemon(error)
-        else:
-            outcome = f"mode {state.mode}"
-        milliseconds = round((time.monotonic() - start) * 1e3, 1)
-        return {"server_ms": milliseconds, "way": way, "outcome": outcome}
-
-    async def _stop_without_daemon(self, why: NoDaemon) -> str:
-        """Run `fishctl estop`, which can end the pulses without fishd; return what it did."""
-        command = fishctl_command(*self.endpoint_options, "estop", "--json")
-        process = await asyncio.create_subprocess_exec(
-            *command, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
-        )
-        try:
-            async with asyncio.timeout(LAST_RESORT_TIMEOUT_S):
-                output, errors = await process.communicate()
-        except TimeoutError:
-            process.kill()
-            raise why from None
-        if process.returncode:
-            raise FishError(text.line(errors.decode("utf-8", "replace"))) from why
-        answer = msgspec.json.decode(output)
-        return str(answer.get("pulses", answer.get("mode", "")))
-
     async def request(
-        self, op: str, arguments: dict[str, Any], holder: str, take: bool
+        self,
+        op: str,
+        arguments: dict[str, Any],
+        holder: str,
+        take: bool,
+        check: Callable[[], None],
     ) -> dict[str, Any]:
         """Carry out a request, and return its result; raise `FishdError`.
 
         holder: name of the lease under which the fish swims
         take: whether to take the fish from an experiment
+        check: raises `FishdError` if the sender no longer drives; a request may have to wait
         """
         if op == "stop":  # must not wait for a controller that loads
             return _builtins(await self._stopper.stop())
@@ -347,20 +310,28 @@ class FishLink:
         self._waiting += 1
         try:
             async with self._taking:
-                return await self._perform(op, arguments, holder, take)
+                return await self._perform(op, arguments, holder, take, check)
         finally:
             self._waiting -= 1
 
     async def _perform(
-        self, op: str, arguments: dict[str, Any], holder: str, take: bool
+        self,
+        op: str,
+        arguments: dict[str, Any],
+        holder: str,
+        take: bool,
+        check: Callable[[], None],
     ) -> dict[str, Any]:
         fish = self._fish
+        check()
         if op == "clear-fault":
             return _builtins(await fish.clear_fault())
         if op == "mark":
             return _builtins(await fish.mark(arguments["text"]))
         for is_last in (False, True):
+            check()
             await self._hold(holder, take)
+            check()
             try:
                 if op == "set-controller":
                     name, parameters = arguments["name"], arguments["parameters"]
@@ -379,27 +350,38 @@ class FishLink:
         if self._lease:
             return
         stack = AsyncExitStack()
-        await stack.enter_async_context(
+        renewal = await stack.enter_async_context(
             self._fish.lease(text.line(holder, 60), take, idle_limit=None)
         )
-        self._lease = stack
+        self._lease = _HeldLease(renewal, stack)
 
-    async def give_back(self) -> None:
-        """End the lease: the fish comes to rest, if it swims under it."""
+    async def give_back(self, is_driven: Callable[[], bool] = lambda: False) -> None:
+        """End the lease: the fish comes to rest, if it swims under it.
+
+        It does so at once, also while a controller is loaded, which then does not start.
+
+        is_driven: returns whether another page has begun to drive, which then keeps the lease
+        """
+        if self._lease and self._taking.locked():
+            with suppress(FishError):
+                await self._stopper.end_lease(self._lease.renewal.token)
         async with self._taking:
-            await self._drop_lease()
+            if not is_driven():
+                await self._drop_lease()
 
     async def _drop_lease(self) -> None:
-        stack, self._lease = self._lease, None
-        if stack:
+        lease, self._lease = self._lease, None
+        if lease:
             with suppress(FishError):
-                await stack.aclose()
+                await lease.stack.aclose()
 
 
-def fishctl_command(*arguments: str) -> list[str]:
-    """Return the command that runs fishctl with the Python of this process."""
-    code = "from fishd.__main__ import fishctl; fishctl()"
-    return python_command("-c", code, *arguments)
+class _HeldLease(NamedTuple):
+    """Lease of the fish."""
+
+    renewal: LeaseRenewal
+    stack: AsyncExitStack
+    """Ends the lease when it is closed."""
 
 
 def _builtins(result: Struct) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from msgspec import Struct
 from fishd.core.decoding import decoder
 from fishd.core.schema import json_schema, schema_name
 from fishd.core.signals import Event, Status, Tick
-from fishd.window.web_server import Viewer
+from fishd.window.viewer import Viewer
 
 PROTOCOL = "foxglove.sdk.v1"
 CHANNELS: dict[str, type[Struct]] = {"tick": Tick, "event": Event, "status": Status}

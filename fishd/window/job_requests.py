@@ -53,7 +53,8 @@ class JobRequests:
         if body.kind in DRIVING_KINDS:
             self._pages.require_driver(link.name, page)
             await link.give_back()  # the experiment takes the fish itself
-        job = self._jobs.start(body.kind, link.name, link.endpoint_options, options)
+        endpoint, device = link.endpoint_options, access.device_id
+        job = self._jobs.start(body.kind, link.name, endpoint, options, device)
         self._pages.tell_job(job)
         return success(job)
 

@@ -5,12 +5,10 @@ window that was killed is among the jobs of its successor.
 """
 
 import asyncio
-import csv
 import shutil
 import signal
-import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Set
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -22,9 +20,11 @@ from msgspec import Struct
 from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
-from fishd.window.children import JobError, call, spawn
+from fishd.window.children import JobError, spawn
+from fishd.window.curves import read_curve
 from fishd.window.job_options import DRIVING_KINDS, ResumeOptions, list_words
 from fishd.window.runs import Runs
+from fishd.window.scratch import Scratch
 
 MAX_RUNNING_JOBS = 4
 MAX_REMEMBERED_JOBS = 20
@@ -34,8 +34,6 @@ STOP_TIMEOUT_S = 5.0
 """Time from SIGINT to SIGTERM, and from that to SIGKILL [s]."""
 TELL_DELAY_S = 0.2
 """Time for which lines of a job are gathered before pages get them [s]."""
-_CURVE = ("time", "fx", "fy", "phi_c", "alpha", "thrust")
-"""Columns of a simulated run that a page draws."""
 _RESUMABLE = ("measure", "sweep", "compare")
 """Kinds of experiments that a page resumes."""
 _FOLDER_KINDS = ("record", "rerun")
@@ -88,11 +86,13 @@ class Jobs:
         """Start of each job that runs [s, monotonic]."""
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._tasks: dict[str, asyncio.Task[None]] = {}
+        self._owners: dict[str, str] = {}
+        """Identifier of the device that started each job that runs."""
         self._stopping: set[str] = set()
         self._pending: set[str] = set()
         self._count = 0
-        self._cache = tempfile.TemporaryDirectory(prefix="fishd-window-")
-        self.runs = Runs(runs, Path(self._cache.name))
+        self._scratch = Scratch("fishd-window-")
+        self.runs = Runs(runs, self._scratch)
         self._folder = runs
 
     async def close(self) -> None:
@@ -101,7 +101,7 @@ class Jobs:
             self.stop(name)
         if self._tasks:
             await asyncio.wait(self._tasks.values())
-        self._cache.cleanup()
+        self._scratch.close()
 
     def all(self) -> list[Job]:
         """Return all jobs, the oldest first."""
@@ -155,10 +155,13 @@ class Jobs:
         self._count += 1
         return str(self._count)
 
-    def start(self, kind: str, fish: str, endpoint: Iterable[str], options: Any) -> Job:
+    def start(
+        self, kind: str, fish: str, endpoint: Iterable[str], options: Any, device: str
+    ) -> Job:
         """Start a job; raise `JobError`.
 
         fish: name of the fish; endpoint: options of fishctl for it
+        device: identifier of the device that starts it
         """
         if len(self._tasks) >= MAX_RUNNING_JOBS:
             raise JobError(f"{MAX_RUNNING_JOBS} jobs run already; wait for the end of one")
@@ -181,6 +184,7 @@ class Jobs:
         shown = [f"--folder={self._folder}"] if self._show_folder and kind in _FOLDER_KINDS else []
         name = self._new_id()
         job = Job(name, kind, fish, ["fishctl", *words, *shown], "running", 0.0, run)
+        words += self._list_hidden_words(job, is_resumed=isinstance(options, ResumeOptions))
         self._jobs[name], self._starts[name] = job, time.monotonic()
         while len(self._jobs) > MAX_REMEMBERED_JOBS:
             ended = next((j.id for j in self._jobs.values() if j.state != "running"), None)
@@ -188,7 +192,7 @@ class Jobs:
                 break
             del self._jobs[ended]
         self._keep_running()
-        words += self._list_hidden_words(job, is_resumed=isinstance(options, ResumeOptions))
+        self._owners[name] = device
         self._tasks[name] = asyncio.create_task(self._run(job, words))
         return job
 
@@ -212,9 +216,13 @@ class Jobs:
         if job.kind in _FOLDER_KINDS:
             return [f"--folder={self._folder}", "--json"]
         if job.kind == "simulate":
-            return [f"--record={self._cache.name}/simulate-{job.id}.mcap", "--json"]
+            return [f"--record={self._recording_of(job)}", "--json"]
         place = [] if is_resumed else ["--on=live", f"--folder={self._folder / job.run}"]
-        return [*place, f"--plot={self._cache.name}/{job.id}.png", "--json"]
+        return [*place, f"--plot={self._scratch.folder}/{job.id}.png", "--json"]
+
+    def _recording_of(self, job: Job) -> Path:
+        """Return the path of the recording of a simulated fish."""
+        return self._scratch.folder / f"simulate-{job.id}.mcap"
 
     def _keep_running(self) -> None:
         self._keep([job for job in self._jobs.values() if job.state == "running"])
@@ -232,6 +240,13 @@ class Jobs:
             loop.call_later(2.0 * STOP_TIMEOUT_S, self._signal, name, signal.SIGKILL)
         return job
 
+    def stop_without_access(self, paired: Set[str]) -> None:
+        """Stop the jobs of devices that are not among the paired ones, by their identifiers."""
+        for name, device in self._owners.items():
+            if device not in paired and name not in self._stopping:
+                self._jobs[name].lines.append("stopped: the device that started it was revoked")
+                self.stop(name)
+
     def _signal(self, name: str, number: signal.Signals) -> None:
         if process := self._processes.get(name):
             with suppress(ProcessLookupError):
@@ -243,7 +258,8 @@ class Jobs:
             with suppress(msgspec.DecodeError):
                 job.result = msgspec.json.decode(output)
             if job.kind == "simulate" and job.exit == 0:
-                job.result = {**job.result, "curve": await self._read_curve(job.id)}
+                curve = await read_curve(self._recording_of(job), self._folder, self._scratch)
+                job.result = {**job.result, "curve": curve}
             self._keep_picture(job)
             stopped = job.id in self._stopping
             job.state = "stopped" if stopped else "done" if job.exit == 0 else "failed"
@@ -255,6 +271,7 @@ class Jobs:
             self._with_elapsed_time(job)
             self._starts.pop(job.id, None)
             self._tasks.pop(job.id, None)
+            self._owners.pop(job.id, None)
             self._stopping.discard(job.id)
             self.runs.forget()
             self._keep_running()
@@ -262,13 +279,16 @@ class Jobs:
 
     def _keep_picture(self, job: Job) -> None:
         """Move the picture of an experiment into its folder."""
-        picture, folder = Path(self._cache.name, f"{job.id}.png"), self._folder / job.run
-        if job.run and picture.exists() and folder.is_dir():
+        if not job.run:
+            return
+        picture, folder = self._scratch.folder / f"{job.id}.png", self._folder / job.run
+        if picture.exists() and folder.is_dir():
             shutil.move(picture, folder / f"{job.kind}.png")
 
     async def _run_child(self, job: Job, words: list[str]) -> bytes:
         """Run fishctl; return its output."""
-        process = self._processes[job.id] = await spawn(words, self._folder)
+        process = await spawn(words, self._folder, self._scratch.descriptor)
+        self._processes[job.id] = process
         if job.id in self._stopping:
             self._signal(job.id, signal.SIGINT)
         assert process.stdout
@@ -301,18 +321,6 @@ class Jobs:
             self._pending.add(job.id)
             asyncio.get_running_loop().call_later(TELL_DELAY_S, tell)
 
-    async def _read_curve(self, name: str) -> dict[str, list[float | None]]:
-        """Return columns of a simulated run."""
-        run, folder = Path(self._cache.name, f"simulate-{name}.mcap"), Path(self._cache.name, name)
-        folder.mkdir()
-        words = ["export", str(run), "--csv", f"--to={folder}", "--force"]
-        await call(words, self._folder)
-        try:
-            return await asyncio.to_thread(_read_columns, next(folder.glob("*[!s].csv")))
-        finally:
-            run.unlink(missing_ok=True)
-            shutil.rmtree(folder)
-
 
 async def _read_all(stream: asyncio.StreamReader) -> bytes:
     """Return the output of a process, up to `MAX_OUTPUT_BYTES`."""
@@ -322,14 +330,3 @@ async def _read_all(stream: asyncio.StreamReader) -> bytes:
             parts.append(chunk)
         size += len(chunk)
     return b"".join(parts)
-
-
-def _read_columns(path: Path) -> dict[str, list[float | None]]:
-    columns: dict[str, list[float | None]] = {}
-    with path.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            for name in _CURVE:
-                if name in row:
-                    value = row[name]
-                    columns.setdefault(name, []).append(float(value) if value else None)
-    return columns

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import msgspec
 from aiohttp import WSMsgType
 
-from fishd.window.web_server import Viewer
+from fishd.window.viewer import Viewer
 
 MAX_TICK_MESSAGES = 40
 """Number of messages with ticks that wait for a slow page; it misses the older ones."""

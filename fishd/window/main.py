@@ -21,8 +21,8 @@ from fishd.window.settings import DEFAULT_LISTEN, WindowSettings, load
 
 log = logging.getLogger(__name__)
 NAME = "fishd-window"
-NOTIFY_PERIOD_S = 1.0
-"""Longest time between two notifications of systemd [s]."""
+NOTIFY_PERIOD_S = 0.2
+"""Time between two looks for a signal, with a notification of systemd [s]."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -115,7 +115,7 @@ def serve(
             when_up(server.url)
             while not stopping.is_set():
                 notifier.ticked(time.monotonic())
-                await asyncio.to_thread(stopping.wait, NOTIFY_PERIOD_S)
+                await asyncio.sleep(NOTIFY_PERIOD_S)  # a thread may have to wait for a disk
             notifier.stopping()
 
     return run_service(NAME, log_format, lambda stopping: asyncio.run(run_window(stopping)))

@@ -4,7 +4,7 @@ import asyncio
 import logging
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager
 from typing import Any
 
@@ -12,7 +12,6 @@ import msgspec
 from aiohttp import web
 
 from fishd.core import text
-from fishd.core.errors import FishdError
 from fishd.window.access import Access, AccessControl
 from fishd.window.answers import ApiError
 from fishd.window.devices import DeviceError
@@ -20,7 +19,7 @@ from fishd.window.fish_link import FishLink
 from fishd.window.foxglove import FoxglovePage
 from fishd.window.jobs import Job
 from fishd.window.live import Driver, LivePage, encode, encode_message
-from fishd.window.web_server import Viewer
+from fishd.window.viewer import Viewer
 
 log = logging.getLogger(__name__)
 
@@ -39,19 +38,24 @@ class Pages:
         access: AccessControl,
         list_jobs: Callable[[], list[Job]],
         list_viewers: Callable[[], Iterable[Viewer]],
+        stop_jobs: Callable[[Set[str]], None],
     ) -> None:
         """
         endpoints: control socket of each fish, by its name
         list_jobs, list_viewers: return all jobs, and the open WebSockets of all kinds
+        stop_jobs: ends those of devices without access; gets the identifiers of those with it
         """
         self.links = {
             name: FishLink(name, endpoint, self._teller(name))
             for name, endpoint in endpoints.items()
         }
         self._access, self._list_jobs, self._list_viewers = access, list_jobs, list_viewers
+        self._stop_jobs = stop_jobs
         self._pages: set[LivePage] = set()
         self._session = secrets.token_hex(4)
         self._drivers: dict[str, Driver] = {}
+        self._absent: dict[str, Driver] = {}
+        """Driver of each fish that swims on without its page."""
         self._endings: set[asyncio.Task[None]] = set()
         """Ends of the role of drivers that are gone; fishd may be slow to answer."""
 
@@ -135,7 +139,7 @@ class Pages:
                 for page in pages:
                     try:
                         self._greet(page)
-                    except DeviceError:  # it was revoked, or the file is damaged
+                    except DeviceError:  # it was revoked
                         page.end()
                 return
             message = encode_message(kind, payload)
@@ -182,6 +186,7 @@ class Pages:
 
     def set_driver(self, name: str, driver: Driver | None) -> None:
         """Let a page drive a fish, or none."""
+        self._absent.pop(name, None)
         if driver:
             self._drivers[name] = driver
         else:
@@ -206,35 +211,45 @@ class Pages:
         if self._drivers.get(name) is not driver:
             return
         self.set_driver(name, None)
-        if driver and not driver.keep:
-            await self.links[name].give_back()
+        if driver and driver.keep:
+            self._absent[name] = driver
+        elif driver:
+            await self._return(name)
+
+    async def _return(self, name: str) -> None:
+        """Let a fish come to rest, unless another page drives it by then."""
+        await self.links[name].give_back(is_driven=lambda: name in self._drivers)
 
     async def _watch(self) -> None:
         """Close pages of revoked devices, and end the role of drivers that are gone."""
-        next_connection = 0.0
+        next_connection, warned = 0.0, dict.fromkeys(self.links, False)
         while True:
             await asyncio.sleep(WATCH_PERIOD_S)
             self._endings = {ending for ending in self._endings if not ending.done()}
-            try:
-                self._close_revoked()
-            except FishdError as error:
-                log.error("%s", error)
+            self._access.refresh()
+            self._close_revoked()
             for name, driver in list(self._drivers.items()):
                 if driver.is_gone:
                     log.warning("%s has left while it drove %s", driver.page.device, name)
                     self._endings.add(asyncio.create_task(self.end_driving(name, driver)))
-            if time.monotonic() >= next_connection:
+            is_due = time.monotonic() >= next_connection
+            if is_due:
                 next_connection = time.monotonic() + CONNECTION_PERIOD_S
-                for name, link in self.links.items():
-                    if link.connection.state in ("stale", "lost"):
-                        self._teller(name)("connection", encode(link.connection))
+            for name, link in self.links.items():
+                warns = bool(link.connection.warning)
+                is_bad = warns or link.connection.state in ("stale", "lost")
+                if warns != warned[name] or (is_due and is_bad):
+                    warned[name] = warns
+                    self._teller(name)("connection", encode(link.connection))
 
     def _close_revoked(self) -> None:
         paired = self._access.paired_ids()
         for viewer in self._list_viewers():
             if viewer.device_id not in paired:
                 viewer.end()
-        for name, driver in list(self._drivers.items()):
+        for name, driver in [*self._drivers.items(), *self._absent.items()]:
             if driver.page.device_id not in paired:
-                driver.page.seen = -1e9
                 log.warning("%s drives %s and was revoked", driver.page.device, name)
+                self.set_driver(name, None)
+                self._endings.add(asyncio.create_task(self._return(name)))
+        self._stop_jobs(paired)

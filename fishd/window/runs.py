@@ -1,11 +1,12 @@
 """Runs: the recordings and experiments of a folder, their pictures, and what an end left of one."""
 
 import asyncio
+import os
 import re
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
 from msgspec import Struct
@@ -13,12 +14,14 @@ from msgspec import Struct
 from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.window.children import JobError, call
+from fishd.window.pictures import open_picture, open_run_picture
+from fishd.window.scratch import Scratch
 
 RUNS_AGE_S = 1.0
 """Longest age of a list of runs [s]."""
 MAX_WAITING_PLOTS = 8
 MAX_HEADER_BYTES = 2**20
-_RUN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]*", re.A)
+_RUN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,199}", re.A)
 
 
 class Header(Struct):
@@ -36,9 +39,9 @@ _decode_header: Callable[[bytes], Header] = decoder(Header)
 class Runs:
     """The runs of a folder; use it in one event loop."""
 
-    def __init__(self, folder: Path, cache: Path) -> None:
-        """cache: folder for pictures of recordings"""
-        self.folder, self._cache = folder, cache
+    def __init__(self, folder: Path, scratch: Scratch) -> None:
+        """scratch: place for pictures of recordings"""
+        self.folder, self._scratch = folder, scratch
         self._list: tuple[float, Any] = (-RUNS_AGE_S, [])
         self._listing, self._plotting = asyncio.Lock(), asyncio.Lock()
         self._waiting_plots = 0
@@ -76,30 +79,34 @@ class Runs:
         except msgspec.DecodeError:
             raise JobError(f"the runs in {self.folder} could not be listed") from None
 
-    async def plot(self, name: str) -> bytes:
-        """Return the picture of a recording, or of an experiment; raise `JobError`."""
+    async def plot(self, name: str) -> BinaryIO:
+        """Return the picture of a recording, or of an experiment, open; raise `JobError`."""
         if not _RUN_NAME.fullmatch(name):
             raise JobError(f"'{text.quoted(name)}' is not the name of a run")
-        experiment = self.folder / name
-        if experiment.is_dir():
-            picture = next(experiment.glob("*.png"), None)
-            if picture is None:
-                raise JobError(f"{name} has no picture: one is drawn at the end of an experiment")
-            return await asyncio.to_thread(picture.read_bytes)
+        try:
+            if os.path.lexists(self.folder / name):
+                return await asyncio.to_thread(open_run_picture, self.folder, name)
+            return await self._draw(name)
+        except files.FileProblem as problem:
+            raise JobError(str(problem)) from None
+
+    async def _draw(self, name: str) -> BinaryIO:
+        """Return the picture of a recording, which is drawn if there is none; raise `JobError`."""
         if self._waiting_plots >= MAX_WAITING_PLOTS:
             raise JobError("too many pictures are being drawn; try again later")
         self._waiting_plots += 1
         try:
             async with self._plotting:
-                picture = self._cache / f"{name}.png"
-                stamp = _read_stamp(experiment.with_name(f"{name}.mcap"))
+                cache = self._scratch.folder
+                picture = cache / f"{name}.png"
+                stamp = _read_stamp(self.folder / f"{name}.mcap")
                 if stamp is None or stamp != self._drawn.get(name):
-                    where = (f"--folder={self.folder}", f"--to={self._cache}")
+                    where = (f"--folder={self.folder}", f"--to={cache}")
                     words = ["plot", name, "--png", "--force", *where, "--json"]
-                    await call(words, self.folder)
+                    await call(words, self.folder, self._scratch.descriptor)
                     self._drawn[name] = stamp
-                return await asyncio.to_thread(picture.read_bytes)
-        except FileNotFoundError:
+                return await asyncio.to_thread(open_picture, picture, f"the picture of {name}")
+        except files.NoFile:
             raise JobError(f"{name} could not be drawn") from None
         finally:
             self._waiting_plots -= 1

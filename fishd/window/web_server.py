@@ -8,21 +8,20 @@ the pages show, or send their requests.
 import asyncio
 import gzip
 import hashlib
-import ipaddress
 import logging
 import os
 import socket
-import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator, Mapping, Set
 from importlib.resources.abc import Traversable
-from itertools import islice
 from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlsplit
 
-from aiohttp import WSMsgType, http_exceptions, web
+from aiohttp import http_exceptions, web
 
 from fishd.core.errors import StartupError
+from fishd.window.places import Places, parse_ip
+from fishd.window.viewer import CLOSE_TIMEOUT_S, Viewer
 
 log = logging.getLogger(__name__)
 
@@ -30,20 +29,18 @@ MAX_VIEWERS = 16
 """Largest number of WebSockets that are served at a time."""
 MAX_VIEWERS_PER_ADDRESS = 12
 """Largest number of WebSockets of one address."""
-MAX_CONNECTIONS = 64
-"""Largest number of connections; a further one replaces one that has not sent a request."""
-MAX_ASKING_PER_ADDRESS = 16
-"""Largest number of connections of one address that have not sent a request."""
+REFUSAL_DELAY_S = 1.0
+"""Time until a page that is one too many is refused: it may come again at once [s]."""
 REQUEST_TIMEOUT_S = 3.0
 """Longest time until a connection has sent its request, to the end of the headers [s]."""
-LOG_PERIOD_S = 1.0
-"""Shortest time between two lines in the log about malformed requests [s]."""
 HEARTBEAT_PERIOD_S = 10.0
 """Period of pings to a page, which must answer within half of it [s]."""
-CLOSE_TIMEOUT_S = 0.4
-"""Half of the longest time that open requests may take when the server closes [s]."""
+RECEIVE_BYTES = 16 * 2**10
+"""Size of what a connection may send before it is read [bytes]: little is read at a time."""
 MAX_MESSAGE_BYTES = 1024
 """Largest size of a message from a page [bytes]."""
+ESTOP = "estop"
+"""Name of the route of an emergency stop; its connections are ended last."""
 MIN_COMPRESSED_BYTES = 1024
 """Smallest size of a file that is sent compressed [bytes]."""
 _CONTENT_TYPES = {
@@ -77,6 +74,7 @@ class WebServer:
         names: Iterable[str] = (),
         middlewares: Iterable[Any] = (),
         readers: Mapping[str, Set[str]] | None = None,
+        is_paired: Callable[[web.Request], bool] = lambda request: False,
         max_body_bytes: int = 1024,
         advice: str = "name another port with --port",
     ) -> None:
@@ -85,14 +83,15 @@ class WebServer:
         names: further host names by which this machine is reached
         middlewares: those of aiohttp that get what the guards refuse, too
         readers: origins of other pages that may open a WebSocket, by its path
+        is_paired: returns whether a request is from a paired device
         advice: remedy where the port cannot be taken
         """
         self._host, self._port, self._advice = host, port, advice
         self._readers = readers or {}
         self.viewers: set[Viewer] = set()
         """Open WebSockets."""
-        self._asking: dict[web.RequestHandler, tuple[str, asyncio.TimerHandle]] = {}
-        """Address and timeout of each connection that has not sent a request, oldest first."""
+        self._places = Places()
+        self._is_paired, self._max_body_bytes = is_paired, max_body_bytes
         self._names = {socket.gethostname().lower(), "localhost"}
         self._names |= {f"{name}.local" for name in self._names}
         self._names |= {name.lower() for name in names}
@@ -106,6 +105,7 @@ class WebServer:
         self._runner = web.AppRunner(
             self._app,
             access_log=None,
+            auto_decompress=False,
             handle_signals=False,
             keepalive_timeout=REQUEST_TIMEOUT_S,
             lingering_time=CLOSE_TIMEOUT_S,
@@ -113,9 +113,14 @@ class WebServer:
             shutdown_timeout=CLOSE_TIMEOUT_S,
         )
         await self._runner.setup()
-        loop = asyncio.get_running_loop()
+        server, loop = self._runner.server, asyncio.get_running_loop()
+        assert server
         try:
-            self._server = await loop.create_server(self._connected, self._host, self._port)
+            self._server = await loop.create_server(
+                lambda: self._places.protocol(server), self._host, self._port
+            )
+            for listener in self._server.sockets:  # its connections have the same size
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
         except OSError as error:
             await self._runner.cleanup()
             number = error.errno or 0  # negative for errors of the resolver
@@ -144,12 +149,13 @@ class WebServer:
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/"
 
     async def serve_viewer(
-        self, request: web.Request, viewer: "Viewer", protocols: Iterable[str] = ()
+        self, request: web.Request, viewer: Viewer, protocols: Iterable[str] = ()
     ) -> web.StreamResponse:
         """Serve a WebSocket until the page or the server closes it."""
         viewer.address = request.remote or ""
         own = sum(other.address == viewer.address for other in self.viewers)
         if len(self.viewers) >= MAX_VIEWERS or own >= MAX_VIEWERS_PER_ADDRESS:
+            await asyncio.sleep(REFUSAL_DELAY_S)
             raise web.HTTPServiceUnavailable(
                 text=f"{len(self.viewers)} pages are open already, {own} of them from "
                 f"{viewer.address}; close one of them\n"
@@ -157,67 +163,36 @@ class WebServer:
         sock = web.WebSocketResponse(
             protocols=protocols,
             timeout=CLOSE_TIMEOUT_S,
+            autoclose=False,
+            autoping=False,
             heartbeat=HEARTBEAT_PERIOD_S,
             max_msg_size=MAX_MESSAGE_BYTES,
             compress=False,
         )
         self.viewers.add(viewer)
+        transport = request.transport
         try:
             await sock.prepare(request)
+            self._places.leave(request.protocol)
             await viewer.serve(sock)
         finally:
             self.viewers.discard(viewer)
+            if transport and transport.get_write_buffer_size():
+                transport.abort()  # close() would wait for a page that never reads
         return sock
-
-    def _connected(self) -> asyncio.Protocol:
-        """Return the protocol of a new connection."""
-        return _Door(self._admit)
-
-    def _admit(self, transport: asyncio.Transport) -> None:
-        """Serve a connection, and end another one where there are too many."""
-        server = self._runner.server
-        assert server
-        address = str((transport.get_extra_info("peername") or ("",))[0])
-        for handler in [handler for handler in self._asking if not handler.transport]:
-            self._forget(handler)
-        owners = [owner for owner, _ in self._asking.values()]
-        crowded = ""
-        if owners.count(address) >= MAX_ASKING_PER_ADDRESS:
-            crowded = address
-        elif len(server.connections) >= MAX_CONNECTIONS:
-            crowded = max(owners, key=owners.count, default="")
-            if not crowded:
-                transport.abort()
-                return
-        if crowded:
-            place = owners.index(crowded)
-            self._end(next(islice(self._asking, place, None)))
-        handler = server()
-        timeout = asyncio.get_running_loop().call_later(REQUEST_TIMEOUT_S, self._end, handler)
-        self._asking[handler] = address, timeout
-        transport.set_protocol(handler)
-        handler.connection_made(transport)
-
-    def _end(self, handler: web.RequestHandler) -> None:
-        """End a connection that has not sent a request."""
-        self._forget(handler)
-        if isinstance(handler.transport, asyncio.Transport):
-            handler.transport.abort()
-
-    def _forget(self, handler: web.RequestHandler) -> None:
-        """Count a connection no longer among those that have not sent a request."""
-        _, timeout = self._asking.pop(handler, ("", None))
-        if timeout:
-            timeout.cancel()  # it would keep the connection in memory
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        self._forget(request.protocol)
         try:
             if not self._is_ours(request.host):
                 raise web.HTTPForbidden(text="this is not a name of this machine\n")
             if request.match_info.http_exception is None:
                 check_origin(request, self._readers.get(request.path, frozenset()))
+            check_body(request, self._max_body_bytes)
+            if self._is_paired(request):
+                self._places.reserve(request.remote or "")
+            if request.match_info.route.name == ESTOP:
+                self._places.keep(request.protocol)
             response = await handler(request)
         except web.HTTPException as error:
             finish(error)
@@ -232,111 +207,27 @@ class WebServer:
         return parse_ip(name) is not None or name in self._names
 
 
-class Viewer:
-    """One open WebSocket; `take` returns the messages that are sent next."""
-
-    OPCODE = WSMsgType.BINARY
-    """Kind of the messages that are bytes."""
-    address = ""
-    """Address of the page."""
-    device_id = ""
-    """Identifier of the paired device; empty for a browser on this machine."""
-
-    def __init__(self) -> None:
-        self._waiting = asyncio.Event()
-        self._ended = False
-
-    def take(self) -> Iterable[str | bytes]:
-        """Return the messages that wait, and forget them."""
-        raise NotImplementedError
-
-    def receive(self, message: str) -> None:
-        """Handle a text from the page; by default, ignore it."""
-
-    def wake(self) -> None:
-        """Send what waits, as soon as the page has taken what was sent before."""
-        self._waiting.set()
-
-    def end(self) -> None:
-        """Close the page."""
-        self._ended = True
-        self._waiting.set()
-
-    async def serve(self, sock: web.WebSocketResponse) -> None:
-        """Send messages until the page or the server closes."""
-        listening = asyncio.create_task(self._listen(sock))
-        self._waiting.set()
-        try:
-            while not self._ended and not sock.closed:
-                await self._waiting.wait()
-                self._waiting.clear()
-                for message in self.take():
-                    if self._ended or sock.closed:
-                        break
-                    if isinstance(message, str):
-                        await sock.send_str(message)
-                    else:
-                        await sock.send_frame(message, self.OPCODE)
-        except ConnectionError:
-            pass
-        finally:
-            listening.cancel()
-        await sock.close()
-
-    async def _listen(self, sock: web.WebSocketResponse) -> None:
-        """Read messages, and detect that the page is closed."""
-        async for message in sock:
-            if message.type is WSMsgType.ERROR:
-                break
-            if message.type is WSMsgType.TEXT:
-                self.receive(message.data)
-        self.end()
-
-
-class _Door(asyncio.Protocol):
-    """Protocol of a connection until it is admitted, which depends on its address."""
-
-    def __init__(self, admit: Callable[[asyncio.Transport], None]) -> None:
-        self._admit = admit
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Admit the connection."""
-        assert isinstance(transport, asyncio.Transport)
-        self._admit(transport)
-
-
 class _RequestLog(logging.LoggerAdapter[logging.Logger]):
-    """Log of the HTTP server, without tracebacks for malformed requests."""
+    """Log of the HTTP server, without tracebacks for malformed requests.
 
-    _next_line = 0.0
-    _left_out = 0
+    A page that closes before its answer is not an error of the server.
+    """
 
     def exception(self, msg: object, *args: Any, exc_info: Any = True, **options: Any) -> None:
-        """Log an error of the server with its traceback, a malformed request in one line.
-
-        A page that closes before its answer is not an error of the server.
-        """
+        """Log an error of the server with its traceback, a malformed request in one line."""
         if isinstance(exc_info, http_exceptions.HttpProcessingError | ConnectionError):
-            self._log_malformed(args[0] if args else "", exc_info)
+            self.debug(msg, *args, exc_info=exc_info)
         else:
             super().exception(msg, *args, exc_info=exc_info, **options)
 
     def debug(self, msg: object, *args: Any, exc_info: Any = None, **options: Any) -> None:
-        """Log a malformed request in one line."""
-        if isinstance(exc_info, http_exceptions.HttpProcessingError):
-            self._log_malformed(args[0] if args else "", exc_info)
-        else:
-            super().debug(msg, *args, exc_info=exc_info, **options)
-
-    def _log_malformed(self, address: object, error: Exception) -> None:
-        now = time.monotonic()
-        if now < self._next_line:
-            self._left_out += 1
-            return
-        more = f" ({self._left_out} more since the last line)" if self._left_out else ""
-        self._next_line, self._left_out = now + LOG_PERIOD_S, 0
-        kind = type(error).__name__  # the text of the error quotes the request
-        self.logger.debug("%s sent a malformed request: %s%s", address, kind, more)
+        """Log a malformed request in one line, which does not quote the request."""
+        if exc_info:
+            msg, args = (
+                "malformed request from %s: %s",
+                (args[0] if args else "", type(exc_info).__name__),
+            )
+        super().debug(msg, *args, **options)
 
 
 def finish(response: web.StreamResponse) -> None:
@@ -344,6 +235,19 @@ def finish(response: web.StreamResponse) -> None:
     response.headers.update(_HEADERS)
     response.headers.setdefault("Cache-Control", "no-store")
     response.force_close()  # an idle connection would take the place of others
+
+
+def check_body(request: web.Request, max_bytes: int) -> None:
+    """Raise `HTTPClientError` for a body that is compressed, too long, or of unknown length."""
+    if "Content-Encoding" in request.headers:
+        raise web.HTTPUnsupportedMediaType(text="Content-Encoding is not supported\n")
+    if "Transfer-Encoding" in request.headers:
+        raise web.HTTPLengthRequired(text="Content-Length is needed\n")
+    length = request.content_length or 0
+    if length > max_bytes:
+        raise web.HTTPRequestEntityTooLarge(
+            max_bytes, length, text=f"a body of at most {max_bytes} bytes is needed\n"
+        )
 
 
 def check_origin(request: web.Request, readers: Set[str] = frozenset()) -> None:
@@ -381,14 +285,6 @@ def host_name(host: str) -> str:
     except ValueError:
         return ""
     return "" if "@" in host or parts.netloc != host else name
-
-
-def parse_ip(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """Return an IP address; None for any other name."""
-    try:
-        return ipaddress.ip_address(name)
-    except ValueError:
-        return None
 
 
 def file_routes(folder: Traversable, index: str) -> Iterator[web.RouteDef]:

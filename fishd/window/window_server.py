@@ -10,13 +10,13 @@ from msgspec import Raw
 
 from fishd.window.access import AccessControl
 from fishd.window.answers import answer_in_json
-from fishd.window.devices import Devices
 from fishd.window.fish_requests import FishRequests
 from fishd.window.foxglove import PROTOCOL
 from fishd.window.job_requests import JobRequests
 from fishd.window.jobs import Jobs
 from fishd.window.live import encode
 from fishd.window.pages import Pages
+from fishd.window.paired_devices import PairedDevices
 from fishd.window.register import Register, take_lost_jobs
 from fishd.window.settings import WindowSettings
 from fishd.window.web_server import WebServer, file_routes
@@ -29,7 +29,7 @@ class WindowServer(WebServer):
 
     def __init__(self, settings: WindowSettings) -> None:
         """Raises `DeviceError` where the state folder cannot be used."""
-        access = AccessControl(Devices(settings.state_folder), settings.pair_all)
+        access = AccessControl(PairedDevices(settings.state_folder), settings.pair_all)
         self._settings, self._register = settings, Register(settings.state_folder)
         self._jobs = Jobs(
             settings.runs_folder,
@@ -37,7 +37,13 @@ class WindowServer(WebServer):
             keep=lambda jobs: self._register.change(jobs=[Raw(encode(job)) for job in jobs]),
             show_folder=settings.runs is not None,
         )
-        self._pages = Pages(settings.endpoints, access, self._jobs.all, lambda: self.viewers)
+        self._pages = Pages(
+            settings.endpoints,
+            access,
+            self._jobs.all,
+            lambda: self.viewers,
+            self._jobs.stop_without_access,
+        )
         host, port = settings.address
         routes = [
             *file_routes(resources.files(__package__).joinpath("page"), "index.html"),
@@ -54,6 +60,7 @@ class WindowServer(WebServer):
             names=settings.names,
             middlewares=[answer_in_json],
             readers={"/foxglove": frozenset(settings.origins)},
+            is_paired=access.is_paired,
             max_body_bytes=MAX_BODY_BYTES,
             advice="name another one with --listen",
         )

@@ -28,7 +28,7 @@ from rigs.processes import (
     sets,
     wait_until,
 )
-from rigs.window_process import Browser, open_page, run, running_window
+from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
 
 from fishd.client import Fish, Refused
 from fishd.client.zmq_sockets import connect_subscriber
@@ -343,6 +343,48 @@ def test_keys_made_with_fishctl_connect_two_that_add_the_printed_lines(tmp_path:
     assert other == {"folder": f"{rig.folder}/bob", "public_key": rig.key("bob")}
     again = call(FISHCTL, "keygen", "--to", str(rig.folder / "anna"))
     assert "anna/key: it exists, and is not overwritten" in one_line(again)
+
+
+def test_a_folder_of_keys_that_others_may_write_is_refused_by_fishd_fishctl_and_the_window(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = KeyedDaemon(tmp_path / "k", anna="drive")
+    anna, theirs = rig.folder / "anna", rig.folder / "fishd"
+    theirs.chmod(0o770)
+    with Daemon(tmp_path, *rig.settings) as daemon:
+        status, _, errors = daemon.finish()
+    assert (status, errors.count("\n")) == (78, 1)
+    assert f"{theirs}: other users may change it (mode 770); run 'chmod go-w {theirs}'" in errors
+    theirs.chmod(0o700)
+    anna.chmod(0o777)
+    problem = f"{anna}: other users may change it (mode 777); run 'chmod go-w {anna}'"
+    monkeypatch.setenv("FISHD_KEYS", str(anna))
+    with rig.running():
+        assert problem in one_line(rig.fishctl("anna", "status"))
+        with WindowProcess(tmp_path, fish=rig.endpoint) as window:
+            status, _, errors = window.finish()
+        assert (status, errors.count("\n")) == (1, 1)
+        assert problem in errors
+        assert problem in one_line(call(FISHCTL, "keygen", "--to", str(anna)))
+        anna.chmod(0o700)
+        assert rig.fishctl("anna", "status").returncode == 0
+
+
+def test_no_client_comes_in_while_others_may_write_the_folder_of_keys(
+    as_client: type[Client], tmp_path: Path
+) -> None:
+    keyed = as_client.keyed = KeyedDaemon(tmp_path, driver="drive")
+    as_client.stack.enter_context(keyed.running())
+    reports = as_client.subscribe_to_reports()
+    next(as_client.connect("driver").ticks())  # both gateways have read the file
+    folder = keyed.known.parent
+    folder.chmod(0o777)
+    with pytest.raises(NoKey, match="not known"):
+        as_client.connect("driver").status()
+    problem = reports.until(kind="gateway")
+    assert problem["message"].endswith(f"run 'chmod go-w {folder}'")
+    folder.chmod(0o700)
+    assert as_client.connect("driver").stop().mode == "idle"
 
 
 def test_a_plain_client_connects_as_the_page_says(keyed: KeyedDaemon) -> None:

@@ -113,8 +113,8 @@ class Fishd(Process):
 
     def gateways(self) -> list[int]:
         """Return the process of the gateways' fork server, then those of the gateways."""
-        servers = _children(self.pid)
-        return [*servers, *(pid for server in servers for pid in _children(server))]
+        servers = list_children(self.pid)
+        return [*servers, *(pid for server in servers for pid in list_children(server))]
 
     def cpu_seconds(self) -> float:
         """Return the user and system time of all threads and of the gateways [s]."""
@@ -152,7 +152,8 @@ def virtual_pi_settings(address: Path, port: int) -> list[str]:
     ]
 
 
-def _children(pid: int) -> list[int]:
+def list_children(pid: int) -> list[int]:
+    """Return the children of a process; none after its end."""
     try:
         children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
     except OSError:  # the process has ended

@@ -20,6 +20,7 @@ NAMES = (
     "soak",
     "systemd",
     "window",
+    "window_estop",
     "window_kills",
 )
 

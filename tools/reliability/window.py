@@ -208,9 +208,13 @@ def memory(pid: int) -> float:
 class Window(Process):
     """A `fishd-window` of one fish; a context manager."""
 
-    def __init__(self, endpoint: str, folder: str) -> None:
-        options = ("--listen", "127.0.0.1:0", "--state", folder, "--fish", f"fish={endpoint}")
-        super().__init__(sys.executable, "-P", "-c", START, *options)
+    def __init__(
+        self, endpoint: str, folder: str, listen: str = "127.0.0.1:0", config: str = ""
+    ) -> None:
+        """config: configuration of fishd, by which fishctl finds the servo without it"""
+        options = ("--listen", listen, "--state", folder, "--fish", f"fish={endpoint}")
+        environment = {**os.environ, "FISHD_CONFIG": config}
+        super().__init__(sys.executable, "-P", "-c", START, *options, env=environment)
         assert self.process.stderr
         line = self.process.stderr.readline()
         self.port = int(line.rstrip().rstrip("/").rpartition(":")[2])

@@ -26,6 +26,8 @@ _FLUSH_TIMEOUT_S = 0.3
 UNHURRIED_FLUSH_TIMEOUT_S = 2.0
 """Maximum time to write the last lines if no servo is driven: long enough for a busy machine
 [s]."""
+LINE_PERIOD_S = 1.0
+"""Shortest time between two lines of a kind where they are limited [s]."""
 _MAX_MESSAGE_CHARACTERS = 2000
 _MAX_TRACEBACK_CHARACTERS = 10_000
 """Maximum length of a traceback; longer ones are cut [characters]."""
@@ -107,6 +109,28 @@ class _Queued(logging.handlers.QueueHandler):
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  (logging's name)
         """Ignore the error: standard error, where it would be printed, may block."""
+
+
+class LineLimit(logging.Filter):
+    """Limit of one line a second of each kind, which a place in the code writes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._places: dict[tuple[str, int], tuple[float, int]] = {}
+        """By place: when it may write again [s, monotonic], and the lines left out since."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether a line is written; it says how many like it were left out before."""
+        place, now = (record.pathname, record.lineno), time.monotonic()
+        due, left_out = self._places.get(place, (now, 0))
+        if now < due:
+            self._places[place] = due, left_out + 1
+            return False
+        self._places[place] = now + LINE_PERIOD_S, 0
+        if left_out:
+            record.msg = f"{record.getMessage()} ({left_out} more like this before)"
+            record.args = None
+        return True
 
 
 class LogWriter:

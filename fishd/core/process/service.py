@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from fishd.core.errors import FishdError
 from fishd.core.process.interruption import on_signal
-from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
+from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LineLimit, LogWriter
 
 log = logging.getLogger(__name__)
 
@@ -17,6 +17,7 @@ def run_service(name: str, log_format: str, serve: Callable[[threading.Event], o
     serve: returns soon after SIGINT, SIGTERM or SIGHUP has set its event
     """
     logs = LogWriter(log_format)
+    logging.getLogger().handlers[0].addFilter(LineLimit())
     stopping = threading.Event()
     try:
         with on_signal(stopping.set):

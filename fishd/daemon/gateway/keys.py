@@ -11,6 +11,7 @@ from zmq.utils import z85
 from fishd.core import keys
 from fishd.core.errors import ConfigError, Refused
 from fishd.core.protocol import READ_OPERATIONS
+from fishd.core.trusted_folder import find_folder_problem
 
 WATCH_OPERATIONS = READ_OPERATIONS | {"estop"}
 """Operations for which the role `watch` is enough."""
@@ -30,8 +31,8 @@ class KnownKeys:
         self.path = folder / keys.KNOWN_FILE
         self._clients: dict[str, keys.KnownKey] = {}
         self._change = ""
-        self._stamp: tuple[int, ...] = ()
-        while not self._stamp:
+        self._stamp: tuple[int, int, int, str] | None = None
+        while self._stamp is None:
             self._update()
             time.sleep(SETTLE_TIME_S / 10)
         self.mistake: str = self._change
@@ -46,8 +47,9 @@ class KnownKeys:
     def _update(self) -> None:
         """Read the file if it has changed; note what is wrong with it, or which key was removed."""
         now, stamp = time.time(), self._read_stamp()
-        settle_time = SETTLE_TIME_S if stamp[1] else EMPTY_SETTLE_TIME_S
-        if stamp == self._stamp or abs(now - stamp[0] * 1e-9) < settle_time:
+        changed, size, *_ = stamp
+        settle_time = SETTLE_TIME_S if size else EMPTY_SETTLE_TIME_S
+        if stamp == self._stamp or abs(now - changed * 1e-9) < settle_time:
             return
         try:
             lines, mistakes = keys.read_known(self.path.parent)
@@ -79,13 +81,14 @@ class KnownKeys:
                 f" has the role {client.what} in {self.path}",
             )
 
-    def _read_stamp(self) -> tuple[int, ...]:
+    def _read_stamp(self) -> tuple[int, int, int, str]:
         """Return time of the last change and size of the file, and what else shows another one."""
+        problem = find_folder_problem(self.path.parent)
         try:
             status = self.path.stat()
         except OSError:
-            return 0, 0
-        return status.st_ctime_ns, status.st_size, status.st_ino
+            return 0, 0, 0, problem
+        return status.st_ctime_ns, status.st_size, status.st_ino, problem
 
 
 def require_keys(server: "zmq.Socket[bytes]", secret: str, folder: str) -> KnownKeys:

@@ -9,7 +9,8 @@ from importlib import resources
 from aiohttp import web
 
 from fishd.window.camera_page.feed import News
-from fishd.window.web_server import Viewer, WebServer, file_routes
+from fishd.window.viewer import Viewer
+from fishd.window.web_server import WebServer, file_routes
 
 
 class PageServer(WebServer):

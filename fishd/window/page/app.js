@@ -12,6 +12,8 @@ import { Ring, Stream, ticksOf } from "./stream.js";
 const byId = (id) => document.getElementById(id);
 const STALE_S = 0.8;
 const STALE_TICKS = 5;
+/** Time without a message after which an emergency stop may not reach fishd-window. */
+const SILENT_S = 2;
 const CHECK_MS = 200;
 const VALUES_MS = 250;
 /** Longest wait for the answer to an emergency stop, and pause until it is sent again: at first, and at most. */
@@ -27,7 +29,7 @@ const state = {
   name: "", fish: [], session: null, status: null, controllers: [], events: [], jobs: new Map(),
   connection: null, driver: null, linked: false, helloed: false, refused: "", lastTick: null, tick: null, interval: 0.05,
   changedSeq: 0, own: new Set(), selected: null, edited: null, keep: recall("keep", false), estop: null,
-  notices: [], reference: null, seconds: recall("seconds", 15),
+  notices: [], reference: null, seconds: recall("seconds", 15), heard: performance.now(),
 };
 let ring = new Ring(0.05), charts, view, stream, drawing = false, valuesAt = 0;
 /** Number of connections in a row that ended without a first message. */
@@ -192,9 +194,23 @@ function freshness() {
   return { kind: "live", age };
 }
 
-let shownKind = "";
+/** Return why an emergency stop may not arrive, before anybody presses; empty if its way has answered lately. */
+function estopWarning() {
+  if (state.session?.paired === false) return "";
+  const silence = (performance.now() - state.heard) / 1000;
+  return silence > SILENT_S ? `fishd-window has not answered for ${duration(silence)}` : state.connection?.warning ?? "";
+}
+
+let shownKind = "", shownWarning = "";
 function checkConnection() {
   const { kind, message } = freshness();
+  const warning = estopWarning();
+  document.body.classList.toggle("unreachable", warning !== "");
+  if (warning !== shownWarning) {
+    if (!shownWarning) say("The emergency stop may not reach the fish.");
+    shownWarning = warning;
+    changed();
+  }
   document.body.classList.toggle("stale", kind !== "live");
   document.body.classList.toggle("unpaired", kind === "not paired");
   if (kind !== shownKind) {
@@ -340,11 +356,14 @@ function Banner() {
   const { estop, status, session } = state;
   const mode = status?.mode;
   const { kind, message } = freshness();
+  const warning = estopWarning(), isOld = kind === "lost" || kind === "stale";
   const reason = status?.reason;
   const latched = mode === "estop" || mode === "fault";
   return html`
     ${session && session.paired === false && html`<${Pairing} />`}
-    ${(kind === "lost" || kind === "stale") && html`<div class="banner warn"><b>${kind === "lost" ? "Connection lost." : "Stale."}</b>
+    ${warning && html`<div class="banner warn" id="unreachable"><b>The E‑stop may not reach the fish.</b>
+      <span>To stop it now, use the button of the panel, or run fishctl estop on its computer. ${sentence(warning)}${isOld && " What is greyed is old."}</span></div>`}
+    ${isOld && !warning && html`<div class="banner warn"><b>${kind === "lost" ? "Connection lost." : "Stale."}</b>
       <span>${sentence(message)} What is greyed is old.</span></div>`}
     ${estop?.phase === "sending" && html`<div class="banner bad"><b>Emergency stop sent …</b></div>`}
     ${estop?.phase === "failed" && html`<div class="banner bad" role="alert"><b>Emergency stop NOT confirmed.</b>
@@ -548,7 +567,13 @@ async function start() {
   changed();
   if (state.session.paired === false) return;
   const before = recall("client", "", "sessionStorage"); // a page that is loaded again goes on driving
-  stream = new Stream(nameInAddress(), before, (type, payload) => receive[type]?.(payload), noteClosed);
+  stream = new Stream(nameInAddress(), before, take, noteClosed);
+}
+
+/** Take a message of the server. */
+function take(type, payload) {
+  state.heard = performance.now();
+  receive[type]?.(payload);
 }
 
 /** Find out why the connection has ended: no server, a device that was revoked, or too many pages. */
@@ -559,7 +584,7 @@ async function noteClosed() {
   changed();
   const session = await call("GET", "/api/session").catch(() => null);
   if (state.linked) return;
-  if (session) state.session = session;
+  if (session) Object.assign(state, { session, heard: performance.now() });
   if (session?.paired && failures > 1) state.refused = "fishd-window refuses this page, maybe because too many are open; it is tried again";
   else state.refused = "";
   changed();

@@ -13,7 +13,7 @@ import pytest
 from rigs.processes import PATIENCE
 
 from fishd.core.errors import StartupError
-from fishd.window import web_server
+from fishd.window import places, web_server
 from fishd.window.camera_page.feed import News
 from fishd.window.camera_page.server import PageServer
 
@@ -226,7 +226,7 @@ def test_no_client_keeps_the_page_from_others(sent: bytes, monkeypatch: pytest.M
         clients = [await connect(server, sent) for _ in range(100)]
         ends = [asyncio.create_task(reader.read()) for reader, _ in clients]
         try:
-            while sum(end.done() for end in ends) < 100 - web_server.MAX_ASKING_PER_ADDRESS:
+            while sum(end.done() for end in ends) < 100 - places.PLACES:
                 await asyncio.sleep(0.01)  # until the server has seen them all
             async with neighbour(server) as second_session, asyncio.timeout(60.0):
                 for client in (session, second_session):

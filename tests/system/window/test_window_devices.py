@@ -120,7 +120,7 @@ def test_a_revoked_device_loses_its_page_and_the_fish_stops(window: WindowProces
             async with paired(window, "drive", "stolen") as browser, open_page(browser) as page:
                 await page.swim()
                 removed = window.ask("revoke", "stolen")
-                assert removed == "stolen is no longer paired\n"
+                assert removed == "stolen is no longer paired; what it drives and its jobs end\n"
                 while (await page.sock.receive()).type is aiohttp.WSMsgType.TEXT:
                     pass
                 assert page.sock.closed
@@ -165,6 +165,20 @@ def test_a_token_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         paired.pair(paired.invite("watch"), "second")
 
 
+def test_a_state_folder_that_others_may_write_is_refused_as_they_could_pair_devices(
+    tmp_path: Path,
+) -> None:
+    state = tmp_path / "window"
+    state.mkdir()
+    state.chmod(0o770)
+    problem = f"{state}: other users may change it (mode 770), and so pair devices; run 'chmod go-w"
+    assert problem in one_line(fishctl("window", "devices", "--state", str(state)))
+    with WindowProcess(tmp_path) as window:
+        status, _, errors = window.finish()
+    assert (status, errors.count("\n")) == (1, 1)
+    assert problem in errors
+
+
 def test_devices_of_one_name_are_told_apart_and_names_are_printable(tmp_path: Path) -> None:
     paired = Devices(tmp_path)
     names = [
@@ -173,13 +187,15 @@ def test_devices_of_one_name_are_told_apart_and_names_are_printable(tmp_path: Pa
     assert names == ["a", "a 2", "?[2J", "device"]
 
 
-def test_a_damaged_file_pairs_nothing_and_says_so(tmp_path: Path) -> None:
+def test_a_damaged_file_pairs_nothing_and_says_what_to_do(tmp_path: Path) -> None:
     paired = Devices(tmp_path)
-    _, secret = paired.pair(paired.invite("drive"), "tablet")
-    assert paired.find(secret)
+    paired.pair(paired.invite("drive"), "tablet")
     (tmp_path / "devices.json").write_text("{")
-    with pytest.raises(DeviceError, match=r"devices\.json: .*; remove it, and pair"):
-        paired.find(secret)
+    for change in (paired.all, lambda: paired.invite("watch"), lambda: paired.revoke("tablet")):
+        with pytest.raises(DeviceError, match=r"devices\.json: .*; replace it by"):
+            change()
+    (tmp_path / "devices.copy.json").replace(tmp_path / "devices.json")
+    assert [device.name for device in paired.all()] == ["tablet"]
 
 
 def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:

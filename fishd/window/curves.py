@@ -1,0 +1,38 @@
+"""Curves of a simulated fish, which a page draws beside those of the true one."""
+
+import asyncio
+import csv
+import shutil
+from pathlib import Path
+
+from fishd.window.children import call
+from fishd.window.scratch import Scratch
+
+_COLUMNS = ("time", "fx", "fy", "phi_c", "alpha", "thrust")
+"""Columns of a recording that a page draws."""
+
+
+async def read_curve(
+    recording: Path, runs: Path, scratch: Scratch
+) -> dict[str, list[float | None]]:
+    """Return columns of a recording in the scratch folder, and remove it; raise `JobError`."""
+    folder = recording.with_suffix("")
+    folder.mkdir()
+    try:
+        words = ["export", str(recording), "--csv", f"--to={folder}", "--force"]
+        await call(words, runs, scratch.descriptor)
+        return await asyncio.to_thread(_read_columns, next(folder.glob("*[!s].csv")))
+    finally:
+        recording.unlink(missing_ok=True)
+        shutil.rmtree(folder)
+
+
+def _read_columns(path: Path) -> dict[str, list[float | None]]:
+    columns: dict[str, list[float | None]] = {}
+    with path.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            for name in _COLUMNS:
+                if name in row:
+                    value = row[name]
+                    columns.setdefault(name, []).append(float(value) if value else None)
+    return columns

@@ -1,0 +1,116 @@
+"""Places of connections: however many are opened, an emergency stop finds one."""
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable
+from ipaddress import IPv4Address, IPv6Address, ip_address
+
+from aiohttp import web
+from msgspec import Struct
+
+PLACES = 96
+"""Largest number of connections of each group of senders; a further one replaces one of them."""
+MAX_PAIRED_ADDRESSES = 200
+
+
+class _Place(Struct, eq=False):
+    """Place that a connection takes."""
+
+    transport: asyncio.Transport
+    address: str
+    is_kept: bool = False
+    """Whether other connections are ended before this one."""
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether the connection still exists; one that closes may have to send its answer."""
+        return not self.transport.is_closing() or self.transport.get_write_buffer_size() > 0
+
+
+class Places:
+    """Places of the connections of a server, WebSockets aside, in three groups of senders.
+
+    This machine, addresses of paired devices, and all others have places of their own. A connection
+    that finds none replaces the oldest one of that address of its group that has most of them: its
+    sender had the most time to send a request, and others are not disturbed.
+    """
+
+    def __init__(self) -> None:
+        self._places: dict[web.RequestHandler, _Place] = {}
+        """Place of each connection, the oldest first."""
+        self._paired: dict[str, None] = {}
+        """Addresses from which a paired device has sent a request, the newest last."""
+
+    def protocol(self, create: Callable[[], web.RequestHandler]) -> asyncio.Protocol:
+        """Return the protocol of a new connection; `create` returns that of an admitted one."""
+        return _Door(self, create)
+
+    def reserve(self, address: str) -> None:
+        """Let connections from the address of a paired device have the places of that group."""
+        self._paired.pop(address, None)
+        self._paired[address] = None
+        if len(self._paired) > MAX_PAIRED_ADDRESSES:
+            del self._paired[next(iter(self._paired))]
+
+    def keep(self, handler: web.RequestHandler) -> None:
+        """End this connection last."""
+        if place := self._places.get(handler):
+            place.is_kept = True
+
+    def leave(self, handler: web.RequestHandler) -> None:
+        """Let a connection no longer take a place."""
+        self._places.pop(handler, None)
+
+    def admit(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
+        """Give a place to a new connection, and end another one if there is none."""
+        address = str((transport.get_extra_info("peername") or ("",))[0])
+        group = self._find_group(address)
+        self._places = {key: place for key, place in self._places.items() if place.is_taken}
+        rivals = [
+            (key, place)
+            for key, place in self._places.items()
+            if self._find_group(place.address) == group
+        ]
+        if len(rivals) >= PLACES:
+            counts = Counter(place.address for _, place in rivals)
+            key, place = min(
+                rivals, key=lambda rival: (rival[1].is_kept, -counts[rival[1].address])
+            )
+            del self._places[key]
+            place.transport.abort()
+        self._places[handler] = _Place(transport, address)
+
+    def _find_group(self, address: str) -> str:
+        if is_loopback(address):
+            return "this machine"
+        return "paired" if address in self._paired else "others"
+
+
+class _Door(asyncio.Protocol):
+    """Protocol of a connection until it is admitted, which depends on its address."""
+
+    def __init__(self, places: Places, create: Callable[[], web.RequestHandler]) -> None:
+        self._places, self._create = places, create
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Admit the connection."""
+        assert isinstance(transport, asyncio.Transport)
+        handler = self._create()
+        self._places.admit(handler, transport)
+        transport.set_protocol(handler)
+        handler.connection_made(transport)
+
+
+def parse_ip(name: str) -> IPv4Address | IPv6Address | None:
+    """Return an IP address; None for any other name."""
+    try:
+        return ip_address(name)
+    except ValueError:
+        return None
+
+
+def is_loopback(name: str) -> bool:
+    """Return whether a name is an IP address of loopback."""
+    address = parse_ip(name)
+    mapped = getattr(address, "ipv4_mapped", None)
+    return address is not None and (mapped or address).is_loopback
