@@ -1,70 +1,25 @@
 """A disk that becomes full, read-only or stalls while a fish is recorded: no silent loss."""
 
-import contextlib
 import json
 import re
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from rigs.processes import FISHCTL, Daemon, Process, call, running, wait_until
+from rigs.processes import FISHCTL, Daemon, Process, running, wait_until
 
+from common.small_disk import Disk, NoDisk, small_disk
 from fishd.core.errors import RecordingError
 from fishd.recording import open_run
-
-IMAGE_BYTES = 64 * 2**20
-"""Size of the disk [bytes]; a recording ends where 16 MB are left."""
-
-
-class Disk:
-    """Small disk, mounted at `folder`."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def make_read_only(self) -> None:
-        """Let writes fail, as the kernel does after an error of the disk."""
-        device = call("findmnt", "-no", "SOURCE", str(self.folder)).stdout.strip()
-        Path(f"/sys/fs/ext4/{Path(device).name}/trigger_fs_error").write_text("a test")
-
-    def fill(self) -> None:
-        """Leave no room."""
-        with contextlib.suppress(OSError), (self.folder / "filler").open("wb") as filler:
-            while True:
-                filler.write(bytes(2**20))
-
-    def empty(self) -> None:
-        """Make room again."""
-        (self.folder / "filler").unlink()
-
-    @contextlib.contextmanager
-    def stalled(self) -> Iterator[None]:
-        """Let all writes wait."""
-        subprocess.run(["fsfreeze", "-f", str(self.folder)], check=True)
-        try:
-            yield
-        finally:
-            subprocess.run(["fsfreeze", "-u", str(self.folder)], check=True)
 
 
 @pytest.fixture
 def disk(tmp_path: Path) -> Iterator[Disk]:
-    folder, image = tmp_path / "disk", tmp_path / "image"
-    folder.mkdir()
-    with image.open("wb") as file:
-        file.truncate(IMAGE_BYTES)
-    made = call("mkfs.ext4", "-q", "-F", str(image))
-    if (
-        made.returncode
-        or call("mount", "-o", "loop,errors=remount-ro", str(image), str(folder)).returncode
-    ):
-        pytest.skip("no file system may be mounted here")
-    assert folder.is_mount()
     try:
-        yield Disk(folder)
-    finally:
-        call("umount", "--lazy", str(folder))
+        with small_disk(tmp_path) as made:
+            yield made
+    except NoDisk as reason:
+        pytest.skip(str(reason))
 
 
 def last_tick(folder: Path) -> int:

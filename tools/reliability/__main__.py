@@ -11,6 +11,7 @@ NAMES = (
     "clock_steps",
     "deaths",
     "deb",
+    "disks",
     "half_open",
     "kills",
     "misbehaviour",

@@ -103,7 +103,13 @@ def measure(options: Namespace) -> Report:
     ]
     head = "verb | steps | recordings | length | largest error | steps listed | mistakes"
     wrong = sum(len(outcome.mistakes) for outcome in outcomes)
-    return Report({"clock-steps": table(head, rows)}, outcomes, wrong > 0)
+    result = (
+        f"{wrong} mistakes after {sum(outcome.steps for outcome in outcomes)} steps; lengths of "
+        f"{sum(outcome.recordings for outcome in outcomes)} recordings right within "
+        f"{max(outcome.error for outcome in outcomes) * 1e3:.0f} ms"
+    )
+    sections = {"reliability clock_steps": table(head, rows)}
+    return Report(sections, outcomes, broken=wrong > 0, number=result)
 
 
 def _try(name: str, seed: int) -> Outcome:

@@ -331,7 +331,12 @@ def measure(options: Namespace) -> Report:
     head = "program | silences | hang | lost | counted | silent losses"
     text = f"{table(head, rows)}\n\nSeed {options.seed}."
     broken = any(trial.is_broken for trial in done)
-    return Report({"reliability half_open": text}, done, broken=broken)
+    silent = sum(not trial.said or trial.lost != trial.counted for trial in done)
+    result = (
+        f"{silent} silent losses and {sum(trial.hangs for trial in done)} hangs in {len(done)} "
+        f"silences; {sum(trial.counted or 0 for trial in done)} lost ticks and frames counted"
+    )
+    return Report({"reliability half_open": text}, done, broken=broken, number=result)
 
 
 def _mark(rig: Rig, stopped: threading.Event) -> None:
