@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -23,6 +24,8 @@ log = logging.getLogger(__name__)
 NAME = "fishd-window"
 NOTIFY_PERIOD_S = 0.2
 """Time between two looks for a signal, with a notification of systemd [s]."""
+SWITCH_INTERVAL_S = 5e-4
+"""Time after which a thread, such as that of an emergency stop, gets the interpreter [s]."""
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -109,6 +112,7 @@ def serve(
         )
 
     async def run_window(stopping: threading.Event) -> None:
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         notifier = SystemdNotifier()
         async with WindowServer(settings) as server:
             log.info("the fish is at %s", server.url)

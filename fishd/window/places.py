@@ -8,7 +8,7 @@ from ipaddress import IPv4Address, IPv6Address, ip_address
 from aiohttp import web
 from msgspec import Struct
 
-PLACES = 96
+PLACES = 256
 """Largest number of connections of each group of senders; a further one replaces one of them."""
 MAX_PAIRED_ADDRESSES = 200
 

@@ -48,9 +48,12 @@ class WindowProcess(Process):
 
     def wait_until_up(self) -> Self:
         assert self.process.stderr
-        self.log = self.process.stderr.readline()
-        match = re.search(r"the fish is at (http://\S+)/", self.log)
-        assert match, self.log + self.process.stderr.read()
+        self.log, match = "", None
+        while not match:
+            line = self.process.stderr.readline()
+            self.log += line
+            assert line, self.log
+            match = re.search(r"the fish is at (http://\S+)/", line)
         self.url = match[1]
         return self
 

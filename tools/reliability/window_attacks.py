@@ -49,7 +49,7 @@ class Target(NamedTuple):
             lines.append(f"Cookie: fishd_window={self.cookie}")
         if method == "POST":
             lines.append("Content-Type: application/json")
-            if not any(header.startswith("Content-Length") for header in headers):
+            if not any(header.startswith(("Content-Length", "Transfer")) for header in headers):
                 lines.append(f"Content-Length: {len(body)}")
         return "\r\n".join([*lines, "", ""]).encode() + body
 
