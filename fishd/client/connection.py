@@ -13,10 +13,8 @@ import msgspec
 from fishd.core import protocol, text
 from fishd.core.addresses import (
     ENDPOINT_VARIABLE,
-    default_address,
     estop_path,
     find_control_address,
-    is_usual,
     socket_path,
 )
 from fishd.core.decoding import decoder
@@ -65,11 +63,7 @@ class Connection:
         """Keys of this client and of the fishd; None for a connection without keys."""
         self._was_named = bool(endpoint or os.environ.get(ENDPOINT_VARIABLE))
         self.detour = ""
-        """How a fishd was reached that is not where clients look for it; empty if it is there."""
-        if not self._was_named and not is_usual(self.endpoint):
-            self.detour = (
-                f"no fishd at {default_address()}; the one of this user serves {self.endpoint}"
-            )
+        """How the latest answer came without the control socket; empty if it came through it."""
         self.timeout = timeout
         self.telemetry_address = telemetry
         self.held: LeaseRenewal | None = None

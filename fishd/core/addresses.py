@@ -176,30 +176,18 @@ def find_control_address() -> str:
     """Return the address at which a client looks for the daemon of this machine.
 
     $FISHD_ENDPOINT, else a daemon of this user, else the system's service. A socket that another
-    user has created in the place of this user's does not hide the service. If both are certainly
-    not there, the only daemon that this user may ask, wherever its socket is.
+    user has created in the place of this user's does not hide the service.
     """
     endpoint = os.environ.get(ENDPOINT_VARIABLE)
     if endpoint:
         return endpoint
     own = _private_socket("control")
-    if not unix_sockets.is_deserted(own) and not unix_sockets.find_trust_problem(own):
-        return f"ipc://{own}"
     # A daemon that was killed leaves its socket behind.
-    if _may_exist(_SERVICE_SOCKET) and not unix_sockets.is_deserted(_SERVICE_SOCKET):
+    if _may_exist(_SERVICE_SOCKET) and (
+        unix_sockets.is_deserted(own) or unix_sockets.find_trust_problem(own)
+    ):
         return f"ipc://{_SERVICE_SOCKET}"
-    if unix_sockets.is_deserted(own):
-        from fishd.core import local_daemons
-
-        daemons = local_daemons.find_own()
-        if len(daemons) == 1 and (elsewhere := daemons[0].control_address()):
-            return elsewhere
-    return f"ipc://{_SERVICE_SOCKET if _may_exist(_SERVICE_SOCKET) else own}"
-
-
-def is_usual(endpoint: str) -> bool:
-    """Return whether a client looks for a daemon at this address first."""
-    return endpoint in (default_address(), f"ipc://{_SERVICE_SOCKET}")
+    return f"ipc://{own}"
 
 
 def _may_exist(path: Path) -> bool:

@@ -106,6 +106,7 @@ class WebServer:
             self._app,
             access_log=None,
             auto_decompress=False,
+            read_bufsize=RECEIVE_BYTES,
             handle_signals=False,
             keepalive_timeout=REQUEST_TIMEOUT_S,
             lingering_time=CLOSE_TIMEOUT_S,

@@ -112,9 +112,10 @@ def test_connections_of_others_take_no_place_of_this_machine(
                     assert await first.read() == b""
             writer.write(here.request("POST", "/api/fish/fish/estop", body=b"{}"))
             assert b'"outcome":"mode estop"' in await reader.read()
-            writer.close()
-            for _, other in others:
-                other.close()
+            writers = [writer, *(other for _, other in others)]
+            for each in writers:
+                each.close()
+            await asyncio.gather(*(w.wait_closed() for w in writers), return_exceptions=True)
 
         run(test())
 

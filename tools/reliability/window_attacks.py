@@ -61,6 +61,8 @@ class Target(NamedTuple):
             return await reader.read()
         finally:
             writer.close()
+            with suppress(OSError):
+                await writer.wait_closed()
 
     async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         """Open a connection from the address of this target to that address."""
@@ -154,7 +156,7 @@ async def _send_head(target: Target, sent: Callable[[], None]) -> None:
             sent()
             await reader.read()  # until the window ends the connection
         finally:
-            writer.close()
+            writer.transport.abort()
 
 
 async def _read_history(target: Target, sent: Callable[[], None]) -> None:
@@ -175,7 +177,8 @@ async def _flood(target: Target, sent: Callable[[], None]) -> None:
                 await writer.drain()
         finally:
             reading.cancel()
-            writer.close()
+            writer.transport.abort()  # close() would wait until all is sent
+            await asyncio.sleep(0)
 
 
 async def _discard(reader: asyncio.StreamReader) -> None:

@@ -41,7 +41,7 @@ WARM_UP_S = 2.0
 """Time from the start of an attack to the first press [s]."""
 DEAD_PRESSES = 60
 """Number of presses at the same time while fishd is dead."""
-HISTORY_S = 20.0
+HISTORY_S = 10.0
 """Time for which the window gathers ticks before the first attack [s]."""
 
 

@@ -14,7 +14,7 @@ import msgspec
 import pytest
 from rigs.processes import PATIENCE
 
-from fishd.core.process.logs import JsonFormatter, LogWriter, TextFormatter
+from fishd.core.process.logs import JsonFormatter, LineLimit, LogWriter, TextFormatter
 
 
 def record(message: str, error: BaseException | None = None) -> logging.LogRecord:
@@ -151,3 +151,22 @@ def test_what_cannot_start_says_why_however_late_its_line_is_written(
     assert ended.returncode == 1
     assert f"{tmp_path}/no" in ended.stderr
     assert ended.stderr.endswith("\n")
+
+
+def test_a_service_writes_one_line_of_a_kind_in_a_second_and_counts_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    limit, now, written = LineLimit(), 0.0, list[str]()
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+
+    def write(place: int, text: str) -> None:
+        line = logging.LogRecord("fishd", logging.INFO, "file.py", place, "%s", (text,), None)
+        if limit.filter(line):
+            written.append(line.getMessage())
+
+    for count in range(30):
+        write(1, f"100 % {count}")
+    write(2, "other")
+    now = 1.0
+    write(1, "later")
+    assert written == ["100 % 0", "other", "later (29 more like this before)"]
