@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from _pytest.runner import runtestprotocol
 from hypothesis import HealthCheck, settings
-from rigs import forked_workers
+from rigs import forked_workers, own_network
 
 # Each process computes with one thread; set before numpy or torch is loaded, here or in a child.
 LIBRARIES = "OMP", "OPENBLAS", "MKL", "NUMBA"
@@ -203,6 +203,9 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
+    is_alone = not getattr(session.config.option, "numprocesses", None)
+    if is_alone or hasattr(session.config, "workerinput"):  # else it runs no tests itself
+        own_network.isolate()
     if session.config.option.realtime:
         session.config.stash[LOST_TIME] = LostTime()
 

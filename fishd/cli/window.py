@@ -137,10 +137,10 @@ def devices(as_json: bool, **values: Any) -> None:
 @click.argument("device")
 @json_option
 def revoke(device: str, as_json: bool, **values: Any) -> None:
-    """Remove a device, close its pages, and end what it does: its driving and its jobs.
+    """Remove a device, and end what it does.
 
-    The fish comes to rest, also where it would keep swimming without the page. DEVICE is its name
-    or id, as `fishctl window devices` shows it.
+    Its pages are closed, and its jobs stop. The fish comes to rest, also where it would keep
+    swimming without the page. DEVICE is its name or id, as `fishctl window devices` shows it.
     """
     removed = _open_devices(_load_running(**values)).revoke(device)
     if as_json:

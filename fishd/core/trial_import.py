@@ -3,8 +3,9 @@
 import os
 import signal
 import subprocess
-import sys
 from functools import lru_cache
+
+from fishd.core.process.safe_path import python_command
 
 TIMEOUT_S = 8.0
 """Longest time that an import may take [s]."""
@@ -31,7 +32,7 @@ def find_danger(module: str) -> str:
     An import that raises an exception is no danger.
     """
     reader, writer = os.pipe()
-    command = [sys.executable, "-P", "-c", _CHILD, str(writer), module]
+    command = python_command("-c", _CHILD, str(writer), module)
     quiet = subprocess.DEVNULL
     try:
         status = subprocess.run(

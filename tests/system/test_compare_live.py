@@ -30,7 +30,7 @@ def test_a_signal_lets_the_fish_rest(daemon: Daemon, number: int, runs: Path) ->
     process.send_signal(number)
     out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, out) == (130, f"fish: the fish of fishd at {daemon.endpoint}\n")
-    (folder,) = runs.iterdir()
+    (folder,) = runs.glob("[!.]*")
     resume = f"fishctl compare --resume {folder}"
     assert err == f"fishctl: interrupted; the fish rests; resume with: {resume}\n"
     assert daemon.status().mode == "idle"

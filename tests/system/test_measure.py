@@ -103,7 +103,7 @@ def test_whoever_ends_it_leaves_the_fish_at_rest(
 ) -> None:
     status, out, err = start_measurement(daemon).end(how)
     assert (status, out.count("\n")) == (130, 1)
-    (folder,) = runs.iterdir()
+    (folder,) = runs.glob("[!.]*")
     resume = f"fishctl measure --resume {folder}"
     assert err == f"fishctl: interrupted, the fish rests; resume with: {resume}\n"
     assert daemon.status().mode == "idle"

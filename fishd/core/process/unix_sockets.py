@@ -123,6 +123,9 @@ def claim_socket(path: Path, name: str, rival: str, advice: str) -> Iterator[Non
         try:
             if path.exists() and not path.is_socket():
                 raise StartupError(f"{path} exists and is not a socket; choose another address")
+            path.parent.stat()
+            if not os.access(path.parent, os.W_OK):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
             stack.enter_context(claimed(_claim_name(path)))
         except NameTaken as taken:
             raise StartupError(
@@ -130,7 +133,7 @@ def claim_socket(path: Path, name: str, rival: str, advice: str) -> Iterator[Non
             ) from None
         except OSError as error:
             raise StartupError(
-                f"{path} cannot be used: {error.strerror}; choose an address in a folder that "
+                f"{path} cannot be created: {error.strerror}; choose an address in a folder that "
                 "exists and that you may write to"
             ) from None
         deadline = time.monotonic() + RELEASE_TIMEOUT_S

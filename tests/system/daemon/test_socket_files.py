@@ -236,15 +236,16 @@ def test_after_a_logout_the_socket_is_elsewhere_until_the_next_login(user: User)
     assert not [path for path in elsewhere.parent.iterdir() if path.is_socket()]
 
 
-def test_verbs_from_cron_find_the_fishd_of_a_login_session_and_say_so(user: User) -> None:
+def test_from_cron_a_fishd_is_stopped_and_other_verbs_say_where_it_is(user: User) -> None:
     session = open_session(user)
     with user.fishd(session):
         wait_until((session / "fishd" / "control.estop").exists)
-        told = f"the one of this user serves ipc://{session}/fishd/control"
-        for verb in (["status"], list(SWIM), ["stop"], ["estop"]):
-            done = user.fishctl(None, *verb)
+        for verb in ("status", "stop", "estop"):
+            done = user.fishctl(None, verb)
             assert done.returncode == 0, done.stderr
-            assert told in done.stderr + done.stdout
+            assert "answered at its name in the kernel" in done.stderr + done.stdout
+        refused = one_line(user.fishctl(None, *SWIM))
+        assert f"serves ipc://{session}/fishd/control: name it with --endpoint" in refused
         assert user.fishctl(session, "status").stderr == ""
 
 
@@ -266,7 +267,7 @@ def test_a_fishd_answers_no_other_user_at_its_name_and_none_can_pretend_to_be_it
     user: User,
 ) -> None:
     session = open_session(user)
-    stranger = user.number + 1000
+    stranger = user.number + 10_000_000
     with user.fishd(session) as process:
         wait_until((session / "fishd" / "control.estop").exists)
         (own,) = user.daemons()

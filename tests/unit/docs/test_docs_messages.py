@@ -180,6 +180,7 @@ NEGATIONS = (
 IN_GAPS = (
     "another fishd (pid 812)",
     "not connected: Connection",
+    "not connected: no answer",
     "cannot start",
     "load 2",
     "servo driver",

@@ -91,9 +91,9 @@ def test_a_meter_at_the_address_of_the_force_sensor_is_refused() -> None:
 
 
 def test_a_bus_of_its_own_is_claimed_and_one_that_the_force_sensor_has_once_only() -> None:
-    for bus, expected in ((1, ["fishd-i2c-1"]), (3, ["fishd-i2c-1", "fishd-i2c-3"])):
+    for bus, expected in ((1, ["drives/i2c-1"]), (3, ["drives/i2c-1", "drives/i2c-3"])):
         config = load(None, ["robot=pi", METER, f"power_meter.bus={bus}"])
-        names = [part.path.name for part in parts_of(config)]
+        names = [part.name for part in parts_of(config)]
         assert [name for name in names if "i2c" in name] == expected
 
 
