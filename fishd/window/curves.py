@@ -17,18 +17,23 @@ async def read_curve(
 ) -> dict[str, list[float | None]]:
     """Return columns of a recording in the scratch folder, and remove it; raise `JobError`."""
     folder = recording.with_suffix("")
-    folder.mkdir()
+    await asyncio.to_thread(folder.mkdir)
     try:
         words = ["export", str(recording), "--csv", f"--to={folder}", "--force"]
         await call(words, runs, scratch.descriptor)
-        return await asyncio.to_thread(_read_columns, next(folder.glob("*[!s].csv")))
+        return await asyncio.to_thread(_read_columns, folder)
     finally:
-        recording.unlink(missing_ok=True)
-        shutil.rmtree(folder)
+        await asyncio.to_thread(_remove, recording, folder)
 
 
-def _read_columns(path: Path) -> dict[str, list[float | None]]:
+def _remove(recording: Path, folder: Path) -> None:
+    recording.unlink(missing_ok=True)
+    shutil.rmtree(folder)
+
+
+def _read_columns(folder: Path) -> dict[str, list[float | None]]:
     columns: dict[str, list[float | None]] = {}
+    path = next(folder.glob("*[!s].csv"))
     with path.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             for name in _COLUMNS:

@@ -54,7 +54,7 @@ class JobRequests:
             self._pages.require_driver(link.name, page)
             await link.give_back()  # the experiment takes the fish itself
         endpoint, device = link.endpoint_options, access.device_id
-        job = self._jobs.start(body.kind, link.name, endpoint, options, device)
+        job = await self._jobs.start(body.kind, link.name, endpoint, options, device)
         self._pages.tell_job(job)
         return success(job)
 

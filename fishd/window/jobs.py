@@ -94,6 +94,7 @@ class Jobs:
         self._scratch = Scratch("fishd-window-")
         self.runs = Runs(runs, self._scratch)
         self._folder = runs
+        self._starting = asyncio.Lock()
 
     async def close(self) -> None:
         """Stop all jobs, and wait for their ends."""
@@ -155,7 +156,7 @@ class Jobs:
         self._count += 1
         return str(self._count)
 
-    def start(
+    async def start(
         self, kind: str, fish: str, endpoint: Iterable[str], options: Any, device: str
     ) -> Job:
         """Start a job; raise `JobError`.
@@ -163,28 +164,47 @@ class Jobs:
         fish: name of the fish; endpoint: options of fishctl for it
         device: identifier of the device that starts it
         """
-        if len(self._tasks) >= MAX_RUNNING_JOBS:
-            raise JobError(f"{MAX_RUNNING_JOBS} jobs run already; wait for the end of one")
+        async with self._starting:
+            if len(self._tasks) >= MAX_RUNNING_JOBS:
+                raise JobError(f"{MAX_RUNNING_JOBS} jobs run already; wait for the end of one")
+            # A disk may stall, and an emergency stop must not wait for it.
+            prepared = await asyncio.to_thread(self._prepare, kind, options)
+            return self._start_prepared(*prepared, fish, endpoint, options, device)
+
+    def _prepare(self, kind: str, options: Any) -> tuple[str, str, list[str]]:
+        """Return kind, folder and command line of a job, whose folders exist then."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise JobError(f"{self._folder} cannot be created: {error.strerror}") from None
+        self._scratch.create()
         if kind == "resume":
-            kind, run, words = self._resume(options)
+            return self._resume(options)
+        run = f"{kind}-{datetime.now():%Y%m%d-%H%M%S}" if kind in DRIVING_KINDS else ""
+        return kind, self._unused_name(run) if run else "", list_words(kind, options)
+
+    def _start_prepared(
+        self,
+        kind: str,
+        run: str,
+        words: list[str],
+        fish: str,
+        endpoint: Iterable[str],
+        options: Any,
+        device: str,
+    ) -> Job:
+        is_resumed = isinstance(options, ResumeOptions)
+        if is_resumed:
             for job in self._jobs.values():
                 if job.run == run and job.resumable:
                     job.resumable = False
                     self._tell(job)
-        else:
-            words = list_words(kind, options)
-            run = f"{kind}-{datetime.now():%Y%m%d-%H%M%S}" if kind in DRIVING_KINDS else ""
-            run = self._unused_name(run) if run else ""
         if kind in ("record", *DRIVING_KINDS):
             words += endpoint
         shown = [f"--folder={self._folder}"] if self._show_folder and kind in _FOLDER_KINDS else []
         name = self._new_id()
         job = Job(name, kind, fish, ["fishctl", *words, *shown], "running", 0.0, run)
-        words += self._list_hidden_words(job, is_resumed=isinstance(options, ResumeOptions))
+        words += self._list_hidden_words(job, is_resumed=is_resumed)
         self._jobs[name], self._starts[name] = job, time.monotonic()
         while len(self._jobs) > MAX_REMEMBERED_JOBS:
             ended = next((j.id for j in self._jobs.values() if j.state != "running"), None)
@@ -207,7 +227,8 @@ class Jobs:
     def _unused_name(self, name: str) -> str:
         """Return the name of a folder that does not exist; two jobs may start in one second."""
         number, wanted = 2, name
-        while (self._folder / name).exists() or any(job.run == name for job in self._jobs.values()):
+        runs = {job.run for job in list(self._jobs.values())}
+        while name in runs or (self._folder / name).exists():
             name, number = f"{wanted}-{number}", number + 1
         return name
 
@@ -260,10 +281,10 @@ class Jobs:
             if job.kind == "simulate" and job.exit == 0:
                 curve = await read_curve(self._recording_of(job), self._folder, self._scratch)
                 job.result = {**job.result, "curve": curve}
-            self._keep_picture(job)
+            await asyncio.to_thread(self._keep_picture, job)
             stopped = job.id in self._stopping
+            await asyncio.to_thread(self._conclude, job)
             job.state = "stopped" if stopped else "done" if job.exit == 0 else "failed"
-            self._conclude(job)
         except (OSError, FishdError) as error:
             job.lines.append(text.describe_error(error))
             job.state = "failed"

@@ -65,10 +65,10 @@ class Runs:
         async with self._listing:
             read, runs = self._list
             if time.monotonic() - read >= RUNS_AGE_S:
-                self.folder.mkdir(parents=True, exist_ok=True)
-                runs = []
-                if not _is_empty(self.folder):  # saves a process for each page of a new window
-                    runs = await self._list_folder()
+                # A disk may stall, and an emergency stop must not wait for it.
+                is_empty = await asyncio.to_thread(_is_empty, self.folder)
+                # An empty folder saves a process for each page of a new window.
+                runs = [] if is_empty else await self._list_folder()
                 self._list = (time.monotonic(), runs)
             return runs
 
@@ -84,7 +84,7 @@ class Runs:
         if not _RUN_NAME.fullmatch(name):
             raise JobError(f"'{text.quoted(name)}' is not the name of a run")
         try:
-            if os.path.lexists(self.folder / name):
+            if await asyncio.to_thread(os.path.lexists, self.folder / name):
                 return await asyncio.to_thread(open_run_picture, self.folder, name)
             return await self._draw(name)
         except files.FileProblem as problem:
@@ -97,9 +97,10 @@ class Runs:
         self._waiting_plots += 1
         try:
             async with self._plotting:
+                await asyncio.to_thread(self._scratch.create)
                 cache = self._scratch.folder
                 picture = cache / f"{name}.png"
-                stamp = _read_stamp(self.folder / f"{name}.mcap")
+                stamp = await asyncio.to_thread(_read_stamp, self.folder / f"{name}.mcap")
                 if stamp is None or stamp != self._drawn.get(name):
                     where = (f"--folder={self.folder}", f"--to={cache}")
                     words = ["plot", name, "--png", "--force", *where, "--json"]
@@ -113,7 +114,9 @@ class Runs:
 
 
 def _is_empty(folder: Path) -> bool:
+    """Create a folder if there is none, and return whether it is empty."""
     try:
+        folder.mkdir(parents=True, exist_ok=True)
         return next(folder.iterdir(), None) is None
     except OSError:
         return False

@@ -31,6 +31,13 @@ class Scratch:
         """prefix: beginning of its name"""
         self._prefix = prefix
 
+    def create(self) -> None:
+        """Make the folder if there is none; raises `JobError` if it cannot be made.
+
+        It may wait for a disk; `folder` and `descriptor` do not afterwards.
+        """
+        _ = self._content
+
     @property
     def folder(self) -> Path:
         """The folder; raises `JobError` if it cannot be made."""

@@ -31,6 +31,7 @@ from reliability.window_attacks import (
     own_address,
     pair,
     press,
+    stalled,
     unsee,
 )
 
@@ -178,6 +179,35 @@ def test_an_emergency_stop_waits_for_no_disk_and_no_lock(
 
         run(test())
     mounting.__exit__(None, None, None)
+
+
+def test_an_emergency_stop_waits_for_no_folder_of_runs(daemon: Daemon, tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    with running_window(tmp_path, fish=daemon.endpoint) as window:
+
+        async def test() -> None:
+            here = Target("127.0.0.1", window.port)
+            paths = ["/api/runs", "/api/runs/any/plot.png"]
+            asking = [
+                asyncio.ensure_future(here.exchange(here.request("GET", path))) for path in paths
+            ]
+            for _ in range(3):
+                await asyncio.sleep(0.1)
+                assert await press(here) is not None
+            assert not asking[0].done()
+            for task in asking:
+                task.cancel()
+
+        try:
+            trouble = stalled(runs)
+            trouble.__enter__()
+        except OSError:
+            pytest.skip("this user may not mount")
+        try:
+            run(test())
+        finally:
+            trouble.__exit__(None, None, None)
 
 
 def test_a_paired_device_stops_the_fish_after_a_restart_with_a_damaged_file(
