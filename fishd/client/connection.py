@@ -5,7 +5,7 @@ import math
 import os
 import socket
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgspec
@@ -78,7 +78,7 @@ class Connection:
         Raise `Untrusted` if the process of another user may answer. An endpoint that the user named
         is trusted.
         """
-        if self._path and is_deserted(self._path):
+        if self.is_deserted:
             raise self._no_daemon("no process listens there")
         try:
             self._listener()
@@ -96,10 +96,11 @@ class Connection:
 
     def _no_daemon(self, why: str) -> NoDaemon:
         if elsewhere := self._local_daemons():
-            found = ", ".join(daemon.describe() for daemon in elsewhere)
+            from fishd.core import local_daemons
+
             return NoDaemon(
-                f"no fishd at {self.endpoint}: {why}; {found}: name it with --endpoint or "
-                "$FISHD_ENDPOINT"
+                f"no fishd at {self.endpoint}: {why}; {local_daemons.describe(elsewhere)}: name it "
+                "with --endpoint or $FISHD_ENDPOINT"
             )
         return NoDaemon(
             f"no fishd at {self.endpoint}: {why}; start one with 'fishd', or a simulated fish "
@@ -110,8 +111,7 @@ class Connection:
         """Return the fishds of this machine that a client of this endpoint may mean."""
         from fishd.core import local_daemons
 
-        same = local_daemons.find_own(self.endpoint)
-        return same if same or self._was_named else local_daemons.find_own()
+        return local_daemons.find_own(self.endpoint if self._was_named else None)
 
     def no_answer_error(self, patience: float = 0.0) -> NoDaemon:
         """Return the error for a missing answer; patience: time beyond the timeout [s]."""
@@ -168,9 +168,17 @@ class Connection:
             raise ParameterError(f"{op}: the request is longer than {protocol.MAX_MESSAGE} bytes")
         return identity, payload
 
-    def estop_without_gateway(self, message: str) -> State | None:
-        """Request an emergency stop at fishd's own sockets; None if none answers."""
-        path = estop_path(self.endpoint)
+    @property
+    def is_deserted(self) -> bool:
+        """Whether it is certain that no process listens at the endpoint."""
+        return self._path is not None and is_deserted(self._path)
+
+    def estop_without_gateway(self, message: str, *, trusted: bool = True) -> State | None:
+        """Request an emergency stop at fishd's own sockets; None if none answers.
+
+        trusted: whether only this user and those that it trusts can listen in the folder
+        """
+        path = estop_path(self.endpoint) if trusted else None
         identity, request = self.request("estop", {"message": message})
         if path is None:
             return self._estop_all(message)
@@ -188,34 +196,45 @@ class Connection:
 
     def _estop_all(self, message: str) -> State | None:
         """Request an emergency stop of every fishd that this endpoint may mean, by its name."""
-        answers = [
-            self._ask(daemon, State, "estop", {"message": message})
-            for daemon in self._local_daemons()
-        ]
-        states = [state for state in answers if state]
+        states = self._ask(self._local_daemons(), State, "estop", {"message": message})
         self.estop_taken_by = "kernel" if states else ""
-        return states[0] if states else None
+        return next(iter(states.values()), None)
 
     def ask_directly(self, kind: type[T], op: str, args: Mapping[str, Any]) -> T | None:
         """Send a request to the name of a fishd in the kernel; None without an answer.
 
         For a fishd whose control socket is gone. Return None also if it may be one of several.
         """
-        daemons = self._local_daemons()
-        return self._ask(daemons[0], kind, op, args) if len(daemons) == 1 else None
+        daemons = self._ask(self._local_daemons(), Status, "status", {})
+        if len(daemons) != 1:
+            self.detour = ""
+            return None
+        return next(iter(self._ask(daemons, kind, op, args).values()), None)
 
     def _ask(
-        self, daemon: "LocalDaemon", kind: type[T], op: str, args: Mapping[str, Any]
-    ) -> T | None:
+        self, daemons: "Iterable[LocalDaemon]", kind: type[T], op: str, args: Mapping[str, Any]
+    ) -> "dict[LocalDaemon, T]":
+        """Return the results of those that answer; raise the refusal if all refuse."""
+        from fishd.core import local_daemons
+
         identity, request = self.request(op, args)
-        reply = daemon.ask(request)
-        result = self.result((reply,), identity, kind) if reply else None
-        if result is not None:
+        results, refusal = {}, None
+        for daemon, reply in local_daemons.ask(daemons, request).items():
+            try:
+                result = self.result((reply,), identity, kind)
+            except FishError as error:
+                refusal = error
+            else:
+                if result is not None:
+                    results[daemon] = result
+        if refusal and not results:
+            raise refusal
+        if results:
+            pids = ", ".join(str(daemon.pid) for daemon in results)
             self.detour = (
-                f"no answer from {self.endpoint}; process {daemon.pid} answered at its name in the "
-                "kernel"
+                f"no answer from {self.endpoint}; process {pids} answered at its name in the kernel"
             )
-        return result
+        return results
 
     def result(self, frames: Sequence[bytes], identity: int, kind: type[T]) -> T | None:
         """Return the result in a reply; None if it answers an earlier request that timed out."""

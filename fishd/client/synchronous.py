@@ -138,11 +138,15 @@ class Fish(Connection):
         timeout: time to wait for an answer after these first attempts, which take up to 0.5 s [s];
             None for that of other requests
         """
+        if self.is_deserted and (answer := self.estop_without_gateway(message)):
+            return answer
         try:
             state = self._call(
                 State, "estop", patience=ESTOP_FALLBACK_DELAY_S - self.timeout, message=message
             )
         except Untrusted:
+            if answer := self.estop_without_gateway(message, trusted=False):
+                return answer
             raise
         except NoDaemon:
             if answer := self.estop_without_gateway(message):
@@ -288,9 +292,7 @@ class Fish(Connection):
         if self._socket is None:
             try:
                 self.check_endpoint()
-            except Untrusted:
-                raise
-            except NoDaemon:
+            except (NoDaemon, Untrusted):
                 if op in DIRECT_OPERATIONS and op != "estop":
                     result = self.ask_directly(kind, op, args)
                     if result is not None:

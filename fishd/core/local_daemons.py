@@ -7,7 +7,8 @@ requests at it, of its own user, of root, and of the members of its group.
 
 import os
 from binascii import crc32
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,28 +36,58 @@ class LocalDaemon(NamedTuple):
     """Hash of the address of its control socket when it started."""
     name: str
 
-    def ask(self, request: bytes, timeout: float = ANSWER_TIMEOUT_S) -> bytes | None:
-        """Send a request and return the reply; None without one from this process.
+    @property
+    def may_be_asked(self) -> bool:
+        """Whether it answers this user: one of this user, or that of the service; root may ask all.
 
-        timeout: longest time to wait [s]
+        The service answers only the members of its group.
         """
-        answer = kernel_names.exchange_datagrams(self.name, request, timeout)
-        return answer[0] if answer and answer[1] == (self.pid, self.user) else None
+        return os.geteuid() in (0, self.user) or self.user == _service_user()
 
-    def describe(self) -> str:
-        """Return a phrase that names the process and its address."""
-        where = self.control_address()
-        place = f"serves {where}" if where else "does not answer, or has no control socket"
-        return f"the fishd of process {Holder(self.pid, self.user)} {place}"
 
-    def control_address(self) -> str:
-        """Return the address of its control socket; empty if it has none or does not answer."""
-        request = protocol.Request(v=protocol.VERSION, id=1, op="status", args={})
-        try:
-            reply = protocol.decode_reply(self.ask(protocol.encode(request)) or b"")
-            return msgspec.json.decode(reply.result or b"", type=Status).control
-        except (msgspec.DecodeError, FishError):
-            return ""
+def ask(
+    daemons: Iterable[LocalDaemon], request: bytes, timeout: float = ANSWER_TIMEOUT_S
+) -> dict[LocalDaemon, bytes]:
+    """Send a request to each of these at once; return the replies.
+
+    A reply of another process than the one that the name says is dropped: any user can hold any
+    name.
+
+    timeout: longest time to wait for all of them [s]
+    """
+    by_name = {daemon.name: daemon for daemon in daemons}
+    answers = kernel_names.exchange_datagrams(by_name, request, timeout)
+    return {
+        daemon: answers[name][0]
+        for name, daemon in by_name.items()
+        if name in answers and answers[name][1] == (daemon.pid, daemon.user)
+    }
+
+
+def describe(daemons: Iterable[LocalDaemon]) -> str:
+    """Return a phrase that names processes and where they can be reached."""
+    daemons = list(daemons)
+    request = protocol.Request(v=protocol.VERSION, id=1, op="status", args={})
+    replies = ask((d for d in daemons if d.may_be_asked), protocol.encode(request))
+    phrases = []
+    for daemon in daemons:
+        who = f"the fishd of process {Holder(daemon.pid, daemon.user)}"
+        if not daemon.may_be_asked:
+            phrases.append(f"{who}, which this user may not ask")
+        elif where := _read_control_address(replies.get(daemon, b"")):
+            phrases.append(f"{who} serves {where}")
+        else:
+            phrases.append(f"{who} does not answer, or has no control socket")
+    return ", ".join(phrases)
+
+
+def _read_control_address(reply: bytes) -> str:
+    """Return the address in the reply to `status`; empty if there is none."""
+    try:
+        result = protocol.decode_reply(reply).result
+        return msgspec.json.decode(result or b"", type=Status).control
+    except (msgspec.DecodeError, FishError):
+        return ""
 
 
 def name_of_this(control: str) -> str:
@@ -66,8 +97,8 @@ def name_of_this(control: str) -> str:
 
 
 def find_all() -> list[LocalDaemon]:
-    """Return the fishds of all users, as far as this user can see their processes."""
-    return [daemon for daemon in _parse_names() if _is_process_of(daemon.pid, daemon.user)]
+    """Return the fishds of all users."""
+    return list(_parse_names())
 
 
 def find_own(control: str | None = None) -> list[LocalDaemon]:
@@ -76,30 +107,31 @@ def find_own(control: str | None = None) -> list[LocalDaemon]:
     control: address of the control socket that they had when they started; None for any
     Root may ask all. Whether one is what its name says, only its answer shows.
     """
-    trusted = {os.geteuid(), _service_user()}
-    return [
-        daemon
-        for daemon in _parse_names()
-        if (daemon.user in trusted or os.geteuid() == 0)
-        and (control is None or daemon.hash == _hash(control))
-    ]
+    own = (daemon for daemon in _parse_names() if daemon.may_be_asked)
+    return [daemon for daemon in own if control is None or daemon.hash == _hash(control)]
 
 
 def _parse_names() -> Iterator[LocalDaemon]:
     for name in kernel_names.read_names(_PREFIX):
         parts = name.removeprefix(_PREFIX).split("/")
         if len(parts) == 4 and parts[0].isdecimal() and parts[1].isdecimal():
-            yield LocalDaemon(int(parts[0]), int(parts[1]), parts[2], name)
+            daemon = LocalDaemon(int(parts[0]), int(parts[1]), parts[2], name)
+            if not _is_of_another_user(daemon):
+                yield daemon
 
 
-def _is_process_of(pid: int, user: int) -> bool:
-    """Return whether a process is one of a user: any user can hold any name."""
+def _is_of_another_user(daemon: LocalDaemon) -> bool:
+    """Return whether its process certainly belongs to another user than its name says.
+
+    This user may not see the processes of others, or those in another container.
+    """
     try:
-        return Path(f"/proc/{pid}").stat().st_uid == user
+        return Path(f"/proc/{daemon.pid}").stat().st_uid != daemon.user
     except OSError:
         return False
 
 
+@cache
 def _service_user() -> int:
     import pwd
 

@@ -21,8 +21,11 @@ from fishd.core.process.kernel_names import Holder
 
 log = logging.getLogger(__name__)
 
-_MAX_REFUSED = 32
-"""Largest number of datagrams of other users that are read, and dropped, for one that is not."""
+_MAX_REFUSED = 16
+"""Largest number of datagrams of other users that are read, and dropped, in a period.
+
+More than the kernel queues.
+"""
 
 Perform = Callable[[bytes], Awaitable[bytes]]
 
@@ -54,11 +57,14 @@ class DirectSocket:
             self._events.add_reader(self._socket, self._take)
 
     def _take(self) -> None:
-        received = self._receive()
-        if received:
-            self._events.remove_reader(self._socket)
+        if received := self._receive():
+            self._pause()
             self._task = self._events.create_task(self._answer(*received))
-            self._events.call_later(self._period, self._resume)
+
+    def _pause(self) -> None:
+        """Read nothing more for a period."""
+        self._events.remove_reader(self._socket)
+        self._events.call_later(self._period, self._resume)
 
     def _receive(self) -> tuple[bytes, str | bytes | None] | None:
         """Return a request and the address of its client; None without a permitted one."""
@@ -95,6 +101,7 @@ class KernelSocket(DirectSocket):
                 return None
             if self._is_permitted(client):
                 return payload, sender
+        self._pause()  # another user floods it
         return None
 
     def _is_permitted(self, client: Holder) -> bool:

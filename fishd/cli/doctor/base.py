@@ -56,13 +56,15 @@ def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
     """
     given_endpoint, endpoint = endpoint, endpoint or find_control_address()
     try:
-        if is_unused(endpoint) and not local_daemons.find_own(endpoint):
+        if is_unused(endpoint) and not local_daemons.find_own(given_endpoint):
             return None
     except PermissionError:
         return Unreachable(f"there may be a fishd at {endpoint}, but this user may not ask", True)
     try:
         with Fish(given_endpoint, timeout=ANSWER_TIMEOUT_S) as fish:
-            return Running(fish.status(), _latest_tick(fish), _read_calibrations(fish), endpoint)
+            status = fish.status()
+            where = status.control if fish.detour else endpoint
+            return Running(status, _latest_tick(fish), _read_calibrations(fish), where)
     except Untrusted as error:
         reason = str(error)
     except NoDaemon:

@@ -27,7 +27,7 @@ def daemon(context: Context) -> Result:
         if others := local_daemons.find_all():
             return warning(
                 f"no fishd at {context.endpoint or addresses.find_control_address()}, but "
-                f"{', '.join(other.describe() for other in others)}",
+                f"{local_daemons.describe(others)}",
                 "name the one that you mean with --endpoint",
             )
         return ok("no fishd is running")
@@ -63,7 +63,7 @@ def control(context: Context) -> Result:
     if isinstance(context.daemon, Running):
         served = context.daemon.endpoint
         if not context.daemon.status.control:
-            return fail(f"{served} is gone, and fishd cannot create it", "see 'daemon'")
+            return fail("its file is gone, and fishd cannot create it", "see 'daemon'")
     try:
         address = context.config.control.address or served or addresses.control_address()
     except StartupError as error:

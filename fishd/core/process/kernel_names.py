@@ -8,9 +8,11 @@ names its pid and user.
 
 import errno
 import os
+import select
 import socket
 import struct
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -84,9 +86,15 @@ def find_holder(name: str) -> Holder | None:
 
 
 def read_names(prefix: str) -> list[str]:
-    """Return the names that begin with a prefix and are held now by processes of any user."""
+    """Return the names that begin with a prefix and are held now by processes of any user.
+
+    None where the kernel's list cannot be read, as with `ProcSubset=pid` of systemd.
+    """
     start = f"@{_PREFIX}/{prefix}"
-    table = _TABLE.read_text(encoding="utf-8", errors="replace")
+    try:
+        table = _TABLE.read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return []
     words = (line.rpartition(" ")[2] for line in table.splitlines())
     return [word.removeprefix(f"@{_PREFIX}/") for word in words if word.startswith(start)]
 
@@ -104,21 +112,32 @@ def bind_datagrams(name: str) -> socket.socket:
     return server
 
 
-def exchange_datagrams(name: str, request: bytes, timeout: float) -> tuple[bytes, Holder] | None:
-    """Send a datagram to a name and return the answer with its sender; None without an answer.
+def exchange_datagrams(
+    names: Iterable[str], request: bytes, timeout: float
+) -> dict[str, tuple[bytes, Holder]]:
+    """Send a datagram to each name at once; return the answers and their senders, by name.
 
-    timeout: longest time to wait [s]
+    timeout: longest time to wait for all of them [s]
     """
+    waiting = {_address(name): name for name in names}
+    answers: dict[str, tuple[bytes, Holder]] = {}
     with bind_datagrams("") as client:
-        client.settimeout(timeout)
-        try:
-            client.sendto(request, _address(name))
-            while True:
+        for address in list(waiting):
+            try:
+                client.sendto(request, address)
+            except OSError:  # it has ended, or does not read
+                del waiting[address]
+        deadline = time.monotonic() + timeout
+        while waiting and (remaining := deadline - time.monotonic()) > 0.0:
+            if not select.select([client], [], [], remaining)[0]:
+                break
+            try:
                 answer, holder, sender = receive_datagram(client, _MAX_ANSWER_BYTES)
-                if sender == _address(name):
-                    return answer, holder
-        except OSError:
-            return None
+            except OSError:
+                continue
+            if isinstance(sender, bytes) and sender in waiting:  # else another user's
+                answers[waiting.pop(sender)] = answer, holder
+    return answers
 
 
 def receive_datagram(server: socket.socket, size: int) -> tuple[bytes, Holder, str | bytes | None]:

@@ -338,8 +338,8 @@ class Gateway(_Peer):
         """
         if self._link is not None:  # else the next process gets the listener when it starts
             socket.send_fds(self._link, [LISTEN + address.encode()], [listener.fileno()])
-        self._listener.close()
-        self._listener = listener.dup()
+        former, self._listener = self._listener, listener.dup()
+        former.close()
         self.address = address
 
     def read(self, enabled: bool) -> None:
