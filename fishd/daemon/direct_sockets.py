@@ -108,22 +108,19 @@ class KernelSocket(DirectSocket):
         return client.user in self._permitted
 
 
-def open_at_file(path: Path, perform: Perform, period: float) -> DirectSocket | None:
-    """Return a socket at a path next to a socket that is `claimed`; None if it cannot be made.
+def open_at_file(path: Path, perform: Perform, period: float) -> DirectSocket:
+    """Return a socket at a path next to a socket that is `claimed`; raise OSError or ValueError.
 
-    The reason is logged. Only this user and the group of this process may connect.
+    Only this user and the group of this process may connect.
     """
     server = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    server.setblocking(False)
     try:
+        server.setblocking(False)
         unix_sockets.check_length(str(path))
         unix_sockets.bind(server, path, unix_sockets.GROUP_MASK)
-    except (OSError, ValueError) as error:
-        log.warning(
-            "%s: not available, so an emergency stop needs the control socket: %s", path, error
-        )
+    except (OSError, ValueError):
         server.close()
-        return None
+        raise
     return DirectSocket(server, perform, period)
 
 

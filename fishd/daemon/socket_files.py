@@ -4,9 +4,10 @@ A logout removes the folder of the login session, and with it all sockets in it;
 that cleans /tmp, or a person. Existing connections go on, but no client can connect any more.
 """
 
+import logging
 import os
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from fishd.control.loop import ControlLoop
@@ -18,8 +19,7 @@ from fishd.core.signals import Level, Reason
 from fishd.daemon.direct_sockets import DirectSocket
 from fishd.daemon.gateway.gateways import Gateway, Gateways
 
-CHECK_PERIOD_S = 0.5
-"""Time between two checks whether the files exist [s]."""
+log = logging.getLogger(__name__)
 
 
 class SocketFile:
@@ -36,14 +36,22 @@ class SocketFile:
         self._configured = configured
         self._key, self._group = key, group
         self._claimed = {gateway.address}
-        self._identity = _identify(gateway.address)
         path = addresses.socket_path(gateway.address)
+        self._identity = _identify(path)
         self._folder = path.parent.stat() if path else None
+        self.problem = ""
+        """Why the file could not be created again; empty if it is there."""
 
     @property
     def is_there(self) -> bool:
         """Whether clients can find the socket where it was created."""
-        return self._folder is None or self._identity == _identify(self._gateway.address) != ()
+        path = addresses.socket_path(self._gateway.address)
+        if path is None:
+            return True
+        identity = _identify(path)
+        if identity != self._identity and _is_own(path):  # touched, not replaced
+            self._identity = identity
+        return identity == self._identity != ()
 
     @property
     def is_away(self) -> bool:
@@ -62,14 +70,15 @@ class SocketFile:
         assert former
         if self._configured:
             self._restore_folder(path.parent)
+        # Claiming an address would wait for a program that listens there.
+        if path.exists() and not (path.is_socket() and unix_sockets.is_deserted(path)):
+            raise StartupError(f"another program has put something else at {path}; remove that")
         if address not in self._claimed:
             claims.enter_context(addresses.claim_address(address))
             self._claimed.add(address)
-        elif path.exists() and not (path.is_socket() and unix_sockets.is_deserted(path)):
-            raise StartupError(f"another program has put something else at {path}; remove that")
         with addresses.listen(address, self._key, group=self._group) as listener:
             self._gateway.listen_at(address, listener)
-        self._identity = _identify(address)
+        self._identity = _identify(path)
         if former != path:
             former.unlink(missing_ok=True)
 
@@ -91,27 +100,27 @@ class SocketWatch:
         loop: ControlLoop,
         gateways: Gateways,
         configured: str | None,
-        open_direct: Callable[[Path], DirectSocket | None],
+        open_direct: Callable[[Path], DirectSocket],
     ) -> None:
         """
         configured: `control.address`
-        open_direct: function that opens fishd's own socket at a path
+        open_direct: function that opens fishd's own socket at a path, or raises OSError or
+            ValueError
         """
         self._loop = loop
-        self._control = gateways.control
-        self._files = [
-            SocketFile(gateways.control, configured, "control.address", group=True),
-            SocketFile(
-                gateways.telemetry, gateways.telemetry.address, "telemetry.address", group=False
-            ),
-        ]
+        self._gateways = gateways
+        self._control = SocketFile(gateways.control, configured, "control.address", group=True)
+        telemetry = gateways.telemetry
+        self._telemetry = SocketFile(telemetry, telemetry.address, "telemetry.address", group=False)
         self._open_direct = open_direct
         self._claims = ExitStack()
         self._claims.callback(self._close_direct_file)
         self._direct: DirectSocket | None = None
         self._direct_file: Path | None = None
         self._direct_identity: tuple[int, ...] = ()
-        self._problem = ""
+        self._direct_error = ""
+        self._reported = ""
+        """Problem that was reported last."""
         self.restored = 0
         """Number of times that files were created again since start."""
         self._open_direct_file()
@@ -119,18 +128,29 @@ class SocketWatch:
     @property
     def control(self) -> str:
         """Address of the control socket; empty while its file cannot be created."""
-        return self._control.address if self._files[0].is_there else ""
+        return "" if self._control.problem else self._gateways.control.address
 
     @property
     def limitation(self) -> str:
         """Line about files that are gone or in another folder; empty if there are none."""
         if self._problem:
             return self._problem
-        if self._files[0].is_away:
+        if self._control.is_away:
             return (
                 f"the folder of {addresses.default_address()} is gone, as after a logout: the "
-                f"control socket is {self._control.address}"
+                f"control socket is {self._gateways.control.address}"
             )
+        return ""
+
+    @property
+    def _problem(self) -> str:
+        if why := self._control.problem:
+            return (
+                f"the control socket is gone and cannot be created: {why}; only 'fishctl estop', "
+                "'stop' and 'status' of this user reach this fishd"
+            )
+        if why := self._telemetry.problem:
+            return f"the socket of telemetry is gone and cannot be created: {why}"
         return ""
 
     def close(self) -> None:
@@ -138,69 +158,88 @@ class SocketWatch:
         self._claims.close()
 
     def check(self) -> None:
-        """Create files that are gone, and report that; let the fish rest if that fails."""
-        missing = [file for file in self._files if not file.is_there]
-        direct_missing = self._direct_identity != _identify(f"ipc://{self._direct_file}")
-        if not missing and not direct_missing:
-            self._problem = ""
-            if self._files[0].is_away:
-                self._return_home()
-            return
+        """Create files that are gone, and report that; let the fish rest if that fails twice."""
+        was_missing = bool(self._control.problem)
+        restored = [self._restore(file) for file in (self._control, self._telemetry)]
+        if not self._control.problem and (restored[0] or self._is_direct_file_missing()):
+            restored.append(self._open_direct_file())
+            if path := addresses.socket_path(self._gateways.control.address):
+                self._loop.robot.write_recipes(path)
+        if any(restored):
+            self.restored += 1
+            self._report("were gone and have been created again", "warning")
+        if self._problem != self._reported:
+            self._reported = self._problem
+            if self._problem:
+                self._loop.reporter.event("sockets", self._problem, "error", control=self.control)
+        if self._control.problem:
+            if was_missing and not self._gateways.keyed_control:
+                self._let_fish_rest()
+        elif self._control.is_away and not any(restored):
+            self._return_home()
+
+    def _restore(self, file: SocketFile) -> bool:
+        """Create a file again if it is gone; return whether it was created."""
+        before, file.problem = file.problem, ""
+        if file.is_there:
+            return bool(before)
         try:
-            for file in missing:
-                file.restore(self._claims)
+            file.restore(self._claims)
         except (OSError, StartupError) as error:
-            self._report_failure(str(error))
-            self._let_fish_rest()
-            return
-        self._finish()
-        self._problem = ""
-        self.restored += 1
-        self._report("were gone and have been created again", "warning")
+            file.problem = str(error)
+            return False
+        return True
 
     def _return_home(self) -> None:
         """Move the control socket to the folder of the login session, if that exists again."""
-        before = self._control.address
+        before = self._gateways.control.address
         try:
-            self._files[0].restore(self._claims)
+            self._control.restore(self._claims)
         except (OSError, StartupError):
             return  # such as another fishd that has started there since
-        if self._control.address != before:
-            self._finish()
+        if self._gateways.control.address != before:
+            self._open_direct_file()
+            if path := addresses.socket_path(self._gateways.control.address):
+                self._loop.robot.write_recipes(path)
             self._report("are in the folder of the login session again", "info")
 
-    def _finish(self) -> None:
-        self._open_direct_file()
-        if path := addresses.socket_path(self._control.address):
-            self._loop.robot.write_recipes(path)
+    def _is_direct_file_missing(self) -> bool:
+        return self._direct_file is not None and (
+            self._direct is None or self._direct_identity != _identify(self._direct_file)
+        )
 
-    def _open_direct_file(self) -> None:
+    def _open_direct_file(self) -> bool:
+        """Open fishd's own socket beside the control socket; return whether there is one now."""
         self._close_direct_file()
-        self._direct_file = addresses.estop_path(self._control.address)
-        if self._direct_file:
-            self._direct = self._open_direct(self._direct_file)
-            self._direct_identity = _identify(f"ipc://{self._direct_file}")
+        self._direct_file = path = addresses.estop_path(self._gateways.control.address)
+        if path is None:
+            return False
+        try:
+            self._direct = self._open_direct(path)
+        except (OSError, ValueError) as error:
+            if self._direct_error != str(error):
+                self._direct_error = str(error)
+                log.warning(
+                    "%s: not available, so an emergency stop needs the control socket: %s",
+                    path,
+                    error,
+                )
+            return False
+        self._direct_identity, self._direct_error = _identify(path), ""
+        return True
 
     def _close_direct_file(self) -> None:
         if self._direct and self._direct_file:
             self._direct.close()
-            if self._direct_identity == _identify(f"ipc://{self._direct_file}"):
-                self._direct_file.unlink(missing_ok=True)
+            if self._direct_identity == _identify(self._direct_file):
+                with suppress(OSError):
+                    self._direct_file.unlink()
         self._direct = None
 
     def _report(self, what: str, level: Level) -> None:
-        address = self._control.address
-        message = f"the files of fishd's sockets {what}; control {address}"
-        self._loop.reporter.event("sockets", message, level, control=address)
-
-    def _report_failure(self, why: str) -> None:
-        problem = (
-            f"the files of fishd's sockets are gone and cannot be created: {why}; only 'fishctl "
-            "estop', 'stop' and 'status' of this user reach this fishd"
-        )
-        if problem != self._problem:
-            self._problem = problem
-            self._loop.reporter.event("sockets", problem, "error", control="")
+        where = f"; control {self.control}" if self.control else ""
+        message = f"the files of fishd's sockets {what}{where}"
+        self._loop.reporter.event("sockets", message, level, control=self.control)
 
     def _let_fish_rest(self) -> None:
         """Let a fish fade to neutral that no live client drives, and that none can reach."""
@@ -213,11 +252,18 @@ class SocketWatch:
         loop.reporter.event("sockets", f"{message}: it fades to neutral", "warning", control="")
 
 
-def _identify(address: str) -> tuple[int, ...]:
-    """Return numbers that tell the file of an address from any later one; empty without a file."""
-    path = addresses.socket_path(address)
+def _is_own(path: Path) -> bool:
+    """Return whether this process listens at a path."""
+    with suppress(PermissionError):
+        listener = unix_sockets.find_listener(path)
+        return listener is not None and listener.pid == os.getpid()
+    return False
+
+
+def _identify(path: Path | None) -> tuple[int, ...]:
+    """Return numbers that tell a file from one that replaces it; empty without a file."""
     try:
         status = path.lstat() if path else None
     except OSError:
         return ()
-    return (status.st_dev, status.st_ino, status.st_ctime_ns) if status else ()
+    return (status.st_dev, status.st_ino, status.st_mtime_ns) if status else ()

@@ -14,7 +14,7 @@ _CLONE_NEWNET = 0x40000000
 _SIOCSIFADDR, _SIOCSIFFLAGS = 0x8916, 0x8914
 _UP = 0x1 | 0x8 | 0x40
 """Flags of an interface that is up, as that of the loopback is."""
-ADDRESS = "192.0.2.1"
+ADDRESS = "198.51.100.1"
 """Address of this machine that is not a loopback address, for clients from the network."""
 
 

@@ -8,7 +8,7 @@ import asyncio
 import json
 import os
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -163,12 +163,12 @@ def test_an_emergency_stop_waits_for_no_disk_and_no_lock(
 ) -> None:
     state = tmp_path / "window"
     state.mkdir(mode=0o700)
-    try:
-        mounting = mounted(state)
-        mounting.__enter__()
-    except OSError:
-        pytest.skip("this user may not mount")
-    with running_window(tmp_path, *EVERYWHERE, fish=daemon.endpoint) as window:
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(mounted(state))
+        except OSError:
+            pytest.skip("this user may not mount")
+        window = stack.enter_context(running_window(tmp_path, *EVERYWHERE, fish=daemon.endpoint))
 
         async def test() -> None:
             tablet = await pair_tablet(window)
@@ -178,7 +178,6 @@ def test_an_emergency_stop_waits_for_no_disk_and_no_lock(
                     assert await press(presser) is not None
 
         run(test())
-    mounting.__exit__(None, None, None)
 
 
 def test_an_emergency_stop_waits_for_no_folder_of_runs(daemon: Daemon, tmp_path: Path) -> None:
@@ -199,15 +198,12 @@ def test_an_emergency_stop_waits_for_no_folder_of_runs(daemon: Daemon, tmp_path:
             for task in asking:
                 task.cancel()
 
-        try:
-            trouble = stalled(runs)
-            trouble.__enter__()
-        except OSError:
-            pytest.skip("this user may not mount")
-        try:
+        with ExitStack() as stack:
+            try:
+                stack.enter_context(stalled(runs))
+            except OSError:
+                pytest.skip("this user may not mount")
             run(test())
-        finally:
-            trouble.__exit__(None, None, None)
 
 
 def test_a_paired_device_stops_the_fish_after_a_restart_with_a_damaged_file(

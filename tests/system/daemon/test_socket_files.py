@@ -1,5 +1,6 @@
 """A fishd whose sockets, or their folder, are gone can be found, seen and stopped."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -105,7 +106,7 @@ def test_a_fish_that_no_client_can_reach_rests_and_can_still_be_stopped(folder: 
         assert status.returncode == 0
         assert f"process {daemon.pid} answered at its name in the kernel" in status.stderr
         assert "rests, as   no client can connect to this fishd" in status.stdout
-        assert "are gone and cannot be created: " in status.stdout
+        assert "the control socket is gone and cannot be created: " in status.stdout
         assert daemon.fishctl("stop").stdout.startswith("idle")
         refused = one_line(daemon.fishctl("set-controller", "swing"))
         assert f"no fishd at {daemon.endpoint}" in refused
@@ -156,8 +157,8 @@ def test_a_file_of_another_program_is_not_replaced(folder: Path) -> None:
             complaint = "another program has put something else at "
 
             def is_reported() -> bool:
-                (own,) = local_daemons.find_own(daemon.endpoint)
-                return complaint in str(own.ask(b'{"v": 2, "op": "status"}'))
+                own = local_daemons.find_own(daemon.endpoint)
+                return complaint in str(local_daemons.ask(own, b'{"v": 2, "op": "status"}'))
 
             if (folder / "control").stat().st_ino == found:  # bound before fishd looked
                 wait_until(is_reported)
@@ -276,18 +277,17 @@ def test_a_fishd_answers_no_other_user_at_its_name_and_none_can_pretend_to_be_it
             "import os, sys\n"
             "from fishd.core.process.kernel_names import exchange_datagrams as ask\n"
             "os.setgid(int(sys.argv[1])); os.setuid(int(sys.argv[1]))\n"
-            "print(ask(sys.argv[2], sys.argv[3].encode(), 1.0))"
+            "print(ask([sys.argv[2]], sys.argv[3].encode(), 1.0))"
         )
         arguments = [sys.executable, "-c", ask, str(stranger), own.name, request.decode()]
         refused = subprocess.run(arguments, capture_output=True, text=True, check=True)
-        assert refused.stdout == "None\n"
+        assert refused.stdout == "{}\n"
         assert "mode        idle" in user.fishctl(session, "status").stdout
-        assert own.ask(request)  # root may
+        assert local_daemons.ask([own], request)  # root may
         assert process.pid == own.pid
     forged = f"daemon/{user.number}/{os.getpid()}/00000000/forged"
     with kernel_names.bind_datagrams(forged):
-        pretender = local_daemons.LocalDaemon(user.number, os.getpid(), "00000000", forged)
-        assert pretender not in local_daemons.find_all()
+        assert not [daemon for daemon in local_daemons.find_all() if daemon.name == forged]
 
 
 def test_an_answer_of_another_process_is_not_believed(tmp_path: Path) -> None:
@@ -304,3 +304,70 @@ def test_an_answer_of_another_process_is_not_believed(tmp_path: Path) -> None:
         with Fish(endpoint) as fish, pytest.raises(NoDaemon):
             fish.estop()
         process.kill()
+
+
+def test_a_socket_whose_rights_or_times_were_changed_is_still_there(folder: Path) -> None:
+    with running(folder) as daemon:
+        assert daemon.fishctl(*SWIM).returncode == 0
+        (folder / "control").chmod(0o666)
+        os.utime(folder / "control")
+        seq = daemon.status().seq + 40  # four checks
+        wait_until(lambda: daemon.status().seq > seq)
+        status = daemon.status()
+        assert (status.mode, status.control) == ("running", daemon.endpoint)
+        assert status.recovered_errors["sockets_restored"] == 0
+
+
+def test_names_that_another_user_holds_neither_hide_a_fishd_nor_delay_its_stop(
+    user: User,
+) -> None:
+    session = open_session(user)
+    with user.fishd(session) as process, contextlib.ExitStack() as stack:
+        wait_until((session / "fishd" / "control.estop").exists)
+        for number in range(30):  # processes of this user, which is root
+            name = f"daemon/{user.number}/{1_000_000_000 + number}/00000000/fake"
+            stack.enter_context(kernel_names.bind_datagrams(name))
+        for verb in ("status", "stop", "estop"):
+            done = user.fishctl(None, verb)
+            assert done.returncode == 0, done.stderr
+            assert f"process {process.pid} answered" in done.stderr + done.stdout
+
+
+def test_a_stop_waits_once_for_all_names_that_do_not_answer() -> None:
+    names = [f"daemon/0/1/00000000/{number}" for number in range(20)]
+    with contextlib.ExitStack() as stack:
+        for name in names:
+            stack.enter_context(kernel_names.bind_datagrams(name))
+        waits: list[float] = []
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("select.select", lambda *args: waits.append(args[3]) or ([], [], []))
+            assert kernel_names.exchange_datagrams(names, b"", 0.4) == {}
+    assert len(waits) == 1
+
+
+def test_a_user_in_the_place_of_the_folder_takes_no_stop_away(user: User) -> None:
+    session = open_session(user)
+    os.chown(user.home, 0, 0)
+    stranger = user.number + 10_000_000
+    with user.fishd(session):
+        wait_until((session / "fishd" / "control.estop").exists)
+        shutil.rmtree(session)
+        session.mkdir()
+        (session / "fishd").mkdir()
+        os.chown(session / "fishd", stranger, stranger)
+        with socket.socket(socket.AF_UNIX) as planted:
+            planted.bind(f"{session}/fishd/control")
+            planted.listen()
+            (session / "fishd" / "control").chmod(0o777)
+            done = user.fishctl(session, "estop")
+            assert done.returncode == 0, done.stderr
+            assert done.stdout.startswith("estop")
+            assert "answered at its name in the kernel" in done.stdout
+
+
+def test_where_the_kernel_lists_no_names_there_are_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(kernel_names, "_TABLE", tmp_path / "net" / "unix")
+    with Fish(f"ipc://{tmp_path}/control") as fish, pytest.raises(NoDaemon, match="start one"):
+        fish.estop()
