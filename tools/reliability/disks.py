@@ -1,7 +1,8 @@
 """Recordings on a disk that becomes full, read-only or stalls at a random instant; needs root.
 
 `fishctl record` runs on a small disk of its own. Afterwards its file must hold the ticks that it
-says are stored, without a gap that is not counted. Each tick that fishd had published until the
+says are stored, without a gap that is not counted, and after a failure it must not be called
+complete. Each tick that fishd had published until the
 trouble, or until the end after a stall, must be stored or counted as lost. An exit status of 0
 means that nothing was lost.
 """
@@ -43,13 +44,14 @@ class Trial(Struct):
     """Number of ticks from the first stored one that fishd has certainly published."""
     said_stored: int
     said_lost: int
+    said_complete: bool
 
     @property
     def is_silent(self) -> bool:
         """Whether ticks are missing that the recorder did not count."""
         missing = max(self.gaps, self.published - self.stored)
         is_wrong = self.stored != self.said_stored or self.said_lost < missing
-        return is_wrong or (self.status == 0 and self.said_lost > 0)
+        return is_wrong or self.said_complete != (self.status == 0 and not self.said_lost)
 
 
 def run(trouble: str, age: float, stall: float) -> Trial:
@@ -88,7 +90,8 @@ def run(trouble: str, age: float, stall: float) -> Trial:
         ticks = [tick.seq for tick in open_run(path if path.exists() else part).ticks]
     gaps = ticks[-1] - ticks[0] + 1 - len(ticks)
     published -= ticks[0] - 1
-    return Trial(trouble, status, len(ticks), gaps, published, said["ticks"], said["lost_ticks"])
+    stored, lost, is_complete = said["ticks"], said["lost_ticks"], said["complete"]
+    return Trial(trouble, status, len(ticks), gaps, published, stored, lost, is_complete)
 
 
 OPTIONS: Options = {
