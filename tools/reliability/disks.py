@@ -18,9 +18,10 @@ from pathlib import Path
 from msgspec import Struct
 
 from common.daemon import Fishd
-from common.processes import FISHCTL, PATIENCE, Process
+from common.processes import FISHCTL, Process, wait_until
 from common.report import Options, Report, progress, table
 from common.small_disk import small_disk
+from fishd.core.errors import RecordingError
 from fishd.recording import open_run
 
 TROUBLES = ("full", "read-only", "stalled")
@@ -69,11 +70,7 @@ def run(trouble: str, age: float, stall: float) -> Trial:
         words = ("record", "run", "--folder", str(disk.folder), "--json")
         with Process(FISHCTL, "--endpoint", fishd.endpoint, *words) as recorder:
             part = disk.folder / "run.mcap.part"
-            deadline = time.monotonic() + PATIENCE
-            while not (part.exists() and part.stat().st_size > 2000):
-                if time.monotonic() > deadline:
-                    raise SystemExit("the recording did not begin")
-                time.sleep(0.02)
+            wait_until(lambda: _has_ticks(part))
             time.sleep(age)
             published = fishd.waiting_ticks()[-1].seq
             if trouble == "stalled":
@@ -92,6 +89,13 @@ def run(trouble: str, age: float, stall: float) -> Trial:
     published -= ticks[0] - 1
     stored, lost, is_complete = said["ticks"], said["lost_ticks"], said["complete"]
     return Trial(trouble, status, len(ticks), gaps, published, stored, lost, is_complete)
+
+
+def _has_ticks(path: Path) -> bool:
+    try:
+        return bool(open_run(path).ticks)
+    except RecordingError:
+        return False
 
 
 OPTIONS: Options = {
