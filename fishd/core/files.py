@@ -1,4 +1,4 @@
-"""Reading of files that a user names, and atomic writing of files.
+"""Reading of files that a user names, unused names of files, and atomic writing of files.
 
 A read never blocks, whether the name belongs to a pipe, a device or a file without an end.
 """
@@ -151,6 +151,18 @@ def check_writable(path: Path) -> None:
     finally:
         with suppress(OSError, ValueError):
             part.unlink(missing_ok=True)
+
+
+def unused_path(folder: Path, name: str, *suffixes: str) -> Path:
+    """Return `name`, else `name-2`, `name-3` and so on in a folder, with the first suffix.
+
+    suffixes: with each of them, no file and no folder of that name exists
+    """
+    unused, number = name, 1
+    while any(os.path.lexists(folder / f"{unused}{suffix}") for suffix in suffixes):
+        number += 1
+        unused = f"{name}-{number}"
+    return folder / f"{unused}{suffixes[0]}"
 
 
 def _temporary_path(path: Path) -> Path:

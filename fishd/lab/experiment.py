@@ -5,7 +5,6 @@ the same header. Files are written atomically, and each row immediately.
 """
 
 import math
-import os
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -155,11 +154,7 @@ class Experiment:
 
     def recording(self, stem: str) -> Path:
         """Return an unused path for a recording; an incomplete recording keeps its name."""
-        number, path = 1, self.path / f"{stem}{SUFFIX}"
-        while path.exists() or path.with_name(path.name + PART_SUFFIX).exists():
-            number += 1
-            path = self.path / f"{stem}-{number}{SUFFIX}"
-        return path
+        return files.unused_path(self.path, stem, SUFFIX, SUFFIX + PART_SUFFIX)
 
     @contextmanager
     def _os_errors_as_fishd_errors(self) -> Iterator[None]:
@@ -176,11 +171,7 @@ class Experiment:
 def default_folder(kind: str) -> Path:
     """Return a path in the folder of all runs, with date and time in its name."""
     name = f"{kind.split()[-1]}-{datetime.now():%Y%m%d-%H%M%S}"
-    path, number = runs_folder() / name, 1
-    while os.path.lexists(path):  # the clock was set back
-        number += 1
-        path = path.with_name(f"{name}-{number}")
-    return path
+    return files.unused_path(runs_folder(), name, "")  # it may exist: the clock was set back
 
 
 @contextmanager

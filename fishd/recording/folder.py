@@ -80,11 +80,7 @@ def open_new(folder: Path, open_writer: Callable[[Path], RunWriter], prefix: str
 def new_path(folder: Path, prefix: str = "") -> Path:
     """Return a path for a recording that begins now, named after the local date and time."""
     name = f"{prefix}{datetime.now():%Y-%m-%d-%H%M%S}"
-    path, number = folder / (name + SUFFIX), 1
-    while os.path.lexists(path) or os.path.lexists(f"{path}{PART_SUFFIX}"):
-        number += 1
-        path = folder / f"{name}-{number}{SUFFIX}"
-    return path
+    return files.unused_path(folder, name, SUFFIX, SUFFIX + PART_SUFFIX)
 
 
 def recording_path(run: str, folder: Path | None = None) -> Path:

@@ -5,6 +5,7 @@ Neither a modification time nor a date decides: both follow the unix clock, whic
 
 import fcntl
 import os
+import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -15,6 +16,8 @@ from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 
 COUNTER_FILE = ".fishd-number"
 """File of a folder with the largest number given there, so that none is given twice."""
+MAX_LOCK_WAIT_S = 2.0
+"""Longest wait for another process that holds the lock of that file, as a stopped one does [s]."""
 _WIDTH = 18
 """Number of digits in that file, always the same: a full disk can replace them, too."""
 
@@ -22,18 +25,30 @@ _WIDTH = 18
 def next_number(folder: Path, known: Iterable[int]) -> int:
     """Return a number above all that were given in a folder, whatever was deleted since.
 
-    known: numbers there, also of files from another machine; if the counter file cannot be read
-    or written, they alone decide
+    known: numbers there, also of files from another machine; if the counter file cannot be locked,
+    read or written, they alone decide
     """
     number = max(known, default=0) + 1
     with suppress(OSError):
         descriptor = os.open(folder / COUNTER_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         with os.fdopen(descriptor, "r+b", buffering=0) as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+            _lock(file.fileno())
             number = max(number, parse_number(os.pread(descriptor, _WIDTH, 0)) + 1)
             os.pwrite(descriptor, b"%0*d\n" % (_WIDTH, number), 0)
             os.fsync(descriptor)
     return number
+
+
+def _lock(descriptor: int) -> None:
+    """Lock a file, or raise OSError if another process holds its lock for too long."""
+    deadline = time.monotonic() + MAX_LOCK_WAIT_S
+    while True:
+        try:
+            return fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if time.monotonic() > deadline:
+                raise
+        time.sleep(0.01)
 
 
 def parse_number(digits: str | bytes) -> int:

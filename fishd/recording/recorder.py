@@ -130,8 +130,9 @@ class Recorder:
         self._gone = False
         self._refused = 0
         """Number of messages that are not fishd's."""
-        self.is_complete = True
-        """Whether the files hold every tick and frame since the beginning, as far as is known."""
+        self._has_losses = False
+        self.has_unknown_losses = False
+        """Whether ticks or frames may be lost that are not counted, as after every error."""
         self.reason = "stopped"
         """Reason of the end, for the file."""
 
@@ -144,6 +145,7 @@ class Recorder:
             self._open()
             self._begin(self._telemetry)
         except BaseException:
+            self.has_unknown_losses = True
             self._close()
             raise
         return self
@@ -153,14 +155,17 @@ class Recorder:
         self._close()
         if self._refused > 1:
             self._tell(f"messages that are not fishd's, ignored: {self._refused}")
+        was_in_doubt = self.has_unknown_losses or error is not None
+        self.has_unknown_losses = True  # until the file is finished
         self.writer.close(self.reason if error is None else text.describe_error(error))
+        self.has_unknown_losses = was_in_doubt
 
     def _begin(self, telemetry: "Telemetry") -> None:
         """Wait until telemetry arrives; if it does not, ticks count as lost from now on."""
         if self._after and self._after.pid == self.status.pid:
             self.writer.tally.expect(self._after.seq)
         elif self._after:
-            self._lose("fishd was restarted meanwhile: how many ticks were lost is not known")
+            self._doubt("fishd was restarted meanwhile: how many ticks were lost is not known")
         elif not telemetry.wait(FISHD_TIMEOUT_S):
             self.writer.status(self.status)
 
@@ -170,6 +175,11 @@ class Recorder:
         if not self.began or not self.writer.stored_seq:
             return self._after
         return Position(self.status.pid, self.writer.stored_seq)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the files hold every tick and frame since the beginning, as far as is known."""
+        return not (self._has_losses or self.has_unknown_losses)
 
     @property
     def began(self) -> bool:
@@ -272,13 +282,18 @@ class Recorder:
             self._lose(f"{where}, ticks were lost: {gap.lost}")
 
     def _lose(self, line: str) -> None:
-        """Report a loss."""
-        self.is_complete = False
+        """Report a counted loss."""
+        self._has_losses = True
+        self._tell(line)
+
+    def _doubt(self, line: str) -> None:
+        """Report that it is not known what was lost."""
+        self.has_unknown_losses = True
         self._tell(line)
 
     def _doubt_end(self, line: str) -> None:
         """Report that it is not known what was lost at the end; the file says so, too."""
-        self._lose(line)
+        self._doubt(line)
         self.reason = f"{self.reason}; {line}"
 
     def _take_frames(self, camera: FrameSource) -> None:
@@ -323,7 +338,7 @@ class Recorder:
             return
         if isinstance(message, TickHead):
             if message.seq <= self._seq:
-                self._lose(TAKEOVER_MESSAGE)
+                self._doubt(TAKEOVER_MESSAGE)
             elif self._gone:
                 self._tell("fishd sends again: the recording continues")
             self._gone = False
@@ -336,7 +351,7 @@ class Recorder:
         elif isinstance(message, Status):
             self._report_gaps(known, f"up to tick {message.seq}")
             if self.writer.tally.restarts > restarts:  # its ticks had higher numbers
-                self._lose(TAKEOVER_MESSAGE)
+                self._doubt(TAKEOVER_MESSAGE)
             # After its first ticks, so that the file assigns the ticks to the right fishd.
             if message.pid != self.status.pid and self._seq <= message.seq:
                 self._ask_again()

@@ -49,7 +49,18 @@ def test_a_disk_that_becomes_read_only_ends_a_recording_which_says_what_is_store
     assert said["ticks"] == len(stored)
     (lost,) = re.findall(r"its last (\d+) ticks are lost", lines)
     assert said["lost_ticks"] == int(lost) > 0
+    assert not said["complete"]
     assert "make the disk writable, then run fishctl recover" in lines
+
+
+def test_a_full_disk_ends_a_recording_that_is_not_called_complete(
+    tmp_path: Path, disk: Disk
+) -> None:
+    with running(tmp_path) as daemon, record(daemon, disk, "run") as recording:
+        wait_until(lambda: last_tick(disk.folder) > 0)
+        disk.fill()
+        status, out, _ = recording.finish()
+    assert (status, json.loads(out)["complete"]) == (1, False)
 
 
 def test_a_disk_that_stalls_loses_no_tick_and_the_stall_is_said(tmp_path: Path, disk: Disk) -> None:
@@ -61,7 +72,7 @@ def test_a_disk_that_stalls_loses_no_tick_and_the_stall_is_said(tmp_path: Path, 
         wait_until(lambda: last_tick(disk.folder) > seq)
         status, out, lines = recording.end()
     said = json.loads(out)
-    assert (status, said["lost_ticks"]) == (0, 0)
+    assert (status, said["lost_ticks"], said["complete"]) == (0, 0, True)
     ticks = [tick.seq for tick in open_run(disk.folder / "run.mcap").ticks]
     assert ticks == list(range(ticks[0], ticks[-1] + 1))
     assert "a write to the disk took" in lines

@@ -1,7 +1,8 @@
 """Recordings on a disk that becomes full, read-only or stalls at a random instant; needs root.
 
 `fishctl record` runs on a small disk of its own. Afterwards its file must hold the ticks that it
-says are stored, without a gap that is not counted. Each tick that fishd had published until the
+says are stored, without a gap that is not counted, and after a failure it must not be called
+complete. Each tick that fishd had published until the
 trouble, or until the end after a stall, must be stored or counted as lost. An exit status of 0
 means that nothing was lost.
 """
@@ -17,9 +18,10 @@ from pathlib import Path
 from msgspec import Struct
 
 from common.daemon import Fishd
-from common.processes import FISHCTL, PATIENCE, Process
+from common.processes import FISHCTL, Process, wait_until
 from common.report import Options, Report, progress, table
 from common.small_disk import small_disk
+from fishd.core.errors import RecordingError
 from fishd.recording import open_run
 
 TROUBLES = ("full", "read-only", "stalled")
@@ -43,13 +45,14 @@ class Trial(Struct):
     """Number of ticks from the first stored one that fishd has certainly published."""
     said_stored: int
     said_lost: int
+    said_complete: bool
 
     @property
     def is_silent(self) -> bool:
         """Whether ticks are missing that the recorder did not count."""
         missing = max(self.gaps, self.published - self.stored)
         is_wrong = self.stored != self.said_stored or self.said_lost < missing
-        return is_wrong or (self.status == 0 and self.said_lost > 0)
+        return is_wrong or self.said_complete != (self.status == 0 and not self.said_lost)
 
 
 def run(trouble: str, age: float, stall: float) -> Trial:
@@ -67,11 +70,7 @@ def run(trouble: str, age: float, stall: float) -> Trial:
         words = ("record", "run", "--folder", str(disk.folder), "--json")
         with Process(FISHCTL, "--endpoint", fishd.endpoint, *words) as recorder:
             part = disk.folder / "run.mcap.part"
-            deadline = time.monotonic() + PATIENCE
-            while not (part.exists() and part.stat().st_size > 2000):
-                if time.monotonic() > deadline:
-                    raise SystemExit("the recording did not begin")
-                time.sleep(0.02)
+            wait_until(lambda: _has_ticks(part))
             time.sleep(age)
             published = fishd.waiting_ticks()[-1].seq
             if trouble == "stalled":
@@ -88,7 +87,15 @@ def run(trouble: str, age: float, stall: float) -> Trial:
         ticks = [tick.seq for tick in open_run(path if path.exists() else part).ticks]
     gaps = ticks[-1] - ticks[0] + 1 - len(ticks)
     published -= ticks[0] - 1
-    return Trial(trouble, status, len(ticks), gaps, published, said["ticks"], said["lost_ticks"])
+    stored, lost, is_complete = said["ticks"], said["lost_ticks"], said["complete"]
+    return Trial(trouble, status, len(ticks), gaps, published, stored, lost, is_complete)
+
+
+def _has_ticks(path: Path) -> bool:
+    try:
+        return bool(open_run(path).ticks)
+    except RecordingError:
+        return False
 
 
 OPTIONS: Options = {

@@ -6,6 +6,7 @@ telemetry, or goes on. Nothing may hang, every lost tick and frame must be count
 say so.
 """
 
+import csv
 import json
 import random
 import re
@@ -30,8 +31,10 @@ from common import half_open
 from common.daemon import START, TIMEOUT_S
 from common.processes import BIN, FISHCTL, Process, call, sets, wait_until
 from common.report import Options, Report, progress, table
+from fishd.camera.client import CameraClient
 from fishd.client import Fish, FishError
 from fishd.core.errors import RecordingError
+from fishd.lab.experiment import ROWS
 from fishd.recording import open_run
 
 KINDS = ("forgotten", "for some seconds", "for ever")
@@ -45,6 +48,10 @@ RECOVERY_S = 9.0
 MAX_END_S = 20.0
 """Largest time from a request to end until the end [s]."""
 MARK_PERIOD_S = 0.2
+TICK_S = 0.05
+"""Period of the ticks of fishd [s]."""
+MAX_LOST_TICKS = 8
+"""Largest number of ticks that a measurement of 21 s may lack."""
 NOTICED = "nothing arrives from its telemetry"
 """Part of the line about a silence."""
 LISTENER = """
@@ -105,6 +112,11 @@ class Rig:
                 return fish.status().seq
         except FishError:
             return 0
+
+    def published_frames(self) -> int:
+        """Return the number of the latest frame, requested without a path."""
+        with CameraClient(f"tcp://{half_open.HOST}:{self.requests}") as camera:
+            return camera.status().seq
 
 
 def _reserve() -> socket.socket:
@@ -167,7 +179,9 @@ class Run:
         with Process(*command, "--json", *words) as process:
             wait_until(lambda: _has_ticks(folder))
             self._disturb()
+            first_end = self._rig.published_frames()
             status, out, lines = self._end(process)
+            last_end = self._rig.published_frames()
         if self._trial.hangs:
             return
         run = open_run(next(folder.glob("*.mcap")))
@@ -176,13 +190,14 @@ class Run:
         if trial.program == "camera":
             seqs = [head.seq for head in run.frame_heads]
             trial.counted = sum(reported)
-            trial.lost = seqs[-1] - seqs[0] + 1 - len(seqs)
-            if at_end := re.search(r"at the end, frames were lost: (\d+)", lines):
-                trial.lost += int(at_end[1])
+            unknown = "the camera does not answer" in lines
+            # What the camera has published when the recording ends lies between these two.
+            ends = (seqs[-1],) * 2 if unknown else (first_end, last_end)
+            least, most = (max(end, seqs[-1]) - seqs[0] + 1 - len(seqs) for end in ends)
+            trial.lost = min(max(trial.counted, least), most)
+            trial.said = status == (3 if trial.lost or unknown else 0)
             if trial.kind == "for ever":
-                trial.said = status == 3 and ("does not answer" in lines or bool(at_end))
-            else:
-                trial.said = status == (3 if trial.lost else 0)
+                trial.said = trial.said and unknown == trial.with_control
             return
         unknown = "is not known" in lines
         seqs = [tick.seq for tick in run.ticks]
@@ -231,8 +246,12 @@ class Run:
             except subprocess.TimeoutExpired:
                 trial.hangs = True
                 return
-        lost = re.findall(r"lost on their way from fishd: (\d+)|(\d+) of \d+ ticks were", lines)
-        trial.said = status != 0 or sum(int(a or b) for a, b in lost) <= 8 or NOTICED not in lines
+        trial.counted = sum(map(int, re.findall(r"lost on their way from fishd: (\d+)", lines)))
+        # The end of a swim that did not end is not in the table; then the measurement fails.
+        trial.lost = _lost_in_experiment(folder)
+        trial.said = status != 0 or trial.lost <= MAX_LOST_TICKS
+        if trial.kind == "for ever":
+            trial.said = trial.said and status != 0 and bool(lines)
 
     def listen(self) -> None:
         """Listen to events, of which there is one in each 0.2 s."""
@@ -268,6 +287,17 @@ def _has_ticks(folder: Path) -> bool:
         return bool(open_run(next(folder.glob("*.part"))).ticks)
     except (StopIteration, RecordingError):
         return False
+
+
+def _lost_in_experiment(folder: Path) -> int:
+    """Return how many ticks of the swims and rests in the table the recordings lack."""
+    seqs = [tick.seq for path in folder.glob("*.mcap*") for tick in open_run(path).ticks]
+    lost = 0
+    if (table := folder / ROWS).exists():
+        for row in csv.DictReader(table.read_text().splitlines()):
+            stored = sum(int(row["first_tick"]) <= seq <= int(row["last_tick"]) for seq in seqs)
+            lost += round(float(row["seconds"]) / TICK_S) - stored
+    return lost
 
 
 def _longest_gap(times: list[float]) -> float:
@@ -329,7 +359,12 @@ def measure(options: Namespace) -> Report:
             ]
         )
     head = "program | silences | hang | lost | counted | silent losses"
-    text = f"{table(head, rows)}\n\nSeed {options.seed}."
+    text = (
+        f"{table(head, rows)}\n\nSeed {options.seed}. Lost ticks and frames are those that the "
+        "files lack; frames after the last one in a file are counted from what the camera, asked "
+        "directly before and after the end, has published, unless the recorder says that it "
+        "cannot know them."
+    )
     broken = any(trial.is_broken for trial in done)
     silent = sum(not trial.said or trial.lost != trial.counted for trial in done)
     result = (

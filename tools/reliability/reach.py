@@ -184,8 +184,9 @@ def measure(options: Namespace) -> Report:
         own = [each for each in attempts if each.event == event]
         late = [each.restored for each in own if each.delay > MAX_GONE_S]
         never = event == "a file replaces the folder"
+        in_time = never or all(wait is not None and wait <= MAX_GONE_S for wait in late)
         lost = sum(not each.stopped for each in own)
-        broken |= lost > 0 or not (never or all(late)) or not all(each.said for each in own)
+        broken |= lost > 0 or not in_time or not all(each.said for each in own)
         waits = [each.restored for each in own if each.restored is not None]
         ways = sorted({each.way for each in own})
         rows.append(

@@ -227,7 +227,7 @@ def _record_one(
     finally:
         if recorder.began:
             _end_line()
-            _print_summary(recorder.writer, recorder.is_complete, as_json)
+            _print_summary(recorder, as_json)
     if not recorder.is_complete:
         sys.exit(INCOMPLETE)
 
@@ -307,14 +307,14 @@ def _end_line() -> None:
         click.echo("\r\x1b[K", nl=False)
 
 
-def _print_summary(writer: RunWriter, is_complete: bool, as_json: bool) -> None:
+def _print_summary(recorder: Recorder, as_json: bool) -> None:
     """Print the contents of a recording that has ended."""
-    summary = writer.summary
+    writer, is_complete = recorder.writer, recorder.is_complete
     if as_json:
         facts = {"path": str(writer.path), "bytes": writer.size, "complete": is_complete}
-        print_json({**facts, **asdict(summary)})
+        print_json({**facts, **asdict(writer.summary)})
         return
-    unknown = "" if is_complete or summary.lost_ticks else "; perhaps more are lost, see above"
+    unknown = "; perhaps more are lost, as another line says" if recorder.has_unknown_losses else ""
     echo(f"{writer.path.name}: {_format_amount(writer)}{unknown}")
 
 

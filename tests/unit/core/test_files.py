@@ -188,3 +188,10 @@ def test_an_unwritable_file_is_refused(tmp_path: Path, name: str, complaint: str
     with pytest.raises(files.FileProblem, match=complaint):
         files.check_writable(tmp_path / name)
     assert {file.name for file in tmp_path.iterdir()} == {"file", "link"}
+
+
+def test_a_new_name_is_unused_with_every_suffix(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").touch()
+    (tmp_path / "run-2.mcap.part").symlink_to("nowhere")
+    for suffixes, name in (((".mcap", ".mcap.part"), "run-3.mcap"), (("",), "run")):
+        assert files.unused_path(tmp_path, "run", *suffixes) == tmp_path / name

@@ -2,6 +2,8 @@
 
 import os
 import shutil
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -15,6 +17,14 @@ from fishd.recording.black_box import BlackBox
 from fishd.recording.folder import find_recording, list_recordings, open_new
 from fishd.recording.numbering import COUNTER_FILE, read_number
 
+HOLDER = """
+import fcntl, sys
+counter = open(sys.argv[1], "rb")
+fcntl.flock(counter, fcntl.LOCK_EX)
+print("locked", flush=True)
+sys.stdin.read()
+"""
+"""Program that holds the lock of a counter until its input ends, as if it were stopped."""
 YEAR_S = 365 * 86400.0
 
 
@@ -98,6 +108,21 @@ def test_without_its_counter_the_numbers_of_the_recordings_decide(
         counter.write_text("" if damage == "empty" else "twelve")
     record(tmp_path, "b")
     assert names(tmp_path) == ["a", "b"]
+    assert read_number(tmp_path / "b.mcap") == 2
+
+
+def test_without_the_lock_of_the_counter_the_numbers_of_the_recordings_decide(
+    tmp_path: Path,
+) -> None:
+    record(tmp_path, "a")
+    command = (sys.executable, "-c", HOLDER, str(tmp_path / COUNTER_FILE))
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout
+        assert holder.stdout.readline() == b"locked\n"
+        try:
+            record(tmp_path, "b")  # while the lock is held
+        finally:
+            holder.communicate()
     assert read_number(tmp_path / "b.mcap") == 2
 
 

@@ -16,6 +16,7 @@ from rigs.harness import Rig
 from rigs.kills import ends_before
 from rigs.recordings import record_run, status, swum, write
 
+from fishd.cli.recording.record import _print_summary
 from fishd.config import Config
 from fishd.core.errors import NoDaemon, RecordingError, Refused
 from fishd.core.signals import Tick
@@ -379,4 +380,35 @@ def test_ticks_that_are_lost_between_two_files_of_a_black_box_are_reported(tmp_p
     hear(recorder, ticks[5], pid=1)
     recorder.__exit__(None, None, None)
     assert lines == [f"just before tick {ticks[5].seq}, ticks were lost: 4"]
+    assert not recorder.is_complete
+
+
+def test_counted_losses_are_told_from_those_that_are_not_known(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ticks, doubt = swum().recorder.ticks, "perhaps more are lost"
+    recorder = Recorder(None, lambda: RunWriter(tmp_path / "run"), tell=lambda line: None)
+    recorder._described = description_of(ticks[0], pid=1)
+    recorder._open()
+    hear(recorder, ticks[5], pid=1)
+    hear(recorder, ticks[9], pid=1)
+    _print_summary(recorder, as_json=False)
+    counted = capsys.readouterr().out
+    assert "3 lost" in counted
+    assert doubt not in counted
+    hear(recorder, ticks[2], pid=1)  # of another fishd, which has taken over
+    recorder.__exit__(None, None, None)
+    _print_summary(recorder, as_json=False)
+    assert doubt in capsys.readouterr().out
+    assert not recorder.is_complete
+
+
+def test_a_recording_that_an_error_ends_is_not_complete(tmp_path: Path) -> None:
+    tick = swum().recorder.ticks[0]
+    recorder = Recorder(None, lambda: RunWriter(tmp_path / "run"), tell=lambda line: None)
+    recorder._described = description_of(tick, pid=1)
+    recorder._open()
+    hear(recorder, tick, pid=1)
+    assert recorder.is_complete
+    recorder.__exit__(None, RecordingError("the disk is full"), None)
     assert not recorder.is_complete
