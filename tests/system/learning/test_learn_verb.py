@@ -56,7 +56,7 @@ def test_a_run_a_resume_and_a_run_that_begins_with_its_networks(
     assert result.returncode == 0, result.stderr
     assert "128 steps, in whole rollouts of 64 in simulation" in result.stdout
     assert re.search("\n128 steps in 0:0. of tank time without evaluations\n", result.stdout)
-    (folder,) = Path("runs").iterdir()
+    (folder,) = Path("runs").glob("[!.]*")
     assert folder.name.startswith("ppo-20")
     assert result.stdout.count(" in the tank without evaluations: ") >= 2  # one per evaluation
     result = learn("ppo", "--resume", str(folder), "--steps", "192")
