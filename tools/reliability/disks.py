@@ -72,12 +72,12 @@ def run(trouble: str, age: float, stall: float) -> Trial:
             part = disk.folder / "run.mcap.part"
             wait_until(lambda: _has_ticks(part))
             time.sleep(age)
-            published = fishd.waiting_ticks()[-1].seq
+            published = fishd.status().seq
             if trouble == "stalled":
                 with disk.stalled():
                     time.sleep(stall)
                 time.sleep(2.0)
-                published = fishd.waiting_ticks()[-1].seq
+                published = fishd.status().seq
                 status, out, _ = recorder.end()
             else:
                 (disk.fill if trouble == "full" else disk.make_read_only)()

@@ -110,12 +110,100 @@ def measure(options: Namespace) -> Report:
         f"{table(head, rows)}\n\nWith fishd dead, at most {outcomes[-1].processes} fishctl ran "
         "at a time."
     )
-    attacked = outcomes[:-1]
+    tried = outcomes[:-1]
     result = (
-        f"{sum(o.answered for o in attacked)} of {sum(o.presses for o in attacked)} answered; "
-        f"slowest {1e3 * max(o.slowest for o in attacked):.0f} ms, of each attack alone "
-        f"{1e3 * max(o.slowest for o in attacked[:-1]):.0f} ms; at most "
+        f"{sum(o.answered for o in tried)} of {sum(o.presses for o in tried)} answered; "
+        f"slowest {1e3 * max(o.slowest for o in tried):.0f} ms, of each attack alone "
+        f"{1e3 * max(o.slowest for o in tried[:-1]):.0f} ms; at most "
         f"{max(o.megabytes for o in outcomes):.0f} MB; {outcomes[-1].processes} last resort at a "
         "time"
     )
     return Report({"reliability window-estop": text}, outcomes, broken=broken, number=result)
+
+
+def describe(outcome: Outcome) -> str:
+    """Return a line about an outcome."""
+    return (
+        f"{outcome.what} | {outcome.answered} of {outcome.presses} | "
+        f"{1e3 * outcome.slowest:.0f} ms | {outcome.megabytes:.0f} MB"
+    )
+
+
+@contextmanager
+def attacked(names: Sequence[str], targets: Sequence[Target]) -> Iterator[None]:
+    """Attack a window at several addresses in other processes."""
+    context = multiprocessing.get_context("spawn")
+    processes = [
+        context.Process(target=_attack, args=(name, target), daemon=True)
+        for name in names
+        for target in targets
+    ]
+    for process in processes:
+        process.start()
+    try:
+        if processes:
+            time.sleep(WARM_UP_S)
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.join()
+
+
+def _attack(name: str, target: Target) -> None:
+    async def run() -> None:
+        await NETWORK_ATTACKS[name](target, lambda: None)
+
+    asyncio.run(run())
+
+
+def press_all(what: str, targets: Sequence[Target], number: int, pid: int) -> Outcome:
+    """Press one after the other, and for at least as long as a disk stalls."""
+    times: list[float | None] = []
+    outcome = Outcome(what, number, 0, 0.0, 0.0)
+
+    async def run() -> None:
+        period = max(PRESS_PERIOD_S, MIN_TROUBLE_S / number)
+        for count in range(number):
+            times.append(await press(targets[count % len(targets)]))
+            outcome.megabytes = max(outcome.megabytes, memory(pid))
+            await asyncio.sleep(period)
+
+    asyncio.run(run())
+    answers = [seconds for seconds in times if seconds is not None]
+    outcome.answered, outcome.slowest = len(answers), max(answers, default=0.0)
+    return outcome
+
+
+def try_dead_fishd() -> Outcome:
+    """Press many times at once while fishd is dead and the pulses of a virtual servo are on."""
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        _, settings = stack.enter_context(virtual_pi(folder))
+        config = folder / "fishd.yaml"
+        config.write_text("\n".join(line_of(setting) for setting in settings))
+        fishd = stack.enter_context(Fishd(*settings))
+        window = stack.enter_context(Window(fishd.endpoint, str(folder), config=str(config)))
+        fishd.next_tick(TIMEOUT_S)
+        fishd.kill()
+        return asyncio.run(press_dead(Target("127.0.0.1", window.port), window.pid))
+
+
+def line_of(setting: str) -> str:
+    """Return a line of YAML for a setting KEY=VALUE."""
+    key, _, value = setting.partition("=")
+    section, dot, name = key.partition(".")
+    return f"{section}: {{{name}: {value}}}" if dot else f"{key}: {value}"
+
+
+async def press_dead(target: Target, pid: int) -> Outcome:
+    """Press many times at once, and count the programs that the window starts."""
+    outcome = Outcome(f"fishd is dead, {DEAD_PRESSES} presses at once", DEAD_PRESSES, 0, 0.0, 0.0)
+    pressing = asyncio.gather(*(press(target) for _ in range(DEAD_PRESSES)))
+    while not pressing.done():
+        outcome.processes = max(outcome.processes, len(list_children(pid)))
+        outcome.megabytes = max(outcome.megabytes, memory(pid))
+        await asyncio.sleep(0.02)
+    answers = [seconds for seconds in pressing.result() if seconds is not None]
+    outcome.answered, outcome.slowest = len(answers), max(answers, default=0.0)
+    return outcome
