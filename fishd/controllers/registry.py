@@ -39,8 +39,9 @@ _plugins: Plugins[Controller[Any]] = Plugins(
     },
     UnknownController,
 )
-names, find = _plugins.names, _plugins.find
-"""Functions that return all names, and the class of a name (or raise `UnknownController`)."""
+names, find, try_import = _plugins.names, _plugins.find, _plugins.try_import
+"""Functions that return all names, and the class of a name (or raise `UnknownController`), and one
+that imports it in a child process first."""
 
 
 def split_spec(spec: str) -> tuple[str, list[tuple[str, str]]]:
@@ -85,9 +86,10 @@ def describe_all(prefix: str = "") -> list[ControllerInfo]:
     """
     descriptions = []
     for name in filter(lambda name: name.startswith(prefix), names()):
-        attempt = Attempt(partial(describe, name))  # the import may never end
-        if attempt.wait(IMPORT_TIMEOUT_S) or not attempt.give_up():
-            with contextlib.suppress(UnknownController):
+        with contextlib.suppress(UnknownController):
+            try_import(name)  # has a time limit of its own
+            attempt = Attempt(partial(describe, name))  # the import may never end
+            if attempt.wait(IMPORT_TIMEOUT_S) or not attempt.give_up():
                 descriptions.append(attempt.result())
     return descriptions
 

@@ -88,14 +88,49 @@ class Plugins(Generic[T]):
         `problems` has the reason why a plug-in does not load, until it does.
         """
         if name not in self._found:
-            try:
+            with self._noted(name):
                 self._found[name] = self._load(name)
-            except self._unknown as error:
-                if name in self._built_in or name in self._entries:
-                    self.problems[name] = text.error_message(error)
-                raise
             self.problems.pop(name, None)
         return self._found[name]
+
+    def try_import(self, name: str, timeout: float | None = None) -> None:
+        """Import a plug-in of another package in a child process, for `find` after it.
+
+        So the time that it takes is no part of that of `find`, except for the import itself.
+
+        timeout: longest time of the import; None for that of `trial_import` [s]
+        Raise `unknown` if the import ends or crashes its process, or does not end.
+        """
+        entry = None if name in self._built_in else self._offered().get(name)
+        if entry is None or name in self._found:
+            return
+        module = entry.value.partition(":")[0].strip()
+        if module in sys.modules:
+            return
+        from fishd.core.trial_import import find_danger  # imports subprocess
+
+        with self._noted(name):
+            try:
+                danger = find_danger(module, timeout)
+            except OSError as error:
+                danger = text.describe_error(error)
+            if danger:
+                raise self._unknown(f"{self._where(name)} does not load: {danger}")
+
+    @contextmanager
+    def _noted(self, name: str) -> Iterator[None]:
+        """Keep the reason in `problems` if a plug-in does not load."""
+        try:
+            yield
+        except self._unknown as error:
+            if name in self._built_in or name in self._entries:
+                self.problems[name] = text.error_message(error)
+            raise
+
+    def _where(self, name: str) -> str:
+        """Return the name and origin of a plug-in that exists, for messages."""
+        value = self._built_in.get(name) or self._offered()[name].value
+        return f"{self.kind} '{name}' ({value} in {self.package(name)})"
 
     def _load(self, name: str) -> type[T]:
         # Entry points only if they are needed: finding them takes tens of milliseconds.
@@ -103,13 +138,8 @@ class Plugins(Generic[T]):
         if not value:
             hint = suggest(name, self.names())
             raise self._unknown(f"no {self.kind} is named '{text.quoted(name)}'; {hint}")
-        where = f"{self.kind} '{name}' ({value} in {self.package(name)})"
-        module = value.partition(":")[0].strip()
-        if name not in self._built_in and module not in sys.modules:
-            from fishd.core.trial_import import find_danger  # imports subprocess
-
-            if danger := find_danger(module):
-                raise self._unknown(f"{where} does not load: {danger}")
+        self.try_import(name)
+        where = self._where(name)
         try:
             with _kept_process_state():
                 plugin = call_foreign(_load_class, value.partition(" [")[0])
@@ -141,7 +171,7 @@ class Plugins(Generic[T]):
         if stamps != self._stamps:
             importlib.invalidate_caches()
             if trials := sys.modules.get("fishd.core.trial_import"):
-                trials.find_danger.cache_clear()
+                trials.forget()
             self._entries = self._read_entry_points()
             self._stamps = stamps
         return self._entries

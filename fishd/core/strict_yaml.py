@@ -80,19 +80,24 @@ def read(
 
 
 def parse(
-    text: str, name: str = "the document", problems: list[ValueProblem] | None = None
+    text: str,
+    name: str = "the document",
+    problems: list[ValueProblem] | None = None,
+    *,
+    typed: bool = True,
 ) -> Document:
     """Parse `text`; raise `YamlProblem`.
 
     name: name of a value outside of any key, for the error
     problems: receives the problems of single values, which are then left out
+    typed: whether a person typed the text, and may have typed odd white space; False for `dump`'s
     """
     if len(text) > files.MAX_SETTINGS_BYTES:
         raise YamlProblem(1, f"longer than {files.MAX_SETTINGS_BYTES // 2**10} kB")
     try:
         loader = _Loader(text)
         root = loader.get_single_node()
-        if not text.isascii():
+        if typed and not text.isascii():
             _check_white_space(text, root)
     except yaml.MarkedYAMLError as error:
         raise _explain(text, error) from None
@@ -236,12 +241,19 @@ def _name(character: str) -> str:
     return f"{article}{name} (U+{ord(character):04X})"
 
 
-def _is_odd(character: str) -> bool:
-    """Return whether a character looks like a space, or like none, but is not one for YAML."""
-    import unicodedata
+_INVISIBLE = "\u200b\u2060\ufeff"
+"""Characters without width that separate words, and change no other character."""
+_OVERRIDES = "\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+"""Characters that show a text in another order than that in which it is read."""
 
+
+def _is_odd(character: str) -> bool:
+    """Return whether a character looks like a space, or like none, but is not one for YAML.
+
+    Joiners, as in emoji and Persian, soft hyphens and marks of direction are parts of words.
+    """
     return not character.isascii() and (
-        character.isspace() or unicodedata.category(character) == "Cf"
+        character.isspace() or character in _INVISIBLE or character in _OVERRIDES
     )
 
 

@@ -3,11 +3,10 @@
 import os
 import signal
 import subprocess
-from functools import lru_cache
 
 from fishd.core.process.safe_path import python_command
 
-TIMEOUT_S = 8.0
+TIMEOUT_S = 10.0
 """Longest time that an import may take [s]."""
 _CLOSED = 99
 """Exit status of the child whose pipe was closed."""
@@ -25,12 +24,33 @@ os._exit(0)
 """
 
 
-@lru_cache
-def find_danger(module: str) -> str:
+_verdicts: dict[str, str] = {}
+
+
+def forget() -> None:
+    """Forget the results of all trials, since the packages have changed."""
+    _verdicts.clear()
+
+
+def find_danger(module: str, timeout: float | None = None) -> str:
     """Return what the import of a module does to its process; empty if it survives.
 
-    An import that raises an exception is no danger.
+    An import that raises an exception is no danger. The result is kept, unless the import did not
+    end in time: that may be the fault of a busy machine.
+
+    timeout: longest time of the import; None for `TIMEOUT_S` [s]
+    Raise `OSError` if the trial is not possible.
     """
+    if module not in _verdicts:
+        limit = TIMEOUT_S if timeout is None else timeout
+        try:
+            _verdicts[module] = _try(module, limit)
+        except subprocess.TimeoutExpired:
+            return f"its import does not end within {limit:g} s"
+    return _verdicts[module]
+
+
+def _try(module: str, timeout: float) -> str:
     reader, writer = os.pipe()
     command = python_command("-c", _CHILD, str(writer), module)
     quiet = subprocess.DEVNULL
@@ -38,14 +58,12 @@ def find_danger(module: str) -> str:
         status = subprocess.run(
             command,
             pass_fds=(writer,),
-            timeout=TIMEOUT_S,
+            timeout=timeout,
             stdin=quiet,
             stdout=quiet,
             stderr=quiet,
             check=False,
         ).returncode
-    except subprocess.TimeoutExpired:
-        return f"its import does not end within {TIMEOUT_S:g} s"
     finally:
         os.close(writer)
         os.set_blocking(reader, False)
@@ -59,5 +77,13 @@ def find_danger(module: str) -> str:
     if status == _CLOSED:
         return "its import closes files of its process"
     if status < 0:
-        return f"its import ends its process with {signal.Signals(-status).name}"
+        return f"its import ends its process with {_name(-status)}"
     return f"its import ends its process with exit status {status}"
+
+
+def _name(number: int) -> str:
+    """Return the name of a signal; most of the real-time signals have none in Python."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"

@@ -16,7 +16,7 @@ from fishd.control.lease import RETURN_REASON
 from fishd.control.loop import ControlLoop
 from fishd.control.supervisor import Mode
 from fishd.controllers import registry
-from fishd.controllers.base import Controller
+from fishd.controllers.base import Controller, Limits
 from fishd.controllers.policy import library
 from fishd.core import protocol, text
 from fishd.core.clock import Clock, SlowClock, read_boot_id
@@ -261,7 +261,7 @@ class Operations:
         return self._state()
 
     async def _load(self, request: protocol.SetController) -> Controller[Any]:
-        create = partial(registry.create, request.name, request.parameters, self._loop.limits)
+        create = partial(_create, request.name, request.parameters, self._loop.limits)
         is_new = request.name not in self._at_start
         if is_new:
             create = partial(_create_newly_installed, request.name, create)
@@ -348,6 +348,15 @@ class Operations:
             parameters=loop.active.parameters,
             previous_holder=previous_holder,
         )
+
+
+_TRIAL_TIMEOUT_S = 0.8 * protocol.LOADING_TIMEOUT_S
+"""Longest time that a package may take in its trial, so that the reason is said in time [s]."""
+
+
+def _create(name: str, values: Mapping[str, Any], limits: Limits) -> Controller[Any]:
+    registry.try_import(name, _TRIAL_TIMEOUT_S)
+    return registry.create(name, values, limits)
 
 
 def _create_newly_installed(name: str, create: Callable[[], Controller[Any]]) -> Controller[Any]:

@@ -130,7 +130,7 @@ class Run:
     def _parsed(self, number: int) -> dict[str, Any]:
         name = f"{self.path}: {CONFIG_ATTACHMENT} of fishd {number}"
         try:
-            data = strict_yaml.parse(self._yaml[number].decode()).data
+            data = strict_yaml.parse(self._yaml[number].decode(), typed=False).data
         except UnicodeDecodeError as error:
             raise RecordingError(f"{name}: not a text in UTF-8 ({error.reason})") from None
         except strict_yaml.YamlProblem as problem:

@@ -4,12 +4,15 @@ and names them.
 
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
-from rigs.processes import START, call, install, one_line, running
+from rigs.processes import PATIENCE, START, call, install, one_line, running
 
+from fishd.controllers import registry
 from fishd.core import trial_import
+from fishd.core.errors import UnknownController
 
 DANGERS = {
     "exiting": ("import os\nos._exit(0)\n", "its import ends its process with exit status 0"),
@@ -22,7 +25,7 @@ DANGERS = {
         "    try:\n        os.close(number)\n    except OSError:\n        pass\n",
         "its import closes files of its process",
     ),
-    "endless": ("while True:\n    pass\n", "its import does not end within 8 s"),
+    "endless": ("while True:\n    pass\n", "its import does not end within 10 s"),
     "quitting": ("import sys\nsys.exit(3)\n", "SystemExit: 3"),
 }
 CHANGING = """
@@ -88,5 +91,56 @@ def test_a_package_that_is_repaired_is_tried_again(
     file.write_text(DANGERS["exiting"][0])
     assert trial_import.find_danger("repaired") == DANGERS["exiting"][1]
     file.write_text("repaired = True\n")
-    trial_import.find_danger.cache_clear()  # as an installation does
+    trial_import.forget()  # as an installation does
     assert trial_import.find_danger("repaired") == ""
+
+
+SLOW_IN_ITS_TRIAL = """
+import sys, time
+if "pytest" not in sys.modules:
+    time.sleep(3.0)
+"""
+
+
+def test_the_trial_takes_no_time_from_the_import_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, {"slow_trial": SLOW_IN_ITS_TRIAL + CHANGING}, slow="slow_trial:Harmless")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(trial_import, "TIMEOUT_S", PATIENCE)
+    monkeypatch.setattr(registry, "IMPORT_TIMEOUT_S", 2.5)
+    assert [info.name for info in registry.describe_all("slow")] == ["slow"]
+
+
+def test_an_import_that_did_not_end_in_time_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(trial_import, "TIMEOUT_S", 0.5)
+    file = tmp_path / "delayed.py"
+    file.write_text(DANGERS["endless"][0])
+    assert trial_import.find_danger("delayed") == "its import does not end within 0.5 s"
+    file.write_text("delayed = True\n")
+    monkeypatch.setattr(trial_import, "TIMEOUT_S", PATIENCE)
+    assert trial_import.find_danger("delayed") == ""
+
+
+def test_every_signal_that_ends_an_import_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    number = signal.SIGRTMIN + 1
+    (tmp_path / "real_time.py").write_text(f"import os\nos.kill(os.getpid(), {number})\n")
+    line = f"its import ends its process with signal {number}"
+    assert trial_import.find_danger("real_time") == line
+
+
+def test_a_trial_that_is_not_possible_is_a_reason_not_to_load(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install(tmp_path, {"untried": CHANGING}, untried="untried:Harmless")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "python"))  # it was upgraded
+    with pytest.raises(UnknownController, match="does not load: FileNotFoundError"):
+        registry.find("untried")

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -93,3 +94,22 @@ def test_a_black_box_goes_on_when_the_disk_has_room_again_and_counts_what_it_los
     assert status == 0
     assert "the black box tries again" in lines
     assert f"just before tick {first}, ticks were lost: {first - before - 1}\n" in lines
+
+
+def test_a_black_box_goes_on_when_the_folder_of_its_full_disk_is_gone(
+    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = disk.folder / "box"
+    monkeypatch.setenv("FISHD_RUNS", str(place))
+    with running(tmp_path) as daemon:
+        command = (FISHCTL, "--endpoint", daemon.endpoint, "record", "--black-box")
+        with Process(*command, "--keep", "10MB", "--json") as box:
+            wait_until(lambda: last_tick(place) > 0)
+            disk.fill()
+            wait_until(lambda: bool(list(place.glob("blackbox-*.mcap"))))  # it has ended
+            shutil.rmtree(place)
+            disk.empty()
+            wait_until(lambda: box.process.poll() is not None or last_tick(place) > 0)
+            status, _, lines = box.end()
+    assert status == 0
+    assert "the black box tries again" in lines

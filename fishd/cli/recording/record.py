@@ -147,7 +147,11 @@ def record(
         box = BlackBox(place, keep, begin)
 
         def has_room() -> bool:
-            return shutil.disk_usage(place).free > 2 * MIN_FREE_BYTES
+            try:  # the folder may be gone, such as that of a disk that was removed
+                place.mkdir(parents=True, exist_ok=True)
+                return shutil.disk_usage(place).free > 2 * MIN_FREE_BYTES
+            except OSError:
+                return False
 
         def open_recorder(after: Position | None) -> Recorder:
             return Recorder(endpoint, box.open, tell=_print_line, after=after, due=box.due)

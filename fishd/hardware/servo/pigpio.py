@@ -242,9 +242,15 @@ def _pigpiod(machine: Machine, settings: PigpioSettings) -> Result:
             remedy = _start_pigpiod(machine)
         elif settings.host in _LOCAL_HOSTS and not _may_run_pigpiod(machine):
             why = str(error).partition(f"{place}: ")[2].partition(": ")[0]
+            if _sees_all_processes(machine):
+                return fail(
+                    f"what answers at {place} is not pigpiod, of which there is no process: {why}",
+                    _ANOTHER_PORT,
+                )
             return fail(
-                f"what answers at {place} is not pigpiod, of which there is no process: {why}",
-                _ANOTHER_PORT,
+                f"what answers at {place} is perhaps not pigpiod, of which no process is visible "
+                f"here: {why}",
+                f"if pigpiod runs outside of this container, restart it; else {_ANOTHER_PORT}",
             )
         else:
             remedy = f"sudo systemctl restart pigpiod; if another program is at {place}, stop it"
@@ -265,6 +271,14 @@ def _may_run_pigpiod(machine: Machine) -> bool:
     """Return whether a process is named pigpiod, or this user may not see all processes."""
     names = {machine.text(f"/proc/{n.name}/comm") for n in machine.path("/proc").glob("[0-9]*")}
     return "pigpiod" in names or not machine.text("/proc/1/comm")
+
+
+def _sees_all_processes(machine: Machine) -> bool:
+    """Return whether the processes of the whole machine are visible: those of the kernel are.
+
+    In a container they are not, even if its processes use the network of its host.
+    """
+    return machine.text("/proc/2/comm") == "kthreadd"
 
 
 def _start_pigpiod(machine: Machine) -> str:

@@ -5,10 +5,12 @@ line; and I2C addresses whose 0x was forgotten.
 from pathlib import Path
 
 import pytest
+from rigs.recordings import record_run, swum
 
 from fishd.config import load
 from fishd.core.errors import ConfigError
 from fishd.core.strict_yaml import YamlProblem, dump, parse
+from fishd.recording import open_run, writer
 
 SPACE = "is not a space for YAML: type a space, or put the text in quotes"
 
@@ -26,6 +28,8 @@ SPACE = "is not a space for YAML: type a space, or put the text in quotes"
         ("tick: 0.05\n\u2003robot: pi\n", 2, f"an em space (U+2003) {SPACE}"),
         ("tick: 0.05\n\ufeffrobot: pi\n", 2, f"a zero width no-break space (U+FEFF) {SPACE}"),
         ("tick:\u200b0.05\n", 1, f"a zero width space (U+200B) {SPACE}"),
+        ("robot: pi\u2060\n", 1, f"a word joiner (U+2060) {SPACE}"),
+        ("robot: \u202epi\n", 1, f"a right-to-left override (U+202E) {SPACE}"),
         ("tick: 0.05 # a\u2028robot: pi\n", 1, f"a line separator (U+2028) {SPACE}"),
         ("servo:\n\tgpio: 18\n", 2, "a tab is not permitted here: type spaces instead"),
         ("tick:\t0.05\n", 1, "a tab is not permitted here: type spaces instead"),
@@ -44,6 +48,27 @@ def test_what_cannot_be_seen_is_named_with_its_line(
 def test_a_text_in_quotes_a_comment_and_a_byte_order_mark_may_have_such_characters() -> None:
     text = "\ufeffa: '12\xa0kg' # 1\xa0kg\nb: |\n  3\u2009N\n"
     assert parse(text).data == {"a": "12\xa0kg", "b": "3\u2009N\n"}
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "\U0001f469\u200d\U0001f52c lab",
+        "\u0645\u06cc\u200c\u0631\u0648\u062f",
+        "Tail\xadfin",
+        "a\u200eb",
+    ],
+)
+def test_joiners_and_soft_hyphens_are_parts_of_words(word: str) -> None:
+    assert parse(f"name: {word}\n{word}: 1\n").data == {"name": word, word: 1}
+
+
+def test_a_recording_whose_fishd_wrote_odd_spaces_without_quotes_can_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "to_yaml", lambda config: "name: x\xa0y\n")  # as formerly
+    path = record_run(swum(), tmp_path / "run")
+    assert open_run(path).settings_of(0) == {"name": "x\xa0y"}
 
 
 @pytest.mark.parametrize("text", ["x\xa0y", "\u2003", "a\u2028b", "\ufeffx", "é"])

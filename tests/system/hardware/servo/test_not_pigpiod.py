@@ -83,7 +83,12 @@ def test_doctor_looks_for_a_process_of_pigpiod_where_nothing_is_sent(
             return f"{result.message}; {result.remedy}"
 
         assert "sudo systemctl restart pigpiod" in examine(), "this user may not see processes"
+        put(board.root, "proc/1/comm", "sh\n")
+        line = examine()
+        assert "is perhaps not pigpiod, of which no process is visible here" in line, "a container"
+        assert "if pigpiod runs outside of this container, restart it" in line
         put(board.root, "proc/1/comm", "systemd\n")
+        put(board.root, "proc/2/comm", "kthreadd\n")
         line = examine()
         assert line.startswith(f"what answers at 127.0.0.1:{port} is not pigpiod, of which there ")
         assert "stop that program" in line
