@@ -137,8 +137,8 @@ def attempt(event: str, age: float, delay: float) -> Attempt:
             started = time.monotonic()
             done = call(FISHCTL, "estop", env=cron if from_cron else login)
             seconds = time.monotonic() - started
-            (own,) = local_daemons.find_own()
-            mode = str(own.ask(b'{"v": 2, "op": "status"}', PATIENCE))
+            own = local_daemons.find_own()
+            mode = str(local_daemons.ask(own, b'{"v": 2, "op": "status"}', PATIENCE))
             with suppress(IndexError):
                 done.stdout = done.stdout.split("stopped through: ")[1].partition(";")[0]
             fishd.end_or_kill(PATIENCE)
