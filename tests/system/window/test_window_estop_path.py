@@ -1,0 +1,102 @@
+"""An emergency stop of the window arrives though a thread, a disk or ZeroMQ fails."""
+
+import signal
+from pathlib import Path
+
+import pytest
+from rigs.keyed_daemon import KeyedDaemon
+from rigs.processes import Daemon, wait_until
+from rigs.window_process import NETWORK_HOST, Browser, open_page, run, running_window
+
+from fishd.window.devices import Devices
+from fishd.window.estop_path import ESTOP_THREADS
+
+STALLED_KEYS = """
+import signal, threading
+from fishd.core import keys
+real, is_stalled = keys.read_known, threading.Event()
+def read_known(folder):
+    if is_stalled.is_set():
+        threading.Event().wait()
+    return real(folder)
+keys.read_known = read_known
+signal.signal(signal.SIGUSR1, lambda *_: is_stalled.set())
+"""
+"""Code of a window: from SIGUSR1 on, the disk of its keys does not answer."""
+SILENT = """
+import signal, threading
+from fishd.client import Fish
+signal.signal(
+    signal.SIGUSR1, lambda *_: setattr(Fish, "estop", lambda *_: threading.Event().wait())
+)
+"""
+"""Code of a window: from SIGUSR1 on, a thread with an emergency stop waits forever."""
+BROKEN = """
+import signal, zmq
+from fishd.client import Fish
+def fail(*_):
+    raise zmq.ZMQError(24)
+def break_all(*_):
+    Fish.status = Fish.estop = fail
+signal.signal(signal.SIGUSR1, break_all)
+"""
+"""Code of a window: from SIGUSR1 on, no thread can open a socket of ZeroMQ."""
+
+
+def test_an_emergency_stop_over_the_network_reads_no_keys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyed = KeyedDaemon(tmp_path, client="watch")
+    monkeypatch.setenv("FISHD_KEYS", str(tmp_path / "client"))
+    with (
+        keyed.running() as daemon,
+        running_window(tmp_path, changes=STALLED_KEYS, fish=keyed.endpoint) as window,
+    ):
+
+        async def test() -> None:
+            async with Browser(window.url) as browser, open_page(browser) as page:
+                window.process.send_signal(signal.SIGUSR1)
+                await page.until("connection", lambda connection: connection["warning"])
+                for _ in range(ESTOP_THREADS + 1):
+                    assert (await page.post("estop"))["way"] == "control"
+
+        run(test())
+        assert daemon.status().mode == "estop"
+
+
+def test_the_last_resort_runs_though_all_threads_of_emergency_stops_wait_forever(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    with running_window(tmp_path, changes=SILENT, fish=daemon.endpoint) as window:
+
+        async def test() -> None:
+            async with Browser(window.url) as browser:
+                window.process.send_signal(signal.SIGUSR1)
+                for _ in range(ESTOP_THREADS + 1):
+                    answer = await browser.post("/api/fish/fish/estop")
+                    assert answer["way"] == "last resort"
+
+        run(test())
+        assert daemon.status().mode == "estop"
+
+
+def test_an_error_of_zeromq_ends_neither_the_emergency_stop_nor_the_warning_nor_revocation(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    with running_window(tmp_path, changes=BROKEN, fish=daemon.endpoint) as window:
+
+        async def test() -> None:
+            token = Devices(window.state).invite("watch")
+            async with Browser(window.url, NETWORK_HOST) as browser:
+                await browser.post("/api/pair", {"token": token, "name": "tablet"})
+                async with open_page(browser) as page:
+                    window.process.send_signal(signal.SIGUSR1)
+                    await page.until("connection", lambda connection: connection["warning"])
+                    assert (await page.post("estop"))["way"] == "last resort"
+                    window.ask("revoke", "tablet")
+                    while not page.sock.closed:
+                        await page.sock.receive()
+
+        run(test())
+        wait_until(lambda: daemon.status().mode == "estop")
+        assert window.end()[2].count("cannot be probed") == 1
