@@ -50,11 +50,17 @@ class JobRequests:
         options = convert(body.options, KINDS[body.kind], f"{body.kind}: ")
         if getattr(options, "parameters", None):
             _check_parameters(options, link.controllers)
+
+        def check() -> None:
+            self._access.require(request, "drive")
+            if body.kind in DRIVING_KINDS:
+                self._pages.require_driver(link.name, page)
+
+        check()
         if body.kind in DRIVING_KINDS:
-            self._pages.require_driver(link.name, page)
             await link.give_back()  # the experiment takes the fish itself
         endpoint, device = link.endpoint_options, access.device_id
-        job = await self._jobs.start(body.kind, link.name, endpoint, options, device)
+        job = await self._jobs.start(body.kind, link.name, endpoint, options, device, check)
         self._pages.tell_job(job)
         return success(job)
 

@@ -157,18 +157,26 @@ class Jobs:
         return str(self._count)
 
     async def start(
-        self, kind: str, fish: str, endpoint: Iterable[str], options: Any, device: str
+        self,
+        kind: str,
+        fish: str,
+        endpoint: Iterable[str],
+        options: Any,
+        device: str,
+        check: Callable[[], object],
     ) -> Job:
         """Start a job; raise `JobError`.
 
         fish: name of the fish; endpoint: options of fishctl for it
         device: identifier of the device that starts it
+        check: raises `FishdError` if that may no longer start it; the disk may have to wait
         """
         async with self._starting:
             if len(self._tasks) >= MAX_RUNNING_JOBS:
                 raise JobError(f"{MAX_RUNNING_JOBS} jobs run already; wait for the end of one")
             # A disk may stall, and an emergency stop must not wait for it.
             prepared = await asyncio.to_thread(self._prepare, kind, options)
+            check()
             return self._start_prepared(*prepared, fish, endpoint, options, device)
 
     def _prepare(self, kind: str, options: Any) -> tuple[str, str, list[str]]:
