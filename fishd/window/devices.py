@@ -214,7 +214,7 @@ class Devices:
             raise DeviceError(f"no device is named '{text.quoted(name)}'; paired: {known}")
         with self._changing() as content:
             others = tuple(entry for entry in content.devices if entry.id != match.id)
-            self._write(replace(content, devices=others))
+            self._write(replace(content, devices=others), forgets=True)
         return match
 
     @contextmanager
@@ -236,13 +236,29 @@ class Devices:
         finally:
             os.close(descriptor)
 
-    def _write(self, content: _Content) -> None:
-        """Write the file, and a copy by which the devices are known where the file is damaged."""
+    def _write(self, content: _Content, *, forgets: bool = False) -> None:
+        """Write the file, and a copy by which the devices are known where the file is damaged.
+
+        forgets: whether nothing changes unless the copy is written or removed: a revoked device in
+            it would regain its access where the file is damaged later
+        """
         payload = msgspec.json.format(msgspec.json.encode(content))
+        try:
+            self._write_file(self._copy, payload)
+        except OSError:
+            if forgets:
+                self._remove_copy()
         self._write_file(self._path, payload)
         self._content, self._version = content, self._version_now()
-        with suppress(OSError):
-            self._write_file(self._copy, payload)
+
+    def _remove_copy(self) -> None:
+        try:
+            self._copy.unlink(missing_ok=True)
+        except OSError as error:
+            raise DeviceError(
+                f"{self._copy} can be neither written nor removed: {error.strerror}; the device "
+                "stays paired: remove that file, and revoke the device again"
+            ) from None
 
     def _write_file(self, path: Path, payload: bytes) -> None:
         new = path.with_suffix(".new")

@@ -198,6 +198,29 @@ def test_a_damaged_file_pairs_nothing_and_says_what_to_do(tmp_path: Path) -> Non
     assert [device.name for device in paired.all()] == ["tablet"]
 
 
+def test_the_copy_of_the_file_revives_no_revoked_device(tmp_path: Path) -> None:
+    paired = Devices(tmp_path)
+    for name in ("stolen", "tablet"):
+        paired.pair(paired.invite("drive"), name)
+    copy = tmp_path / "devices.copy.json"
+    (tmp_path / "devices.copy.new").mkdir()  # the copy can be removed, but not written
+    paired.revoke("stolen")
+    assert not copy.exists()
+    copy.mkdir()  # nor removed
+    with pytest.raises(DeviceError, match="neither written nor removed: .*; the device stays"):
+        paired.revoke("tablet")
+    assert [device.name for device in Devices(tmp_path).all()] == ["tablet"]
+
+
+def test_the_file_is_written_after_its_copy(tmp_path: Path) -> None:
+    paired = Devices(tmp_path)
+    paired.pair(paired.invite("drive"), "stolen")
+    (tmp_path / "devices.new").mkdir()  # as if the machine lost its power between the two
+    with pytest.raises(OSError, match="devices.new"):
+        paired.revoke("stolen")
+    assert paired.read_copy() == ()
+
+
 def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:
     async def test() -> None:
         async with paired(window, "watch", "viewer") as browser:
