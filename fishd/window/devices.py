@@ -22,7 +22,7 @@ from msgspec.structs import replace
 from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
-from fishd.window.expiry import SteadyClock, boot_id, boot_time
+from fishd.window.expiry import SteadyClock, boot_id, boot_time, is_synchronised
 
 Scope = Literal["watch", "drive"]
 INVITATION_S = 600.0
@@ -164,22 +164,25 @@ class Devices:
     def all(self) -> tuple[Device, ...]:
         """Return all devices whose access has not expired; remove from the file what has."""
         self.list_stored()
-        valid = self._keep_valid(self._content)
-        if valid != self._content and time.monotonic() >= self._next_drop:
+        if self._drop(self._content) != self._content and time.monotonic() >= self._next_drop:
             self._next_drop = time.monotonic() + DROP_RETRY_S
             with suppress(DeviceError, OSError), self._changing(timeout=0.0) as content:
-                self._write(self._keep_valid(content))
+                self._write(self._drop(content))
                 self._next_drop = 0.0
-        return valid.devices
+        return tuple(device for device in self._content.devices if self.is_paired(device))
 
     def is_paired(self, device: Device) -> bool:
         """Return whether the access of a device has not expired; reads no disk."""
         return self.now() - device.paired < DEVICE_S
 
-    def _keep_valid(self, content: _Content) -> _Content:
-        """Return the content without what has expired."""
+    def _drop(self, content: _Content) -> _Content:
+        """Return the content without what has expired for certain: a wall clock may be wrong."""
+        devices, now = content.devices, time.time()
+        expired = {d.id for d in devices if not self.is_paired(d) and now - d.paired >= DEVICE_S}
+        if not expired or not is_synchronised():
+            expired = set()
         return _Content(
-            tuple(device for device in content.devices if self.is_paired(device)),
+            tuple(device for device in devices if device.id not in expired),
             tuple(entry for entry in content.invitations if entry.is_valid),
         )
 

@@ -207,7 +207,7 @@ def test_the_copy_of_the_file_revives_no_revoked_device(tmp_path: Path) -> None:
     paired.revoke("stolen")
     assert not copy.exists()
     copy.mkdir()  # nor removed
-    with pytest.raises(DeviceError, match="neither written nor removed: .*; the device stays"):
+    with pytest.raises(DeviceError, match=r"neither written nor removed: .*; the device stays"):
         paired.revoke("tablet")
     assert [device.name for device in Devices(tmp_path).all()] == ["tablet"]
 
@@ -216,7 +216,7 @@ def test_the_file_is_written_after_its_copy(tmp_path: Path) -> None:
     paired = Devices(tmp_path)
     paired.pair(paired.invite("drive"), "stolen")
     (tmp_path / "devices.new").mkdir()  # as if the machine lost its power between the two
-    with pytest.raises(OSError, match="devices.new"):
+    with pytest.raises(OSError, match=r"devices\.new"):
         paired.revoke("stolen")
     assert paired.read_copy() == ()
 
