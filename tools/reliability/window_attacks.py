@@ -21,6 +21,8 @@ HELD_BODIES = 64
 """Number of connections that send no body while others come."""
 ARRIVALS_PER_S = 22
 BARE_CONNECTIONS_PER_S = 1000
+BARE_CONNECTIONS = f"{BARE_CONNECTIONS_PER_S} bare connections a second"
+"""Description of the attack with these."""
 MAX_BARE_CONNECTIONS = 600
 """Number of bare connections that are open at a time."""
 HISTORIES = 60
@@ -162,7 +164,7 @@ async def bare_connections(target: Target, sent: Callable[[], None]) -> None:
 NETWORK_ATTACKS: dict[str, Attack] = {
     f"{SLOW_BODIES} connections without their body": slow_bodies,
     f"{HELD_BODIES} of these, and {ARRIVALS_PER_S} new ones a second": arriving_bodies,
-    f"{BARE_CONNECTIONS_PER_S} bare connections a second": bare_connections,
+    BARE_CONNECTIONS: bare_connections,
     f"{HISTORIES} requests for the history at a time": histories,
     f"{FLOODS} WebSockets full of messages": frames,
 }

@@ -1,11 +1,12 @@
 """An emergency stop of the window arrives though a thread, a disk or ZeroMQ fails."""
 
+import asyncio
 import signal
 from pathlib import Path
 
 import pytest
 from rigs.keyed_daemon import KeyedDaemon
-from rigs.processes import Daemon, wait_until
+from rigs.processes import PATIENCE, Daemon, wait_until
 from rigs.window_process import NETWORK_HOST, Browser, open_page, run, running_window
 
 from fishd.window.devices import Devices
@@ -23,6 +24,16 @@ keys.read_known = read_known
 signal.signal(signal.SIGUSR1, lambda *_: is_stalled.set())
 """
 """Code of a window: from SIGUSR1 on, the disk of its keys does not answer."""
+STALLED_DISKS = """
+import signal, threading
+from fishd.window import register, runs
+def stall(*_):
+    threading.Event().wait()
+def stall_all(*_):
+    runs._is_empty = register.write_atomically = stall
+signal.signal(signal.SIGUSR1, stall_all)
+"""
+"""Code of a window: from SIGUSR1 on, the disks of its runs and of its state do not answer."""
 SILENT = """
 import signal, threading
 from fishd.client import Fish
@@ -100,3 +111,21 @@ def test_an_error_of_zeromq_ends_neither_the_emergency_stop_nor_the_warning_nor_
         run(test())
         wait_until(lambda: daemon.status().mode == "estop")
         assert window.end()[2].count("cannot be probed") == 1
+
+
+def test_a_window_whose_disks_do_not_answer_ends_at_sigterm(daemon: Daemon, tmp_path: Path) -> None:
+    with running_window(tmp_path, changes=STALLED_DISKS, fish=daemon.endpoint) as window:
+
+        async def test() -> None:
+            async with Browser(window.url) as browser, open_page(browser) as page:
+                window.process.send_signal(signal.SIGUSR1)
+                body = {"fish": "fish", "kind": "record"}
+                await page.post("/api/jobs", body)  # the register stalls
+                listing = asyncio.create_task(browser.get("/api/runs"))
+                assert (await page.post("estop"))["way"] == "control"
+                assert not listing.done()
+                listing.cancel()
+
+        run(test())
+        window.process.terminate()
+        assert window.process.wait(PATIENCE) == 0

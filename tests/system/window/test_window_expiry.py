@@ -33,8 +33,8 @@ devices.is_synchronised = expiry.is_synchronised = lambda: True
 signal.signal(signal.SIGUSR1, lambda *_: steps.reverse())
 signal.signal(signal.SIGUSR2, lambda *_: setattr(devices, "DEVICE_S", 0.0))
 """
-"""Code of a window: SIGUSR1 sets its clock back by a day, later right again; SIGUSR2 lets its devices
-expire."""
+"""Code of a window: SIGUSR1 sets its clock back by a day, later right again; SIGUSR2 lets its
+devices expire."""
 Step = Callable[[float], None]
 
 
