@@ -2,15 +2,17 @@
 
 import asyncio
 import signal
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
 from rigs.keyed_daemon import KeyedDaemon
-from rigs.processes import PATIENCE, Daemon, wait_until
+from rigs.processes import PATIENCE, Daemon, reserve_port, wait_until
 from rigs.window_process import NETWORK_HOST, Browser, open_page, run, running_window
 
 from fishd.window.devices import Devices
 from fishd.window.estop_path import ESTOP_THREADS
+from fishd.window.job_requests import MAX_WAITING_REQUESTS
 
 STALLED_KEYS = """
 import signal, threading
@@ -129,3 +131,41 @@ def test_a_window_whose_disks_do_not_answer_ends_at_sigterm(daemon: Daemon, tmp_
         run(test())
         window.process.terminate()
         assert window.process.wait(PATIENCE) == 0
+
+
+def test_requests_that_wait_for_the_disk_of_the_runs_are_refused_above_a_number(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    with running_window(tmp_path, changes=STALLED_DISKS, fish=daemon.endpoint) as window:
+
+        async def test() -> None:
+            async with Browser(window.url) as browser:
+                window.process.send_signal(signal.SIGUSR1)
+                await browser.post("/api/fish/fish/estop")  # by then, the disk stalls
+                waiting = [
+                    asyncio.create_task(browser.refusal("/api/runs"))
+                    for _ in range(MAX_WAITING_REQUESTS + 1)
+                ]
+                done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+                assert {task.result() for task in done} == {(503, "busy")}
+                for task in waiting:
+                    task.cancel()
+
+        run(test())
+        window.process.terminate()
+        assert window.process.wait(PATIENCE) == 0
+
+
+def test_an_emergency_stop_whose_last_resort_fails_is_no_mistake_of_the_window(
+    tmp_path: Path,
+) -> None:
+    with closing(reserve_port()) as port, ExitStack() as stack:
+        endpoint = f"tcp://127.0.0.1:{port.getsockname()[1]}"  # where no fishd listens
+        window = stack.enter_context(running_window(tmp_path, fish=endpoint))
+
+        async def test() -> None:
+            async with Browser(window.url) as browser:
+                refusal = await browser.refusal("/api/fish/fish/estop", {})
+                assert refusal == (503, "no-daemon")
+
+        run(test())
