@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from fishd.core import protocol, text
 from fishd.core.addresses import (
@@ -56,10 +57,16 @@ ESTOP_SOCKET_TIMEOUT_S = 0.4
 class Connection:
     """Base of both clients: addresses, encoding of requests and replies, and errors."""
 
-    def __init__(self, endpoint: str | None, timeout: float, telemetry: str | None) -> None:
+    def __init__(
+        self,
+        endpoint: str | None,
+        timeout: float,
+        telemetry: str | None,
+        access: "Access | UnsetType | None" = UNSET,
+    ) -> None:
         self.endpoint = endpoint or find_control_address()
         self._path = socket_path(self.endpoint)
-        self.access = _find_access(self.endpoint)
+        self.access = _find_access(self.endpoint) if access is UNSET else access
         """Keys of this client and of the fishd; None for a connection without keys."""
         self._was_named = bool(endpoint or os.environ.get(ENDPOINT_VARIABLE))
         self.detour = ""

@@ -8,6 +8,8 @@ from contextlib import closing, contextmanager
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
+from msgspec import UNSET, UnsetType
+
 from fishd.client.connection import (
     DEFAULT_IDLE_LIMIT_S,
     DEFAULT_TIMEOUT_S,
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
     import zmq
 
     from fishd.client.lease import LeaseRenewal
+    from fishd.core.keys import Access
 
 T = TypeVar("T")
 
@@ -53,13 +56,15 @@ class Fish(Connection):
         *,
         timeout: float = DEFAULT_TIMEOUT_S,
         telemetry: str | None = None,
+        access: "Access | UnsetType | None" = UNSET,
     ) -> None:
         """
         endpoint: address of the control socket; None for the daemon of this machine
         timeout: time to wait for an answer or a tick [s]
         telemetry: address of the telemetry socket; None for the address that the daemon reports
+        access: keys for this endpoint, None for none; read from their folder by default
         """
-        super().__init__(endpoint, timeout, telemetry)
+        super().__init__(endpoint, timeout, telemetry, access)
         self._socket: Requests | None = None
         self._asked = 0.0
         """Time of the first request since the latest answer [s, monotonic]; 0 without one."""

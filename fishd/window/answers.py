@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from fishd.core import text
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishdError, NoDaemon, ParameterError, Refused
+from fishd.core.errors import FishdError, FishError, NoDaemon, ParameterError, Refused
 from fishd.window import web_server
 from fishd.window.children import JobError
 from fishd.window.devices import DeviceError, DevicesBusy
@@ -118,4 +118,6 @@ def _refusal(error: FishdError) -> ApiError:
         return ApiError(403, "device", message)
     if isinstance(error, ParameterError):
         return ApiError(400, "bad-arguments", message)
+    if isinstance(error, FishError):
+        return ApiError(503, "no-daemon", message)
     return ApiError(500, "failed", message)

@@ -22,7 +22,7 @@ from msgspec.structs import replace
 from fishd.core import files, text
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError
-from fishd.window.expiry import SteadyClock, boot_id, boot_time
+from fishd.window.expiry import SteadyClock, boot_id, boot_time, is_synchronised
 
 Scope = Literal["watch", "drive"]
 INVITATION_S = 600.0
@@ -133,8 +133,13 @@ class Devices:
             self._write(replace(content, invitations=kept))
         return token
 
-    def pair(self, token: str, name: str) -> tuple[Device, str]:
-        """Use up a token; return the new device, and the token for its cookie."""
+    def pair(
+        self, token: str, name: str, is_wanted: Callable[[], bool] = lambda: True
+    ) -> tuple[Device, str]:
+        """Use up a token; return the new device, and the token for its cookie.
+
+        is_wanted: returns whether a browser still waits for this token, just before it is stored
+        """
         digest, secret = hash_token(token), secrets.token_urlsafe(32)
         with self._changing() as content:
             match = next((entry for entry in content.invitations if entry.token == digest), None)
@@ -157,6 +162,8 @@ class Devices:
                 paired=max(now, time.time()),  # which may have been set since
                 seen=now,
             )
+            if not is_wanted():
+                raise DevicesBusy("the browser no longer waits to be paired")
             others = tuple(entry for entry in content.invitations if entry is not match)
             self._write(_Content((*content.devices, device), others))
         return device, secret
@@ -164,22 +171,25 @@ class Devices:
     def all(self) -> tuple[Device, ...]:
         """Return all devices whose access has not expired; remove from the file what has."""
         self.list_stored()
-        valid = self._keep_valid(self._content)
-        if valid != self._content and time.monotonic() >= self._next_drop:
+        if self._drop(self._content) != self._content and time.monotonic() >= self._next_drop:
             self._next_drop = time.monotonic() + DROP_RETRY_S
             with suppress(DeviceError, OSError), self._changing(timeout=0.0) as content:
-                self._write(self._keep_valid(content))
+                self._write(self._drop(content))
                 self._next_drop = 0.0
-        return valid.devices
+        return tuple(device for device in self._content.devices if self.is_paired(device))
 
     def is_paired(self, device: Device) -> bool:
         """Return whether the access of a device has not expired; reads no disk."""
         return self.now() - device.paired < DEVICE_S
 
-    def _keep_valid(self, content: _Content) -> _Content:
-        """Return the content without what has expired."""
+    def _drop(self, content: _Content) -> _Content:
+        """Return the content without what has expired for certain: a wall clock may be wrong."""
+        devices, now = content.devices, time.time()
+        expired = {d.id for d in devices if not self.is_paired(d) and now - d.paired >= DEVICE_S}
+        if not expired or not is_synchronised():
+            expired = set()
         return _Content(
-            tuple(device for device in content.devices if self.is_paired(device)),
+            tuple(device for device in devices if device.id not in expired),
             tuple(entry for entry in content.invitations if entry.is_valid),
         )
 
@@ -214,7 +224,7 @@ class Devices:
             raise DeviceError(f"no device is named '{text.quoted(name)}'; paired: {known}")
         with self._changing() as content:
             others = tuple(entry for entry in content.devices if entry.id != match.id)
-            self._write(replace(content, devices=others))
+            self._write(replace(content, devices=others), forgets=True)
         return match
 
     @contextmanager
@@ -236,13 +246,29 @@ class Devices:
         finally:
             os.close(descriptor)
 
-    def _write(self, content: _Content) -> None:
-        """Write the file, and a copy by which the devices are known where the file is damaged."""
+    def _write(self, content: _Content, *, forgets: bool = False) -> None:
+        """Write the file, and a copy by which the devices are known where the file is damaged.
+
+        forgets: whether nothing changes unless the copy is written or removed: a revoked device in
+            it would regain its access where the file is damaged later
+        """
         payload = msgspec.json.format(msgspec.json.encode(content))
+        try:
+            self._write_file(self._copy, payload)
+        except OSError:
+            if forgets:
+                self._remove_copy()
         self._write_file(self._path, payload)
         self._content, self._version = content, self._version_now()
-        with suppress(OSError):
-            self._write_file(self._copy, payload)
+
+    def _remove_copy(self) -> None:
+        try:
+            self._copy.unlink(missing_ok=True)
+        except OSError as error:
+            raise DeviceError(
+                f"{self._copy} can be neither written nor removed: {error.strerror}; the device "
+                "stays paired: remove that file, and revoke the device again"
+            ) from None
 
     def _write_file(self, path: Path, payload: bytes) -> None:
         new = path.with_suffix(".new")

@@ -1,9 +1,15 @@
-"""Clocks by which tokens expire: a step of the wall clock neither revives nor ends one."""
+"""Clocks by which tokens expire: no wrong wall clock revives one or removes it from the file."""
 
 import time
 from functools import cache
 from pathlib import Path
 
+LOOK_PERIOD_S = 1.0
+"""Time between two looks at the wall clock [s]."""
+_TIMEX_BYTES = 512
+"""Size that no `struct timex` of Linux exceeds [bytes]."""
+_TIME_ERROR = 5
+"""State of a clock that is not synchronised."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
@@ -18,13 +24,30 @@ def boot_id() -> str:
     return _BOOT_ID.read_text(encoding="ascii").strip()
 
 
+def is_synchronised() -> bool:
+    """Return whether a time server keeps the wall clock right; a step by hand ends that."""
+    import ctypes
+
+    state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
+    return 0 <= int(state) < _TIME_ERROR
+
+
 class SteadyClock:
-    """Time of day that is set once, and then follows no step of the wall clock."""
+    """Time of day that never goes back, and follows only a time server forward.
+
+    A computer without a clock of its own begins in the past, until it finds a time server.
+    """
 
     def __init__(self, earliest: float) -> None:
         """earliest: time before which it cannot be, whatever the wall clock shows [s, unix]"""
         self._start = max(time.time(), earliest) - boot_time()
+        self._next_look = 0.0
 
     def now(self) -> float:
         """Return the time [s, unix]."""
-        return self._start + boot_time()
+        boot = boot_time()
+        if boot >= self._next_look:
+            self._next_look = boot + LOOK_PERIOD_S
+            if (start := time.time() - boot) > self._start and is_synchronised():
+                self._start = start
+        return self._start + boot

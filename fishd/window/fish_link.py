@@ -56,7 +56,7 @@ class Connection(Struct, frozen=True):
     """Time since the last tick [s]."""
     message: str
     warning: str
-    """Why an emergency stop may not reach the fish; empty if its way answers."""
+    """Why an emergency stop may not reach the fish; empty if its path answers."""
 
 
 class Busy(FishError):
@@ -91,7 +91,7 @@ class FishLink:
         self._fish = AsyncFish(endpoint)
         self._stopper = AsyncFish(endpoint)
         self._monitor = AsyncFish(endpoint, timeout=PROBE_TIMEOUT_S)
-        self.estop_path = EstopPath(name, endpoint)
+        self.estop_path = EstopPath(name, endpoint, self._fish.access)
         self._context = zmq.asyncio.Context()
         self._batch: list[bytes] = []
         self._flush: asyncio.TimerHandle | None = None
@@ -276,9 +276,9 @@ class FishLink:
         return columns
 
     def history(self) -> tuple[bytes, bytes]:
-        """Return the columns as JSON, shared by all who ask within a second, and later ticks.
+        """Return the columns as JSON, shared by requests within a second, and later ticks.
 
-        Many who ask must not take the processor from an emergency stop.
+        Many requests must not take the processor from an emergency stop.
         """
         encoded, last, payload = self._history
         if time.monotonic() - encoded > HISTORY_AGE_S:

@@ -1,6 +1,7 @@
 """Requests of a page for experiments, and for the runs that they leave."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from aiohttp import web
@@ -10,9 +11,13 @@ from fishd.core import text
 from fishd.core.signals import ControllerInfo
 from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
+from fishd.window.fish_link import Busy
 from fishd.window.job_options import DRIVING_KINDS, KINDS
 from fishd.window.jobs import Jobs
 from fishd.window.pages import Pages
+
+MAX_WAITING_REQUESTS = 16
+"""Number of requests that wait for the disk of runs above which a further one is refused."""
 
 
 class JobRequest(Struct, forbid_unknown_fields=True):
@@ -28,6 +33,7 @@ class JobRequests:
 
     def __init__(self, access: AccessControl, pages: Pages, jobs: Jobs) -> None:
         self._access, self._pages, self._jobs = access, pages, jobs
+        self._waiting = 0
         self.routes = [
             web.get("/api/jobs", self._list_jobs),
             web.post("/api/jobs", self._start_job),
@@ -35,6 +41,17 @@ class JobRequests:
             web.get("/api/runs", self._list_runs),
             web.get("/api/runs/{run}/plot.png", self._plot_run),
         ]
+
+    @contextmanager
+    def _waiting_for_disk(self) -> Iterator[None]:
+        """Count a request that may wait for the disk of runs; raise `Busy` for one too many."""
+        if self._waiting >= MAX_WAITING_REQUESTS:
+            raise Busy(f"{self._waiting} requests wait for the disk of the runs; try again later")
+        self._waiting += 1
+        try:
+            yield
+        finally:
+            self._waiting -= 1
 
     async def _list_jobs(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")
@@ -50,11 +67,18 @@ class JobRequests:
         options = convert(body.options, KINDS[body.kind], f"{body.kind}: ")
         if getattr(options, "parameters", None):
             _check_parameters(options, link.controllers)
+
+        def check() -> None:
+            self._access.require(request, "drive")
+            if body.kind in DRIVING_KINDS:
+                self._pages.require_driver(link.name, page)
+
+        check()
         if body.kind in DRIVING_KINDS:
-            self._pages.require_driver(link.name, page)
             await link.give_back()  # the experiment takes the fish itself
         endpoint, device = link.endpoint_options, access.device_id
-        job = await self._jobs.start(body.kind, link.name, endpoint, options, device)
+        with self._waiting_for_disk():
+            job = await self._jobs.start(body.kind, link.name, endpoint, options, device, check)
         self._pages.tell_job(job)
         return success(job)
 
@@ -65,11 +89,13 @@ class JobRequests:
 
     async def _list_runs(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")
-        return success(await self._jobs.runs.list_all())
+        with self._waiting_for_disk():
+            return success(await self._jobs.runs.list_all())
 
     async def _plot_run(self, request: web.Request) -> web.Response:
         self._access.require(request, "watch")
-        picture = await self._jobs.runs.plot(request.match_info["run"])
+        with self._waiting_for_disk():
+            picture = await self._jobs.runs.plot(request.match_info["run"])
         return web.Response(body=picture, content_type="image/png")
 
 

@@ -32,6 +32,8 @@ MAX_LINES = 50
 MAX_OUTPUT_BYTES = 4 * 2**20
 STOP_TIMEOUT_S = 5.0
 """Time from SIGINT to SIGTERM, and from that to SIGKILL [s]."""
+CLOSE_TIMEOUT_S = 3.0 * STOP_TIMEOUT_S
+"""Longest wait for the ends of all jobs [s]."""
 TELL_DELAY_S = 0.2
 """Time for which lines of a job are gathered before pages get them [s]."""
 _RESUMABLE = ("measure", "sweep", "compare")
@@ -97,11 +99,11 @@ class Jobs:
         self._starting = asyncio.Lock()
 
     async def close(self) -> None:
-        """Stop all jobs, and wait for their ends."""
+        """Stop all jobs, and wait for their ends, but not for a disk that stalls."""
         for name in list(self._tasks):
             self.stop(name)
         if self._tasks:
-            await asyncio.wait(self._tasks.values())
+            await asyncio.wait(self._tasks.values(), timeout=CLOSE_TIMEOUT_S)
         self._scratch.close()
 
     def all(self) -> list[Job]:
@@ -157,18 +159,26 @@ class Jobs:
         return str(self._count)
 
     async def start(
-        self, kind: str, fish: str, endpoint: Iterable[str], options: Any, device: str
+        self,
+        kind: str,
+        fish: str,
+        endpoint: Iterable[str],
+        options: Any,
+        device: str,
+        check: Callable[[], object],
     ) -> Job:
         """Start a job; raise `JobError`.
 
         fish: name of the fish; endpoint: options of fishctl for it
         device: identifier of the device that starts it
+        check: raises `FishdError` if that may no longer start it; the disk may have to wait
         """
         async with self._starting:
             if len(self._tasks) >= MAX_RUNNING_JOBS:
                 raise JobError(f"{MAX_RUNNING_JOBS} jobs run already; wait for the end of one")
             # A disk may stall, and an emergency stop must not wait for it.
             prepared = await asyncio.to_thread(self._prepare, kind, options)
+            check()
             return self._start_prepared(*prepared, fish, endpoint, options, device)
 
     def _prepare(self, kind: str, options: Any) -> tuple[str, str, list[str]]:

@@ -5,7 +5,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -122,7 +122,14 @@ def serve(
                 await asyncio.sleep(NOTIFY_PERIOD_S)  # a thread may have to wait for a disk
             notifier.stopping()
 
-    return run_service(NAME, log_format, lambda stopping: asyncio.run(run_window(stopping)))
+    return run_service(NAME, log_format, lambda stopping: _run_to_end(run_window(stopping)))
+
+
+def _run_to_end(window: Coroutine[Any, Any, None]) -> None:
+    """Run a coroutine, without a wait for threads at its end: their disks may stall."""
+    loop = asyncio.new_event_loop()
+    asyncio.set_event_loop(loop)
+    loop.run_until_complete(window)
 
 
 def main() -> None:

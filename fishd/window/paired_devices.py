@@ -6,6 +6,7 @@ device keeps its access, so that its emergency stop works.
 
 import asyncio
 import logging
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -71,7 +72,13 @@ class PairedDevices:
 
     async def pair(self, token: str, name: str) -> tuple[Device, str]:
         """Use up a token; return the new device, and the token for its cookie."""
-        return await self._change(lambda: self._file.pair(token, name))
+        is_late = threading.Event()
+        try:
+            return await self._change(
+                lambda: self._file.pair(token, name, lambda: not is_late.is_set())
+            )
+        finally:
+            is_late.set()
 
     async def revoke(self, name: str) -> Device:
         """Remove the device with this name or id; raise `DeviceError` if there is none."""

@@ -27,6 +27,48 @@ class _Place(Struct, eq=False):
         return not self.transport.is_closing() or self.transport.get_write_buffer_size() > 0
 
 
+class _Group:
+    """Places of one group of senders, the oldest first."""
+
+    def __init__(self) -> None:
+        self._places: dict[web.RequestHandler, _Place] = {}
+        self._counts = Counter[str]()
+        """Number of places of each address."""
+
+    def find(self, handler: web.RequestHandler) -> _Place | None:
+        """Return the place of a connection."""
+        return self._places.get(handler)
+
+    def add(self, handler: web.RequestHandler, place: _Place) -> None:
+        """Give a place to a connection, and end another one if there is none."""
+        if len(self._places) >= PLACES:
+            self._make_room()
+        self._places[handler] = place
+        self._counts[place.address] += 1
+
+    def remove(self, handler: web.RequestHandler) -> None:
+        """Let a connection no longer take a place."""
+        if place := self._places.pop(handler, None):
+            self._counts[place.address] -= 1
+            if not self._counts[place.address]:
+                del self._counts[place.address]
+
+    def _make_room(self) -> None:
+        """End the connection that `Places` describes, unless another one has ended already."""
+        victim, lowest = None, (True, 1)
+        for handler, place in self._places.items():
+            if not place.is_taken:
+                self.remove(handler)
+                return
+            rank = (place.is_kept, -self._counts[place.address])
+            if rank < lowest:
+                victim, lowest = handler, rank
+        assert victim
+        transport = self._places[victim].transport
+        self.remove(victim)
+        transport.abort()
+
+
 class Places:
     """Places of the connections of a server, WebSockets aside, in three groups of senders.
 
@@ -36,8 +78,7 @@ class Places:
     """
 
     def __init__(self) -> None:
-        self._places: dict[web.RequestHandler, _Place] = {}
-        """Place of each connection, the oldest first."""
+        self._groups = self._here, self._paired_devices, self._others = _Group(), _Group(), _Group()
         self._paired: dict[str, None] = {}
         """Addresses from which a paired device has sent a request, the newest last."""
 
@@ -54,36 +95,24 @@ class Places:
 
     def keep(self, handler: web.RequestHandler) -> None:
         """End this connection last."""
-        if place := self._places.get(handler):
-            place.is_kept = True
+        for group in self._groups:
+            if place := group.find(handler):
+                place.is_kept = True
 
     def leave(self, handler: web.RequestHandler) -> None:
         """Let a connection no longer take a place."""
-        self._places.pop(handler, None)
+        for group in self._groups:
+            group.remove(handler)
 
     def admit(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
         """Give a place to a new connection, and end another one if there is none."""
         address = str((transport.get_extra_info("peername") or ("",))[0])
-        group = self._find_group(address)
-        self._places = {key: place for key, place in self._places.items() if place.is_taken}
-        rivals = [
-            (key, place)
-            for key, place in self._places.items()
-            if self._find_group(place.address) == group
-        ]
-        if len(rivals) >= PLACES:
-            counts = Counter(place.address for _, place in rivals)
-            key, place = min(
-                rivals, key=lambda rival: (rival[1].is_kept, -counts[rival[1].address])
-            )
-            del self._places[key]
-            place.transport.abort()
-        self._places[handler] = _Place(transport, address)
+        self._find_group(address).add(handler, _Place(transport, address))
 
-    def _find_group(self, address: str) -> str:
+    def _find_group(self, address: str) -> _Group:
         if is_loopback(address):
-            return "this machine"
-        return "paired" if address in self._paired else "others"
+            return self._here
+        return self._paired_devices if address in self._paired else self._others
 
 
 class _Door(asyncio.Protocol):

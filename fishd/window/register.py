@@ -5,7 +5,7 @@ window` finds the window, and a later window learns which experiments were lost 
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, suppress
 from os import getpid
 from pathlib import Path
@@ -23,6 +23,8 @@ from fishd.core.process.lockfile import LockHeld, find_lock_holder, lock_path, l
 from fishd.window.settings import WindowSettings
 
 MAX_FILE_BYTES = 2**20
+CLOSE_TIMEOUT_S = 1.0
+"""Longest wait for the disk at the end [s]; a later window removes what stays."""
 _PATTERN = "window-*.json"
 
 
@@ -56,7 +58,7 @@ class Register:
             raise StartupError(f"{lock_path(self._path)} cannot be locked: {error}") from None
         self._stack.callback(self._path.unlink, missing_ok=True)
         # A disk may be slow, and an emergency stop must not wait for it.
-        self._disk = self._stack.enter_context(ThreadPoolExecutor(1, thread_name_prefix="register"))
+        self._disk = ThreadPoolExecutor(1, thread_name_prefix="register")
         return self
 
     def __exit__(
@@ -65,7 +67,8 @@ class Register:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._stack.close()
+        wait([self._disk.submit(self._stack.close)], CLOSE_TIMEOUT_S)
+        self._disk.shutdown(wait=False)
 
     def change(self, **fields: Any) -> Future[None]:
         """Change fields of the entry soon; a full disk keeps the earlier entry."""

@@ -19,7 +19,6 @@ from fishd.window.scratch import Scratch
 
 RUNS_AGE_S = 1.0
 """Longest age of a list of runs [s]."""
-MAX_WAITING_PLOTS = 8
 MAX_HEADER_BYTES = 2**20
 _RUN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,199}", re.A)
 
@@ -44,7 +43,6 @@ class Runs:
         self.folder, self._scratch = folder, scratch
         self._list: tuple[float, Any] = (-RUNS_AGE_S, [])
         self._listing, self._plotting = asyncio.Lock(), asyncio.Lock()
-        self._waiting_plots = 0
         self._drawn: dict[str, tuple[int, ...] | None] = {}
         """Stamp of each recording when its picture was drawn."""
 
@@ -92,9 +90,6 @@ class Runs:
 
     async def _draw(self, name: str) -> BinaryIO:
         """Return the picture of a recording, which is drawn if there is none; raise `JobError`."""
-        if self._waiting_plots >= MAX_WAITING_PLOTS:
-            raise JobError("too many pictures are being drawn; try again later")
-        self._waiting_plots += 1
         try:
             async with self._plotting:
                 await asyncio.to_thread(self._scratch.create)
@@ -109,8 +104,6 @@ class Runs:
                 return await asyncio.to_thread(open_picture, picture, f"the picture of {name}")
         except files.NoFile:
             raise JobError(f"{name} could not be drawn") from None
-        finally:
-            self._waiting_plots -= 1
 
 
 def _is_empty(folder: Path) -> bool:

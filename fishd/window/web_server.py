@@ -29,6 +29,8 @@ MAX_VIEWERS = 16
 """Largest number of WebSockets that are served at a time."""
 MAX_VIEWERS_PER_ADDRESS = 12
 """Largest number of WebSockets of one address."""
+BACKLOG = 1024
+"""Number of connections that the kernel keeps until they are admitted."""
 REFUSAL_DELAY_S = 1.0
 """Time until a page that is one too many is refused: it may come again at once [s]."""
 REQUEST_TIMEOUT_S = 3.0
@@ -118,7 +120,7 @@ class WebServer:
         assert server
         try:
             self._server = await loop.create_server(
-                lambda: self._places.protocol(server), self._host, self._port
+                lambda: self._places.protocol(server), self._host, self._port, backlog=BACKLOG
             )
             for listener in self._server.sockets:  # its connections have the same size
                 listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)

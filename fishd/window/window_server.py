@@ -1,6 +1,7 @@
 """Server of the page of the fish: its files, its WebSockets, and its requests."""
 
 import asyncio
+import logging
 from contextlib import AsyncExitStack
 from importlib import resources
 from urllib.parse import urlsplit
@@ -8,6 +9,7 @@ from urllib.parse import urlsplit
 from aiohttp import web
 from msgspec import Raw
 
+from fishd.core import text
 from fishd.window.access import AccessControl
 from fishd.window.answers import answer_in_json
 from fishd.window.fish_requests import FishRequests
@@ -20,6 +22,8 @@ from fishd.window.paired_devices import PairedDevices
 from fishd.window.register import Register, take_lost_jobs
 from fishd.window.settings import WindowSettings
 from fishd.window.web_server import WebServer, file_routes
+
+log = logging.getLogger(__name__)
 
 MAX_BODY_BYTES = 16 * 2**10
 
@@ -76,6 +80,7 @@ class WindowServer(WebServer):
             entry = self._register.change(listen=listen, names=self._settings.names)
             await asyncio.wrap_future(entry)
             self._run = asyncio.create_task(self._pages.run())
+            self._run.add_done_callback(_log_failure)
             self._stack = stack.pop_all()
         return self
 
@@ -95,3 +100,11 @@ class WindowServer(WebServer):
     async def _serve_foxglove(self, request: web.Request) -> web.StreamResponse:
         with self._pages.open_foxglove(request) as page:
             return await self.serve_viewer(request, page, [PROTOCOL])
+
+
+def _log_failure(run: asyncio.Task[None]) -> None:
+    if not run.cancelled() and (error := run.exception()):
+        log.critical(
+            "pages no longer follow the fish, and revocation has no effect: %s; restart it",
+            text.describe_error(error),
+        )

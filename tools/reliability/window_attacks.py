@@ -7,6 +7,7 @@ import json
 import os
 import socket
 import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
@@ -19,6 +20,11 @@ SLOW_BODIES = 70
 HELD_BODIES = 64
 """Number of connections that send no body while others come."""
 ARRIVALS_PER_S = 22
+BARE_CONNECTIONS_PER_S = 1000
+BARE_CONNECTIONS = f"{BARE_CONNECTIONS_PER_S} bare connections a second"
+"""Description of the attack with these."""
+MAX_BARE_CONNECTIONS = 600
+"""Number of bare connections that are open at a time."""
 HISTORIES = 60
 FLOODS = 10
 """Number of WebSockets that send as many messages as the window takes."""
@@ -132,9 +138,32 @@ async def frames(target: Target, sent: Callable[[], None]) -> None:
     await asyncio.gather(*(_repeat(_flood, target, sent) for _ in range(FLOODS)))
 
 
+async def bare_connections(target: Target, sent: Callable[[], None]) -> None:
+    """Open connections that send nothing."""
+    loop, opened = asyncio.get_running_loop(), deque[socket.socket]()
+    start, count = loop.time(), 0
+    try:
+        while True:
+            while count < (loop.time() - start) * BARE_CONNECTIONS_PER_S:
+                count += 1
+                client = socket.socket()
+                opened.append(client)
+                client.setblocking(False)
+                client.bind((target.address, 0))
+                client.connect_ex((target.address, target.port))
+                sent()
+                if len(opened) > MAX_BARE_CONNECTIONS:
+                    opened.popleft().close()
+            await asyncio.sleep(0.005)
+    finally:
+        for client in opened:
+            client.close()
+
+
 NETWORK_ATTACKS: dict[str, Attack] = {
     f"{SLOW_BODIES} connections without their body": slow_bodies,
     f"{HELD_BODIES} of these, and {ARRIVALS_PER_S} new ones a second": arriving_bodies,
+    BARE_CONNECTIONS: bare_connections,
     f"{HISTORIES} requests for the history at a time": histories,
     f"{FLOODS} WebSockets full of messages": frames,
 }

@@ -20,18 +20,21 @@ from rigs.window_process import (
     running_window,
 )
 
-from fishd.window import devices
+from fishd.window import devices, expiry
 from fishd.window.devices import DeviceError, Devices
 
 YEAR_S = 365 * 86400.0
 STEPPED = """
 import signal, time
-from fishd.window import devices
-real = time.time
-signal.signal(signal.SIGUSR1, lambda *_: setattr(time, "time", lambda: real() - 86400.0))
+from fishd.window import devices, expiry
+real, steps = time.time, [0.0, -86400.0]
+time.time = lambda: real() + steps[0]
+devices.is_synchronised = expiry.is_synchronised = lambda: True
+signal.signal(signal.SIGUSR1, lambda *_: steps.reverse())
 signal.signal(signal.SIGUSR2, lambda *_: setattr(devices, "DEVICE_S", 0.0))
 """
-"""Code of a window: SIGUSR1 sets its clock back by a day, SIGUSR2 lets its devices expire."""
+"""Code of a window: SIGUSR1 sets its clock back by a day, later right again; SIGUSR2 lets its
+devices expire."""
 Step = Callable[[float], None]
 
 
@@ -44,6 +47,18 @@ def step(monkeypatch: pytest.MonkeyPatch) -> Step:
         monkeypatch.setattr(time, "time", lambda: real() + seconds)
 
     return step
+
+
+@pytest.fixture(autouse=True)
+def synchronise(monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], None]:
+    """Let no time server keep the clock; return a function that changes that."""
+
+    def synchronise(is_synchronised: bool) -> None:
+        for module in (expiry, devices):
+            monkeypatch.setattr(module, "is_synchronised", lambda: is_synchronised)
+
+    synchronise(False)
+    return synchronise
 
 
 @pytest.fixture
@@ -113,12 +128,17 @@ def test_a_device_that_has_expired_loses_its_page_its_fish_and_its_place_in_the_
             assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
 
     run(test())
+    assert len(content_of(stepped_window.state)["devices"]) == 1  # this clock may be wrong
+    stepped_window.process.send_signal(signal.SIGUSR1)
     wait_until(lambda: content_of(stepped_window.state)["devices"] == [])
     wait_until(lambda: daemon.status().mode == "idle")
 
 
 def test_a_step_of_the_clock_neither_ends_nor_prolongs_the_access_of_a_device(
-    tmp_path: Path, step: Step, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    step: Step,
+    synchronise: Callable[[bool], None],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     paired = Devices(tmp_path)
     device, _ = paired.pair(paired.invite("drive"), "tablet")
@@ -127,7 +147,40 @@ def test_a_step_of_the_clock_neither_ends_nor_prolongs_the_access_of_a_device(
     assert Devices(tmp_path).list_stored() == (device,)  # as 'fishctl window devices' shows it
     step(-2.0 * YEAR_S)
     assert paired.all() == (device,)
+    step(0.0)
+    synchronise(True)
     monkeypatch.setattr(devices, "DEVICE_S", 0.0)
+    assert paired.all() == ()
+    assert content_of(tmp_path)["devices"] == []
+
+
+def test_a_wrong_clock_at_the_start_removes_no_device_from_the_file(
+    tmp_path: Path, step: Step, synchronise: Callable[[bool], None]
+) -> None:
+    paired = Devices(tmp_path)
+    device, _ = paired.pair(paired.invite("drive"), "tablet")
+    step(2.0 * YEAR_S)
+    wrong = Devices(tmp_path)
+    assert wrong.all() == ()
+    step(0.0)
+    synchronise(True)
+    assert wrong.all() == ()  # a step back revives nothing
+    assert Devices(tmp_path).all() == (device,)
+
+
+def test_a_clock_that_was_in_the_past_at_the_start_follows_a_time_server_but_no_hand(
+    tmp_path: Path,
+    step: Step,
+    synchronise: Callable[[bool], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(expiry, "LOOK_PERIOD_S", 0.0)
+    step(-2.0 * YEAR_S)
+    paired = Devices(tmp_path)
+    paired.pair(paired.invite("drive"), "tablet")
+    step(0.0)
+    assert len(paired.all()) == 1
+    synchronise(True)
     assert paired.all() == ()
     assert content_of(tmp_path)["devices"] == []
 
@@ -146,8 +199,9 @@ def test_a_window_that_starts_with_a_clock_that_was_set_back_does_not_revive_a_d
 
 
 def test_what_has_expired_is_refused_where_the_file_cannot_be_changed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synchronise: Callable[[bool], None]
 ) -> None:
+    synchronise(True)
     paired = Devices(tmp_path)
     paired.pair(paired.invite("drive"), "tablet")
     monkeypatch.setattr(devices, "DEVICE_S", 0.0)

@@ -26,6 +26,18 @@ from fishd.window import live
 signal.signal(signal.SIGUSR1, lambda *_: setattr(live, "DRIVER_TIMEOUT_S", 0.0))
 """
 """Code of a window for which, from SIGUSR1 on, a page has left."""
+SLOW_DISK = """
+import signal, threading
+from fishd.window import jobs
+real, goes_on = jobs.list_words, threading.Event()
+def list_words(*arguments):
+    print("waiting for the disk", flush=True)
+    goes_on.wait()
+    return real(*arguments)
+jobs.list_words = list_words
+signal.signal(signal.SIGUSR1, lambda *_: goes_on.set())
+"""
+"""Code of a window whose jobs wait for a disk until SIGUSR1."""
 WAITING = '''
 """A controller that loads until a file is there."""
 
@@ -206,3 +218,37 @@ def test_a_revoked_device_whose_controller_still_loads_stops_at_once_and_does_no
 
     run(test())
     assert (daemon.status().mode, daemon.status().lease) == ("idle", None)
+
+
+def test_a_job_that_waited_for_the_disk_does_not_start_once_its_device_is_revoked_or_replaced(
+    daemon: Daemon, tmp_path: Path
+) -> None:
+    with running_window(tmp_path, changes=SLOW_DISK, fish=daemon.endpoint) as window:
+        stdout = window.process.stdout
+        assert stdout
+
+        async def test() -> None:
+            async with (
+                Browser(window.url) as here,
+                open_page(here) as page,
+                open_page(here) as other,
+                paired(window, "stolen") as browser,
+                open_page(browser) as theirs,
+            ):
+                body: dict[str, Any] = {"fish": "fish", "kind": "record"}
+                revoked = asyncio.create_task(theirs.refusal("/api/jobs", body))
+                assert await asyncio.to_thread(stdout.readline)
+                await page.drive()
+                body = {"fish": "fish", "kind": "measure", "options": {"controller": "square"}}
+                replaced = asyncio.create_task(page.refusal("/api/jobs", body))
+                await revoke_by_command(window, browser, "stolen")
+                while not theirs.sock.closed:
+                    await theirs.sock.receive()
+                await asyncio.sleep(0.2)
+                await other.drive()
+                window.process.send_signal(signal.SIGUSR1)
+                assert await revoked == (401, "not-paired")
+                assert await replaced == (409, "not-driver")
+                assert await here.get("/api/jobs") == []
+
+        run(test())
