@@ -222,7 +222,7 @@ async def _discard(reader: asyncio.StreamReader) -> None:
 @contextmanager
 def mounted(folder: Path) -> Iterator[None]:
     """Mount a small file system in memory at a folder; raise OSError where that is forbidden."""
-    _mount("tmpfs", folder, "tmpfs", f"size={FULL_BYTES}")
+    _mount("tmpfs", folder, "tmpfs", f"size={FULL_BYTES},mode=700")
     try:
         yield
     finally:
