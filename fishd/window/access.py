@@ -1,4 +1,4 @@
-"""Access to the window: who sends a request, what it may do, and the pairing of devices.
+"""Access to the window: the device of a request, what it may do, and the pairing of devices.
 
 A request from the network needs a paired device; an emergency stop is open to each of them.
 """
