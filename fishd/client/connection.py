@@ -106,8 +106,7 @@ class Connection:
             from fishd.core import local_daemons
 
             return NoDaemon(
-                f"no fishd at {self.endpoint}: {why}; {local_daemons.describe(elsewhere)}: name it "
-                "with --endpoint or $FISHD_ENDPOINT"
+                f"no fishd at {self.endpoint}: {why}; {local_daemons.describe(elsewhere)}"
             )
         return NoDaemon(
             f"no fishd at {self.endpoint}: {why}; start one with 'fishd', or a simulated fish "

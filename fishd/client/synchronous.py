@@ -298,10 +298,8 @@ class Fish(Connection):
             try:
                 self.check_endpoint()
             except (NoDaemon, Untrusted):
-                if op in DIRECT_OPERATIONS and op != "estop":
-                    result = self.ask_directly(kind, op, args)
-                    if result is not None:
-                        return result
+                if (result := self._ask_directly(kind, op, args)) is not None:
+                    return result
                 raise
             self._socket = self._open_socket()
         connection = self._socket
@@ -326,7 +324,15 @@ class Fish(Connection):
                     raise self.lost_command_error(op)
         if not self._path and time.monotonic() - self._asked >= MAX_UNANSWERED_S:
             self._disconnect()  # a router may have forgotten it
+        # Another program may listen in the place of fishd.
+        if self._path and (result := self._ask_directly(kind, op, args)) is not None:
+            return result
         raise self.no_answer_error(patience)
+
+    def _ask_directly(self, kind: type[T], op: str, args: dict[str, Any]) -> T | None:
+        """Do as `ask_directly` for the operations that are tried so only after a failure."""
+        is_possible = op in DIRECT_OPERATIONS and op != "estop"  # which has further sockets
+        return self.ask_directly(kind, op, args) if is_possible else None
 
     def _open_socket(self) -> Requests:
         if not self.access:

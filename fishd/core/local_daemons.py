@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from fishd.core import protocol
+from fishd.core import protocol, text
 from fishd.core.errors import FishError
 from fishd.core.process import kernel_names
 from fishd.core.process.kernel_names import Holder
@@ -74,20 +74,22 @@ def describe(daemons: Iterable[LocalDaemon]) -> str:
         who = f"the fishd of process {Holder(daemon.pid, daemon.user)}"
         if not daemon.may_be_asked:
             phrases.append(f"{who}, which this user may not ask")
-        elif where := _read_control_address(replies.get(daemon, b"")):
-            phrases.append(f"{who} serves {where}")
+        elif (status := _read_status(replies.get(daemon, b""))) is None:
+            phrases.append(f"{who} does not answer")
+        elif status.control:
+            phrases.append(f"{who} serves {status.control}: name it with --endpoint")
         else:
-            phrases.append(f"{who} does not answer, or has no control socket")
-    return ", ".join(phrases)
+            phrases.append(f"{who} says: {text.line(status.limitations[-1])}")
+    return "; ".join(phrases)
 
 
-def _read_control_address(reply: bytes) -> str:
-    """Return the address in the reply to `status`; empty if there is none."""
+def _read_status(reply: bytes) -> Status | None:
+    """Return the status in a reply; None if there is none."""
     try:
         result = protocol.decode_reply(reply).result
-        return msgspec.json.decode(result or b"", type=Status).control
+        return msgspec.json.decode(result or b"", type=Status)
     except (msgspec.DecodeError, FishError):
-        return ""
+        return None
 
 
 def name_of_this(control: str) -> str:

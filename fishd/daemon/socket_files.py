@@ -35,7 +35,10 @@ class SocketFile:
         self._gateway = gateway
         self._configured = configured
         self._key, self._group = key, group
-        self._claimed = {gateway.address}
+        self._home = gateway.address
+        """Address at the start, which is claimed as long as fishd runs."""
+        self._claim = ExitStack()
+        """Claim of another address."""
         path = addresses.socket_path(gateway.address)
         self._identity = _identify(path)
         self._folder = path.parent.stat() if path else None
@@ -58,10 +61,13 @@ class SocketFile:
         """Whether the folder of the login session was gone, and the socket is in another one."""
         return not self._configured and self._gateway.address != addresses.default_address()
 
-    def restore(self, claims: ExitStack) -> None:
+    def close(self) -> None:
+        """Release the claim of another folder, and remove the file there; may be called twice."""
+        self._claim.close()
+
+    def restore(self) -> None:
         """Create the file again, in the folder where clients now look for it.
 
-        claims: holds the claims of further addresses, and removes their files at its end
         Raise `StartupError` or OSError.
         """
         address = self._configured or addresses.control_address()
@@ -73,14 +79,18 @@ class SocketFile:
         # Claiming an address would wait for a program that listens there.
         if path.exists() and not (path.is_socket() and unix_sockets.is_deserted(path)):
             raise StartupError(f"another program has put something else at {path}; remove that")
-        if address not in self._claimed:
-            claims.enter_context(addresses.claim_address(address))
-            self._claimed.add(address)
-        with addresses.listen(address, self._key, group=self._group) as listener:
-            self._gateway.listen_at(address, listener)
+        with ExitStack() as claim:
+            if address not in (self._home, self._gateway.address):
+                claim.enter_context(addresses.claim_address(address))
+            with addresses.listen(address, self._key, group=self._group) as listener:
+                self._gateway.listen_at(address, listener)
+            if former != path:
+                self._claim.close()
+                self._claim = claim.pop_all()
         self._identity = _identify(path)
         if former != path:
-            former.unlink(missing_ok=True)
+            with suppress(OSError):
+                former.unlink()
 
     def _restore_folder(self, folder: Path) -> None:
         """Create a configured folder as it was; raise `StartupError` for another user's folder."""
@@ -113,8 +123,6 @@ class SocketWatch:
         telemetry = gateways.telemetry
         self._telemetry = SocketFile(telemetry, telemetry.address, "telemetry.address", group=False)
         self._open_direct = open_direct
-        self._claims = ExitStack()
-        self._claims.callback(self._close_direct_file)
         self._direct: DirectSocket | None = None
         self._direct_file: Path | None = None
         self._direct_identity: tuple[int, ...] = ()
@@ -155,7 +163,9 @@ class SocketWatch:
 
     def close(self) -> None:
         """Remove the files that this object has created; may be called twice."""
-        self._claims.close()
+        self._close_direct_file()
+        self._control.close()
+        self._telemetry.close()
 
     def check(self) -> None:
         """Create files that are gone, and report that; let the fish rest if that fails twice."""
@@ -184,7 +194,7 @@ class SocketWatch:
         if file.is_there:
             return bool(before)
         try:
-            file.restore(self._claims)
+            file.restore()
         except (OSError, StartupError) as error:
             file.problem = str(error)
             return False
@@ -194,7 +204,7 @@ class SocketWatch:
         """Move the control socket to the folder of the login session, if that exists again."""
         before = self._gateways.control.address
         try:
-            self._control.restore(self._claims)
+            self._control.restore()
         except (OSError, StartupError):
             return  # such as another fishd that has started there since
         if self._gateways.control.address != before:

@@ -163,6 +163,8 @@ def test_a_file_of_another_program_is_not_replaced(folder: Path) -> None:
             if (folder / "control").stat().st_ino == found:  # bound before fishd looked
                 wait_until(is_reported)
                 assert (folder / "control").stat().st_ino == found
+                with Fish(daemon.endpoint, timeout=0.1) as fish:  # which the other does not answer
+                    assert fish.stop().mode == "idle"
         (folder / "control").unlink()
         wait_until((folder / "control").exists)
 
@@ -231,6 +233,9 @@ def test_after_a_logout_the_socket_is_elsewhere_until_the_next_login(user: User)
             f"control     ipc://{session}/fishd/control" in user.fishctl(session, "status").stdout
         )
         assert not elsewhere.exists()
+        with user.fishd(None) as second:  # the address there is free again
+            wait_until((elsewhere.parent / "control.estop").exists)
+            assert second.end()[0] == 0
         shutil.rmtree(session)
         wait_until((elsewhere.parent / "control.estop").exists)
         assert process.end()[0] == 0
