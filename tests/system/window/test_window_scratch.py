@@ -34,8 +34,9 @@ def window(daemon: Daemon, tmp_path: Path, temporary: Path) -> Iterator[WindowPr
 
 
 def children_of(pid: int) -> list[int]:
-    """Return the processes that a process has started."""
-    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    """Return the processes that the threads of a process have started, the earliest first."""
+    files = Path(f"/proc/{pid}/task").glob("*/children")
+    return sorted(int(word) for file in files for word in file.read_text().split())
 
 
 @pytest.mark.parametrize("kind", START)
