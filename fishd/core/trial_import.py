@@ -52,7 +52,7 @@ def find_danger(module: str, timeout: float | None = None) -> str:
 
 def _try(module: str, timeout: float) -> str:
     reader, writer = os.pipe()
-    command = python_command("-c", _CHILD, str(writer), module)
+    command = python_command("-B", "-c", _CHILD, str(writer), module)
     quiet = subprocess.DEVNULL
     try:
         status = subprocess.run(

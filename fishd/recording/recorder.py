@@ -10,7 +10,7 @@ import msgspec
 import zmq
 
 from fishd.client import Fish
-from fishd.client.zmq_sockets import Subscription, connect_subscriber
+from fishd.client.zmq_sockets import TELEMETRY_TIMEOUT_S, Subscription, connect_subscriber
 from fishd.core import text
 from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishError, NoDaemon, RecordingError, Refused
@@ -166,7 +166,7 @@ class Recorder:
             self.writer.tally.expect(self._after.seq)
         elif self._after:
             self._doubt("fishd was restarted meanwhile: how many ticks were lost is not known")
-        elif not telemetry.wait(FISHD_TIMEOUT_S):
+        elif not telemetry.wait(TELEMETRY_TIMEOUT_S):
             self.writer.status(self.status)
 
     @property
@@ -243,7 +243,7 @@ class Recorder:
     def _count_last_ticks(self, telemetry: "Telemetry") -> None:
         """Take the ticks that fishd has published until now; count those that do not arrive."""
         try:
-            with Fish(self._endpoint, timeout=FISHD_TIMEOUT_S) as fish:
+            with Fish(self._endpoint) as fish:
                 status = fish.status()
         except FishError:
             self._doubt_end(
@@ -251,7 +251,7 @@ class Recorder:
                 "known"
             )
             return
-        deadline = time.monotonic() + FISHD_TIMEOUT_S
+        deadline = time.monotonic() + TELEMETRY_TIMEOUT_S
         while self._seq < status.seq and time.monotonic() < deadline:
             self._take_all(telemetry)
             time.sleep(POLL_INTERVAL_S)

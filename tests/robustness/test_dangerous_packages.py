@@ -107,6 +107,8 @@ def test_the_trial_takes_no_time_from_the_import_itself(
 ) -> None:
     install(tmp_path, {"slow_trial": SLOW_IN_ITS_TRIAL + CHANGING}, slow="slow_trial:Harmless")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    # Its compiled module would be a change of its folder, like an installation.
+    monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(trial_import, "TIMEOUT_S", PATIENCE)
     monkeypatch.setattr(registry, "IMPORT_TIMEOUT_S", 8.5)

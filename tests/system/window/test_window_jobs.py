@@ -27,7 +27,7 @@ def test_a_recording_is_made_listed_and_drawn(window: WindowProcess) -> None:
             job = await start(page, "record", name="first", seconds=0.5, note="a; $(b) 'c'")
             assert job["command"][:3] == ["fishctl", "record", "first"]
             ended = await end_of(page, job)
-            assert (ended["state"], ended["exit"]) == ("done", 0)
+            assert (ended["state"], ended["exit"]) == ("done", 0), ended["lines"]
             assert ended["result"]["ticks"] > 0
             run_ = next(
                 entry for entry in await browser.get("/api/runs") if entry["name"] == "first"
