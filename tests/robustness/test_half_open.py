@@ -123,7 +123,7 @@ def test_a_recorder_that_begins_in_silence_counts_from_its_beginning(
     with Recording(distant, runs, "run") as recording:
         wait_until(lambda: bool(list(runs.glob("*.part"))))
         begun = distant.seq
-        wait_until(lambda: distant.seq > begun + 40)
+        wait_until(lambda: distant.seq > begun + 80)
         distant.path.restore(distant.telemetry_port)
         recording.wait_for_tick(distant.seq)
         status, _, lines = recording.end()

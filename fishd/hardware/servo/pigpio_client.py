@@ -114,7 +114,7 @@ class TimedSocket:
             self._answer()
 
     def provoke(self) -> bytes:
-        """Send an empty line to a silent server; return all that has arrived then.
+        """Send an empty line to a silent server; return what arrives, until it cannot be pigpiod.
 
         Servers of texts, such as HTTP, answer at the end of a line. A pigpiod ignores one when the
         connection closes after it.
@@ -123,7 +123,8 @@ class TimedSocket:
             self.deadline = time.monotonic() + _PROVOCATION_S
             self._socket.settimeout(_PROVOCATION_S)
             self._socket.sendall(b"\r\n\r\n")
-            self._fill(_ANSWER.size)
+            while len(self._received) < len(_ECHO) and _ECHO.startswith(self._received):
+                self._fill(len(self._received) + 1)
         return self.received
 
     @property
