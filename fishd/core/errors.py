@@ -119,6 +119,11 @@ class FishError(FishdError):
 class NoDaemon(FishError, ConnectionError):
     """Nothing answers at the endpoint."""
 
+    def __init__(self, problem: str, remedy: str = "") -> None:
+        super().__init__(f"{problem}; {remedy}" if remedy else problem)
+        self.problem = problem
+        """The message without its remedy."""
+
 
 class Untrusted(NoDaemon):
     """Another user's process listens where the fishd of this user would."""

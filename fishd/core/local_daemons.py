@@ -42,7 +42,7 @@ class LocalDaemon(NamedTuple):
 
         The service answers only the members of its group.
         """
-        return os.geteuid() in (0, self.user) or self.user == _service_user()
+        return os.geteuid() in (0, self.user) or self.user == service_user()
 
 
 def ask(
@@ -64,23 +64,46 @@ def ask(
     }
 
 
-def describe(daemons: Iterable[LocalDaemon]) -> str:
-    """Return a phrase that names processes and where they can be reached."""
+def find_silent(daemons: Iterable[LocalDaemon]) -> list[LocalDaemon]:
+    """Return those that do not answer."""
     daemons = list(daemons)
+    replies = _ask_status(daemons)
+    return [daemon for daemon in daemons if daemon not in replies]
+
+
+def _ask_status(daemons: Iterable[LocalDaemon]) -> dict[LocalDaemon, bytes]:
     request = protocol.Request(v=protocol.VERSION, id=1, op="status", args={})
-    replies = ask((d for d in daemons if d.may_be_asked), protocol.encode(request))
-    phrases = []
+    return ask(daemons, protocol.encode(request))
+
+
+def describe(daemons: Iterable[LocalDaemon], estop: str = "fishctl estop") -> str:
+    """Return a phrase that names processes and where they can be reached.
+
+    estop: command that ends the pulses of one that does not answer
+    """
+    daemons = list(daemons)
+    replies, phrases = _ask_status(d for d in daemons if d.may_be_asked), []
     for daemon in daemons:
-        who = f"the fishd of process {Holder(daemon.pid, daemon.user)}"
+        status = _read_status(replies.get(daemon, b""))
+        name = format_name(daemon, status)
         if not daemon.may_be_asked:
-            phrases.append(f"{who}, which this user may not ask")
-        elif (status := _read_status(replies.get(daemon, b""))) is None:
-            phrases.append(f"{who} does not answer")
+            phrases.append(f"{name} runs, which this user may not ask")
+        elif status is None:
+            phrases.append(f"{name} hangs or is stopped: '{estop}' ends its pulses")
         elif status.control:
-            phrases.append(f"{who} serves {status.control}: name it with --endpoint")
+            phrases.append(f"{name} runs: name it with --endpoint {status.control}")
         else:
-            phrases.append(f"{who} says: {text.line(status.limitations[-1])}")
+            phrases.append(f"{name} says: {text.line(status.limitations[-1])}")
     return "; ".join(phrases)
+
+
+def format_name(daemon: LocalDaemon, status: Status | None) -> str:
+    """Return a phrase that names a fishd; status: its answer, if it has given one."""
+    process = f"process {Holder(daemon.pid, daemon.user)}"
+    if status is None:
+        return f"the fishd of {process}"
+    where = f", control {status.control}" if status.control else ""
+    return text.line(f"fish {status.name} ({process}{where})")
 
 
 def _read_status(reply: bytes) -> Status | None:
@@ -95,7 +118,7 @@ def _read_status(reply: bytes) -> Status | None:
 def name_of_this(control: str) -> str:
     """Return the name of this process; control: address of its control socket."""
     unique = os.urandom(4).hex()  # containers may share names, but not pids
-    return f"{_PREFIX}{os.geteuid()}/{os.getpid()}/{_hash(control)}/{unique}"
+    return f"{_PREFIX}{os.geteuid()}/{os.getpid()}/{hash_address(control)}/{unique}"
 
 
 def find_all() -> list[LocalDaemon]:
@@ -110,7 +133,7 @@ def find_own(control: str | None = None) -> list[LocalDaemon]:
     Root may ask all. Whether one is what its name says, only its answer shows.
     """
     own = (daemon for daemon in _parse_names() if daemon.may_be_asked)
-    return [daemon for daemon in own if control is None or daemon.hash == _hash(control)]
+    return [daemon for daemon in own if control is None or daemon.hash == hash_address(control)]
 
 
 def _parse_names() -> Iterator[LocalDaemon]:
@@ -134,7 +157,8 @@ def _is_of_another_user(daemon: LocalDaemon) -> bool:
 
 
 @cache
-def _service_user() -> int:
+def service_user() -> int:
+    """Return the number of the user of the system's service; -1 if there is none."""
     import pwd
 
     try:
@@ -143,7 +167,8 @@ def _service_user() -> int:
         return -1
 
 
-def _hash(control: str) -> str:
+def hash_address(control: str) -> str:
+    """Return the hash of the address of a control socket, the same for all links to it."""
     kind, _, path = control.partition("://")
     real = f"{kind}://{os.path.realpath(path)}" if kind == "ipc" else control
     return f"{crc32(os.fsencode(real)):08x}"

@@ -25,7 +25,7 @@ from fishd.core import addresses, local_daemons
 from fishd.core.clock import Clock, SlowClock, SystemClock, Ticker, VirtualClock
 from fishd.core.console import log_format_option, run, status_line
 from fishd.core.errors import ConfigError, FishdError, ServoError
-from fishd.core.process import realtime
+from fishd.core.process import kernel_names, realtime
 from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
 from fishd.core.process.shutdown import Shutdown, exit_now
 from fishd.core.process.systemd_notify import SystemdNotifier
@@ -215,6 +215,7 @@ class Daemon:
 
     def _check_sockets(self) -> None:
         self._sockets.check()
+        kernel_names.drop_readers()
 
     def _access(self) -> Access:
         gateways, sockets = self._gateways, self._sockets

@@ -1,11 +1,13 @@
-"""Watch over the files of fishd's sockets, which are created again when they are gone.
+"""Watch over the files of fishd's sockets: files that are gone, and modes that were changed.
 
 A logout removes the folder of the login session, and with it all sockets in it; so may a program
-that cleans /tmp, or a person. Existing connections go on, but no client can connect any more.
+that cleans /tmp, or a person. Existing connections go on, but no client can connect any more. A
+mode that was changed keeps clients out, or lets other users replace the sockets.
 """
 
 import logging
 import os
+import stat
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -20,6 +22,10 @@ from fishd.daemon.direct_sockets import DirectSocket
 from fishd.daemon.gateway.gateways import Gateway, Gateways
 
 log = logging.getLogger(__name__)
+
+_CREATED, _OPENED = "were gone and have been created again", "can be reached again"
+_MODES = "or their folder had other modes, and have those of the start again"
+"""What was restored, for messages about the files."""
 
 
 class SocketFile:
@@ -42,15 +48,50 @@ class SocketFile:
         path = addresses.socket_path(gateway.address)
         self._identity = _identify(path)
         self._folder = path.parent.stat() if path else None
+        self._mode = self._identity[-1] if self._identity else 0
         self.problem = ""
         """Why the file could not be created again; empty if it is there."""
+        self.limitation = ""
+        """Mode that fishd may not restore; empty if there is none."""
 
-    @property
-    def is_there(self) -> bool:
-        """Whether clients can find the socket where it was created."""
-        path = addresses.socket_path(self._gateway.address)
+    def keep(self) -> str:
+        """Restore the modes, or the file if it is gone; return what was restored, or "".
+
+        Raise `StartupError` or OSError.
+        """
+        path, self.limitation = addresses.socket_path(self._gateway.address), ""
         if path is None:
-            return True
+            return ""
+        assert self._folder
+        restored = self._restore_mode(path.parent, self._folder.st_mode)
+        if _identify(path)[:2] == self._identity[:2]:
+            restored |= self._restore_mode(path, self._mode)
+        if not self._is_there(path):
+            self._create()
+            return _CREATED
+        return _MODES if restored else ""
+
+    def _restore_mode(self, path: Path, start_mode: int) -> bool:
+        """Give a file of this user its mode of the start; return whether it had another one."""
+        try:
+            status = path.stat()
+        except OSError:
+            return False
+        is_other_kind = stat.S_IFMT(status.st_mode) != stat.S_IFMT(start_mode)
+        if is_other_kind or status.st_mode == start_mode:
+            return False
+        mode = stat.S_IMODE(start_mode)
+        if status.st_uid != os.geteuid():
+            self.limitation = (
+                f"{path} belongs to another user, and its mode was changed from {mode:o} to "
+                f"{stat.S_IMODE(status.st_mode):o}: sudo chmod {mode:o} {path}"
+            )
+            return False
+        path.chmod(mode)
+        return True
+
+    def _is_there(self, path: Path) -> bool:
+        """Return whether clients can find the socket where it was created."""
         identity = _identify(path)
         if identity != self._identity and _is_own(path):  # touched, not replaced
             self._identity = identity
@@ -61,15 +102,19 @@ class SocketFile:
         """Whether the folder of the login session was gone, and the socket is in another one."""
         return not self._configured and self._gateway.address != addresses.default_address()
 
+    def return_home(self) -> bool:
+        """Move to the folder of the login session if that exists again; return whether it does."""
+        before = self._gateway.address
+        with suppress(OSError, StartupError):  # such as another fishd that has started there since
+            self._create()
+        return self._gateway.address != before
+
     def close(self) -> None:
         """Release the claim of another folder, and remove the file there; may be called twice."""
         self._claim.close()
 
-    def restore(self) -> None:
-        """Create the file again, in the folder where clients now look for it.
-
-        Raise `StartupError` or OSError.
-        """
+    def _create(self) -> None:
+        """Create the file again, in the folder where clients now look for it."""
         address = self._configured or addresses.control_address()
         path, former = addresses.socket_path(address), addresses.socket_path(self._gateway.address)
         assert path
@@ -88,7 +133,9 @@ class SocketFile:
                 self._claim.close()
                 self._claim = claim.pop_all()
         self._identity = _identify(path)
+        self._mode = self._identity[-1] if self._identity else 0
         if former != path:
+            self._folder = path.parent.stat()
             with suppress(OSError):
                 former.unlink()
 
@@ -141,8 +188,8 @@ class SocketWatch:
     @property
     def limitation(self) -> str:
         """Line about files that are gone or in another folder; empty if there are none."""
-        if self._problem:
-            return self._problem
+        if problem := self._problem:
+            return problem
         if self._control.is_away:
             return (
                 f"the folder of {addresses.default_address()} is gone, as after a logout: the "
@@ -154,12 +201,12 @@ class SocketWatch:
     def _problem(self) -> str:
         if why := self._control.problem:
             return (
-                f"the control socket is gone and cannot be created: {why}; only 'fishctl estop', "
-                "'stop' and 'status' of this user reach this fishd"
+                f"clients cannot reach the control socket, which cannot be created again: {why}; "
+                "only 'fishctl estop', 'stop' and 'status' of this user reach this fishd"
             )
         if why := self._telemetry.problem:
-            return f"the socket of telemetry is gone and cannot be created: {why}"
-        return ""
+            return f"clients cannot reach telemetry, whose socket cannot be created again: {why}"
+        return self._control.limitation or self._telemetry.limitation
 
     def close(self) -> None:
         """Remove the files that this object has created; may be called twice."""
@@ -168,16 +215,16 @@ class SocketWatch:
         self._telemetry.close()
 
     def check(self) -> None:
-        """Create files that are gone, and report that; let the fish rest if that fails twice."""
+        """Restore files and modes, and report that; let the fish rest if that fails twice."""
         was_missing = bool(self._control.problem)
         restored = [self._restore(file) for file in (self._control, self._telemetry)]
         if not self._control.problem and (restored[0] or self._is_direct_file_missing()):
-            restored.append(self._open_direct_file())
+            restored.append(_CREATED if self._open_direct_file() else "")
             if path := addresses.socket_path(self._gateways.control.address):
                 self._loop.robot.write_recipes(path)
         if any(restored):
             self.restored += 1
-            self._report("were gone and have been created again", "warning")
+            self._report(next(filter(None, restored)), "warning")
         if self._problem != self._reported:
             self._reported = self._problem
             if self._problem:
@@ -188,26 +235,18 @@ class SocketWatch:
         elif self._control.is_away and not any(restored):
             self._return_home()
 
-    def _restore(self, file: SocketFile) -> bool:
-        """Create a file again if it is gone; return whether it was created."""
+    def _restore(self, file: SocketFile) -> str:
+        """Restore a file and its modes; return what was restored, or ""."""
         before, file.problem = file.problem, ""
-        if file.is_there:
-            return bool(before)
         try:
-            file.restore()
+            return file.keep() or (_OPENED if before else "")
         except (OSError, StartupError) as error:
-            file.problem = str(error)
-            return False
-        return True
+            file.problem = file.limitation or str(error)
+            return ""
 
     def _return_home(self) -> None:
         """Move the control socket to the folder of the login session, if that exists again."""
-        before = self._gateways.control.address
-        try:
-            self._control.restore()
-        except (OSError, StartupError):
-            return  # such as another fishd that has started there since
-        if self._gateways.control.address != before:
+        if self._control.return_home():
             self._open_direct_file()
             if path := addresses.socket_path(self._gateways.control.address):
                 self._loop.robot.write_recipes(path)
@@ -276,4 +315,4 @@ def _identify(path: Path | None) -> tuple[int, ...]:
         status = path.lstat() if path else None
     except OSError:
         return ()
-    return (status.st_dev, status.st_ino, status.st_mtime_ns) if status else ()
+    return (status.st_dev, status.st_ino, status.st_mtime_ns, status.st_mode) if status else ()

@@ -19,6 +19,7 @@ from fishd.core import local_daemons
 from fishd.core.addresses import find_control_address, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
 from fishd.core.plugins import Plugins
+from fishd.core.process.kernel_names import Holder
 from fishd.core.process.unix_sockets import is_deserted
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status, Tick
@@ -38,6 +39,8 @@ class Running(NamedTuple):
     calibrations: Calibrations | None
     """Calibrations in use; None for a robot that has none."""
     endpoint: str
+    detour: str
+    """How it answered without its control socket; empty if it answered there."""
 
 
 class Unreachable(NamedTuple):
@@ -46,6 +49,8 @@ class Unreachable(NamedTuple):
     why: str
     forbidden: bool
     """Whether this user lacks the permission to connect."""
+    hung: tuple[Holder, ...] = ()
+    """The processes, if they are known."""
 
 
 def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
@@ -55,22 +60,30 @@ def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
     another endpoint than the given one stays undetected, even if it owns the same bus.
     """
     given_endpoint, endpoint = endpoint, endpoint or find_control_address()
+    forbidden, local = False, local_daemons.find_own(given_endpoint)
     try:
-        if is_unused(endpoint) and not local_daemons.find_own(given_endpoint):
+        if is_unused(endpoint) and not local:
             return None
     except PermissionError:
-        return Unreachable(f"there may be a fishd at {endpoint}, but this user may not ask", True)
+        forbidden = True
     try:
         with Fish(given_endpoint, timeout=ANSWER_TIMEOUT_S) as fish:
             status = fish.status()
-            where = status.control if fish.detour else endpoint
-            return Running(status, _latest_tick(fish), _read_calibrations(fish), where)
+            detour, where = fish.detour, status.control if fish.detour else endpoint
+            return Running(status, _latest_tick(fish), _read_calibrations(fish), where, detour)
     except Untrusted as error:
         reason = str(error)
-    except NoDaemon:
-        reason = (
-            f"no answer from {endpoint} within {ANSWER_TIMEOUT_S:g} s, but a fishd may be there"
-        )
+    except NoDaemon as error:
+        reason = f"no answer from {endpoint} within {ANSWER_TIMEOUT_S:g} s"
+        if forbidden:
+            reason = f"there may be a fishd at {endpoint}, but this user may not ask"
+        elif hung := tuple(Holder(d.pid, d.user) for d in local_daemons.find_silent(local)):
+            processes = " and ".join(f"process {holder}" for holder in hung)
+            reason += f": {processes}, a fishd, does not answer: it hangs or is stopped"
+            return Unreachable(reason, False, hung)
+        else:
+            reason = str(error) if local else f"{reason}, but a fishd may be there"
+        return Unreachable(reason, forbidden)
     except FishError as error:
         reason = str(error)
     return Unreachable(reason, False)
@@ -181,6 +194,12 @@ class Context(Machine):
         """Return the remedy for a daemon that does not answer."""
         if daemon.forbidden:
             return f"{self.as_fishd}, or name another with --endpoint"
+        if daemon.hung:
+            option = f" --endpoint {self.endpoint}" if self.endpoint else ""
+            pids = " ".join(str(holder.pid) for holder in daemon.hung)
+            is_service = daemon.hung[0].user == local_daemons.service_user()
+            restart = "sudo systemctl restart fishd" if is_service else f"kill -9 {pids}"
+            return f"'fishctl estop{option}' ends its pulses; then: {restart}"
         return "stop what hangs there, or name the fishd with --endpoint"
 
     @property

@@ -9,6 +9,7 @@ import zmq
 from fishd.cli.doctor.base import ANSWER_TIMEOUT_S, Context, Running, Unreachable, is_unused
 from fishd.core import addresses, local_daemons
 from fishd.core.errors import FishError, StartupError
+from fishd.core.process.unix_sockets import is_open_to_all
 from fishd.hardware.checks import Check, Result, fail, ok, skipped, warning
 
 UNIT = "fishd.service"
@@ -32,7 +33,8 @@ def daemon(context: Context) -> Result:
             )
         return ok("no fishd is running")
     if isinstance(context.daemon, Unreachable):
-        return warning(context.daemon.why, context.suggest_remedy(context.daemon))
+        result = fail if context.daemon.hung else warning
+        return result(context.daemon.why, context.suggest_remedy(context.daemon))
     status, endpoint = context.daemon.status, context.daemon.endpoint
     message = f"fishd {status.version} (pid {status.pid}), robot {status.robot}, {status.mode}"
     if status.robot != context.config.robot:
@@ -49,6 +51,9 @@ def daemon(context: Context) -> Result:
         return warning(
             f"{message}; {'; '.join(status.limitations)}", "see docs/how-to/troubleshooting.md"
         )
+    if context.daemon.detour:
+        remedy = f"name it: --endpoint {endpoint}, or export FISHD_ENDPOINT={endpoint}"
+        return warning(f"{message}; {context.daemon.detour}", remedy)
     return ok(message)
 
 
@@ -122,6 +127,10 @@ def _check_address(context: Context, address: str, key: str) -> Result:
     daemon = context.daemon
     if isinstance(daemon, Unreachable):  # binding could take its socket away
         return skipped("not tried: a fishd may use it; see 'daemon'")
+    if (path := addresses.socket_path(address)) and is_open_to_all(path.parent):
+        return warning(
+            f"every user of this machine may replace {address}", f"chmod o-w {path.parent}"
+        )
     if daemon and address in (daemon.status.telemetry, daemon.endpoint):
         return ok(f"{address} is served by the running fishd")
     try:

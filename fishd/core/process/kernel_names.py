@@ -13,7 +13,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ _PREFIX = "fishd"
 _MAX_NAME_BYTES = 107
 """Maximum length of an abstract name in Linux, without the zero byte before it [bytes]."""
 _BACKLOG = 4096
-"""Maximum number of processes that can read the holder of a name."""
+"""Maximum number of processes that can read the holder of a name until it drops them."""
 _TABLE = Path("/proc/net/unix")
 """The kernel's list of Unix sockets."""
 _MAX_ANSWER_BYTES = 2**20
@@ -29,6 +29,8 @@ _MAX_ANSWER_BYTES = 2**20
 _CREDENTIALS = "3i"
 """Layout of the kernel's struct ucred: pid, uid, gid."""
 _NO_CONNECTION = {errno.ECONNREFUSED, errno.ENOENT}
+_held: list[socket.socket] = []
+"""Sockets of the names that this process holds."""
 
 
 class Holder(NamedTuple):
@@ -67,7 +69,20 @@ def claimed(name: str) -> Iterator[None]:
                 raise
             raise NameTaken(name) from None
         held.listen(_BACKLOG)
-        yield
+        held.setblocking(False)
+        _held.append(held)
+        try:
+            yield
+        finally:
+            _held.remove(held)
+
+
+def drop_readers(limit: int = 50) -> None:
+    """Drop the connections of processes that have read the holder of a name; limit: of each."""
+    for held in _held:
+        with suppress(OSError):
+            for _ in range(limit):
+                held.accept()[0].close()
 
 
 def find_holder(name: str) -> Holder | None:
@@ -77,10 +92,13 @@ def find_holder(name: str) -> Holder | None:
         failure = probe.connect_ex(_address(name))
         if failure in _NO_CONNECTION:
             return None
-        if failure:  # too many processes have connected
-            return Holder(0, -1)
-        size = struct.calcsize(_CREDENTIALS)
-        peer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
+        return read_listener(probe) if not failure else Holder(0, -1)  # too many have connected
+
+
+def read_listener(probe: socket.socket) -> Holder:
+    """Return the process that listens where a Unix socket is connected."""
+    size = struct.calcsize(_CREDENTIALS)
+    peer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
     pid, user, _ = struct.unpack(_CREDENTIALS, peer)
     return Holder(pid, user)
 

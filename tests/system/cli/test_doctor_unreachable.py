@@ -35,12 +35,13 @@ def test_beside_a_fishd_that_hangs_no_hardware_is_touched(pi: Bench) -> None:
             status, findings = doctor(pi.folder, *pi.settings)
         finally:
             daemon.process.send_signal(signal.SIGCONT)
-        assert status == 0
+        assert status == 1
         assert findings["adc"] == findings["force"]
         assert findings["adc"][0] == "skipped"
         assert f"no answer from {daemon.endpoint}" in findings["adc"][1]
-        assert "--endpoint" in findings["adc"][1]
-        assert findings["daemon"][0] == "warning"
+        assert f"'fishctl estop --endpoint {daemon.endpoint}' ends" in findings["adc"][1]
+        assert findings["daemon"][0] == "FAIL"
+        assert f"process {daemon.pid}, a fishd, does not answer" in findings["daemon"][1]
         assert daemon.fishctl("status").returncode == 0  # its socket is still there
 
 
