@@ -110,17 +110,18 @@ class Connection:
         if elsewhere := self.find_local_daemons():
             from fishd.core import local_daemons
 
-            return NoDaemon(problem, local_daemons.describe(elsewhere, self._estop_command))
+            where = local_daemons.describe(elsewhere, self._option)
+            return NoDaemon(problem, f"; {where}")
         return NoDaemon(
             problem,
-            "start one with 'fishd', or a simulated fish that swims with 'make run'; or name "
+            "; start one with 'fishd', or a simulated fish that swims with 'make run'; or name "
             "another with --endpoint or $FISHD_ENDPOINT",
         )
 
     @property
-    def _estop_command(self) -> str:
-        """Command that ends the pulses of this fishd, also without it."""
-        return "fishctl estop" + (f" --endpoint {self.endpoint}" if self._was_named else "")
+    def _option(self) -> str:
+        """Option with which another verb means this fishd; empty if it needs none."""
+        return f" --endpoint {self.endpoint}" if self._was_named else ""
 
     def find_local_daemons(self) -> "list[LocalDaemon]":
         """Return the fishds of this machine that a client of this endpoint may mean."""
@@ -144,7 +145,7 @@ class Connection:
         return NoDaemon(
             f"{why} from process {listener}, which serves {self.endpoint}: it hangs, is stopped "
             "or is overloaded",
-            f"'{self._estop_command}' ends the pulses without it",
+            f"; 'fishctl estop{self._option}' ends the pulses without it",
         )
 
     def lost_command_error(self, op: str) -> NoDaemon:
@@ -242,7 +243,12 @@ class Connection:
         """Store which of these have answered at their names in the kernel."""
         from fishd.core import local_daemons
 
-        names = [local_daemons.format_name(daemon, statuses.get(daemon)) for daemon in daemons]
+        names = []
+        for daemon in daemons:
+            status = statuses.get(daemon)
+            address = status.control if status else ""
+            where = f" at {text.line(address)}" if address not in ("", self.endpoint) else ""
+            names.append(local_daemons.format_name(daemon, status) + where)
         place = "their names" if len(names) > 1 else "its name"
         self.detour = (
             f"{'nothing listens at' if self.is_deserted else 'no answer from'} {self.endpoint}; "

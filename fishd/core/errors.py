@@ -120,7 +120,8 @@ class NoDaemon(FishError, ConnectionError):
     """Nothing answers at the endpoint."""
 
     def __init__(self, problem: str, remedy: str = "") -> None:
-        super().__init__(f"{problem}; {remedy}" if remedy else problem)
+        """remedy: end of the message, which begins with a semicolon"""
+        super().__init__(problem + remedy)
         self.problem = problem
         """The message without its remedy."""
 

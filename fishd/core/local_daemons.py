@@ -76,10 +76,10 @@ def _ask_status(daemons: Iterable[LocalDaemon]) -> dict[LocalDaemon, bytes]:
     return ask(daemons, protocol.encode(request))
 
 
-def describe(daemons: Iterable[LocalDaemon], estop: str = "fishctl estop") -> str:
+def describe(daemons: Iterable[LocalDaemon], option: str = "") -> str:
     """Return a phrase that names processes and where they can be reached.
 
-    estop: command that ends the pulses of one that does not answer
+    option: option with which `fishctl estop` means these
     """
     daemons = list(daemons)
     replies, phrases = _ask_status(d for d in daemons if d.may_be_asked), []
@@ -89,7 +89,7 @@ def describe(daemons: Iterable[LocalDaemon], estop: str = "fishctl estop") -> st
         if not daemon.may_be_asked:
             phrases.append(f"{name} runs, which this user may not ask")
         elif status is None:
-            phrases.append(f"{name} hangs or is stopped: '{estop}' ends its pulses")
+            phrases.append(f"{name} hangs or is stopped: 'fishctl estop{option}' ends its pulses")
         elif status.control:
             phrases.append(f"{name} runs: name it with --endpoint {status.control}")
         else:
@@ -99,11 +99,10 @@ def describe(daemons: Iterable[LocalDaemon], estop: str = "fishctl estop") -> st
 
 def format_name(daemon: LocalDaemon, status: Status | None) -> str:
     """Return a phrase that names a fishd; status: its answer, if it has given one."""
-    process = f"process {Holder(daemon.pid, daemon.user)}"
+    process = Holder(daemon.pid, daemon.user)
     if status is None:
-        return f"the fishd of {process}"
-    where = f", control {status.control}" if status.control else ""
-    return text.line(f"fish {status.name} ({process}{where})")
+        return f"the fishd of process {process}"
+    return text.line(f"fish {status.name} (process {process})")
 
 
 def _read_status(reply: bytes) -> Status | None:

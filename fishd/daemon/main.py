@@ -143,9 +143,11 @@ class Daemon:
         except ServoError as failure:
             if isinstance(error, Exception):  # the exception below replaces it
                 log.critical("fishd failed", exc_info=error)
+            address = self._config.control.address
+            option = f" --endpoint {address}" if address else ""
             raise ServoError(
                 f"the servo could not be released and may keep its pulses: {failure}; "
-                "once it can be reached, 'fishctl release' releases it"
+                f"once it can be reached, 'fishctl estop{option}' ends them"
             ) from None
 
     async def run(self, stopping: asyncio.Event) -> None:

@@ -293,7 +293,7 @@ class SocketWatch:
     def _let_fish_rest(self) -> None:
         """Let a fish fade to neutral that no live client drives, and that none can reach."""
         loop = self._loop
-        if loop.lease.active or not (loop.supervisor.mode is Mode.RUNNING or loop.has_pending):
+        if loop.lease.active or not (loop.supervisor.mode is Mode.RUNNING or loop.pending):
             return
         loop.stop()
         message = "no client can connect to this fishd, and no experiment holds the fish"

@@ -195,6 +195,16 @@ def test_a_controller_that_is_to_start_later_does_not_start_unreachable(folder: 
         kept.rename(folder)
 
 
+def test_stop_says_that_it_has_cancelled_the_controller_of_start(folder: Path) -> None:
+    with running(folder, *sets("start.controller=swing", "start.rest=3600")) as daemon:
+        stopped = daemon.fishctl("stop")
+        assert stopped.stdout.startswith("idle")
+        assert stopped.stderr == (
+            "fishctl: swing, the controller of 'start', does not start any more\n"
+        )
+        assert daemon.fishctl("stop").stderr == ""
+
+
 def test_a_file_of_another_program_is_not_replaced(folder: Path) -> None:
     with running(folder) as daemon:
         with socket.socket(socket.AF_UNIX) as other:
@@ -302,7 +312,7 @@ def test_from_cron_a_fishd_is_stopped_and_other_verbs_say_where_it_is(user: User
             assert done.returncode == 0, done.stderr
             said = done.stderr + done.stdout
             assert f"nothing listens at ipc:///tmp/fishd-{user.number}/control; fish " in said
-            assert f"control ipc://{session}/fishd/control) answered at its name in the ke" in said
+            assert f" at ipc://{session}/fishd/control answered at its name in the kern" in said
         refused = one_line(user.fishctl(None, *SWIM))
         assert f"runs: name it with --endpoint ipc://{session}/fishd/control" in refused
         (todo,) = (
@@ -364,7 +374,7 @@ def test_estop_stops_every_fishd_that_may_be_meant_and_stop_asks_which(user: Use
         stopped = user.fishctl(None, "estop")
         assert stopped.returncode == 0
         for session in (one, other):
-            assert f", control ipc://{session}/fishd/control)" in stopped.stdout
+            assert f" at ipc://{session}/fishd/control" in stopped.stdout
         assert stopped.stdout.endswith(" answered at their names in the kernel\n")
         for session in (one, other):
             assert "mode        estop" in user.fishctl(session, "status").stdout
@@ -435,7 +445,7 @@ def test_names_that_another_user_holds_neither_hide_a_fishd_nor_delay_its_stop(
         for verb in ("status", "stop", "estop"):
             done = user.fishctl(None, verb)
             assert done.returncode == 0, done.stderr
-            assert f"(process {process.pid}, control ipc://" in done.stderr + done.stdout
+            assert f"(process {process.pid}) at ipc://" in done.stderr + done.stdout
 
 
 def test_a_stop_waits_once_for_all_names_that_do_not_answer() -> None:
