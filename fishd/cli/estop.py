@@ -54,7 +54,8 @@ def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) 
             way, summary = _describe_way(fish, path), format_state(state)
             answer = _to_builtins(state)
             if recipes := _find_recipes(fish.silent):
-                summary += f"; of the fishd that does not answer: {_carry_out(recipes)}"
+                pids = " and ".join(str(daemon.pid) for daemon in fish.silent)
+                summary += f"; of process {pids}, which does not answer: {_carry_out(recipes)}"
     with output_may_fail(summary):
         if as_json:
             print_json({"way": way, **answer})

@@ -127,7 +127,12 @@ class Connection:
         """Return the fishds of this machine that a client of this endpoint may mean."""
         from fishd.core import local_daemons
 
-        return local_daemons.find_own(self.endpoint if self._was_named else None)
+        daemons = local_daemons.find_own(self.endpoint if self._was_named else None)
+        with suppress(PermissionError):
+            listener = self._listener()
+            here = [daemon for daemon in daemons if listener and daemon.pid == listener.pid]
+            return here or daemons
+        return daemons
 
     def no_answer_error(self, patience: float = 0.0) -> NoDaemon:
         """Return the error for a missing answer; patience: time beyond the timeout [s]."""
@@ -214,7 +219,7 @@ class Connection:
         """Request an emergency stop of every fishd that this endpoint may mean, by its name."""
         daemons = self.find_local_daemons()
         states = self._ask(daemons, State, "estop", {"message": message})
-        self.silent = [daemon for daemon in daemons if daemon not in states]
+        self.silent = [daemon for daemon in daemons if daemon not in states and daemon.is_certain]
         self.estop_taken_by = "kernel" if states else ""
         if states:
             statuses: dict[LocalDaemon, Status] = {}
@@ -229,8 +234,10 @@ class Connection:
         For a fishd whose control socket is gone. Return None also if it may be one of several.
         """
         self.detour = ""
-        statuses = self._ask(self.find_local_daemons(), Status, "status", {})
-        if len(statuses) != 1:
+        daemons = self.find_local_daemons()
+        statuses = self._ask(daemons, Status, "status", {})
+        is_unsure = any(daemon not in statuses and daemon.is_certain for daemon in daemons)
+        if is_unsure or len(statuses) != 1:
             return None
         result = next(iter(self._ask(statuses, kind, op, args).values()), None)
         if result is not None:

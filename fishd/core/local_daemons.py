@@ -35,6 +35,13 @@ class LocalDaemon(NamedTuple):
     hash: str
     """Hash of the address of its control socket when it started."""
     name: str
+    socket: str
+    """Number of the socket that has this name."""
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is certain that its process has this name: any user can hold any name."""
+        return kernel_names.holds(self.pid, self.socket)
 
     @property
     def may_be_asked(self) -> bool:
@@ -65,10 +72,10 @@ def ask(
 
 
 def find_silent(daemons: Iterable[LocalDaemon]) -> list[LocalDaemon]:
-    """Return those that do not answer."""
+    """Return those that certainly exist and do not answer."""
     daemons = list(daemons)
     replies = _ask_status(daemons)
-    return [daemon for daemon in daemons if daemon not in replies]
+    return [daemon for daemon in daemons if daemon not in replies and daemon.is_certain]
 
 
 def _ask_status(daemons: Iterable[LocalDaemon]) -> dict[LocalDaemon, bytes]:
@@ -88,6 +95,8 @@ def describe(daemons: Iterable[LocalDaemon], option: str = "") -> str:
         name = format_name(daemon, status)
         if not daemon.may_be_asked:
             phrases.append(f"{name} runs, which this user may not ask")
+        elif status is None and not daemon.is_certain:
+            phrases.append(f"{name} does not answer")
         elif status is None:
             phrases.append(f"{name} hangs or is stopped: 'fishctl estop{option}' ends its pulses")
         elif status.control:
@@ -136,10 +145,10 @@ def find_own(control: str | None = None) -> list[LocalDaemon]:
 
 
 def _parse_names() -> Iterator[LocalDaemon]:
-    for name in kernel_names.read_names(_PREFIX):
+    for name, number in kernel_names.read_names(_PREFIX).items():
         parts = name.removeprefix(_PREFIX).split("/")
         if len(parts) == 4 and parts[0].isdecimal() and parts[1].isdecimal():
-            daemon = LocalDaemon(int(parts[0]), int(parts[1]), parts[2], name)
+            daemon = LocalDaemon(int(parts[0]), int(parts[1]), parts[2], name, number)
             if not _is_of_another_user(daemon):
                 yield daemon
 

@@ -18,6 +18,7 @@ from fishd.config.drivers import CHOICES
 from fishd.core import local_daemons
 from fishd.core.addresses import find_control_address, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
+from fishd.core.local_daemons import LocalDaemon
 from fishd.core.plugins import Plugins
 from fishd.core.process.kernel_names import Holder
 from fishd.core.process.unix_sockets import is_deserted
@@ -49,8 +50,9 @@ class Unreachable(NamedTuple):
     why: str
     forbidden: bool
     """Whether this user lacks the permission to connect."""
-    hung: tuple[Holder, ...] = ()
-    """The processes, if they are known."""
+    remedy: str = ""
+    is_hung: bool = False
+    """Whether it is certain that this is a fishd, which hangs or is stopped."""
 
 
 def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
@@ -77,16 +79,33 @@ def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
         reason = f"no answer from {endpoint} within {ANSWER_TIMEOUT_S:g} s"
         if forbidden:
             reason = f"there may be a fishd at {endpoint}, but this user may not ask"
-        elif hung := tuple(Holder(d.pid, d.user) for d in local_daemons.find_silent(local)):
-            processes = " and ".join(f"process {holder}" for holder in hung)
-            reason += f": {processes}, a fishd, does not answer: it hangs or is stopped"
-            return Unreachable(reason, False, hung)
+        elif hung := local_daemons.find_silent(local):
+            return Unreachable(*_describe_hung(reason, hung, given_endpoint), is_hung=True)
+        elif local:
+            remedy = "name the one that you mean with --endpoint"
+            return Unreachable(str(error), False, remedy)
         else:
-            reason = str(error) if local else f"{reason}, but a fishd may be there"
+            reason += ", but a fishd may be there"
         return Unreachable(reason, forbidden)
     except FishError as error:
         reason = str(error)
     return Unreachable(reason, False)
+
+
+def _describe_hung(
+    reason: str, hung: list[LocalDaemon], endpoint: str | None
+) -> tuple[str, bool, str]:
+    """Return the fields of `Unreachable` for these; endpoint: the given one."""
+    processes = " and ".join(f"process {Holder(daemon.pid, daemon.user)}" for daemon in hung)
+    option = f" --endpoint {endpoint}" if endpoint else ""
+    is_service = hung[0].user == local_daemons.service_user()
+    pids = " ".join(str(daemon.pid) for daemon in hung)
+    restart = "sudo systemctl restart fishd" if is_service else f"kill -9 {pids}"
+    return (
+        f"{reason}: {processes}, a fishd, does not answer: it hangs or is stopped",
+        False,
+        f"'fishctl estop{option}' ends its pulses; then: {restart}",
+    )
 
 
 def is_unused(endpoint: str) -> bool:
@@ -194,13 +213,7 @@ class Context(Machine):
         """Return the remedy for a daemon that does not answer."""
         if daemon.forbidden:
             return f"{self.as_fishd}, or name another with --endpoint"
-        if daemon.hung:
-            option = f" --endpoint {self.endpoint}" if self.endpoint else ""
-            pids = " ".join(str(holder.pid) for holder in daemon.hung)
-            is_service = daemon.hung[0].user == local_daemons.service_user()
-            restart = "sudo systemctl restart fishd" if is_service else f"kill -9 {pids}"
-            return f"'fishctl estop{option}' ends its pulses; then: {restart}"
-        return "stop what hangs there, or name the fishd with --endpoint"
+        return daemon.remedy or "stop what hangs there, or name the fishd with --endpoint"
 
     @property
     def as_fishd(self) -> str:

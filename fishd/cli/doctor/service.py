@@ -33,9 +33,10 @@ def daemon(context: Context) -> Result:
             )
         return ok("no fishd is running")
     if isinstance(context.daemon, Unreachable):
-        result = fail if context.daemon.hung else warning
+        result = fail if context.daemon.is_hung else warning
         return result(context.daemon.why, context.suggest_remedy(context.daemon))
     status, endpoint = context.daemon.status, context.daemon.endpoint
+    option = f" --endpoint {endpoint}" if context.daemon.detour and endpoint else ""
     message = f"fishd {status.version} (pid {status.pid}), robot {status.robot}, {status.mode}"
     if status.robot != context.config.robot:
         return warning(
@@ -45,14 +46,14 @@ def daemon(context: Context) -> Result:
     if status.reason:
         return fail(
             f"{message}: {status.reason.code}: {status.reason.message}",
-            "mend the cause, then fishctl clear-fault",
+            f"mend the cause, then fishctl clear-fault{option}",
         )
     if status.limitations:
         return warning(
             f"{message}; {'; '.join(status.limitations)}", "see docs/how-to/troubleshooting.md"
         )
     if context.daemon.detour:
-        remedy = f"name it: --endpoint {endpoint}, or export FISHD_ENDPOINT={endpoint}"
+        remedy = f"name it:{option}, or export FISHD_ENDPOINT={endpoint}"
         return warning(f"{message}; {context.daemon.detour}", remedy)
     return ok(message)
 

@@ -103,18 +103,29 @@ def read_listener(probe: socket.socket) -> Holder:
     return Holder(pid, user)
 
 
-def read_names(prefix: str) -> list[str]:
+def read_names(prefix: str) -> dict[str, str]:
     """Return the names that begin with a prefix and are held now by processes of any user.
 
-    None where the kernel's list cannot be read, as with `ProcSubset=pid` of systemd.
+    Each has the number of its socket, for `holds`. None where the kernel's list cannot be read, as
+    with `ProcSubset=pid` of systemd.
     """
     start = f"@{_PREFIX}/{prefix}"
     try:
         table = _TABLE.read_text(encoding="utf-8", errors="replace")
     except OSError:
-        return []
-    words = (line.rpartition(" ")[2] for line in table.splitlines())
-    return [word.removeprefix(f"@{_PREFIX}/") for word in words if word.startswith(start)]
+        return {}
+    rows = (line.split()[-2:] for line in table.splitlines())
+    return {
+        row[1].removeprefix(f"@{_PREFIX}/"): row[0] for row in rows if row[-1].startswith(start)
+    }
+
+
+def holds(pid: int, number: str) -> bool:
+    """Return whether it is certain that a process of this user has the socket of this number."""
+    with suppress(OSError):
+        links = Path(f"/proc/{pid}/fd").iterdir()
+        return any(str(link.readlink()) == f"socket:[{number}]" for link in links)
+    return False
 
 
 def bind_datagrams(name: str) -> socket.socket:

@@ -364,7 +364,7 @@ def test_a_mode_that_fishd_may_not_restore_is_a_limitation_with_its_remedy(user:
 
 def test_estop_stops_every_fishd_that_may_be_meant_and_stop_asks_which(user: User) -> None:
     one, other = open_session(user, "one"), open_session(user, "other")
-    with user.fishd(one), user.fishd(other):
+    with user.fishd(one) as first, user.fishd(other):
         for session in (one, other):
             wait_until((session / "fishd" / "control.estop").exists)
         refused = user.fishctl(None, "stop")
@@ -376,6 +376,15 @@ def test_estop_stops_every_fishd_that_may_be_meant_and_stop_asks_which(user: Use
         for session in (one, other):
             assert f" at ipc://{session}/fishd/control" in stopped.stdout
         assert stopped.stdout.endswith(" answered at their names in the kernel\n")
+        first.stop()
+        for session in (one, None):  # a stop that reached only the other fish would deceive
+            refused = user.fishctl(session, "stop")
+            assert refused.returncode == 1
+            assert f"process {first.pid}" in refused.stderr
+            assert "'fishctl estop' ends " in refused.stderr
+        stopped = user.fishctl(None, "estop")
+        assert f"; of process {first.pid}, which does not answer: no pulses" in stopped.stdout
+        first.process.send_signal(signal.SIGCONT)
         for session in (one, other):
             assert "mode        estop" in user.fishctl(session, "status").stdout
 
