@@ -94,6 +94,8 @@ class Connection:
         try:
             self._listener()
         except PermissionError:
+            if any(daemon.user == os.geteuid() for daemon in self.find_local_daemons()):
+                raise self._no_daemon("this user may not connect") from None
             raise NoDaemon(
                 f"this user may not connect to the fishd at {self.endpoint}: join the group of its "
                 "socket "

@@ -69,7 +69,7 @@ def control(context: Context) -> Result:
     if isinstance(context.daemon, Running):
         served = context.daemon.endpoint
         if not context.daemon.status.control:
-            return fail("its file is gone, and fishd cannot create it", "see 'daemon'")
+            return fail("clients cannot reach it, and fishd cannot create it again", "see 'daemon'")
     try:
         address = context.config.control.address or served or addresses.control_address()
     except StartupError as error:

@@ -356,6 +356,9 @@ def test_a_mode_that_fishd_may_not_restore_is_a_limitation_with_its_remedy(user:
                 )
             )
             assert ("cannot be created again" in limitation()) == (other == 0o700)
+        refused = one_line(user.fishctl(None, "--endpoint", f"ipc://{shared}/control", *SWIM))
+        assert "this user may not connect; fish " in refused
+        assert f"sudo chmod 777 {shared}" in refused
         shared.chmod(0o777)
         wait_until(lambda: not limitation())
         for verb in ("stop", "estop"):
