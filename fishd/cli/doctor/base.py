@@ -51,6 +51,7 @@ class Unreachable(NamedTuple):
     forbidden: bool
     """Whether this user lacks the permission to connect."""
     remedy: str = ""
+    """Remedy, if it is not the general one."""
     is_hung: bool = False
     """Whether it is certain that this is a fishd, which hangs or is stopped."""
 

@@ -74,12 +74,16 @@ def test_the_socket_of_a_killed_daemon_is_not_a_daemon(tmp_path: Path, scheme: s
         with socket.socket(socket.AF_UNIX) as stale:
             stale.bind(str(tmp_path / "old"))
         endpoint = f"ipc://{tmp_path}/old"
+        tmp_path.chmod(0o777)
         _, findings = doctor(tmp_path, "--endpoint", endpoint, *free_telemetry())
     else:
         with socket.socket() as port:  # no program listens there, and none can start to
             port.bind(("127.0.0.1", 0))
             endpoint = f"tcp://127.0.0.1:{port.getsockname()[1]}"
             _, findings = doctor(tmp_path, "--endpoint", endpoint, *free_telemetry())
+    if scheme == "ipc":
+        assert findings["control"][0] == "warning"
+        assert "every user of this machine may replace ipc://" in findings["control"][1]
     level, message = findings["daemon"]
     # Other tests may run a fishd now.
     assert (level, message) == ("ok", "no fishd is running") or message.startswith(
