@@ -14,7 +14,7 @@ from fishd.cli.output import echo, format_state, output_may_fail, print_json
 from fishd.client import Fish
 from fishd.core.addresses import socket_path
 from fishd.core.errors import NoDaemon, StartupError, Untrusted
-from fishd.core.local_daemons import LocalDaemon
+from fishd.core.local_daemons import LocalDaemon, become
 from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.core.protocol import State
 from fishd.hardware import release_recipe
@@ -90,7 +90,7 @@ def _end_pulses(fish: Fish, path: Path | None, file: Path | None, no_answer: NoD
     problem = no_answer.problem
     for daemon in fish.silent:
         if daemon.user != os.geteuid():
-            problem += f"; for process {daemon.pid}, run fishctl estop as user {daemon.user}"
+            problem += f"; for process {daemon.pid}, run: {become(daemon.user)}fishctl estop"
     return release_by_config(problem, file)
 
 

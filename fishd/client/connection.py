@@ -149,10 +149,12 @@ class Connection:
             return NoDaemon(f"no fishd at {self.endpoint}: {problem}")
         if listener is None:
             return self._no_daemon(why)
+        from fishd.core.local_daemons import become
+
         return NoDaemon(
             f"{why} from process {listener}, which serves {self.endpoint}: it hangs, is stopped "
             "or is overloaded",
-            f"; 'fishctl estop{self._option}' ends the pulses without it",
+            f"; '{become(listener.user)}fishctl estop{self._option}' ends the pulses without it",
         )
 
     def lost_command_error(self, op: str) -> NoDaemon:

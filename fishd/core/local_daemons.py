@@ -71,6 +71,18 @@ def ask(
     }
 
 
+def become(user: int) -> str:
+    """Return the beginning of a command that ends pulses: only a fishd's user uses its recipe."""
+    if user in (os.geteuid(), service_user()):
+        return ""
+    import pwd
+
+    try:
+        return f"sudo -u {pwd.getpwuid(user).pw_name} "
+    except KeyError:
+        return f"sudo -u \\#{user} "
+
+
 def find_silent(daemons: Iterable[LocalDaemon]) -> list[LocalDaemon]:
     """Return those that certainly exist and do not answer."""
     daemons = list(daemons)
@@ -98,7 +110,10 @@ def describe(daemons: Iterable[LocalDaemon], option: str = "") -> str:
         elif status is None and not daemon.is_certain:
             phrases.append(f"{name} does not answer")
         elif status is None:
-            phrases.append(f"{name} hangs or is stopped: 'fishctl estop{option}' ends its pulses")
+            sudo = become(daemon.user)
+            phrases.append(
+                f"{name} hangs or is stopped: '{sudo}fishctl estop{option}' ends its pulses"
+            )
         elif status.control:
             phrases.append(f"{name} runs: name it with --endpoint {status.control}")
         else:

@@ -100,12 +100,12 @@ def _describe_hung(
     processes = " and ".join(f"process {Holder(daemon.pid, daemon.user)}" for daemon in hung)
     option = f" --endpoint {endpoint}" if endpoint else ""
     is_service = hung[0].user == local_daemons.service_user()
-    pids = " ".join(str(daemon.pid) for daemon in hung)
+    sudo, pids = local_daemons.become(hung[0].user), " ".join(str(daemon.pid) for daemon in hung)
     restart = "sudo systemctl restart fishd" if is_service else f"kill -9 {pids}"
     return (
         f"{reason}: {processes}, a fishd, does not answer: it hangs or is stopped",
         False,
-        f"'fishctl estop{option}' ends its pulses; then: {restart}",
+        f"'{sudo}fishctl estop{option}' ends its pulses; then: {restart}",
     )
 
 

@@ -26,6 +26,7 @@ from rigs.processes import (
     Process,
     Subscriber,
     call,
+    fishctl,
     one_line,
     running,
     sets,
@@ -329,6 +330,9 @@ def test_from_cron_a_fishd_is_stopped_and_other_verbs_say_where_it_is(user: User
         assert status == 1
         assert findings["daemon"][0] == "FAIL"
         assert f"process {fishd.pid}, a fishd, does not answer" in findings["daemon"][1]
+        hung = one_line(fishctl("--endpoint", f"ipc://{session}/fishd/control", "status"))
+        assert f"process {fishd.pid} of user {user.number}, which serves" in hung
+        assert f"'sudo -u \\#{user.number} fishctl estop --endpoint ipc://" in hung  # here: root
         hung = one_line(user.fishctl(None, "status"))
         assert "hangs or is stopped: 'fishctl estop' ends its pulses" in hung
         ended = user.fishctl(None, "estop")
