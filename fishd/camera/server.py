@@ -141,8 +141,23 @@ class Server:
             )
         if silence < WATCHDOG_TIMEOUT_S:
             self._notifier.ticked(now)
+        if now >= self._next_state:
+            self._restore_files()
         if state_requested or now >= self._next_state:
             self._publish_state(False)
+
+    def _restore_files(self) -> None:
+        """Create files of sockets again that are gone, and restore their modes."""
+        lines = []
+        for server in (self._publisher, self._requests):
+            before, restored = server.file.problem, server.file.restore()
+            if restored:
+                lines.append(f"the files of the socket {server.address} {restored}")
+            elif (problem := server.file.problem) and problem != before:
+                lines.append(f"clients cannot reach {server.address}: {problem}")
+        if lines:
+            self._register_sockets()
+            log.warning("%s", "; ".join(lines))
 
     def _run_source(self) -> None:
         """Run the source, and again after an unexpected failure of a driver or library."""

@@ -13,6 +13,7 @@ from fishd.camera.messages import FRAME, STATE, UNTIL, VIEW
 from fishd.core import addresses, protocol, text
 from fishd.core.errors import Refused
 from fishd.core.schema import suggest
+from fishd.core.socket_file import SocketFile
 
 MAX_QUEUED_MESSAGES = 256
 """Largest number of messages that wait for a slow subscriber; later ones are dropped for it."""
@@ -45,11 +46,21 @@ class Publisher:
     def __init__(self, address: str, stack: ExitStack) -> None:
         """Listen at an address; raises `StartupError`."""
         self._listener, self.address = _listen(address, "publish.frames", stack)
+        self.file = SocketFile(self, self.address, "publish.frames", group=False)
         self._topics: set[bytes] = set()
         """Subscriptions that match views: `view`, or a prefix of it."""
         self._reopen_time = 0.0
         self._open()
+        stack.callback(lambda: self._listener.close())
         stack.callback(self._close)
+
+    def listen_at(self, _: str, listener: sockets.socket) -> None:
+        """Listen at a new file from now on; all subscribers connect again."""
+        self._listener.close()
+        self._listener = listener.dup()
+        if self.socket is not None:
+            self._close()
+            self._open()
 
     def send(self, parts: list[bytes]) -> None:
         """Publish a message."""
@@ -111,9 +122,18 @@ class Requests:
     def __init__(self, address: str, stack: ExitStack) -> None:
         """Listen at an address; raises `StartupError`."""
         listener, self.address = _listen(address, "publish.requests", stack)
-        self.socket = _bind(zmq.ROUTER, self.address, listener, stack)
+        self.file = SocketFile(self, self.address, "publish.requests", group=False)
+        self._stack = ExitStack()
+        stack.callback(lambda: self._stack.close())
+        self.listen_at(self.address, listener)
         self.operations: dict[str, Callable[[], Any]] = {}
         """Functions that compute the results of requests, by name of the operation."""
+
+    def listen_at(self, address: str, listener: sockets.socket) -> None:
+        """Listen at a new file from now on; all clients connect again."""
+        self._stack.close()
+        self._stack = ExitStack()
+        self.socket = _bind(zmq.ROUTER, address, listener, self._stack)
 
     def answer(self) -> None:
         """Answer the waiting requests; an invalid message gets an error, or no answer."""

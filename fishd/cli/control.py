@@ -113,6 +113,9 @@ def _change(endpoint: str | None, as_json: bool, change: "Callable[[client.Fish]
         print_json(state)
         return
     echo(format_state(state))
+    if state.cancelled:
+        name = make_printable(state).cancelled
+        echo(f"fishctl: {name}, the controller of 'start', does not start any more", err=True)
     if holder := state.previous_holder:
         previous = make_printable(holder)
         echo(

@@ -1,6 +1,8 @@
 """`fishctl estop`: ends the pulses through fishd, or without it if it does not answer."""
 
+import os
 import signal
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from fishd.cli.output import echo, format_state, output_may_fail, print_json
 from fishd.client import Fish
 from fishd.core.addresses import socket_path
 from fishd.core.errors import NoDaemon, StartupError, Untrusted
+from fishd.core.local_daemons import LocalDaemon, become
 from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.core.protocol import State
 from fishd.hardware import release_recipe
@@ -45,11 +48,14 @@ def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) 
         except Untrusted:
             raise
         except NoDaemon as no_answer:
-            way, summary = "last resort", _end_pulses(no_answer, path, file)
+            way, summary = "last resort", _end_pulses(fish, path, file, no_answer)
             answer: dict[str, Any] = {"pulses": summary}
         else:
             way, summary = _describe_way(fish, path), format_state(state)
             answer = _to_builtins(state)
+            if recipes := _find_recipes(fish.silent):
+                pids = " and ".join(str(daemon.pid) for daemon in fish.silent)
+                summary += f"; of process {pids}, which does not answer: {_carry_out(recipes)}"
     with output_may_fail(summary):
         if as_json:
             print_json({"way": way, **answer})
@@ -71,20 +77,50 @@ def _to_builtins(state: State) -> dict[str, Any]:
     return builtins
 
 
-def _end_pulses(no_answer: NoDaemon, path: Path | None, file: Path | None) -> str:
+def _end_pulses(fish: Fish, path: Path | None, file: Path | None, no_answer: NoDaemon) -> str:
     """End the pulses without the daemon; return what was done, in words."""
-    recipe = release_recipe.read(str(path)) if path and not file else None
-    if recipe is None:
-        from fishd.cli.release import release_by_config
+    if not file:
+        recipes = _find_recipes(fish.silent)
+        if path and (own := release_recipe.read(str(path))):
+            recipes.append(own)
+        if recipes:
+            return _carry_out({recipe["config"]: recipe for recipe in recipes}.values())
+    from fishd.cli.release import release_by_config
 
-        return release_by_config(no_answer, file)
-    if not recipe["function"]:
-        return f"no pulses: the fish is simulated, and its fishd does not answer ({no_answer})"
-    try:
-        with handle_signals(SIGNALS, signal.SIG_IGN):  # it must not end halfway
-            result = release_recipe.carry_out(
-                recipe["function"], recipe["neutral"], recipe["arguments"]
+    problem = no_answer.problem
+    for daemon in fish.silent:
+        if daemon.user != os.geteuid():
+            problem += f"; for process {daemon.pid}, run: {become(daemon.user)}fishctl estop"
+    return release_by_config(problem, file)
+
+
+def _find_recipes(daemons: Iterable[LocalDaemon]) -> list[dict[str, Any]]:
+    """Return the recipes that these fishds have left."""
+    if not daemons:
+        return []
+    from fishd.hardware.recipes import find_recipe
+
+    return [recipe for daemon in daemons if (recipe := find_recipe(daemon))]
+
+
+def _carry_out(recipes: Iterable[dict[str, Any]]) -> str:
+    """End the pulses by all of these; return what was done, in words."""
+    done, failures = [], []
+    with handle_signals(SIGNALS, signal.SIG_IGN):  # it must not end halfway
+        for recipe in recipes:
+            function, neutral, arguments = (
+                recipe[key] for key in ("function", "neutral", "arguments")
             )
-    except (StartupError, ImportError, OSError) as error:
-        raise click.ClickException(f"{error}; {release_recipe.NOT_RELEASED}") from None
-    return release_recipe.describe_outcome(result)
+            try:
+                done.append(
+                    release_recipe.describe_outcome(
+                        release_recipe.carry_out(function, neutral, arguments)
+                    )
+                    if function
+                    else "no pulses: the fish is simulated, and its fishd does not answer"
+                )
+            except (StartupError, ImportError, OSError) as error:
+                failures.append(str(error))
+    if failures:
+        raise click.ClickException(f"{'; '.join(failures)}; {release_recipe.NOT_RELEASED}")
+    return "; ".join(done)

@@ -39,10 +39,10 @@ def _list_from_daemon(
     try:
         with client.Fish(endpoint) as fish:
             return ask(fish)
-    except NoDaemon:
+    except NoDaemon as error:
         if endpoint or os.environ.get(ENDPOINT_VARIABLE):
             raise
-        echo(f"fishctl: no fishd is running; these are the {noun} of this machine", err=True)
+        echo(f"fishctl: {error.problem}; these are the {noun} of this machine", err=True)
         return look()
 
 

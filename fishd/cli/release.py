@@ -15,7 +15,7 @@ from fishd.client import Fish
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file
 from fishd.core import text
 from fishd.core.addresses import find_control_address
-from fishd.core.errors import ConfigError, FishError, NoDaemon, ServoError, StartupError
+from fishd.core.errors import ConfigError, FishError, ServoError, StartupError
 from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.core.process.kernel_names import Holder
 from fishd.hardware.release_recipe import NOT_RELEASED, describe_outcome
@@ -67,20 +67,20 @@ def _print(done: str, as_json: bool) -> None:
         echo(done)
 
 
-def release_by_config(no_answer: NoDaemon, file: Path | None) -> str:
+def release_by_config(problem: str, file: Path | None) -> str:
     """Do as the verb, for a fishd that does not answer; return what was done, in words.
 
-    no_answer: error to report if no configuration names a servo
+    problem: phrase that says how it does not answer
     """
     config, source = _load_without_bad_folder(file, ())
     if config.kind.has_hardware:
         return _release(config)
     if source is None:
         raise click.ClickException(
-            f"{no_answer}; nothing was released: without a configuration file (${FILE_VARIABLE}, "
+            f"{problem}; nothing was released: without a configuration file (${FILE_VARIABLE}, "
             f"else {SERVICE_FILE}) no servo is known; fishctl estop --config FILE names one"
         )
-    return f"a simulated fish, by {source}, has no pulses; its fishd does not answer ({no_answer})"
+    return f"a simulated fish, by {source}, has no pulses ({problem})"
 
 
 def _release(config: Config) -> str:

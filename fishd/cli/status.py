@@ -33,23 +33,27 @@ def status(timing: bool, endpoint: str | None, as_json: bool) -> None:
     with Fish(endpoint) as fish:
         fish_status = fish.status()
     report_detour(fish)
+    address = f" --endpoint {fish_status.control}" if fish.detour and fish_status.control else ""
     if as_json:
         print_json(fish_status)
         return
-    rows = _status_rows(fish_status := make_printable(fish_status))
+    rows = _status_rows(fish_status := make_printable(fish_status), address)
     if timing:
         rows += _timing_rows(fish_status)
     echo_rows(rows)
 
 
-def _status_rows(status: Status) -> list[tuple[str, str]]:
-    """Return names and values: those of the fish first, those of the daemon last."""
+def _status_rows(status: Status, address: str) -> list[tuple[str, str]]:
+    """Return names and values: those of the fish first, those of the daemon last.
+
+    address: options with which the next verb reaches this fishd
+    """
     mode = [("mode", status.mode)]
     if reason := status.reason:
         remedy = f"{reason.remedy or 'mend the cause'} ({_REMEDIES_PAGE}, {reason.code})"
         mode = [
             ("mode", f"{status.mode} ({format_reason(reason)})"),
-            ("to do", f"{remedy}; then: fishctl clear-fault"),
+            ("to do", f"{remedy}; then: fishctl clear-fault{address}"),
         ]
     if holder := status.lease:
         mode.append(("held by", f"{holder}, for {holder.age:.0f} s"))

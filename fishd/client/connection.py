@@ -6,6 +6,7 @@ import os
 import socket
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgspec
@@ -27,7 +28,8 @@ from fishd.core.errors import (
     Refused,
     Untrusted,
 )
-from fishd.core.process.unix_sockets import Listener, find_listener, find_trust_problem, is_deserted
+from fishd.core.process.kernel_names import Holder
+from fishd.core.process.unix_sockets import find_listener, find_trust_problem, is_deserted
 from fishd.core.protocol import State
 from fishd.core.signals import Status
 
@@ -71,6 +73,8 @@ class Connection:
         self._was_named = bool(endpoint or os.environ.get(ENDPOINT_VARIABLE))
         self.detour = ""
         """How the latest answer came without the control socket; empty if it came through it."""
+        self.silent: list[LocalDaemon] = []
+        """The fishds that did not answer the latest emergency stop at their names in the kernel."""
         self.timeout = timeout
         self.telemetry_address = telemetry
         self.held: LeaseRenewal | None = None
@@ -90,6 +94,8 @@ class Connection:
         try:
             self._listener()
         except PermissionError:
+            if any(daemon.user == os.geteuid() for daemon in self.find_local_daemons()):
+                raise self._no_daemon("this user may not connect") from None
             raise NoDaemon(
                 f"this user may not connect to the fishd at {self.endpoint}: join the group of its "
                 "socket "
@@ -102,22 +108,33 @@ class Connection:
             )
 
     def _no_daemon(self, why: str) -> NoDaemon:
-        if elsewhere := self._local_daemons():
+        problem = f"no fishd at {self.endpoint}: {why}"
+        if elsewhere := self.find_local_daemons():
             from fishd.core import local_daemons
 
-            return NoDaemon(
-                f"no fishd at {self.endpoint}: {why}; {local_daemons.describe(elsewhere)}"
-            )
+            where = local_daemons.describe(elsewhere, self._option)
+            return NoDaemon(problem, f"; {where}")
         return NoDaemon(
-            f"no fishd at {self.endpoint}: {why}; start one with 'fishd', or a simulated fish "
-            "that swims with 'make run'; or name another with --endpoint or $FISHD_ENDPOINT"
+            problem,
+            "; start one with 'fishd', or a simulated fish that swims with 'make run'; or name "
+            "another with --endpoint or $FISHD_ENDPOINT",
         )
 
-    def _local_daemons(self) -> "list[LocalDaemon]":
+    @property
+    def _option(self) -> str:
+        """Option with which another verb means this fishd; empty if it needs none."""
+        return f" --endpoint {self.endpoint}" if self._was_named else ""
+
+    def find_local_daemons(self) -> "list[LocalDaemon]":
         """Return the fishds of this machine that a client of this endpoint may mean."""
         from fishd.core import local_daemons
 
-        return local_daemons.find_own(self.endpoint if self._was_named else None)
+        daemons = local_daemons.find_own(self.endpoint if self._was_named else None)
+        with suppress(PermissionError):
+            listener = self._listener()
+            here = [daemon for daemon in daemons if listener and daemon.pid == listener.pid]
+            return here or daemons
+        return daemons
 
     def no_answer_error(self, patience: float = 0.0) -> NoDaemon:
         """Return the error for a missing answer; patience: time beyond the timeout [s]."""
@@ -132,10 +149,12 @@ class Connection:
             return NoDaemon(f"no fishd at {self.endpoint}: {problem}")
         if listener is None:
             return self._no_daemon(why)
+        from fishd.core.local_daemons import become
+
         return NoDaemon(
-            f"{why} from process {listener.pid}, which serves {self.endpoint}: it hangs, is "
-            "stopped "
-            "or is overloaded; 'fishctl release --config FILE' stops the servo without it"
+            f"{why} from process {listener}, which serves {self.endpoint}: it hangs, is stopped "
+            "or is overloaded",
+            f"; '{become(listener.user)}fishctl estop{self._option}' ends the pulses without it",
         )
 
     def lost_command_error(self, op: str) -> NoDaemon:
@@ -145,7 +164,7 @@ class Connection:
             "known whether fishd has carried it out; 'fishctl status' shows the state of the fish"
         )
 
-    def _listener(self) -> Listener | None:
+    def _listener(self) -> Holder | None:
         """Return the listener of a Unix socket, None if unknown; raise PermissionError."""
         return find_listener(self._path) if self._path else None
 
@@ -202,8 +221,15 @@ class Connection:
 
     def _estop_all(self, message: str) -> State | None:
         """Request an emergency stop of every fishd that this endpoint may mean, by its name."""
-        states = self._ask(self._local_daemons(), State, "estop", {"message": message})
+        daemons = self.find_local_daemons()
+        states = self._ask(daemons, State, "estop", {"message": message})
+        self.silent = [daemon for daemon in daemons if daemon not in states and daemon.is_certain]
         self.estop_taken_by = "kernel" if states else ""
+        if states:
+            statuses: dict[LocalDaemon, Status] = {}
+            with suppress(FishError):
+                statuses = self._ask(states, Status, "status", {})
+            self._note_detour(states, statuses)
         return next(iter(states.values()), None)
 
     def ask_directly(self, kind: type[T], op: str, args: Mapping[str, Any]) -> T | None:
@@ -211,11 +237,34 @@ class Connection:
 
         For a fishd whose control socket is gone. Return None also if it may be one of several.
         """
-        daemons = self._ask(self._local_daemons(), Status, "status", {})
-        if len(daemons) != 1:
-            self.detour = ""
+        self.detour = ""
+        daemons = self.find_local_daemons()
+        statuses = self._ask(daemons, Status, "status", {})
+        is_unsure = any(daemon not in statuses and daemon.is_certain for daemon in daemons)
+        if is_unsure or len(statuses) != 1:
             return None
-        return next(iter(self._ask(daemons, kind, op, args).values()), None)
+        result = next(iter(self._ask(statuses, kind, op, args).values()), None)
+        if result is not None:
+            self._note_detour(statuses, statuses)
+        return result
+
+    def _note_detour(
+        self, daemons: "Iterable[LocalDaemon]", statuses: "Mapping[LocalDaemon, Status]"
+    ) -> None:
+        """Store which of these have answered at their names in the kernel."""
+        from fishd.core import local_daemons
+
+        names = []
+        for daemon in daemons:
+            status = statuses.get(daemon)
+            address = status.control if status else ""
+            where = f" at {text.line(address)}" if address not in ("", self.endpoint) else ""
+            names.append(local_daemons.format_name(daemon, status) + where)
+        place = "their names" if len(names) > 1 else "its name"
+        self.detour = (
+            f"{'nothing listens at' if self.is_deserted else 'no answer from'} {self.endpoint}; "
+            f"{' and '.join(names)} answered at {place} in the kernel"
+        )
 
     def _ask(
         self, daemons: "Iterable[LocalDaemon]", kind: type[T], op: str, args: Mapping[str, Any]
@@ -235,11 +284,6 @@ class Connection:
                     results[daemon] = result
         if refusal and not results:
             raise refusal
-        if results:
-            pids = ", ".join(str(daemon.pid) for daemon in results)
-            self.detour = (
-                f"no answer from {self.endpoint}; process {pids} answered at its name in the kernel"
-            )
         return results
 
     def result(self, frames: Sequence[bytes], identity: int, kind: type[T]) -> T | None:

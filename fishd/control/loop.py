@@ -225,9 +225,9 @@ class ControlLoop:
             self.lateral_sign.rest()
 
     @property
-    def has_pending(self) -> bool:
-        """Whether a controller is to start after a time at rest."""
-        return self._pending is not None
+    def pending(self) -> str:
+        """Name of the controller that is to start after a time at rest; empty if there is none."""
+        return self._pending[1] if self._pending else ""
 
     def stop(self) -> None:
         """Fade to neutral and stay there; has no effect while a fault or estop is latched."""

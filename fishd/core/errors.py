@@ -119,6 +119,12 @@ class FishError(FishdError):
 class NoDaemon(FishError, ConnectionError):
     """Nothing answers at the endpoint."""
 
+    def __init__(self, problem: str, remedy: str = "") -> None:
+        """remedy: end of the message, which begins with a semicolon"""
+        super().__init__(problem + remedy)
+        self.problem = problem
+        """The message without its remedy."""
+
 
 class Untrusted(NoDaemon):
     """Another user's process listens where the fishd of this user would."""

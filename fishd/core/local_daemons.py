@@ -35,6 +35,13 @@ class LocalDaemon(NamedTuple):
     hash: str
     """Hash of the address of its control socket when it started."""
     name: str
+    socket: str
+    """Number of the socket that has this name."""
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is certain that its process has this name: any user can hold any name."""
+        return kernel_names.holds(self.pid, self.socket)
 
     @property
     def may_be_asked(self) -> bool:
@@ -42,7 +49,7 @@ class LocalDaemon(NamedTuple):
 
         The service answers only the members of its group.
         """
-        return os.geteuid() in (0, self.user) or self.user == _service_user()
+        return os.geteuid() in (0, self.user) or self.user == service_user()
 
 
 def ask(
@@ -64,23 +71,62 @@ def ask(
     }
 
 
-def describe(daemons: Iterable[LocalDaemon]) -> str:
-    """Return a phrase that names processes and where they can be reached."""
+def become(user: int) -> str:
+    """Return the beginning of a command that ends pulses: only a fishd's user uses its recipe."""
+    if user in (os.geteuid(), service_user()):
+        return ""
+    import pwd
+
+    try:
+        return f"sudo -u {pwd.getpwuid(user).pw_name} "
+    except KeyError:
+        return f"sudo -u \\#{user} "
+
+
+def find_silent(daemons: Iterable[LocalDaemon]) -> list[LocalDaemon]:
+    """Return those that certainly exist and do not answer."""
     daemons = list(daemons)
+    replies = _ask_status(daemons)
+    return [daemon for daemon in daemons if daemon not in replies and daemon.is_certain]
+
+
+def _ask_status(daemons: Iterable[LocalDaemon]) -> dict[LocalDaemon, bytes]:
     request = protocol.Request(v=protocol.VERSION, id=1, op="status", args={})
-    replies = ask((d for d in daemons if d.may_be_asked), protocol.encode(request))
-    phrases = []
+    return ask(daemons, protocol.encode(request))
+
+
+def describe(daemons: Iterable[LocalDaemon], option: str = "") -> str:
+    """Return a phrase that names processes and where they can be reached.
+
+    option: option with which `fishctl estop` means these
+    """
+    daemons = list(daemons)
+    replies, phrases = _ask_status(d for d in daemons if d.may_be_asked), []
     for daemon in daemons:
-        who = f"the fishd of process {Holder(daemon.pid, daemon.user)}"
+        status = _read_status(replies.get(daemon, b""))
+        name = format_name(daemon, status)
         if not daemon.may_be_asked:
-            phrases.append(f"{who}, which this user may not ask")
-        elif (status := _read_status(replies.get(daemon, b""))) is None:
-            phrases.append(f"{who} does not answer")
+            phrases.append(f"{name} runs, which this user may not ask")
+        elif status is None and not daemon.is_certain:
+            phrases.append(f"{name} does not answer")
+        elif status is None:
+            sudo = become(daemon.user)
+            phrases.append(
+                f"{name} hangs or is stopped: '{sudo}fishctl estop{option}' ends its pulses"
+            )
         elif status.control:
-            phrases.append(f"{who} serves {status.control}: name it with --endpoint")
+            phrases.append(f"{name} runs: name it with --endpoint {status.control}")
         else:
-            phrases.append(f"{who} says: {text.line(status.limitations[-1])}")
+            phrases.append(f"{name} says: {text.line(status.limitations[-1])}")
     return "; ".join(phrases)
+
+
+def format_name(daemon: LocalDaemon, status: Status | None) -> str:
+    """Return a phrase that names a fishd; status: its answer, if it has given one."""
+    process = Holder(daemon.pid, daemon.user)
+    if status is None:
+        return f"the fishd of process {process}"
+    return text.line(f"fish {status.name} (process {process})")
 
 
 def _read_status(reply: bytes) -> Status | None:
@@ -95,7 +141,7 @@ def _read_status(reply: bytes) -> Status | None:
 def name_of_this(control: str) -> str:
     """Return the name of this process; control: address of its control socket."""
     unique = os.urandom(4).hex()  # containers may share names, but not pids
-    return f"{_PREFIX}{os.geteuid()}/{os.getpid()}/{_hash(control)}/{unique}"
+    return f"{_PREFIX}{os.geteuid()}/{os.getpid()}/{hash_address(control)}/{unique}"
 
 
 def find_all() -> list[LocalDaemon]:
@@ -110,14 +156,14 @@ def find_own(control: str | None = None) -> list[LocalDaemon]:
     Root may ask all. Whether one is what its name says, only its answer shows.
     """
     own = (daemon for daemon in _parse_names() if daemon.may_be_asked)
-    return [daemon for daemon in own if control is None or daemon.hash == _hash(control)]
+    return [daemon for daemon in own if control is None or daemon.hash == hash_address(control)]
 
 
 def _parse_names() -> Iterator[LocalDaemon]:
-    for name in kernel_names.read_names(_PREFIX):
+    for name, number in kernel_names.read_names(_PREFIX).items():
         parts = name.removeprefix(_PREFIX).split("/")
         if len(parts) == 4 and parts[0].isdecimal() and parts[1].isdecimal():
-            daemon = LocalDaemon(int(parts[0]), int(parts[1]), parts[2], name)
+            daemon = LocalDaemon(int(parts[0]), int(parts[1]), parts[2], name, number)
             if not _is_of_another_user(daemon):
                 yield daemon
 
@@ -134,7 +180,8 @@ def _is_of_another_user(daemon: LocalDaemon) -> bool:
 
 
 @cache
-def _service_user() -> int:
+def service_user() -> int:
+    """Return the number of the user of the system's service; -1 if there is none."""
     import pwd
 
     try:
@@ -143,7 +190,8 @@ def _service_user() -> int:
         return -1
 
 
-def _hash(control: str) -> str:
+def hash_address(control: str) -> str:
+    """Return the hash of the address of a control socket, the same for all links to it."""
     kind, _, path = control.partition("://")
     real = f"{kind}://{os.path.realpath(path)}" if kind == "ipc" else control
     return f"{crc32(os.fsencode(real)):08x}"

@@ -25,21 +25,20 @@ def find_name_problem(address: str) -> str:
     def look_up() -> None:
         try:
             socket.getaddrinfo(where.host, None, type=socket.SOCK_STREAM)
-        except socket.gaierror as error:
-            is_unsure = error.errno == socket.EAI_AGAIN
-            problems.append("no name server answers" if is_unsure else "")
-        except UnicodeError:
-            problems.append("")
+        except (socket.gaierror, UnicodeError) as error:
+            problems.append(describe_name_error(where.host, error))
 
     thread = threading.Thread(target=look_up, name="name", daemon=True)
     thread.start()
     thread.join(NAME_TIMEOUT_S)
-    if not problems:
-        return ""
-    zone = where.host.partition("%")[2]
-    why = f"this machine has no network interface {zone}" if zone else problems[0]
-    reason = f" ({why})" if why else ""
-    return (
-        f"the name {where.host} is not known{reason}; check its spelling, or write the address "
-        "in numbers"
-    )
+    return problems[0] if problems else ""
+
+
+def describe_name_error(host: str, error: Exception) -> str:
+    """Return that a name is not known, and why; error: that of its look-up."""
+    zone, why = host.partition("%")[2], ""
+    if isinstance(error, socket.gaierror) and error.errno == socket.EAI_AGAIN:
+        why = " (no name server answers)"
+    if zone:
+        why = f" (this machine has no network interface {zone})"
+    return f"the name {host} is not known{why}; check its spelling, or write the address in numbers"

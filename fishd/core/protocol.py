@@ -93,6 +93,10 @@ class State(Struct, frozen=True):
         LeaseHolder | None,
         note("The experiment whose [lease](#leases) this request has ended; null if none."),
     ] = None
+    cancelled: Annotated[
+        str,
+        note("The controller of `start` that `stop` has kept from starting; empty if none."),
+    ] = ""
 
 
 class Grant(Struct, frozen=True):

@@ -65,6 +65,8 @@ class Dealer(ABC, Generic[T]):
         """Whether to stay with the peer of this connection, and never reconnect."""
         self.lost = False
         """Whether the connection to that peer was lost."""
+        self.problem = ""
+        """Why the latest look-up of the name of the peer failed; empty without one."""
         self.needs_key = False
         """Whether the peer has refused a connection without a key."""
         self._socket: socket.socket | None = None
@@ -147,7 +149,10 @@ class Dealer(ABC, Generic[T]):
         while not self._closed and not self._targets:
             try:
                 self._targets = _addresses(self._where, 0)
-            except (OSError, UnicodeError):
+            except (OSError, UnicodeError) as error:
+                from fishd.core.names import describe_name_error
+
+                self.problem = describe_name_error(self._where.host, error)
                 time.sleep(1.0)
 
     def _advance(self) -> None:

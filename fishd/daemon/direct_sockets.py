@@ -11,6 +11,8 @@ import logging
 import os
 import pwd
 import socket
+import threading
+import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
@@ -21,6 +23,8 @@ from fishd.core.process.kernel_names import Holder
 
 log = logging.getLogger(__name__)
 
+MEMBERS_PERIOD_S = 5.0
+"""Shortest time between two reads of the system's list of groups [s]."""
 _MAX_REFUSED = 16
 """Largest number of datagrams of other users that are read, and dropped, in a period.
 
@@ -88,7 +92,10 @@ class KernelSocket(DirectSocket):
 
     def __init__(self, name: str, perform: Perform, period: float) -> None:
         """Listen at a name; raise OSError."""
-        self._permitted = {0, os.geteuid(), *_members_of_group()}
+        self._permitted = _permitted_users()
+        self._reader: threading.Thread | None = None
+        self._next_read = 0.0
+        """Time from which on the list of groups may be read again [s, monotonic]."""
         super().__init__(kernel_names.bind_datagrams(name), perform, period)
 
     def _receive(self) -> tuple[bytes, str | bytes | None] | None:
@@ -99,13 +106,33 @@ class KernelSocket(DirectSocket):
                 )
             except OSError:
                 return None
-            if self._is_permitted(client):
+            if client.user in self._permitted:
                 return payload, sender
+            self._read_members_again(client, payload, sender)
         self._pause()  # another user floods it
         return None
 
-    def _is_permitted(self, client: Holder) -> bool:
-        return client.user in self._permitted
+    def _read_members_again(
+        self, client: Holder, payload: bytes, sender: str | bytes | None
+    ) -> None:
+        """Read the members of the group in a thread; answer a client that has joined it since."""
+        now = time.monotonic()
+        if now < self._next_read or (self._reader and self._reader.is_alive()):
+            return
+        self._next_read = now + MEMBERS_PERIOD_S
+
+        def read() -> None:
+            permitted = _permitted_users()
+            with suppress(RuntimeError):  # the asyncio loop is closed
+                self._events.call_soon_threadsafe(update, permitted)
+
+        def update(permitted: set[int]) -> None:
+            self._permitted = permitted
+            if client.user in permitted and self._socket.fileno() >= 0:
+                self._task = self._events.create_task(self._answer(payload, sender))
+
+        self._reader = threading.Thread(target=read, name="members", daemon=True)
+        self._reader.start()
 
 
 def open_at_file(path: Path, perform: Perform, period: float) -> DirectSocket:
@@ -136,11 +163,11 @@ def open_in_kernel(name: str, perform: Perform, period: float) -> KernelSocket |
         return None
 
 
-def _members_of_group() -> set[int]:
-    """Return the users that belong to the group of this process by the system's list of groups."""
-    members = set()
+def _permitted_users() -> set[int]:
+    """Return root, this user, and the members of its group by the system's list of groups."""
+    users = {0, os.geteuid()}
     with suppress(KeyError, OSError):
         for name in grp.getgrgid(os.getegid()).gr_mem:
             with suppress(KeyError):
-                members.add(pwd.getpwnam(name).pw_uid)
-    return members
+                users.add(pwd.getpwnam(name).pw_uid)
+    return users

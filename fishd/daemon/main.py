@@ -25,7 +25,7 @@ from fishd.core import addresses, local_daemons
 from fishd.core.clock import Clock, SlowClock, SystemClock, Ticker, VirtualClock
 from fishd.core.console import log_format_option, run, status_line
 from fishd.core.errors import ConfigError, FishdError, ServoError
-from fishd.core.process import realtime
+from fishd.core.process import kernel_names, realtime
 from fishd.core.process.logs import UNHURRIED_FLUSH_TIMEOUT_S, LogWriter
 from fishd.core.process.shutdown import Shutdown, exit_now
 from fishd.core.process.systemd_notify import SystemdNotifier
@@ -143,9 +143,11 @@ class Daemon:
         except ServoError as failure:
             if isinstance(error, Exception):  # the exception below replaces it
                 log.critical("fishd failed", exc_info=error)
+            address = self._config.control.address
+            option = f" --endpoint {address}" if address else ""
             raise ServoError(
                 f"the servo could not be released and may keep its pulses: {failure}; "
-                "once it can be reached, 'fishctl release' releases it"
+                f"once it can be reached, 'fishctl estop{option}' ends them"
             ) from None
 
     async def run(self, stopping: asyncio.Event) -> None:
@@ -215,6 +217,7 @@ class Daemon:
 
     def _check_sockets(self) -> None:
         self._sockets.check()
+        kernel_names.drop_readers()
 
     def _access(self) -> Access:
         gateways, sockets = self._gateways, self._sockets

@@ -308,8 +308,9 @@ class Operations:
         self._renew(request.lease)
         self._carried_out = self._next_arrival()
         former = self._end_unless(request.lease, "the fish was stopped by hand")
+        cancelled = self._loop.pending
         self._loop.stop()
-        return self._state(former)
+        return self._state(former, cancelled)
 
     async def _estop(self, request: protocol.Estop) -> State:
         self._carried_out = self._next_arrival()
@@ -338,7 +339,7 @@ class Operations:
         self._arrivals += 1
         return self._arrivals
 
-    def _state(self, previous_holder: LeaseHolder | None = None) -> State:
+    def _state(self, previous_holder: LeaseHolder | None = None, cancelled: str = "") -> State:
         loop = self._loop
         return State(
             seq=loop.seq + 1,
@@ -347,6 +348,7 @@ class Operations:
             controller=loop.active.name,
             parameters=loop.active.parameters,
             previous_holder=previous_holder,
+            cancelled=cancelled,
         )
 
 

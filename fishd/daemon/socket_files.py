@@ -1,105 +1,24 @@
-"""Watch over the files of fishd's sockets, which are created again when they are gone.
+"""Watch over the files of fishd's sockets: files that are gone, and modes that were changed.
 
 A logout removes the folder of the login session, and with it all sockets in it; so may a program
-that cleans /tmp, or a person. Existing connections go on, but no client can connect any more.
+that cleans /tmp, or a person. Existing connections go on, but no client can connect any more. A
+mode that was changed keeps clients out, or lets other users replace the sockets.
 """
 
 import logging
-import os
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 
 from fishd.control.loop import ControlLoop
 from fishd.control.supervisor import Mode
 from fishd.core import addresses
-from fishd.core.errors import StartupError
-from fishd.core.process import unix_sockets
 from fishd.core.signals import Level, Reason
+from fishd.core.socket_file import CREATED, SocketFile, identify
 from fishd.daemon.direct_sockets import DirectSocket
-from fishd.daemon.gateway.gateways import Gateway, Gateways
+from fishd.daemon.gateway.gateways import Gateways
 
 log = logging.getLogger(__name__)
-
-
-class SocketFile:
-    """File of a socket on which a gateway listens."""
-
-    def __init__(self, gateway: Gateway, configured: str | None, key: str, group: bool) -> None:
-        """
-        gateway: its address may be that of a file, or another one, which cannot be removed
-        configured: address by the configuration; None for one that depends on the login session
-        key: key of the configuration, for messages
-        group: whether only the user and the group of this process may connect
-        """
-        self._gateway = gateway
-        self._configured = configured
-        self._key, self._group = key, group
-        self._home = gateway.address
-        """Address at the start, which is claimed as long as fishd runs."""
-        self._claim = ExitStack()
-        """Claim of another address."""
-        path = addresses.socket_path(gateway.address)
-        self._identity = _identify(path)
-        self._folder = path.parent.stat() if path else None
-        self.problem = ""
-        """Why the file could not be created again; empty if it is there."""
-
-    @property
-    def is_there(self) -> bool:
-        """Whether clients can find the socket where it was created."""
-        path = addresses.socket_path(self._gateway.address)
-        if path is None:
-            return True
-        identity = _identify(path)
-        if identity != self._identity and _is_own(path):  # touched, not replaced
-            self._identity = identity
-        return identity == self._identity != ()
-
-    @property
-    def is_away(self) -> bool:
-        """Whether the folder of the login session was gone, and the socket is in another one."""
-        return not self._configured and self._gateway.address != addresses.default_address()
-
-    def close(self) -> None:
-        """Release the claim of another folder, and remove the file there; may be called twice."""
-        self._claim.close()
-
-    def restore(self) -> None:
-        """Create the file again, in the folder where clients now look for it.
-
-        Raise `StartupError` or OSError.
-        """
-        address = self._configured or addresses.control_address()
-        path, former = addresses.socket_path(address), addresses.socket_path(self._gateway.address)
-        assert path
-        assert former
-        if self._configured:
-            self._restore_folder(path.parent)
-        # Claiming an address would wait for a program that listens there.
-        if path.exists() and not (path.is_socket() and unix_sockets.is_deserted(path)):
-            raise StartupError(f"another program has put something else at {path}; remove that")
-        with ExitStack() as claim:
-            if address not in (self._home, self._gateway.address):
-                claim.enter_context(addresses.claim_address(address))
-            with addresses.listen(address, self._key, group=self._group) as listener:
-                self._gateway.listen_at(address, listener)
-            if former != path:
-                self._claim.close()
-                self._claim = claim.pop_all()
-        self._identity = _identify(path)
-        if former != path:
-            with suppress(OSError):
-                former.unlink()
-
-    def _restore_folder(self, folder: Path) -> None:
-        """Create a configured folder as it was; raise `StartupError` for another user's folder."""
-        assert self._folder
-        if not folder.exists():
-            folder.mkdir()
-            folder.chmod(self._folder.st_mode & 0o7777)
-        if folder.stat().st_uid not in (self._folder.st_uid, os.geteuid()):
-            raise StartupError(f"{folder} belongs to another user now; remove it")
 
 
 class SocketWatch:
@@ -141,8 +60,8 @@ class SocketWatch:
     @property
     def limitation(self) -> str:
         """Line about files that are gone or in another folder; empty if there are none."""
-        if self._problem:
-            return self._problem
+        if problem := self._problem:
+            return problem
         if self._control.is_away:
             return (
                 f"the folder of {addresses.default_address()} is gone, as after a logout: the "
@@ -154,12 +73,12 @@ class SocketWatch:
     def _problem(self) -> str:
         if why := self._control.problem:
             return (
-                f"the control socket is gone and cannot be created: {why}; only 'fishctl estop', "
-                "'stop' and 'status' of this user reach this fishd"
+                f"clients cannot reach the control socket, which cannot be created again: {why}; "
+                "only 'fishctl estop', 'stop' and 'status' of this user reach this fishd"
             )
         if why := self._telemetry.problem:
-            return f"the socket of telemetry is gone and cannot be created: {why}"
-        return ""
+            return f"clients cannot reach telemetry, whose socket cannot be created again: {why}"
+        return self._control.limitation or self._telemetry.limitation
 
     def close(self) -> None:
         """Remove the files that this object has created; may be called twice."""
@@ -168,16 +87,16 @@ class SocketWatch:
         self._telemetry.close()
 
     def check(self) -> None:
-        """Create files that are gone, and report that; let the fish rest if that fails twice."""
+        """Restore files and modes, and report that; let the fish rest if that fails twice."""
         was_missing = bool(self._control.problem)
-        restored = [self._restore(file) for file in (self._control, self._telemetry)]
+        restored = [file.restore() for file in (self._control, self._telemetry)]
         if not self._control.problem and (restored[0] or self._is_direct_file_missing()):
-            restored.append(self._open_direct_file())
+            restored.append(CREATED if self._open_direct_file() else "")
             if path := addresses.socket_path(self._gateways.control.address):
                 self._loop.robot.write_recipes(path)
         if any(restored):
             self.restored += 1
-            self._report("were gone and have been created again", "warning")
+            self._report(next(filter(None, restored)), "warning")
         if self._problem != self._reported:
             self._reported = self._problem
             if self._problem:
@@ -188,26 +107,9 @@ class SocketWatch:
         elif self._control.is_away and not any(restored):
             self._return_home()
 
-    def _restore(self, file: SocketFile) -> bool:
-        """Create a file again if it is gone; return whether it was created."""
-        before, file.problem = file.problem, ""
-        if file.is_there:
-            return bool(before)
-        try:
-            file.restore()
-        except (OSError, StartupError) as error:
-            file.problem = str(error)
-            return False
-        return True
-
     def _return_home(self) -> None:
         """Move the control socket to the folder of the login session, if that exists again."""
-        before = self._gateways.control.address
-        try:
-            self._control.restore()
-        except (OSError, StartupError):
-            return  # such as another fishd that has started there since
-        if self._gateways.control.address != before:
+        if self._control.return_home():
             self._open_direct_file()
             if path := addresses.socket_path(self._gateways.control.address):
                 self._loop.robot.write_recipes(path)
@@ -215,7 +117,7 @@ class SocketWatch:
 
     def _is_direct_file_missing(self) -> bool:
         return self._direct_file is not None and (
-            self._direct is None or self._direct_identity != _identify(self._direct_file)
+            self._direct is None or self._direct_identity != identify(self._direct_file)
         )
 
     def _open_direct_file(self) -> bool:
@@ -235,13 +137,13 @@ class SocketWatch:
                     error,
                 )
             return False
-        self._direct_identity, self._direct_error = _identify(path), ""
+        self._direct_identity, self._direct_error = identify(path), ""
         return True
 
     def _close_direct_file(self) -> None:
         if self._direct and self._direct_file:
             self._direct.close()
-            if self._direct_identity == _identify(self._direct_file):
+            if self._direct_identity == identify(self._direct_file):
                 with suppress(OSError):
                     self._direct_file.unlink()
         self._direct = None
@@ -254,26 +156,9 @@ class SocketWatch:
     def _let_fish_rest(self) -> None:
         """Let a fish fade to neutral that no live client drives, and that none can reach."""
         loop = self._loop
-        if loop.lease.active or not (loop.supervisor.mode is Mode.RUNNING or loop.has_pending):
+        if loop.lease.active or not (loop.supervisor.mode is Mode.RUNNING or loop.pending):
             return
         loop.stop()
         message = "no client can connect to this fishd, and no experiment holds the fish"
         loop.lease.expired = Reason("unreachable", message, "restart fishd, or log in again")
         loop.reporter.event("sockets", f"{message}: it fades to neutral", "warning", control="")
-
-
-def _is_own(path: Path) -> bool:
-    """Return whether this process listens at a path."""
-    with suppress(PermissionError):
-        listener = unix_sockets.find_listener(path)
-        return listener is not None and listener.pid == os.getpid()
-    return False
-
-
-def _identify(path: Path | None) -> tuple[int, ...]:
-    """Return numbers that tell a file from one that replaces it; empty without a file."""
-    try:
-        status = path.lstat() if path else None
-    except OSError:
-        return ()
-    return (status.st_dev, status.st_ino, status.st_mtime_ns) if status else ()

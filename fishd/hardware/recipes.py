@@ -1,9 +1,13 @@
 """All recipes that one fishd writes, with which other programs end the pulses of its servo."""
 
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
+from fishd.core.local_daemons import LocalDaemon, hash_address
+from fishd.core.process.runtime_folder import runtime_folder
 from fishd.hardware import release_recipe
 from fishd.hardware.driver import LastResort
 
@@ -59,3 +63,28 @@ class Recipes:
 
     def _names(self) -> list[str]:
         return [str(path) for path in (self._file, *self._controls) if path]
+
+
+def find_recipe(daemon: LocalDaemon) -> dict[str, Any] | None:
+    """Return the recipe of a fishd of this user for its control socket; None if there is none.
+
+    It lies in a folder that the environment of the fishd names, which that of this process may not.
+    """
+    environment = _read_environment(daemon.pid) or {
+        "XDG_RUNTIME_DIR": f"/run/user/{daemon.user}"  # most likely
+    }
+    for folder in dict.fromkeys((runtime_folder(environment), runtime_folder({}))):
+        for recipe in release_recipe.read_all(folder):
+            if hash_address(f"ipc://{recipe['config']}") == daemon.hash:
+                return recipe
+    return None
+
+
+def _read_environment(pid: int) -> dict[str, str]:
+    """Return the environment with which a process was started; empty if it cannot be read."""
+    try:
+        variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    except OSError:
+        return {}
+    pairs = (os.fsdecode(variable).partition("=") for variable in variables)
+    return {name: value for name, _, value in pairs}

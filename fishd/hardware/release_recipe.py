@@ -18,6 +18,7 @@ from fishd.core.process.runtime_folder import runtime_folder
 NOT_RELEASED = "the servo was not released and may still have pulses: cut its power"
 """Message of a failed release."""
 
+_PREFIX = "release-"
 _MAX_BYTES = 65_536
 _MIN_NEUTRAL_US, _MAX_NEUTRAL_US = 500, 2500
 
@@ -86,27 +87,45 @@ def read(config: str) -> dict[str, Any] | None:
     Its key `fresh` is True if that file has not changed since. A recipe that another user may have
     written, or that is incomplete, is ignored.
     """
+    recipe = _read(_path(config))
+    if recipe is None or recipe["config"] != os.path.realpath(config):
+        return None
+    return recipe | {"fresh": recipe["file"] == _signature(config)}
+
+
+def read_all(folder: str) -> list[dict[str, Any]]:
+    """Return the recipes in a folder that can only come from this user or root."""
     try:
-        file = os.open(_path(config), os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        names = os.listdir(folder)
+    except OSError:
+        return []
+    recipes = (_read(f"{folder}/{name}") for name in names if name.startswith(_PREFIX))
+    return [recipe for recipe in recipes if recipe]
+
+
+def _read(path: str) -> dict[str, Any] | None:
+    try:
+        file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         try:
             if not _is_trusted(os.fstat(file), stat.S_ISREG):
                 return None
-            recipe = json.loads(os.read(file, _MAX_BYTES))
+            recipe: dict[str, Any] = json.loads(os.read(file, _MAX_BYTES))
         finally:
             os.close(file)
         valid = (
-            recipe["config"] == os.path.realpath(config)
+            isinstance(recipe["config"], str)
+            and isinstance(recipe["file"], list)
             and isinstance(recipe["function"], str)
             and isinstance(recipe["arguments"], dict)
             and _MIN_NEUTRAL_US <= recipe["neutral"] <= _MAX_NEUTRAL_US
         )
-        return recipe | {"fresh": recipe["file"] == _signature(config)} if valid else None
+        return recipe if valid else None
     except (OSError, ValueError, LookupError, TypeError):
         return None
 
 
 def _path(config: str) -> str:
-    return f"{runtime_folder()}/release-{crc32(os.fsencode(os.path.realpath(config))):08x}.json"
+    return f"{runtime_folder()}/{_PREFIX}{crc32(os.fsencode(os.path.realpath(config))):08x}.json"
 
 
 def _signature(config: str) -> list[int]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import subprocess
 from pathlib import Path
 
 from rigs.processes import FISHCTL, call, fishctl
@@ -16,10 +17,16 @@ def doctor(
     verb = ("doctor", "--json", "--set", f"control.address=ipc://{folder}/control", *settings)
     apart = bool(under or env)
     ended = call(*under, FISHCTL, *verb, env=os.environ | env) if apart else fishctl(*verb)
+    status, findings = read_findings(ended)
+    assert not any("broke off" in message for _, message in findings.values())
+    return status, findings
+
+
+def read_findings(ended: "subprocess.CompletedProcess[str]") -> tuple[int, Findings]:
+    """Return the exit status of `fishctl doctor --json`, and its findings."""
     assert ended.stderr == ""
     findings = json.loads(ended.stdout)
     assert all(bool(f["remedy"]) == (f["level"] in ("warning", "FAIL")) for f in findings)
-    assert not any("broke off" in finding["message"] for finding in findings)
     return ended.returncode, {f["check"]: (f["level"], f["message"]) for f in findings}
 
 

@@ -7,7 +7,7 @@ from rigs.processes import Subscriber, fishctl, running
 from rigs.virtual_pi_process import virtual_pi
 
 
-def test_the_last_line_says_so_and_fishctl_release_ends_the_pulses_later(tmp_path: Path) -> None:
+def test_the_last_line_says_so_and_fishctl_estop_ends_the_pulses_later(tmp_path: Path) -> None:
     with virtual_pi(tmp_path) as pi:
         # This loads the drivers: the next start must be faster than pigpiod's countdown.
         assert fishctl("release", *pi.settings).stdout == "there were no pulses\n"
@@ -20,10 +20,11 @@ def test_the_last_line_says_so_and_fishctl_release_ends_the_pulses_later(tmp_pat
         assert code == 1
         last = errors.splitlines()[-1]
         assert "the servo could not be released and may keep its pulses: pigpiod at 127." in last
-        assert last.endswith("; once it can be reached, 'fishctl release' releases it")
+        command = ["estop", "--endpoint", daemon.endpoint]
+        assert last.endswith(f"; once it can be reached, 'fishctl {' '.join(command)}' ends them")
         assert "reconnecting" not in last
         assert pi.pulse() > 0.0
         pi.control("clear")
-        release = fishctl("release", *pi.settings)
-        assert "pulses were on: neutral, then off" in release.stdout, release.stderr
+        ended = fishctl(*command)
+        assert "pulses were on: neutral, then off" in ended.stdout, ended.stderr
         pi.wait_until_released()

@@ -160,7 +160,7 @@ def measure(options: Namespace) -> Report:
                 cells += row
                 progress(condition, group, "; ".join(_describe(cell) for cell in row))
     return Report(
-        {"reliability odd-conditions": _table(cells, conditions, groups)},
+        {"reliability odd_conditions": _table(cells, conditions, groups)},
         cells,
         broken=any(cell.wrong for cell in cells),
         number=f"{sum(bool(cell.wrong) for cell in cells)} of "

@@ -119,7 +119,7 @@ def measure(options: Namespace) -> Report:
         f"{max(o.megabytes for o in outcomes):.0f} MB; {outcomes[-1].processes} last resort at a "
         "time"
     )
-    return Report({"reliability window-estop": text}, outcomes, broken=broken, number=result)
+    return Report({"reliability window_estop": text}, outcomes, broken=broken, number=result)
 
 
 def describe(outcome: Outcome) -> str:

@@ -64,7 +64,7 @@ def align(
     with ExitStack() as stack:
         fish = find_fishd(endpoint, stack)
         if swim and fish is None:
-            raise NoDaemon("no fishd is running, so no fish can swim; leave --swim out")
+            raise NoDaemon("no fishd answers, so no fish can swim; leave --swim out")
         client = stack.enter_context(CameraClient(address, fish=fish if swim else None))
         settings = client.settings()
         try:

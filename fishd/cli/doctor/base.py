@@ -18,7 +18,9 @@ from fishd.config.drivers import CHOICES
 from fishd.core import local_daemons
 from fishd.core.addresses import find_control_address, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
+from fishd.core.local_daemons import LocalDaemon
 from fishd.core.plugins import Plugins
+from fishd.core.process.kernel_names import Holder
 from fishd.core.process.unix_sockets import is_deserted
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status, Tick
@@ -38,6 +40,8 @@ class Running(NamedTuple):
     calibrations: Calibrations | None
     """Calibrations in use; None for a robot that has none."""
     endpoint: str
+    detour: str
+    """How it answered without its control socket; empty if it answered there."""
 
 
 class Unreachable(NamedTuple):
@@ -46,6 +50,10 @@ class Unreachable(NamedTuple):
     why: str
     forbidden: bool
     """Whether this user lacks the permission to connect."""
+    remedy: str = ""
+    """Remedy, if it is not the general one."""
+    is_hung: bool = False
+    """Whether it is certain that this is a fishd, which hangs or is stopped."""
 
 
 def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
@@ -55,25 +63,50 @@ def ask_daemon(endpoint: str | None) -> Running | Unreachable | None:
     another endpoint than the given one stays undetected, even if it owns the same bus.
     """
     given_endpoint, endpoint = endpoint, endpoint or find_control_address()
+    forbidden, local = False, local_daemons.find_own(given_endpoint)
     try:
-        if is_unused(endpoint) and not local_daemons.find_own(given_endpoint):
+        if is_unused(endpoint) and not local:
             return None
     except PermissionError:
-        return Unreachable(f"there may be a fishd at {endpoint}, but this user may not ask", True)
+        forbidden = True
     try:
         with Fish(given_endpoint, timeout=ANSWER_TIMEOUT_S) as fish:
             status = fish.status()
-            where = status.control if fish.detour else endpoint
-            return Running(status, _latest_tick(fish), _read_calibrations(fish), where)
+            detour, where = fish.detour, status.control if fish.detour else endpoint
+            return Running(status, _latest_tick(fish), _read_calibrations(fish), where, detour)
     except Untrusted as error:
         reason = str(error)
-    except NoDaemon:
-        reason = (
-            f"no answer from {endpoint} within {ANSWER_TIMEOUT_S:g} s, but a fishd may be there"
-        )
+    except NoDaemon as error:
+        reason = f"no answer from {endpoint} within {ANSWER_TIMEOUT_S:g} s"
+        if forbidden:
+            reason = f"there may be a fishd at {endpoint}, but this user may not ask"
+        elif hung := local_daemons.find_silent(local):
+            return Unreachable(*_describe_hung(reason, hung, given_endpoint), is_hung=True)
+        elif local:
+            remedy = "name the one that you mean with --endpoint"
+            return Unreachable(str(error), False, remedy)
+        else:
+            reason += ", but a fishd may be there"
+        return Unreachable(reason, forbidden)
     except FishError as error:
         reason = str(error)
     return Unreachable(reason, False)
+
+
+def _describe_hung(
+    reason: str, hung: list[LocalDaemon], endpoint: str | None
+) -> tuple[str, bool, str]:
+    """Return the fields of `Unreachable` for these; endpoint: the given one."""
+    processes = " and ".join(f"process {Holder(daemon.pid, daemon.user)}" for daemon in hung)
+    option = f" --endpoint {endpoint}" if endpoint else ""
+    is_service = hung[0].user == local_daemons.service_user()
+    sudo, pids = local_daemons.become(hung[0].user), " ".join(str(daemon.pid) for daemon in hung)
+    restart = "sudo systemctl restart fishd" if is_service else f"kill -9 {pids}"
+    return (
+        f"{reason}: {processes}, a fishd, does not answer: it hangs or is stopped",
+        False,
+        f"'{sudo}fishctl estop{option}' ends its pulses; then: {restart}",
+    )
 
 
 def is_unused(endpoint: str) -> bool:
@@ -181,7 +214,7 @@ class Context(Machine):
         """Return the remedy for a daemon that does not answer."""
         if daemon.forbidden:
             return f"{self.as_fishd}, or name another with --endpoint"
-        return "stop what hangs there, or name the fishd with --endpoint"
+        return daemon.remedy or "stop what hangs there, or name the fishd with --endpoint"
 
     @property
     def as_fishd(self) -> str:

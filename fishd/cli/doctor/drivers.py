@@ -103,7 +103,7 @@ def force(context: Context) -> Result:
 
 def _check_force_of_daemon(context: Context) -> Result:
     assert context.running
-    status, tick, _, _ = context.running
+    status, tick, *_ = context.running
     if tick is None:
         return fail(f"fishd runs, but {status.telemetry} is silent", "fishctl status; a firewall?")
     if status.reason and status.reason.code.startswith("sensor"):

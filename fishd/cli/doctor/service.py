@@ -9,6 +9,7 @@ import zmq
 from fishd.cli.doctor.base import ANSWER_TIMEOUT_S, Context, Running, Unreachable, is_unused
 from fishd.core import addresses, local_daemons
 from fishd.core.errors import FishError, StartupError
+from fishd.core.process.unix_sockets import is_open_to_all
 from fishd.hardware.checks import Check, Result, fail, ok, skipped, warning
 
 UNIT = "fishd.service"
@@ -32,8 +33,10 @@ def daemon(context: Context) -> Result:
             )
         return ok("no fishd is running")
     if isinstance(context.daemon, Unreachable):
-        return warning(context.daemon.why, context.suggest_remedy(context.daemon))
+        result = fail if context.daemon.is_hung else warning
+        return result(context.daemon.why, context.suggest_remedy(context.daemon))
     status, endpoint = context.daemon.status, context.daemon.endpoint
+    option = f" --endpoint {endpoint}" if context.daemon.detour and endpoint else ""
     message = f"fishd {status.version} (pid {status.pid}), robot {status.robot}, {status.mode}"
     if status.robot != context.config.robot:
         return warning(
@@ -43,12 +46,15 @@ def daemon(context: Context) -> Result:
     if status.reason:
         return fail(
             f"{message}: {status.reason.code}: {status.reason.message}",
-            "mend the cause, then fishctl clear-fault",
+            f"mend the cause, then fishctl clear-fault{option}",
         )
     if status.limitations:
         return warning(
             f"{message}; {'; '.join(status.limitations)}", "see docs/how-to/troubleshooting.md"
         )
+    if context.daemon.detour:
+        remedy = f"name it:{option}, or export FISHD_ENDPOINT={endpoint}"
+        return warning(f"{message}; {context.daemon.detour}", remedy)
     return ok(message)
 
 
@@ -63,7 +69,7 @@ def control(context: Context) -> Result:
     if isinstance(context.daemon, Running):
         served = context.daemon.endpoint
         if not context.daemon.status.control:
-            return fail("its file is gone, and fishd cannot create it", "see 'daemon'")
+            return fail("clients cannot reach it, and fishd cannot create it again", "see 'daemon'")
     try:
         address = context.config.control.address or served or addresses.control_address()
     except StartupError as error:
@@ -122,6 +128,10 @@ def _check_address(context: Context, address: str, key: str) -> Result:
     daemon = context.daemon
     if isinstance(daemon, Unreachable):  # binding could take its socket away
         return skipped("not tried: a fishd may use it; see 'daemon'")
+    if (path := addresses.socket_path(address)) and is_open_to_all(path.parent):
+        return warning(
+            f"every user of this machine may replace {address}", f"chmod o-w {path.parent}"
+        )
     if daemon and address in (daemon.status.telemetry, daemon.endpoint):
         return ok(f"{address} is served by the running fishd")
     try:

@@ -287,9 +287,8 @@ class Remote(Controller[RemoteParameters]):
             what = f"from the agent at {agent} within {self.parameters.first_action:g} s"
             if self._late or self._foreign:
                 raise _silence_fault(f"no action has come in time {what} ({self._wrong})")
-            raise _silence_fault(
-                f"no action has come {what}; start the agent, and check its address"
-            )
+            remedy = self._wire.problem or "start the agent, and check its address"
+            raise _silence_fault(f"no action has come {what}; {remedy}")
         self.silent += 1
         if self.silent >= self.parameters.misses:
             raise _silence_fault(

@@ -13,7 +13,7 @@ import socket
 import struct
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ _PREFIX = "fishd"
 _MAX_NAME_BYTES = 107
 """Maximum length of an abstract name in Linux, without the zero byte before it [bytes]."""
 _BACKLOG = 4096
-"""Maximum number of processes that can read the holder of a name."""
+"""Maximum number of processes that can read the holder of a name until it drops them."""
 _TABLE = Path("/proc/net/unix")
 """The kernel's list of Unix sockets."""
 _MAX_ANSWER_BYTES = 2**20
@@ -29,6 +29,8 @@ _MAX_ANSWER_BYTES = 2**20
 _CREDENTIALS = "3i"
 """Layout of the kernel's struct ucred: pid, uid, gid."""
 _NO_CONNECTION = {errno.ECONNREFUSED, errno.ENOENT}
+_held: list[socket.socket] = []
+"""Sockets of the names that this process holds."""
 
 
 class Holder(NamedTuple):
@@ -67,7 +69,20 @@ def claimed(name: str) -> Iterator[None]:
                 raise
             raise NameTaken(name) from None
         held.listen(_BACKLOG)
-        yield
+        held.setblocking(False)
+        _held.append(held)
+        try:
+            yield
+        finally:
+            _held.remove(held)
+
+
+def drop_readers(limit: int = 50) -> None:
+    """Drop the connections of processes that have read the holder of a name; limit: of each."""
+    for held in _held:
+        with suppress(OSError):
+            for _ in range(limit):
+                held.accept()[0].close()
 
 
 def find_holder(name: str) -> Holder | None:
@@ -77,26 +92,40 @@ def find_holder(name: str) -> Holder | None:
         failure = probe.connect_ex(_address(name))
         if failure in _NO_CONNECTION:
             return None
-        if failure:  # too many processes have connected
-            return Holder(0, -1)
-        size = struct.calcsize(_CREDENTIALS)
-        peer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
+        return read_listener(probe) if not failure else Holder(0, -1)  # too many have connected
+
+
+def read_listener(probe: socket.socket) -> Holder:
+    """Return the process that listens where a Unix socket is connected."""
+    size = struct.calcsize(_CREDENTIALS)
+    peer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, size)
     pid, user, _ = struct.unpack(_CREDENTIALS, peer)
     return Holder(pid, user)
 
 
-def read_names(prefix: str) -> list[str]:
+def read_names(prefix: str) -> dict[str, str]:
     """Return the names that begin with a prefix and are held now by processes of any user.
 
-    None where the kernel's list cannot be read, as with `ProcSubset=pid` of systemd.
+    Each has the number of its socket, for `holds`. None where the kernel's list cannot be read, as
+    with `ProcSubset=pid` of systemd.
     """
     start = f"@{_PREFIX}/{prefix}"
     try:
         table = _TABLE.read_text(encoding="utf-8", errors="replace")
     except OSError:
-        return []
-    words = (line.rpartition(" ")[2] for line in table.splitlines())
-    return [word.removeprefix(f"@{_PREFIX}/") for word in words if word.startswith(start)]
+        return {}
+    rows = (line.split()[-2:] for line in table.splitlines())
+    return {
+        row[1].removeprefix(f"@{_PREFIX}/"): row[0] for row in rows if row[-1].startswith(start)
+    }
+
+
+def holds(pid: int, number: str) -> bool:
+    """Return whether it is certain that a process of this user has the socket of this number."""
+    with suppress(OSError):
+        links = Path(f"/proc/{pid}/fd").iterdir()
+        return any(str(link.readlink()) == f"socket:[{number}]" for link in links)
+    return False
 
 
 def bind_datagrams(name: str) -> socket.socket:

@@ -82,7 +82,7 @@ class Shutdown:
         elif _call_within(_RELEASE_TIMEOUT_S, self.release):
             outcome = "the servo is released and"
         else:
-            outcome = "the servo may keep its pulses ('fishctl release' releases it) and"
+            outcome = "the servo may keep its pulses ('fishctl estop' ends them) and"
         place = _format_place(sys._current_frames().get(self._main))
         line = (
             f"{name} came {SHUTDOWN_TIMEOUT_S:g} s ago, and fishd hangs {place}: {outcome} the "

@@ -7,15 +7,13 @@ import errno
 import os
 import socket
 import stat
-import struct
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
 
 from fishd.core.errors import StartupError
-from fishd.core.process.kernel_names import NameTaken, claimed
+from fishd.core.process.kernel_names import Holder, NameTaken, claimed, read_listener
 
 MAX_PATH_BYTES = 107
 """Maximum length of the path of a Unix socket in Linux [bytes]."""
@@ -66,18 +64,20 @@ def find_trust_problem(path: Path) -> str:
     return ""
 
 
+def is_open_to_all(folder: Path) -> bool:
+    """Return whether every user may remove the files of others in a folder."""
+    try:
+        mode = folder.stat().st_mode
+    except OSError:
+        return False
+    return bool(mode & stat.S_IWOTH and not mode & stat.S_ISVTX)
+
+
 def _only_root_may_write(folder: os.stat_result) -> bool:
     return folder.st_uid == _ROOT and not folder.st_mode & _WRITABLE_BY_OTHERS
 
 
-class Listener(NamedTuple):
-    """Process that listens on a socket, and its user."""
-
-    pid: int
-    user: int
-
-
-def find_listener(path: Path) -> Listener | None:
+def find_listener(path: Path) -> Holder | None:
     """Return the listener of a socket; None if there is none, or it cannot accept now.
 
     Raise PermissionError if this user may not connect.
@@ -86,11 +86,7 @@ def find_listener(path: Path) -> Listener | None:
         failure = _connect(probe, path)
         if failure == errno.EACCES:
             raise PermissionError(failure, os.strerror(failure), os.fspath(path))
-        if failure:
-            return None
-        peer = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-    pid, user, _ = struct.unpack("3i", peer)
-    return Listener(pid, user)
+        return None if failure else read_listener(probe)
 
 
 def is_deserted(path: Path) -> bool:

@@ -21,6 +21,10 @@ PING, PONG = b"~", b"-"
 """First bytes of a heartbeat and of the answer to it."""
 LISTEN = b"@"
 """First byte of a further address to listen at; its listener is sent with it."""
+MAX_FORMER_LISTENERS = 16
+"""Largest number of further listeners of a gateway."""
+_former_listeners: list[str] = []
+"""Addresses of the further listeners of this process."""
 START, STARTED = b"*", b"/"
 """First bytes of a request to the fork server for a gateway, and of the answer to it."""
 _PART, _LAST = b"+", b"="
@@ -48,11 +52,22 @@ def kind_and_address(message: bytes) -> tuple[str, str]:
 
 
 def listen(server: "zmq.Socket[bytes]", message: bytes, listener: int) -> None:
-    """Let a gateway's socket listen at the address in a message, too; `listener` is its socket."""
+    """Let a gateway's socket listen at the address in a message, too; `listener` is its socket.
+
+    Connections end with the listener through which they came, so former ones are kept, but no more
+    than `MAX_FORMER_LISTENERS`: then all connections end, and clients connect again.
+    """
     import zmq
 
+    if len(_former_listeners) >= MAX_FORMER_LISTENERS:
+        for address in set(_former_listeners):  # `unbind` closes all listeners of an address
+            server.unbind(address)
+        _former_listeners.clear()
     server.set(zmq.USE_FD, listener)
     server.bind(message[1:].decode())
+    bound = server.get(zmq.LAST_ENDPOINT)
+    assert isinstance(bound, bytes)
+    _former_listeners.append(bound.rstrip(b"\0").decode())
 
 
 def started(kind: str, pid: int, outcome: str) -> bytes:

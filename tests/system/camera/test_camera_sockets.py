@@ -3,6 +3,7 @@
 import json
 import os
 import resource
+import shutil
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -221,3 +222,28 @@ def test_a_frame_is_young_when_a_learner_has_it(camera: CameraProcess) -> None:
     # One stall of the machine delays more than 1 % of all frames, so the best third is judged.
     thirds = [float(np.percentile(ages[begin : begin + 200], 99)) for begin in (0, 200, 400)]
     assert min(thirds) <= 0.010
+
+
+def test_files_of_the_sockets_that_are_gone_are_created_again(both: Both, tmp_path: Path) -> None:
+    folder = tmp_path / "sockets"
+    folder.mkdir()
+    with running_camera(
+        folder, f"simulated.fishd={both[0].endpoint}", "simulated.rate=120"
+    ) as camera:
+        camera.is_in("streaming")
+        files = [
+            Path(address.removeprefix("ipc://")) for address in (camera.endpoint, camera.frames)
+        ]
+        with camera.client() as earlier:
+            next(earlier.frames())
+            shutil.rmtree(folder)
+            wait_until(lambda: all(file.exists() for file in files))
+            files[0].chmod(0)
+            wait_until(lambda: bool(files[0].stat().st_mode & 0o200))
+            with camera.client() as client:
+                next(client.frames())
+            assert earlier.status().state == "streaming"
+            next(earlier.frames())
+        said = camera.end()[2]
+    for address in (camera.endpoint, camera.frames):
+        assert f"the files of the socket {address} were gone and have been created again" in said

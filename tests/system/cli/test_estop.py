@@ -59,6 +59,25 @@ def test_a_fishd_that_hangs_or_is_dead_keeps_no_pulses(pi: Bench, number: signal
     )
 
 
+def test_the_recipe_of_a_fishd_that_hangs_is_found_from_another_environment(pi: Bench) -> None:
+    session = pi.folder / "session"
+    session.mkdir()
+    login = ("env", f"XDG_RUNTIME_DIR={session}")
+    with running(pi.folder, *pi.settings, under=login) as daemon:
+        swim(pi, daemon)
+        cron = {name: value for name, value in os.environ.items() if name != "XDG_RUNTIME_DIR"}
+        daemon.stop()
+        try:
+            hung = one_line(daemon.fishctl("status"))
+            ended = daemon.fishctl_apart("estop", env=cron)
+            assert pi.pi.pulse() == 0
+        finally:
+            daemon.process.send_signal(signal.SIGCONT)
+    assert f"'fishctl estop --endpoint {daemon.endpoint}' ends the pulses without it" in hung
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.endswith("\nstopped through: last resort\n")
+
+
 def test_pulses_that_cannot_be_ended_are_no_success(pi: Bench) -> None:
     with pi.daemon() as daemon:
         swim(pi, daemon)

@@ -110,7 +110,7 @@ def test_a_servo_that_is_not_released_keeps_nobody_and_is_named() -> None:
     hang = {"hang": "time.sleep(60)", "limits": SLOW_LAST_WORDS}
     for status, output in ends(*(hang | {"release": release} for release in releases)):
         assert (status, output.partition("\n")[0]) == (1, "released")
-        assert "the servo may keep its pulses ('fishctl release' releases it)" in output
+        assert "the servo may keep its pulses ('fishctl estop' ends them)" in output
 
 
 @pytest.mark.realtime

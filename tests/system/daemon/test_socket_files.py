@@ -1,9 +1,11 @@
 """A fishd whose sockets, or their folder, are gone can be found, seen and stopped."""
 
+import asyncio
 import contextlib
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -14,15 +16,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from rigs.doctor_process import doctor, free_telemetry
+from rigs.doctor_process import Findings, doctor, free_telemetry, read_findings
 from rigs.other_user import command_as_user, spare_user
 from rigs.processes import (
     FISHCTL,
     FISHD,
+    PATIENCE,
     Daemon,
     Process,
     Subscriber,
     call,
+    fishctl,
     one_line,
     running,
     sets,
@@ -32,6 +36,7 @@ from rigs.processes import (
 from fishd.client import Fish, NoDaemon
 from fishd.core import local_daemons
 from fishd.core.process import kernel_names
+from fishd.daemon import direct_sockets
 
 SWIM = ("set-controller", "hold", "--angle", "0.2")
 
@@ -73,6 +78,50 @@ def test_sockets_are_created_again_when_their_folder_was_removed(folder: Path) -
     assert list(folder.iterdir()) == []
 
 
+def mode(path: Path) -> int:
+    return path.stat().st_mode & 0o7777
+
+
+def test_modes_of_sockets_and_of_their_folder_are_restored(folder: Path) -> None:
+    with Daemon(folder) as daemon:
+        events = Subscriber(daemon.wait_until_up().telemetry, b"event").connected()
+        files = folder, folder / "control", folder / "control.estop"
+        before = [mode(file) for file in files]
+        assert before == [0o755, 0o660, 0o660]
+        assert daemon.fishctl(*SWIM).returncode == 0
+        for count, (file, other) in enumerate(((files[0], 0), (files[0], 0o777), (files[1], 0)), 1):
+            file.chmod(other)
+            event = events.until(kind="sockets")
+            assert (
+                "or their folder had other modes, and have those of the start" in event["message"]
+            )
+            assert [mode(file) for file in files] == before
+            assert daemon.status().recovered_errors["sockets_restored"] == count
+        files[2].chmod(0)
+        wait_until(lambda: mode(files[2]) == 0o660)
+        assert daemon.status().mode == "running"
+        events.close()
+
+
+def test_telemetry_in_a_folder_is_restored_or_reported(folder: Path) -> None:
+    apart = folder.with_name("telemetry")
+    apart.mkdir()
+    with running(folder, *sets(f"telemetry.address=ipc://{apart}/telemetry")) as daemon:
+        shutil.rmtree(apart)
+        wait_until((apart / "telemetry").exists)
+        wait_until(lambda: daemon.status().recovered_errors["sockets_restored"] == 1)
+        with Fish(daemon.endpoint) as fish:
+            next(fish.ticks())
+        kept = break_folder(apart)
+        why = "clients cannot reach telemetry, whose socket cannot be created again: "
+        wait_until(lambda: why in str(daemon.status().limitations))
+        assert daemon.status().control == daemon.endpoint
+        apart.unlink()
+        kept.rename(apart)
+        wait_until(lambda: daemon.status().limitations == ())
+        assert why in daemon.end()[2]
+
+
 def test_the_loss_of_sockets_is_an_event_and_a_line_in_the_log(folder: Path) -> None:
     with Daemon(folder) as daemon:
         events = Subscriber(daemon.wait_until_up().telemetry, b"event").connected()
@@ -105,9 +154,9 @@ def test_a_fish_that_no_client_can_reach_rests_and_can_still_be_stopped(folder: 
         wait_until(lambda: daemon.status().mode == "idle")  # by its name in the kernel
         status = daemon.fishctl("status")
         assert status.returncode == 0
-        assert f"process {daemon.pid} answered at its name in the kernel" in status.stderr
+        assert f"(process {daemon.pid}) answered at its name in the kernel" in status.stderr
         assert "rests, as   no client can connect to this fishd" in status.stdout
-        assert "the control socket is gone and cannot be created: " in status.stdout
+        assert "the control socket, which cannot be created again: " in status.stdout
         assert daemon.fishctl("stop").stdout.startswith("idle")
         refused = one_line(daemon.fishctl("set-controller", "swing"))
         assert f"no fishd at {daemon.endpoint}" in refused
@@ -147,6 +196,16 @@ def test_a_controller_that_is_to_start_later_does_not_start_unreachable(folder: 
         kept.rename(folder)
 
 
+def test_stop_says_that_it_has_cancelled_the_controller_of_start(folder: Path) -> None:
+    with running(folder, *sets("start.controller=swing", "start.rest=3600")) as daemon:
+        stopped = daemon.fishctl("stop")
+        assert stopped.stdout.startswith("idle")
+        assert stopped.stderr == (
+            "fishctl: swing, the controller of 'start', does not start any more\n"
+        )
+        assert daemon.fishctl("stop").stderr == ""
+
+
 def test_a_file_of_another_program_is_not_replaced(folder: Path) -> None:
     with running(folder) as daemon:
         with socket.socket(socket.AF_UNIX) as other:
@@ -183,14 +242,16 @@ class User(NamedTuple):
         *become, env, path, python = self.command
         return [*become, env, login, f"HOME={self.home}", path, python]
 
-    def fishd(self, session: Path | None) -> Process:
+    def fishd(self, session: Path | None, *settings: str) -> Process:
         """Start a fishd with its default control address."""
-        return Process(
-            *self.in_session(session), FISHD, *sets("telemetry.address=tcp://127.0.0.1:0")
-        )
+        where = sets("telemetry.address=tcp://127.0.0.1:0", *settings)
+        return Process(*self.in_session(session), FISHD, *where)
 
     def fishctl(self, session: Path | None, *arguments: str) -> "subprocess.CompletedProcess[str]":
         return call(*self.in_session(session), FISHCTL, *arguments)
+
+    def doctor(self, session: Path | None) -> tuple[int, Findings]:
+        return read_findings(self.fishctl(session, "doctor", "--json", *free_telemetry()))
 
     def daemons(self) -> list[local_daemons.LocalDaemon]:
         return [daemon for daemon in local_daemons.find_all() if daemon.user == self.number]
@@ -245,27 +306,92 @@ def test_after_a_logout_the_socket_is_elsewhere_until_the_next_login(user: User)
 
 def test_from_cron_a_fishd_is_stopped_and_other_verbs_say_where_it_is(user: User) -> None:
     session = open_session(user)
-    with user.fishd(session):
+    with user.fishd(session) as fishd:
         wait_until((session / "fishd" / "control.estop").exists)
         for verb in ("status", "stop", "estop"):
             done = user.fishctl(None, verb)
             assert done.returncode == 0, done.stderr
-            assert "answered at its name in the kernel" in done.stderr + done.stdout
+            said = done.stderr + done.stdout
+            assert f"nothing listens at ipc:///tmp/fishd-{user.number}/control; fish " in said
+            assert f" at ipc://{session}/fishd/control answered at its name in the kern" in said
         refused = one_line(user.fishctl(None, *SWIM))
-        assert f"serves ipc://{session}/fishd/control: name it with --endpoint" in refused
+        assert f"runs: name it with --endpoint ipc://{session}/fishd/control" in refused
+        (todo,) = (
+            line for line in user.fishctl(None, "status").stdout.splitlines() if "to do" in line
+        )
+        remedy = todo.partition("then: fishctl ")[2].split()
+        assert user.fishctl(None, *remedy).stdout.startswith("idle")
         assert user.fishctl(session, "status").stderr == ""
+        _, findings = user.doctor(None)
+        assert findings["daemon"][0] == "warning"
+        assert "answered at its name in the kernel" in findings["daemon"][1]
+        fishd.stop()
+        status, findings = user.doctor(None)
+        assert status == 1
+        assert findings["daemon"][0] == "FAIL"
+        assert f"process {fishd.pid}, a fishd, does not answer" in findings["daemon"][1]
+        hung = one_line(fishctl("--endpoint", f"ipc://{session}/fishd/control", "status"))
+        assert f"process {fishd.pid} of user {user.number}, which serves" in hung
+        assert f"'sudo -u \\#{user.number} fishctl estop --endpoint ipc://" in hung  # here: root
+        hung = one_line(user.fishctl(None, "status"))
+        assert "hangs or is stopped: 'fishctl estop' ends its pulses" in hung
+        ended = user.fishctl(None, "estop")
+        assert ended.stderr == ""
+        assert ended.stdout.startswith("no pulses: the fish is simulated")
+        assert "start one" not in ended.stdout
+        fishd.process.send_signal(signal.SIGCONT)
+
+
+def test_a_mode_that_fishd_may_not_restore_is_a_limitation_with_its_remedy(user: User) -> None:
+    shared = user.home / "shared"
+    shared.mkdir()
+    shared.chmod(0o777)  # root's
+    with user.fishd(None, f"control.address=ipc://{shared}/control"):
+        wait_until((shared / "control.estop").exists)
+
+        def limitation() -> str:
+            return user.fishctl(None, "status").stdout.partition("limitation")[2]
+
+        for other in (0o755, 0o700):  # only the latter keeps clients out
+            shared.chmod(other)
+            wait_until(
+                lambda other=other: (
+                    f"from 777 to {other:o}: sudo chmod 777 {shared}" in limitation()
+                )
+            )
+            assert ("cannot be created again" in limitation()) == (other == 0o700)
+        refused = one_line(user.fishctl(None, "--endpoint", f"ipc://{shared}/control", *SWIM))
+        assert "this user may not connect; fish " in refused
+        assert f"sudo chmod 777 {shared}" in refused
+        shared.chmod(0o777)
+        wait_until(lambda: not limitation())
+        for verb in ("stop", "estop"):
+            assert user.fishctl(None, verb).returncode == 0
 
 
 def test_estop_stops_every_fishd_that_may_be_meant_and_stop_asks_which(user: User) -> None:
     one, other = open_session(user, "one"), open_session(user, "other")
-    with user.fishd(one), user.fishd(other):
+    with user.fishd(one) as first, user.fishd(other):
         for session in (one, other):
             wait_until((session / "fishd" / "control.estop").exists)
         refused = user.fishctl(None, "stop")
         assert refused.returncode == 1
         for session in (one, other):
-            assert f"serves ipc://{session}/fishd/control" in refused.stderr
-        assert user.fishctl(None, "estop").returncode == 0
+            assert f"--endpoint ipc://{session}/fishd/control" in refused.stderr
+        stopped = user.fishctl(None, "estop")
+        assert stopped.returncode == 0
+        for session in (one, other):
+            assert f" at ipc://{session}/fishd/control" in stopped.stdout
+        assert stopped.stdout.endswith(" answered at their names in the kernel\n")
+        first.stop()
+        for session in (one, None):  # a stop that reached only the other fish would deceive
+            refused = user.fishctl(session, "stop")
+            assert refused.returncode == 1
+            assert f"process {first.pid}" in refused.stderr
+            assert "'fishctl estop' ends " in refused.stderr
+        stopped = user.fishctl(None, "estop")
+        assert f"; of process {first.pid}, which does not answer: no pulses" in stopped.stdout
+        first.process.send_signal(signal.SIGCONT)
         for session in (one, other):
             assert "mode        estop" in user.fishctl(session, "status").stdout
 
@@ -312,10 +438,9 @@ def test_an_answer_of_another_process_is_not_believed(tmp_path: Path) -> None:
         process.kill()
 
 
-def test_a_socket_whose_rights_or_times_were_changed_is_still_there(folder: Path) -> None:
+def test_a_socket_whose_times_were_changed_is_still_there(folder: Path) -> None:
     with running(folder) as daemon:
         assert daemon.fishctl(*SWIM).returncode == 0
-        (folder / "control").chmod(0o666)
         os.utime(folder / "control")
         seq = daemon.status().seq + 40  # four checks
         wait_until(lambda: daemon.status().seq > seq)
@@ -336,7 +461,7 @@ def test_names_that_another_user_holds_neither_hide_a_fishd_nor_delay_its_stop(
         for verb in ("status", "stop", "estop"):
             done = user.fishctl(None, verb)
             assert done.returncode == 0, done.stderr
-            assert f"process {process.pid} answered" in done.stderr + done.stdout
+            assert f"(process {process.pid}) at ipc://" in done.stderr + done.stdout
 
 
 def test_a_stop_waits_once_for_all_names_that_do_not_answer() -> None:
@@ -377,3 +502,33 @@ def test_where_the_kernel_lists_no_names_there_are_none(
     monkeypatch.setattr(kernel_names, "_TABLE", tmp_path / "net" / "unix")
     with Fish(f"ipc://{tmp_path}/control") as fish, pytest.raises(NoDaemon, match="start one"):
         fish.estop()
+
+
+def test_a_user_who_joins_the_group_is_answered_without_a_restart(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(direct_sockets, "MEMBERS_PERIOD_S", 0.0)
+    stranger = command_as_user(spare_user())
+    name = f"daemon/0/{os.getpid()}/00000000/group"
+    code = (
+        "import sys\nfrom fishd.core.process.kernel_names import exchange_datagrams as ask\n"
+        "print(len(ask([sys.argv[1]], b'', float(sys.argv[2]))))"
+    )
+
+    async def ask(seconds: float) -> str:
+        child = await asyncio.create_subprocess_exec(
+            *stranger, "-c", code, name, str(seconds), stdout=subprocess.PIPE
+        )
+        return (await child.communicate())[0].decode()
+
+    async def perform(_: bytes) -> bytes:
+        return b"answer"
+
+    async def try_both() -> None:
+        kernel = direct_sockets.KernelSocket(name, perform, 0.01)
+        assert await ask(0.1) == "0\n"
+        monkeypatch.setattr(direct_sockets, "_permitted_users", lambda: {spare_user()})
+        assert await ask(PATIENCE) == "1\n"
+        kernel.close()
+
+    asyncio.run(try_both())

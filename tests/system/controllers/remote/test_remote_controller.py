@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 from rigs.harness import LIMITS, Rig
+from rigs.processes import wait_until
 from rigs.scripted_agent import (
     ScriptedAgent,
     connect,
@@ -88,6 +89,16 @@ def test_the_first_action_may_take_its_time_at_neutral(rig: Rig, agent: Scripted
     assert rig.reason == "remote-silent"
     assert "no action has come from" in reason(rig)
     assert "within 2 s; start the agent, and check its address" in reason(rig)
+
+
+def test_a_host_that_no_name_server_knows_is_named(rig: Rig) -> None:
+    rig.start("remote", agent="tcp://fish_1.invalid:9873", first_action=2.0, deadline=0.001)
+    rig.run()
+    wire = remote(rig)._wire
+    wait_until(lambda: bool(wire.problem))
+    rig.run_for(2.0)
+    assert rig.reason == "remote-silent"
+    assert "within 2 s; the name fish_1.invalid is not known" in reason(rig)
 
 
 def test_a_late_action_is_for_no_other_tick(rig: Rig, agent: ScriptedAgent) -> None:

@@ -1,8 +1,14 @@
 """Messages between fishd and its gateways."""
 
+import os
+import socket
+from pathlib import Path
+
 import pytest
+import zmq
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs.processes import wait_until
 
 from fishd.daemon.gateway import link
 
@@ -40,3 +46,31 @@ def test_a_link_never_blocks_its_sender() -> None:
 
     with ours, theirs, pytest.raises(BlockingIOError):
         fill()
+
+
+def count_files() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def test_a_socket_that_is_created_again_and_again_keeps_few_listeners(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(link, "_former_listeners", [])
+    path = tmp_path / "control"
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as server:
+        before = count_files()
+        for _ in range(5 * link.MAX_FORMER_LISTENERS):
+            path.unlink(missing_ok=True)
+            with socket.socket(socket.AF_UNIX) as listener:
+                listener.bind(str(path))
+                listener.listen()
+                link.listen(
+                    server, link.LISTEN + f"ipc://{path}".encode(), os.dup(listener.fileno())
+                )
+        wait_until(lambda: count_files() <= before + link.MAX_FORMER_LISTENERS)
+        with context.socket(zmq.DEALER) as client:
+            client.set(zmq.LINGER, 0)
+            client.connect(f"ipc://{path}")
+            client.send(b"request")
+            assert server.poll(60_000)
+            assert server.recv_multipart()[-1] == b"request"
