@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
-import msgspec
 from msgspec import to_builtins
 
 from fishd.cli.completion import complete_contestant
@@ -187,7 +186,8 @@ def _swim(task: _Task) -> _Outcome:
             result = comparison.compare(
                 config, accepted, task.seconds, settle, task.runs, bar.at, camera
             )
-        _write_result(experiment, result[0])
+        if experiment:
+            experiment.write_result(result[0])
     return _Outcome(
         *result,
         [(*omitted, 0) for omitted in left_out],
@@ -227,17 +227,12 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
                 ending.is_interrupted = True
             elif ending.is_interrupted:
                 ended, status = f"interrupted; the fish rests; {ending.hint}", INTERRUPTED
-            _write_result(experiment, live.standings())
+            if experiment:
+                experiment.write_result(live.standings())
     return _Outcome(
         live.standings(), live.traces(), live.left_out, session.amplitude, session.unit, True,
         ended, status,
     )  # fmt: skip
-
-
-def _write_result(experiment: "Experiment | None", standings: "list[Standing]") -> None:
-    """Write the result into the folder of the experiment, if there is one."""
-    if experiment:
-        experiment.write("result.json", msgspec.json.encode(standings))
 
 
 def _check_camera(camera: str | None, chosen: "list[Contestant]") -> None:

@@ -203,6 +203,7 @@ class _Optimisation:
         proposal = self.search.propose()
         with ending.measuring():
             optimum = self._judge(proposal, waiting)
+            self.experiment.write_result(optimum)
             folder, unit = self.experiment.path, self.session.unit
             if self.as_json:
                 print_json(optimum)

@@ -256,8 +256,10 @@ class _Sweep:
             for curve in all_curves
             if (best := curves.find_best(curve))
         ]
+        best_points = [curves.best_to_builtins(best, quantity) for _, best in bests]
+        folder.experiment.write_result(best_points)
         if self.as_json:
-            print_json([curves.best_to_builtins(best, quantity) for _, best in bests])
+            print_json(best_points)
         else:
             for curve, best in bests:
                 unit = self.units.get(best.x_name, "")

@@ -243,7 +243,9 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     words += ["--vary", "plant.xi=0.9,1.2", "--jobs", "2"]
     first = fishctl(*words, "--frequency", "1.4:2:0.2")
     assert (first.returncode, first.stderr) == (0, "")
-    assert "sine plant.xi=1.2: best measured at frequency" in first.stdout, "four points are too few"
+    assert "sine plant.xi=1.2: best measured at frequency" in first.stdout, (
+        "four points are too few"
+    )
     second = fishctl("sweep", "--resume", str(folder), "--frequency", "1.2:2:0.2", "--json")
     assert second.returncode == 0
     assert "20 points, 16 of them measured already" in second.stderr
@@ -253,6 +255,7 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     ]
     assert all(curve["x_ci95_low"] < curve["x"] < curve["x_ci95_high"] for curve in best)
     assert all(curve["parameters"]["frequency"] == curve["x"] for curve in best)
+    assert msgspec.json.decode((folder / "result.json").read_bytes()) == best
     assert all(curve["measured"]["x"] in (1.2, 1.4, 1.6, 1.8, 2.0) for curve in best)
     with (folder / "rows.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
