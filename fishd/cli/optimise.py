@@ -140,7 +140,7 @@ def _optimise(
             "objective": aim.objective,
             "target": aim.target,
         }
-        with place.open(fish, session.config, settings, session.unit) as experiment:
+        with place.open(fish, settings, session) as experiment:
             fish.announce(as_json)
             return _Optimisation(
                 name, parameters, search, budget, min_gain, aim, session, experiment, fish, as_json

@@ -108,7 +108,10 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     more = fishctl(*again.split(), "40")
     assert f"{folder}: 3 candidates measured already" in more.stdout
     assert (folder / "rows.csv").read_text().startswith(table)
-    assert len(read(folder / "search-2.mcap")) > 100
+    second = open_run(folder / "search-2.mcap").ticks
+    assert len(second) > 100
+    noise = [{tick.fx for tick in ticks[:20]} for ticks in (run.ticks, second)]
+    assert not noise[0] & noise[1], "what is measured later is independent"
     refused = one_line(fishctl(*words, "--resume", str(folder), "--amplitude", "0.3"))
     assert "began with parameters.amplitude = None, now it is 0.3" in refused
     assert "--resume" in one_line(fishctl(*words, "--folder", str(folder)))
