@@ -29,7 +29,7 @@ def picture_options(function: F) -> F:
 
 def _picture_path(picture: Path | None, file: Path, what: str, force: bool) -> Path:
     """Return the file of a picture of a swim; raises `ParameterError` if it must not be written."""
-    path = picture or Path(f"{file.stem}-{what}.png")
+    path = picture or file.with_name(f"{file.stem}-{what}.png")
     check_new_files([path], replace=force)
     return path
 
@@ -47,7 +47,7 @@ def midlines(file: Path, settle: float, picture: Path | None, force: bool, as_js
     """Draw the midlines of a tail beat relative to the mean, and the amplitude along the body.
 
     SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is a .png
-    file in this folder, named after SWIM.
+    file beside SWIM, named after it.
     """
     from fishd.lab.swimmer.midlines import compute_envelope, draw_midlines
     from fishd.virtual.swimmer import checkpoint
@@ -98,7 +98,7 @@ def wake(
     """Draw the water at the end of a swim, and the body in it.
 
     SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is a .png
-    file in this folder, named after SWIM.
+    file beside SWIM, named after it.
     """
     from fishd.lab.swimmer import wake as water
     from fishd.virtual.swimmer import checkpoint
