@@ -90,7 +90,7 @@ def adapt(
     settings = {"steps": steps, "seed": seed}
     with fish.session() as session:
         session.check_calibrated()
-        with place.open(fish, session.config, settings) as experiment:
+        with place.open(fish, settings, session) as experiment:
             run = AdaptFolder(experiment)
             ending = ExperimentEnding(experiment)
             fish.announce(as_json)

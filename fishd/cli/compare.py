@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import click
-import msgspec
 from msgspec import to_builtins
 
 from fishd.cli.completion import complete_contestant
@@ -40,6 +39,8 @@ if TYPE_CHECKING:
 PIPE_TABLE_COLUMNS = 1000
 """Width of a table in a file or a pipe, where lines are not wrapped [columns]."""
 DEFAULT_RUN_S, DEFAULT_SETTLE_S = 60.0, 10.0
+DEFAULT_RUNS = 5
+"""Number of runs of each contestant in simulation where runs differ."""
 
 
 class _Outcome(NamedTuple):
@@ -60,9 +61,8 @@ class _Outcome(NamedTuple):
 @click.option(
     "--runs",
     type=click.IntRange(1, 1000),
-    default=1,
-    show_default=True,
-    help="Runs of each contestant; in simulation, with different noise.",
+    help="Runs of each contestant; in simulation, with different noise. "
+    f"[default: {DEFAULT_RUNS} in simulation if they differ, else 1]",
 )
 @for_option(
     "Duration of each run [s]; live, with rests.",
@@ -93,7 +93,7 @@ class _Outcome(NamedTuple):
 @plot_option("command, fin, force and result of each")
 def compare(
     contestants: tuple[str, ...],
-    runs: int,
+    runs: int | None,
     seconds: float,
     settle: float | None,
     fish: ChosenFish,
@@ -130,7 +130,7 @@ def compare(
         drawing.check(picture)
     task = _Task(contestants, fish, seconds, settle, runs, camera_config or camera, place, as_json)
     outcome = _measure(task, agent) if fish.on == "live" else _swim(task)
-    status = _report(outcome, runs, as_json)
+    status = _report(outcome, runs or 1, as_json)
     if picture and outcome.standings:
         from fishd.lab.compare.figures import draw
 
@@ -143,7 +143,7 @@ class _Task(NamedTuple):
     fish: ChosenFish
     seconds: float
     settle: float | None
-    runs: int
+    runs: int | None
     camera: str | None
     """File of a simulated camera; address of the camera of a live fish."""
     place: ExperimentFolder
@@ -179,20 +179,22 @@ def _swim(task: _Task) -> _Outcome:
     refused = [contestant for contestant, _ in left_out]
     accepted = [contestant for contestant in chosen if contestant not in refused]
     settle = DEFAULT_SETTLE_S if task.settle is None else task.settle
+    is_random = config.simulation.is_random
+    differ = any(comparison.depends_on_seed(contestant, is_random) for contestant in accepted)
+    runs = task.runs or (DEFAULT_RUNS if differ and len(accepted) > 1 else 1)
     with task.keep(None, chosen) as experiment:
         task.fish.announce(task.as_json)
-        with show_progress(
-            len(accepted) * task.runs * task.seconds, "s swum", err=task.as_json
-        ) as bar:
+        with show_progress(len(accepted) * runs * task.seconds, "s swum", err=task.as_json) as bar:
             result = comparison.compare(
-                config, accepted, task.seconds, settle, task.runs, bar.at, camera
+                config, accepted, task.seconds, settle, runs, bar.at, camera
             )
-        _write_result(experiment, result[0])
+        if experiment:
+            experiment.write_result(result[0])
     return _Outcome(
         *result,
         [(*omitted, 0) for omitted in left_out],
         config.amplitude_limit,
-        is_random=config.simulation.is_random,
+        is_random=is_random,
     )
 
 
@@ -200,7 +202,7 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
     from fishd.lab.compare.contestants import absolute, parse
     from fishd.lab.compare.live import LiveComparison
 
-    ended, status = "", 0
+    ended, status, runs = "", 0, task.runs or 1
     chosen = [absolute(parse(text)) for text in task.texts]
     with task.fish.session(camera=task.camera, agent=agent) as session:
         chosen = chosen or _default_contestants(session.read_config())
@@ -214,11 +216,11 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
                 ending.measuring(),
                 session,
                 record_session(experiment, session),
-                show_progress(len(chosen) * task.runs * task.seconds, "s", err=task.as_json) as bar,
+                show_progress(len(chosen) * runs * task.seconds, "s", err=task.as_json) as bar,
             ):
                 session.progress = bar.at
                 try:
-                    live.swim(task.seconds, task.runs)
+                    live.swim(task.seconds, runs)
                 except ParameterError:
                     raise
                 except FishdError as error:
@@ -227,17 +229,12 @@ def _measure(task: _Task, agent: str | None) -> _Outcome:
                 ending.is_interrupted = True
             elif ending.is_interrupted:
                 ended, status = f"interrupted; the fish rests; {ending.hint}", INTERRUPTED
-            _write_result(experiment, live.standings())
+            if experiment:
+                experiment.write_result(live.standings())
     return _Outcome(
         live.standings(), live.traces(), live.left_out, session.amplitude, session.unit, True,
         ended, status,
     )  # fmt: skip
-
-
-def _write_result(experiment: "Experiment | None", standings: "list[Standing]") -> None:
-    """Write the result into the folder of the experiment, if there is one."""
-    if experiment:
-        experiment.write("result.json", msgspec.json.encode(standings))
 
 
 def _check_camera(camera: str | None, chosen: "list[Contestant]") -> None:
@@ -334,11 +331,9 @@ def _make_table(standings: "list[Standing]", unit: str) -> "Table":
     from rich.table import Table
 
     simulated = all(standing.runs for standing in standings)
-    several = simulated and len(standings[0].runs) > 1
     table = Table(box=None, pad_edge=False)
     table.add_column("contestant", overflow="fold")
-    heads = ["relative thrust"] if simulated else []
-    heads += ["lowest – highest"] if several else []
+    heads = ["relative"] if simulated else []
     metered = all(standing.thrust_per_watt is not None for standing in standings)
     costs = ["W", f"m{unit}/W"] if metered else []
     parts = [] if simulated else ["statistical", "calibration"]
@@ -346,9 +341,6 @@ def _make_table(standings: "list[Standing]", unit: str) -> "Table":
         table.add_column(head, justify="right", no_wrap=True)
     for standing in standings:
         cells = [f"{standing.relative_thrust:.1%}"] if simulated else []
-        if several:
-            shares = [run.relative_thrust for run in standing.runs]
-            cells.append(f"{min(shares):.1%} – {max(shares):.1%}")
         table.add_row(
             standing.contestant,
             *cells,

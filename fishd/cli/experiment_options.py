@@ -102,25 +102,28 @@ class ExperimentFolder(NamedTuple):
 
     @contextmanager
     def open(
-        self, fish: ChosenFish, config: dict[str, Any], settings: dict[str, Any], unit: str = "N"
+        self, fish: ChosenFish, settings: dict[str, Any], session: "Session | None"
     ) -> "Iterator[Experiment]":
         """Begin or resume the experiment; raises `ConfigError`.
 
-        config: configuration of the fish; settings: what else the rows depend on; unit: unit of the
-            forces
+        settings: what else the rows depend on, besides the fish
+        session: not entered yet; None for fish that swim without one
         """
-        from fishd.lab.experiment import Header, open_experiment
+        from fishd.lab.experiment import Header, count_rows, open_experiment
+        from fishd.lab.session import VirtualSession
 
         endpoint_words = ("--endpoint", fish.endpoint) if fish.endpoint else ()
         header = Header(
             kind=self.kind,
             on=fish.on,
-            config=config,
+            config=session.config if session else to_builtins(fish.load()),
             settings=settings,
-            force_unit=unit,
+            force_unit=session.unit if session else "N",
             command=[*self.command, "--on", fish.on, *endpoint_words],
         )
         with open_experiment(self.path, header, resume=self.resume) as experiment:
+            if isinstance(session, VirtualSession) and (measured := count_rows(self.path)):
+                session.resume(measured)
             yield experiment
 
 
@@ -252,8 +255,7 @@ def keep_experiment(
     if fish.on == "simulation" and not place.is_named:
         yield None
         return
-    config = session.config if session else to_builtins(fish.load())
-    with place.open(fish, config, settings, session.unit if session else "N") as experiment:
+    with place.open(fish, settings, session) as experiment:
         yield experiment
 
 

@@ -1,6 +1,5 @@
 """The verb `fishctl measure`, which measures a controller's thrust on a live or simulated fish."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,6 +66,7 @@ def _measure(
     as_json: bool,
 ) -> int:
     from fishd.lab import drawing
+    from fishd.lab.error_budget import unknown_calibration
     from fishd.lab.measurement import measure as run_measurement
     from fishd.lab.measurement import plan, summarise
     from fishd.lab.session import LiveSession
@@ -108,7 +108,7 @@ def _measure(
         echo(_format_result(measured))
         if experiment:
             echo(f"folder: {experiment.path}")
-    for line in _find_warnings(measured):
+    if line := unknown_calibration(measured.calibration_ci95, measured.unit):
         echo(f"fishctl: {line}", err=True)
     if picture:
         from fishd.lab.measurement_figure import draw
@@ -128,6 +128,7 @@ def _format_result(measured: "ThrustMeasurement") -> str:
         measured.calibration_ci95,
         measured.total_ci95,
         measured.unit,
+        measured.rotation,
     )
     line = f"{command}: thrust {thrust} at {measured.frequency:.3f} Hz, from {measured.swims} swims"
     disturbances = spell(measured.disturbances, measured.unit)
@@ -137,16 +138,6 @@ def _format_result(measured: "ThrustMeasurement") -> str:
         + (f"; accounted for: {disturbances}" if disturbances else "")
         + (f"; careful: {measured.remark}" if measured.remark else "")
     )
-
-
-def _find_warnings(measured: "ThrustMeasurement") -> "Iterator[str]":
-    """Yield warnings about errors that the interval does not cover, or covers only by a guess."""
-    from fishd.lab.error_budget import rotation_remark, unknown_calibration
-
-    if line := unknown_calibration(measured.calibration_ci95, measured.unit):
-        yield line
-    if line := rotation_remark(measured.rotation):
-        yield line
 
 
 def _format_power(measured: "ThrustMeasurement") -> str:

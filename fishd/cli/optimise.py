@@ -140,7 +140,7 @@ def _optimise(
             "objective": aim.objective,
             "target": aim.target,
         }
-        with place.open(fish, session.config, settings, session.unit) as experiment:
+        with place.open(fish, settings, session) as experiment:
             fish.announce(as_json)
             return _Optimisation(
                 name, parameters, search, budget, min_gain, aim, session, experiment, fish, as_json
@@ -203,6 +203,7 @@ class _Optimisation:
         proposal = self.search.propose()
         with ending.measuring():
             optimum = self._judge(proposal, waiting)
+            self.experiment.write_result(optimum)
             folder, unit = self.experiment.path, self.session.unit
             if self.as_json:
                 print_json(optimum)
@@ -487,7 +488,12 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
         )
         echo(f"best {name} of {optimum.controller}: {value:.4g}{symbol} {interval}")
     thrust = error_budget.format_with_budget(
-        optimum.thrust, optimum.thrust_ci95, optimum.calibration_ci95, optimum.total_ci95, unit
+        optimum.thrust,
+        optimum.thrust_ci95,
+        optimum.calibration_ci95,
+        optimum.total_ci95,
+        unit,
+        optimum.rotation,
     )
     echo(f"thrust there: {thrust}")
     if optimum.power is not None and optimum.power_ci95 is not None:
@@ -502,8 +508,7 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
             f"power there: {optimum.power * 1e3:.0f} ± {optimum.power_ci95 * 1e3:.0f} mW, "
             f"{per_watt_text}"
         )
-    unknown = error_budget.unknown_calibration(optimum.calibration_ci95, unit)
-    for line in filter(None, (unknown, error_budget.rotation_remark(optimum.rotation))):
+    if line := error_budget.unknown_calibration(optimum.calibration_ci95, unit):
         echo(f"fishctl: {line}", err=True)
     if optimum.target is not None and optimum.thrust < optimum.target:
         echo(

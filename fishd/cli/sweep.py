@@ -159,7 +159,7 @@ class _Sweep:
         config = self.fish.load()
         lengths = Lengths.of(config, **given)
         settings = {"lengths": msgspec.to_builtins(lengths)}
-        with self.place.open(self.fish, msgspec.to_builtins(config), settings) as experiment:
+        with self.place.open(self.fish, settings, None) as experiment:
             folder = self._open_folder(experiment)
             ending = ExperimentEnding(experiment)
             with show_progress(len(pairs), "points", err=self.as_json) as show:
@@ -185,7 +185,7 @@ class _Sweep:
         settings = {"lengths": {"seconds": seconds}}
         with self.fish.session() as session:
             grid.check_remote(self.points, Limits(session.amplitude, session.tick))
-            with self.place.open(self.fish, session.config, settings, session.unit) as experiment:
+            with self.place.open(self.fish, settings, session) as experiment:
                 folder = self._open_folder(experiment)
                 ending = ExperimentEnding(experiment)
                 session.used = self.finished * seconds
@@ -256,8 +256,10 @@ class _Sweep:
             for curve in all_curves
             if (best := curves.find_best(curve))
         ]
+        best_points = [curves.best_to_builtins(best, quantity) for _, best in bests]
+        folder.experiment.write_result(best_points)
         if self.as_json:
-            print_json([curves.best_to_builtins(best, quantity) for _, best in bests])
+            print_json(best_points)
         else:
             for curve, best in bests:
                 unit = self.units.get(best.x_name, "")

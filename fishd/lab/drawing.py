@@ -1,6 +1,7 @@
 """Figures in one style, without a display; equal data give equal files."""
 
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -71,6 +72,31 @@ def plain(words: str) -> str:
     return text.line(words, MAX_LABEL_CHARS).replace("$", r"\$")
 
 
+def load_matplotlib() -> None:
+    """Import matplotlib without the settings of the user; call it before any other import of it.
+
+    They may be for another program, as the backend of a Jupyter notebook is, or damaged: each
+    error in them would end the import. A `matplotlibrc` in the working folder may be of any other
+    user. Raises `MissingPackage` without matplotlib (extra: lab).
+    """
+    check_installed()
+    if "matplotlib" in sys.modules:
+        return  # `open_figure` replaces its settings
+    spec = find_spec("matplotlib")
+    assert spec
+    assert spec.origin
+    folder = os.open(".", os.O_PATH | os.O_DIRECTORY)  # it may have been removed
+    backend = os.environ.pop("MPLBACKEND", None)
+    try:
+        os.chdir(Path(spec.origin).with_name("mpl-data"))  # has the file of the defaults
+        import matplotlib  # noqa: F401
+    finally:
+        os.fchdir(folder)
+        os.close(folder)
+        if backend is not None:
+            os.environ["MPLBACKEND"] = backend
+
+
 @contextmanager
 def open_figure(path: str | os.PathLike[str], size: tuple[float, float]) -> Iterator["Figure"]:
     """Provide a figure of `size` (width and height, inch), and write it to a file at the end.
@@ -79,10 +105,13 @@ def open_figure(path: str | os.PathLike[str], size: tuple[float, float]) -> Iter
     Raises the errors of `check`, and `FishdError` where writing fails.
     """
     check(path)
-    from matplotlib import rc_context
+    load_matplotlib()
+    from matplotlib import rc_context, rcdefaults, rcParams
     from matplotlib.figure import Figure
 
-    with rc_context(_STYLE):
+    with rc_context():
+        rcdefaults()
+        rcParams.update(_STYLE)
         figure = Figure(figsize=size, layout="constrained")
         yield figure
         save(figure, Path(path))

@@ -67,10 +67,13 @@ def format_with_budget(
     calibration_ci95: float | None,
     total_ci95: float | None,
     unit: str,
+    rotation: float = 0.0,
 ) -> str:
     """Return a force, or a force for each watt, with its error budget, in thousandths of its unit.
 
     Where the part of the calibration is unknown, the text gives the statistical error and says so.
+
+    rotation: rotation of the sensor's axes, from `visible_rotation`; it is part of the calibration
     """
     if calibration_ci95 is None or total_ci95 is None:
         total_ci95 = statistical_ci95
@@ -79,7 +82,8 @@ def format_with_budget(
         calibration = text.format_half_width(calibration_ci95)
     return (
         f"{text.format_measured(value, total_ci95, unit)} "
-        f"(statistical {text.format_half_width(statistical_ci95)}, calibration {calibration})"
+        f"(statistical {text.format_half_width(statistical_ci95)}, calibration {calibration}"
+        + (f", with the sensor rotated by {math.degrees(rotation):+.1f}°)" if rotation else ")")
     )
 
 
@@ -95,17 +99,6 @@ def unknown_calibration(calibration_ci95: float | None, unit: str) -> str:
     return (
         "the uncertainty of the gains of the force sensor is unknown, so the interval is "
         "statistical only; run 'fishctl calibrate force'"
-    )
-
-
-def rotation_remark(rotation: float) -> str:
-    """Return a remark on a rotation of the sensor; empty where there is none."""
-    if not rotation:
-        return ""
-    hidden = 1.0 - math.cos(rotation)
-    return (
-        f"F_x follows F_y as for a sensor that is rotated by {math.degrees(rotation):+.1f}° "
-        f"against the fish: this hides {hidden:.2%} of the thrust, which the interval includes"
     )
 
 

@@ -152,6 +152,10 @@ class Experiment:
         """Write a struct as JSON; raises `FishdError`."""
         self.write(name, _as_json(value))
 
+    def write_result(self, result: Any) -> None:
+        """Write the result of the experiment, as its JSON output has it; raises `FishdError`."""
+        self.write(RESULT, msgspec.json.encode(result))
+
     def recording(self, stem: str) -> Path:
         """Return an unused path for a recording; an incomplete recording keeps its name."""
         return files.unused_path(self.path, stem, SUFFIX, SUFFIX + PART_SUFFIX)

@@ -10,6 +10,7 @@ from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
+from msgspec.structs import replace
 
 from fishd.client import Fish
 from fishd.client.lease import LeaseRenewal
@@ -250,13 +251,28 @@ class VirtualSession(Session):
         self.source: Source = "simulation"
         self.config = msgspec.to_builtins(config)
         self._queue = _MessageQueue()
-        self._run = VirtualRun(config, self._queue)
+        self._calibration = calibration
+        self._run = self._begin(config)
         robot = self._run.loop.robot
-        if calibration and robot.tared:
-            robot.tared.recalibrate(calibration)
         saved = robot.calibrated.sensor.calibration if robot.calibrated else EXACT
         self.calibration = calibration or saved
         self.unit = robot.force_unit
+
+    def _begin(self, config: Config) -> VirtualRun:
+        run = VirtualRun(config, self._queue)
+        if self._calibration and run.loop.robot.tared:
+            run.loop.robot.tared.recalibrate(self._calibration)
+        return run
+
+    def resume(self, measured: int) -> None:
+        """Begin again with other noise than before, which the kept measurements have; not entered.
+
+        measured: number of kept measurements; each resumption has noise of its own by it
+        """
+        config = self._run.config
+        noise = replace(config.simulation, seed=config.simulation.seed + measured)
+        self._run.close()
+        self._run = self._begin(replace(config, simulation=noise))
 
     def describe(self, writer: "RunWriter") -> None:
         """Write the configuration and the robot to a recording."""

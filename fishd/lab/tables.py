@@ -33,7 +33,7 @@ def read(path: Path, longest: int = files.MAX_TABLE_BYTES) -> list[list[str]]:
     longest: largest size of the file [bytes]
     Raises `FileProblem`.
     """
-    content = files.read_text(path, longest, "a table")
+    content = files.read_text(path, longest, "a table").removeprefix("\ufeff")  # of a spreadsheet
     try:
         rows = [list(map(_unescape, row)) for row in csv.reader(io.StringIO(content))]
     except csv.Error as error:

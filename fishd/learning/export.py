@@ -1,16 +1,29 @@
 """Export of a checkpoint, or a model of stable-baselines3, to a file for the controller `ppo`."""
 
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import gymnasium
 import msgspec
 import numpy as np
 import torch
+from gymnasium import wrappers
 from msgspec import Struct
 from msgspec.structs import replace
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    VecCheckNan,
+    VecEnv,
+    VecEnvWrapper,
+    VecMonitor,
+    VecVideoRecorder,
+)
 
 from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config, adopt
@@ -35,6 +48,22 @@ from fishd.learning.settings import EvaluationSettings, TrainingSettings, from_p
 TOLERANCE = 1e-4
 """Largest difference between the outputs of the file and of the trained policy, as a share of Φ:
 pixels and large weights are summed, in an order that differs between libraries."""
+NEUTRAL_WRAPPERS: tuple[type[Any], ...] = (
+    Monitor,
+    VecCheckNan,
+    VecMonitor,
+    VecVideoRecorder,
+    wrappers.Autoreset,
+    wrappers.HumanRendering,
+    wrappers.NormalizeReward,
+    wrappers.OrderEnforcing,
+    wrappers.PassiveEnvChecker,
+    wrappers.RecordEpisodeStatistics,
+    wrappers.RecordVideo,
+    wrappers.RenderCollection,
+    wrappers.TimeLimit,
+)
+"""Wrappers of environments that change neither observations nor actions."""
 _PROBE_INPUTS = 1000
 _PROBE_STACKS = 100
 """Number of stacks of noise, and of stacks of a moving tail."""
@@ -78,30 +107,21 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
 def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Path:
     """Write the policy of a model of stable-baselines3 that was trained on a `SwimEnv`.
 
-    model: PPO or A2C with an `MlpPolicy` of tanh or relu, and without `VecNormalize`, whose
-        averages are not stored in a policy file
+    model: PPO or A2C with an `MlpPolicy` of tanh or relu; its environment has no wrappers but
+        `NEUTRAL_WRAPPERS` and those of rewards. It is reset, and stepped for the proof
     note: text for the user, stored in the file
 
     Raises `PolicyError` for any other model, and where the outputs of the file would differ from
     those of the policy.
     """
     path = Path(target)
-    vec_env, policy = model.get_env(), model.policy
-    env = vec_env.envs[0].unwrapped if isinstance(vec_env, DummyVecEnv) else None
-    if not isinstance(env, SwimEnv):
-        raise PolicyError(
-            f"{path}: the environment of this model, {type(vec_env).__name__}, is not a SwimEnv "
-            "alone, so the inputs of the network are not known"
-        )
+    env = _find_swim_env(model.get_env(), path)
     if env.extractor:
         raise PolicyError(
             f"{path}: a model that sees pictures is not exported from Python; train it with "
             "'fishctl learn ppo --see camera'"
         )
-    if not isinstance(policy, ActorCriticPolicy) or not isinstance(
-        policy.features_extractor, FlattenExtractor
-    ):
-        raise PolicyError(f"{path}: {type(policy).__name__} is not an MlpPolicy of PPO or A2C")
+    policy = _check_network(model.policy, path)
     seen = TrainingSettings(environment=env.settings)
     card = make_card(env.config, seen, env.features, "a SwimEnv", 0, None, note)
     past = replace(
@@ -114,15 +134,102 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     card = replace(card, provenance=past)
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
     evaluation = evaluate_in_simulation(env.config, decide, EvaluationSettings())
-    _write(path, _complete_card(card, evaluation), policy, env.perception)
+    _write(path, _complete_card(card, evaluation), policy, env.perception, _observe(model))
     return path
 
 
-def _write(target: Path, card: Card, policy: ActorCriticPolicy, perception: Perception) -> int:
-    """Write the file atomically; return its size [bytes]. Raises `PolicyError`."""
+def _find_swim_env(env: VecEnv | None, path: Path) -> SwimEnv:
+    """Return the environment of a model; raise `PolicyError` if a wrapper changes what passes."""
+    while isinstance(env, VecEnvWrapper):
+        _check_wrapper(env, path)
+        env = env.venv
+    inner = env.envs if isinstance(env, DummyVecEnv) else []
+    for layer in (layer for environment in inner for layer in _unwrap(environment)):
+        _check_wrapper(layer, path)
+    found = inner[0].unwrapped if inner else None
+    if not isinstance(found, SwimEnv):
+        raise PolicyError(
+            f"{path}: the environment of this model, {type(found or env).__name__}, is not a "
+            "SwimEnv of this process, so the inputs of the network are not known; load the model "
+            "with env=gymnasium.make('fishd/Swim-v0')"
+        )
+    return found
+
+
+def _unwrap(env: Any) -> Iterator[Any]:
+    """Yield the wrappers of an environment, from the outside."""
+    while isinstance(env, gymnasium.Wrapper):
+        yield env
+        env = env.env
+
+
+def _check_wrapper(wrapper: Any, path: Path) -> None:
+    """Raise `PolicyError` for a wrapper that may change observations or actions."""
+    kind = type(wrapper)
+    is_reward = (
+        isinstance(wrapper, gymnasium.RewardWrapper)
+        and kind.step is gymnasium.RewardWrapper.step
+        and kind.reset is gymnasium.Wrapper.reset
+    )
+    if kind not in NEUTRAL_WRAPPERS and not is_reward:
+        raise PolicyError(
+            f"{path}: this model was trained behind the wrapper {kind.__name__}, which may change "
+            "observations or actions; a policy file has no wrappers, so the policy would swim "
+            "otherwise: train it without that one"
+        )
+
+
+def _check_network(policy: Any, path: Path) -> ActorCriticPolicy:
+    """Return the policy; raise `PolicyError` for a network that a policy file cannot have."""
+    needed = "a policy file has the MlpPolicy of PPO or A2C"
+    if type(policy) is not ActorCriticPolicy or type(policy.mlp_extractor) is not MlpExtractor:
+        raise PolicyError(f"{path}: {needed}, not {type(policy).__name__}")
+    if type(policy.features_extractor) is not FlattenExtractor:
+        extractor = type(policy.features_extractor).__name__
+        raise PolicyError(f"{path}: {needed} without the extractor of features {extractor}")
+    if policy.squash_output:
+        raise PolicyError(f"{path}: {needed} without squash_output")
+    activation = activation_of(policy)
+    for part in (*policy.mlp_extractor.policy_net, policy.action_net):
+        if type(part) not in (torch.nn.Linear, policy.activation_fn):
+            layers = f"linear layers and {activation}"
+            raise PolicyError(f"{path}: {needed} with {layers}, not with {type(part).__name__}")
+    for parameter in policy.parameters():
+        if parameter.dtype is not torch.float32:
+            kind = str(parameter.dtype).removeprefix("torch.")
+            raise PolicyError(
+                f"{path}: {needed} in float32, this one is in {kind}: call model.policy.float()"
+            )
+    return policy
+
+
+def _observe(model: BaseAlgorithm) -> NDArray[np.float32]:
+    """Return observations of random swimming; the model's next training resets its environment."""
+    env = model.get_env()
+    assert env
+    random = np.random.default_rng(2)
+    rows: list[Any] = [env.reset()]
+    while sum(map(len, rows)) < _PROBE_INPUTS:
+        actions = random.uniform(-1.0, 1.0, (env.num_envs, *(env.action_space.shape or ())))
+        rows.append(env.step(actions.astype(np.float32))[0])
+    model._last_obs = None
+    return np.concatenate(rows)
+
+
+def _write(
+    target: Path,
+    card: Card,
+    policy: ActorCriticPolicy,
+    perception: Perception,
+    observations: NDArray[np.float32] | None = None,
+) -> int:
+    """Write the file atomically; return its size [bytes]. Raises `PolicyError`.
+
+    observations: inputs on which the file is compared with the policy; None for random ones
+    """
     sight = _make_sight(policy, perception)
     content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
-    _verify(PolicyFile(target, content, card), policy, perception)
+    _verify(PolicyFile(target, content, card), policy, perception, observations)
     if not target.name or (target.exists() and not target.is_file()):
         raise PolicyError(f"{target}: exists already, and is not a regular file")
     try:
@@ -212,13 +319,20 @@ def _complete_card(card: Card, evaluation: Evaluation, note: str = "") -> Card:
     return replace(card, provenance=past)
 
 
-def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception) -> None:
+def _verify(
+    file: PolicyFile,
+    policy: ActorCriticPolicy,
+    perception: Perception,
+    observations: NDArray[np.float32] | None = None,
+) -> None:
     """Compare the file, run as on the robot, with the policy; raises `PolicyError`."""
     network = Network(file)
     random = np.random.default_rng(0)
     stacks = _probe_stacks(file.card)
     number = len(stacks) or _PROBE_INPUTS
-    rows = random.normal(0.0, 1.5, (number, file.card.numbers)).astype(np.float32)
+    rows = observations
+    if rows is None:
+        rows = random.normal(0.0, 1.5, (number, file.card.numbers)).astype(np.float32)
     given, outputs = [], []
     for index, row in enumerate(rows):
         network.row[:] = row
@@ -232,8 +346,9 @@ def _verify(file: PolicyFile, policy: ActorCriticPolicy, perception: Perception)
     worst = float(np.abs(np.array(outputs) - expected[:, 0]).max())
     if not worst <= TOLERANCE:
         raise PolicyError(
-            f"with this onnxruntime, the outputs of the file differ from those of the policy, by "
-            f"up to {worst:.2g} of Φ; install another version of it"
+            f"the outputs of the file differ from those of the policy by up to {worst:.2g} of Φ: "
+            "the model has something that a policy file cannot have, or this version of "
+            "onnxruntime is at fault"
         )
 
 

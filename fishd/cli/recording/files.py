@@ -55,20 +55,23 @@ def _target_option(suffixes: str) -> Callable[[F], F]:
         "--to",
         "target",
         type=click.Path(path_type=Path),
-        default=Path(),
         metavar="FILE|FOLDER",
         help=f"File to write ({suffixes}), or a folder for files named after the recording. "
-        "[default: this folder]",
+        "[default: beside the recording]",
     )
 
 
-def _target_paths(target: Path, name: str, forms: Sequence[str], form: str | None) -> list[Path]:
+def _target_paths(
+    target: Path | None, run: Run, forms: Sequence[str], form: str | None
+) -> list[Path]:
     """Return the files to write: the target, or in that folder a file for each form.
 
+    target: None for the folder of the recording
     form: the only form in that folder; None for all
     """
+    target = target or run.path.parent
     if target.is_dir():
-        return [target / f"{name}.{chosen}" for chosen in ([form] if form else forms)]
+        return [target / f"{run.name}.{chosen}" for chosen in ([form] if form else forms)]
     if form and target.suffix != f".{form}":
         raise click.UsageError(f"--{form}: --to {target} is a file of another format, or no folder")
     return [target]
@@ -90,7 +93,7 @@ def _target_paths(target: Path, name: str, forms: Sequence[str], form: str | Non
 def export(
     run: str,
     form: str | None,
-    target: Path,
+    target: Path | None,
     force: bool,
     folder: Path | None,
     as_json: bool,
@@ -103,7 +106,7 @@ def export(
 
     recorded = open_recording(run, folder)
     forms = ("csv", "parquet")
-    path, *others = _target_paths(target, recorded.name, forms, form)
+    path, *others = _target_paths(target, recorded, forms, form)
     if others:
         raise click.UsageError("--csv or --parquet is needed, or the name of a file for --to")
     print_paths(write(recorded, path, replace=force), as_json)
@@ -128,7 +131,7 @@ def plot(
     run: str,
     begin: float,
     end: float | None,
-    target: Path,
+    target: Path | None,
     only: str | None,
     force: bool,
     folder: Path | None,
@@ -144,7 +147,7 @@ def plot(
 
     recorded = open_recording(run, folder)
     run_traces = traces(recorded, begin, math.inf if end is None else end)
-    paths = _target_paths(target, recorded.name, ("png", "html"), only)
+    paths = _target_paths(target, recorded, ("png", "html"), only)
     check_new_files(paths, replace=force)
     for path in paths:
         if path.suffix == ".html":

@@ -1,17 +1,17 @@
 """The verbs `fishctl swimmer wake` and `fishctl swimmer midlines`, which draw pictures."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from fishd.cli.options import F, FiniteRange, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, print_paths
 from fishd.core import text
-from fishd.lab.swimmer import wake as water
-from fishd.lab.swimmer.midlines import compute_envelope, draw_midlines
 from fishd.recording.folder import check_new_files
-from fishd.virtual.swimmer import checkpoint
+
+if TYPE_CHECKING:
+    from fishd.lab.swimmer.wake import Quantity
 
 
 def picture_options(function: F) -> F:
@@ -29,7 +29,7 @@ def picture_options(function: F) -> F:
 
 def _picture_path(picture: Path | None, file: Path, what: str, force: bool) -> Path:
     """Return the file of a picture of a swim; raises `ParameterError` if it must not be written."""
-    path = picture or Path(f"{file.stem}-{what}.png")
+    path = picture or file.with_name(f"{file.stem}-{what}.png")
     check_new_files([path], replace=force)
     return path
 
@@ -47,8 +47,11 @@ def midlines(file: Path, settle: float, picture: Path | None, force: bool, as_js
     """Draw the midlines of a tail beat relative to the mean, and the amplitude along the body.
 
     SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is a .png
-    file in this folder, named after SWIM.
+    file beside SWIM, named after it.
     """
+    from fishd.lab.swimmer.midlines import compute_envelope, draw_midlines
+    from fishd.virtual.swimmer import checkpoint
+
     path = _picture_path(picture, file, "midlines", force)
     time, lines = checkpoint.load(file).midlines.arrays()
     envelope = compute_envelope(time, lines.astype(float), settle)
@@ -68,7 +71,7 @@ def midlines(file: Path, settle: float, picture: Path | None, force: bool, as_js
 @click.command()
 @click.option(
     "--field",
-    type=click.Choice(water.QUANTITIES),
+    type=click.Choice(("vorticity", "speed", "pressure")),
     default="vorticity",
     show_default=True,
     help="Quantity to draw.",
@@ -85,7 +88,7 @@ def midlines(file: Path, settle: float, picture: Path | None, force: bool, as_js
 @picture_options
 def wake(
     file: Path,
-    field: water.Quantity,
+    field: "Quantity",
     whole: bool,
     limit: float | None,
     picture: Path | None,
@@ -95,8 +98,11 @@ def wake(
     """Draw the water at the end of a swim, and the body in it.
 
     SWIM is a file of 'fishctl simulate ... --to FILE.npz'. Without --plot, the picture is a .png
-    file in this folder, named after SWIM.
+    file beside SWIM, named after it.
     """
+    from fishd.lab.swimmer import wake as water
+    from fishd.virtual.swimmer import checkpoint
+
     path = _picture_path(picture, file, field, force)
     fish = water.restore_fish(checkpoint.load(file))
     window = (water.whole_window if whole else water.window_around)(fish.settings)

@@ -212,7 +212,7 @@ def judge_standings(standings: Sequence[Standing], is_random: bool = True) -> Ve
     fair = [item for item in standings if not item.faults and not item.fallbacks]
     if len(fair) < 2:
         return None
-    if any(item.thrust_ci95 is None and _depends_on_seed(item, is_random) for item in fair):
+    if any(item.thrust_ci95 is None and depends_on_seed(item, is_random) for item in fair):
         return Verdict("none: a single run with noise has no interval; use --runs 5", ())
     candidates = [_candidate(item) for item in fair]
     ranking = rank(candidates)
@@ -231,10 +231,10 @@ def judge_standings(standings: Sequence[Standing], is_random: bool = True) -> Ve
     )
 
 
-def _depends_on_seed(standing: Standing, is_random: bool) -> bool:
+def depends_on_seed(contestant: Contestant | Standing, is_random: bool) -> bool:
     """Return whether another run would differ; a given wave swims the same for any noise."""
-    sees = standing.controller == "ppo" and may_see_pictures(standing.parameters.get("policy"))
-    return sees or (is_random and complexity(standing.controller) > 0)
+    sees = contestant.controller == "ppo" and may_see_pictures(contestant.parameters.get("policy"))
+    return sees or (is_random and complexity(contestant.controller) > 0)
 
 
 def _candidate(standing: Standing) -> Candidate:

@@ -22,7 +22,7 @@ The reversals of a short swim then stay in the same ticks.
 UPPER_FRACTION = 0.85
 """Fraction of the highest value above which neighbouring points belong to the parabola."""
 MIN_POINTS = 5
-"""Smallest number of points of the parabola if the curve has as many; at least three."""
+"""Smallest number of points of the parabola."""
 
 
 class Peak(NamedTuple):
@@ -74,14 +74,28 @@ class WholeTicks(Struct, frozen=True):
     """Frequency of whole ticks nearest the maximum of the curve, if it was not measured [Hz]."""
 
 
+class HighestPoint(Struct, frozen=True):
+    """The highest measured point of a curve."""
+
+    x: float | None
+    """Value of the quantity along the curve; None if nothing was varied."""
+    value: float
+    """Measured thrust [N] or speed [m/s]."""
+    value_ci95: float | None
+    """Half-width of the 95 % confidence interval of `value`."""
+
+
 class Best(Struct, frozen=True):
-    """The best point of a curve, in the form of the JSON output."""
+    """The best point of a curve, in the form of the JSON output.
+
+    It is the maximum of the parabola, or the highest measured point of a curve without one.
+    """
 
     controller: str
     parameters: dict[str, Any]
-    """Parameters of the highest measured point."""
+    """Parameters at the maximum."""
     keys: dict[str, Any]
-    """Keys of the configuration that differ at that point, in dotted form."""
+    """Keys of the configuration that differ there, in dotted form."""
     x_name: str
     """Name of the quantity along the curve, such as `frequency`; empty for a single point."""
     x: float | None
@@ -96,6 +110,7 @@ class Best(Struct, frozen=True):
     """Half-width of the 95 % confidence interval of `value`."""
     at_edge: bool
     """Whether the highest point is at the edge of the grid; the maximum may lie beyond it."""
+    measured: HighestPoint
     whole_ticks: WholeTicks | None = None
     """Best point of whole ticks; None for a curve that is not over frequencies of whole ticks."""
 
@@ -132,25 +147,35 @@ def find_best(curve: Curve) -> Best | None:
         return None
     value, index = max(measured)
     point, maximum = curve.points[index], curve.peak
+    error = curve.results[index].value_ci95
+    parameters, keys = dict(point.parameters), dict(point.keys)
+    if maximum:
+        varied = parameters if curve.x_name in parameters else keys
+        varied[curve.x_name] = maximum.x
     return Best(
         controller=point.controller,
-        parameters=point.parameters,
-        keys=point.keys,
+        parameters=parameters,
+        keys=keys,
         x_name=curve.x_name,
         x=maximum.x if maximum else None,
         x_ci95_low=maximum.x_ci95_low if maximum else None,
         x_ci95_high=maximum.x_ci95_high if maximum else None,
         value=maximum.y if maximum else value,
-        value_ci95=maximum.y_ci95 if maximum else curve.results[index].value_ci95,
+        value_ci95=maximum.y_ci95 if maximum else error,
         at_edge=maximum.at_edge if maximum else False,
+        measured=HighestPoint(curve.x[index] if maximum else None, value, error),
     )
 
 
 def best_to_builtins(best: Best, quantity: Quantity) -> dict[str, Any]:
     """Return the best point as plain data, its value under the name of the quantity."""
     names = {"value": quantity.name, "value_ci95": f"{quantity.name}_ci95"}
-    fields = msgspec.structs.asdict(best)
-    return {names.get(name, name): value for name, value in fields.items()}
+
+    def rename(values: dict[str, Any]) -> dict[str, Any]:
+        return {names.get(name, name): value for name, value in values.items()}
+
+    measured = rename(msgspec.structs.asdict(best.measured))
+    return rename(msgspec.structs.asdict(best)) | {"measured": measured}
 
 
 def find_best_of_whole_ticks(folder: SweepFolder, curve: Curve) -> WholeTicks | None:
@@ -230,7 +255,7 @@ def find_peak(x: Sequence[float], y: Sequence[float], y_ci95: Sequence[float | N
         float(xs[top]), None, None, float(ys[top]), highest, at_edge, None, float(xs[top]),
         (float(xs[first]), float(xs[last])),
     )  # fmt: skip
-    if at_edge or last - first < 2:
+    if at_edge or last - first + 1 < MIN_POINTS:
         return without_parabola
     return _fit_vertex(xs[selection], ys[selection], deviations[selection]) or without_parabola
 

@@ -59,7 +59,9 @@ def draw(
             axes.set_xlabel(plain(f"{x_name} ({unit})" if unit not in ("", "1") else x_name))
             axes.legend()
         panel_axes[0].set_ylabel(plain(f"{quantity.name} (m{quantity.unit})"))
-        note = f"bars: 95 % interval of {error_of}; cross: maximum of the fitted parabola"
+        note = f"bars: 95 % interval of {error_of}"
+        if any(curve.peak and curve.peak.coefficients for curve in curves):
+            note += "; cross: maximum of the fitted parabola"
         panel_axes[0].set_title(note, fontsize=8, fontweight="normal", color=GREY)
         for path in paths[1:]:
             save(figure, path)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.core.errors import FishdError, MissingPackage
+from fishd.lab.drawing import load_matplotlib
 from fishd.lab.swimmer.wake import (
     COLOURS,
     SIGNED_QUANTITIES,
@@ -172,6 +173,7 @@ class Film:
     @cached_property
     def _palette(self) -> list[int]:
         """Palette of the frames: water and its mixtures with ink; ink; paper and its mixtures."""
+        load_matplotlib()
         from matplotlib import colormaps
 
         shares = np.linspace(0.0, 1.0, _LEVELS)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.core.errors import FishdError
-from fishd.lab.drawing import BLACK, GREY, open_figure
+from fishd.lab.drawing import BLACK, GREY, load_matplotlib, open_figure
 
 Array = NDArray[np.float64]
 PHASE_COUNT = 64
@@ -111,6 +111,7 @@ def _to_body_frame(beat: Array) -> Array:
 
 def draw_midlines(envelope: Envelope, title: str, path: str | os.PathLike[str]) -> None:
     """Write the picture as PNG, PDF or SVG; raises `FishdError` and `MissingPackage`."""
+    load_matplotlib()
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm, ListedColormap

@@ -43,7 +43,7 @@ const choicesOf = (field) => field.interval.split("|").map((word) => word.trim()
 function Field({ field, value, disabled, status, edit }) {
   const id = `parameter-${field.name}`;
   const slider = sliderOf(field, status);
-  const special = value === null ? "null" : field.words?.includes(value) ? value : null;
+  const special = value === null && field.optional ? "null" : field.words?.includes(value) ? value : null;
   const specials = [...(field.optional ? ["null"] : []), ...(field.words ?? [])];
   const shown = typeof value === "number" ? +value.toPrecision(6) : special === null ? value : "";
   const fallback = typeof defaultOf(field) === "number" ? defaultOf(field) : slider?.high;
@@ -73,7 +73,7 @@ function Field({ field, value, disabled, status, edit }) {
       ${input}<span class="unit">${unitText(field.unit)}</span>
     </span>
     ${slider && html`<input type="range" class="slider" aria-label=${`${field.name}, slider`} min=${slider.low} max=${slider.high}
-      step=${slider.step} disabled=${disabled || special !== null} value=${special === null ? value : fallback}
+      step=${slider.step} disabled=${disabled || special !== null} value=${special === null ? value ?? fallback : fallback}
       onInput=${(event) => edit(field.name, Number(event.target.value))} />
       <span class="bounds"><span>${short(slider.low)}</span><span>${short(slider.high)}</span></span>`}
     <small id=${`${id}-help`}>${field.description.replace("null:", `${nullName}:`)}</small>

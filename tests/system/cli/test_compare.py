@@ -30,7 +30,7 @@ def test_the_command_draws_a_picture_and_prints_a_table(tmp_path: Path) -> None:
     fish, *table, verdict = done.stdout.splitlines()
     assert fish == "fish: the default simulated fish"
     assert max(len(line.rstrip()) for line in table) <= 80
-    assert verdict == "Verdict: none: a single run with noise has no interval; use --runs 5."
+    assert verdict == "Verdict: swing:C=0.5 wins: no other one has a thrust above zero."
 
 
 def test_the_command_prints_json_with_every_run() -> None:

@@ -243,7 +243,9 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
     words += ["--vary", "plant.xi=0.9,1.2", "--jobs", "2"]
     first = fishctl(*words, "--frequency", "1.4:2:0.2")
     assert (first.returncode, first.stderr) == (0, "")
-    assert "sine plant.xi=1.2: best frequency" in first.stdout
+    assert "sine plant.xi=1.2: best measured at frequency" in first.stdout, (
+        "four points are too few"
+    )
     second = fishctl("sweep", "--resume", str(folder), "--frequency", "1.2:2:0.2", "--json")
     assert second.returncode == 0
     assert "20 points, 16 of them measured already" in second.stderr
@@ -252,6 +254,9 @@ def test_a_sweep_is_a_table_recordings_and_a_picture_and_grows(tmp_path: Path) -
         (name, {"plant.xi": xi}) for xi in (0.9, 1.2) for name in ("square", "sine")
     ]
     assert all(curve["x_ci95_low"] < curve["x"] < curve["x_ci95_high"] for curve in best)
+    assert all(curve["parameters"]["frequency"] == curve["x"] for curve in best)
+    assert msgspec.json.decode((folder / "result.json").read_bytes()) == best
+    assert all(curve["measured"]["x"] in (1.2, 1.4, 1.6, 1.8, 2.0) for curve in best)
     with (folder / "rows.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["parameters.frequency"] for row in rows[:5]] == ["1.2", "1.4", "1.6", "1.8", "2.0"]
@@ -328,7 +333,7 @@ def test_what_is_best_is_printed_though_its_picture_fails(
 
     monkeypatch.setattr("fishd.lab.sweep.figure.draw", full)
     done = run_sweep(tmp_path / "run", "square", "--frequency", "1.5,1.7,1.9")
-    assert "\nsquare: best frequency 1.7" in done.stdout
+    assert "\nsquare: best measured at frequency 1.7" in done.stdout
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
     assert "No space left" in done.stderr
 

@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from gymnasium import wrappers
 from msgspec.structs import replace
 from rigs.harness import Rig, observe
 from rigs.swimming import NOISY, brief_job
 from stable_baselines3 import A2C, PPO, SAC
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize
 
 from fishd.cli.main import fishctl
 from fishd.controllers import registry
@@ -151,17 +154,104 @@ def test_a_model_of_the_user_becomes_a_policy_file(tmp_path: Path, kind: Any) ->
     assert set(past.settings) == {"environment"}
 
 
-def test_a_model_that_a_policy_file_cannot_represent_is_refused(tmp_path: Path) -> None:
-    normalised = PPO("MlpPolicy", VecNormalize(DummyVecEnv([own_env])), device="cpu")
-    elsewhere = PPO("MlpPolicy", "Pendulum-v1", device="cpu")
-    for model in (normalised, elsewhere):
-        with pytest.raises(PolicyError, match="is not a SwimEnv alone"):
-            export_model(model, tmp_path / "a.onnx")
-    with pytest.raises(PolicyError, match="is not an MlpPolicy of PPO or A2C"):
-        export_model(SAC("MlpPolicy", own_env(), device="cpu"), tmp_path / "a.onnx")
-    elu = PPO("MlpPolicy", own_env(), policy_kwargs={"activation_fn": torch.nn.ELU}, device="cpu")
-    with pytest.raises(PolicyError, match="activation ELU cannot be exported"):
-        export_model(elu, tmp_path / "a.onnx")
+def test_wrappers_that_change_nothing_that_the_policy_sees_or_does_are_permitted(
+    tmp_path: Path,
+) -> None:
+    env = wrappers.TransformReward(Monitor(wrappers.TimeLimit(own_env(), 100)), lambda r: 2.0 * r)
+    model = PPO("MlpPolicy", VecCheckNan(DummyVecEnv([lambda: env])), n_steps=64, device="cpu")
+    model.learn(64)
+    assert read(export_model(model, tmp_path / "own.onnx")).card.provenance.steps == 64
+    model.learn(64)
+
+
+class Turned(gymnasium.RewardWrapper):
+    """Wrapper of rewards that changes actions, too."""
+
+    def reward(self, reward: Any) -> Any:
+        return reward
+
+    def step(self, action: Any) -> Any:
+        return super().step(-action)
+
+
+BOX = gymnasium.spaces.Box(-1.0, 1.0, (1,), np.float32)
+INPUTS = gymnasium.spaces.Box(-np.inf, np.inf, (5,), np.float32)
+CHANGES: dict[str, Any] = {
+    "TransformAction": lambda env: wrappers.TransformAction(env, lambda a: -a, BOX),
+    "DelayObservation": lambda env: wrappers.DelayObservation(env, 2),
+    "TransformObservation": lambda env: wrappers.TransformObservation(
+        env, lambda observation: 10.0 * observation, INPUTS
+    ),
+    "NormalizeObservation": wrappers.NormalizeObservation,
+    "StickyAction": lambda env: wrappers.StickyAction(env, 0.5),
+    "RescaleAction": lambda env: wrappers.RescaleAction(env, np.float32([-2.0]), np.float32([2.0])),
+    "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
+    "Turned": Turned,
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_wrapper_that_a_policy_file_would_lack_is_refused_by_name(
+    tmp_path: Path, name: str
+) -> None:
+    model = PPO("MlpPolicy", CHANGES[name](own_env()), n_steps=64, device="cpu")
+    with pytest.raises(PolicyError, match=f"trained behind the wrapper {name}, which may change"):
+        export_model(model, tmp_path / "a.onnx")
+    assert not list(tmp_path.iterdir())
+
+
+class OwnExtractor(FlattenExtractor):
+    """Extractor of features that is not that of stable-baselines3."""
+
+
+def own_ppo(**policy: Any) -> PPO:
+    return PPO("MlpPolicy", own_env(), n_steps=64, device="cpu", policy_kwargs=policy)
+
+
+def with_norm() -> PPO:
+    model = own_ppo()
+    net = model.policy.mlp_extractor.policy_net
+    net.append(torch.nn.LayerNorm(net[-2].out_features))
+    return model
+
+
+def in_double_precision() -> PPO:
+    model = own_ppo()
+    model.policy.double()
+    return model
+
+
+def squashed() -> PPO:
+    options = {"squash_output": True}
+    return PPO("MlpPolicy", own_env(), use_sde=True, policy_kwargs=options, device="cpu")
+
+
+REFUSED: dict[str, tuple[Any, str]] = {
+    "elsewhere": (
+        lambda: PPO("MlpPolicy", "Pendulum-v1", device="cpu"),
+        "PendulumEnv, is not a SwimEnv of this process",
+    ),
+    "normalised": (
+        lambda: PPO("MlpPolicy", VecNormalize(DummyVecEnv([own_env])), device="cpu"),
+        "behind the wrapper VecNormalize",
+    ),
+    "SAC": (lambda: SAC("MlpPolicy", own_env(), device="cpu"), "of PPO or A2C, not SACPolicy"),
+    "ELU": (lambda: own_ppo(activation_fn=torch.nn.ELU), "activation ELU cannot be exported"),
+    "extractor": (
+        lambda: own_ppo(features_extractor_class=OwnExtractor),
+        "without the extractor of features OwnExtractor",
+    ),
+    "norm": (with_norm, "with linear layers and tanh, not with LayerNorm"),
+    "double": (in_double_precision, r"is in float64: call model\.policy\.float\(\)"),
+    "squashed": (squashed, "without squash_output"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_model_that_a_policy_file_cannot_represent_is_refused(tmp_path: Path, name: str) -> None:
+    make, message = REFUSED[name]
+    with pytest.raises(PolicyError, match=message):
+        export_model(make(), tmp_path / "a.onnx")
     assert not list(tmp_path.iterdir())
 
 

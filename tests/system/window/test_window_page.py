@@ -160,6 +160,26 @@ def test_stop_lets_the_fish_rest_and_keeps_the_parameters_for_the_next_start(
         assert complaints == []
 
 
+def test_every_controller_that_is_listed_can_be_started(window: WindowProcess) -> None:
+    needed = {"target": "0.01", "policy": "default-fish"}
+    with live_page(window.url) as (page, _):
+        listed = page.locator("#controller option").all_inner_texts()
+        assert {"hold", "square", "swing", "thrust", "ppo", "remote"} <= set(listed)
+        for name in listed:
+            page.select_option("#controller", name)
+            expect(page.locator("#start")).to_contain_text(name)
+            for parameter, value in needed.items():
+                field = page.locator(f"#parameter-{parameter}")
+                if field.count() and not field.input_value():
+                    expect(page.locator("#start")).to_be_disabled()
+                    field.fill(value)
+                    field.blur()
+            with page.expect_response("**/request", timeout=PATIENCE * 1e3) as response:
+                page.click("#start")
+            assert response.value.ok, f"{name}: {response.value.text()}"
+            expect(page.locator("#start")).to_have_text(f"Restart {name}")
+
+
 def test_the_outcome_of_an_emergency_stop_is_in_sight_of_a_page_that_is_scrolled(
     window: WindowProcess,
 ) -> None:

@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,6 +34,24 @@ def test_no_summary_is_cut(path: tuple[str, ...]) -> None:
     shown = CliRunner().invoke(fishctl, [*path, "--help"], terminal_width=80)
     assert shown.exit_code == 0
     assert "..." not in shown.stdout.replace("[ARGS]...", "")
+
+
+WITHOUT_EXTRAS = """
+import sys
+sys.modules |= dict.fromkeys(("aiohttp", "cv2", "numba", "onnx", "torch"))
+from click.testing import CliRunner
+from fishd.cli.main import fishctl
+from verb_reference import commands
+for words, _ in commands(fishctl):
+    done = CliRunner().invoke(fishctl, [*words.split(), "--help"])
+    assert done.exit_code == 0, (words, done.output, done.exception)
+"""
+
+
+def test_the_help_of_every_verb_needs_the_extra_lab_at_most() -> None:
+    folders = [str(folder) for folder in sys.path if folder]
+    code = f"import sys; sys.path[:] = {folders!r}\n{WITHOUT_EXTRAS}"
+    subprocess.run([sys.executable, "-P", "-c", code], check=True)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rigs.pictures import letters_of
+from rigs.pictures import letters_of, texts_in_pictures
 from rigs.policy_files import write
 
 from fishd.config import load
@@ -146,11 +146,11 @@ def test_the_picture_begins_with_an_upward_reversal() -> None:
 
 @pytest.mark.slow
 def test_the_picture_names_each_line_bar_and_whisker_and_the_amplitude(tmp_path: Path) -> None:
-    matplotlib = pytest.importorskip("matplotlib", reason=FIGURES)
+    pytest.importorskip("matplotlib", reason=FIGURES)
     from fishd.lab.compare.figures import draw
 
     contestants = [parse("swing"), parse("sine:frequency=1.8")]
-    with matplotlib.rc_context({"svg.fonttype": "none"}):
+    with texts_in_pictures():
         for runs in (1, 3):
             standings, traces = compare(CONFIG, contestants, 20.0, 5.0, runs)
             draw(tmp_path / f"{runs}.svg", standings, traces, 0.42)

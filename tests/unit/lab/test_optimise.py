@@ -1,5 +1,6 @@
 """Search of the best parameters: few ticks of swimming, and intervals that hold."""
 
+import json
 import os
 import signal
 from itertools import pairwise
@@ -10,7 +11,7 @@ import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import load
-from fishd.lab.experiment import Header, open_experiment
+from fishd.lab.experiment import Header, find_largest_thrust, open_experiment
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
     Trial,
@@ -98,11 +99,19 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert (folder / "thrust.svg").stat().st_size > 10_000
     again = f"optimise --resume {folder} --budget"
     assert f"To continue: fishctl {again} SECONDS" in done.stderr
+    answer = json.loads((folder / "result.json").read_text())
+    assert f"{1e3 * answer['thrust']:.2f} ± " in done.stdout, "not the luckiest of the candidates"
+    assert find_largest_thrust(folder) == tuple(
+        answer[key] for key in ("thrust", "thrust_ci95", "total_ci95")
+    )
     table = (folder / "rows.csv").read_text()
     more = fishctl(*again.split(), "40")
     assert f"{folder}: 3 candidates measured already" in more.stdout
     assert (folder / "rows.csv").read_text().startswith(table)
-    assert len(read(folder / "search-2.mcap")) > 100
+    second = open_run(folder / "search-2.mcap").ticks
+    assert len(second) > 100
+    noise = [{tick.fx for tick in ticks[:20]} for ticks in (run.ticks, second)]
+    assert not noise[0] & noise[1], "what is measured later is independent"
     refused = one_line(fishctl(*words, "--resume", str(folder), "--amplitude", "0.3"))
     assert "began with parameters.amplitude = None, now it is 0.3" in refused
     assert "--resume" in one_line(fishctl(*words, "--folder", str(folder)))

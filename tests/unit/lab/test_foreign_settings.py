@@ -1,0 +1,60 @@
+"""Settings of matplotlib that are for other programs, or damaged, change no figure."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DRAW = """
+import sys
+if "imported" in sys.argv:
+    import matplotlib
+    matplotlib.rcParams.update({"text.usetex": True, "figure.facecolor": "red"})
+from fishd.lab.drawing import open_figure
+with open_figure(sys.argv[1], (2.0, 1.0)) as figure:
+    axes = figure.subplots()
+    axes.plot([0.0, 1.0], [0.0, 1.0])
+    axes.set_title("$F_x$ (mN) # 50 %")
+"""
+USETEX = "text.usetex: True\naxes.facecolor: red\n"
+
+
+def draw(folder: Path, *arguments: str, **environment: str) -> bytes:
+    """Draw a figure in a process in this folder; return its file."""
+    command = [sys.executable, "-P", "-c", DRAW, "figure.svg", *arguments]
+    subprocess.run(command, cwd=folder, env=os.environ | environment, check=True)
+    return (folder / "figure.svg").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    return draw(tmp_path_factory.mktemp("plain"))
+
+
+def test_the_backend_of_a_notebook_is_for_the_notebook(tmp_path: Path, plain: bytes) -> None:
+    assert draw(tmp_path, MPLBACKEND="module://matplotlib_inline.backend_inline") == plain
+
+
+@pytest.mark.parametrize("content", [USETEX.encode(), b"axes.titlecolor: red # caf\xe9\n"])
+def test_a_file_that_somebody_has_put_into_the_working_folder_is_not_read(
+    content: bytes, tmp_path: Path, plain: bytes
+) -> None:
+    (tmp_path / "matplotlibrc").write_bytes(content)
+    assert draw(tmp_path) == plain
+
+
+@pytest.mark.parametrize("content", [USETEX.encode(), b"axes.titlecolor: red # caf\xe9\n"])
+def test_the_settings_of_the_user_are_for_the_figures_of_the_user(
+    content: bytes, tmp_path: Path, plain: bytes
+) -> None:
+    settings = tmp_path / "home" / "matplotlib"
+    settings.mkdir(parents=True)
+    (settings / "matplotlibrc").write_bytes(content)
+    assert draw(tmp_path, XDG_CONFIG_HOME=str(settings.parent)) == plain
+    assert draw(tmp_path, MATPLOTLIBRC=str(settings)) == plain
+
+
+def test_a_program_that_has_changed_them_gets_the_same_figure(tmp_path: Path, plain: bytes) -> None:
+    assert draw(tmp_path, "imported") == plain
