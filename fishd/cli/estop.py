@@ -10,13 +10,14 @@ import msgspec
 from fishd.cli.options import daemon_options
 from fishd.cli.output import echo, format_state, output_may_fail, print_json
 from fishd.client import Fish
+from fishd.core import addresses
 from fishd.core.addresses import socket_path
-from fishd.core.errors import NoDaemon, StartupError, Untrusted
+from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
 from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.core.protocol import State
 from fishd.hardware import release_recipe
 
-_TIMEOUT_S = 0.3
+_TIMEOUT_S = 0.1
 """Longest further wait for an answer, if neither socket has answered at once [s]."""
 
 
@@ -42,10 +43,10 @@ def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) 
         path = socket_path(fish.endpoint)
         try:
             state = fish.estop(message, timeout=_TIMEOUT_S if path else None)
-        except Untrusted:
+        except (Refused, Untrusted):
             raise
-        except NoDaemon as no_answer:
-            way, summary = "last resort", _end_pulses(no_answer, path, file)
+        except FishError as no_answer:
+            way, summary = "last resort", _end_pulses(no_answer, fish.endpoint, file)
             answer: dict[str, Any] = {"pulses": summary}
         else:
             way, summary = _describe_way(fish, path), format_state(state)
@@ -71,10 +72,16 @@ def _to_builtins(state: State) -> dict[str, Any]:
     return builtins
 
 
-def _end_pulses(no_answer: NoDaemon, path: Path | None, file: Path | None) -> str:
+def _end_pulses(no_answer: FishError, endpoint: str, file: Path | None) -> str:
     """End the pulses without the daemon; return what was done, in words."""
+    path = socket_path(endpoint)
     recipe = release_recipe.read(str(path)) if path and not file else None
     if recipe is None:
+        if not file and not addresses.is_own(endpoint):
+            raise NoDaemon(
+                f"{no_answer}; nothing was released: the servo is that of another machine, so run "
+                "fishctl estop there"
+            )
         from fishd.cli.release import release_by_config
 
         return release_by_config(no_answer, file)

@@ -15,7 +15,7 @@ from fishd.client import Fish
 from fishd.config import FILE_VARIABLE, SERVICE_FILE, Config, load, service_file
 from fishd.core import text
 from fishd.core.addresses import find_control_address
-from fishd.core.errors import ConfigError, FishError, NoDaemon, ServoError, StartupError
+from fishd.core.errors import ConfigError, FishError, ServoError, StartupError
 from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.core.process.kernel_names import Holder
 from fishd.hardware.release_recipe import NOT_RELEASED, describe_outcome
@@ -67,7 +67,7 @@ def _print(done: str, as_json: bool) -> None:
         echo(done)
 
 
-def release_by_config(no_answer: NoDaemon, file: Path | None) -> str:
+def release_by_config(no_answer: FishError, file: Path | None) -> str:
     """Do as the verb, for a fishd that does not answer; return what was done, in words.
 
     no_answer: error to report if no configuration names a servo

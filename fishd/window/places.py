@@ -1,72 +1,114 @@
-"""Places of connections: however many are opened, an emergency stop finds one."""
+"""Places of connections: however many are opened, an emergency stop finds one.
+
+A connection that has sent nothing costs a descriptor and no more: the HTTP server sees it once its
+first byte is there, so thousands of them a second do not take the processor.
+"""
 
 import asyncio
+import socket
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import partial
 from ipaddress import IPv4Address, IPv6Address, ip_address
 
 from aiohttp import web
-from msgspec import Struct
 
 PLACES = 256
 """Largest number of connections of each group of senders; a further one replaces one of them."""
 MAX_PAIRED_ADDRESSES = 200
+MAX_ACCEPTED = 16
+"""Largest number of connections that are accepted before others are served."""
+ACCEPT_PAUSE_S = 1.0
+"""Time until connections are accepted again after a failure, such as no free descriptor [s]."""
 
 
-class _Place(Struct, eq=False):
+class _Place:
     """Place that a connection takes."""
 
-    transport: asyncio.Transport
-    address: str
-    is_kept: bool = False
-    """Whether other connections are ended before this one."""
+    def __init__(self, connection: socket.socket, address: str) -> None:
+        self.connection, self.address = connection, address
+        self.timeout: asyncio.TimerHandle | None = None
+        """End of a connection that sends nothing; None once it has sent something."""
+        self.transport: asyncio.Transport | None = None
+        self.handler: web.RequestHandler | None = None
+        """Protocol that serves it; None until it has sent something."""
+        self.is_kept = False
+        """Whether other connections are ended before this one."""
+        self.is_ended = False
 
     @property
     def is_taken(self) -> bool:
         """Whether the connection still exists; one that closes may have to send its answer."""
-        return not self.transport.is_closing() or self.transport.get_write_buffer_size() > 0
+        transport = self.transport
+        return not transport or not transport.is_closing() or transport.get_write_buffer_size() > 0
+
+    def wait(self, seconds: float, begin: Callable[["_Place"], None], end: "_End") -> None:
+        """Wait for the first byte, at most for this time [s]."""
+        loop = asyncio.get_running_loop()
+        self.timeout = loop.call_later(seconds, end, self)
+        loop.add_reader(self.connection, begin, self)
+
+    def stop_waiting(self) -> None:
+        """Leave the connection to another reader."""
+        if self.timeout:
+            self.timeout.cancel()
+            asyncio.get_running_loop().remove_reader(self.connection)
+            self.timeout = None
+
+    def end(self) -> None:
+        """End the connection at once; while its transport is created, `_Door` does so."""
+        self.is_ended = True
+        if self.transport:
+            self.transport.abort()
+        elif self.timeout:
+            self.stop_waiting()
+            self.connection.close()
+
+
+_End = Callable[[_Place], None]
 
 
 class _Group:
     """Places of one group of senders, the oldest first."""
 
     def __init__(self) -> None:
-        self._places: dict[web.RequestHandler, _Place] = {}
+        self.places: dict[_Place, None] = {}
         self._counts = Counter[str]()
         """Number of places of each address."""
 
-    def find(self, handler: web.RequestHandler) -> _Place | None:
-        """Return the place of a connection."""
-        return self._places.get(handler)
-
-    def add(self, handler: web.RequestHandler, place: _Place) -> None:
+    def add(self, place: _Place) -> None:
         """Give a place to a connection, and end another one if there is none."""
-        if len(self._places) >= PLACES:
+        if len(self.places) >= PLACES:
             self._make_room()
-        self._places[handler] = place
+        self.places[place] = None
         self._counts[place.address] += 1
 
-    def remove(self, handler: web.RequestHandler) -> None:
+    def remove(self, place: _Place) -> None:
         """Let a connection no longer take a place."""
-        if place := self._places.pop(handler, None):
+        if place in self.places:
+            del self.places[place]
             self._counts[place.address] -= 1
             if not self._counts[place.address]:
                 del self._counts[place.address]
 
+    def end(self, place: _Place) -> None:
+        """End a connection."""
+        self.remove(place)
+        place.end()
+
     def _make_room(self) -> None:
         """End the connection that `Places` describes, unless another one has ended already."""
         victim, lowest = None, (True, 1)
-        for handler, place in self._places.items():
+        for place in self.places:
             if not place.is_taken:
-                self.remove(handler)
+                self.remove(place)
                 return
             rank = (place.is_kept, -self._counts[place.address])
             if rank < lowest:
-                victim, lowest = handler, rank
+                victim, lowest = place, rank
         assert victim
-        transport = self._places[victim].transport
-        self.remove(victim)
-        transport.abort()
+        self.end(victim)
 
 
 class Places:
@@ -81,10 +123,34 @@ class Places:
         self._groups = self._here, self._paired_devices, self._others = _Group(), _Group(), _Group()
         self._paired: dict[str, None] = {}
         """Addresses from which a paired device has sent a request, the newest last."""
+        self._listeners: list[socket.socket] = []
+        self._opening: set[asyncio.Task[object]] = set()
 
-    def protocol(self, create: Callable[[], web.RequestHandler]) -> asyncio.Protocol:
-        """Return the protocol of a new connection; `create` returns that of an admitted one."""
-        return _Door(self, create)
+    def open(
+        self,
+        listeners: Iterable[socket.socket],
+        create: Callable[[], web.RequestHandler],
+        timeout: float,
+    ) -> None:
+        """Accept connections.
+
+        listeners: listening sockets, which this object closes
+        create: returns the protocol of a connection that has sent something
+        timeout: longest time until a connection has sent something [s]
+        """
+        self._create, self._timeout = create, timeout
+        self._listeners += listeners
+        for listener in self._listeners:
+            self._listen(listener)
+
+    def close(self) -> None:
+        """Accept no more connections, and end those that have sent nothing."""
+        for listener in self._listeners:
+            asyncio.get_running_loop().remove_reader(listener)
+            listener.close()
+        for group in self._groups:
+            for place in [place for place in group.places if place.timeout]:
+                group.end(place)
 
     def reserve(self, address: str) -> None:
         """Let connections from the address of a paired device have the places of that group."""
@@ -96,18 +162,51 @@ class Places:
     def keep(self, handler: web.RequestHandler) -> None:
         """End this connection last."""
         for group in self._groups:
-            if place := group.find(handler):
-                place.is_kept = True
+            for place in group.places:
+                if place.handler is handler:
+                    place.is_kept = True
 
     def leave(self, handler: web.RequestHandler) -> None:
         """Let a connection no longer take a place."""
         for group in self._groups:
-            group.remove(handler)
+            for place in [place for place in group.places if place.handler is handler]:
+                group.remove(place)
 
-    def admit(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Give a place to a new connection, and end another one if there is none."""
-        address = str((transport.get_extra_info("peername") or ("",))[0])
-        self._find_group(address).add(handler, _Place(transport, address))
+    def _listen(self, listener: socket.socket) -> None:
+        if listener.fileno() >= 0:
+            asyncio.get_running_loop().add_reader(listener, self._accept, listener)
+
+    def _accept(self, listener: socket.socket) -> None:
+        """Admit connections that have come, a few at a time."""
+        for _ in range(MAX_ACCEPTED):
+            try:
+                connection, peer = listener.accept()
+            except (BlockingIOError, ConnectionAbortedError):
+                return
+            except OSError:
+                loop = asyncio.get_running_loop()
+                loop.remove_reader(listener)
+                loop.call_later(ACCEPT_PAUSE_S, self._listen, listener)
+                return
+            connection.setblocking(False)
+            place, group = _Place(connection, str(peer[0])), self._find_group(str(peer[0]))
+            group.add(place)
+            place.wait(self._timeout, partial(self._begin, group), group.end)
+
+    def _begin(self, group: _Group, place: _Place) -> None:
+        """Serve a connection that has sent something, or has ended."""
+        first = b""
+        with suppress(OSError):
+            first = place.connection.recv(1, socket.MSG_PEEK)
+        if not first:
+            group.end(place)
+            return
+        place.stop_waiting()
+        loop = asyncio.get_running_loop()
+        door = partial(_Door, place, self._create)
+        opening = loop.create_task(loop.connect_accepted_socket(door, place.connection))
+        self._opening.add(opening)
+        opening.add_done_callback(self._opening.discard)
 
     def _find_group(self, address: str) -> _Group:
         if is_loopback(address):
@@ -116,16 +215,19 @@ class Places:
 
 
 class _Door(asyncio.Protocol):
-    """Protocol of a connection until it is admitted, which depends on its address."""
+    """Protocol of a connection until it has a transport; another one may have its place by then."""
 
-    def __init__(self, places: Places, create: Callable[[], web.RequestHandler]) -> None:
-        self._places, self._create = places, create
+    def __init__(self, place: _Place, create: Callable[[], web.RequestHandler]) -> None:
+        self._place, self._create = place, create
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Admit the connection."""
+        """Serve the connection."""
         assert isinstance(transport, asyncio.Transport)
-        handler = self._create()
-        self._places.admit(handler, transport)
+        self._place.transport = transport
+        if self._place.is_ended:
+            transport.abort()
+            return
+        self._place.handler = handler = self._create()
         transport.set_protocol(handler)
         handler.connection_made(transport)
 

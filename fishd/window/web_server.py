@@ -120,10 +120,14 @@ class WebServer:
         assert server
         try:
             self._server = await loop.create_server(
-                lambda: self._places.protocol(server), self._host, self._port, backlog=BACKLOG
+                asyncio.Protocol, self._host, self._port, start_serving=False
             )
-            for listener in self._server.sockets:  # its connections have the same size
+            listeners = [listener.dup() for listener in self._server.sockets]
+            for listener in listeners:  # its connections have the same size
                 listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
+                listener.setblocking(False)
+                listener.listen(BACKLOG)
+            self._places.open(listeners, server, REQUEST_TIMEOUT_S)
         except OSError as error:
             await self._runner.cleanup()
             number = error.errno or 0  # negative for errors of the resolver
@@ -136,6 +140,7 @@ class WebServer:
     async def __aexit__(self, *_: object) -> None:
         """Close all pages, and abort connections that do not close."""
         self._server.close()
+        self._places.close()
         for viewer in tuple(self.viewers):
             viewer.end()
         server = self._runner.server

@@ -6,14 +6,13 @@ until the stop is confirmed.
 
 import asyncio
 import json
-import os
+import signal
 from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack, asynccontextmanager, suppress
 from pathlib import Path
 
 import pytest
 from rigs.processes import Daemon, wait_until
-from rigs.virtual_pi_process import virtual_pi
 from rigs.window_process import WindowProcess, run, running_window
 
 from common.daemon import list_children
@@ -243,18 +242,12 @@ def test_when_a_device_was_seen_is_stored_once_the_disk_allows_it(
     wait_until(lambda: json.loads(file.read_bytes())["devices"][0]["seen"] > 0.0)
 
 
-def test_all_presses_while_fishd_is_dead_share_one_last_resort(
-    own_daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_all_presses_while_fishd_is_dead_or_hangs_share_one_last_resort(
+    own_daemon: Daemon, tmp_path: Path, number: signal.Signals
 ) -> None:
-    config = tmp_path / "fishd.yaml"
-    monkeypatch.setenv("FISHD_CONFIG", os.fspath(config))
-    with (
-        virtual_pi(tmp_path) as pi,
-        running_window(tmp_path, fish=own_daemon.endpoint) as window,
-    ):
-        socket, port = f"virtual_pi: {{socket: {pi.path}}}", f"servo: {{port: {pi.port}}}"
-        config.write_text(f"robot: virtual-pi\n{socket}\n{port}\n")
-        own_daemon.kill()
+    with running_window(tmp_path, fish=own_daemon.endpoint) as window:
+        own_daemon.process.send_signal(number)
         here = Target("127.0.0.1", window.port)
 
         async def test() -> None:
@@ -265,8 +258,11 @@ def test_all_presses_while_fishd_is_dead_share_one_last_resort(
                 await asyncio.sleep(0.005)
             assert None not in pressing.result()
             assert most == 1
+            payload = here.request("POST", "/api/fish/fish/estop", body=b"{}")
+            assert b'"way":"last resort"' in await here.exchange(payload)
 
         run(test())
+        own_daemon.process.send_signal(signal.SIGCONT)
 
 
 REFUSED = [
