@@ -6,11 +6,11 @@ first byte is there, so thousands of them a second do not take the processor.
 
 import asyncio
 import socket
-from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from functools import partial
+from functools import lru_cache, partial
 from ipaddress import IPv4Address, IPv6Address, ip_address
+from itertools import chain
 
 from aiohttp import web
 
@@ -18,7 +18,10 @@ PLACES = 256
 """Largest number of connections of each group of senders; a further one replaces one of them."""
 MAX_PAIRED_ADDRESSES = 200
 MAX_ACCEPTED = 16
-"""Largest number of connections that are accepted before others are served."""
+"""Largest number of connections that are accepted before others are served.
+
+Few against `PLACES`: a request reaches its handler before as many others have come.
+"""
 ACCEPT_PAUSE_S = 1.0
 """Time until connections are accepted again after a failure, such as no free descriptor [s]."""
 
@@ -26,38 +29,31 @@ ACCEPT_PAUSE_S = 1.0
 class _Place:
     """Place that a connection takes."""
 
-    def __init__(self, connection: socket.socket, address: str) -> None:
-        self.connection, self.address = connection, address
+    def __init__(self, group: "_Group", connection: socket.socket, address: str) -> None:
+        self.group, self.connection, self.address = group, connection, address
         self.timeout: asyncio.TimerHandle | None = None
         """End of a connection that sends nothing; None once it has sent something."""
         self.transport: asyncio.Transport | None = None
-        self.handler: web.RequestHandler | None = None
-        """Protocol that serves it; None until it has sent something."""
         self.is_kept = False
         """Whether other connections are ended before this one."""
         self.is_ended = False
 
-    @property
-    def is_taken(self) -> bool:
-        """Whether the connection still exists; one that closes may have to send its answer."""
-        transport = self.transport
-        return not transport or not transport.is_closing() or transport.get_write_buffer_size() > 0
-
-    def wait(self, seconds: float, begin: Callable[["_Place"], None], end: "_End") -> None:
+    def wait(self, seconds: float, begin: Callable[["_Place"], None]) -> None:
         """Wait for the first byte, at most for this time [s]."""
         loop = asyncio.get_running_loop()
-        self.timeout = loop.call_later(seconds, end, self)
-        loop.add_reader(self.connection, begin, self)
+        self.timeout = loop.call_later(seconds, self.end)
+        loop.add_reader(self.connection.fileno(), begin, self)
 
     def stop_waiting(self) -> None:
         """Leave the connection to another reader."""
         if self.timeout:
             self.timeout.cancel()
-            asyncio.get_running_loop().remove_reader(self.connection)
+            asyncio.get_running_loop().remove_reader(self.connection.fileno())
             self.timeout = None
 
     def end(self) -> None:
         """End the connection at once; while its transport is created, `_Door` does so."""
+        self.group.remove(self)
         self.is_ended = True
         if self.transport:
             self.transport.abort()
@@ -66,49 +62,38 @@ class _Place:
             self.connection.close()
 
 
-_End = Callable[[_Place], None]
-
-
 class _Group:
-    """Places of one group of senders, the oldest first."""
+    """Places of one group of senders."""
 
     def __init__(self) -> None:
-        self.places: dict[_Place, None] = {}
-        self._counts = Counter[str]()
-        """Number of places of each address."""
+        self._places: dict[str, dict[_Place, None]] = {}
+        """Places of each address, the oldest first."""
+        self._count = 0
+
+    def __iter__(self) -> Iterator[_Place]:
+        return (place for places in tuple(self._places.values()) for place in tuple(places))
 
     def add(self, place: _Place) -> None:
         """Give a place to a connection, and end another one if there is none."""
-        if len(self.places) >= PLACES:
-            self._make_room()
-        self.places[place] = None
-        self._counts[place.address] += 1
+        if self._count >= PLACES:
+            self._find_victim().end()
+        self._places.setdefault(place.address, {})[place] = None
+        self._count += 1
 
     def remove(self, place: _Place) -> None:
-        """Let a connection no longer take a place."""
-        if place in self.places:
-            del self.places[place]
-            self._counts[place.address] -= 1
-            if not self._counts[place.address]:
-                del self._counts[place.address]
+        """Let a connection no longer take a place; may be called twice."""
+        places = self._places.get(place.address, {})
+        if place in places:
+            del places[place]
+            self._count -= 1
+            if not places:
+                del self._places[place.address]
 
-    def end(self, place: _Place) -> None:
-        """End a connection."""
-        self.remove(place)
-        place.end()
-
-    def _make_room(self) -> None:
-        """End the connection that `Places` describes, unless another one has ended already."""
-        victim, lowest = None, (True, 1)
-        for place in self.places:
-            if not place.is_taken:
-                self.remove(place)
-                return
-            rank = (place.is_kept, -self._counts[place.address])
-            if rank < lowest:
-                victim, lowest = place, rank
-        assert victim
-        self.end(victim)
+    def _find_victim(self) -> _Place:
+        """Return the connection that a further one replaces, as `Places` describes."""
+        busiest = max(self._places.values(), key=len)
+        free: Iterator[_Place] = (place for place in chain(busiest, self) if not place.is_kept)
+        return next(chain(free, busiest))
 
 
 class Places:
@@ -123,6 +108,8 @@ class Places:
         self._groups = self._here, self._paired_devices, self._others = _Group(), _Group(), _Group()
         self._paired: dict[str, None] = {}
         """Addresses from which a paired device has sent a request, the newest last."""
+        self._served: dict[web.RequestHandler, _Place] = {}
+        """Places of connections that have sent something, by their protocol."""
         self._listeners: list[socket.socket] = []
         self._opening: set[asyncio.Task[object]] = set()
 
@@ -149,8 +136,9 @@ class Places:
             asyncio.get_running_loop().remove_reader(listener)
             listener.close()
         for group in self._groups:
-            for place in [place for place in group.places if place.timeout]:
-                group.end(place)
+            for place in group:
+                if place.timeout:
+                    place.end()
 
     def reserve(self, address: str) -> None:
         """Let connections from the address of a paired device have the places of that group."""
@@ -161,16 +149,24 @@ class Places:
 
     def keep(self, handler: web.RequestHandler) -> None:
         """End this connection last."""
-        for group in self._groups:
-            for place in group.places:
-                if place.handler is handler:
-                    place.is_kept = True
+        if place := self._served.get(handler):
+            place.is_kept = True
 
     def leave(self, handler: web.RequestHandler) -> None:
         """Let a connection no longer take a place."""
-        for group in self._groups:
-            for place in [place for place in group.places if place.handler is handler]:
-                group.remove(place)
+        if place := self._served.get(handler):
+            place.group.remove(place)
+
+    def serve(self, place: _Place) -> web.RequestHandler:
+        """Return the protocol of a connection that has sent something."""
+        handler = self._create()
+        self._served[handler] = place
+        return handler
+
+    def forget(self, handler: web.RequestHandler) -> None:
+        """Free the place of a connection that has ended."""
+        place = self._served.pop(handler)
+        place.group.remove(place)
 
     def _listen(self, listener: socket.socket) -> None:
         if listener.fileno() >= 0:
@@ -189,21 +185,22 @@ class Places:
                 loop.call_later(ACCEPT_PAUSE_S, self._listen, listener)
                 return
             connection.setblocking(False)
-            place, group = _Place(connection, str(peer[0])), self._find_group(str(peer[0]))
-            group.add(place)
-            place.wait(self._timeout, partial(self._begin, group), group.end)
+            address = str(peer[0])
+            place = _Place(self._find_group(address), connection, address)
+            place.group.add(place)
+            place.wait(self._timeout, self._begin)
 
-    def _begin(self, group: _Group, place: _Place) -> None:
+    def _begin(self, place: _Place) -> None:
         """Serve a connection that has sent something, or has ended."""
         first = b""
         with suppress(OSError):
             first = place.connection.recv(1, socket.MSG_PEEK)
         if not first:
-            group.end(place)
+            place.end()
             return
         place.stop_waiting()
         loop = asyncio.get_running_loop()
-        door = partial(_Door, place, self._create)
+        door = partial(_Door, self, place)
         opening = loop.create_task(loop.connect_accepted_socket(door, place.connection))
         self._opening.add(opening)
         opening.add_done_callback(self._opening.discard)
@@ -215,21 +212,47 @@ class Places:
 
 
 class _Door(asyncio.Protocol):
-    """Protocol of a connection until it has a transport; another one may have its place by then."""
+    """Protocol of a connection that has sent something: that of the HTTP server, and its place."""
 
-    def __init__(self, place: _Place, create: Callable[[], web.RequestHandler]) -> None:
-        self._place, self._create = place, create
+    def __init__(self, places: Places, place: _Place) -> None:
+        self._places, self._place = places, place
+        self._handler: web.RequestHandler | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Serve the connection."""
+        """Serve the connection, unless another one has its place by now."""
         assert isinstance(transport, asyncio.Transport)
         self._place.transport = transport
         if self._place.is_ended:
             transport.abort()
             return
-        self._place.handler = handler = self._create()
-        transport.set_protocol(handler)
-        handler.connection_made(transport)
+        self._handler = self._places.serve(self._place)
+        self._handler.connection_made(transport)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        """Free the place."""
+        if self._handler:
+            self._places.forget(self._handler)
+            self._handler.connection_lost(error)
+
+    def data_received(self, data: bytes) -> None:
+        """Pass on what the connection has sent."""
+        if self._handler:
+            self._handler.data_received(data)
+
+    def eof_received(self) -> None:
+        """Pass on the end of what the connection sends."""
+        if self._handler:
+            self._handler.eof_received()
+
+    def pause_writing(self) -> None:
+        """Pass on that the connection does not read."""
+        if self._handler:
+            self._handler.pause_writing()
+
+    def resume_writing(self) -> None:
+        """Pass on that the connection reads again."""
+        if self._handler:
+            self._handler.resume_writing()
 
 
 def parse_ip(name: str) -> IPv4Address | IPv6Address | None:
@@ -240,6 +263,7 @@ def parse_ip(name: str) -> IPv4Address | IPv6Address | None:
         return None
 
 
+@lru_cache(maxsize=1024)
 def is_loopback(name: str) -> bool:
     """Return whether a name is an IP address of loopback."""
     address = parse_ip(name)

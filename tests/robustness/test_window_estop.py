@@ -19,7 +19,6 @@ from common.daemon import list_children
 from fishd.window.devices import Devices
 from fishd.window.places import PLACES
 from reliability.window_attacks import (
-    BARE_CONNECTIONS,
     DISK_TROUBLES,
     FLOODS,
     HISTORIES,
@@ -78,7 +77,7 @@ async def attacking(attack: Attack, target: Target, requests: int) -> AsyncItera
             await task
 
 
-@pytest.mark.parametrize("name", sorted(NETWORK_ATTACKS.keys() - {BARE_CONNECTIONS}))
+@pytest.mark.parametrize("name", NETWORK_ATTACKS)
 def test_an_emergency_stop_gets_through_an_attack_from_its_own_address(
     open_window: WindowProcess, daemon: Daemon, name: str
 ) -> None:

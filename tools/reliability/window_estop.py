@@ -21,7 +21,6 @@ from common.report import Options, Report, progress, table
 from fishd.window.devices import Devices
 from reliability.window import Window, memory
 from reliability.window_attacks import (
-    BARE_CONNECTIONS,
     DISK_TROUBLES,
     NETWORK_ATTACKS,
     Target,
@@ -144,12 +143,12 @@ def describe(outcome: Outcome) -> str:
 
 @contextmanager
 def attacked(names: Sequence[str], targets: Sequence[Target]) -> Iterator[None]:
-    """Attack a window at several addresses in other processes; bare connections: the network's."""
+    """Attack a window at several addresses in other processes."""
     context = multiprocessing.get_context("spawn")
     processes = [
         context.Process(target=_attack, args=(name, target), daemon=True)
         for name in names
-        for target in (targets[1:] if name == BARE_CONNECTIONS else targets)
+        for target in targets
     ]
     for process in processes:
         process.start()
