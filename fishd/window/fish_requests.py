@@ -25,8 +25,6 @@ log = logging.getLogger(__name__)
 
 MAX_SENT_HISTORIES = 2
 """Number of answers with the history that are sent at a time."""
-PART_BYTES = 2**15
-"""Size of the parts in which a long answer is sent [bytes]."""
 Text = Annotated[str, Meta(max_length=1000)]
 
 
@@ -155,13 +153,14 @@ class FishRequests:
         )
 
     async def _send_history(self, link: FishLink) -> AsyncIterator[bytes]:
-        """Yield an answer in parts: of the whole, each client that is slow kept a copy.
+        """Yield an answer in parts, the messages that a page gets.
 
         Others wait, as an emergency stop must find the processor free.
         """
         async with self._sending:
-            history, _ = link.history()
-            yield b'{"ok":true,"result":'
-            for begin in range(0, len(history), PART_BYTES):
-                yield history[begin : begin + PART_BYTES]
-            yield b"}"
+            messages, _ = link.history()
+            before = b'{"ok":true,"result":['
+            for message in messages:
+                yield before + message
+                before = b","
+            yield b"]}" if messages else before + b"]}"

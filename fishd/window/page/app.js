@@ -54,16 +54,22 @@ const receive = {
     });
     if (state.estop?.phase === "done" && payload.status?.mode !== "estop") state.estop = null;
     ring = new Ring(payload.status?.tick ?? 0.05);
-    for (const tick of ticksOf(payload.history)) ring.push(tick);
-    state.tick = ring.latest;
-    const age = payload.connection?.age;
-    state.lastTick = ring.latest && Number.isFinite(age) ? performance.now() - 1000 * age : null;
+    state.tick = state.lastTick = null;
     charts.setRing(ring);
     charts.marks.length = 0;
     for (const event of state.events) markEvent(event);
     setStatus(payload.status);
     document.title = `${state.name} · fishd`;
     document.body.classList.remove("waiting");
+    changed();
+  },
+  /** Take a part of the history. */
+  history(columns) {
+    for (const tick of ticksOf(columns)) ring.push(tick);
+    state.tick = ring.latest;
+    const age = state.connection?.age;
+    state.lastTick ??= Number.isFinite(age) ? performance.now() - 1000 * age : null;
+    charts.dirty = true;
     changed();
   },
   ticks(ticks) {
