@@ -17,11 +17,10 @@ from aiohttp import web
 PLACES = 256
 """Largest number of connections of each group of senders; a further one replaces one of them."""
 MAX_PAIRED_ADDRESSES = 200
-MAX_ACCEPTED = 16
-"""Largest number of connections that are accepted before others are served.
-
-Few against `PLACES`: a request reaches its handler before as many others have come.
-"""
+MAX_ACCEPTED = 256
+"""Largest number of connections that are accepted before others are served."""
+RECEIVE_BYTES = 16 * 2**10
+"""Size of what a connection may send before it is read [bytes]: little is read at a time."""
 ACCEPT_PAUSE_S = 1.0
 """Time until connections are accepted again after a failure, such as no free descriptor [s]."""
 
@@ -34,6 +33,8 @@ class _Place:
         self.timeout: asyncio.TimerHandle | None = None
         """End of a connection that sends nothing; None once it has sent something."""
         self.transport: asyncio.Transport | None = None
+        self.is_silent = True
+        """Whether it has sent nothing yet."""
         self.is_kept = False
         """Whether other connections are ended before this one."""
         self.is_ended = False
@@ -66,30 +67,34 @@ class _Group:
     """Places of one group of senders."""
 
     def __init__(self) -> None:
-        self._places: dict[str, dict[_Place, None]] = {}
-        """Places of each address, the oldest first."""
+        self._places: dict[tuple[str, bool], dict[_Place, None]] = {}
+        """Places of each address, those that are silent apart, the oldest first."""
         self._count = 0
 
     def __iter__(self) -> Iterator[_Place]:
         return (place for places in tuple(self._places.values()) for place in tuple(places))
 
+    @property
+    def is_full(self) -> bool:
+        """Whether a further connection has no place."""
+        return self._count >= PLACES
+
     def add(self, place: _Place) -> None:
-        """Give a place to a connection, and end another one if there is none."""
-        if self._count >= PLACES:
-            self._find_victim().end()
-        self._places.setdefault(place.address, {})[place] = None
+        """Give a place to a connection."""
+        self._places.setdefault((place.address, place.is_silent), {})[place] = None
         self._count += 1
 
     def remove(self, place: _Place) -> None:
         """Let a connection no longer take a place; may be called twice."""
-        places = self._places.get(place.address, {})
+        key = place.address, place.is_silent
+        places = self._places.get(key, {})
         if place in places:
             del places[place]
             self._count -= 1
             if not places:
-                del self._places[place.address]
+                del self._places[key]
 
-    def _find_victim(self) -> _Place:
+    def find_victim(self) -> _Place:
         """Return the connection that a further one replaces, as `Places` describes."""
         busiest = max(self._places.values(), key=len)
         free: Iterator[_Place] = (place for place in chain(busiest, self) if not place.is_kept)
@@ -101,7 +106,8 @@ class Places:
 
     This machine, addresses of paired devices, and all others have places of their own. A connection
     that finds none replaces the oldest one of that address of its group that has most of them: its
-    sender had the most time to send a request, and others are not disturbed.
+    sender had the most time to send a request, and others are not disturbed. Those of one address
+    that have sent nothing do not replace those that have, nor the reverse.
     """
 
     def __init__(self) -> None:
@@ -187,11 +193,17 @@ class Places:
             connection.setblocking(False)
             address = str(peer[0])
             place = _Place(self._find_group(address), connection, address)
+            while place.group.is_full:
+                victim = place.group.find_victim()
+                if victim.is_silent:
+                    self._begin(victim)  # what it has sent may have come now
+                else:
+                    victim.end()
             place.group.add(place)
             place.wait(self._timeout, self._begin)
 
     def _begin(self, place: _Place) -> None:
-        """Serve a connection that has sent something, or has ended."""
+        """Serve a connection if it has sent something, else end it."""
         first = b""
         with suppress(OSError):
             first = place.connection.recv(1, socket.MSG_PEEK)
@@ -199,6 +211,9 @@ class Places:
             place.end()
             return
         place.stop_waiting()
+        place.group.remove(place)
+        place.is_silent = False
+        place.group.add(place)
         loop = asyncio.get_running_loop()
         door = partial(_Door, self, place)
         opening = loop.create_task(loop.connect_accepted_socket(door, place.connection))
@@ -211,8 +226,13 @@ class Places:
         return self._paired_devices if address in self._paired else self._others
 
 
-class _Door(asyncio.Protocol):
-    """Protocol of a connection that has sent something: that of the HTTP server, and its place."""
+class _Door(asyncio.BufferedProtocol):
+    """Protocol of a connection that has sent something: that of the HTTP server, and its place.
+
+    All connections are read into one buffer, one after the other.
+    """
+
+    _BUFFER = memoryview(bytearray(RECEIVE_BYTES))
 
     def __init__(self, places: Places, place: _Place) -> None:
         self._places, self._place = places, place
@@ -234,10 +254,14 @@ class _Door(asyncio.Protocol):
             self._places.forget(self._handler)
             self._handler.connection_lost(error)
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Return the buffer to read into."""
+        return self._BUFFER
+
+    def buffer_updated(self, nbytes: int) -> None:
         """Pass on what the connection has sent."""
         if self._handler:
-            self._handler.data_received(data)
+            self._handler.data_received(bytes(self._BUFFER[:nbytes]))
 
     def eof_received(self) -> None:
         """Pass on the end of what the connection sends."""

@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 from aiohttp import http_exceptions, web
 
 from fishd.core.errors import StartupError
-from fishd.window.places import Places, parse_ip
+from fishd.window.places import RECEIVE_BYTES, Places, parse_ip
 from fishd.window.viewer import CLOSE_TIMEOUT_S, Viewer
 
 log = logging.getLogger(__name__)
@@ -37,8 +37,6 @@ REQUEST_TIMEOUT_S = 3.0
 """Longest time until a connection has sent its request, to the end of the headers [s]."""
 HEARTBEAT_PERIOD_S = 10.0
 """Period of pings to a page, which must answer within half of it [s]."""
-RECEIVE_BYTES = 16 * 2**10
-"""Size of what a connection may send before it is read [bytes]: little is read at a time."""
 MAX_MESSAGE_BYTES = 1024
 """Largest size of a message from a page [bytes]."""
 ESTOP = "estop"

@@ -169,5 +169,6 @@ def test_an_emergency_stop_whose_last_resort_fails_is_no_mistake_of_the_window(
             async with Browser(window.url) as browser:
                 refusal = await browser.refusal("/api/fish/fish/estop", {})
                 assert refusal == (503, "no-daemon")
+                assert await browser.refusal("/api/fish/shark/estop", {}) == (404, "no-fish")
 
         run(test())

@@ -134,7 +134,6 @@ def test_a_wrong_request_is_answered_with_its_mistake(
 @pytest.mark.parametrize(
     ("path", "status", "code"),
     [
-        ("/api/fish/shark/history", 404, "no-fish"),
         ("/api/fish/fish/drive", 405, "method-not-allowed"),
         ("/api/none", 404, "not-found"),
         ("/api/runs/..%2f..%2fetc/plot.png", 409, "job"),
