@@ -42,7 +42,7 @@ MAX_SILENCE_S = 2.0
 
 
 Outcome = tuple[str, str]
-"""What has stopped the pulses, a socket of fishd or the last resort, and the state since."""
+"""Way that stopped the pulses, a socket of fishd or the last resort, and the state since."""
 
 
 class _Request(Struct, eq=False):

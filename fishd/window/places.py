@@ -16,6 +16,8 @@ from aiohttp import web
 
 PLACES = 256
 """Largest number of connections of each group of senders; a further one replaces one of them."""
+MAX_SILENT = 64
+"""Number of places of a group above which those that have sent nothing replace one another."""
 MAX_PAIRED_ADDRESSES = 200
 MAX_ACCEPTED = 256
 """Largest number of connections that are accepted before others are served."""
@@ -96,7 +98,11 @@ class _Group:
 
     def find_victim(self) -> _Place:
         """Return the connection that a further one replaces, as `Places` describes."""
-        busiest = max(self._places.values(), key=len)
+        silent = [places for (_, is_silent), places in self._places.items() if is_silent]
+        if sum(map(len, silent)) < MAX_SILENT:  # a flood of these must not end those that speak
+            silent = []
+        others = [places for (_, is_silent), places in self._places.items() if not is_silent]
+        busiest = max(silent or others or self._places.values(), key=len)
         free: Iterator[_Place] = (place for place in chain(busiest, self) if not place.is_kept)
         return next(chain(free, busiest))
 
@@ -106,8 +112,8 @@ class Places:
 
     This machine, addresses of paired devices, and all others have places of their own. A connection
     that finds none replaces the oldest one of that address of its group that has most of them: its
-    sender had the most time to send a request, and others are not disturbed. Those of one address
-    that have sent nothing do not replace those that have, nor the reverse.
+    sender had the most time to send a request, and others are not disturbed. Where many have
+    sent nothing, one of them is replaced.
     """
 
     def __init__(self) -> None:
