@@ -12,14 +12,15 @@ import msgspec
 from fishd.cli.options import daemon_options
 from fishd.cli.output import echo, format_state, output_may_fail, print_json
 from fishd.client import Fish
+from fishd.core import addresses
 from fishd.core.addresses import socket_path
-from fishd.core.errors import NoDaemon, StartupError, Untrusted
+from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
 from fishd.core.local_daemons import LocalDaemon, become
 from fishd.core.process.interruption import SIGNALS, handle_signals
 from fishd.core.protocol import State
 from fishd.hardware import release_recipe
 
-_TIMEOUT_S = 0.3
+_TIMEOUT_S = 0.1
 """Longest further wait for an answer, if neither socket has answered at once [s]."""
 
 
@@ -45,9 +46,9 @@ def estop(message: str, file: Path | None, endpoint: str | None, as_json: bool) 
         path = socket_path(fish.endpoint)
         try:
             state = fish.estop(message, timeout=_TIMEOUT_S if path else None)
-        except Untrusted:
+        except (Refused, Untrusted):
             raise
-        except NoDaemon as no_answer:
+        except FishError as no_answer:
             way, summary = "last resort", _end_pulses(fish, path, file, no_answer)
             answer: dict[str, Any] = {"pulses": summary}
         else:
@@ -77,17 +78,22 @@ def _to_builtins(state: State) -> dict[str, Any]:
     return builtins
 
 
-def _end_pulses(fish: Fish, path: Path | None, file: Path | None, no_answer: NoDaemon) -> str:
+def _end_pulses(fish: Fish, path: Path | None, file: Path | None, no_answer: FishError) -> str:
     """End the pulses without the daemon; return what was done, in words."""
+    problem = no_answer.problem if isinstance(no_answer, NoDaemon) else str(no_answer)
     if not file:
         recipes = _find_recipes(fish.silent)
         if path and (own := release_recipe.read(str(path))):
             recipes.append(own)
         if recipes:
             return _carry_out({recipe["config"]: recipe for recipe in recipes}.values())
+        if not addresses.is_own(fish.endpoint):
+            raise NoDaemon(
+                f"{problem}; nothing was released: the servo is that of another machine, so run "
+                "fishctl estop there"
+            )
     from fishd.cli.release import release_by_config
 
-    problem = no_answer.problem
     for daemon in fish.silent:
         if daemon.user != os.geteuid():
             problem += f"; for process {daemon.pid}, run: {become(daemon.user)}fishctl estop"

@@ -18,6 +18,7 @@ from fishd.cli.output import echo, print_json
 from fishd.core import text
 from fishd.core.console import log_format_option
 from fishd.core.errors import StartupError
+from fishd.core.process.shutdown import exit_now
 from fishd.window.main import load_options, serve, window_options
 from fishd.window.settings import WindowSettings
 
@@ -63,18 +64,18 @@ def open_page(**values: Any) -> int:
     """Open the page in a browser; start it unless it runs."""
     settings = _load_running(**values)
     url = _local_url(settings)
-    if _answers(url):
-        _show(url)
-        return 0
-    return serve(settings, when_up=_show)
+    if not _answers(url):
+        exit_now(serve(settings, when_up=_show))
+    _show(url)
+    return 0
 
 
 @window.command()
 @window_options
 @log_format_option
-def start(log_format: str, **values: Any) -> int:
+def start(log_format: str, **values: Any) -> None:
     """Serve the page until Ctrl-C, as fishd-window does."""
-    return serve(load_options(**values), log_format)
+    exit_now(serve(load_options(**values), log_format))
 
 
 @window.command()

@@ -30,7 +30,6 @@ from fishd.core.errors import (
 )
 from fishd.core.process.kernel_names import Holder
 from fishd.core.process.unix_sockets import find_listener, find_trust_problem, is_deserted
-from fishd.core.protocol import State
 from fishd.core.signals import Status
 
 if TYPE_CHECKING:
@@ -53,7 +52,9 @@ forgotten it, and the next request connects again [s]."""
 ESTOP_FALLBACK_DELAY_S = 0.1
 """Time after which an emergency stop is also sent to fishd's emergency socket [s]."""
 ESTOP_SOCKET_TIMEOUT_S = 0.4
-"""Maximum time to wait for the answer of the emergency socket [s]."""
+"""Maximum time to wait for the answer of a socket of fishd itself [s]."""
+HUNG_TIMEOUT_S = 0.1
+"""The same after the emergency socket has not answered: most likely, that fishd hangs [s]."""
 
 
 class Connection:
@@ -198,39 +199,42 @@ class Connection:
         """Whether it is certain that no process listens at the endpoint."""
         return self._path is not None and is_deserted(self._path)
 
-    def estop_without_gateway(self, message: str, *, trusted: bool = True) -> State | None:
-        """Request an emergency stop at fishd's own sockets; None if none answers.
+    def ask_without_gateway(
+        self, kind: type[T], op: str, args: Mapping[str, Any], *, trusted: bool = True
+    ) -> T | None:
+        """Send a request to fishd's own sockets; return None if none answers.
 
         trusted: whether only this user and those that it trusts can listen in the folder
         """
         path = estop_path(self.endpoint) if trusted else None
-        identity, request = self.request("estop", {"message": message})
-        if path is None:
-            return self._estop_all(message)
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
-            client.settimeout(ESTOP_SOCKET_TIMEOUT_S)
-            try:
-                client.bind("")  # any free name, as the address of the answer
-                client.connect(os.fspath(path))
-                client.send(request)
-                reply = client.recv(2**20)
-            except OSError:
-                return self._estop_all(message)
-        self.estop_taken_by = "estop"
-        return self.result((reply,), identity, State)
-
-    def _estop_all(self, message: str) -> State | None:
-        """Request an emergency stop of every fishd that this endpoint may mean, by its name."""
+        timeout = ESTOP_SOCKET_TIMEOUT_S
+        if path:
+            identity, request = self.request(op, args)
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as client:
+                client.settimeout(timeout)
+                try:
+                    client.bind("")  # any free name, as the address of the answer
+                    client.connect(os.fspath(path))
+                    client.send(request)
+                    reply = client.recv(2**20)
+                except TimeoutError:
+                    timeout = HUNG_TIMEOUT_S
+                except OSError:
+                    pass
+                else:
+                    self.estop_taken_by = "estop"
+                    return self.result((reply,), identity, kind)
+        # Every fishd that this endpoint may mean, by its name.
         daemons = self.find_local_daemons()
-        states = self._ask(daemons, State, "estop", {"message": message})
-        self.silent = [daemon for daemon in daemons if daemon not in states and daemon.is_certain]
-        self.estop_taken_by = "kernel" if states else ""
-        if states:
+        results = self._ask(daemons, kind, op, args, timeout)
+        self.silent = [daemon for daemon in daemons if daemon not in results and daemon.is_certain]
+        self.estop_taken_by = "kernel" if results else ""
+        if results:
             statuses: dict[LocalDaemon, Status] = {}
             with suppress(FishError):
-                statuses = self._ask(states, Status, "status", {})
-            self._note_detour(states, statuses)
-        return next(iter(states.values()), None)
+                statuses = self._ask(results, Status, "status", {})
+            self._note_detour(results, statuses)
+        return next(iter(results.values()), None)
 
     def ask_directly(self, kind: type[T], op: str, args: Mapping[str, Any]) -> T | None:
         """Send a request to the name of a fishd in the kernel; None without an answer.
@@ -267,14 +271,22 @@ class Connection:
         )
 
     def _ask(
-        self, daemons: "Iterable[LocalDaemon]", kind: type[T], op: str, args: Mapping[str, Any]
+        self,
+        daemons: "Iterable[LocalDaemon]",
+        kind: type[T],
+        op: str,
+        args: Mapping[str, Any],
+        timeout: float = ESTOP_SOCKET_TIMEOUT_S,
     ) -> "dict[LocalDaemon, T]":
-        """Return the results of those that answer; raise the refusal if all refuse."""
+        """Return the results of those that answer; raise the refusal if all refuse.
+
+        timeout: longest time to wait for all of them [s]
+        """
         from fishd.core import local_daemons
 
         identity, request = self.request(op, args)
         results, refusal = {}, None
-        for daemon, reply in local_daemons.ask(daemons, request).items():
+        for daemon, reply in local_daemons.ask(daemons, request, timeout).items():
             try:
                 result = self.result((reply,), identity, kind)
             except FishError as error:

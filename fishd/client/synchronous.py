@@ -22,7 +22,7 @@ from fishd.client.connection import (
 from fishd.client.request_socket import Requests, RequestSocket
 from fishd.core.calibration import ForceCalibration, ForceSample, ServoCalibration
 from fishd.core.decoding import decoder
-from fishd.core.errors import FishError, LeaseLost, NoDaemon, NoKey, Untrusted
+from fishd.core.errors import FishError, LeaseLost, NoDaemon, NoKey, Refused, Untrusted
 from fishd.core.protocol import (
     DIRECT_OPERATIONS,
     LOADING_TIMEOUT_S,
@@ -143,23 +143,30 @@ class Fish(Connection):
         timeout: time to wait for an answer after these first attempts, which take up to 0.5 s [s];
             None for that of other requests
         """
-        if self.is_deserted and (answer := self.estop_without_gateway(message)):
+        return self._call_urgently(State, "estop", timeout, message=message)
+
+    def probe_estop(self) -> Status:
+        """Return the status by the path of `estop`, or raise what that would raise."""
+        return self._call_urgently(Status, "status", None)
+
+    def _call_urgently(self, kind: type[T], op: str, timeout: float | None, **args: Any) -> T:
+        """Do as `estop` for an operation that all of fishd's sockets take."""
+        if self.is_deserted and (answer := self.ask_without_gateway(kind, op, args)):
             return answer
         try:
-            state = self._call(
-                State, "estop", patience=ESTOP_FALLBACK_DELAY_S - self.timeout, message=message
-            )
-        except Untrusted:
-            if answer := self.estop_without_gateway(message, trusted=False):
-                return answer
+            result = self._ask_gateway(kind, op, ESTOP_FALLBACK_DELAY_S - self.timeout, args)
+        except Refused:
             raise
-        except NoDaemon:
-            if answer := self.estop_without_gateway(message):
+        except FishError as error:  # such as NoDaemon, or for another program in its place
+            is_trusted = not isinstance(error, Untrusted)
+            if answer := self.ask_without_gateway(kind, op, args, trusted=is_trusted):
                 return answer
+            if not is_trusted:
+                raise
             patience = 0.0 if timeout is None else timeout - self.timeout
-            state = self._call(State, "estop", patience=patience, message=message)
+            result = self._ask_gateway(kind, op, patience, args)
         self.estop_taken_by = "control"
-        return state
+        return result
 
     def clear_fault(self) -> State:
         """Leave mode fault or estop."""
@@ -288,6 +295,17 @@ class Fish(Connection):
             late answer [s]
         """
         try:
+            return self._ask_gateway(kind, op, patience, args)
+        except NoDaemon:
+            # The file of its socket may be gone, or another program may listen in its place.
+            can_ask = self._path and op in DIRECT_OPERATIONS
+            if can_ask and (result := self.ask_directly(kind, op, args)) is not None:
+                return result
+            raise
+
+    def _ask_gateway(self, kind: type[T], op: str, patience: float, args: dict[str, Any]) -> T:
+        """Do as `_call`, through the control socket alone."""
+        try:
             return self._exchange(kind, op, patience, args)
         except NoKey:  # the next request connects again
             self._disconnect()
@@ -295,12 +313,7 @@ class Fish(Connection):
 
     def _exchange(self, kind: type[T], op: str, patience: float, args: dict[str, Any]) -> T:
         if self._socket is None:
-            try:
-                self.check_endpoint()
-            except (NoDaemon, Untrusted):
-                if (result := self._ask_directly(kind, op, args)) is not None:
-                    return result
-                raise
+            self.check_endpoint()
             self._socket = self._open_socket()
         connection = self._socket
         identity, request = self.request(op, args)
@@ -324,15 +337,7 @@ class Fish(Connection):
                     raise self.lost_command_error(op)
         if not self._path and time.monotonic() - self._asked >= MAX_UNANSWERED_S:
             self._disconnect()  # a router may have forgotten it
-        # Another program may listen in the place of fishd.
-        if self._path and (result := self._ask_directly(kind, op, args)) is not None:
-            return result
         raise self.no_answer_error(patience)
-
-    def _ask_directly(self, kind: type[T], op: str, args: dict[str, Any]) -> T | None:
-        """Do as `ask_directly` for the operations that are tried so only after a failure."""
-        is_possible = op in DIRECT_OPERATIONS and op != "estop"  # which has further sockets
-        return self.ask_directly(kind, op, args) if is_possible else None
 
     def _open_socket(self) -> Requests:
         if not self.access:

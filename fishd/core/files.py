@@ -5,6 +5,7 @@ A read never blocks, whether the name belongs to a pipe, a device or a file with
 
 import os
 import stat
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -158,11 +159,20 @@ def unused_path(folder: Path, name: str, *suffixes: str) -> Path:
 
     suffixes: with each of them, no file and no folder of that name exists
     """
+
+    def is_taken(name: str) -> bool:
+        return any(os.path.lexists(folder / f"{name}{suffix}") for suffix in suffixes)
+
+    return folder / f"{unused_name(name, is_taken)}{suffixes[0]}"
+
+
+def unused_name(name: str, is_taken: Callable[[str], bool], separator: str = "-") -> str:
+    """Return `name`, else `name-2`, `name-3` and so on: the first one that is not taken."""
     unused, number = name, 1
-    while any(os.path.lexists(folder / f"{unused}{suffix}") for suffix in suffixes):
+    while is_taken(unused):
         number += 1
-        unused = f"{name}-{number}"
-    return folder / f"{unused}{suffixes[0]}"
+        unused = f"{name}{separator}{number}"
+    return unused
 
 
 def _temporary_path(path: Path) -> Path:

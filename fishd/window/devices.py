@@ -156,7 +156,7 @@ class Devices:
             wanted = text.line(name, MAX_NAME_CHARACTERS) or "device"
             device = Device(
                 id=secrets.token_hex(4),
-                name=_unused_name(wanted, taken),
+                name=files.unused_name(wanted, taken.__contains__, " "),
                 scope=match.scope,
                 token=hash_token(secret),
                 paired=max(now, time.time()),  # which may have been set since
@@ -321,13 +321,6 @@ def _give_to_owner(folder: Path, descriptor: int) -> None:
     if os.geteuid() == 0:
         owner = folder.stat()
         os.fchown(descriptor, owner.st_uid, owner.st_gid)
-
-
-def _unused_name(name: str, taken: set[str]) -> str:
-    number, wanted = 2, name
-    while name in taken:
-        name, number = f"{wanted} {number}", number + 1
-    return name
 
 
 def hash_token(token: str) -> str:

@@ -7,6 +7,7 @@ before it is needed.
 import asyncio
 import logging
 import time
+from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +27,10 @@ log = logging.getLogger(__name__)
 ESTOP_THREADS = 4
 ESTOP_TIMEOUT_S = 0.5
 """Time to wait for the answer of one socket of fishd [s]."""
+LAST_RESORT_DELAY_S = 0.3
+"""Time from a press to the start of `fishctl estop`, if fishd has not answered by then [s]."""
 ANSWER_TIMEOUT_S = 2.0
-"""Longest time from a press to the last resort, whatever the threads wait for [s]."""
+"""Longest wait for fishd, beside the last resort and whatever the threads wait for [s]."""
 LAST_RESORT_TIMEOUT_S = 10.0
 """Time to wait for the end of the last resort [s]."""
 PROBE_PERIOD_S = 0.5
@@ -38,11 +41,14 @@ MAX_SILENCE_S = 2.0
 """Time without an answer after which pages warn [s]."""
 
 
-class _Attempt(Struct, eq=False):
+Outcome = tuple[str, str]
+"""Way that stopped the pulses, a socket of fishd or the last resort, and the state since."""
+
+
+class _Request(Struct, eq=False):
     """Request for an emergency stop, for all presses before it is sent."""
 
-    answer: asyncio.Future[tuple[str, str]] | None = None
-    """Mode of fishd, and the socket that answered."""
+    answer: asyncio.Task[Outcome] | None = None
     is_sent: bool = False
 
 
@@ -58,8 +64,8 @@ class EstopPath:
         self._endpoint, self._access = endpoint, access
         self._threads = ThreadPoolExecutor(ESTOP_THREADS, thread_name_prefix=f"estop {name}")
         self._prober = ThreadPoolExecutor(1, thread_name_prefix=f"probe {name}")
-        self._attempt = _Attempt(is_sent=True)
-        self._last_resort: asyncio.Future[str] | None = None
+        self._request = _Request(is_sent=True)
+        self._last_resort: asyncio.Task[Outcome] | None = None
         self._answered = time.monotonic()
 
     def close(self) -> None:
@@ -70,42 +76,48 @@ class EstopPath:
     async def stop(self, message: str) -> dict[str, Any]:
         """Stop the pulses; raise `FishError` if neither fishd nor the last resort does so."""
         start = time.monotonic()
-        try:
-            async with asyncio.timeout(ANSWER_TIMEOUT_S):
-                mode, way = await asyncio.shield(self._request(message))
-            outcome = f"mode {mode}"
-        except Refused:
-            raise
-        except TimeoutError:
-            error = NoDaemon(f"no answer within {ANSWER_TIMEOUT_S:g} s")
-            way, outcome = "last resort", await self._stop_without_daemon(error)
-        except Exception as error:
-            way, outcome = "last resort", await self._stop_without_daemon(error)
+        way, outcome = await self._stop(message)
         milliseconds = round((time.monotonic() - start) * 1e3, 1)
         return {"server_ms": milliseconds, "way": way, "outcome": outcome}
 
-    def _request(self, message: str) -> asyncio.Future[tuple[str, str]]:
-        """Return the answer to a request that is not sent yet, which all presses share."""
-        if self._attempt.is_sent:
-            attempt = _Attempt()
-            attempt.answer = asyncio.get_running_loop().run_in_executor(
-                self._threads, self._send, attempt, message
-            )
-            self._attempt = attempt
-        assert self._attempt.answer
-        return self._attempt.answer
+    async def _stop(self, message: str) -> Outcome:
+        """Return the first outcome: fishd goes on being asked while the last resort runs."""
+        if self._request.is_sent:
+            self._request = _Request()
+            self._request.answer = _start(self._ask(self._request, message))
+        answer = self._request.answer
+        assert answer
+        is_last_resort_running = self._last_resort and not self._last_resort.done()
+        try:
+            async with asyncio.timeout(0.0 if is_last_resort_running else LAST_RESORT_DELAY_S):
+                return await asyncio.shield(answer)
+        except Refused:
+            raise
+        except TimeoutError:
+            problem = f"no answer within {LAST_RESORT_DELAY_S:g} s"
+        except Exception as error:
+            problem = text.error_message(error)
+        if not self._last_resort or self._last_resort.done():  # while it runs, presses share it
+            self._last_resort = _start(_run_last_resort(self._endpoint, problem))
+        return await _first_result(self._last_resort, answer)
 
-    def _send(self, attempt: _Attempt, message: str) -> tuple[str, str]:
-        attempt.is_sent = True  # a later press needs another request
+    async def _ask(self, request: _Request, message: str) -> Outcome:
+        """Return the answer of fishd."""
+        loop = asyncio.get_running_loop()
+        try:
+            async with asyncio.timeout(ANSWER_TIMEOUT_S):
+                outcome = await loop.run_in_executor(self._threads, self._send, request, message)
+        finally:
+            request.is_sent = True
+        self._answered = time.monotonic()
+        return outcome
+
+    def _send(self, request: _Request, message: str) -> Outcome:
+        request.is_sent = True  # a later press needs another request
         # The disk of the keys may stall, so the probe has read them.
         with Fish(self._endpoint, timeout=ESTOP_TIMEOUT_S, access=self._access) as fish:
-            return fish.estop(message).mode, fish.estop_taken_by
-
-    async def _stop_without_daemon(self, error: Exception) -> str:
-        """Return what the last resort has done; while it runs, all presses share it."""
-        if self._last_resort is None or self._last_resort.done():
-            self._last_resort = asyncio.ensure_future(_run_last_resort(self._endpoint, error))
-        return await asyncio.shield(self._last_resort)
+            state = fish.estop(message)
+            return fish.estop_taken_by, f"mode {state.mode}"
 
     async def watch(self) -> None:
         """Probe the path periodically, until this task is cancelled."""
@@ -122,9 +134,9 @@ class EstopPath:
             await asyncio.sleep(PROBE_PERIOD_S)
 
     def _probe(self) -> None:
-        with Fish(self._endpoint, timeout=PROBE_TIMEOUT_S) as fish:  # as an emergency stop connects
+        with Fish(self._endpoint, timeout=PROBE_TIMEOUT_S) as fish:
             self._access = fish.access
-            fish.status()
+            fish.probe_estop()
 
     @property
     def warning(self) -> str:
@@ -132,11 +144,34 @@ class EstopPath:
         silence = time.monotonic() - self._answered
         if silence < MAX_SILENCE_S:
             return ""
-        return f"fishd has not answered at its control socket for {silence:.0f} s"
+        return f"fishd has not answered at any of its sockets for {silence:.0f} s"
 
 
-async def _run_last_resort(endpoint: str | None, error: Exception) -> str:
-    """Run `fishctl estop`, which can end the pulses without fishd; return what it did."""
+def _start(attempt: Coroutine[Any, Any, Outcome]) -> asyncio.Task[Outcome]:
+    """Start an attempt whose failure is no mistake, also if no press waits for it any more."""
+    task = asyncio.create_task(attempt)
+    task.add_done_callback(lambda task: task.cancelled() or task.exception())
+    return task
+
+
+async def _first_result(*attempts: asyncio.Task[Outcome]) -> Outcome:
+    """Return the first outcome of attempts; raise the error of the first one if all fail."""
+    pending = set(attempts)
+    while pending:
+        done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
+        for attempt in done:
+            if not attempt.exception():
+                return attempt.result()
+    return attempts[0].result()
+
+
+async def _run_last_resort(endpoint: str | None, problem: str) -> Outcome:
+    """Run `fishctl estop`, which can end the pulses without fishd; return what it did.
+
+    It asks fishd once more, as it may be this process that fails.
+
+    problem: why fishd has not answered
+    """
     options = [] if endpoint is None else ["--endpoint", endpoint]
     process = await asyncio.create_subprocess_exec(
         *fishctl_command(*options, "estop", "--json"),
@@ -148,14 +183,16 @@ async def _run_last_resort(endpoint: str | None, error: Exception) -> str:
             output, errors = await process.communicate()
     except TimeoutError:
         process.kill()
-        raise NoDaemon(text.error_message(error)) from None
+        raise NoDaemon(problem) from None
     if process.returncode:
-        raise NoDaemon(text.line(errors.decode("utf-8", "replace"))) from error
+        raise NoDaemon(text.line(errors.decode("utf-8", "replace")))
     try:
         answer = msgspec.json.decode(output, type=dict[str, Any])
     except msgspec.DecodeError:
-        raise NoDaemon("it is not known whether fishctl has ended the pulses") from error
-    return str(answer.get("pulses", answer.get("mode", "")))
+        raise NoDaemon("it is not known whether fishctl has ended the pulses") from None
+    if "pulses" in answer:
+        return "last resort", str(answer["pulses"])
+    return "fishctl", f"mode {answer.get('mode')}"
 
 
 def fishctl_command(*arguments: str) -> list[str]:

@@ -21,6 +21,7 @@ from fishd.core.decoding import decoder
 from fishd.core.errors import FishError, LeaseLost
 from fishd.core.signals import ControllerInfo, Event, Status, Tick
 from fishd.window.estop_path import EstopPath
+from fishd.window.live import encode_message
 
 log = logging.getLogger(__name__)
 
@@ -28,6 +29,8 @@ MAX_TICKS = 2400
 """Number of ticks in the history for a page that opens: two minutes of 20 Hz."""
 HISTORY_AGE_S = 1.0
 """Longest age of the encoded history that is sent again [s]."""
+PART_TICKS = 200
+"""Number of ticks in a part of the history: of a long message, each slow page kept a copy."""
 MAX_EVENTS = 100
 STALE_AFTER_S = 0.7
 """Time without a tick after which the fish counts as stale [s]."""
@@ -78,8 +81,8 @@ class FishLink:
         self.events: deque[bytes] = deque(maxlen=MAX_EVENTS)
         self._ticks: deque[tuple[int, bytes]] = deque(maxlen=MAX_TICKS)
         """Number and payload of each tick of the history."""
-        self._history = (-HISTORY_AGE_S, 0, b"{}")
-        """When the history was encoded [s, monotonic], its last tick, and its payload."""
+        self._history: tuple[float, int, list[bytes]] = (-HISTORY_AGE_S, 0, [])
+        """When the history was encoded [s, monotonic], its last tick, and its messages."""
         self.listeners: set[Callable[[str, float, bytes], None]] = set()
         """Functions that receive topic, time [s] and payload of each message.
 
@@ -246,7 +249,7 @@ class FishLink:
     def _forget(self) -> None:
         """Forget the ticks of an earlier fishd."""
         self._ticks.clear()
-        self._history = (-HISTORY_AGE_S, 0, b"{}")
+        self._history = (-HISTORY_AGE_S, 0, [])
         self._batch.clear()
         self._seq = 0
         self._ahead = None
@@ -263,29 +266,21 @@ class FishLink:
         self._state, self._message = state, text.line(message)
         self._tell("connection", _RAW(self.connection))
 
-    def _columns(self) -> dict[str, Any]:
-        """Return the history as columns by field; those of the quantities are in a mapping."""
-        ticks = [_decode_tick(payload) for _, payload in self._ticks]
-        columns: dict[str, Any] = {}
-        for name in Tick.__struct_fields__:
-            column = [getattr(tick, name) for tick in ticks]
-            if name == "quantities":
-                columns[name] = _transpose([{} if row is UNSET else row for row in column])
-            elif name not in _OPTIONAL or any(value is not UNSET for value in column):
-                columns[name] = [None if value is UNSET else value for value in column]
-        return columns
-
-    def history(self) -> tuple[bytes, bytes]:
-        """Return the columns as JSON, shared by requests within a second, and later ticks.
+    def history(self) -> tuple[list[bytes], bytes]:
+        """Return the history as messages for pages, shared by all within a second, and later ticks.
 
         Many requests must not take the processor from an emergency stop.
         """
-        encoded, last, payload = self._history
+        encoded, last, messages = self._history
         if time.monotonic() - encoded > HISTORY_AGE_S:
-            payload, last = _RAW(self._columns()), self._seq
-            self._history = time.monotonic(), last, payload
+            payloads, last = [payload for _, payload in self._ticks], self._seq
+            messages = [
+                encode_message("history", _RAW(_columns(payloads[first : first + PART_TICKS])))
+                for first in range(0, len(payloads), PART_TICKS)
+            ]
+            self._history = time.monotonic(), last, messages
         later = b",".join(payload for seq, payload in self._ticks if seq > last)
-        return payload, b"[%s]" % later
+        return messages, b"[%s]" % later
 
     # Requests
 
@@ -387,6 +382,19 @@ class _HeldLease(NamedTuple):
 def _builtins(result: Struct) -> dict[str, Any]:
     builtins: dict[str, Any] = msgspec.to_builtins(result)
     return builtins
+
+
+def _columns(payloads: Iterable[bytes]) -> dict[str, Any]:
+    """Return ticks as columns by field; those of the quantities are in a mapping."""
+    ticks = [_decode_tick(payload) for payload in payloads]
+    columns: dict[str, Any] = {}
+    for name in Tick.__struct_fields__:
+        column = [getattr(tick, name) for tick in ticks]
+        if name == "quantities":
+            columns[name] = _transpose([{} if row is UNSET else row for row in column])
+        elif name not in _OPTIONAL or any(value is not UNSET for value in column):
+            columns[name] = [None if value is UNSET else value for value in column]
+    return columns
 
 
 def _transpose(rows: Iterable[dict[str, float]]) -> dict[str, list[float | None]]:

@@ -1,11 +1,9 @@
-"""Requests of a page to a fish: drive it, change how it swims, stop it, read its history.
+"""Requests of a page to a fish: drive it, change how it swims, stop it.
 
 Only the page that drives changes how a fish swims.
 """
 
-import asyncio
 import logging
-from collections.abc import AsyncIterator
 from functools import partial
 from typing import Annotated, Any
 
@@ -16,17 +14,12 @@ from msgspec import Meta, Struct
 from fishd.core import text
 from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
-from fishd.window.fish_link import FishLink
 from fishd.window.live import Driver
 from fishd.window.pages import Pages
 from fishd.window.web_server import ESTOP
 
 log = logging.getLogger(__name__)
 
-MAX_SENT_HISTORIES = 2
-"""Number of answers with the history that are sent at a time."""
-PART_BYTES = 2**15
-"""Size of the parts in which a long answer is sent [bytes]."""
 Text = Annotated[str, Meta(max_length=1000)]
 
 
@@ -78,14 +71,12 @@ class FishRequests:
 
     def __init__(self, access: AccessControl, pages: Pages) -> None:
         self._access, self._pages = access, pages
-        self._sending = asyncio.Semaphore(MAX_SENT_HISTORIES)
         self.routes = [
             web.get("/api/fish", self._list_fish),
             web.post("/api/fish/{fish}/estop", self._estop, name=ESTOP),
             web.post("/api/fish/{fish}/drive", self._drive),
             web.post("/api/fish/{fish}/release", self._release),
             web.post("/api/fish/{fish}/request", self._request),
-            web.get("/api/fish/{fish}/history", self._get_history),
         ]
 
     async def _list_fish(self, request: web.Request) -> web.Response:
@@ -145,23 +136,3 @@ class FishRequests:
             self._pages.set_driver(link.name, Driver(page, False))
         holder = f"window: {access.name}"
         return success(await link.request(body.op, arguments, holder, body.take, check))
-
-    async def _get_history(self, request: web.Request) -> web.Response:
-        self._access.require(request, "watch")
-        link = self._pages.find_link(request.match_info["fish"])
-        return web.Response(
-            body=self._send_history(link),
-            content_type="application/json",
-        )
-
-    async def _send_history(self, link: FishLink) -> AsyncIterator[bytes]:
-        """Yield an answer in parts: of the whole, each client that is slow kept a copy.
-
-        Others wait, as an emergency stop must find the processor free.
-        """
-        async with self._sending:
-            history, _ = link.history()
-            yield b'{"ok":true,"result":'
-            for begin in range(0, len(history), PART_BYTES):
-                yield history[begin : begin + PART_BYTES]
-            yield b"}"

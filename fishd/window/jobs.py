@@ -5,6 +5,7 @@ window that was killed is among the jobs of its successor.
 """
 
 import asyncio
+import os
 import shutil
 import signal
 import time
@@ -191,7 +192,7 @@ class Jobs:
         if kind == "resume":
             return self._resume(options)
         run = f"{kind}-{datetime.now():%Y%m%d-%H%M%S}" if kind in DRIVING_KINDS else ""
-        return kind, self._unused_name(run) if run else "", list_words(kind, options)
+        return kind, self._unused_run(run) if run else "", list_words(kind, options)
 
     def _start_prepared(
         self,
@@ -234,13 +235,12 @@ class Jobs:
         words = [header.kind, "--resume", str(self._folder / options.run)]
         return header.kind, options.run, words + (["--take"] if options.take else [])
 
-    def _unused_name(self, name: str) -> str:
+    def _unused_run(self, name: str) -> str:
         """Return the name of a folder that does not exist; two jobs may start in one second."""
-        number, wanted = 2, name
         runs = {job.run for job in list(self._jobs.values())}
-        while name in runs or (self._folder / name).exists():
-            name, number = f"{wanted}-{number}", number + 1
-        return name
+        return files.unused_name(
+            name, lambda name: name in runs or os.path.lexists(self._folder / name)
+        )
 
     def _list_hidden_words(self, job: Job, *, is_resumed: bool) -> list[str]:
         """Return the arguments that serve this window only: where a job leaves its results."""

@@ -155,20 +155,21 @@ class Pages:
             page.push("job", message)
 
     def _greet(self, page: LivePage) -> None:
-        """Send the first message to a page, and the ticks that are not in its history."""
+        """Send the first message to a page, the history, and the ticks that are not in it."""
         history, later = self.links[page.fish].history()
-        page.push("hello", encode_message("hello", encode(self._hello(page, history))))
+        page.push("hello", encode_message("hello", encode(self._hello(page))))
+        for message in history:
+            page.push("history", message)
         if later != b"[]":
             page.push("ticks", encode_message("ticks", later))
 
-    def _hello(self, page: LivePage, history: bytes) -> dict[str, Any]:
+    def _hello(self, page: LivePage) -> dict[str, Any]:
         link, driver = self.links[page.fish], self._drivers.get(page.fish)
         return {
             "client": page.client,
             "fish": list(self.links),
             "name": link.name,
             "session": self._access.find_device(page.device_id).describe(),
-            "history": msgspec.Raw(history),
             "status": link.status,
             "controllers": link.controllers,
             "events": [msgspec.Raw(event) for event in link.events],

@@ -1,72 +1,110 @@
-"""Places of connections: however many are opened, an emergency stop finds one."""
+"""Places of connections: however many are opened, an emergency stop finds one.
+
+A connection that has sent nothing costs a descriptor and no more: the HTTP server sees it once its
+first byte is there, so thousands of them a second do not take the processor.
+"""
 
 import asyncio
-from collections import Counter
-from collections.abc import Callable
+import socket
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from functools import lru_cache, partial
 from ipaddress import IPv4Address, IPv6Address, ip_address
+from itertools import chain
 
 from aiohttp import web
-from msgspec import Struct
 
 PLACES = 256
 """Largest number of connections of each group of senders; a further one replaces one of them."""
+MAX_SILENT = 64
+"""Number of places of a group above which those that have sent nothing replace one another."""
 MAX_PAIRED_ADDRESSES = 200
+MAX_ACCEPTED = 256
+"""Largest number of connections that are accepted before others are served."""
+RECEIVE_BYTES = 16 * 2**10
+"""Size of what a connection may send before it is read [bytes]: little is read at a time."""
+ACCEPT_PAUSE_S = 1.0
+"""Time until connections are accepted again after a failure, such as no free descriptor [s]."""
 
 
-class _Place(Struct, eq=False):
+class _Place:
     """Place that a connection takes."""
 
-    transport: asyncio.Transport
-    address: str
-    is_kept: bool = False
-    """Whether other connections are ended before this one."""
+    def __init__(self, group: "_Group", connection: socket.socket, address: str) -> None:
+        self.group, self.connection, self.address = group, connection, address
+        self.timeout: asyncio.TimerHandle | None = None
+        """End of a connection that sends nothing; None once it has sent something."""
+        self.transport: asyncio.Transport | None = None
+        self.is_silent = True
+        """Whether it has sent nothing yet."""
+        self.is_kept = False
+        """Whether other connections are ended before this one."""
+        self.is_ended = False
 
-    @property
-    def is_taken(self) -> bool:
-        """Whether the connection still exists; one that closes may have to send its answer."""
-        return not self.transport.is_closing() or self.transport.get_write_buffer_size() > 0
+    def wait(self, seconds: float, begin: Callable[["_Place"], None]) -> None:
+        """Wait for the first byte, at most for this time [s]."""
+        loop = asyncio.get_running_loop()
+        self.timeout = loop.call_later(seconds, self.end)
+        loop.add_reader(self.connection.fileno(), begin, self)
+
+    def stop_waiting(self) -> None:
+        """Leave the connection to another reader."""
+        if self.timeout:
+            self.timeout.cancel()
+            asyncio.get_running_loop().remove_reader(self.connection.fileno())
+            self.timeout = None
+
+    def end(self) -> None:
+        """End the connection at once; while its transport is created, `_Door` does so."""
+        self.group.remove(self)
+        self.is_ended = True
+        if self.transport:
+            self.transport.abort()
+        elif self.timeout:
+            self.stop_waiting()
+            self.connection.close()
 
 
 class _Group:
-    """Places of one group of senders, the oldest first."""
+    """Places of one group of senders."""
 
     def __init__(self) -> None:
-        self._places: dict[web.RequestHandler, _Place] = {}
-        self._counts = Counter[str]()
-        """Number of places of each address."""
+        self._places: dict[tuple[str, bool], dict[_Place, None]] = {}
+        """Places of each address, those that are silent apart, the oldest first."""
+        self._count = 0
 
-    def find(self, handler: web.RequestHandler) -> _Place | None:
-        """Return the place of a connection."""
-        return self._places.get(handler)
+    def __iter__(self) -> Iterator[_Place]:
+        return (place for places in tuple(self._places.values()) for place in tuple(places))
 
-    def add(self, handler: web.RequestHandler, place: _Place) -> None:
-        """Give a place to a connection, and end another one if there is none."""
-        if len(self._places) >= PLACES:
-            self._make_room()
-        self._places[handler] = place
-        self._counts[place.address] += 1
+    @property
+    def is_full(self) -> bool:
+        """Whether a further connection has no place."""
+        return self._count >= PLACES
 
-    def remove(self, handler: web.RequestHandler) -> None:
-        """Let a connection no longer take a place."""
-        if place := self._places.pop(handler, None):
-            self._counts[place.address] -= 1
-            if not self._counts[place.address]:
-                del self._counts[place.address]
+    def add(self, place: _Place) -> None:
+        """Give a place to a connection."""
+        self._places.setdefault((place.address, place.is_silent), {})[place] = None
+        self._count += 1
 
-    def _make_room(self) -> None:
-        """End the connection that `Places` describes, unless another one has ended already."""
-        victim, lowest = None, (True, 1)
-        for handler, place in self._places.items():
-            if not place.is_taken:
-                self.remove(handler)
-                return
-            rank = (place.is_kept, -self._counts[place.address])
-            if rank < lowest:
-                victim, lowest = handler, rank
-        assert victim
-        transport = self._places[victim].transport
-        self.remove(victim)
-        transport.abort()
+    def remove(self, place: _Place) -> None:
+        """Let a connection no longer take a place; may be called twice."""
+        key = place.address, place.is_silent
+        places = self._places.get(key, {})
+        if place in places:
+            del places[place]
+            self._count -= 1
+            if not places:
+                del self._places[key]
+
+    def find_victim(self) -> _Place:
+        """Return the connection that a further one replaces, as `Places` describes."""
+        silent = [places for (_, is_silent), places in self._places.items() if is_silent]
+        if sum(map(len, silent)) < MAX_SILENT:  # a flood of these must not end those that speak
+            silent = []
+        others = [places for (_, is_silent), places in self._places.items() if not is_silent]
+        busiest = max(silent or others or self._places.values(), key=len)
+        free: Iterator[_Place] = (place for place in chain(busiest, self) if not place.is_kept)
+        return next(chain(free, busiest))
 
 
 class Places:
@@ -74,17 +112,45 @@ class Places:
 
     This machine, addresses of paired devices, and all others have places of their own. A connection
     that finds none replaces the oldest one of that address of its group that has most of them: its
-    sender had the most time to send a request, and others are not disturbed.
+    sender had the most time to send a request, and others are not disturbed. Where many have
+    sent nothing, one of them is replaced.
     """
 
     def __init__(self) -> None:
         self._groups = self._here, self._paired_devices, self._others = _Group(), _Group(), _Group()
         self._paired: dict[str, None] = {}
         """Addresses from which a paired device has sent a request, the newest last."""
+        self._served: dict[web.RequestHandler, _Place] = {}
+        """Places of connections that have sent something, by their protocol."""
+        self._listeners: list[socket.socket] = []
+        self._opening: set[asyncio.Task[object]] = set()
 
-    def protocol(self, create: Callable[[], web.RequestHandler]) -> asyncio.Protocol:
-        """Return the protocol of a new connection; `create` returns that of an admitted one."""
-        return _Door(self, create)
+    def open(
+        self,
+        listeners: Iterable[socket.socket],
+        create: Callable[[], web.RequestHandler],
+        timeout: float,
+    ) -> None:
+        """Accept connections.
+
+        listeners: listening sockets, which this object closes
+        create: returns the protocol of a connection that has sent something
+        timeout: longest time until a connection has sent something [s]
+        """
+        self._create, self._timeout = create, timeout
+        self._listeners += listeners
+        for listener in self._listeners:
+            self._listen(listener)
+
+    def close(self) -> None:
+        """Accept no more connections, and end those that have sent nothing."""
+        for listener in self._listeners:
+            asyncio.get_running_loop().remove_reader(listener)
+            listener.close()
+        for group in self._groups:
+            for place in group:
+                if place.timeout:
+                    place.end()
 
     def reserve(self, address: str) -> None:
         """Let connections from the address of a paired device have the places of that group."""
@@ -95,19 +161,70 @@ class Places:
 
     def keep(self, handler: web.RequestHandler) -> None:
         """End this connection last."""
-        for group in self._groups:
-            if place := group.find(handler):
-                place.is_kept = True
+        if place := self._served.get(handler):
+            place.is_kept = True
 
     def leave(self, handler: web.RequestHandler) -> None:
         """Let a connection no longer take a place."""
-        for group in self._groups:
-            group.remove(handler)
+        if place := self._served.get(handler):
+            place.group.remove(place)
 
-    def admit(self, handler: web.RequestHandler, transport: asyncio.Transport) -> None:
-        """Give a place to a new connection, and end another one if there is none."""
-        address = str((transport.get_extra_info("peername") or ("",))[0])
-        self._find_group(address).add(handler, _Place(transport, address))
+    def serve(self, place: _Place) -> web.RequestHandler:
+        """Return the protocol of a connection that has sent something."""
+        handler = self._create()
+        self._served[handler] = place
+        return handler
+
+    def forget(self, handler: web.RequestHandler) -> None:
+        """Free the place of a connection that has ended."""
+        place = self._served.pop(handler)
+        place.group.remove(place)
+
+    def _listen(self, listener: socket.socket) -> None:
+        if listener.fileno() >= 0:
+            asyncio.get_running_loop().add_reader(listener, self._accept, listener)
+
+    def _accept(self, listener: socket.socket) -> None:
+        """Admit connections that have come, a few at a time."""
+        for _ in range(MAX_ACCEPTED):
+            try:
+                connection, peer = listener.accept()
+            except (BlockingIOError, ConnectionAbortedError):
+                return
+            except OSError:
+                loop = asyncio.get_running_loop()
+                loop.remove_reader(listener)
+                loop.call_later(ACCEPT_PAUSE_S, self._listen, listener)
+                return
+            connection.setblocking(False)
+            address = str(peer[0])
+            place = _Place(self._find_group(address), connection, address)
+            while place.group.is_full:
+                victim = place.group.find_victim()
+                if victim.is_silent:
+                    self._begin(victim)  # what it has sent may have come now
+                else:
+                    victim.end()
+            place.group.add(place)
+            place.wait(self._timeout, self._begin)
+
+    def _begin(self, place: _Place) -> None:
+        """Serve a connection if it has sent something, else end it."""
+        first = b""
+        with suppress(OSError):
+            first = place.connection.recv(1, socket.MSG_PEEK)
+        if not first:
+            place.end()
+            return
+        place.stop_waiting()
+        place.group.remove(place)
+        place.is_silent = False
+        place.group.add(place)
+        loop = asyncio.get_running_loop()
+        door = partial(_Door, self, place)
+        opening = loop.create_task(loop.connect_accepted_socket(door, place.connection))
+        self._opening.add(opening)
+        opening.add_done_callback(self._opening.discard)
 
     def _find_group(self, address: str) -> _Group:
         if is_loopback(address):
@@ -115,19 +232,57 @@ class Places:
         return self._paired_devices if address in self._paired else self._others
 
 
-class _Door(asyncio.Protocol):
-    """Protocol of a connection until it is admitted, which depends on its address."""
+class _Door(asyncio.BufferedProtocol):
+    """Protocol of a connection that has sent something: that of the HTTP server, and its place.
 
-    def __init__(self, places: Places, create: Callable[[], web.RequestHandler]) -> None:
-        self._places, self._create = places, create
+    All connections are read into one buffer, one after the other.
+    """
+
+    _BUFFER = memoryview(bytearray(RECEIVE_BYTES))
+
+    def __init__(self, places: Places, place: _Place) -> None:
+        self._places, self._place = places, place
+        self._handler: web.RequestHandler | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Admit the connection."""
+        """Serve the connection, unless another one has its place by now."""
         assert isinstance(transport, asyncio.Transport)
-        handler = self._create()
-        self._places.admit(handler, transport)
-        transport.set_protocol(handler)
-        handler.connection_made(transport)
+        self._place.transport = transport
+        if self._place.is_ended:
+            transport.abort()
+            return
+        self._handler = self._places.serve(self._place)
+        self._handler.connection_made(transport)
+
+    def connection_lost(self, error: Exception | None) -> None:
+        """Free the place."""
+        if self._handler:
+            self._places.forget(self._handler)
+            self._handler.connection_lost(error)
+
+    def get_buffer(self, sizehint: int) -> memoryview:
+        """Return the buffer to read into."""
+        return self._BUFFER
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """Pass on what the connection has sent."""
+        if self._handler:
+            self._handler.data_received(bytes(self._BUFFER[:nbytes]))
+
+    def eof_received(self) -> None:
+        """Pass on the end of what the connection sends."""
+        if self._handler:
+            self._handler.eof_received()
+
+    def pause_writing(self) -> None:
+        """Pass on that the connection does not read."""
+        if self._handler:
+            self._handler.pause_writing()
+
+    def resume_writing(self) -> None:
+        """Pass on that the connection reads again."""
+        if self._handler:
+            self._handler.resume_writing()
 
 
 def parse_ip(name: str) -> IPv4Address | IPv6Address | None:
@@ -138,6 +293,7 @@ def parse_ip(name: str) -> IPv4Address | IPv6Address | None:
         return None
 
 
+@lru_cache(maxsize=1024)
 def is_loopback(name: str) -> bool:
     """Return whether a name is an IP address of loopback."""
     address = parse_ip(name)

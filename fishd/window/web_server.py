@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 from aiohttp import http_exceptions, web
 
 from fishd.core.errors import StartupError
-from fishd.window.places import Places, parse_ip
+from fishd.window.places import RECEIVE_BYTES, Places, parse_ip
 from fishd.window.viewer import CLOSE_TIMEOUT_S, Viewer
 
 log = logging.getLogger(__name__)
@@ -37,8 +37,6 @@ REQUEST_TIMEOUT_S = 3.0
 """Longest time until a connection has sent its request, to the end of the headers [s]."""
 HEARTBEAT_PERIOD_S = 10.0
 """Period of pings to a page, which must answer within half of it [s]."""
-RECEIVE_BYTES = 16 * 2**10
-"""Size of what a connection may send before it is read [bytes]: little is read at a time."""
 MAX_MESSAGE_BYTES = 1024
 """Largest size of a message from a page [bytes]."""
 ESTOP = "estop"
@@ -120,10 +118,14 @@ class WebServer:
         assert server
         try:
             self._server = await loop.create_server(
-                lambda: self._places.protocol(server), self._host, self._port, backlog=BACKLOG
+                asyncio.Protocol, self._host, self._port, start_serving=False
             )
-            for listener in self._server.sockets:  # its connections have the same size
+            listeners = [listener.dup() for listener in self._server.sockets]
+            for listener in listeners:  # its connections have the same size
                 listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
+                listener.setblocking(False)
+                listener.listen(BACKLOG)
+            self._places.open(listeners, server, REQUEST_TIMEOUT_S)
         except OSError as error:
             await self._runner.cleanup()
             number = error.errno or 0  # negative for errors of the resolver
@@ -136,6 +138,7 @@ class WebServer:
     async def __aexit__(self, *_: object) -> None:
         """Close all pages, and abort connections that do not close."""
         self._server.close()
+        self._places.close()
         for viewer in tuple(self.viewers):
             viewer.end()
         server = self._runner.server

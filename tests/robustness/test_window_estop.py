@@ -6,21 +6,19 @@ until the stop is confirmed.
 
 import asyncio
 import json
-import os
+import signal
 from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack, asynccontextmanager, suppress
 from pathlib import Path
 
 import pytest
 from rigs.processes import Daemon, wait_until
-from rigs.virtual_pi_process import virtual_pi
-from rigs.window_process import WindowProcess, run, running_window
+from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
 
 from common.daemon import list_children
 from fishd.window.devices import Devices
 from fishd.window.places import PLACES
 from reliability.window_attacks import (
-    BARE_CONNECTIONS,
     DISK_TROUBLES,
     FLOODS,
     HISTORIES,
@@ -79,7 +77,7 @@ async def attacking(attack: Attack, target: Target, requests: int) -> AsyncItera
             await task
 
 
-@pytest.mark.parametrize("name", sorted(NETWORK_ATTACKS.keys() - {BARE_CONNECTIONS}))
+@pytest.mark.parametrize("name", NETWORK_ATTACKS)
 def test_an_emergency_stop_gets_through_an_attack_from_its_own_address(
     open_window: WindowProcess, daemon: Daemon, name: str
 ) -> None:
@@ -140,20 +138,19 @@ def test_a_window_does_not_read_all_that_a_page_sends(open_window: WindowProcess
     run(test())
 
 
-def test_all_requests_for_the_history_share_one_answer(daemon: Daemon, tmp_path: Path) -> None:
+def test_all_pages_that_open_share_one_history(daemon: Daemon, tmp_path: Path) -> None:
     with running_window(tmp_path, changes=SAME_HISTORY, fish=daemon.endpoint) as window:
 
         async def test() -> None:
-            here = Target("127.0.0.1", window.port)
-            while b'"live"' not in await here.exchange(here.request("GET", "/api/fish")):
-                pass
-            request = here.request("GET", "/api/fish/fish/history")
-            answers = set()
-            for _ in range(10):
-                answers.add((await here.exchange(request)).partition(b"\r\n\r\n")[2])
-                await asyncio.sleep(0.1)  # another tick
-            assert len(answers) == 1
-            assert b'"seq":[' in answers.pop()
+            async with Browser(window.url) as browser:
+                while (await browser.get("/api/fish"))[0]["state"] != "live":
+                    pass
+                histories = []
+                for _ in range(3):
+                    async with open_page(browser) as page:
+                        histories.append((await page.until("history"))["seq"])
+                        await page.until("ticks", lambda ticks: ticks[-1]["seq"] > histories[0][-1])
+                assert histories == 3 * histories[:1]
 
         run(test())
 
@@ -243,18 +240,12 @@ def test_when_a_device_was_seen_is_stored_once_the_disk_allows_it(
     wait_until(lambda: json.loads(file.read_bytes())["devices"][0]["seen"] > 0.0)
 
 
-def test_all_presses_while_fishd_is_dead_share_one_last_resort(
-    own_daemon: Daemon, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_all_presses_while_fishd_is_dead_or_hangs_share_one_last_resort(
+    own_daemon: Daemon, tmp_path: Path, number: signal.Signals
 ) -> None:
-    config = tmp_path / "fishd.yaml"
-    monkeypatch.setenv("FISHD_CONFIG", os.fspath(config))
-    with (
-        virtual_pi(tmp_path) as pi,
-        running_window(tmp_path, fish=own_daemon.endpoint) as window,
-    ):
-        socket, port = f"virtual_pi: {{socket: {pi.path}}}", f"servo: {{port: {pi.port}}}"
-        config.write_text(f"robot: virtual-pi\n{socket}\n{port}\n")
-        own_daemon.kill()
+    with running_window(tmp_path, fish=own_daemon.endpoint) as window:
+        own_daemon.process.send_signal(number)
         here = Target("127.0.0.1", window.port)
 
         async def test() -> None:
@@ -265,8 +256,11 @@ def test_all_presses_while_fishd_is_dead_share_one_last_resort(
                 await asyncio.sleep(0.005)
             assert None not in pressing.result()
             assert most == 1
+            payload = here.request("POST", "/api/fish/fish/estop", body=b"{}")
+            assert b'"way":"last resort"' in await here.exchange(payload)
 
         run(test())
+        own_daemon.process.send_signal(signal.SIGCONT)
 
 
 REFUSED = [

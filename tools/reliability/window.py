@@ -34,7 +34,7 @@ FRAMES_PER_CONNECTION = 20
 START = "from fishd.__main__ import fishd_window; fishd_window()"
 PATHS = (
     "/", "/live", "/foxglove", "/api/session", "/api/pair", "/api/unpair", "/api/fish", "/api/jobs",
-    "/api/runs", "/api/fish/fish/drive", "/api/fish/fish/request", "/api/fish/fish/history",
+    "/api/runs", "/api/fish/fish/drive", "/api/fish/fish/request",
     "/api/jobs/1/stop", "/api/runs/a/plot.png", "/vendor/manifest.json", "/none",
 )  # fmt: skip
 BODIES = (

@@ -129,7 +129,7 @@ async def arriving_bodies(target: Target, sent: Callable[[], None]) -> None:
 
 
 async def histories(target: Target, sent: Callable[[], None]) -> None:
-    """Request the history again and again."""
+    """Open pages, which get the history, again and again."""
     await asyncio.gather(*(_repeat(_read_history, target, sent) for _ in range(HISTORIES)))
 
 
@@ -164,7 +164,7 @@ NETWORK_ATTACKS: dict[str, Attack] = {
     f"{SLOW_BODIES} connections without their body": slow_bodies,
     f"{HELD_BODIES} of these, and {ARRIVALS_PER_S} new ones a second": arriving_bodies,
     BARE_CONNECTIONS: bare_connections,
-    f"{HISTORIES} requests for the history at a time": histories,
+    f"{HISTORIES} pages that open at a time": histories,
     f"{FLOODS} WebSockets full of messages": frames,
 }
 """Attacks over the network by their description."""
@@ -189,8 +189,15 @@ async def _send_head(target: Target, sent: Callable[[], None]) -> None:
 
 async def _read_history(target: Target, sent: Callable[[], None]) -> None:
     with suppress(OSError):
-        await target.exchange(target.request("GET", "/api/fish/fish/history"))
-        sent()
+        reader, writer = await target.connect()
+        try:
+            writer.write(target.request("GET", "/live", *_HANDSHAKE))
+            sent()
+            with suppress(asyncio.IncompleteReadError):
+                while b'["history",' not in await reader.readexactly(2**10):
+                    pass
+        finally:
+            writer.transport.abort()
 
 
 async def _flood(target: Target, sent: Callable[[], None]) -> None:

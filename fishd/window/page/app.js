@@ -16,8 +16,11 @@ const STALE_TICKS = 5;
 const SILENT_S = 2;
 const CHECK_MS = 200;
 const VALUES_MS = 250;
-/** Longest wait for the answer to an emergency stop, and pause until it is sent again: at first, and at most. */
-const ESTOP_TIMEOUT_MS = [3000, 12_000];
+/**
+ * Longest wait for the answer to an emergency stop, and pause until it is sent again: at first, and at most.
+ * fishd-window needs 2 s without fishd, longer on a busy machine.
+ */
+const ESTOP_TIMEOUT_MS = [5000, 15_000];
 const ESTOP_RETRY_MS = [250, 2000];
 const NOTICE_MS = { info: 6_000, warning: 20_000, error: 20_000 };
 const MAX_EVENTS = 100;
@@ -51,16 +54,22 @@ const receive = {
     });
     if (state.estop?.phase === "done" && payload.status?.mode !== "estop") state.estop = null;
     ring = new Ring(payload.status?.tick ?? 0.05);
-    for (const tick of ticksOf(payload.history)) ring.push(tick);
-    state.tick = ring.latest;
-    const age = payload.connection?.age;
-    state.lastTick = ring.latest && Number.isFinite(age) ? performance.now() - 1000 * age : null;
+    state.tick = state.lastTick = null;
     charts.setRing(ring);
     charts.marks.length = 0;
     for (const event of state.events) markEvent(event);
     setStatus(payload.status);
     document.title = `${state.name} · fishd`;
     document.body.classList.remove("waiting");
+    changed();
+  },
+  /** Take a part of the history. */
+  history(columns) {
+    for (const tick of ticksOf(columns)) ring.push(tick);
+    state.tick = ring.latest;
+    const age = state.connection?.age;
+    state.lastTick ??= Number.isFinite(age) ? performance.now() - 1000 * age : null;
+    charts.dirty = true;
     changed();
   },
   ticks(ticks) {
@@ -91,6 +100,7 @@ const receive = {
       if (event.data.mode !== "estop" && state.estop?.phase === "done") state.estop = null; // another client cleared it
       noticeOther(event);
     }
+    if (event.kind === "sockets") notice(event.level, event.message);
     if (event.kind === "lease" && event.data.lease === "taken" && !event.data.name.startsWith(OWN_LEASE)) {
       notice("info", `the experiment ${event.data.name} holds the fish`);
     }
@@ -194,9 +204,9 @@ function freshness() {
   return { kind: "live", age };
 }
 
-/** Return why an emergency stop may not arrive, before anybody presses; empty if its way has answered lately. */
+/** Return why an emergency stop may not arrive; empty if its path has answered lately, and after a stop that was confirmed. */
 function estopWarning() {
-  if (state.session?.paired === false) return "";
+  if (state.session?.paired === false || state.estop?.phase === "done") return "";
   const silence = (performance.now() - state.heard) / 1000;
   return silence > SILENT_S ? `fishd-window has not answered for ${duration(silence)}` : state.connection?.warning ?? "";
 }
@@ -338,7 +348,7 @@ const nameInAddress = () => new URLSearchParams(location.search).get("fish") ?? 
 
 function Head() {
   const { kind, age, message } = freshness();
-  const mode = state.status?.mode ?? "unknown";
+  const mode = state.status?.mode ?? "unknown", modeText = mode === "estop" ? "E-stop" : mode;
   const lease = experimentOf(state.status);
   const driver = lease ? `${lease.name} drives` : state.driver ? (state.driver.you_drive ? "you drive" : `${driverName(state)} drives`) : "no driver";
   return html`
@@ -346,7 +356,7 @@ function Head() {
       ? html`<nav class="tabs" aria-label="Fish"><h1 class="unseen">${state.name}</h1>${state.fish.map((name) => html`<a href=${`?fish=${encodeURIComponent(name)}`}
           aria-current=${name === state.name ? "page" : undefined}>${name}</a>`)}</nav>`
       : html`<h1>${state.name || "fishd"}</h1>`}
-    ${kind !== "not paired" && html`<span class=${`pill mode ${mode}`} id="mode">${mode === "estop" ? "E-stop" : mode}</span>`}
+    ${kind !== "not paired" && html`<span class=${`pill mode ${mode}`} id="mode">${kind === "lost" && state.status ? `was ${modeText}` : modeText}</span>`}
     <span class=${`pill connection ${kind}`} id="connection" title=${message ?? ""}>
       <span class="dot"></span>${kind === "live" ? "live" : kind} <span class="age">${kind === "connecting" || kind === "not paired" ? "" : Number.isFinite(age) ? duration(age) : "no tick yet"}</span></span>
     ${kind !== "not paired" && html`<span class="driver" id="driver">${driver}</span>`}`;
@@ -365,6 +375,9 @@ function Banner() {
       <span>To stop it now, use the button of the panel, or run fishctl estop on its computer. ${sentence(warning)}${isOld && " What is greyed is old."}</span></div>`}
     ${isOld && !warning && html`<div class="banner warn"><b>${kind === "lost" ? "Connection lost." : "Stale."}</b>
       <span>${sentence(message)} What is greyed is old.</span></div>`}
+    ${(status?.control === "" || status?.lease_expiry?.code === "unreachable") && html`<div class="banner warn" id="sockets">
+      <b>${status.lease_expiry?.code === "unreachable" ? "fishd has let the fish rest." : "No further client can connect to fishd."}</b>
+      <span>${status.control === "" ? sentence(status.limitations.at(-1)) : sentence(status.lease_expiry.message)} ${sentence(status.lease_expiry?.remedy)}</span></div>`}
     ${estop?.phase === "sending" && html`<div class="banner bad"><b>Emergency stop sent …</b></div>`}
     ${estop?.phase === "failed" && html`<div class="banner bad" role="alert"><b>Emergency stop NOT confirmed.</b>
       <span>${sentence(estop.message)} Sent ${estop.attempts === 1 ? "once" : `${estop.attempts} times`}. Use the button of the panel, or: fishctl estop. ${sentence(estop.remedy)}</span>
@@ -457,6 +470,7 @@ function Events() {
     ${events.length === 0 ? html`<p class="muted">None yet.</p>` : html`<ol class="events" tabindex="0" aria-label="Latest events first">
       ${events.map((event) => html`<li key=${`${event.t}${event.kind}`} class=${event.level}><time>${timeOfDay(event.t)}</time>
         <span class="kind">${event.kind}</span><span>${event.message}</span></li>`)}</ol>`}
+    ${state.status?.limitations?.map((line) => html`<p class="foot">Limitation: ${line}.</p>`)}
     ${state.session && !state.session.loopback && state.session.paired && html`<p class="foot">Paired as ${state.session.device || "this device"}.
       <button type="button" class="link" onClick=${() => call("POST", "/api/unpair", {}).then(() => location.reload())}>Forget this device</button></p>`}`;
 }

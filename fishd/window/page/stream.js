@@ -116,8 +116,8 @@ export class Ring {
 
 /** Yield the ticks that columns hold. */
 export function* ticksOf(history) {
-  const { quantities = {}, ...columns } = history ?? {};
-  for (let row = 0; row < (columns.seq?.length ?? 0); row++) {
+  const { quantities = {}, ...columns } = history;
+  for (let row = 0; row < columns.seq.length; row++) {
     const tick = {};
     for (const name in columns) if (columns[name][row] != null) tick[name] = columns[name][row];
     const own = Object.entries(quantities).filter(([, column]) => column[row] != null);

@@ -104,6 +104,16 @@ def test_without_a_fishd_and_without_a_servo_it_reports_that_it_did_nothing(tmp_
     assert "fishctl estop --config FILE" in line
 
 
+def test_a_servo_of_this_machine_is_not_taken_for_that_of_another_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "fish.yaml"
+    file.write_text("robot: simulated\n")
+    monkeypatch.setenv("FISHD_CONFIG", os.fspath(file))
+    line = one_line(fishctl("--endpoint", "tcp://192.0.2.1:9", "estop"))
+    assert "nothing was released: the servo is that of another machine" in line
+
+
 def test_a_configuration_names_the_servo_of_a_fishd_without_a_recipe(pi: Bench) -> None:
     file = pi.folder / "fish.yaml"
     file.write_text(

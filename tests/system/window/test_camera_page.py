@@ -10,6 +10,7 @@ from typing import Any
 import aiohttp
 import msgspec
 import pytest
+from aiohttp import web
 from rigs.processes import PATIENCE
 
 from fishd.core.errors import StartupError
@@ -236,6 +237,27 @@ def test_no_client_keeps_the_page_from_others(sent: bytes, monkeypatch: pytest.M
             for _, writer in clients:
                 writer.close()
             await asyncio.gather(*ends, return_exceptions=True)
+
+    run(test)
+
+
+def test_a_connection_that_sends_nothing_costs_no_handler(monkeypatch: pytest.MonkeyPatch) -> None:
+    create, created = web.Server.__call__, 0
+
+    def count(server: web.Server) -> web.RequestHandler:
+        nonlocal created
+        created += 1
+        return create(server)
+
+    monkeypatch.setattr(web.Server, "__call__", count)
+
+    async def test(server: PageServer, session: aiohttp.ClientSession) -> None:
+        silent = [await connect(server) for _ in range(50)]
+        async with session.get("/") as response:  # is accepted after them
+            assert response.status == 200
+        assert created == 1
+        for _, writer in silent:
+            writer.close()
 
     run(test)
 

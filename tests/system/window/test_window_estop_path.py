@@ -39,6 +39,8 @@ signal.signal(signal.SIGUSR1, stall_all)
 SILENT = """
 import signal, threading
 from fishd.client import Fish
+from fishd.window import estop_path
+estop_path.ANSWER_TIMEOUT_S = 1e6
 signal.signal(
     signal.SIGUSR1, lambda *_: setattr(Fish, "estop", lambda *_: threading.Event().wait())
 )
@@ -50,7 +52,7 @@ from fishd.client import Fish
 def fail(*_):
     raise zmq.ZMQError(24)
 def break_all(*_):
-    Fish.status = Fish.estop = fail
+    Fish.probe_estop = Fish.status = Fish.estop = fail
 signal.signal(signal.SIGUSR1, break_all)
 """
 """Code of a window: from SIGUSR1 on, no thread can open a socket of ZeroMQ."""
@@ -87,7 +89,7 @@ def test_the_last_resort_runs_though_all_threads_of_emergency_stops_wait_forever
                 window.process.send_signal(signal.SIGUSR1)
                 for _ in range(ESTOP_THREADS + 1):
                     answer = await browser.post("/api/fish/fish/estop")
-                    assert answer["way"] == "last resort"
+                    assert answer["way"] == "fishctl"
 
         run(test())
         assert daemon.status().mode == "estop"
@@ -105,7 +107,7 @@ def test_an_error_of_zeromq_ends_neither_the_emergency_stop_nor_the_warning_nor_
                 async with open_page(browser) as page:
                     window.process.send_signal(signal.SIGUSR1)
                     await page.until("connection", lambda connection: connection["warning"])
-                    assert (await page.post("estop"))["way"] == "last resort"
+                    assert (await page.post("estop"))["way"] == "fishctl"
                     window.ask("revoke", "tablet")
                     while not page.sock.closed:
                         await page.sock.receive()
@@ -167,5 +169,6 @@ def test_an_emergency_stop_whose_last_resort_fails_is_no_mistake_of_the_window(
             async with Browser(window.url) as browser:
                 refusal = await browser.refusal("/api/fish/fish/estop", {})
                 assert refusal == (503, "no-daemon")
+                assert await browser.refusal("/api/fish/shark/estop", {}) == (404, "no-fish")
 
         run(test())

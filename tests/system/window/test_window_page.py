@@ -298,6 +298,7 @@ def test_a_killed_fishd_shows_at_once_and_a_new_one_is_said(
         age = page.locator("#connection .age")
         expect(age).not_to_have_text(age.inner_text())
         expect(page.locator("#banner")).to_contain_text("What is greyed is old")
+        expect(page.locator("#mode")).to_have_text("was idle")
         with running(tmp_path):
             expect(page.locator("#connection")).to_contain_text("live")
             expect(page.locator("#notices")).to_contain_text("restarted")
