@@ -2,7 +2,9 @@
 
 import os
 import signal
+import socket
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +14,7 @@ import msgspec
 from fishd.cli.options import daemon_options
 from fishd.cli.output import echo, format_state, output_may_fail, print_json
 from fishd.client import Fish
-from fishd.core import addresses
-from fishd.core.addresses import socket_path
+from fishd.core.addresses import Ipc, parse, socket_path
 from fishd.core.errors import FishError, NoDaemon, Refused, StartupError, Untrusted
 from fishd.core.local_daemons import LocalDaemon, become
 from fishd.core.process.interruption import SIGNALS, handle_signals
@@ -87,7 +88,7 @@ def _end_pulses(fish: Fish, path: Path | None, file: Path | None, no_answer: Fis
             recipes.append(own)
         if recipes:
             return _carry_out({recipe["config"]: recipe for recipe in recipes}.values())
-        if not addresses.is_own(fish.endpoint):
+        if not _is_of_this_machine(fish.endpoint):
             raise NoDaemon(
                 f"{problem}; nothing was released: the servo is that of another machine, so run "
                 "fishctl estop there"
@@ -98,6 +99,22 @@ def _end_pulses(fish: Fish, path: Path | None, file: Path | None, no_answer: Fis
         if daemon.user != os.geteuid():
             problem += f"; for process {daemon.pid}, run: {become(daemon.user)}fishctl estop"
     return release_by_config(problem, file)
+
+
+def _is_of_this_machine(endpoint: str) -> bool:
+    """Return whether an endpoint leads to this machine, as far as the addresses of it say."""
+    try:
+        address = parse(endpoint)
+        if isinstance(address, Ipc):
+            return True
+        places = socket.getaddrinfo(address.host, None, type=socket.SOCK_DGRAM)
+    except (OSError, ValueError):
+        return False
+    for family, kind, _, _, place in places:
+        with suppress(OSError), socket.socket(family, kind) as probe:
+            probe.bind(place)  # fails for an address of another machine
+            return True
+    return False
 
 
 def _find_recipes(daemons: Iterable[LocalDaemon]) -> list[dict[str, Any]]:

@@ -75,7 +75,7 @@ class Connection:
         self.detour = ""
         """How the latest answer came without the control socket; empty if it came through it."""
         self.silent: list[LocalDaemon] = []
-        """The fishds that did not answer the latest emergency stop at their names in the kernel."""
+        """The fishds that did not answer the latest emergency stop at their names."""
         self.timeout = timeout
         self.telemetry_address = telemetry
         self.held: LeaseRenewal | None = None
@@ -255,7 +255,7 @@ class Connection:
     def _note_detour(
         self, daemons: "Iterable[LocalDaemon]", statuses: "Mapping[LocalDaemon, Status]"
     ) -> None:
-        """Store which of these have answered at their names in the kernel."""
+        """Store which of these have answered at their names."""
         from fishd.core import local_daemons
 
         names = []
@@ -265,9 +265,9 @@ class Connection:
             where = f" at {text.line(address)}" if address not in ("", self.endpoint) else ""
             names.append(local_daemons.format_name(daemon, status) + where)
         place = "their names" if len(names) > 1 else "its name"
+        why = "nothing listens at" if self.is_deserted else "no answer from"
         self.detour = (
-            f"{'nothing listens at' if self.is_deserted else 'no answer from'} {self.endpoint}; "
-            f"{' and '.join(names)} answered at {place} in the kernel"
+            f"{why} {self.endpoint}; {' and '.join(names)} answered at {place} in the kernel"
         )
 
     def _ask(

@@ -91,22 +91,6 @@ def is_local(text: str) -> bool:
     return number is not None and number.version == 4 and number.is_loopback
 
 
-def is_own(text: str) -> bool:
-    """Return whether an endpoint leads to this machine, as far as the addresses of it say."""
-    try:
-        endpoint = parse(text)
-        if isinstance(endpoint, Ipc):
-            return True
-        places = socket.getaddrinfo(endpoint.host, None, type=socket.SOCK_DGRAM)
-    except (OSError, ValueError):
-        return False
-    for family, kind, _, _, place in places:
-        with suppress(OSError), socket.socket(family, kind) as probe:
-            probe.bind(place)  # fails for an address of another machine
-            return True
-    return False
-
-
 def find_listen_problem(text: str) -> str:
     """Return why fishd cannot listen on an address; empty if it can. Port 0 means any free port."""
     try:

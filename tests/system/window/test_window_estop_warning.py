@@ -91,10 +91,12 @@ def test_a_page_says_that_no_further_client_can_connect_to_fishd_which_lets_the_
         shutil.rmtree(folder)
         folder.touch()
         banner = page.locator("#sockets")
-        expect(banner).to_contain_text("control socket is gone and cannot be created")
+        expect(banner).to_contain_text("Clients cannot reach the control socket")
         expect(banner).to_contain_text("fishd has let the fish rest")
         expect(banner).to_contain_text("Restart fishd, or log in again.")
-        expect(page.locator("#events")).to_contain_text("Limitation: the control socket is gone")
+        expect(page.locator("#events")).to_contain_text(
+            "Limitation: clients cannot reach the control socket"
+        )
         expect(page.locator("body.unreachable")).to_have_count(0)
         page.click("#estop")
         expect(page.locator("#mode")).to_have_text("E-stop")
