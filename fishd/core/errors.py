@@ -119,7 +119,7 @@ class FishError(FishdError):
 class NoDaemon(FishError, ConnectionError):
     """Nothing answers at the endpoint."""
 
-    def __init__(self, problem: str, remedy: str = "") -> None:
+    def __init__(self, problem: str = "", remedy: str = "") -> None:
         """remedy: end of the message, which begins with a semicolon"""
         super().__init__(problem + remedy)
         self.problem = problem

@@ -259,7 +259,8 @@ class Recorder:
         known = len(self.writer.gaps)
         self.writer.status(status)
         self._report_gaps(known, f"up to tick {status.seq}, at the end")
-        if self._seq > status.seq or self.writer.tally.restarts > restarts:
+        # Later ticks than that of the status may have arrived by now.
+        if status.pid != self.status.pid or self.writer.tally.restarts > restarts:
             self._doubt_end("at the end another fishd runs, whose ticks are not recorded")
 
     def _count_last_frames(self) -> None:

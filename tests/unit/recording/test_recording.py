@@ -8,6 +8,7 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import ClassVar, Self
+from unittest.mock import MagicMock
 
 import msgspec
 import pytest
@@ -282,6 +283,26 @@ def hear(recorder: Recorder, tick: Tick, pid: int) -> None:
     """A tick, and a status behind it."""
     recorder._take("tick", msgspec.json.encode(tick))
     recorder._take("status", msgspec.json.encode(status(tick, pid)))
+
+
+@pytest.mark.parametrize(("pid", "complete"), [(1, True), (2, False)], ids=["same", "another"])
+def test_ticks_that_arrive_after_the_last_status_are_no_sign_of_another_fishd(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pid: int, complete: bool
+) -> None:
+    ticks = swum().recorder.ticks
+    late = [("tick", msgspec.json.encode(tick)) for tick in ticks[1:5]]
+    fishd, telemetry = MagicMock(), MagicMock()
+    fishd.return_value.__enter__.return_value.status.return_value = status(ticks[2], pid)
+    telemetry.messages.return_value = late
+    monkeypatch.setattr(recorder_module, "Fish", fishd)
+    recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=lambda line: None)
+    recorder._described = description_of(ticks[0], pid=1)
+    recorder._open()
+    hear(recorder, ticks[0], pid=1)
+    recorder._count_last_ticks(telemetry)
+    recorder.__exit__(None, None, None)
+    assert recorder.is_complete == complete
+    assert len(open_run(tmp_path / "run.mcap").ticks) == 5
 
 
 def test_what_fishd_could_not_be_told_of_the_camera_it_is_told_later(
