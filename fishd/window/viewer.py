@@ -9,9 +9,10 @@ from aiohttp import WSMsgType, web
 CLOSE_TIMEOUT_S = 0.4
 """Half of the longest time that a page may take to close [s]."""
 MIN_MESSAGE_PERIOD_S = 0.02
-"""Shortest mean time between two messages from a page; more are read later [s]."""
+"""Shortest mean time between two messages from a page; more wait in the network [s]."""
 MAX_MESSAGES_AT_ONCE = 50
-"""Number of messages from a page after a pause that are read without delay."""
+"""Number of messages from a page after a pause that are read without delay, and without a chance
+for others."""
 
 
 class Viewer:
@@ -42,9 +43,9 @@ class Viewer:
         """Close the page."""
         self._ended.set()
 
-    async def serve(self, sock: web.WebSocketResponse) -> None:
+    async def serve(self, sock: web.WebSocketResponse, transport: asyncio.Transport) -> None:
         """Send messages until the page or the server closes, whether or not the page reads them."""
-        jobs = (self._talk(sock), self._listen(sock), self._ended.wait())
+        jobs = (self._talk(sock), self._listen(sock, transport), self._ended.wait())
         tasks = [asyncio.create_task(job) for job in jobs]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
@@ -70,13 +71,23 @@ class Viewer:
                 else:
                     await sock.send_frame(message, self.OPCODE)
 
-    async def _listen(self, sock: web.WebSocketResponse) -> None:
+    async def _listen(self, sock: web.WebSocketResponse, transport: asyncio.Transport) -> None:
         """Read messages, and detect that the page is closed.
 
-        Where too many come, they wait in the network.
+        Where too many come, nothing more is read from the page for a time.
         """
         loop = asyncio.get_running_loop()
-        due = loop.time()
+        due, is_paused = loop.time(), False
+
+        def resume() -> None:
+            nonlocal is_paused
+            if (wait := due - loop.time()) > 0.0:
+                loop.call_later(wait, resume)
+                return
+            is_paused = False
+            transport.resume_reading()
+
+        count = 0
         async for message in sock:
             if message.type is WSMsgType.ERROR:
                 break
@@ -86,5 +97,10 @@ class Viewer:
                 await sock.pong(message.data)
             due = max(due, loop.time() - MAX_MESSAGES_AT_ONCE * MIN_MESSAGE_PERIOD_S)
             due += MIN_MESSAGE_PERIOD_S
-            if due > loop.time():
-                await asyncio.sleep(MIN_MESSAGE_PERIOD_S)
+            if due > loop.time() and not is_paused:
+                is_paused = True
+                transport.pause_reading()
+                resume()
+            count += 1
+            if count % MAX_MESSAGES_AT_ONCE == 0:
+                await asyncio.sleep(0.0)

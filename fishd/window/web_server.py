@@ -180,7 +180,8 @@ class WebServer:
         try:
             await sock.prepare(request)
             self._places.leave(request.protocol)
-            await viewer.serve(sock)
+            if transport:
+                await viewer.serve(sock, transport)
         finally:
             self.viewers.discard(viewer)
             if transport and transport.get_write_buffer_size():
