@@ -1,6 +1,7 @@
 """Command `fishd-window`, which serves a page of the fish until a signal ends it."""
 
 import asyncio
+import gc
 import logging
 import sys
 import threading
@@ -24,6 +25,9 @@ log = logging.getLogger(__name__)
 NAME = "fishd-window"
 NOTIFY_PERIOD_S = 0.2
 """Time between two looks for a signal, with a notification of systemd [s]."""
+GARBAGE_THRESHOLDS = 700, 5, 3
+"""Thresholds of the garbage collector. Connections that have ended are cycles of much memory; with
+the default 700, 10, 10 they wait for long, and then take much time at once."""
 SWITCH_INTERVAL_S = 5e-4
 """Time after which a thread, such as that of an emergency stop, gets the interpreter [s]."""
 F = TypeVar("F", bound=Callable[..., Any])
@@ -113,6 +117,8 @@ def serve(
 
     async def run_window(stopping: threading.Event) -> None:
         sys.setswitchinterval(SWITCH_INTERVAL_S)
+        gc.freeze()
+        gc.set_threshold(*GARBAGE_THRESHOLDS)
         notifier = SystemdNotifier()
         async with WindowServer(settings) as server:
             log.info("the fish is at %s", server.url)
