@@ -102,14 +102,21 @@ class ExperimentFolder(NamedTuple):
 
     @contextmanager
     def open(
-        self, fish: ChosenFish, settings: dict[str, Any], session: "Session | None"
+        self,
+        fish: ChosenFish,
+        settings: dict[str, Any],
+        session: "Session | None",
+        *,
+        begins_again: bool = False,
     ) -> "Iterator[Experiment]":
         """Begin or resume the experiment; raises `ConfigError`.
 
         settings: what else the rows depend on, besides the fish
         session: not entered yet; None for fish that swim without one
+        begins_again: whether a resumed simulation keeps nothing that was measured before; else it
+            continues with other noise
         """
-        from fishd.lab.experiment import Header, count_rows, open_experiment
+        from fishd.lab.experiment import Header, count_attempts, open_experiment
         from fishd.lab.session import VirtualSession
 
         endpoint_words = ("--endpoint", fish.endpoint) if fish.endpoint else ()
@@ -122,8 +129,8 @@ class ExperimentFolder(NamedTuple):
             command=[*self.command, "--on", fish.on, *endpoint_words],
         )
         with open_experiment(self.path, header, resume=self.resume) as experiment:
-            if isinstance(session, VirtualSession) and (measured := count_rows(self.path)):
-                session.resume(measured)
+            if isinstance(session, VirtualSession) and not begins_again:
+                session.resume(count_attempts(self.path))
             yield experiment
 
 
@@ -255,7 +262,7 @@ def keep_experiment(
     if fish.on == "simulation" and not place.is_named:
         yield None
         return
-    with place.open(fish, settings, session) as experiment:
+    with place.open(fish, settings, session, begins_again=True) as experiment:
         yield experiment
 
 

@@ -278,6 +278,11 @@ def count_rows(path: Path) -> int | None:
         return None
 
 
+def count_attempts(path: Path) -> int:
+    """Return a number that grows with each attempt at an experiment that has kept something."""
+    return (count_rows(path) or 0) + sum(1 for _ in path.glob(f"*{SUFFIX}*"))
+
+
 def find_largest_thrust(path: Path) -> tuple[float, float | None, float | None] | None:
     """Return the largest thrust of an experiment, with two half-widths of its 95 % interval.
 

@@ -264,13 +264,15 @@ class VirtualSession(Session):
             run.loop.robot.tared.recalibrate(self._calibration)
         return run
 
-    def resume(self, measured: int) -> None:
-        """Begin again with other noise than before, which the kept measurements have; not entered.
+    def resume(self, attempts: int) -> None:
+        """Begin again with other noise than the kept measurements have; call before entering.
 
-        measured: number of kept measurements; each resumption has noise of its own by it
+        attempts: a number that differs for each attempt at the experiment; 0 for the first
         """
+        if not attempts:
+            return
         config = self._run.config
-        noise = replace(config.simulation, seed=config.simulation.seed + measured)
+        noise = replace(config.simulation, seed=config.simulation.seed + attempts)
         self._run.close()
         self._run = self._begin(replace(config, simulation=noise))
 

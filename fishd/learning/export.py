@@ -108,7 +108,7 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     """Write the policy of a model of stable-baselines3 that was trained on a `SwimEnv`.
 
     model: PPO or A2C with an `MlpPolicy` of tanh or relu; its environment has no wrappers but
-        `NEUTRAL_WRAPPERS` and those of rewards. It is reset, and stepped for the proof
+        `NEUTRAL_WRAPPERS` and those of rewards
     note: text for the user, stored in the file
 
     Raises `PolicyError` for any other model, and where the outputs of the file would differ from
@@ -134,7 +134,7 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     card = replace(card, provenance=past)
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
     evaluation = evaluate_in_simulation(env.config, decide, EvaluationSettings())
-    _write(path, _complete_card(card, evaluation), policy, env.perception, _observe(model))
+    _write(path, _complete_card(card, evaluation), policy, env.perception, _observe(env))
     return path
 
 
@@ -146,14 +146,14 @@ def _find_swim_env(env: VecEnv | None, path: Path) -> SwimEnv:
     inner = env.envs if isinstance(env, DummyVecEnv) else []
     for layer in (layer for environment in inner for layer in _unwrap(environment)):
         _check_wrapper(layer, path)
-    found = inner[0].unwrapped if inner else None
-    if not isinstance(found, SwimEnv):
+    innermost = inner[0].unwrapped if inner else None
+    if not isinstance(innermost, SwimEnv):
         raise PolicyError(
-            f"{path}: the environment of this model, {type(found or env).__name__}, is not a "
+            f"{path}: the environment of this model, {type(innermost or env).__name__}, is not a "
             "SwimEnv of this process, so the inputs of the network are not known; load the model "
             "with env=gymnasium.make('fishd/Swim-v0')"
         )
-    return found
+    return innermost
 
 
 def _unwrap(env: Any) -> Iterator[Any]:
@@ -203,17 +203,19 @@ def _check_network(policy: Any, path: Path) -> ActorCriticPolicy:
     return policy
 
 
-def _observe(model: BaseAlgorithm) -> NDArray[np.float32]:
-    """Return observations of random swimming; the model's next training resets its environment."""
-    env = model.get_env()
-    assert env
+def _observe(env: SwimEnv) -> NDArray[np.float32]:
+    """Return observations of random swimming in simulation: the model's own fish may be a real one.
+
+    Wrappers that are permitted do not change them.
+    """
+    simulated = SwimEnv(SimulatedLink(env.config), env.config, env.settings)
     random = np.random.default_rng(2)
-    rows: list[Any] = [env.reset()]
-    while sum(map(len, rows)) < _PROBE_INPUTS:
-        actions = random.uniform(-1.0, 1.0, (env.num_envs, *(env.action_space.shape or ())))
-        rows.append(env.step(actions.astype(np.float32))[0])
-    model._last_obs = None
-    return np.concatenate(rows)
+    rows = [simulated.reset(seed=2)[0]]
+    while len(rows) < _PROBE_INPUTS:
+        action = random.uniform(-1.0, 1.0, simulated.action_space.shape).astype(np.float32)
+        observation, _, *ended, _ = simulated.step(action)
+        rows.append(simulated.reset()[0] if any(ended) else observation)
+    return np.array(rows)
 
 
 def _write(

@@ -148,7 +148,7 @@ class EstopPath:
 
 
 def _start(attempt: Coroutine[Any, Any, Outcome]) -> asyncio.Task[Outcome]:
-    """Start an attempt whose failure is no mistake, also if no press waits for it any more."""
+    """Start an attempt; asyncio does not log its failure if no press waits for it any more."""
     task = asyncio.create_task(attempt)
     task.add_done_callback(lambda task: task.cancelled() or task.exception())
     return task
@@ -168,7 +168,7 @@ async def _first_result(*attempts: asyncio.Task[Outcome]) -> Outcome:
 async def _run_last_resort(endpoint: str | None, problem: str) -> Outcome:
     """Run `fishctl estop`, which can end the pulses without fishd; return what it did.
 
-    It asks fishd once more, as it may be this process that fails.
+    It asks fishd again, because this process may be at fault.
 
     problem: why fishd has not answered
     """

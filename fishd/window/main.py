@@ -26,8 +26,8 @@ NAME = "fishd-window"
 NOTIFY_PERIOD_S = 0.2
 """Time between two looks for a signal, with a notification of systemd [s]."""
 GARBAGE_THRESHOLDS = 700, 5, 3
-"""Thresholds of the garbage collector. Connections that have ended are cycles of much memory; with
-the default 700, 10, 10 they wait for long, and then take much time at once."""
+"""Thresholds of the garbage collector. Ended connections are cycles of much memory; with the
+default 700, 10, 10 they are kept for long, and collecting them then takes the window longer."""
 SWITCH_INTERVAL_S = 5e-4
 """Time after which a thread, such as that of an emergency stop, gets the interpreter [s]."""
 F = TypeVar("F", bound=Callable[..., Any])

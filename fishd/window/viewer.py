@@ -11,8 +11,8 @@ CLOSE_TIMEOUT_S = 0.4
 MIN_MESSAGE_PERIOD_S = 0.02
 """Shortest mean time between two messages from a page; more wait in the network [s]."""
 MAX_MESSAGES_AT_ONCE = 50
-"""Number of messages from a page after a pause that are read without delay, and without a chance
-for others."""
+"""Number of messages from a page after a pause that are read without delay; after as many, other
+connections are served."""
 
 
 class Viewer:

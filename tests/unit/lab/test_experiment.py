@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 from rigs.processes import fishctl, one_line
 
+from fishd.config import load
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Tick
-from fishd.lab.experiment import Header, open_experiment
+from fishd.lab.experiment import Header, count_attempts, open_experiment
 from fishd.lab.session import VirtualSession
 from fishd.recording import open_run
 
@@ -180,3 +181,14 @@ def test_a_measurement_keeps_header_recording_and_result_and_is_listed(tmp_path:
     done = fishctl("runs", "--folder", str(tmp_path))
     assert done.returncode == 1
     assert f"fishctl: {folder}/experiment.json: fishd" in done.stderr
+
+
+def test_each_attempt_at_an_experiment_without_rows_has_noise_of_its_own(tmp_path: Path) -> None:
+    assert count_attempts(tmp_path) == 0
+    noise = []
+    for name in ("excitation.mcap", "excitation-2.mcap.part"):
+        with VirtualSession(load(None)) as session:
+            session.resume(count_attempts(tmp_path))
+            noise.append([tick.fx for tick in session._rest(1.0)])
+        (tmp_path / name).touch()
+    assert not set(noise[0]) & set(noise[1])
