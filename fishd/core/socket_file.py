@@ -136,7 +136,6 @@ class SocketFile:
                 self._claim.close()
                 self._claim = claim.pop_all()
         self._identity = identify(path)
-        self._mode = self._identity[-1] if self._identity else 0
         if former != path:
             self._folder = path.parent.stat()
             with suppress(OSError):
