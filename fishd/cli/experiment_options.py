@@ -27,7 +27,10 @@ if TYPE_CHECKING:
     from fishd.lab.session import Session
 
 On = Literal["live", "simulation"]
-RUN_ONLY_OPTIONS = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0}
+RUN_ONLY_OPTIONS = {
+    **{"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0},
+    "--cluster": 1,
+}
 """Options that a resumed experiment does not take over, and the number of words after each."""
 _COMMAND = "fishd.words"
 """Key of the command line in click's context, for the header of an experiment."""

@@ -45,7 +45,8 @@ def sweep_options(function: Any) -> Any:
         click.option(
             "--cluster",
             metavar="ADDRESS",
-            help="In simulation: address of the Dask scheduler to use.",
+            help="In simulation: let the workers of a Dask cluster swim; address of its scheduler, "
+            "or its file NAME.json. --resume without it swims on this machine.",
         ),
         click.option(
             "--jobs",
@@ -152,6 +153,7 @@ class _Sweep:
 
     def swim(self, given: dict[str, Any], workers: dict[str, Any]) -> int:
         """Swim simulated fish; given: durations, workers: processes or cluster."""
+        from fishd.lab.parallel import Unfinished
         from fishd.lab.sweep.grid import Lengths
         from fishd.lab.sweep.measuring import swim_all
 
@@ -162,7 +164,12 @@ class _Sweep:
         with self.place.open(self.fish, settings, None) as experiment:
             folder = self._open_folder(experiment)
             ending = ExperimentEnding(experiment)
-            with show_progress(len(pairs), "points", err=self.as_json) as show:
+            if workers["cluster"]:
+                ending.hint += "; add --cluster ADDRESS to use a cluster again"
+            with (
+                ending.measuring(Unfinished),
+                show_progress(len(pairs), "points", err=self.as_json) as show,
+            ):
                 show.at(self.finished)
 
                 def done(point: "Point", result: "PointResult") -> None:

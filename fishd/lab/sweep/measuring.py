@@ -187,18 +187,18 @@ def swim_all(
     Raises `FishdError`; the results of finished points are kept.
     """
     missing = [pair for pair in points if folder.key(pair[0]) not in folder.results]
-    is_whole = True
+    if not missing:
+        return True
     with workers(folder.path / STOP_FILE, jobs, cluster) as pool, on_signal(pool.ask_to_stop):
         tasks = [Task(point, config, lengths, pool.stop) for point, config in missing]
         for index, outcome in pool.run(simulate_point, tasks):
             if outcome is None:
-                is_whole = False
                 continue
             point = missing[index][0]
             result, recording = outcome
             folder.add_result(point, result, recording)
             done(point, result)
-    return is_whole
+    return all(folder.key(point) in folder.results for point, _ in missing)
 
 
 def measure_all(
