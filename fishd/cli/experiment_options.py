@@ -27,9 +27,8 @@ if TYPE_CHECKING:
     from fishd.lab.session import Session
 
 On = Literal["live", "simulation"]
-RUN_ONLY_OPTIONS = {
-    **{"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0},
-    "--cluster": 1,
+RUN_ONLY_OPTIONS = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0} | {
+    "--cluster": 1
 }
 """Options that a resumed experiment does not take over, and the number of words after each."""
 _COMMAND = "fishd.words"
@@ -364,10 +363,12 @@ class ResumableGroup(Resumable, ControllerGroup):
 class ExperimentEnding:
     """State of the end of an experiment: whether it was interrupted, and how to resume it."""
 
-    def __init__(self, experiment: "Experiment | None") -> None:
-        """experiment: None where nothing is kept"""
+    def __init__(self, experiment: "Experiment | None", cluster: str | None = None) -> None:
+        """experiment: None where nothing is kept; cluster: address of the cluster it uses"""
         self.hint = f"resume with: {experiment.resume_command}" if experiment else "nothing is kept"
         """How the experiment is resumed, for a message."""
+        if cluster:
+            self.hint += "; add --cluster ADDRESS to use a cluster again"
         self._experiment = experiment
         self._is_interrupted = False
 

@@ -163,9 +163,7 @@ class _Sweep:
         settings = {"lengths": msgspec.to_builtins(lengths)}
         with self.place.open(self.fish, settings, None) as experiment:
             folder = self._open_folder(experiment)
-            ending = ExperimentEnding(experiment)
-            if workers["cluster"]:
-                ending.hint += "; add --cluster ADDRESS to use a cluster again"
+            ending = ExperimentEnding(experiment, workers["cluster"])
             with (
                 ending.measuring(Unfinished),
                 show_progress(len(pairs), "points", err=self.as_json) as show,

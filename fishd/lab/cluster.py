@@ -134,6 +134,7 @@ class Cluster:
                     await asyncio.sleep(0.1)
                 cause = f"the workers of the Dask cluster at {self._address} do not answer"
                 answers = await self._client.run(read_versions, on_error="return")
+                answers["its scheduler"] = await self._read_scheduler_versions()
         except TimeoutError:
             if place == "scheduler_file" and not Path(self._address).exists():
                 cause = f"{nothing}: there is no such file"
@@ -146,6 +147,14 @@ class Cluster:
             raise Unfinished(f"{nothing}: another program listens there; {_REMEDY}") from None
         _check_versions(answers)
 
+    async def _read_scheduler_versions(self) -> dict[str, str] | ImportError:
+        """Return the versions of the scheduler, which reads each task before a worker does."""
+        try:
+            versions: dict[str, str] = await self._client.run_on_scheduler(read_versions)
+        except ImportError as error:
+            return error
+        return versions
+
     async def _set_stop(self) -> None:
         await distributed.Event(self.stop.name, client=self._client).set()
 
@@ -156,7 +165,7 @@ class Cluster:
             future = self._client.submit(_run_checked, versions, function, task, pure=False)
             try:
                 result = await future
-            except asyncio.CancelledError:
+            except (Exception, asyncio.CancelledError):
                 if future.cancelled():
                     raise _Lost(_ENDED) from None
                 raise
@@ -262,21 +271,21 @@ def _check_versions(answers: Mapping[str, Any], here: Mapping[str, str] | None =
     workers: dict[str, list[str]] = {}
     for worker, there in answers.items():
         if isinstance(there, Exception):
-            what = f"cannot import fishd: {there}"
+            what = f"fishd cannot be used there: {there}"
         elif differences := [name for name in here if there[name] != here[name]]:
             names = (f"{name} {there[name]} (here {here[name]})" for name in differences)
-            what = f"has {', '.join(names)}"
+            what = ", ".join(names)
         else:
             continue
         workers.setdefault(what, []).append(worker)
     if workers:
         parts = (
-            f"{several[0]}{f' and {len(several) - 1} more' if several[1:] else ''} {what}"
+            f"{several[0]}{f' and {len(several) - 1} more' if several[1:] else ''}: {what}"
             for what, several in workers.items()
         )
         raise Unfinished(
-            f"workers of the Dask cluster differ from this machine: {'; '.join(parts)}; install "
-            "the same versions of fishd, Python and numpy on all machines, and restart the workers"
+            f"the Dask cluster differs from this machine: {'; '.join(parts)}; install the same "
+            "versions of fishd, Python and numpy on all machines, and restart scheduler and workers"
         )
 
 

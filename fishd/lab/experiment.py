@@ -354,10 +354,10 @@ def _check_same(path: Path, before: Header, header: Header) -> None:
 
 
 def _relevant_values(header: Header) -> dict[str, Any]:
-    """Return the values on which the rows depend, by dotted keys."""
+    """Return the values on which the rows depend, as JSON has them, by dotted keys."""
     return {
         key: value
-        for key, value in _flatten(msgspec.to_builtins(header)).items()
+        for key, value in _flatten(msgspec.json.decode(msgspec.json.encode(header))).items()
         if key.partition(".")[0] not in _NOT_COMPARED
         and key.removeprefix("config.").partition(".")[0] not in IRRELEVANT_KEYS
     }

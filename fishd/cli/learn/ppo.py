@@ -8,10 +8,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import click
+from msgspec import to_builtins
 from msgspec.structs import replace
 
 from fishd.cli.config import config_option, set_option
-from fishd.cli.experiment_options import On, default_on, on_option
+from fishd.cli.experiment_options import (
+    ExperimentEnding,
+    On,
+    default_on,
+    kept_arguments,
+    on_option,
+    restore_arguments,
+)
 from fishd.cli.options import (
     RenamedOption,
     camera_config_option,
@@ -34,10 +42,27 @@ if TYPE_CHECKING:
 
 MAX_RELATIVE_THRUST = 1.03
 """Largest plausible relative thrust; above it the measurement is wrong."""
+_KIND = "learn ppo"
 BY_RESUME = "with --resume, which keeps the options of the run"
 
 
-@click.command()
+def _read_command(_: click.Context, folder: Path) -> list[str]:
+    """Return the arguments of a training with several seeds; none for another folder."""
+    from fishd.lab.experiment import HEADER, read_header
+
+    header = read_header(folder) if (folder / HEADER).exists() else None
+    return header.command if header and header.kind == _KIND else []
+
+
+class _Training(click.Command):
+    """Verb for which `--resume` restores the options of a training with several seeds."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments after those of the resumed training."""
+        return super().parse_args(ctx, restore_arguments(ctx, args, _read_command))
+
+
+@click.command(cls=_Training)
 @on_option
 @config_option("Configuration of the fish. [default: the defaults; live, that of its fishd]")
 @set_option
@@ -78,7 +103,7 @@ BY_RESUME = "with --resume, which keeps the options of the run"
     type=click.Path(path_type=Path),
     metavar="FOLDER",
     help="Resume the training in this folder, from its newest checkpoint and with its settings; "
-    "each of several seeds has its folder: runs/ten/seed-3.",
+    "of several seeds those that are not finished, or one of them: runs/ten/seed-3.",
 )
 @click.option(
     "--fine-tune",
@@ -105,7 +130,10 @@ BY_RESUME = "with --resume, which keeps the options of the run"
     help="With --seeds: number of processes. [default: one per core]",
 )
 @click.option(
-    "--cluster", metavar="ADDRESS", help="With --seeds: address of a Dask scheduler that runs them."
+    "--cluster",
+    metavar="ADDRESS",
+    help="With --seeds: let the workers of a Dask cluster train; address of its scheduler, or its "
+    "file NAME.json. --resume without it trains on this machine.",
 )
 @plot_option("the thrust at each evaluation")
 @json_option
@@ -146,6 +174,9 @@ def ppo(
     }
     run_options |= {"--see": see, "--seed": seed}
     new_run_options = {"--folder": folder, "--fine-tune": parent}
+    resumes_seeds = bool(resume and _read_command(click.get_current_context(), resume))
+    if resumes_seeds:
+        resume, folder = None, resume
     if resume:
         _refuse(BY_RESUME, {**run_options, **new_run_options, "--seeds": seeds})
     if seeds is None:
@@ -168,6 +199,7 @@ def ppo(
     job = replace(job, agent=agent, settings=replace(job.settings, **changed))
     job = _add_camera(job, camera_config or camera)
     if seeds is not None:
+        job = replace(job, resume=resumes_seeds)
         status, draw = _train_seeds(job, seeds, jobs, cluster, as_json), figure.draw_seeds
     else:
         status, draw = _train(job, as_json), figure.draw
@@ -340,13 +372,28 @@ def _train_seeds(
     job: "Job", seeds: int, jobs: int | None, cluster: str | None, as_json: bool
 ) -> int:
     """Train all seeds, print a line as each ends, and a summary; return the exit status."""
+    from fishd.lab.experiment import Header, open_experiment
+    from fishd.lab.parallel import Unfinished
     from fishd.learning.train import seeds as training
 
     if not cluster and find_spec("torch") is None:  # only the training processes load it
         raise ModuleNotFoundError("torch is missing", name="torch")
-    echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps", err=as_json)
+    header = Header(
+        kind=_KIND,
+        on=job.on,
+        config=to_builtins(job.config),
+        settings={"training": to_builtins(job.settings), "camera": to_builtins(job.camera)},
+        command=list(kept_arguments(click.get_current_context())),
+    )
     ended = partial(_print_seed, err=as_json)
-    outcomes = training.train_seeds(job, seeds, jobs, cluster, ended)
+    outcomes: list[Outcome] = []
+    with open_experiment(job.folder, header, resume=job.resume) as experiment:
+        echo(f"{job.folder}: {seeds} seeds of {job.last_step()} steps", err=as_json)
+        ending = ExperimentEnding(experiment, cluster)
+        with ending.measuring(Unfinished):
+            outcomes = training.train_seeds(replace(job, resume=False), seeds, jobs, cluster, ended)
+        ends = {outcome.ended for outcome in outcomes}
+        ending.is_interrupted = ending.is_interrupted or "interrupted" in ends
     if as_json:
         print_json(outcomes)
     for name, evaluations in (
@@ -361,10 +408,10 @@ def _train_seeds(
                 err=as_json,
             )
     echo(f"curves: {job.folder / 'seeds.csv'}", err=as_json)
-    ends = {outcome.ended for outcome in outcomes}
-    if ends - {"finished", "interrupted"}:
-        return 1
-    return INTERRUPTED if "interrupted" in ends else 0
+    if ending.is_interrupted:
+        finished = sum(outcome.ended == "finished" for outcome in outcomes)
+        return ending.interrupted(f"{finished} of {seeds} seeds are finished")
+    return 1 if ends - {"finished"} else 0
 
 
 def _print_seed(seed: int, outcome: "Outcome", err: bool) -> None:

@@ -1,7 +1,8 @@
 """Training with several seeds at once: on the cores of this machine, or on a Dask cluster.
 
-Each seed trains in a folder seed-0, seed-1, ... of the run folder. A seed that fails is reported
-and does not affect the others; one whose process was killed is resumed in another.
+Each seed trains in a folder seed-0, seed-1, ... of the run folder; one that exists is resumed. A
+seed that fails is reported and does not affect the others; one whose process was killed is resumed
+in another.
 """
 
 import io
@@ -16,7 +17,7 @@ from msgspec.structs import replace
 
 from fishd.core.errors import FishdError
 from fishd.core.process.interruption import on_signal
-from fishd.lab.parallel import Killed, Stop, workers
+from fishd.lab.parallel import Stop, workers
 from fishd.learning.train.jobs import Job, Outcome
 
 # Modules that import torch are imported where they are used: a process that is stopped before it
@@ -24,6 +25,8 @@ from fishd.learning.train.jobs import Job, Outcome
 
 STOP = "stop"
 """Name of the file in the run folder that ends the trainings in it."""
+STOP_TIMEOUT_S = 20.0
+"""Time after a signal in which the workers of a cluster send back their checkpoints [s]."""
 
 
 class _Task(NamedTuple):
@@ -31,6 +34,8 @@ class _Task(NamedTuple):
 
     job: Job
     stop: Stop
+    files: bytes = b""
+    """For a cluster: the run folder to resume, packed."""
 
 
 def train_seeds(
@@ -47,10 +52,9 @@ def train_seeds(
         extra `learn`, but no folder in common with this machine
     ended: called with each seed and its outcome as soon as the outcome is known
 
-    SIGINT, SIGTERM and SIGHUP end all of them, each with a checkpoint. Raises `ConfigError` where
-    the folder is in use, and `FishdError` where no scheduler answers.
+    SIGINT, SIGTERM and SIGHUP end all of them, each with a checkpoint. Raises `FishdError` where
+    the workers are lost; the folders of finished seeds are kept.
     """
-    from fishd.lab.experiment import check_free, mark_folder
     from fishd.learning.run_folder.tables import SEEDS, write_summary
 
     folder = job.folder.absolute()
@@ -61,19 +65,27 @@ def train_seeds(
         outcomes[index] = outcome
         ended(waiting[index].settings.seed, outcome)
 
-    check_free(folder)  # before workers remove the file that stops them
-    with workers(folder / STOP, jobs, cluster) as crew, on_signal(crew.ask_to_stop):
-        mark_folder(folder, "learn ppo", job.on)
-        tasks = [_Task(seed_job, crew.stop) for seed_job in waiting]
-        try:
+    try:
+        with (
+            workers(folder / STOP, jobs, cluster, STOP_TIMEOUT_S) as crew,
+            on_signal(crew.ask_to_stop),
+        ):
+            tasks = [
+                _Task(seed, crew.stop, pack(seed.folder) if cluster else b"") for seed in waiting
+            ]
             for index, result in crew.run(_train_remotely if cluster else _train_here, tasks):
                 if result[1]:
                     unpack(result[1], waiting[index].folder)
                 add_outcome(index, result[0])
-        except Killed as killed:
-            for index in killed.unfinished:
-                add_outcome(index, _make_failure(waiting[index], "its process was killed"))
-    write_summary(folder / SEEDS, [job.folder for job in waiting])
+        for index in sorted({*range(seeds)} - {*outcomes}):
+            missing = Outcome(
+                folder=waiting[index].folder,
+                ended="interrupted",
+                message="its worker has not answered",
+            )
+            add_outcome(index, missing)
+    finally:
+        write_summary(folder / SEEDS, [job.folder for job in waiting])
     return [outcomes[index] for index in range(seeds)]
 
 
@@ -97,6 +109,8 @@ def _train_remotely(task: _Task) -> tuple[Outcome, bytes]:
     """Train on a Dask worker, in a temporary folder whose files are sent back."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / task.job.folder.name
+        if task.files:
+            unpack(task.files, folder)
         outcome = _train(replace(task.job, folder=folder), task.stop.make_check())
         home = task.job.folder
         outcome = replace(
@@ -155,10 +169,13 @@ def _make_failure(job: Job, message: str) -> Outcome:
 
 
 def pack(folder: Path) -> bytes:
-    """Return all files of a folder as one zip archive."""
+    """Return all files of a folder as one zip archive; empty without any."""
+    paths = sorted(folder.rglob("*"))
+    if not paths:
+        return b""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in sorted(folder.rglob("*")):
+        for path in paths:
             archive.write(path, path.relative_to(folder))
     return buffer.getvalue()
 

@@ -338,23 +338,6 @@ def test_what_is_best_is_printed_though_its_picture_fails(
     assert "No space left" in done.stderr
 
 
-@pytest.mark.slow
-@pytest.mark.usefixtures("_no_worker_stays")
-def test_a_cluster_finds_what_this_machine_finds(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    words = ["sweep", "square", "--frequency", "1.5,2", "--periods", "3", "--settle", "1"]
-    with distributed.LocalCluster(
-        1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address="127.0.0.1:0"
-    ) as cluster:
-        there = [*words, "--folder", str(tmp_path / "there")]
-        done = fishctl(*there, "--cluster", cluster.scheduler_address)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert fishctl(*words, "--folder", str(tmp_path / "here"), "--jobs", "1").returncode == 0
-    tables = [(tmp_path / name / "rows.csv").read_text() for name in ("here", "there")]
-    here, there = ([row.rpartition(",")[0] for row in text.splitlines()] for text in tables)
-    assert here == there
-
-
 @pytest.mark.parametrize(
     ("words", "named"),
     [

@@ -5,19 +5,19 @@ Training processes take seconds to import torch, so those of this process stay f
 
 import csv
 import os
+import shutil
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 from joblib.externals.loky import get_reusable_executor
+from rigs.dask_cluster import dask_cluster
 from rigs.processes import FISHCTL, fishctl, is_stopped, one_line
 from rigs.swimming import LONG_ENOUGH, Done, brief_job, wait_for, while_it_trains
 
-from fishd.lab import parallel
 from fishd.learning.run_folder.tables import SUMMARY, best_so_far, read_evaluations, write_summary
 from fishd.learning.train.seeds import _train
 
@@ -160,7 +160,9 @@ def test_ctrl_c_ends_all_seeds_with_a_checkpoint_each(tmp_path: Path) -> None:
     )
     assert done.returncode == 130
     assert "Traceback" not in done.stderr
-    assert done.stderr.count("interrupted") == 3
+    assert done.stderr.count("interrupted") == 4
+    resume = f"interrupted, 0 of 3 seeds are finished; resume with: fishctl learn ppo --resume {run}"
+    assert resume in done.stderr
     assert all(list((run / f"seed-{index}").glob("step-*")) for index in (0, 1))
     assert not (run / "seed-2").exists()
     assert (run / "seeds.csv").exists()
@@ -230,52 +232,41 @@ def test_a_folder_that_is_in_use_is_not_changed(tmp_path: Path, name: str) -> No
 @pytest.fixture
 def cluster(tmp_path: Path) -> Iterator[str]:
     """The address of a Dask scheduler with one worker, processes on the loopback interface."""
-    distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    json_load_robust = distributed.utils.json_load_robust
-    elsewhere, file = tmp_path / "worker", tmp_path / "scheduler.json"
+    pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
+    elsewhere = tmp_path / "worker"
     elsewhere.mkdir()
-    here = ["--scheduler-file", str(file), "--host", "127.0.0.1", "--no-dashboard"]
-    single = ["--nworkers", "1", "--nthreads", "1", "--no-nanny", "--death-timeout", "60"]
-    commands = (["scheduler", "--port", "0", *here], ["worker", *single, *here])
-    processes = [
-        subprocess.Popen(
-            [sys.executable, "-m", f"distributed.cli.dask_{kind}", *rest],
-            cwd=elsewhere,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for kind, *rest in commands
-    ]
-    try:
-        address = json_load_robust(file, timeout=LONG_ENOUGH)["address"]
-        with distributed.Client(address, timeout=LONG_ENOUGH) as client:
-            client.wait_for_workers(1, timeout=LONG_ENOUGH)
-        yield address
-    finally:
-        for process in reversed(processes):
-            process.kill()
-            process.wait(LONG_ENOUGH)
+    with dask_cluster(elsewhere) as running:
+        running.add_worker()
+        yield running.address
 
 
-def test_a_cluster_sends_back_the_same_trainings_as_this_machine(
+def test_a_cluster_trains_the_seeds_that_are_missing_as_this_machine_does(
     tmp_path: Path, cluster: str, two: tuple[Path, Done]
 ) -> None:
     here, there = two[0], tmp_path / "run"
-    done = fishctl(*command(tmp_path, "--seeds", "2", "--seed", "5", "--cluster", cluster))
+    shutil.copytree(here, there)
+    shutil.rmtree(there / "seed-1")
+    (there / "seeds.csv").unlink()
+    finished = sorted((there / "seed-0").rglob("*"))
+    done = fishctl("learn", "ppo", "--resume", str(there), "--cluster", cluster)
     assert (done.returncode, done.stderr) == (0, "")
-    for seed in ("seed-0", "seed-1"):
-        assert read_evaluations(here / seed) == read_evaluations(there / seed) != []
-        assert (there / seed / "step-000128" / "model.zip").is_file()
+    assert sorted((there / "seed-0").rglob("*")) == finished, "it was trained again"
+    assert read_evaluations(here / "seed-1") == read_evaluations(there / "seed-1") != []
+    assert (there / "seed-1" / "step-000128" / "model.zip").is_file()
     assert (here / "seeds.csv").read_text() == (there / "seeds.csv").read_text()
 
 
-def test_a_silent_cluster_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_does_not_answer_is_one_line_with_the_command_to_resume(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
-    monkeypatch.setattr(parallel, "CONNECT_TIMEOUT_S", 0.2)
+    from fishd.lab import cluster
+
+    monkeypatch.setattr(cluster, "CONNECT_TIMEOUT_S", 0.2)
     done = fishctl(*command(tmp_path, "--seeds", "2", "--cluster", "tcp://127.0.0.1:1"))
     assert "no Dask scheduler answers at tcp://127.0.0.1:1" in done.stderr
+    assert f"resume with: fishctl learn ppo --resume {tmp_path / 'run'}; add" in done.stderr
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert not (tmp_path / "run").exists()
 
 
 def test_a_summary_repeats_the_last_figures_of_a_seed_that_ended_early(tmp_path: Path) -> None:
