@@ -38,7 +38,7 @@ NO_WORKER_TIMEOUT_S = 8.0
 _ANSWER_TIMEOUT_S = 4.0
 """Timeout of the scheduler's answers during a computation [s]."""
 _CLOSE_TIMEOUT_S = 0.5
-_WATCH_INTERVAL_S = 0.5
+_WATCH_INTERVAL_S = 0.25
 _POLL_INTERVAL_S = 1.0
 """Interval at which a worker asks the scheduler whether to stop [s]."""
 _LOGS = ("distributed", "distributed.client", "tornado.application", "asyncio")

@@ -109,7 +109,7 @@ class _Processes:
 
 @contextmanager
 def workers(
-    stop: Path, jobs: int | None = None, cluster: str | None = None, stop_timeout: float = 2.0
+    stop: Path, jobs: int | None = None, cluster: str | None = None, stop_timeout: float = 0.5
 ) -> Iterator[Workers]:
     """Provide workers while this lasts.
 
