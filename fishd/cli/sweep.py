@@ -153,9 +153,9 @@ class _Sweep:
 
     def swim(self, given: dict[str, Any], workers: dict[str, Any]) -> int:
         """Swim simulated fish; given: durations, workers: processes or cluster."""
-        from fishd.lab.parallel import Unfinished
         from fishd.lab.sweep.grid import Lengths
         from fishd.lab.sweep.measuring import swim_all
+        from fishd.lab.workers import Unfinished
 
         pairs = self._configure_points()
         config = self.fish.load()

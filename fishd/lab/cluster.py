@@ -1,7 +1,8 @@
 """The workers of a Dask cluster, in place of processes on this machine.
 
-The connection has an event loop in a thread of its own. So each wait has a limit, which Dask's
-waits for a program that says nothing do not have, and a signal is handled during each wait.
+The connection has an event loop in a separate thread. So each wait has a limit, also for a program
+that accepts the connection and is silent, for which Dask has none; and signals are handled
+meanwhile.
 """
 
 import asyncio
@@ -11,11 +12,10 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from uuid import uuid4
 
 import distributed
@@ -25,8 +25,7 @@ from distributed.versions import VersionMismatchWarning
 
 from fishd import __version__
 from fishd.core.errors import FishdError
-from fishd.core.process.interruption import raise_on_first_signal
-from fishd.lab.parallel import Stop, Unfinished
+from fishd.lab.workers import Unfinished
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -47,18 +46,40 @@ _ENDED = "its scheduler has ended, or cannot be reached"
 _REMEDY = "give the address from the scheduler's log, such as tcp://HOST:8786"
 _SILENT = f"what listens there is silent, like a dashboard or another program; {_REMEDY}"
 
+_Outcomes = SimpleQueue[tuple[int, Any] | BaseException | None]
+"""Index and result of each task; an error that ends the computation; None after a signal."""
+
+
+class EventStop(NamedTuple):
+    """An event of the scheduler that means stop."""
+
+    name: str
+
+    def make_check(self) -> Callable[[], bool]:
+        """Return a function, for use in a task on a worker, that returns whether to stop."""
+        event = distributed.Event(self.name, client=distributed.get_client())
+        was_set, next_look = False, 0.0
+
+        def stop() -> bool:
+            nonlocal was_set, next_look
+            if not was_set and time.monotonic() >= next_look:
+                was_set = event.is_set()
+                next_look = time.monotonic() + _POLL_INTERVAL_S
+            return was_set
+
+        return stop
+
 
 class Cluster:
     """The workers of a Dask cluster; see `connect`."""
 
     def __init__(self, address: str, stop_timeout: float) -> None:
         """See `connect`, which also opens the connection."""
-        self.stop = Stop(f"fishd-stop-{uuid4().hex}", True)
+        self.stop = EventStop(f"fishd-stop-{uuid4().hex}")
         self._address = address
         self._stop_timeout = stop_timeout
         self._client: Any = None
         self._stop_deadline: float | None = None
-        self._outcomes: SimpleQueue[tuple[int, Any] | BaseException | None] = SimpleQueue()
         self._closing = asyncio.Event()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._run_loop, daemon=True)
@@ -80,10 +101,11 @@ class Cluster:
         task raises an exception.
         """
         unfinished = set(range(len(tasks)))
-        computation = self._start(self._compute(function, tasks))
+        outcomes: _Outcomes = SimpleQueue()
+        computation = self._start(self._compute(function, tasks, outcomes))
         try:
             while unfinished:
-                outcome = self._outcomes.get()
+                outcome = outcomes.get()
                 if outcome is None:
                     return
                 if isinstance(outcome, BaseException):
@@ -112,7 +134,8 @@ class Cluster:
         with suppress(Exception):
             await asyncio.wait_for(self._client.close(), _CLOSE_TIMEOUT_S)
 
-    def _start(self, coroutine: Coroutine[Any, Any, R]) -> "Future[R]":
+    def _start(self, coroutine: Coroutine[Any, Any, Any]) -> Any:
+        """Start a coroutine in the thread of the connection; return its concurrent future."""
         return asyncio.run_coroutine_threadsafe(coroutine, self._loop)
 
     async def _connect(self) -> None:
@@ -140,7 +163,7 @@ class Cluster:
                 cause = f"{nothing}: there is no such file"
             raise Unfinished(cause) from None
         except OSError:
-            raise Unfinished(f"{nothing}: there is no connection; {_REMEDY}") from None
+            raise Unfinished(f"{nothing}: cannot connect; {_REMEDY}") from None
         except ValueError as error:
             raise Unfinished(f"{nothing}: {error}; {_REMEDY}") from None
         except Exception:
@@ -158,7 +181,9 @@ class Cluster:
     async def _set_stop(self) -> None:
         await distributed.Event(self.stop.name, client=self._client).set()
 
-    async def _compute(self, function: Callable[[T], R], tasks: Sequence[T]) -> None:
+    async def _compute(
+        self, function: Callable[[T], R], tasks: Sequence[T], outcomes: _Outcomes
+    ) -> None:
         versions = read_versions()
 
         async def compute(index: int, task: T) -> None:
@@ -169,17 +194,17 @@ class Cluster:
                 if future.cancelled():
                     raise _Lost(_ENDED) from None
                 raise
-            self._outcomes.put((index, result))
+            outcomes.put((index, result))
 
         try:
             async with asyncio.TaskGroup() as group:
-                group.create_task(self._watch())
+                group.create_task(self._watch(outcomes))
                 for index, task in enumerate(tasks):
                     group.create_task(compute(index, task))
         except BaseExceptionGroup as errors:
-            self._outcomes.put(errors.exceptions[0])
+            outcomes.put(errors.exceptions[0])
 
-    async def _watch(self) -> None:
+    async def _watch(self, outcomes: _Outcomes) -> None:
         """Raise `_Lost` when the cluster is lost; end the computation when it is time to stop."""
         last_worker = time.monotonic()
         while True:
@@ -194,7 +219,7 @@ class Cluster:
             elif now > last_worker + NO_WORKER_TIMEOUT_S:
                 raise _Lost("no worker is left")
             if self._stop_deadline and (not workers or now > self._stop_deadline):
-                self._outcomes.put(None)
+                outcomes.put(None)
 
 
 class _Lost(FishdError):
@@ -209,13 +234,12 @@ def connect(address: str, stop_timeout: float) -> Iterator[Cluster]:
     stop_timeout: time after `ask_to_stop` in which results of running tasks are received [s]
 
     Raises `Unfinished` where no scheduler answers, where it has no workers, and where workers have
-    other versions than this machine; `Interrupted` if a signal arrives before that is known.
+    other versions than this machine.
     """
     with _quiet():
         cluster = Cluster(address, stop_timeout)
         try:
-            with raise_on_first_signal():
-                cluster.open()
+            cluster.open()
             yield cluster
         finally:
             cluster.close()
@@ -225,21 +249,6 @@ def read_versions() -> dict[str, str]:
     """Return the versions on which results may depend, by name; called on each worker, too."""
     python = ".".join(platform.python_version_tuple()[:2])
     return {"fishd": __version__, "Python": python, "numpy": np.__version__}
-
-
-def make_event_check(name: str) -> Callable[[], bool]:
-    """Return a function, for use on a Dask worker, that returns whether an event was set."""
-    event = distributed.Event(name, client=distributed.get_client())
-    was_set, next_look = False, 0.0
-
-    def stop() -> bool:
-        nonlocal was_set, next_look
-        if not was_set and time.monotonic() >= next_look:
-            was_set = event.is_set()
-            next_look = time.monotonic() + _POLL_INTERVAL_S
-        return was_set
-
-    return stop
 
 
 def _describe(error: BaseException) -> str:

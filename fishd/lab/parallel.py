@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import joblib
 from joblib._multiprocessing_helpers import mp as multiprocessing
@@ -13,6 +13,7 @@ from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from fishd.core.errors import FishdError
 from fishd.core.process.safe_path import SafeChildren
+from fishd.lab.workers import Unfinished, Workers
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -21,57 +22,25 @@ _MAX_ATTEMPTS = 3
 """Largest number of starts of a task, if processes are killed."""
 
 
-class Unfinished(FishdError):
-    """The processes or the cluster were lost; `unfinished` are the indices of the tasks left."""
+class FileStop(NamedTuple):
+    """A file whose existence means stop."""
 
-    def __init__(self, message: str, unfinished: Sequence[int] = ()) -> None:
-        super().__init__(message)
-        self.unfinished = unfinished
-
-
-class Stop(NamedTuple):
-    """A signal to stop, which is passed to tasks in all processes and on all machines."""
-
-    name: str
-    """Path of the file, or name of the Dask event, whose existence means stop."""
-    is_remote: bool
+    path: Path
 
     def make_check(self) -> Callable[[], bool]:
         """Return a function, for use in a task, that returns whether to stop."""
-        if self.is_remote:
-            from fishd.lab.cluster import make_event_check
-
-            return make_event_check(self.name)
-        return Path(self.name).exists
-
-
-class Workers(Protocol):
-    """The processes that compute: on this machine, or the workers of a cluster."""
-
-    stop: Stop
-
-    def ask_to_stop(self) -> None:
-        """Tell all tasks to stop, also those that have not started; returns immediately."""
-
-    def run(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[tuple[int, R]]:
-        """Yield index and result of each task, in the order in which they end.
-
-        function: function at the top level of a module; its argument and result are pickled
-
-        Tasks are restarted after a process was killed. After `ask_to_stop` this may end without
-        the results of some tasks. Raises `Unfinished`, and what a task raises on this machine.
-        """
+        return self.path.exists
 
 
 class _Processes:
-    """Processes on this machine; see `Workers`."""
+    """Processes on this machine."""
 
     def __init__(self, stop: Path, jobs: int | None) -> None:
-        self.stop = Stop(str(stop), False)
+        self.stop = FileStop(stop)
         self._jobs = jobs
 
     def ask_to_stop(self) -> None:
-        Path(self.stop.name).touch()
+        self.stop.path.touch()
 
     def run(self, function: Callable[[T], R], tasks: Sequence[T]) -> Iterator[tuple[int, R]]:
         unfinished = dict(enumerate(tasks))
@@ -119,8 +88,7 @@ def workers(
     cluster: address of a Dask scheduler whose workers compute instead, or the path of its file
     stop_timeout: time after a request to stop in which results of a cluster are received [s]
 
-    Raises `FishdError` where they cannot be used, and `Interrupted` after a signal before a cluster
-    has answered.
+    Raises `FishdError` where they cannot be used.
     """
     if cluster:
         from fishd.lab.cluster import connect

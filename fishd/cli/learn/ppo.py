@@ -373,7 +373,7 @@ def _train_seeds(
 ) -> int:
     """Train all seeds, print a line as each ends, and a summary; return the exit status."""
     from fishd.lab.experiment import Header, open_experiment
-    from fishd.lab.parallel import Unfinished
+    from fishd.lab.workers import Unfinished
     from fishd.learning.train import seeds as training
 
     if not cluster and find_spec("torch") is None:  # only the training processes load it

@@ -19,13 +19,14 @@ from fishd.core.errors import FishdError
 from fishd.core.process.interruption import on_signal
 from fishd.core.signals import Publisher
 from fishd.lab.measurement import measure
-from fishd.lab.parallel import Stop, workers
+from fishd.lab.parallel import workers
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import Beats, VirtualRun
 from fishd.lab.statistics import per_watt, student95
 from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import PointResult, Result, SpeedResult, SweepFolder
 from fishd.lab.swimmer.refinement import find_grid_error
+from fishd.lab.workers import Stop
 from fishd.recording.writer import RunWriter
 from fishd.virtual.plant.optimum import best_square_wave
 from fishd.virtual.swimmer.track import Track

@@ -17,7 +17,8 @@ from msgspec.structs import replace
 
 from fishd.core.errors import FishdError
 from fishd.core.process.interruption import on_signal
-from fishd.lab.parallel import Stop, workers
+from fishd.lab.parallel import workers
+from fishd.lab.workers import Stop
 from fishd.learning.train.jobs import Job, Outcome
 
 # Modules that import torch are imported where they are used: a process that is stopped before it
@@ -36,6 +37,8 @@ class _Task(NamedTuple):
     stop: Stop
     files: bytes = b""
     """For a cluster: the run folder to resume, packed."""
+    parent: bytes = b""
+    """For a cluster: the checkpoint to begin with, packed."""
 
 
 def train_seeds(
@@ -70,9 +73,12 @@ def train_seeds(
             workers(folder / STOP, jobs, cluster, STOP_TIMEOUT_S) as crew,
             on_signal(crew.ask_to_stop),
         ):
-            tasks = [
-                _Task(seed, crew.stop, pack(seed.folder) if cluster else b"") for seed in waiting
-            ]
+            tasks = [_Task(seed_job, crew.stop) for seed_job in waiting]
+            if cluster:
+                parent = pack(job.parent) if job.parent else b""
+                tasks = [
+                    task._replace(files=pack(task.job.folder), parent=parent) for task in tasks
+                ]
             for index, result in crew.run(_train_remotely if cluster else _train_here, tasks):
                 if result[1]:
                     unpack(result[1], waiting[index].folder)
@@ -108,10 +114,14 @@ def _train_here(task: _Task) -> tuple[Outcome, bytes]:
 def _train_remotely(task: _Task) -> tuple[Outcome, bytes]:
     """Train on a Dask worker, in a temporary folder whose files are sent back."""
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary) / task.job.folder.name
+        folder, parent = Path(temporary) / task.job.folder.name, task.job.parent
         if task.files:
             unpack(task.files, folder)
-        outcome = _train(replace(task.job, folder=folder), task.stop.make_check())
+        if parent:
+            parent = Path(temporary, "parent", *parent.parts[-2:])
+            unpack(task.parent, parent)
+        job = replace(task.job, folder=folder, parent=parent)
+        outcome = _train(job, task.stop.make_check())
         home = task.job.folder
         outcome = replace(
             outcome,
@@ -169,7 +179,7 @@ def _make_failure(job: Job, message: str) -> Outcome:
 
 
 def pack(folder: Path) -> bytes:
-    """Return all files of a folder as one zip archive; empty without any."""
+    """Return all files of a folder as one zip archive, or no bytes if there are none."""
     paths = sorted(folder.rglob("*"))
     if not paths:
         return b""

@@ -14,13 +14,14 @@ from rigs.dask_cluster import DaskCluster, dask_cluster, wait_for_file
 from rigs.processes import FISHCTL, PATIENCE, fishctl, wait_until
 
 from fishd.core.process.interruption import on_signal
-from fishd.lab.parallel import Unfinished, workers
+from fishd.lab.parallel import workers
+from fishd.lab.workers import Unfinished
 
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 
 from fishd.lab import cluster as connection
 
-SHORT = ("--periods", "2", "--settle", "1", "--on", "simulation")
+SHORT_SWIM = ("--periods", "2", "--settle", "1", "--on", "simulation")
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def rows(folder: Path) -> list[str]:
 def test_a_worker_of_one_thread_finds_what_this_machine_finds(
     tmp_path: Path, cluster: DaskCluster
 ) -> None:
-    words = ("sweep", "square", "--frequency", "1.5,2", *SHORT, "--folder")
+    words = ("sweep", "square", "--frequency", "1.5,2", *SHORT_SWIM, "--folder")
     there = fishctl(*words, str(tmp_path / "there"), "--cluster", cluster.address)
     assert (there.returncode, there.stderr) == (0, "")
     assert fishctl(*words, str(tmp_path / "here"), "--jobs", "1").returncode == 0
@@ -82,7 +83,7 @@ def listener(answer: bytes, send: int | None = None) -> Iterator[str]:
     [
         (b"", "what listens there is silent, like a dashboard"),
         (b"SSH-2.0-OpenSSH_9.2\r\n", "another program listens there"),
-        (None, "there is no connection"),
+        (None, "cannot connect"),
     ],
 )
 def test_what_is_not_a_scheduler_is_one_line_with_the_command_to_resume(
@@ -92,7 +93,7 @@ def test_what_is_not_a_scheduler_is_one_line_with_the_command_to_resume(
     folder = str(tmp_path / "run")
     with listener(answer or b"") as address:
         address = "tcp://127.0.0.1:1" if answer is None else address
-        words = ("sweep", "square", "--frequency", "1.5", *SHORT, "--folder", folder)
+        words = ("sweep", "square", "--frequency", "1.5", *SHORT_SWIM, "--folder", folder)
         done = fishctl(*words, "--cluster", address)
     assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
     assert f"no Dask scheduler answers at {address}: {cause}" in done.stderr
@@ -103,7 +104,7 @@ def test_what_is_not_a_scheduler_is_one_line_with_the_command_to_resume(
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_connection_to_a_silent_program(tmp_path: Path, number: int) -> None:
     with listener(b"", send=number) as address:
-        words = ("sweep", "square", "--frequency", "1.5", *SHORT, "--folder", str(tmp_path / "run"))
+        words = ("sweep", "square", *SHORT_SWIM, "--folder", str(tmp_path / "run"))
         done = fishctl(*words, "--cluster", address)
     assert (done.returncode, done.stderr.count("\n")) == (130, 1), done.stderr
     assert "interrupted, 0 of 1 point are kept; resume with: fishctl sweep" in done.stderr
@@ -112,7 +113,9 @@ def test_a_signal_ends_a_connection_to_a_silent_program(tmp_path: Path, number: 
 def test_other_versions_are_refused_also_on_a_worker_that_joins_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cluster: DaskCluster
 ) -> None:
-    difference = rf"\d( and 1 more)?: fishd {connection.__version__} \(here 9\.9\); install the same"
+    difference = (
+        rf"\d( and 1 more)?: fishd {connection.__version__} \(here 9\.9\); install the same"
+    )
     with workers(tmp_path / "stop", cluster=cluster.address) as crew:
         monkeypatch.setattr(connection, "__version__", "9.9")
         with pytest.raises(Unfinished, match=difference) as late:
@@ -131,7 +134,9 @@ def test_a_worker_without_fishd_is_named(tmp_path: Path, cluster: DaskCluster) -
     worker = cluster.add_worker({"PYTHONPATH": str(tmp_path)})
     try:
         with (
-            pytest.raises(Unfinished, match=r"tcp://\S+: fishd cannot be used there: \S+No module named 'fi"),
+            pytest.raises(
+                Unfinished, match=r"\d: fishd cannot be used there: .*No module named 'fi"
+            ),
             workers(tmp_path / "stop", cluster=cluster.address),
         ):
             pass
@@ -167,7 +172,7 @@ def test_the_points_of_a_scheduler_that_dies_are_kept_and_the_rest_swim_here(
     tmp_path: Path,
 ) -> None:
     folder = tmp_path / "run"
-    words = ("sweep", "square", "--frequency", "0.4:4:0.01", *SHORT, "--folder", str(folder))
+    words = ("sweep", "square", "--frequency", "0.4:4:0.01", *SHORT_SWIM, "--folder", str(folder))
     with dask_cluster(tmp_path) as dying:
         dying.add_worker()
         with subprocess.Popen(

@@ -14,12 +14,15 @@ from pathlib import Path
 
 import pytest
 from joblib.externals.loky import get_reusable_executor
+from msgspec.structs import replace
 from rigs.dask_cluster import dask_cluster
 from rigs.processes import FISHCTL, fishctl, is_stopped, one_line
 from rigs.swimming import LONG_ENOUGH, Done, brief_job, wait_for, while_it_trains
 
+from fishd.lab.parallel import FileStop
+from fishd.learning.run_folder.checkpoints import newest, read_card
 from fishd.learning.run_folder.tables import SUMMARY, best_so_far, read_evaluations, write_summary
-from fishd.learning.train.seeds import _train
+from fishd.learning.train.seeds import _Task, _train, _train_remotely, pack, unpack
 
 SETTINGS = """\
 steps: {steps}
@@ -161,8 +164,7 @@ def test_ctrl_c_ends_all_seeds_with_a_checkpoint_each(tmp_path: Path) -> None:
     assert done.returncode == 130
     assert "Traceback" not in done.stderr
     assert done.stderr.count("interrupted") == 4
-    resume = f"interrupted, 0 of 3 seeds are finished; resume with: fishctl learn ppo --resume {run}"
-    assert resume in done.stderr
+    assert "interrupted, 0 of 3 seeds are finished; resume with: fishctl learn" in done.stderr
     assert all(list((run / f"seed-{index}").glob("step-*")) for index in (0, 1))
     assert not (run / "seed-2").exists()
     assert (run / "seeds.csv").exists()
@@ -254,6 +256,18 @@ def test_a_cluster_trains_the_seeds_that_are_missing_as_this_machine_does(
     assert read_evaluations(here / "seed-1") == read_evaluations(there / "seed-1") != []
     assert (there / "seed-1" / "step-000128" / "model.zip").is_file()
     assert (here / "seeds.csv").read_text() == (there / "seeds.csv").read_text()
+
+
+def test_a_worker_needs_no_folder_of_this_machine(tmp_path: Path, two: tuple[Path, Done]) -> None:
+    """The networks that a training begins with are sent to it."""
+    parent = two[0] / "seed-0" / "step-000128"
+    elsewhere = tmp_path / "another machine" / "seed-0" / "step-000128"
+    job = replace(brief_job(tmp_path / "another machine" / "run"), parent=elsewhere)
+    outcome, files = _train_remotely(_Task(job, FileStop(tmp_path / "stop"), parent=pack(parent)))
+    assert (outcome.ended, outcome.message) == ("finished", "")
+    unpack(files, tmp_path / "run")
+    note = read_card(newest(tmp_path / "run")).provenance.note
+    assert note.startswith("began with seed-0/step-000128, 128 steps")
 
 
 def test_a_cluster_that_does_not_answer_is_one_line_with_the_command_to_resume(
