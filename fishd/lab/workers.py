@@ -1,4 +1,4 @@
-"""What computes in parallel: processes on this machine, or the workers of a cluster."""
+"""The interface of parallel workers: processes on this machine, or those of a cluster."""
 
 from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol, TypeVar
