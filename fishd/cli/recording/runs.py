@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, format_count, print_json
-from fishd.cli.recording.files import folder_option, format_damage
+from fishd.cli.recording.files import folder_option
 from fishd.core import text
 from fishd.core.console import format_power
 from fishd.core.errors import ConfigError, RecordingError
@@ -144,7 +144,8 @@ def _to_json(glance: Overview) -> dict[str, Any]:
         "name": glance.name,
         "path": str(glance.path),
         "state": _format_state(glance),
-        "damaged": glance.damaged,
+        "problem": glance.problem,
+        "recorded_ticks": glance.recorded_ticks,
         **msgspec.structs.asdict(glance.summary),
         "about": glance.about,
     }
@@ -201,7 +202,7 @@ def _format_remarks(glance: Overview) -> list[str]:
     restarts = glance.summary.restarts
     return [
         *([state] if state != "finished" else []),
-        *([format_damage(glance.damaged)] if glance.damaged is not None else []),
+        *([glance.problem] if glance.problem else []),
         *([format_count(restarts, "restart")] if restarts else []),
         *([_format_frames(glance.summary)] if glance.summary.frames else []),
         *map(str, glance.summary.clock_steps),

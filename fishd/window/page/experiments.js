@@ -240,8 +240,8 @@ export function Runs(page) {
           const [factor, unit] = forceUnit(run);
           const half = halfWidthOf(run);
           const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, half == null ? NaN : half * factor);
-          return html`<tr key=${run.name} class=${run.damaged ? "damaged" : ""}>
-            <td>${run.name}${run.damaged && html` <span class="pill small" title=${run.damaged}>damaged</span>`}
+          return html`<tr key=${run.name} class=${run.kind === "recording" && run.problem ? "damaged" : ""}>
+            <td>${run.name}
               ${["running", "recording", "unfinished"].includes(run.state) && html` <span class="pill small">${run.state}</span>`}
               ${run.problem && html`<br /><small>${run.problem}</small>`}</td><td>${run.kind === "recording" ? Object.keys(run.swim_ticks ?? {}).join(", ") || "at rest" : run.kind}</td><td>${begin(run) && shortDate.format(new Date(begin(run)))}</td>
             <td class="right">${run.duration !== undefined ? duration(run.duration) : run.kind === "sweep" && run.rows ? `${run.rows} points` : ""}</td>
