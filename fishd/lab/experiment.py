@@ -101,9 +101,15 @@ class Experiment:
         rows: list[list[str]] = []
         if path.exists():
             try:
-                head, *rows = tables.read(path, MAX_TABLE_BYTES)
-            except (FileProblem, ValueError) as problem:
-                raise ConfigError(f"{path}: {problem or 'it is empty'}; {_OTHER_FOLDER}") from None
+                table = tables.read(path, MAX_TABLE_BYTES)
+            except FileProblem as problem:
+                raise ConfigError(f"{path}: {problem}; {_OTHER_FOLDER}") from None
+            if not table:
+                raise ConfigError(
+                    f"{path}: it is empty; delete it to measure everything again, or "
+                    f"{_OTHER_FOLDER}"
+                )
+            head, *rows = table
             head = rename_columns(self.header.kind, head)
             if head != expected:
                 raise ConfigError(
@@ -379,7 +385,7 @@ def _read_struct(path: Path, kind: type[T]) -> T:
             files.read(path, files.MAX_SETTINGS_BYTES, "an experiment"), type=kind
         )
     except FileProblem as problem:
-        raise ConfigError(f"{path}: {problem}") from None
+        raise ConfigError(f"{path}: {problem}; {_OTHER_FOLDER}") from None
     except msgspec.MsgspecError as error:
         raise ConfigError(
             f"{path}: fishd {__version__} cannot read it: {error}; {_OTHER_FOLDER}"

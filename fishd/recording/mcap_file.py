@@ -237,9 +237,14 @@ def _read_outer_records(path: Path) -> Iterator[tuple[int, McapRecord | Damaged]
     """Yield position and content of each record outside of chunks, including the chunks."""
     try:
         with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            if size == 0:
+                raise RecordingError(
+                    f"{path} is empty, as a power cut may leave a file; delete it, there is "
+                    "nothing to recover"
+                )
             if file.read(len(_MAGIC)) != _MAGIC:
                 raise RecordingError(f"{path} is not an MCAP file")
-            size = os.fstat(file.fileno()).st_size
             offset = len(_MAGIC)
             while offset < size:
                 opcode, length, body = _read_record(file, offset, size)

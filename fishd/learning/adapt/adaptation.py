@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from msgspec.structs import replace
 
 from fishd.config import Config, Start
-from fishd.core.errors import FishdError
+from fishd.core.errors import FishdError, RecordingError
 from fishd.lab import error_budget
 from fishd.lab.experiment import Progress
 from fishd.lab.identification import experiment
@@ -102,7 +102,12 @@ class Adaptation:
         assert state.excitation
         self._show.at(self._session.used, "fitting a model of the fish, which rests")
         path = self._run.path / state.excitation
-        identification, state.fitted = do.fit(path, self._session.amplitude, self._seed)
+        try:
+            identification, state.fitted = do.fit(path, self._session.amplitude, self._seed)
+        except RecordingError as error:
+            state.excitation = None
+            self._save()
+            raise RecordingError(f"{error}; if resumed, the fish swims it again") from None
         self._run.experiment.write(FISH, identification.to_yaml("fishctl adapt"))
         explained = " and ".join(f"{channel.explained:.1%}" for channel in identification.channels)
         unused = "" if state.fitted.model.standard_error is not None else ": too little to be used"
