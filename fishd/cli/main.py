@@ -45,6 +45,9 @@ VERBS = {
         "runs": Verb("recording.runs", "runs", "List recordings and experiments."),
         "plot": Verb("recording.files", "plot", "Draw a recording, as a picture and a page."),
         "export": Verb("recording.files", "export", "Write a recording as CSV or Parquet."),
+        "import": Verb(
+            "recording.import_table", "import_table", "Make a recording of a table of another rig."
+        ),
         "replay": Verb("recording.files", "replay", "Publish a recording, as if it were live."),
         "rerun": Verb("recording.rerun", "rerun", "Run a controller again on a recording."),
         "recover": Verb("recording.files", "recover", "Repair a recording that was cut off."),

@@ -106,7 +106,7 @@ class Experiment:
                 raise ConfigError(f"{path}: {problem}; {_OTHER_FOLDER}") from None
             if not table:
                 raise ConfigError(
-                    f"{path}: it is empty; delete it to measure everything again, or "
+                    f"{path}: it has no complete line; delete it to measure everything again, or "
                     f"{_OTHER_FOLDER}"
                 )
             head, *rows = table

@@ -79,7 +79,7 @@ class RunWriter:
     ) -> None:
         """
         path: path of the finished file; `.mcap` is added if it is missing
-        source: origin of the ticks: `fishd`, or `simulation` for a run in virtual time
+        source: origin of the ticks: `fishd`, `simulation` for virtual time, `import` for a table
         operator: name of the operator; by default this user
         subject: name of the fish; note: purpose
         extra: further metadata, such as the point of a sweep

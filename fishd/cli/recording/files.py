@@ -170,7 +170,7 @@ def recover(file: str, folder: Path | None, as_json: bool) -> None:
     run = finish(find_recording(file, folder))
     summary = run.summary
     if as_json:
-        print_json({"path": run.path, "problem": run.problem, **asdict(summary)})
+        print_json({"path": str(run.path), "problem": run.problem, **asdict(summary)})
         return
     frames = f", {format_count(summary.frames, 'frame')}" if summary.frames else ""
     problem = f"; {run.problem.removeprefix(RECOVERED)}" if run.problem else ""
