@@ -135,7 +135,10 @@ def test_a_repaired_file_still_says_what_it_lacks(
 
 SHORT = ("--jobs", "1", "--periods", "2", "--settle", "1")
 SWEEP = ("sweep", "square", "--frequency", "1.5,2", *SHORT)
-EMPTY = "it has no complete line; delete it to measure everything again, or choose a new folder with --folder"
+EMPTY = (
+    "it has no complete line; delete it to measure everything again, or choose a new folder with "
+    "--folder"
+)
 FOLDERS: dict[str, tuple[str, Callable[[bytes], bytes], str | None]] = {
     "a table of Excel": (
         ROWS,

@@ -15,7 +15,7 @@ from fishd.cli.adapt import format_command
 from fishd.cli.experiment_options import ChosenFish
 from fishd.client import Fish
 from fishd.config import Config, load
-from fishd.core.errors import ConfigError, FishdError, Refused
+from fishd.core.errors import ConfigError, FishdError, RecordingError, Refused
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.identification import Channel, Estimate, Fit, Identification, Unidentifiable
 from fishd.lab.ranking import format_ratio
@@ -363,6 +363,22 @@ def test_a_fish_that_is_only_noise_is_refused_in_one_line(
     ):
         Adaptation(rig, run, 150.0, 640, 0, StoringDisplay()).run()
     assert folder(run.path).state.excitation == "excitation.mcap"
+
+
+@pytest.mark.parametrize("content", [b"", bytes(999)], ids=["empty", "zeros"])
+def test_an_excitation_that_a_power_cut_has_emptied_is_swum_again(
+    tmp_path: Path, content: bytes
+) -> None:
+    run = folder(tmp_path / "run")
+    run.state.excitation = "excitation.mcap"
+    run.save()
+    (run.path / "excitation.mcap").write_bytes(content)
+    with (
+        VirtualSession(Config()) as rig,
+        pytest.raises(RecordingError, match=r"excitation\.mcap is .*; if resumed, the fish swims it"),
+    ):
+        Adaptation(rig, run, 150.0, 640, 0, StoringDisplay()).run()
+    assert folder(run.path).state.excitation is None
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,15 @@ def test_endlessly_nested_json_is_one_line(run: Path, name: str, message: str, k
         assert message in complaint(reader, run)
 
 
+@pytest.mark.parametrize("text", ["", "{", "[]", "\0" * 99])
+def test_a_damaged_card_is_one_line_with_a_remedy(run: Path, text: str) -> None:
+    card = run / STEP / "card.json"
+    card.write_text(text, encoding="utf-8")
+    message = complaint(READERS[f"{STEP}/card.json"], run)
+    assert message.startswith(f"{card}: its card is not ")
+    assert message.endswith("; move this checkpoint away to resume from the previous one")
+
+
 def test_an_archive_that_would_fill_the_memory_is_refused(run: Path) -> None:
     with ZipFile(run / STEP / "model.zip", "w", ZIP_DEFLATED, compresslevel=1) as archive:
         for number in range(5):
