@@ -300,14 +300,12 @@ def _read_header(folder: Path) -> "Header":
 
 def _read_command(context: click.Context, folder: Path) -> list[str]:
     """Return the arguments of the experiment in a folder."""
-    from fishd.core.old_names import OLD_OPTIONS
-
     header = _read_header(folder)
     if header.kind != verb_words(context):
         raise click.UsageError(
             f"--resume {folder}: it is of another verb: fishctl {header.kind} --resume {folder}"
         )
-    return [OLD_OPTIONS.get(word, word) for word in header.command]
+    return header.command
 
 
 def restore_arguments(

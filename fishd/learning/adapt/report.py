@@ -54,22 +54,33 @@ def draw(run: AdaptFolder, amplitude: float, path: Path) -> None:
 
 
 def _draw_fit(axis: Any, fitted: Fitted) -> None:
-    """Draw the widths of the intervals of the parameters that are fitted as logarithms.
+    """Draw the intervals of the parameters that are fitted as logarithms, as in the page's table.
 
-    Others may be near zero, so they have no relative error. Intervals are those for a known K_y/K;
-    one that is withheld has no bar.
+    Others may be near zero, so they have no relative error. Where an interval is narrower if K_y/K
+    is the configured one, that is drawn over it. One that is withheld has no bar.
     """
-    shown = []
-    for name, estimate in _read_estimates(fitted):
-        ends = estimate["ci95_low"], estimate["ci95_high"]
-        low, high = estimate.get("if_ratio_holds") or ends
-        if estimate.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio":
-            width = math.nan if low is None or high is None else high - low
-            shown.append((name, 50.0 * width / abs(estimate["value"])))
-    places = np.arange(len(shown))[::-1]
-    axis.barh(places, [width for _, width in shown], color=BLUE, height=0.6)
-    axis.set_yticks(places, [name for name, _ in shown])
-    axis.set_xlabel("half-width of the 95 % interval, % of the value")
+    shown = [
+        (name, estimate)
+        for name, estimate in _read_estimates(fitted)
+        if estimate.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio"
+    ]
+    bars = {}
+    for place, (_, estimate) in enumerate(shown):
+        whole = estimate["ci95_low"], estimate["ci95_high"]
+        narrow = estimate.get("if_ratio_holds") or (None, None)
+        for (low, high), colour, label in (
+            (whole, GREY, "95 %"),
+            (narrow, BLUE, "95 %, if K_y/K is as configured"),
+        ):
+            if low is not None and high is not None:
+                ends = [100.0 * (end / estimate["value"] - 1.0) for end in (low, high)]
+                bars[label] = axis.barh(
+                    -place, ends[1] - ends[0], left=ends[0], color=colour, height=0.6
+                )
+    axis.legend(bars.values(), bars, fontsize="small", loc="upper right")
+    axis.set_yticks([-place for place in range(len(shown))], [name for name, _ in shown])
+    axis.set_xscale("symlog", linthresh=1.0)
+    axis.set_xlabel("95 % interval, % from the value")
     axis.set_title("the fish, as fitted")
 
 

@@ -112,7 +112,7 @@ def test_the_largest_thrust_wins_where_the_measurement_is_decisive() -> None:
     # √2 · 1 % of relative error, for a single comparison
     low, high = won.relative_thrust_ci95_low, won.relative_thrust_ci95_high
     assert (low, high) == pytest.approx((1.0354, 1.0648), abs=5e-4)
-    assert "swing with the C of --C auto wins: it thrusts 105.0 %" in won.claim
+    assert "swing wins: its thrust is 105.0 %" in won.claim
 
 
 def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins() -> None:
@@ -122,10 +122,10 @@ def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins(
     assert (two.chosen_gait, two.is_decided, two.relative_thrust) == ("square", False, 1.0)
     assert three.undecided_gaits == ["square", "swing", "policy"]
     assert three.claim.startswith(
-        "undecided between the best square wave found, swing with the C of --C auto and the "
-        "policy; the best square wave found is chosen because it is the simplest; thrust relative "
+        "undecided between the best square wave tried, swing and the policy; the best square "
+        "wave tried is chosen because it is the simplest. Thrusts relative to the best square "
     )
-    assert "the identified fish explains 61% of its forces only, so it is not used" in three.claim
+    assert "The identified fish explains 61% of its forces only, so it is not used" in three.claim
     assert not any("wins" in verdict.claim for verdict in (two, three))
 
 
