@@ -27,8 +27,12 @@ if TYPE_CHECKING:
     from fishd.lab.session import Session
 
 On = Literal["live", "simulation"]
-RUN_ONLY_OPTIONS = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0}
-"""Options that a resumed experiment does not take over, and the number of words after each."""
+RUN_ONLY_OPTIONS = {
+    "--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0, "--on": 1, "--endpoint": 1
+}  # fmt: skip
+"""Options that are not kept as they are given, and the number of words after each.
+
+The header of an experiment has the fish that `--on` and `--endpoint` stand for."""
 _COMMAND = "fishd.words"
 """Key of the command line in click's context, for the header of an experiment."""
 

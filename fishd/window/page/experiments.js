@@ -261,11 +261,12 @@ function Run({ run, page }) {
   const { controller, own } = selectionWithOwn(state);
   const mayDrive = state.session?.scope === "drive";
   const { subject, note, operator } = run.about ?? {};
-  const about = [subject, note, operator && `by ${operator}`].filter(Boolean).join("; ");
+  const about = [run.summary, subject, note, operator && `by ${operator}`].filter(Boolean).join("; ");
   const rerun = (options) => () => startJob(page, "rerun", { run: run.name, ...options });
   const resumable = run.state === "unfinished" && run.on === "live" && RESUMABLE.includes(run.kind);
   return html`
     ${about && html`<p>${about}</p>`}
+    ${run.command?.length > 0 && html`<p><code>${["fishctl", run.kind, ...run.command].join(" ")}</code></p>`}
     <p class="muted">${run.path}</p>
     ${run.kind === "recording" && html`<div class="buttons">
       <button type="button" disabled=${!mayDrive} onClick=${rerun({})}>Rerun as recorded</button>
