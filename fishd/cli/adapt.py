@@ -3,7 +3,7 @@
 import shlex
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 import msgspec
@@ -102,7 +102,6 @@ def adapt(
                 state = Adaptation(session, run, budget, steps, seed, show).run()
                 words = format_command(_chosen_gait(state), fish)
                 files = report.write(run, session.amplitude, words)
-                experiment.write_result(_make_result(_chosen_gait(state)))
                 if picture:
                     report.draw(run, session.amplitude, picture)
             if ending.is_interrupted:
@@ -128,29 +127,12 @@ def _chosen_gait(state: "State") -> "Contender":
     )
 
 
-def _make_result(gait: "Contender") -> dict[str, Any]:
-    """Return what `fishctl runs` shows of this adaptation."""
-    return {
-        "thrust": gait.thrust,
-        "thrust_ci95": gait.thrust_ci95,
-        "total_ci95": gait.total_ci95,
-        "summary": " ".join(["best:", *_gait_words(gait)]),
-    }
-
-
-def _gait_words(gait: "Contender") -> list[str]:
-    """Return a gait as fishctl takes it: controller, and parameters as options."""
-    words = [gait.controller]
-    for name, value in gait.parameters.items():
-        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
-        words += [f"--{name.replace('_', '-')}", shown]
-    return words
-
-
 def format_command(gait: "Contender", fish: ChosenFish) -> str:
     """Return the command line that swims the same fish with a gait."""
+    from fishd.learning.adapt.report import gait_words
+
     verb = "set-controller" if fish.on == "live" else "simulate"
-    words = ["fishctl", verb, *_gait_words(gait)]
+    words = ["fishctl", verb, *gait_words(gait)]
     words += ["--config", str(fish.file)] if fish.file else []
     words += [word for text in fish.overrides for word in ("--set", text)]
     words += ["--endpoint", fish.endpoint] if fish.endpoint else []

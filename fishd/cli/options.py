@@ -15,7 +15,7 @@ from fishd.cli.output import make_printable
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.core import text
 from fishd.core.errors import FishError, ParameterError, UnknownController
-from fishd.core.schema import Field, describe_permitted, format_literal, parse_value
+from fishd.core.schema import Field, describe_permitted, format_literal, names_file, parse_value
 from fishd.core.signals import ControllerInfo
 
 if TYPE_CHECKING:
@@ -159,10 +159,15 @@ class ParameterType(click.ParamType[Any]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert a text of the command line to a number, boolean or text."""
+        field = self.field
         if not isinstance(value, str):
             return value
+        if field.file and names_file(value, field.file):
+            from fishd.core import files
+
+            return str(files.expand_user(value).absolute())  # fishd may run in another folder
         try:
-            return parse_value(self.field, value)
+            return parse_value(field, value)
         except ValueError as error:
             self.fail(str(error), param, ctx)
 

@@ -481,17 +481,12 @@ def find_doubts(values: Mapping[str, Any], fields: Iterable[Field]) -> list[str]
 def parse_value(field: Field, text: str) -> Any:
     """Return the value of a field for a text of a command line; raise ValueError.
 
-    Whether a number is within its interval is not checked; a path becomes absolute, as fishd may
-    run in another folder.
+    Whether a number is within its interval is not checked.
     """
     if field.optional and text.lower() in ("null", "none", "default"):
         return None
     if text in field.words:
         return text
-    if field.file and names_file(text, field.file):
-        from fishd.core import files
-
-        return str(files.expand_user(text).absolute())
     try:
         if field.kind == "boolean":
             return _BOOLEANS[text.lower()]

@@ -16,7 +16,16 @@ from fishd.lab.identification.figure import format_estimate
 from fishd.lab.identification.fit import LOGARITHMIC
 from fishd.lab.identification.result import Estimate
 from fishd.lab.ranking import format_ratio
-from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State, Verdict
+from fishd.learning.adapt.state import (
+    PAGE,
+    PICTURE,
+    TRAINING,
+    AdaptFolder,
+    Contender,
+    Fitted,
+    State,
+    Verdict,
+)
 from fishd.learning.adapt.verdict import NAMES, SQUARE
 from fishd.learning.run_folder.figure import draw_training
 from fishd.virtual.plant.optimum import square_wave
@@ -29,7 +38,7 @@ img { max-width: 100%; } .claim { font-size: 1.3em; } code { background: #f3f3f3
 
 
 def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
-    """Draw the picture and write the page; return the paths of both.
+    """Draw the picture, and write the page and the result; return the paths of the first two.
 
     amplitude: Φ [rad]; again: command line that runs the chosen gait
     Raises `FishdError` where one cannot be written.
@@ -37,7 +46,25 @@ def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
     picture = run.path / PICTURE
     draw(run, amplitude, picture)
     run.experiment.write(PAGE, page(run.state, picture.read_bytes(), again))
+    run.experiment.write_result(_result(run.state))
     return picture, run.path / PAGE
+
+
+def _result(state: State) -> dict[str, Any]:
+    """Return the measurement of the chosen gait, and the gait in words."""
+    assert state.verdict
+    gait = next(gait for gait in state.contenders if gait.name == state.verdict.chosen_gait)
+    measured = {name: getattr(gait, name) for name in ("thrust", "thrust_ci95", "total_ci95")}
+    return measured | {"summary": " ".join(["chosen:", *gait_words(gait)])}
+
+
+def gait_words(gait: Contender) -> list[str]:
+    """Return a gait as fishctl takes it: its controller, and its parameters as options."""
+    words = [gait.controller]
+    for name, value in gait.parameters.items():
+        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
+        words += [f"--{name.replace('_', '-')}", shown]
+    return words
 
 
 def draw(run: AdaptFolder, amplitude: float, path: Path) -> None:

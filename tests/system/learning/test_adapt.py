@@ -16,7 +16,7 @@ from fishd.cli.experiment_options import ChosenFish
 from fishd.client import Fish
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError, Refused
-from fishd.lab.experiment import Header, open_experiment
+from fishd.lab.experiment import Header, find_answer, open_experiment
 from fishd.lab.identification import Channel, Estimate, Fit, Identification, Unidentifiable
 from fishd.lab.ranking import format_ratio
 from fishd.lab.session import LiveSession, VirtualSession
@@ -327,9 +327,10 @@ def test_a_resume_repeats_no_measurement(tmp_path: Path, monkeypatch: pytest.Mon
     state.contenders[0] = msgspec.structs.replace(state.contenders[0], true_thrust=0.0257)
     picture, page = report.write(folder(path), PHI, "fishctl set-controller <swing>")
     assert picture.stat().st_size > 10_000
+    assert find_answer(path).summary == f"chosen: square --frequency {state.square:.6g}"
     text = page.read_text(encoding="utf-8")
     assert "fishctl set-controller &lt;swing&gt;" in text
-    assert "the best square wave found, chosen" in text
+    assert "the best square wave tried, chosen" in text
     in_the_tank = text.partition("<h2>In the tank</h2>")[2]
     assert format_ratio(state.verdict.relative_thrusts["swing"]) in in_the_tank
     assert "<td>rad/s</td>" in text
