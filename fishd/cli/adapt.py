@@ -129,11 +129,10 @@ def _chosen_gait(state: "State") -> "Contender":
 
 def format_command(gait: "Contender", fish: ChosenFish) -> str:
     """Return the command line that swims the same fish with a gait."""
+    from fishd.learning.adapt.report import gait_words
+
     verb = "set-controller" if fish.on == "live" else "simulate"
-    words = ["fishctl", verb, gait.controller]
-    for name, value in gait.parameters.items():
-        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
-        words += [f"--{name.replace('_', '-')}", shown]
+    words = ["fishctl", verb, *gait_words(gait)]
     words += ["--config", str(fish.file)] if fish.file else []
     words += [word for text in fish.overrides for word in ("--set", text)]
     words += ["--endpoint", fish.endpoint] if fish.endpoint else []

@@ -11,9 +11,10 @@ from fishd.core.errors import FishdError, RecordingError
 from fishd.lab import error_budget
 from fishd.lab.experiment import Progress
 from fishd.lab.identification import experiment
-from fishd.lab.measurement import MEAN_REST_S, measure
+from fishd.lab.measurement import measure
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import simulate
+from fishd.lab.swim_plan import MEAN_REST_S
 from fishd.learning.adapt import steps as do
 from fishd.learning.adapt.state import (
     FISH,

@@ -127,7 +127,7 @@ class Verdict(Struct, frozen=True, kw_only=True):
     relative_thrusts: dict[str, tuple[float, float, float]]
     """Relative thrust, and its interval, of each gait except the square wave."""
     claim: str
-    """The verdict in a sentence."""
+    """The verdict in one or more sentences, without the last full stop."""
 
 
 class State(Struct, kw_only=True, forbid_unknown_fields=True):

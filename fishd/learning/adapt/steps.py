@@ -20,8 +20,6 @@ from fishd.core.errors import PolicyError
 from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
 from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC
 from fishd.lab.identification.result import RIG_PARAMETERS
-from fishd.lab.measurement import MEAN_REST_S, MEAN_SWIM_S
-from fishd.lab.measurement import plan as plan_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
     Trial,
@@ -30,6 +28,8 @@ from fishd.lab.optimise.trials import (
     trial_durations,
 )
 from fishd.lab.session import Session
+from fishd.lab.swim_plan import MEAN_REST_S, MEAN_SWIM_S
+from fishd.lab.swim_plan import plan as plan_of
 from fishd.learning.adapt.prior import (
     combine,
     correlation_of_waves,

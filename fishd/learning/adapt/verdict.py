@@ -24,8 +24,8 @@ from fishd.learning.adapt.state import Contender, Model, Verdict
 SQUARE = "square"
 NAMES = {
     "policy": "the policy",
-    "swing": "swing with the C of --C auto",
-    SQUARE: "the best square wave found",
+    "swing": "swing",
+    SQUARE: "the best square wave tried",
 }
 
 
@@ -57,9 +57,9 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
         reason = _explain_choice(ranking.reason, chosen == names[0], len(left), model)
         claim = format_choice([NAMES[name] for name in names], NAMES[chosen], reason)
         if shares:
-            claim += f"; thrust relative to {NAMES[SQUARE]}: {_format_shares(shares)}"
+            claim += f". Thrusts relative to {NAMES[SQUARE]}: {_format_shares(shares)}"
         if disuse := _explain_disuse(model):
-            claim += f"; {disuse}"
+            claim += f". {disuse[0].upper()}{disuse[1:]}"
     relative_thrust, low, high = shares.get(chosen, (1.0, 1.0, 1.0))
     return Verdict(
         chosen_gait=chosen,
@@ -148,10 +148,10 @@ def _explain_disuse(model: Model) -> str:
 
 def _format_win(name: str, shares: dict[str, tuple[float, float, float]]) -> str:
     if name in shares:
-        return f"{NAMES[name]} wins: it thrusts {format_ratio(shares[name])} of {NAMES[SQUARE]}"
+        return f"{NAMES[name]} wins: its thrust is {format_ratio(shares[name])} of {NAMES[SQUARE]}"
     if not shares:
         return f"{NAMES[SQUARE]} wins: it is the only one that could be measured"
-    return f"{NAMES[SQUARE]} wins; thrust relative to it: {_format_shares(shares)}"
+    return f"{NAMES[SQUARE]} wins. Thrusts relative to it: {_format_shares(shares)}"
 
 
 def _format_shares(shares: dict[str, tuple[float, float, float]]) -> str:

@@ -16,7 +16,7 @@ from fishd.cli.experiment_options import ChosenFish
 from fishd.client import Fish
 from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError, RecordingError, Refused
-from fishd.lab.experiment import Header, open_experiment
+from fishd.lab.experiment import Header, find_answer, open_experiment
 from fishd.lab.identification import Channel, Estimate, Fit, Identification, Unidentifiable
 from fishd.lab.ranking import format_ratio
 from fishd.lab.session import LiveSession, VirtualSession
@@ -112,7 +112,7 @@ def test_the_largest_thrust_wins_where_the_measurement_is_decisive() -> None:
     # √2 · 1 % of relative error, for a single comparison
     low, high = won.relative_thrust_ci95_low, won.relative_thrust_ci95_high
     assert (low, high) == pytest.approx((1.0354, 1.0648), abs=5e-4)
-    assert "swing with the C of --C auto wins: it thrusts 105.0 %" in won.claim
+    assert "swing wins: its thrust is 105.0 %" in won.claim
 
 
 def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins() -> None:
@@ -122,10 +122,10 @@ def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins(
     assert (two.chosen_gait, two.is_decided, two.relative_thrust) == ("square", False, 1.0)
     assert three.undecided_gaits == ["square", "swing", "policy"]
     assert three.claim.startswith(
-        "undecided between the best square wave found, swing with the C of --C auto and the "
-        "policy; the best square wave found is chosen because it is the simplest; thrust relative "
+        "undecided between the best square wave tried, swing and the policy; the best square "
+        "wave tried is chosen because it is the simplest. Thrusts relative to the best square "
     )
-    assert "the identified fish explains 61% of its forces only, so it is not used" in three.claim
+    assert "The identified fish explains 61% of its forces only, so it is not used" in three.claim
     assert not any("wins" in verdict.claim for verdict in (two, three))
 
 
@@ -327,9 +327,10 @@ def test_a_resume_repeats_no_measurement(tmp_path: Path, monkeypatch: pytest.Mon
     state.contenders[0] = msgspec.structs.replace(state.contenders[0], true_thrust=0.0257)
     picture, page = report.write(folder(path), PHI, "fishctl set-controller <swing>")
     assert picture.stat().st_size > 10_000
+    assert find_answer(path).summary == f"chosen: square --frequency {state.square:.6g}"
     text = page.read_text(encoding="utf-8")
     assert "fishctl set-controller &lt;swing&gt;" in text
-    assert "the best square wave found, chosen" in text
+    assert "the best square wave tried, chosen" in text
     in_the_tank = text.partition("<h2>In the tank</h2>")[2]
     assert format_ratio(state.verdict.relative_thrusts["swing"]) in in_the_tank
     assert "<td>rad/s</td>" in text
@@ -375,7 +376,7 @@ def test_an_excitation_that_a_power_cut_has_emptied_is_swum_again(
     (run.path / "excitation.mcap").write_bytes(content)
     with (
         VirtualSession(Config()) as rig,
-        pytest.raises(RecordingError, match=r"excitation\.mcap is .*; if resumed, the fish swims it"),
+        pytest.raises(RecordingError, match=r"mcap is .*; if resumed, the fish swims it again"),
     ):
         Adaptation(rig, run, 150.0, 640, 0, StoringDisplay()).run()
     assert folder(run.path).state.excitation is None
