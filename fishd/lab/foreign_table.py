@@ -14,9 +14,8 @@ import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
 
-from fishd.assembly import build_estimator
+from fishd.assembly import build_estimator, build_live_thrust
 from fishd.config import Config
-from fishd.control.estimators.live_thrust import REST_DELAY_S, LiveThrust
 from fishd.core import files, text
 from fishd.core.errors import RecordingError
 from fishd.core.signals import Measurement, Tick
@@ -42,6 +41,8 @@ MAX_VALUE = 1e10
 """Largest value of a known column [s, N, rad, W]; a larger one is a mistake."""
 MAX_QUANTITIES = 100
 """Largest number of columns that fishd does not know."""
+REST_DELAY_S = 2.5
+"""Time without a change of φ_c after which the fish is at rest, as for a live thrust [s]."""
 _WAVE = (CONTROLLER, dict[str, float]())
 
 Array = NDArray[np.float64]
@@ -149,7 +150,7 @@ def _estimate(
     others = {name: table[name].tolist() for name in table if name not in UNITS}
     missing = " and ".join(name for name in ("fx", "fy") if name not in table)
     settings = Config()
-    estimator, live = build_estimator(settings), LiveThrust(settings.estimator.zero_drift)
+    estimator, live = build_estimator(settings), build_live_thrust(settings)
     leak, applied, before = estimator.found_leak, angles[0], float(time[0]) - period
     for index, now in enumerate(time.tolist()):
         measurement = Measurement(now, fx[index], fy[index], samples)

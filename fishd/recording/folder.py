@@ -38,7 +38,7 @@ class Overview(NamedTuple):
     writing: bool
     """True while a process writes it."""
     problem: str = ""
-    """What the file lacks or has too much, as in `Run.problem`."""
+    """Difference between the file and what was recorded, as in `Run.problem`."""
     recorded_ticks: int | None = None
     """Number of ticks when the recording ended; None if unknown."""
 
@@ -153,7 +153,7 @@ def read_overviews(folder: Path) -> Iterator[Overview | RecordingError]:
 
 
 def read_overview(path: Path) -> Overview:
-    """Return an overview of a recording, quickly if it is finished, and as it was recorded.
+    """Return an overview of a recording, quickly if it is finished and nothing of it is missing.
 
     Raise `RecordingError`.
     """

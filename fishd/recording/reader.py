@@ -267,7 +267,7 @@ class Run:
 
     @property
     def problem(self) -> str:
-        """What the file lacks or has too much, in words; empty if it is as it was recorded.
+        """Difference between the file and what was recorded, in words; empty if there is none.
 
         It is `damaged: 10 ticks lost`, with the reason if known, or `not as recorded: 840 ticks
         instead of 1200`; of a repaired file, what was so before. Raises `RecordingError`.

@@ -36,8 +36,8 @@ LINES = {
     "half-and-then-zeros": "damaged: an unknown number of ticks lost",
     "whole-chunks-and-then-zeros": "damaged: an unknown number of ticks lost",
 }
-"""What every verb says of a file, by name; nothing of one that is as it was recorded."""
-HELD = {
+"""Message of every verb about a file, by name; empty for one that differs in nothing."""
+HELD_TICKS = {
     **dict.fromkeys(LINES, 50),
     "filtered-by-time": 30,
     "filtered-by-topic": TICKS,
@@ -50,15 +50,15 @@ HELD = {
     "whole-chunks-and-then-zeros": 19,
 }
 """Number of ticks in each file, repeated ones counted once."""
-LOST = {"filtered-by-time": 30, **{name: 10 for name in LINES if name.startswith("with-a")}}
+LOST_TICKS = {"filtered-by-time": 30, **{name: 10 for name in LINES if name.startswith("with-a")}}
 """Number of lost ticks that runs shows, where it is not 0."""
 NO_CONFIGURATION = " does not contain the configuration of its fishd"
-"""What rerun says in addition of a file without attachments."""
+"""Further message of rerun about a file without attachments."""
 REFUSED = {
     "empty": "is empty, as a power cut may leave a file; delete it, there is nothing to recover",
     "zeros": "is not an MCAP file",
 }
-"""What every verb says of a file of which nothing can be read."""
+"""Message of every verb about a file of which nothing can be read."""
 
 
 @pytest.fixture(scope="module")
@@ -70,15 +70,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_tables_have_every_file() -> None:
     assert {f"{name}.mcap" for name in (*LINES, *REFUSED)} == set(FILES)
-    assert set(HELD) == set(LINES)
+    assert set(HELD_TICKS) == set(LINES)
 
 
 def test_runs_counts_what_is_in_a_file_and_says_what_was_recorded(folder: Path) -> None:
     listed = fishctl("runs", "--folder", str(folder), "--json")
     runs = {run["name"]: run for run in json.loads(listed.stdout)}
     assert {name: run["problem"] for name, run in runs.items()} == {**LINES, "good": ""}
-    assert {name: runs[name]["ticks"] for name in LINES} == HELD
-    assert {name: runs[name]["lost_ticks"] for name in LINES if runs[name]["lost_ticks"]} == LOST
+    assert {name: runs[name]["ticks"] for name in LINES} == HELD_TICKS
+    assert {
+        name: runs[name]["lost_ticks"] for name in LINES if runs[name]["lost_ticks"]
+    } == LOST_TICKS
     assert runs["filtered-by-time"]["duration"] == pytest.approx(29 * 0.05)
     assert runs["merged-with-a-copy"]["thrust"] == runs["good"]["thrust"]
     assert runs["merged-with-a-copy"]["restarts"] == 0
@@ -133,8 +135,8 @@ def test_a_repaired_file_still_says_what_it_lacks(
     assert done.stderr == f"fishctl: {repaired.path}: {said}\n"
 
 
-SHORT = ("--jobs", "1", "--periods", "2", "--settle", "1")
-SWEEP = ("sweep", "square", "--frequency", "1.5,2", *SHORT)
+SHORT_SWIM = ("--jobs", "1", "--periods", "2", "--settle", "1")
+SWEEP = ("sweep", "square", "--frequency", "1.5,2", *SHORT_SWIM)
 EMPTY = (
     "it has no complete line; delete it to measure everything again, or choose a new folder with "
     "--folder"
