@@ -21,10 +21,10 @@ from fishd.cli.experiment_options import (
 from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress, show_waiting
+from fishd.cli.recording.files import open_recording
 from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.errors import FishdError
-from fishd.recording.folder import find_recording
 from fishd.recording.reader import open_run
 
 if TYPE_CHECKING:
@@ -112,10 +112,10 @@ def identify(
         config, tables, kept = swum
         origin = f"an experiment with {fish}"
     else:
-        config, tables = load(fish.file, fish.overrides), [find_recording(run) for run in runs]
-        kept = None
+        config, kept = load(fish.file, fish.overrides), None
         check_tethered(config.robot, "identify")
-        origin = ", ".join(path.name for path in tables)
+        tables = [open_recording(run, None) for run in runs]
+        origin = ", ".join(run.path.name for run in tables)
     with show_waiting("fitting the model to the forces"):
         identification = lab.identify(
             tables, start=config.plant, rig=config.simulation, fit=names, fix=fixed

@@ -106,6 +106,14 @@ def test_every_verb_says_in_one_line_how_a_file_differs(
             assert said == ([f": {LINES[name]}"] if LINES[name] else []), verb
 
 
+def test_an_identification_says_it_too(folder: Path) -> None:
+    file = folder / "filtered-by-time.mcap"
+    said, ended, *more = fishctl("identify", str(file)).stderr.splitlines()
+    assert said == f"fishctl: {file}: {LINES['filtered-by-time']}"
+    assert ended.startswith("fishctl: there is no passage of 5 s without a gap")
+    assert not more
+
+
 def test_records_of_others_cost_neither_ticks_nor_the_configuration(folder: Path) -> None:
     run, good = open_run(folder / "with-records-of-others.mcap"), open_run(folder / "good.mcap")
     assert (run.ticks, run.events, run.config) == (good.ticks, good.events, good.config)
