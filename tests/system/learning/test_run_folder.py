@@ -184,7 +184,8 @@ def test_the_best_is_the_one_that_was_saved_last_whatever_the_clock_was(
 def test_a_table_of_another_kind_is_one_line(run: Path) -> None:
     (run / "evaluations.csv").write_text("a,b\n1,2\n", encoding="utf-8")
     file = run / "evaluations.csv"
-    assert complaint(read_evaluations, run) == f"{file}: not a table of evaluations"
+    remedy = "move it away, and a new one is begun"
+    assert complaint(read_evaluations, run) == f"{file}: not a table of evaluations; {remedy}"
 
 
 def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> None:
