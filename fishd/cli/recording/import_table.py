@@ -63,8 +63,8 @@ def import_table(
     alpha   rad, deg     true angle of the fin
     power   W, mW        electrical power of the servo
 
-    All are optional; identify needs fx, fy and phi_c. A column of another name is kept as a
-    quantity. A row in which a number is missing is a gap.
+    One besides time is enough; identify needs fx, fy and phi_c. A column of another name is kept
+    as a quantity. A row in which a number is missing is a gap.
     """
     from fishd.lab.foreign_table import UNITS, make_ticks, read_table
 
