@@ -39,6 +39,8 @@ MAX_TABLE_BYTES = 256 * 2**20
 """Largest size of a file [bytes]: 100 columns of an hour at 50 Hz."""
 MAX_VALUE = 1e10
 """Largest value of a known column [s, N, rad, W]; a larger one is a mistake."""
+MAX_GAP_PERIODS = 1e8
+"""Longest time between two rows, in times between most [1]; a longer one is a mistake."""
 MAX_QUANTITIES = 100
 """Largest number of columns that fishd does not know."""
 REST_DELAY_S = 2.5
@@ -135,6 +137,10 @@ def make_ticks(
             "the numbers"
         )
     period = 1.0 / rate if rate is not None else float(np.median(intervals))
+    if (longest := float(intervals.max())) > MAX_GAP_PERIODS * period:
+        raise RecordingError(
+            f"two rows are {longest:.3g} s apart, most are {period:.3g} s: is the unit of time right?"
+        )
     steps = np.maximum(1, np.round(intervals / period)).astype(int)
     numbers = np.concatenate(([1], 1 + np.cumsum(steps)))
     return list(_estimate(table, numbers, period, samples))

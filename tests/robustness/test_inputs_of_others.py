@@ -273,6 +273,11 @@ BAD_TABLES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
         (),
         "the times do not increase: 0.1 s, then 0.05 s, in rows 3 and 4 of the numbers",
     ),
+    "a time of another clock": (
+        "time,fx\n0,1\n1e-6,1\n2e-6,1\n1e9,1\n",
+        (),
+        "two rows are 1e+09 s apart, most are 1e-06 s: is the unit of time right?",
+    ),
     "a text": (
         "time,fx\n0,1\n1,n/a\n",
         (),
