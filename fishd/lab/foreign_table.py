@@ -139,7 +139,8 @@ def make_ticks(
     period = 1.0 / rate if rate is not None else float(np.median(intervals))
     if (longest := float(intervals.max())) > MAX_GAP_PERIODS * period:
         raise RecordingError(
-            f"two rows are {longest:.3g} s apart, most are {period:.3g} s: is the unit of time right?"
+            f"two rows are {longest:.3g} s apart, most are {period:.3g} s: is the unit of time "
+            "right?"
         )
     steps = np.maximum(1, np.round(intervals / period)).astype(int)
     numbers = np.concatenate(([1], 1 + np.cumsum(steps)))
