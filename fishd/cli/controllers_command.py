@@ -12,10 +12,10 @@ class ControllersCommand(click.Command):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse the arguments after writing `CONTROLLER --key value` as `CONTROLLER:key=value`."""
-        return super().parse_args(ctx, _join_parameters(self, args))
+        return super().parse_args(ctx, join_parameters(self, args))
 
 
-def _join_parameters(command: click.Command, args: Sequence[str]) -> list[str]:
+def join_parameters(command: click.Command, args: Sequence[str]) -> list[str]:
     """Return arguments in which each `CONTROLLER --key value` is `CONTROLLER:key=value`."""
     options = {name: param for param in command.params for name in param.opts}
     words: list[str] = []
