@@ -1,8 +1,9 @@
 """Export of a checkpoint, or a model of stable-baselines3, to a file for the controller `ppo`."""
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import msgspec
@@ -14,6 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.vec_env import (
@@ -95,9 +97,8 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
     evaluation = _evaluate(checkpoint, card, policy, perception)
     if evaluation.is_stalled and not force:
         raise PolicyError(
-            f"{checkpoint}: this policy stalls when it swims without exploration: "
-            f"{evaluation.frequency:.2f} Hz, |φ_c| {evaluation.fullness:.0%} of Φ; train longer, "
-            "choose another checkpoint, or export it nevertheless with --force"
+            f"{checkpoint}: {_format_stall(evaluation)}; train longer, choose another checkpoint, "
+            "or export it nevertheless with --force"
         )
     card = _complete_card(card, evaluation, note)
     size = _write(target, card, policy, perception)
@@ -111,8 +112,8 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
         `NEUTRAL_WRAPPERS` and those of rewards
     note: text for the user, stored in the file
 
-    Raises `PolicyError` for any other model, and where the outputs of the file would differ from
-    those of the policy.
+    Warns of a policy that stalls. Raises `PolicyError` for any other model, and where the outputs
+    of the file would differ from those of the policy.
     """
     path = Path(target)
     env = _find_swim_env(model.get_env(), path)
@@ -135,7 +136,23 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
     evaluation = evaluate_in_simulation(env.config, decide, EvaluationSettings())
     _write(path, _complete_card(card, evaluation), policy, env.perception, _observe(env))
+    if evaluation.is_stalled:
+        rollout = cast(OnPolicyAlgorithm, model).n_steps * model.n_envs
+        warnings.warn(
+            f"{path}: {_format_stall(evaluation)}; it learned from "
+            f"{model.num_timesteps // rollout} × {rollout} steps: more updates help, from more "
+            "steps or a smaller n_steps",
+            stacklevel=2,
+        )
     return path
+
+
+def _format_stall(evaluation: Evaluation) -> str:
+    """Return that a policy stalls, with its figures."""
+    return (
+        "this policy stalls when it swims without exploration: "
+        f"{evaluation.frequency:.2f} Hz, |φ_c| {evaluation.fullness:.0%} of Φ"
+    )
 
 
 def _find_swim_env(env: VecEnv | None, path: Path) -> SwimEnv:

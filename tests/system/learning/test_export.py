@@ -139,7 +139,12 @@ def own_env(**options: Any) -> Any:
 def test_a_model_of_the_user_becomes_a_policy_file(tmp_path: Path, kind: Any) -> None:
     model = kind("MlpPolicy", own_env(), n_steps=64, seed=4, device="cpu")
     model.learn(64)
-    path = export_model(model, str(tmp_path / "own.onnx"), note="tried on a whim")
+    with pytest.warns(UserWarning, match="this policy stalls") as warned:
+        path = export_model(model, str(tmp_path / "own.onnx"), note="tried on a whim")
+    assert str(warned[0].message).startswith(f"{path}: this policy stalls when it swims without ")
+    assert str(warned[0].message).endswith(
+        "; it learned from 1 × 64 steps: more updates help, from more steps or a smaller n_steps"
+    )
     controller = registry.create("ppo", {"policy": str(path)}, Limits(amplitude=0.3, tick=0.05))
     card = read(path).card
     env = model.get_env()
@@ -162,7 +167,9 @@ def test_wrappers_that_change_nothing_that_the_policy_sees_or_does_are_permitted
     model = PPO("MlpPolicy", VecCheckNan(DummyVecEnv([lambda: env])), n_steps=64, device="cpu")
     model.learn(64)
     before = monitor.total_steps
-    assert read(export_model(model, tmp_path / "own.onnx")).card.provenance.steps == 64
+    with pytest.warns(UserWarning, match="this policy stalls"):
+        path = export_model(model, tmp_path / "own.onnx")
+    assert read(path).card.provenance.steps == 64
     assert monitor.total_steps == before, "its fish may be a real one"
 
 

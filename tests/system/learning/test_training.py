@@ -194,8 +194,8 @@ def test_the_learning_curve_begins_at_step_zero_and_has_a_point_for_each_early_u
     witness = Witness()
     job = brief_job(tmp_path / "run", steps=64 * 26, ppo=quick, evaluation=evaluation)
     train(job, witness)
-    early = range(FIRST_UPDATES + 1)
-    assert [e.steps for e in witness.evaluations] == [64 * update for update in (*early, 18, 24, 26)]
+    updates = [*range(FIRST_UPDATES + 1), 18, 24, 26]
+    assert [e.steps for e in witness.evaluations] == [64 * update for update in updates]
     board = EventAccumulator(str(job.folder / "tensorboard")).Reload()
     curve = board.Scalars("evaluation/relative_thrust")
     assert [point.step for point in curve] == [64 * update for update in range(27)]

@@ -237,7 +237,9 @@ def test_what_the_model_lacks_or_hides_is_refused(change: Change, words: str) ->
 
 def of_another_tool(*inputs: Any, outputs: int = 1) -> Any:
     """A model without a card: the first input, through a tanh."""
-    ends = [helper.make_tensor_value_info(f"out{n}", TensorProto.FLOAT, [1]) for n in range(outputs)]
+    ends = [
+        helper.make_tensor_value_info(f"out{n}", TensorProto.FLOAT, [1]) for n in range(outputs)
+    ]
     nodes = [helper.make_node("Tanh", ["obs"], [f"out{n}"]) for n in range(outputs)]
     graph = helper.make_graph(nodes, "net", list(inputs), ends)
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
