@@ -42,7 +42,7 @@ from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
 from fishd.learning.env.perception import Perception
 from fishd.learning.extractors import random_angles
 from fishd.learning.picture_networks import PictureExtractor, network_nodes
-from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
+from fishd.learning.ppo import DeterministicPolicy, MeanAction, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.runs import make_card
 from fishd.learning.settings import EvaluationSettings, TrainingSettings, from_plain
@@ -361,13 +361,19 @@ def _verify(
             seen = np.concatenate((perception.extractor.see(stacks[index]), row))
         given.append(seen)
         outputs.append(network.run())
-    expected, _ = policy.predict(np.array(given), deterministic=True)
-    worst = float(np.abs(np.array(outputs) - expected[:, 0]).max())
+    expected = policy.predict(np.array(given), deterministic=True)[0][:, 0]
+    worst = float(np.abs(np.array(outputs) - expected).max())
     if not worst <= TOLERANCE:
+        layers = MeanAction(policy)
+        computed = np.clip([layers(row) for row in np.array(given)], -1.0, 1.0)
+        cause = (
+            "this version of onnxruntime computes its layers wrongly: install another one"
+            if np.abs(computed - expected).max() <= TOLERANCE
+            else "the model does more than its layers, which a policy file cannot have"
+        )
         raise PolicyError(
             f"the outputs of the file differ from those of the policy by up to {worst:.2g} of Φ: "
-            "the model has something that a policy file cannot have, or this version of "
-            "onnxruntime is at fault"
+            f"{cause}"
         )
 
 

@@ -12,6 +12,7 @@ from rigs.harness import Rig, observe
 from rigs.swimming import NOISY, brief_job
 from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize
 
@@ -87,11 +88,13 @@ def test_a_file_with_other_outputs_is_not_written(
     from fishd.learning import export as exporting
 
     to_onnx = exporting.to_onnx
-    monkeypatch.setattr(  # relu where the policy was trained with tanh
+    monkeypatch.setattr(  # relu where the policy has tanh, as by a fault of the runtime
         exporting, "to_onnx", lambda layers, _, card, sight: to_onnx(layers, "relu", card, sight)
     )
     assert by_force.best
-    with pytest.raises(PolicyError, match="outputs of the file differ from those of the"):
+    with pytest.raises(
+        PolicyError, match=r"outputs of the file differ .* wrongly: install another"
+    ):
         export(by_force.best, tmp_path / "policy.onnx")
     assert list(tmp_path.iterdir()) == []
 
@@ -230,6 +233,16 @@ def in_double_precision() -> PPO:
     return model
 
 
+def with_hook() -> PPO:
+    model = own_ppo()
+    model.policy.action_net.register_forward_hook(lambda _net, _inputs, output: output + 0.1)
+    return model
+
+
+class RecurrentActorCriticPolicy(ActorCriticPolicy):
+    """A policy with the name of that of sb3-contrib's RecurrentPPO."""
+
+
 def squashed() -> PPO:
     options = {"squash_output": True}
     return PPO("MlpPolicy", own_env(), use_sde=True, policy_kwargs=options, device="cpu")
@@ -252,6 +265,11 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "norm": (with_norm, "with linear layers and tanh, not with LayerNorm"),
     "double": (in_double_precision, r"is in float64: call model\.policy\.float\(\)"),
+    "hook": (with_hook, "by up to 0.1 of Φ: the model does more than its layers, which a policy"),
+    "recurrent": (
+        lambda: PPO(RecurrentActorCriticPolicy, own_env(), device="cpu"),
+        "the MlpPolicy of PPO or A2C, not RecurrentActorCriticPolicy",
+    ),
     "squashed": (squashed, "without squash_output"),
 }
 
