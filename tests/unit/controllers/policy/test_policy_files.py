@@ -15,13 +15,14 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from rigs.documents import ROOT
+from rigs.documents import FENCE, ROOT, text_of
 from rigs.policy_files import FLIP, card, random_layers, refusal, write
 
 from fishd.controllers.policy import file
 from fishd.controllers.policy.card import CARD_KEY, encode
 from fishd.controllers.policy.checksum import SEAL_REMEDY, seal
 from fishd.controllers.policy.network import to_onnx
+from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
 
 Change = Callable[[Any], None]
@@ -278,6 +279,30 @@ def test_a_file_of_another_tool_becomes_a_policy_with_names_card_and_seal(tmp_pa
     )
     model.graph.node[0].output[0] = "action"
     assert file.read(write(tmp_path, seal(model))).card == card()
+
+
+def test_the_page_shows_how_a_file_of_another_tool_becomes_a_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = [
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, width])]
+        for name, width in (("observation", 2), ("action", 1))
+    ]
+    weights = numpy_helper.from_array(np.float32([[0.5], [-0.25]]), "weights")
+    nodes = [helper.make_node("MatMul", ["observation", "weights"], ["action"])]
+    model = helper.make_model(
+        helper.make_graph(nodes, "main_graph", *ends, [weights]),
+        producer_name="pytorch",
+        opset_imports=[helper.make_opsetid("", 20)],
+    )
+    monkeypatch.chdir(tmp_path)
+    onnx.save(model, "other.onnx")
+    page = ROOT / "docs/reference/policies.md"
+    (example,) = (code for _, code in FENCE.findall(text_of(page)) if "other.onnx" in code)
+    exec(compile(example, page, "exec"), {})
+    network = Network(file.read(tmp_path / "mine.onnx"))
+    network.row[:] = 0.4, 0.2
+    assert network.run() == pytest.approx(0.15)
 
 
 @pytest.mark.parametrize(
