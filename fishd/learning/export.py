@@ -24,6 +24,7 @@ from stable_baselines3.common.vec_env import (
     VecEnv,
     VecEnvWrapper,
     VecMonitor,
+    VecNormalize,
     VecVideoRecorder,
 )
 
@@ -187,12 +188,17 @@ def _check_wrapper(wrapper: Any, path: Path) -> None:
         isinstance(wrapper, gymnasium.RewardWrapper)
         and kind.step is gymnasium.RewardWrapper.step
         and kind.reset is gymnasium.Wrapper.reset
-    )
+    ) or (kind is VecNormalize and not wrapper.norm_obs)
     if kind not in NEUTRAL_WRAPPERS and not is_reward:
+        remedy = {
+            wrappers.NormalizeObservation: "; the observations of a SwimEnv are about 1 already",
+            VecNormalize: " or with norm_obs=False; the observations of a SwimEnv are about 1 "
+            "already",
+        }.get(kind, "")
         raise PolicyError(
             f"{path}: this model was trained behind the wrapper {kind.__name__}, which may change "
             "observations or actions; a policy file has no wrappers, so the policy would swim "
-            "otherwise: train it without that one"
+            f"otherwise: train it without that one{remedy}"
         )
 
 
