@@ -160,6 +160,17 @@ def test_a_model_of_the_user_becomes_a_policy_file(tmp_path: Path, kind: Any) ->
     assert set(past.settings) == {"environment"}
 
 
+def test_the_defaults_of_stable_baselines3_with_shorter_rollouts_learn_to_swim(
+    tmp_path: Path,
+) -> None:
+    torch.set_num_threads(1)
+    model = PPO("MlpPolicy", "fishd/Swim-v0", n_steps=256, seed=0, device="cpu")
+    model.learn(2048)
+    past = read(export_model(model, tmp_path / "own.onnx")).card.provenance
+    assert past.relative_thrust is not None
+    assert past.relative_thrust > 0.7
+
+
 def test_wrappers_that_change_nothing_that_the_policy_sees_or_does_are_permitted(
     tmp_path: Path,
 ) -> None:
