@@ -13,7 +13,6 @@ from msgspec.structs import replace
 from fishd.cli.config import config_option, set_option
 from fishd.cli.experiment_options import On, default_on, on_option
 from fishd.cli.options import (
-    RenamedOption,
     camera_config_option,
     endpoint_option,
     json_option,
@@ -83,8 +82,6 @@ BY_RESUME = "with --resume, which keeps the options of the run"
 @click.option(
     "--fine-tune",
     "parent",
-    cls=RenamedOption,
-    former=("--from",),
     type=click.Path(path_type=Path),
     metavar="FOLDER",
     help="Begin with the best networks of another run, or with those of one of its checkpoints: "

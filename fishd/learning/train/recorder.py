@@ -13,7 +13,9 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 
 from fishd.controllers.policy.card import Card
 from fishd.core.errors import ConfigError
+from fishd.core.files import write_atomically
 from fishd.core.process.lockfile import LockHeld, locked
+from fishd.lab.experiment import RESULT
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints, runs
@@ -162,10 +164,21 @@ class RunRecorder:
             ):
                 self._save("best")
             self._kept = best
+            self._write_result(best)
         if policy_changed or (
             due and (self.checkpoint is None or self.checkpoint.name != f"step-{name}")
         ):
             self.checkpoint = self._save("step")
+
+    def _write_result(self, best: Evaluation) -> None:
+        """Write what `fishctl runs` shows of this training."""
+        result = {
+            "thrust": best.thrust,
+            "thrust_ci95": best.thrust_ci95 or 0.0,  # a simulated fish shows its true thrust
+            "summary": f"{best.relative_thrust:.1%} of the best square wave, after {best.policy} "
+            "steps",
+        }
+        write_atomically(self._job.folder / RESULT, msgspec.json.encode(result))
 
     def close(self) -> None:
         """Close the logs and unlock the folder."""

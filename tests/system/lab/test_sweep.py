@@ -314,7 +314,7 @@ def test_a_sweep_without_a_single_thrust_says_why_and_draws_nothing(tmp_path: Pa
     assert done.stdout.endswith("rows.csv\n")
 
 
-@pytest.mark.parametrize("verb", [("sweep", "square"), ("optimise", "square", "--over=frequency")])
+@pytest.mark.parametrize("verb", [("sweep", "square"), ("optimise", "square", "--frequency=:")])
 def test_what_cannot_be_drawn_here_is_told_before_anything_swims(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: Sequence[str]
 ) -> None:

@@ -66,8 +66,8 @@ def eye(tmp_path: Path) -> str:
 
 
 def test_an_address_in_place_of_the_file_of_a_simulated_camera_is_refused(eye: str) -> None:
-    for verb in (("learn", "look"), ("compare",)):
-        done = fishctl(*verb, eye, "--camera", "tcp://127.0.0.1:9875")
+    for *verb, option in (("learn", "look", "--camera-config"), ("compare", "--camera")):
+        done = fishctl(*verb, eye, option, "tcp://127.0.0.1:9875")
         assert one_line(done) == (
             "fishctl: 'tcp://127.0.0.1:9875' is the address of a running fishd-camera, which sees "
             "the fish of a running fishd; in simulation a simulated camera is needed, such as "
