@@ -200,8 +200,9 @@ def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> No
     with pytest.raises(KeyboardInterrupt):
         train(job, Killed())
     train(replace(job, resume=True))
-    for name in ("progress.csv", "evaluations.csv"):
-        assert [row["steps"] for row in rows(job.folder / name)] == ["64", "128", "192", "256"]
+    updates = ["64", "128", "192", "256"]
+    for name, steps in (("progress.csv", updates), ("evaluations.csv", ["0", *updates])):
+        assert [row["steps"] for row in rows(job.folder / name)] == steps
 
 
 def test_a_row_cut_off_by_a_kill_is_dropped_even_if_only_a_digit_is_missing(run: Path) -> None:
@@ -213,7 +214,7 @@ def test_a_row_cut_off_by_a_kill_is_dropped_even_if_only_a_digit_is_missing(run:
     assert table.path.read_text() == "steps,std\n64,0.75\n"
     with (run / "evaluations.csv").open("a", encoding="utf-8") as file:
         file.write("128,0.")
-    assert [evaluation.steps for evaluation in read_evaluations(run)] == [64]
+    assert [evaluation.steps for evaluation in read_evaluations(run)] == [0, 64]
 
 
 def test_a_run_in_progress_is_not_resumed_by_another(tmp_path: Path) -> None:
