@@ -415,6 +415,11 @@ def build_estimator(config: Config) -> Estimator:
     return LateralForceEstimator(config.estimator)
 
 
+def build_live_thrust(config: Config) -> LiveThrust:
+    """Return the estimate of the thrust and its interval, with nothing known."""
+    return LiveThrust(config.estimator.zero_drift)
+
+
 def build_guard(config: Config) -> Guard:
     """Return a guard with the limits of the configuration."""
     return Guard(config.amplitude_limit, config.tick, config.slew_limit, config.fade_time)
@@ -439,7 +444,7 @@ def build_loop(
     loop = ControlLoop(
         robot=robot,
         estimator=build_estimator(config),
-        thrust=LiveThrust(config.estimator.zero_drift),
+        thrust=build_live_thrust(config),
         guard=guard,
         settings=config,
         limits=config.limits,

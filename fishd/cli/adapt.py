@@ -82,7 +82,7 @@ def adapt(
     from fishd.lab import drawing
     from fishd.lab.session import LiveSession
     from fishd.learning.adapt import report
-    from fishd.learning.adapt.adaptation import Adaptation
+    from fishd.learning.adapt.adaptation import Adaptation, add_true_thrusts
     from fishd.learning.adapt.state import PICTURE, AdaptFolder
 
     drawing.check(picture or PICTURE)
@@ -100,12 +100,14 @@ def adapt(
                 show_progress(budget, "s of tank time", err=as_json) as show,
             ):
                 state = Adaptation(session, run, budget, steps, seed, show).run()
-                words = format_command(_chosen_gait(state), fish)
-                files = report.write(run, session.amplitude, words)
-                if picture:
-                    report.draw(run, session.amplitude, picture)
             if ending.is_interrupted:
                 return ending.interrupted(f"{run.state.tank_time:.0f} s of tank time are kept")
+            if fish.on == "simulation":
+                add_true_thrusts(run, fish.load())
+            words = format_command(_chosen_gait(state), fish)
+            files = report.write(run, session.amplitude, words)
+            if picture:
+                report.draw(run, session.amplitude, picture)
         if as_json:
             print_json(msgspec.to_builtins(state))
         else:
@@ -129,11 +131,10 @@ def _chosen_gait(state: "State") -> "Contender":
 
 def format_command(gait: "Contender", fish: ChosenFish) -> str:
     """Return the command line that swims the same fish with a gait."""
+    from fishd.learning.adapt.report import gait_words
+
     verb = "set-controller" if fish.on == "live" else "simulate"
-    words = ["fishctl", verb, gait.controller]
-    for name, value in gait.parameters.items():
-        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
-        words += [f"--{name.replace('_', '-')}", shown]
+    words = ["fishctl", verb, *gait_words(gait)]
     words += ["--config", str(fish.file)] if fish.file else []
     words += [word for text in fish.overrides for word in ("--set", text)]
     words += ["--endpoint", fish.endpoint] if fish.endpoint else []

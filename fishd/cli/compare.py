@@ -4,12 +4,14 @@ import sys
 from contextlib import AbstractContextManager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 from msgspec import to_builtins
+from msgspec.structs import replace
 
 from fishd.cli.completion import complete_contestant
+from fishd.cli.controllers_command import ControllersCommand
 from fishd.cli.experiment_options import (
     ChosenFish,
     ExperimentEnding,
@@ -20,7 +22,12 @@ from fishd.cli.experiment_options import (
     live_folder_options,
     record_session,
 )
-from fishd.cli.options import camera_config_option, for_option, json_option, plot_option
+from fishd.cli.options import (
+    camera_config_option,
+    for_option,
+    json_option,
+    plot_option,
+)
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress
 from fishd.config import Config, check_tethered
@@ -54,7 +61,11 @@ class _Outcome(NamedTuple):
     status: int = 0
 
 
-@click.command(cls=Resumable)
+class _CompareCommand(ControllersCommand, Resumable):
+    """Verb whose arguments are controllers and policies, and that can be resumed."""
+
+
+@click.command(cls=_CompareCommand)
 @click.argument(
     "contestants", nargs=-1, metavar="[POLICY|CONTROLLER]...", shell_complete=complete_contestant
 )
@@ -107,7 +118,8 @@ def compare(
     """Compare policies and controllers on the same fish.
 
     A contestant is the name of a policy (see `fishctl policies`), an .onnx file, or a controller
-    with parameters, such as swing:C=0.6 or square:frequency=1.7,amplitude=0.3. The default is the
+    with parameters, such as swing:C=0.6 or square --frequency 1.7 --amplitude 0.3. With a list or
+    a range of numbers, such as square:frequency=1.2,1.7, each is a contestant. The default is the
     best square wave, swing, and the named policies that are trained for this fish.
 
     In simulation the thrust is the true thrust, and relative thrust is its ratio to that of the
@@ -164,11 +176,11 @@ class _Task(NamedTuple):
 def _swim(task: _Task) -> _Outcome:
     from fishd.camera import settings as cameras
     from fishd.lab.compare import comparison
-    from fishd.lab.compare.contestants import is_missing, parse, refusal
+    from fishd.lab.compare.contestants import is_missing, parse_all, refusal
 
     config, camera = task.fish.load(), cameras.load_simulated(task.camera)
     check_tethered(config.robot, "compare")
-    chosen = [parse(text) for text in task.texts] or _default_contestants(config)
+    chosen = parse_all(task.texts) or _default_contestants(config)
     _check_camera(task.camera, chosen)
     left_out = [
         (contestant, reason) for contestant in chosen if (reason := refusal(config, contestant))
@@ -199,11 +211,11 @@ def _swim(task: _Task) -> _Outcome:
 
 
 def _measure(task: _Task, agent: str | None) -> _Outcome:
-    from fishd.lab.compare.contestants import absolute, parse
+    from fishd.lab.compare.contestants import absolute, parse_all
     from fishd.lab.compare.live import LiveComparison
 
     ended, status, runs = "", 0, task.runs or 1
-    chosen = [absolute(parse(text)) for text in task.texts]
+    chosen = list(map(absolute, parse_all(task.texts)))
     with task.fish.session(camera=task.camera, agent=agent) as session:
         chosen = chosen or _default_contestants(session.read_config())
         _check_camera(task.camera, chosen)
@@ -286,6 +298,8 @@ def _report(outcome: _Outcome, runs: int, as_json: bool) -> int:
         Console(width=None if sys.stdout.isatty() else PIPE_TABLE_COLUMNS, markup=False).print(
             _make_table(standings, outcome.unit)
         )
+        if _are_exact(standings):
+            echo("These values have no error: nothing in these runs is random.")
         if sentence := _describe_best_square(standings):
             echo(sentence)
         if verdict:
@@ -327,9 +341,20 @@ def _verdict_on(contestant: str, best: tuple[str, ...]) -> str | None:
     return "chosen" if contestant == best[0] else "undecided"
 
 
+def _are_exact(standings: "list[Standing]") -> bool:
+    """Return whether all thrusts are without an error."""
+    errors = [_select_half_width(s.thrust_ci95, s.total_ci95) for s in standings]
+    return all(error is not None and text.format_half_width(error) == "exact" for error in errors)
+
+
 def _make_table(standings: "list[Standing]", unit: str) -> "Table":
     from rich.table import Table
 
+    if _are_exact(standings):
+        no_errors: dict[str, Any] = dict.fromkeys(
+            ("thrust_ci95", "total_ci95", "thrust_per_watt_ci95", "thrust_per_watt_total_ci95")
+        )
+        standings = [replace(standing, **no_errors) for standing in standings]
     simulated = all(standing.runs for standing in standings)
     table = Table(box=None, pad_edge=False)
     table.add_column("contestant", overflow="fold")

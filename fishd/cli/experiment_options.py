@@ -27,10 +27,13 @@ if TYPE_CHECKING:
     from fishd.lab.session import Session
 
 On = Literal["live", "simulation"]
-RUN_ONLY_OPTIONS = {"--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0} | {
-    "--cluster": 1
-}
-"""Options that a resumed experiment does not take over, and the number of words after each."""
+RUN_ONLY_OPTIONS = {
+    "--folder": 1, "--resume": 1, "--plot": 1, "--json": 0, "--take": 0, "--on": 1, "--endpoint": 1,
+    "--cluster": 1,
+}  # fmt: skip
+"""Options that are not kept as they are given, and the number of words after each.
+
+The header of an experiment has the fish that `--on` and `--endpoint` stand for."""
 _COMMAND = "fishd.words"
 """Key of the command line in click's context, for the header of an experiment."""
 
@@ -302,14 +305,12 @@ def _read_header(folder: Path) -> "Header":
 
 def _read_command(context: click.Context, folder: Path) -> list[str]:
     """Return the arguments of the experiment in a folder."""
-    from fishd.core.old_names import OLD_OPTIONS
-
     header = _read_header(folder)
     if header.kind != verb_words(context):
         raise click.UsageError(
             f"--resume {folder}: it is of another verb: fishctl {header.kind} --resume {folder}"
         )
-    return [OLD_OPTIONS.get(word, word) for word in header.command]
+    return header.command
 
 
 def restore_arguments(

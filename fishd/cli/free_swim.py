@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from fishd.cli.experiment_options import RUN_ONLY_OPTIONS, kept_arguments, restore_arguments
-from fishd.cli.options import ControllerGroup, F, FiniteRange, RenamedOption
+from fishd.cli.options import ControllerGroup, F, FiniteRange
 from fishd.cli.output import echo, echo_rows, format_controller, print_json
 from fishd.cli.progress import show_progress
 from fishd.core import files, text
@@ -82,11 +82,9 @@ def _check_writable(path: Path) -> None:
 def swimmer_options(function: F) -> F:
     """Add `--to`, `--checkpoint-every`, `--resume` and `--film`."""
 
-    def file_option(*names: str, about: str, former: Sequence[str] = ()) -> Callable[[F], F]:
+    def file_option(*names: str, about: str) -> Callable[[F], F]:
         return click.option(
             *names,
-            cls=RenamedOption,
-            former=former,
             type=click.Path(path_type=Path, dir_okay=False),
             metavar="FILE",
             help=f"For a swimmer: {about}",
@@ -110,7 +108,6 @@ def swimmer_options(function: F) -> F:
         file_option(
             "--to",
             "target",
-            former=("--save", "--checkpoint"),
             about="write its track, midlines and state for --resume to this new .npz file, also "
             "at Ctrl-C; or its track alone to a .csv file.",
         ),

@@ -21,13 +21,14 @@ from fishd.cli.experiment_options import (
 from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress, show_waiting
+from fishd.cli.recording.files import open_recording
 from fishd.config import Config, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.errors import FishdError
-from fishd.recording.folder import find_recording
 from fishd.recording.reader import open_run
 
 if TYPE_CHECKING:
+    from fishd.lab.experiment import Experiment
     from fishd.lab.identification import Identification
 
 DEFAULT_EXPERIMENT_S = 180.0
@@ -108,18 +109,22 @@ def identify(
         swum = _swim_experiment(fish, seconds or DEFAULT_EXPERIMENT_S, place, as_json)
         if isinstance(swum, int):
             return swum
-        config, tables = swum
+        config, tables, kept = swum
         origin = f"an experiment with {fish}"
     else:
-        config, tables = load(fish.file, fish.overrides), [find_recording(run) for run in runs]
+        config, kept = load(fish.file, fish.overrides), None
         check_tethered(config.robot, "identify")
-        origin = ", ".join(path.name for path in tables)
+        tables = [open_recording(run, None) for run in runs]
+        origin = ", ".join(run.path.name for run in tables)
     with show_waiting("fitting the model to the forces"):
         identification = lab.identify(
             tables, start=config.plant, rig=config.simulation, fit=names, fix=fixed
         )
+    result = identification.to_builtins() | {"origin": origin}
+    if kept:
+        kept.write_result(result | {"summary": identification.summary})
     if as_json:
-        print_json(identification.to_builtins() | {"origin": origin})
+        print_json(result)
     else:
         _print_result(identification)
         echo(f"from {origin}")
@@ -140,11 +145,11 @@ def _parse_names(listed: str) -> tuple[str, ...]:
 
 def _swim_experiment(
     fish: ChosenFish, seconds: float, place: ExperimentFolder, as_json: bool
-) -> tuple[Config, list[Any]] | int:
+) -> "tuple[Config, list[Any], Experiment | None] | int":
     """Swim an experiment, or the rest of one that is resumed.
 
-    Return the start configuration of the fit and the tables of ticks; the exit status if it was
-    interrupted.
+    Return the start configuration of the fit, the tables of ticks and the folder that is kept; the
+    exit status if it was interrupted.
     """
     from fishd.lab.identification import continue_experiment
     from fishd.recording.folder import list_recordings
@@ -172,7 +177,7 @@ def _swim_experiment(
             show_progress(seconds, "s", err=as_json) as bar,
         ):
             session.progress = bar.at
-            return config, continue_experiment(session, before, seconds)
+            return config, continue_experiment(session, before, seconds), experiment
     return ending.interrupted("before the fit")
 
 

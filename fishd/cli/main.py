@@ -38,6 +38,7 @@ VERBS = {
         "sweep": Verb("sweep", "sweep", "Measure thrust over a grid of parameters."),
         "optimise": Verb("optimise", "optimise", "Find the best parameters of a controller."),
         "identify": Verb("identify", "identify", "Fit a fish to its forces, with intervals."),
+        "adapt": Verb("adapt", "adapt", "Find a new fish's best gait: fit, train, measure."),
         "optimum": Verb("optimum", "optimum", "Show the command with the largest thrust."),
     },
     "Record": {
@@ -45,6 +46,9 @@ VERBS = {
         "runs": Verb("recording.runs", "runs", "List recordings and experiments."),
         "plot": Verb("recording.files", "plot", "Draw a recording, as a picture and a page."),
         "export": Verb("recording.files", "export", "Write a recording as CSV or Parquet."),
+        "import": Verb(
+            "recording.import_table", "import_table", "Make a recording of a table of another rig."
+        ),
         "replay": Verb("recording.files", "replay", "Publish a recording, as if it were live."),
         "rerun": Verb("recording.rerun", "rerun", "Run a controller again on a recording."),
         "recover": Verb("recording.files", "recover", "Repair a recording that was cut off."),
@@ -59,7 +63,6 @@ VERBS = {
     "Simulate and learn": {
         "simulate": Verb("simulate", "simulate", "Swim a simulated fish in virtual time."),
         "swimmer": Verb("swimmer", "swimmer", "Draw a fish that swims freely, and its wake."),
-        "adapt": Verb("adapt", "adapt", "Find a new fish's best gait: fit, train, measure."),
         "learn": Verb("learn", "learn", "Train policies, and write them to files."),
         "virtual-pi": Verb(
             "virtual_pi", "virtual_pi", "Run a virtual Raspberry Pi, and inject faults."

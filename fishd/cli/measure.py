@@ -68,8 +68,9 @@ def _measure(
     from fishd.lab import drawing
     from fishd.lab.error_budget import unknown_calibration
     from fishd.lab.measurement import measure as run_measurement
-    from fishd.lab.measurement import plan, summarise
+    from fishd.lab.measurement import summarise
     from fishd.lab.session import LiveSession
+    from fishd.lab.swim_plan import plan
 
     if picture:
         drawing.check(picture)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import click
 from msgspec import Struct
@@ -28,7 +28,7 @@ from fishd.controllers.base import Limits
 from fishd.core import text
 from fishd.core.console import format_power
 from fishd.core.errors import ParameterError
-from fishd.core.schema import Field, format_values, suggest, units_of
+from fishd.core.schema import Field, format_values, units_of
 
 if TYPE_CHECKING:
     from fishd.core.calibration import ForceCalibration
@@ -37,6 +37,37 @@ if TYPE_CHECKING:
     from fishd.lab.optimise.search import Proposal, Range, Search
     from fishd.lab.optimise.trials import Aim, Trial
     from fishd.lab.session import Session
+
+
+class OpenRange(NamedTuple):
+    """Range of a parameter on the command line; None stands for a bound of the parameter."""
+
+    low: float | None
+    high: float | None
+
+
+class RangeType(ParameterType):
+    """Value of a parameter, or the range in which it is searched."""
+
+    metavar = "|LOW:HIGH|:"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Convert `1:3`, `1:` or `:` to an `OpenRange`, other texts to a value."""
+        if not isinstance(value, str) or ":" not in value or self.field.kind != "number":
+            return super().convert(value, param, ctx)
+        try:
+            low, high = value.split(":")
+        except ValueError:
+            self.fail(
+                f"'{value}' is not valid: LOW:HIGH is needed, such as 0.5:4, or ':' for all that "
+                "is permitted",
+                param,
+                ctx,
+            )
+        ends = [
+            super(RangeType, self).convert(end, param, ctx) if end else None for end in (low, high)
+        ]
+        return OpenRange(*ends)
 
 
 def optimise_options(function: Any) -> Any:
@@ -74,25 +105,20 @@ def optimise_options(function: Any) -> Any:
             show_default=True,
             help="Largest tank time, rests included [s].",
         ),
-        click.option(
-            "--over",
-            multiple=True,
-            required=True,
-            metavar="NAME[=LOW:HIGH]",
-            help="Parameter to search, within its bounds or from LOW to HIGH. Repeatable.",
-        ),
     ):
         function = option(function)
     return function
 
 
-@click.group(cls=ResumableGroup, options=optimise_options, remote=True)
+@click.group(cls=ResumableGroup, options=optimise_options, remote=True, kind=RangeType)
 def optimise() -> None:
     """Search the parameters of a controller that give the most thrust, in a minute of swimming.
 
+    A parameter with a range is searched, such as --frequency 0.5:4; ':' is the range of all that
+    is permitted. A parameter with a value has this value.
+
     The fish swims with a candidate, rests, and swims with the next. A Gaussian process chooses
-    the candidates from all measurements and their errors. The other parameters of the controller
-    may be set, too.
+    the candidates from all measurements and their errors.
     --resume continues an interrupted search; --budget may then be larger.
     """
 
@@ -101,7 +127,6 @@ def optimise() -> None:
 def _optimise(
     name: str,
     parameters: dict[str, Any],
-    over: tuple[str, ...],
     budget: float,
     min_gain: float,
     seed: int,
@@ -113,8 +138,8 @@ def _optimise(
     as_json: bool,
 ) -> int:
     from fishd.lab import drawing
-    from fishd.lab.measurement import MEAN_REST_S
     from fishd.lab.optimise.trials import Aim, trial_durations
+    from fishd.lab.swim_plan import MEAN_REST_S
 
     drawing.check_installed()
     if picture:
@@ -125,7 +150,7 @@ def _optimise(
         )
     aim = Aim(objective or "thrust", target_thrust * 1e-3 if target_thrust else None)
     with fish.session() as session:
-        ranges = [_parse_range(text, name, parameters, session) for text in dict.fromkeys(over)]
+        ranges, parameters = _take_ranges(name, parameters, session)
         search = aim.make_search(ranges, seed)
         _check_ends(name, parameters, ranges, session)
         if budget < (least := 2.0 * MEAN_REST_S + trial_durations(parameters)[1]):
@@ -135,7 +160,7 @@ def _optimise(
         settings = {
             "controller": name,
             "parameters": parameters,
-            "over": {searched.name: [searched.low, searched.high] for searched in ranges},
+            "ranges": {searched.name: [searched.low, searched.high] for searched in ranges},
             "seed": seed,
             "objective": aim.objective,
             "target": aim.target,
@@ -313,38 +338,26 @@ def _controller_fields() -> dict[str, Field]:
     return {kind.field.name: kind.field for kind in types if isinstance(kind, ParameterType)}
 
 
-def _parse_range(text: str, controller: str, given: dict[str, Any], session: "Session") -> "Range":
-    """Return the range for `frequency` or `frequency=1:3`; raises `UsageError`."""
-    from fishd.lab.optimise.search import Range
-    from fishd.lab.optimise.trials import check_bounds, default_range, restrict_to_whole_ticks
+def _take_ranges(
+    controller: str, parameters: dict[str, Any], session: "Session"
+) -> "tuple[list[Range], dict[str, Any]]":
+    """Return the ranges to search, and the other parameters; raises `ParameterError`."""
+    from fishd.lab.optimise.trials import make_range
 
-    name, equals, ends = text.partition("=")
     fields = _controller_fields()
-    if name not in fields or fields[name].kind != "number":
-        numbers = [other_name for other_name, field in fields.items() if field.kind == "number"]
-        hint = suggest(name, numbers, listed="it has") if numbers else "it has none"
+    ranges = {name: value for name, value in parameters.items() if isinstance(value, OpenRange)}
+    if not ranges:
+        example = next((name for name, field in fields.items() if field.kind == "number"), None)
+        if example is None:
+            raise click.UsageError(f"{controller} has no numeric parameter that could be searched")
         raise click.UsageError(
-            f"--over {text}: {controller} has no numeric parameter of this name; {hint}"
+            f"no parameter has a range: give one, such as --{example} LOW:HIGH, or "
+            f"--{example} : for all that is permitted"
         )
-    if name in given:
-        raise click.UsageError(f"--over {text}: --{name} is given, too: leave out one of them")
-    if not equals:
-        searched = default_range(fields[name], session)
-        if searched is None:
-            raise click.UsageError(
-                f"--over {name}: it is not bounded on both sides: write --over {name}=LOW:HIGH"
-            )
-        return restrict_to_whole_ticks(searched, session.tick) if name == "frequency" else searched
-    try:
-        low, high = (float(end) for end in ends.split(":"))
-    except ValueError:
-        raise click.UsageError(
-            f"--over {text}: write NAME=LOW:HIGH, such as frequency=0.5:4"
-        ) from None
-    searched = Range(name, low, high)
-    searched.check()
-    check_bounds(searched, fields[name], session)
-    return restrict_to_whole_ticks(searched, session.tick) if name == "frequency" else searched
+    return (
+        [make_range(fields[name], *ends, session) for name, ends in ranges.items()],
+        {name: value for name, value in parameters.items() if name not in ranges},
+    )
 
 
 class Optimum(Struct, frozen=True):

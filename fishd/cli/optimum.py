@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import fish_options
-from fishd.cli.options import RenamedOption, json_option, plot_option
+from fishd.cli.options import json_option, plot_option
 from fishd.cli.output import echo, echo_rows, print_json, warn_of_fin
 from fishd.config import check_tethered, load
 from fishd.virtual.plant.parameters import PlantParameters, without_extensions
@@ -42,8 +42,6 @@ def _check_amplitudes(
 )
 @click.option(
     "--any-shape",
-    cls=RenamedOption,
-    former=("--control",),
     is_flag=True,
     help="Find the best command of any shape, too.",
 )

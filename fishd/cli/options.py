@@ -2,7 +2,7 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
@@ -15,7 +15,7 @@ from fishd.cli.output import make_printable
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.core import text
 from fishd.core.errors import FishError, ParameterError, UnknownController
-from fishd.core.schema import Field, describe_permitted, format_literal, names_file
+from fishd.core.schema import Field, describe_permitted, format_literal, names_file, parse_value
 from fishd.core.signals import ControllerInfo
 
 if TYPE_CHECKING:
@@ -106,28 +106,10 @@ def seed_option(what: str, default: int | None = 0) -> Callable[[F], F]:
     )
 
 
-class RenamedOption(click.Option):
-    """Option that also accepts former names, which help does not show."""
-
-    def __init__(self, *args: Any, former: Sequence[str], **kwargs: Any) -> None:
-        """former: former names, such as `--save`"""
-        super().__init__(*args, **kwargs)
-        self._former = former
-
-    def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
-        """Make the option and its former names known to the parser."""
-        names = self.opts
-        self.opts = [*names, *self._former]
-        super().add_to_parser(parser, ctx)
-        self.opts = names
-
-
-def camera_config_option(scope: str = "", former: Sequence[str] = ()) -> Callable[[F], F]:
+def camera_config_option(scope: str = "") -> Callable[[F], F]:
     """Return the option `--camera-config`; scope: when it can be given."""
     return click.option(
         "--camera-config",
-        cls=RenamedOption,
-        former=former,
         metavar="FILE",
         help=f"{scope}YAML file of a simulated camera, such as config/camera-web.yaml. [default: a "
         "good camera]",
@@ -168,6 +150,9 @@ class Utf8Text(click.ParamType[str]):
 class ParameterType(click.ParamType[Any]):
     """Value of one parameter of a controller; the daemon checks whether it is in range."""
 
+    metavar = ""
+    """Notation of several values, in help texts."""
+
     def __init__(self, field: Field) -> None:
         self.field = field
         self.name = field.kind
@@ -175,20 +160,16 @@ class ParameterType(click.ParamType[Any]):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert a text of the command line to a number, boolean or text."""
         field = self.field
-        if value is None or not isinstance(value, str):
-            return value
-        if field.optional and value.lower() in ("null", "none", "default"):
-            return None
-        if value in field.words:
+        if not isinstance(value, str):
             return value
         if field.file and names_file(value, field.file):
             from fishd.core import files
 
             return str(files.expand_user(value).absolute())  # fishd may run in another folder
         try:
-            return _PARSERS.get(field.kind, str)(value)
-        except ValueError:
-            self.fail(f"'{value}' is not valid: {describe_permitted(field)} is needed", param, ctx)
+            return parse_value(field, value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
@@ -197,31 +178,13 @@ class ParameterType(click.ParamType[Any]):
         return complete_value(self.field, incomplete)
 
 
-def _parse_finite(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError(text)
-    return number
-
-
-def _parse_boolean(text: str) -> bool:
-    words = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
-    if text.lower() not in words:
-        raise ValueError(text)
-    return words[text.lower()]
-
-
-_PARSERS: dict[str, Callable[[str], Any]] = {
-    "number": _parse_finite,
-    "integer": int,
-    "boolean": _parse_boolean,
-}
-
 _PREFIX = "parameter_"
 
 
 class ValuesType(ParameterType):
     """List of values of one parameter: spelled as a list, or as a range of numbers."""
+
+    metavar = "|LOW:HIGH:STEP|VALUE,..."
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert `0.4:4:0.2` or `0.3,0.6` to a list of values."""
@@ -241,12 +204,11 @@ def parameter_options(
     fields: Iterable[Field], kind: type[ParameterType] = ParameterType
 ) -> list[click.Parameter]:
     """Return an option for each parameter of a controller, with its upper case (`--C`)."""
-    list_metavar = "|LOW:HIGH:STEP|VALUE,..." if kind is ValuesType else ""
     return [
         click.Option(
             [_PREFIX + field.name, "--" + field.name.replace("_", "-")],
             type=kind(field),
-            metavar=("NAME|FILE" if field.file else field.kind.upper()) + list_metavar,
+            metavar=("NAME|FILE" if field.file else field.kind.upper()) + kind.metavar,
             help=describe_parameter(field),
             default=None,
         )
@@ -317,25 +279,25 @@ class ControllerGroup(click.Group):
         *args: Any,
         options: Callable[[F], F],
         remote: bool = False,
-        several: bool = False,
+        kind: type[ParameterType] = ParameterType,
         **kwargs: Any,
     ) -> None:
         """
         options: decorator that adds the verb's own options to each sub-command
-        several: `square,sine` is a sub-command, too; each parameter takes several values
+        kind: type of the parameters; with `ValuesType`, `square,sine` is a sub-command, too
         """
         super().__init__(*args, **kwargs)
         self.options_metavar = ""
         self.subcommand_metavar = "CONTROLLER [OPTIONS]"
         self._options = options
         self._remote = remote
-        self._several = several
+        self._kind, self._several = kind, kind is ValuesType
         self._action: Callable[..., Any] = lambda: None
 
     def action(self, function: F) -> F:
         """Decorator: call `function(name, parameters, **options)` for each sub-command.
 
-        With several, `name` is a list of `ControllerInfo`s, and each parameter a list of values.
+        With `ValuesType`, `name` is a list of `ControllerInfo`s, each parameter a list of values.
         """
         self._action = function
         return function
@@ -384,8 +346,7 @@ class ControllerGroup(click.Group):
         command = click.command(cmd_name, _ControllerCommand, help=summary, short_help=summary)(
             decorated
         )
-        kind = ValuesType if self._several else ParameterType
-        command.params = parameter_options(fields.values(), kind) + command.params
+        command.params = parameter_options(fields.values(), self._kind) + command.params
         return command
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -19,7 +19,7 @@ def warn_of_values(
 ) -> None:
     """Print a line for each value far beyond what makes sense, on standard error.
 
-    parameters: a value for each name, or a list of values
+    parameters: a value for each name, or several values
     config: reads the configuration of the fish, or returns None if its forces are in another unit;
         only called if a parameter is a force, which the fish has to produce
     """
@@ -41,7 +41,7 @@ def running_config(fish: "Fish") -> "Config | None":
 
 
 def _largest_value(value: Any) -> Any:
-    if not isinstance(value, list):
+    if not isinstance(value, list | tuple):
         return value
     return max((item for item in value if isinstance(item, int | float)), default=None)
 

@@ -17,7 +17,7 @@ from fishd.cli.experiment_options import (
     folder_options,
 )
 from fishd.cli.free_swim import format_speed
-from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
+from fishd.cli.options import FiniteRange, ValuesType, for_option, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, warn_of_fin
 from fishd.cli.progress import show_progress
 from fishd.config import Config
@@ -78,7 +78,7 @@ def sweep_options(function: Any) -> Any:
     return function
 
 
-@click.group(cls=ResumableGroup, options=sweep_options, remote=True, several=True)
+@click.group(cls=ResumableGroup, options=sweep_options, remote=True, kind=ValuesType)
 def sweep() -> None:
     """Measure thrust over a grid of parameters; write a table, recordings and a picture.
 
@@ -179,9 +179,9 @@ class _Sweep:
 
     def measure(self, seconds: float) -> int:
         """Measure a live fish; seconds: duration of each point [s]."""
-        from fishd.lab.measurement import plan
         from fishd.lab.sweep import grid
         from fishd.lab.sweep.measuring import measure_all
+        from fishd.lab.swim_plan import plan
 
         for point in self.points:
             plan(

@@ -47,15 +47,19 @@ that imports it in a child process first."""
 def split_spec(spec: str) -> tuple[str, list[tuple[str, str]]]:
     """Return name and parameters of a text such as `square:frequency=1.7,amplitude=0.3`.
 
+    A value may be a list, such as `frequency=1,1.5,2`: what has no name continues it.
     Raise `ParameterError` if a parameter is not NAME=VALUE.
     """
     name, _, values = spec.partition(":")
-    pairs = []
+    pairs: list[tuple[str, str]] = []
     for word in filter(None, values.split(",")):
         key, equals, value = word.partition("=")
-        if not (key and equals and value):
+        if pairs and not (equals and key.isidentifier()):
+            pairs[-1] = (pairs[-1][0], f"{pairs[-1][1]},{word}")
+        elif key and equals and value:
+            pairs.append((key, value))
+        else:
             raise ParameterError(f"{spec}: '{word}' is not valid: NAME=VALUE is needed")
-        pairs.append((key, value))
     return name, pairs
 
 
@@ -69,6 +73,11 @@ def describe(name: str) -> ControllerInfo:
         parameters=fields_of(controller.Parameters),
         quantities=quantities_of(controller),
     )
+
+
+def parameter_names(name: str) -> set[str]:
+    """Return the names of a controller's parameters; empty if it is not installed."""
+    return set(units(name))
 
 
 def units(name: str) -> dict[str, str]:

@@ -67,9 +67,6 @@ OLD_NAMES: dict[str, dict[str, str]] = {
 }
 """Present name of each old field, by kind of message, metadata or table."""
 
-OLD_OPTIONS = {"--until": "--min-gain", "--at-least": "--target-thrust"}
-"""Present name of each old option of `fishctl optimise`, for the command line in a header."""
-
 
 def rename_keys(kind: str, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields with their present names."""

@@ -478,6 +478,29 @@ def find_doubts(values: Mapping[str, Any], fields: Iterable[Field]) -> list[str]
     return doubts
 
 
+def parse_value(field: Field, text: str) -> Any:
+    """Return the value of a field for a text of a command line; raise ValueError.
+
+    Whether a number is within its interval is not checked.
+    """
+    if field.optional and text.lower() in ("null", "none", "default"):
+        return None
+    if text in field.words:
+        return text
+    try:
+        if field.kind == "boolean":
+            return _BOOLEANS[text.lower()]
+        value = {"number": float, "integer": int}.get(field.kind, str)(text)
+        if value in (math.inf, -math.inf) or value != value:
+            raise ValueError
+    except (KeyError, ValueError):
+        raise ValueError(f"'{text}' is not valid: {describe_permitted(field)} is needed") from None
+    return value
+
+
+_BOOLEANS = {"true": True, "yes": True, "on": True, "false": False, "no": False, "off": False}
+
+
 def is_valid_number(values: Mapping[str, Any], field: Field) -> bool:
     """Return whether the value of this field is a number within its interval."""
     value = values.get(field.name)

@@ -11,13 +11,13 @@ from contextlib import contextmanager
 from datetime import datetime
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 import msgspec
 from msgspec import Struct
 
 from fishd import __version__
-from fishd.core import files
+from fishd.core import files, text
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
 from fishd.core.old_names import rename_columns
@@ -101,9 +101,15 @@ class Experiment:
         rows: list[list[str]] = []
         if path.exists():
             try:
-                head, *rows = tables.read(path, MAX_TABLE_BYTES)
-            except (FileProblem, ValueError) as problem:
-                raise ConfigError(f"{path}: {problem or 'it is empty'}; {_OTHER_FOLDER}") from None
+                table = tables.read(path, MAX_TABLE_BYTES)
+            except FileProblem as problem:
+                raise ConfigError(f"{path}: {problem}; {_OTHER_FOLDER}") from None
+            if not table:
+                raise ConfigError(
+                    f"{path}: it has no complete line; delete it to measure everything again, or "
+                    f"{_OTHER_FOLDER}"
+                )
+            head, *rows = table
             head = rename_columns(self.header.kind, head)
             if head != expected:
                 raise ConfigError(
@@ -283,19 +289,35 @@ def count_attempts(path: Path) -> int:
     return (count_rows(path) or 0) + sum(1 for _ in path.glob(f"*{SUFFIX}*"))
 
 
-def find_largest_thrust(path: Path) -> tuple[float, float | None, float | None] | None:
-    """Return the largest thrust of an experiment, with two half-widths of its 95 % interval.
+class Answer(NamedTuple):
+    """What an experiment has found so far, as far as one line can hold it."""
 
-    The first is statistical, the second includes the calibration. None where no thrust is in its
-    result or, before its end, in its table.
-    """
-    thrusts = []
-    for result in _read_results(path):
-        keys = ("thrust", "thrust_ci95", "total_ci95")
-        thrust, statistical, total = (_read_number(result.get(key)) for key in keys)
-        if thrust is not None:
-            thrusts.append((thrust, statistical, total))
-    return max(thrusts, key=lambda pair: pair[0], default=None)
+    thrust: float | None = None
+    """Largest thrust of its result or, before its end, of its table [N]."""
+    thrust_ci95: float | None = None
+    """Half-width of the 95 % confidence interval of `thrust`, statistical [N]."""
+    total_ci95: float | None = None
+    """The same with the calibration [N]; None where that is not known."""
+    summary: str = ""
+    """Result other than a thrust, in words."""
+
+
+def find_answer(path: Path) -> Answer:
+    """Return what an experiment has found."""
+    answers = [
+        Answer(
+            _read_number(result.get("thrust")),
+            _read_number(result.get("thrust_ci95")),
+            _read_number(result.get("total_ci95")),
+            text.line(str(result.get("summary", ""))),
+        )
+        for result in _read_results(path)
+    ]
+    return max(
+        answers,
+        key=lambda answer: -math.inf if answer.thrust is None else answer.thrust,
+        default=Answer(),
+    )
 
 
 def _read_results(path: Path) -> Iterable[Mapping[str, Any]]:
@@ -379,7 +401,7 @@ def _read_struct(path: Path, kind: type[T]) -> T:
             files.read(path, files.MAX_SETTINGS_BYTES, "an experiment"), type=kind
         )
     except FileProblem as problem:
-        raise ConfigError(f"{path}: {problem}") from None
+        raise ConfigError(f"{path}: {problem}; {_OTHER_FOLDER}") from None
     except msgspec.MsgspecError as error:
         raise ConfigError(
             f"{path}: fishd {__version__} cannot read it: {error}; {_OTHER_FOLDER}"

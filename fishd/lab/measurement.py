@@ -17,17 +17,10 @@ from fishd.lab.disturbances import RESPONSE_TIMES_S, Disturbance
 from fishd.lab.drift import MIN_FIT_BLOCKS, Array, Blocks, fit
 from fishd.lab.session import Session, refuse_lost
 from fishd.lab.statistics import Z95, per_watt
+from fishd.lab.swim_plan import plan, rest_settle_time
 
-MEAN_SWIM_S, MEAN_REST_S = 6.0, 2.75
-"""Mean length of a swim and of a rest [s]."""
-MIN_SWIM_S, MIN_REST_S = 4.5, 2.25
-"""Length of the shortest swim and of the shortest rest [s]."""
-GOLDEN_RATIO = (math.sqrt(5.0) - 1.0) / 2.0
-"""Number whose multiples, taken modulo 1, are spread evenly and never repeat."""
 MAX_POWER_CHANGE, MAX_REST_POWER = 0.05, 0.01
 """Largest change of the fin's power within a swim, and largest power at rest, as fractions."""
-MAX_MEASUREMENT_S = 3600.0
-"""Length of the longest measurement [s]."""
 SETTLE_REMEDY = "measure again with a longer --settle"
 DISTURBED_REMARK = (
     "the zero of F_x was disturbed too often for the interval to be trusted; measure again"
@@ -138,7 +131,7 @@ def measure(
         ticks += session.swim(controller, parameters, length) if swims else session.rest(length)
     refuse_lost(ticks, (length for _, length in phases), session.tick)
     samples = to_samples(ticks)
-    measurement = evaluate(samples, session.tick, settle, _rest_settle_time(settle))
+    measurement = evaluate(samples, session.tick, settle, rest_settle_time(settle))
     if not measurement.frequency and len({sample.phi_c for sample in samples if sample.swims}) > 1:
         raise ParameterError(
             "no whole beat is left of a swim; lengthen the swims with a longer --settle"
@@ -250,45 +243,6 @@ def summarise(measurement: ThrustMeasurement, tick: float) -> Summary:
         )[1],
         list(measurement.disturbances),
     )
-
-
-def plan(
-    seconds: float, parameters: Mapping[str, Any], settle: float = SWIM_SETTLE_TIME_S
-) -> list[tuple[bool, float]]:
-    """Return swims (True) and rests (False) in order, with the length of each [s].
-
-    The lengths add up to `seconds`. A slow beat lengthens swims; a long settling time lengthens
-    both. Raises `ParameterError` where two swims do not fit.
-    """
-    frequency = parameters.get("frequency")
-    slow_swim = 3.0 / frequency if isinstance(frequency, int | float) and frequency > 0.0 else 0.0
-    swim = settle + max(MEAN_SWIM_S - SWIM_SETTLE_TIME_S, slow_swim)
-    rest = _rest_settle_time(settle) + MEAN_REST_S - REST_SETTLE_TIME_S
-    if not 2 * swim + 3 * rest <= seconds <= MAX_MEASUREMENT_S:  # NaN is not
-        raise ParameterError(
-            f"a measurement of {seconds:g} s is not possible: {2 * swim + 3 * rest:.4g} to "
-            f"{MAX_MEASUREMENT_S:g} s are needed, for two or more swims of {swim:.3g} s between "
-            f"rests of {rest:.3g} s"
-        )
-    count = math.floor((seconds - rest) / (swim + rest) + 1e-9)
-    shortest = (
-        rest - MEAN_REST_S + MIN_REST_S,
-        settle + max(MIN_SWIM_S - SWIM_SETTLE_TIME_S, slow_swim),
-    )
-    weights = [((GOLDEN_RATIO * (index + 1) / 2) % 1.0) ** 2 for index in range(2 * count + 1)]
-    spare_time = (seconds - count * sum(shortest) - shortest[False]) / sum(weights)
-    return [
-        (bool(index % 2), shortest[index % 2] + spare_time * weight)
-        for index, weight in enumerate(weights)
-    ]
-
-
-def _rest_settle_time(settle: float) -> float:
-    """Return the time after which the fin hangs still in a rest [s].
-
-    settle: time until a swim is steady [s]
-    """
-    return REST_SETTLE_TIME_S + max(0.0, settle - SWIM_SETTLE_TIME_S)
 
 
 def evaluate(

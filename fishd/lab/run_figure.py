@@ -50,16 +50,16 @@ def draw_run(traces: Traces, path: str | os.PathLike[str]) -> None:
         for axis in axes:
             _events(axis, traces, named=axis is axes[0])
         if traces.portrait:
-            portrait, spectral, beat = figure.add_subfigure(grid[1]).subplots(3, 1)
+            portrait, amplitude, density, beat = figure.add_subfigure(grid[1]).subplots(4, 1)
             _portrait(portrait, traces, traces.portrait)
-            _spectrum(spectral, traces, traces.portrait)
+            _spectrum(amplitude, density, traces, traces.portrait)
             _mean_beat(beat, traces, traces.portrait)
 
 
 def _forces(axis: "Axes", traces: Traces) -> None:
     axis.axhline(0.0, color="0.85", linewidth=0.6)
-    axis.plot(traces.time, traces.fy, color=ORANGE, linewidth=0.7, label="$F_y$")
-    axis.plot(traces.time, traces.fx, color=BLUE, linewidth=0.9, label="$F_x$")
+    axis.plot(traces.force_time, traces.fy, color=ORANGE, linewidth=0.7, label="$F_y$")
+    axis.plot(traces.force_time, traces.fx, color=BLUE, linewidth=0.9, label="$F_x$")
     axis.set_ylim(*limits(MIN_FORCE_SPAN, traces.fx, traces.fy))
     axis.set_ylabel(f"force ({traces.unit})")
     _legend(axis)
@@ -149,14 +149,21 @@ def _portrait(axis: "Axes", traces: Traces, samples: slice) -> None:
     axis.set_title(f"phase portrait, last {PORTRAIT_S:g} s")
 
 
-def _spectrum(axis: "Axes", traces: Traces, samples: slice) -> None:
+def _spectrum(amplitude: "Axes", density: "Axes", traces: Traces, samples: slice) -> None:
     if spectral := spectrum(traces, samples):
-        axis.plot(spectral.frequency, spectral.fy, color=ORANGE, linewidth=0.9, label="$F_y$")
-        axis.plot(spectral.frequency, spectral.fx, color=BLUE, linewidth=0.9, label="$F_x$")
-        _legend(axis)
-    axis.set_xlabel("frequency (Hz)")
-    axis.set_ylabel(f"amplitude ({traces.unit})")
-    axis.set_title("spectrum of the forces")
+        for axis, fx, fy in (
+            (amplitude, spectral.fx, spectral.fy),
+            (density, spectral.fx_density, spectral.fy_density),
+        ):
+            axis.plot(spectral.frequency, fy, color=ORANGE, linewidth=0.9, label="$F_y$")
+            axis.plot(spectral.frequency, fx, color=BLUE, linewidth=0.9, label="$F_x$")
+        _legend(amplitude)
+        density.set_yscale("log")
+    amplitude.set_ylabel(f"amplitude ({traces.unit})")
+    amplitude.set_title("amplitudes of the forces")
+    density.set_xlabel("frequency (Hz)")
+    density.set_ylabel(f"density ({traces.unit}²/Hz)")
+    density.set_title("power spectral density")
 
 
 def _mean_beat(axis: "Axes", traces: Traces, samples: slice) -> None:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec import UNSET
 from numpy.typing import NDArray
+from scipy.signal import periodogram
 
 from fishd.controllers import registry
 from fishd.core import text
@@ -81,6 +82,12 @@ class Traces(NamedTuple):
     """Samples of the phase portrait; None where no controller swam."""
     events: list[EventLabel]
 
+    @property
+    def force_time(self) -> Array:
+        """Times of the centres of the intervals of which the forces are means [s]."""
+        steps = np.diff(self.time)
+        return self.time - 0.5 * float(np.median(steps)) if len(steps) else self.time
+
 
 def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
     """Return the part from `begin` to `end` [s]; raises `RecordingError` where it is empty."""
@@ -138,29 +145,34 @@ def traces(run: Run, begin: float = 0.0, end: float = math.inf) -> Traces:
 
 
 class Spectrum(NamedTuple):
-    """Amplitudes of the forces over frequency."""
+    """Amplitudes and power spectral densities of the forces over frequency."""
 
     frequency: Array
     """Frequency, without zero [Hz]."""
     fx: Array
-    """Amplitude of F_x [unit of the forces]."""
+    """Amplitude of F_x [unit of the forces]; a peak has the amplitude of its sine wave."""
     fy: Array
     """Amplitude of F_y [unit of the forces]."""
+    fx_density: Array
+    """One-sided power spectral density of F_x [(unit of the forces)²/Hz]."""
+    fy_density: Array
+    """One-sided power spectral density of F_y [(unit of the forces)²/Hz]."""
 
 
 def spectrum(traces: Traces, samples: slice) -> Spectrum | None:
-    """Return the spectrum of the forces after the last gap; None where fewer than 2 s are left."""
-    time, _, fx, fy = _after_last_gap(traces, samples)
+    """Return the spectrum of the forces after the last gap; None where fewer than 2 s are left.
+
+    A flat-top window gives amplitudes that are right to 0.1 % between the frequencies of the
+    spectrum, too; for the density a Hann window has the finer resolution. Both are those of means
+    over a tick T, in which a frequency f is weaker by sinc(f T).
+    """
+    time, _, *forces = _after_last_gap(traces, samples)
     if len(time) < MIN_SPECTRUM_TICKS or time[-1] - time[0] < MIN_SPECTRUM_S:
         return None
-    window = np.hanning(len(time))
-
-    def amplitudes(force: Array) -> Array:
-        folded: Array = np.abs(np.fft.rfft(window * (force - force.mean())))
-        return folded[1:] * (2.0 / float(window.sum()))
-
-    step = (time[-1] - time[0]) / (len(time) - 1)
-    return Spectrum(np.fft.rfftfreq(len(time), step)[1:], amplitudes(fx), amplitudes(fy))
+    rate = (len(time) - 1) / (time[-1] - time[0])
+    frequency, powers = periodogram(forces, rate, "flattop", scaling="spectrum")
+    _, densities = periodogram(forces, rate, "hann", scaling="density")
+    return Spectrum(frequency[1:], *np.sqrt(2.0 * powers[:, 1:]), *densities[:, 1:])
 
 
 class MeanBeat(NamedTuple):
@@ -169,26 +181,37 @@ class MeanBeat(NamedTuple):
     phase: Array
     """Phase of the beat, from 0, where φ_c becomes positive, to 1."""
     fx: Array
-    """F_x [unit of the forces]."""
+    """F_x [unit of the forces]; the mean over phase is that over all beats."""
     fy: Array
     """F_y [unit of the forces]."""
 
 
 def mean_beat(traces: Traces, samples: slice) -> MeanBeat | None:
-    """Return the mean beat after the last gap; None where there are fewer than two beats."""
+    """Return the mean beat after the last gap; None where there are fewer than two beats.
+
+    A force of a tick is the mean since the tick before, so its integral over time is known at
+    each tick. Each beat is cut into parts of equal phase, about one for each tick, whose means
+    follow from that integral. φ_c holds from its tick to the next; a beat begins where it becomes
+    positive, between the centres of two such intervals.
+    """
     time, phi_c, *forces = _after_last_gap(traces, samples)
-    starts = time[1:][(phi_c[:-1] <= 0.0) & (phi_c[1:] > 0.0)]
-    if len(starts) < 3:
+    before = np.flatnonzero((phi_c[:-2] <= 0.0) & (phi_c[1:-1] > 0.0))
+    if len(before) < 3:
         return None
-    counted = (time >= starts[0]) & (time < starts[-1])
-    beat = np.searchsorted(starts, time[counted], side="right") - 1
-    phase = (time[counted] - starts[beat]) / np.diff(starts)[beat]
-    bins = round(counted.sum() / (len(starts) - 1))
-    place = np.round(phase * bins).astype(int) % bins
-    ticks = np.bincount(place, minlength=bins)
-    filled = ticks > 0
-    fx, fy = (np.bincount(place, force[counted], bins)[filled] / ticks[filled] for force in forces)
-    return MeanBeat(np.flatnonzero(filled) / bins, fx, fy)
+    centres = 0.5 * (time[1:] + time[:-1])
+    share = phi_c[before] / (phi_c[before] - phi_c[before + 1])
+    starts = centres[before] + share * (centres[before + 1] - centres[before])
+    parts = round((starts[-1] - starts[0]) / (len(starts) - 1) / float(np.median(np.diff(time))))
+    ends = np.interp(np.arange(parts * (len(starts) - 1) + 1) / parts, range(len(starts)), starts)
+    lengths = np.diff(ends).reshape(-1, parts).sum(axis=0)
+
+    def mean(force: Array) -> Array:
+        integral = np.concatenate(([0.0], np.cumsum(force[1:] * np.diff(time))))
+        pieces = np.diff(np.interp(ends, time, integral)).reshape(-1, parts)
+        means: Array = pieces.sum(axis=0) / lengths
+        return means
+
+    return MeanBeat((np.arange(parts) + 0.5) / parts, mean(forces[0]), mean(forces[1]))
 
 
 def _after_last_gap(traces: Traces, samples: slice) -> tuple[Array, Array, Array, Array]:

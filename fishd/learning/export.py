@@ -1,8 +1,9 @@
 """Export of a checkpoint, or a model of stable-baselines3, to a file for the controller `ppo`."""
 
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium
 import msgspec
@@ -14,6 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.vec_env import (
@@ -22,6 +24,7 @@ from stable_baselines3.common.vec_env import (
     VecEnv,
     VecEnvWrapper,
     VecMonitor,
+    VecNormalize,
     VecVideoRecorder,
 )
 
@@ -40,7 +43,7 @@ from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
 from fishd.learning.env.perception import Perception
 from fishd.learning.extractors import random_angles
 from fishd.learning.picture_networks import PictureExtractor, network_nodes
-from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
+from fishd.learning.ppo import DeterministicPolicy, MeanAction, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.runs import make_card
 from fishd.learning.settings import EvaluationSettings, TrainingSettings, from_plain
@@ -95,9 +98,8 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
     evaluation = _evaluate(checkpoint, card, policy, perception)
     if evaluation.is_stalled and not force:
         raise PolicyError(
-            f"{checkpoint}: this policy stalls when it swims without exploration: "
-            f"{evaluation.frequency:.2f} Hz, |φ_c| {evaluation.fullness:.0%} of Φ; train longer, "
-            "choose another checkpoint, or export it nevertheless with --force"
+            f"{checkpoint}: {_format_stall(evaluation)}; train longer, choose another checkpoint, "
+            "or export it nevertheless with --force"
         )
     card = _complete_card(card, evaluation, note)
     size = _write(target, card, policy, perception)
@@ -111,8 +113,8 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
         `NEUTRAL_WRAPPERS` and those of rewards
     note: text for the user, stored in the file
 
-    Raises `PolicyError` for any other model, and where the outputs of the file would differ from
-    those of the policy.
+    Warns of a policy that stalls. Raises `PolicyError` for any other model, and where the outputs
+    of the file would differ from those of the policy.
     """
     path = Path(target)
     env = _find_swim_env(model.get_env(), path)
@@ -135,7 +137,23 @@ def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Pa
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
     evaluation = evaluate_in_simulation(env.config, decide, EvaluationSettings())
     _write(path, _complete_card(card, evaluation), policy, env.perception, _observe(env))
+    if evaluation.is_stalled:
+        rollout = cast(OnPolicyAlgorithm, model).n_steps * model.n_envs
+        warnings.warn(
+            f"{path}: {_format_stall(evaluation)}; it learned from "
+            f"{model.num_timesteps // rollout} × {rollout} steps: more updates help, from more "
+            "steps or a smaller n_steps",
+            stacklevel=2,
+        )
     return path
+
+
+def _format_stall(evaluation: Evaluation) -> str:
+    """Return that a policy stalls, with its figures."""
+    return (
+        "this policy stalls when it swims without exploration: "
+        f"{evaluation.frequency:.2f} Hz, |φ_c| {evaluation.fullness:.0%} of Φ"
+    )
 
 
 def _find_swim_env(env: VecEnv | None, path: Path) -> SwimEnv:
@@ -170,12 +188,17 @@ def _check_wrapper(wrapper: Any, path: Path) -> None:
         isinstance(wrapper, gymnasium.RewardWrapper)
         and kind.step is gymnasium.RewardWrapper.step
         and kind.reset is gymnasium.Wrapper.reset
-    )
+    ) or (kind is VecNormalize and not wrapper.norm_obs)
     if kind not in NEUTRAL_WRAPPERS and not is_reward:
+        remedy = {
+            wrappers.NormalizeObservation: "; the observations of a SwimEnv are about 1 already",
+            VecNormalize: " or with norm_obs=False; the observations of a SwimEnv are about 1 "
+            "already",
+        }.get(kind, "")
         raise PolicyError(
             f"{path}: this model was trained behind the wrapper {kind.__name__}, which may change "
             "observations or actions; a policy file has no wrappers, so the policy would swim "
-            "otherwise: train it without that one"
+            f"otherwise: train it without that one{remedy}"
         )
 
 
@@ -344,13 +367,19 @@ def _verify(
             seen = np.concatenate((perception.extractor.see(stacks[index]), row))
         given.append(seen)
         outputs.append(network.run())
-    expected, _ = policy.predict(np.array(given), deterministic=True)
-    worst = float(np.abs(np.array(outputs) - expected[:, 0]).max())
+    expected = policy.predict(np.array(given), deterministic=True)[0][:, 0]
+    worst = float(np.abs(np.array(outputs) - expected).max())
     if not worst <= TOLERANCE:
+        layers = MeanAction(policy)
+        computed = np.clip([layers(row) for row in np.array(given)], -1.0, 1.0)
+        cause = (
+            "this version of onnxruntime computes its layers wrongly: install another one"
+            if np.abs(computed - expected).max() <= TOLERANCE
+            else "the model does more than its layers, which a policy file cannot have"
+        )
         raise PolicyError(
             f"the outputs of the file differ from those of the policy by up to {worst:.2g} of Φ: "
-            "the model has something that a policy file cannot have, or this version of "
-            "onnxruntime is at fault"
+            f"{cause}"
         )
 
 

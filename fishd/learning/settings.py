@@ -241,7 +241,14 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
 class EvaluationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The deterministic evaluations during training."""
 
-    every: Annotated[int, note("Number of updates between two evaluations; 0 for none.", ge=0)] = 2
+    every: Annotated[
+        int,
+        note(
+            "Number of updates between two evaluations; 0 for none. In simulation the untrained "
+            "policy and those of the first 16 updates are evaluated, too.",
+            ge=0,
+        ),
+    ] = 2
     patience: Annotated[
         Annotated[int, Meta(ge=1)] | None,
         unit(

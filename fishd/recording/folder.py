@@ -9,10 +9,15 @@ from typing import NamedTuple
 from fishd.core import files
 from fishd.core.errors import RecordingError
 from fishd.core.schema import suggest
-from fishd.recording.mcap_file import read_metadata
+from fishd.recording.mcap_file import read_outline
 from fishd.recording.numbering import list_files, read_number
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX, is_being_written
-from fishd.recording.reader import open_run
+from fishd.recording.reader import (
+    COUNTED_TOPICS,
+    count_messages,
+    find_repaired_problem,
+    open_run,
+)
 from fishd.recording.summary import Summary, from_metadata
 from fishd.recording.writer import RunWriter
 
@@ -32,8 +37,10 @@ class Overview(NamedTuple):
     finished: bool
     writing: bool
     """True while a process writes it."""
-    damaged: int | None = None
-    """Number of ticks that cannot be read; None if the file is undamaged."""
+    problem: str = ""
+    """Difference between the file and what was recorded, as in `Run.problem`."""
+    recorded_ticks: int | None = None
+    """Number of ticks when the recording ended; None if unknown."""
 
 
 def runs_folder() -> Path:
@@ -146,16 +153,24 @@ def read_overviews(folder: Path) -> Iterator[Overview | RecordingError]:
 
 
 def read_overview(path: Path) -> Overview:
-    """Return an overview of a recording, quickly if it is finished and undamaged.
+    """Return an overview of a recording, quickly if it is finished and nothing of it is missing.
 
     Raise `RecordingError`.
     """
-    entries = read_metadata(path) or {}
-    end = entries.get("fishd.end", {})
+    outline = read_outline(path)
+    end = outline.metadata.get("fishd.end", {}) if outline else {}
     summary = from_metadata(end)
-    if summary is not None and "duration" in end and "fishd.run" in entries:
-        return Overview(run_name(path), path, entries["fishd.run"], summary, True, False)
+    if outline and summary and "duration" in end and "fishd.run" in outline.metadata:
+        counts = count_messages(summary)
+        if all(outline.messages[topic] == counts[topic] for topic in COUNTED_TOPICS):
+            problem = find_repaired_problem(end.get("reason", ""))
+            about = outline.metadata["fishd.run"]
+            return Overview(
+                run_name(path), path, about, summary, True, False, problem, summary.ticks
+            )
     run = open_run(path)
     writing = is_being_written(path)
-    damaged = run.damaged if run.is_damaged else None
-    return Overview(run.name, path, run.about, run.summary, run.finished, writing, damaged)
+    return Overview(
+        run.name, path, run.about, run.summary, run.finished, writing, run.problem,
+        run.recorded_ticks,
+    )  # fmt: skip

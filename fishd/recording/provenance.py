@@ -14,8 +14,8 @@ from fishd import __version__
 
 FORMAT = 3
 """Version of the layout of a recording."""
-Source = Literal["fishd", "simulation"]
-"""Origin of the ticks: a running fishd, whatever its robot, or a run in virtual time."""
+Source = Literal["fishd", "simulation", "import"]
+"""Origin of the ticks: a running fishd, whatever its robot, a run in virtual time, or a table."""
 
 
 def provenance(

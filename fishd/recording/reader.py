@@ -2,6 +2,7 @@
 
 import copy
 import os
+from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
 from itertools import islice
@@ -9,7 +10,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import msgspec
-from mcap.records import Attachment, Channel, Footer, Message, Metadata
+from mcap.records import (
+    Attachment,
+    Channel,
+    Footer,
+    McapRecord,
+    Message,
+    Metadata,
+    Statistics,
+)  # fmt: skip
 from msgspec.structs import replace
 
 from fishd.config import Config, adopt
@@ -41,6 +50,13 @@ T = TypeVar("T")
 TOPICS = dict(enumerate((*CHANNELS, IMAGE_TOPIC), start=1))
 """Topics by the channel numbers of `RunWriter`, for a file whose channel records are damaged."""
 
+COUNTED_TOPICS = {"tick": "tick", "event": "event", IMAGE_TOPIC: "frame"}
+"""Topics whose messages are counted when a recording ends, and the word for a message."""
+
+RECOVERED = "recovered: "
+"""Beginning of the reason of the end in a file that `recover` has written."""
+UNFINISHED_REASON = f"{RECOVERED}the recording was not finished"
+
 MAX_DIGITS = 9
 """Maximum number of digits of the number of a fishd in a recording."""
 MAX_COLUMNS = 100
@@ -56,6 +72,10 @@ class Entry(NamedTuple):
     """JSON, exactly as fishd sent it; that of an older fishd has the present names."""
     log_time: int
     """Time of the message in the file [ns]."""
+
+
+class Repeated:
+    """Placeholder of a message that is in the file again."""
 
 
 class Run:
@@ -78,14 +98,22 @@ class Run:
         """False if the recording was not finished, or is in progress."""
         self.reason = ""
         """Reason of the end; empty unless the recording is finished."""
-        self._ended: Summary | None = None
-        """Summary at the end of the recording."""
+        self._ends: list[Summary] = []
+        """Summary at the end of the recording; several after a merge of recordings."""
+        self._indexed: Counter[str] = Counter()
+        """Number of messages by topic, as the index at the end of the file states it."""
+        self.is_damaged = False
+        """Whether there are parts that cannot be read."""
         self._damages: list[int] = []
-        """Number of ticks before each damaged part that was skipped."""
+        """Number of ticks before each damaged part that may contain ticks."""
+        self._repeated: Counter[str] = Counter()
+        """Number of messages by topic that are in the file again, and are left out."""
+        self._topics = dict(TOPICS)
+        """Topics by the numbers of their channels."""
         self.damage_reason = ""
         """Description of the first damage; empty if unknown."""
         self.entries: list[Entry] = []
-        """All messages of fishd, in the order of arrival."""
+        """All messages of fishd, in the order of arrival, each once."""
         self.is_timed = True
         """Whether ticks that have been read have monotonic times; else its times are unix times."""
         self.frame_heads: list[FrameHead] = []
@@ -204,28 +232,96 @@ class Run:
         """Gaps, in which ticks are missing."""
         return self._tally.gaps
 
-    @property
+    @cached_property
     def summary(self) -> Summary:
-        """Summary of the recording."""
-        return self._tally.summary
+        """Summary of what the file contains.
 
-    @property
-    def is_damaged(self) -> bool:
-        """Whether there are parts that cannot be read."""
-        return bool(self._damages)
+        Its lost ticks include those that were in the file when the recording ended.
+        """
+        summary = self._tally.summary
+        if not self._ends:
+            return summary
+        lost = sum(end.lost_ticks + end.ticks for end in self._ends) - summary.ticks
+        return replace(summary, lost_ticks=max(summary.lost_ticks, lost))
 
     @cached_property
-    def damaged(self) -> int:
-        """Known number of ticks in unreadable parts; raises `RecordingError`.
+    def damaged(self) -> int | None:
+        """Number of ticks that the file has lost; None if unknown. Raises `RecordingError`.
 
         Those between two ticks are in `gaps`, too.
         """
-        if not self._damages:
-            return 0
-        if self._ended is not None:
-            return max(0, self._ended.ticks - len(self.ticks))
-        neighbours = [self.ticks[index - 1 : index + 1] for index in set(self._damages) if index]
-        return sum(max(0, pair[1].seq - pair[0].seq - 1) for pair in neighbours if len(pair) == 2)
+        if self.recorded_ticks is not None:
+            return max(0, self.recorded_ticks - len(self.ticks))
+        lost = 0
+        for index in set(self._damages):
+            before, after = self.ticks[:index][-1:], self.ticks[index : index + 1]
+            if not (before and after and before[0].seq < after[0].seq):
+                return None
+            lost += after[0].seq - before[0].seq - 1
+        return lost
+
+    @property
+    def recorded_ticks(self) -> int | None:
+        """Number of ticks when the recording ended; None if unknown."""
+        return None if self._recorded is None else self._recorded["tick"]
+
+    @property
+    def problem(self) -> str:
+        """Difference between the file and what was recorded, in words; empty if there is none.
+
+        It is `damaged: 10 ticks lost`, with the reason if known, or `not as recorded: 840 ticks
+        instead of 1200`; of a repaired file, what was so before. Raises `RecordingError`.
+        """
+        if self.is_damaged:
+            reason = f" ({self.damage_reason})" if self.damage_reason else ""
+            lost = self.damaged
+            ticks = "an unknown number of ticks" if lost is None else _format_count(lost, "tick")
+            return f"damaged: {ticks} lost{reason}"
+        if differences := self._differences():
+            return f"not as recorded: {'; '.join(differences)}"
+        return find_repaired_problem(self.reason)
+
+    @property
+    def is_as_recorded(self) -> bool:
+        """Whether the file is undamaged, and has what it had when the recording ended."""
+        return not self.is_damaged and not self._differences()
+
+    def _differences(self) -> list[str]:
+        """Return in words how the file differs from what it was when the recording ended."""
+        held, recorded = self._held, self._recorded
+        differences = [
+            f"{_format_count(held[topic], message)} instead of {recorded[topic]}"
+            for topic, message in COUNTED_TOPICS.items()
+            if recorded is not None and held[topic] != recorded[topic]
+        ]
+        if self._repeated:
+            differences.append("repeated messages are read once")
+        if not self.about:
+            differences.append(
+                "its metadata are missing, which mcap filter keeps with --include-metadata and "
+                "--include-attachments"
+            )
+        return differences
+
+    @property
+    def _held(self) -> Counter[str]:
+        """Number of messages in the file by topic, the repeated ones included."""
+        held = Counter(entry.topic for entry in self.entries)
+        held[IMAGE_TOPIC] = len(self.frame_heads)
+        return held + self._repeated
+
+    @property
+    def _recorded(self) -> Counter[str] | None:
+        """Number of messages by topic when the recording ended; None if unknown.
+
+        Without metadata of the end, it is that of the index at the end of the file.
+        """
+        if not self._ends:
+            return self._indexed - self._repeated if self._indexed else None
+        total = Counter[str]()
+        for end in self._ends:
+            total.update(count_messages(end))
+        return total
 
     @cached_property
     def _tally(self) -> Tally:
@@ -251,12 +347,29 @@ class Run:
                 raise RecordingError(f"{self.path}: {error}") from None
 
     def _images(self) -> Iterator[bytes]:
-        topics = dict(TOPICS)
-        for record in read_records(self.path):
-            if isinstance(record, Channel):
-                topics[record.id] = record.topic
-            elif isinstance(record, Message) and topics.get(record.channel_id) == IMAGE_TOPIC:
+        for topic, record in self.records():
+            if topic == IMAGE_TOPIC and isinstance(record, Message):
                 yield record.data
+
+    def records(self) -> Iterator[tuple[str, McapRecord | Damaged | Repeated]]:
+        """Yield all records as `read_records` does, messages with their topics.
+
+        `Repeated` replaces a message that is in the file again, as after a merge with a copy. Raise
+        `RecordingError`.
+        """
+        known = set[int]()
+        for record in read_records(self.path):
+            topic = ""
+            if isinstance(record, Channel):
+                self._topics[record.id] = record.topic
+            elif isinstance(record, Message):
+                topic = self._topics.get(record.channel_id, "")
+                key = hash((topic, record.log_time, record.data))
+                if key in known:
+                    yield topic, Repeated()
+                    continue
+                known.add(key)
+            yield topic, record
 
     def frame(self) -> "DataFrame":
         """Return the ticks as a table: see `ticks_to_frame`; raise `RecordingError`.
@@ -274,35 +387,38 @@ class Run:
         return ticks_to_frame(self.ticks).assign(elapsed=self.times_of("tick"))
 
     def _scan(self) -> None:
-        topics = dict(TOPICS)
         ticks = 0
-        for record in read_records(self.path):
+        for topic, record in self.records():
             self.finished = isinstance(record, Footer)
             if isinstance(record, Message):
-                topic = topics.get(record.channel_id, "")
                 if topic == IMAGE_TOPIC:
                     self._take_frame(self._with_present_names("frame", record.data))
                 elif topic in CHANNELS:
                     payload = self._with_present_names(topic, record.data)
                     self.entries.append(Entry(topic, payload, record.log_time))
                     ticks += topic == "tick"
+            elif isinstance(record, Repeated):
+                self._repeated[topic] += 1
             elif isinstance(record, Damaged):
                 self._damages.append(ticks)
-                self.damage_reason = self.damage_reason or record.reason
-            elif isinstance(record, Channel):
-                topics[record.id] = record.topic
+                self._note_damage(record.reason)
+            elif isinstance(record, Statistics):
+                for number, count in record.channel_message_counts.items():
+                    self._indexed[self._topics.get(number, "")] += count
             elif isinstance(record, Metadata):
                 self._take_metadata(record.name, record.metadata)
             elif isinstance(record, Attachment):
                 try:
                     self._take_attachment(record.name, record.data)
                 except ValueError as error:  # also msgspec.DecodeError
-                    self._damages.append(ticks)
-                    why = f"{text.quoted(record.name)}: {text.error_message(error)}"
-                    self.damage_reason = self.damage_reason or why
-        if not self.about and not (self.is_damaged and self.entries):
+                    self._note_damage(f"{text.quoted(record.name)}: {text.error_message(error)}")
+        if not self.about and not self.entries:
             why = f": {self.damage_reason}" if self.damage_reason else ""
             raise RecordingError(f"{self.path} is an MCAP file, but not a recording of fishd{why}")
+
+    def _note_damage(self, reason: str) -> None:
+        self.is_damaged = True
+        self.damage_reason = self.damage_reason or reason
 
     def _with_present_names(self, kind: str, payload: bytes) -> bytes:
         """Return a message; one with old names gets the present ones."""
@@ -328,7 +444,9 @@ class Run:
         elif name == "fishd.daemon":
             self.daemons.append(rename_keys("daemon", data))
         elif name == "fishd.end":
-            self.reason, self._ended = data.get("reason", ""), from_metadata(data)
+            self.reason, end = data.get("reason", ""), from_metadata(data)
+            if end is not None and end not in self._ends:
+                self._ends.append(end)
 
     def _take_attachment(self, name: str, data: bytes) -> None:
         if name == CONFIG_ATTACHMENT:
@@ -359,6 +477,24 @@ def read(path: str | os.PathLike[str]) -> "DataFrame":
     lab).
     """
     return open_run(path).frame()
+
+
+def count_messages(end: Summary) -> Counter[str]:
+    """Return the number of messages by topic in the summary at the end of a recording."""
+    return Counter({"tick": end.ticks, "event": end.events, IMAGE_TOPIC: end.frames})
+
+
+def find_repaired_problem(reason: str) -> str:
+    """Return what a recovery states of the file that it repaired; empty if it lost nothing known.
+
+    reason: reason of the end of a recording
+    """
+    is_problem = reason.startswith(RECOVERED) and reason != UNFINISHED_REASON
+    return text.line(reason) if is_problem else ""
+
+
+def _format_count(number: int, word: str) -> str:
+    return f"{number} {word}" if number == 1 else f"{number} {word}s"
 
 
 def open_run(path: str | os.PathLike[str]) -> Run:

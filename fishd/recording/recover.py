@@ -8,7 +8,6 @@ from mcap.writer import CompressionType, Writer
 from fishd.core.errors import RecordingError
 from fishd.core.schema import json_schema, schema_name
 from fishd.recording.images import IMAGE_SCHEMA, image_json_schema
-from fishd.recording.mcap_file import read_records
 from fishd.recording.part_file import (
     PART_SUFFIX,
     SUFFIX,
@@ -17,19 +16,18 @@ from fishd.recording.part_file import (
     lock_recording,
     rename_to_final,
 )
-from fishd.recording.reader import TOPICS, Run, open_run
+from fishd.recording.reader import RECOVERED, TOPICS, UNFINISHED_REASON, Run, open_run
 from fishd.recording.summary import to_metadata
 from fishd.recording.writer import CHANNELS, CHUNK_BYTES
 
 RECOVERING_SUFFIX = ".recovering"
 """Suffix of the name of the copy until it is complete."""
-UNFINISHED_REASON = "recovered: the recording was not finished"
-DAMAGED_REASON = "recovered: the recording was damaged, ticks that could not be read: {}"
 
 
 def recover(path: Path) -> Run:
     """Copy the readable part of a recording to a finished one, and open that.
 
+    The reason of its end states what was damaged, or not as recorded.
     `RUN.mcap.part` becomes `RUN.mcap`; a file of another name is kept next to
     `NAME-recovered.mcap`. After a kill, the next call completes the recovery.
     Raise `RecordingError` if there is nothing to recover, or not enough space.
@@ -38,14 +36,14 @@ def recover(path: Path) -> Run:
         raise RecordingError(f"{path} is being recorded or recovered; end that process first")
     run = open_run(path)
     is_part = path.name.endswith(SUFFIX + PART_SUFFIX)
-    if not is_part and run.finished and not run.is_damaged:
+    if not is_part and run.finished and run.is_as_recorded:
         raise RecordingError(f"{path} is finished and undamaged: there is nothing to recover")
     final = path.with_name(run.name + ("" if is_part else "-recovered") + SUFFIX)
     try:
         with lock_recording(path):
             # Left by a kill.
             final.with_name(final.name + RECOVERING_SUFFIX).unlink(missing_ok=True)
-            if is_part and run.finished and not run.is_damaged and not final.exists():
+            if is_part and run.finished and run.is_as_recorded and not final.exists():
                 rename_to_final(path, final)  # the recorder was killed just before
             elif not (is_part and _is_copy(final, run)):
                 _write(run, final)
@@ -61,7 +59,7 @@ def _is_copy(final: Path, part: Run) -> bool:
     if not final.exists():
         return False
     run = open_run(final)
-    return run.finished and not run.is_damaged and run.about == part.about
+    return run.finished and run.is_as_recorded and run.about == part.about
 
 
 def _write(run: Run, final: Path) -> None:
@@ -97,7 +95,7 @@ def _copy(run: Run, file: PartFile) -> None:
             channels[number] = writer.register_channel(topic, "json", schema_id)
         return channels[number]
 
-    for record in read_records(run.path):
+    for _, record in run.records():
         if isinstance(record, Message) and (record.channel_id in {*channels, *TOPICS}):
             writer.add_message(
                 channel_of(record.channel_id),
@@ -121,7 +119,7 @@ def _copy(run: Run, file: PartFile) -> None:
             writer.add_attachment(
                 record.create_time, record.log_time, record.name, record.media_type, record.data
             )
-    reason = DAMAGED_REASON.format(run.damaged) if run.is_damaged else UNFINISHED_REASON
+    reason = f"{RECOVERED}{run.problem}" if run.problem else UNFINISHED_REASON
     writer.add_metadata("fishd.end", to_metadata(run.summary) | {"reason": reason})
     writer.flush()  # type: ignore[no-untyped-call]
     writer.finish()  # type: ignore[no-untyped-call]

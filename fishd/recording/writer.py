@@ -75,13 +75,15 @@ class RunWriter:
         subject: str = "",
         note: str = "",
         extra: Mapping[str, str] | None = None,
+        is_temporary: bool = False,
     ) -> None:
         """
         path: path of the finished file; `.mcap` is added if it is missing
-        source: origin of the ticks: `fishd`, or `simulation` for a run in virtual time
+        source: origin of the ticks: `fishd`, `simulation` for virtual time, `import` for a table
         operator: name of the operator; by default this user
         subject: name of the fish; note: purpose
         extra: further metadata, such as the point of a sweep
+        is_temporary: whether the file is removed after an error, so that none can be recovered
 
         Raises `RecordingError` if the file exists or cannot be created.
         """
@@ -93,6 +95,7 @@ class RunWriter:
         self.stored_seq = 0
         """Number of the latest tick that was written to the kernel; 0 before the first."""
         self._has_failed = False
+        self._is_temporary = is_temporary
         self._axis = Axis()
         self._origin_ns: int | None = None
         """Log time of the first message [ns, unix]."""
@@ -304,6 +307,10 @@ class RunWriter:
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
             else "make the disk writable"
         )
+        if self._is_temporary or not seen.ticks:
+            return RecordingError(
+                f"{self.part}: cannot be written: {error.strerror or error}; {remedy}"
+            )
         return RecordingError(
             f"{self.part}: the recording ends after {stored.duration:.0f} s{lost}: "
             f"{error.strerror or error}; the written part is readable; {remedy}, then run fishctl "

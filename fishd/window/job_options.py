@@ -89,7 +89,9 @@ KINDS: dict[str, type[Struct]] = {
     "resume": ResumeOptions,
 }
 """Options of each kind of job."""
-DRIVING_KINDS = {"measure", "sweep", "compare", "resume"}
+MEASURED_KINDS = {"measure", "sweep", "compare"}
+"""Kinds of jobs whose `seconds` must be enough for two swims between rests."""
+DRIVING_KINDS = MEASURED_KINDS | {"resume"}
 """Kinds of jobs that swim the fish."""
 
 
@@ -109,8 +111,7 @@ def _list_arguments(kind: str, options: Any) -> Iterable[str]:
     if kind == "compare":
         return list(options.contestants)
     if kind == "rerun":
-        pairs = options.parameters.items()
-        return [options.run, *(f"{key}={_format_value(value)}" for key, value in pairs)]
+        return [options.run, *filter(None, [options.controller])]
     return [options.controller]
 
 
@@ -122,15 +123,13 @@ def _list_options(kind: str, options: Any) -> Iterator[tuple[str, Any]]:
                 yield name, value
         if options.seconds:
             yield "for", options.seconds
-    elif kind == "rerun":
-        if options.controller:
-            yield "controller", options.controller
     else:
         for name, value in getattr(options, "parameters", {}).items():
             yield name.replace("_", "-"), value
         if kind == "compare" and options.runs > 1:
             yield "runs", options.runs
-        yield "for", options.seconds
+        if kind != "rerun":
+            yield "for", options.seconds
 
 
 def _format_value(value: Any) -> str:

@@ -8,11 +8,13 @@ from aiohttp import web
 from msgspec import Struct
 
 from fishd.core import text
+from fishd.core.errors import ParameterError
 from fishd.core.signals import ControllerInfo
+from fishd.lab.swim_plan import plan
 from fishd.window.access import AccessControl
 from fishd.window.answers import ApiError, NoArguments, convert, read_body, success
 from fishd.window.fish_link import Busy
-from fishd.window.job_options import DRIVING_KINDS, KINDS
+from fishd.window.job_options import DRIVING_KINDS, KINDS, MEASURED_KINDS
 from fishd.window.jobs import Jobs
 from fishd.window.pages import Pages
 
@@ -67,6 +69,8 @@ class JobRequests:
         options = convert(body.options, KINDS[body.kind], f"{body.kind}: ")
         if getattr(options, "parameters", None):
             _check_parameters(options, link.controllers)
+        if body.kind in MEASURED_KINDS:
+            _check_length(body.kind, options)
 
         def check() -> None:
             self._access.require(request, "drive")
@@ -97,6 +101,14 @@ class JobRequests:
         with self._waiting_for_disk():
             picture = await self._jobs.runs.plot(request.match_info["run"])
         return web.Response(body=picture, content_type="image/png")
+
+
+def _check_length(kind: str, options: Any) -> None:
+    """Raise `ApiError` if the time is too short or too long for a measurement."""
+    try:
+        plan(options.seconds, getattr(options, "parameters", {}))
+    except ParameterError as error:
+        raise ApiError(400, "bad-arguments", f"{kind}: {error}") from None
 
 
 def _check_parameters(options: Any, controllers: Collection[ControllerInfo]) -> None:

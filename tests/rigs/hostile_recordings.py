@@ -233,8 +233,8 @@ def parameters_that_no_controller_has(good: Good) -> bytes:
 
 @file
 def thousands_of_events(good: Good) -> bytes:
-    event = Event(1.0, "info", "mark", "again")
-    return with_messages(good, EVENT, [msgspec.json.encode(event)] * 5000)
+    events = (Event(1.0, "info", "mark", f"again {number}") for number in range(5000))
+    return with_messages(good, EVENT, map(msgspec.json.encode, events))
 
 
 @file
@@ -250,7 +250,8 @@ FILES |= {
     ),
     "chunks-of-zeros": lambda good: with_more(good, *[chunk(bytes(2**25))] * 40),
     "half-a-million-messages": lambda good: with_more(
-        good, chunk(message(TICK, b"") * (2**22 // 31))
+        good,
+        chunk(b"".join(message(TICK, struct.pack("<I", n)) for n in range(2**22 // 35))),
     ),
     "record-of-8-exabytes": lambda good: (
         join(good[:6]) + pack(Opcode.CHUNK, b"x" * 99, 2**63) + join(good[6:])

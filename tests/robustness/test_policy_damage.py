@@ -34,8 +34,8 @@ def test_a_weight_that_is_another_number_is_called_damage() -> None:
     place = content.index(onnx.load_model_from_string(content).graph.initializer[0].raw_data)
     damaged = content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
     assert refusal(damaged) == (
-        "it is damaged: its content does not match its checksum; copy it again, or export it "
-        "again with 'fishctl learn export'"
+        "it is damaged: its content does not match its checksum; copy it again; in a program that "
+        "changes it, call fishd.controllers.policy.checksum.seal as the last step"
     )
 
 

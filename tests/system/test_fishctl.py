@@ -140,7 +140,10 @@ def test_a_fish_has_a_name_which_tells_two_daemons_apart(tmp_path: Path) -> None
         (("set-controller", "sine", "--speed", "1"), "No such option"),
         (("set-parameter", "C", "0.4"), "no controller is running (mode idle)"),
         (("set-parameter", "C"), "every NAME needs a VALUE, such as: C 0.7, or C=0.7"),
-        (("optimise", "square"), "Missing option '--over' NAME[=LOW:HIGH]; see 'fishctl optimise"),
+        (
+            ("optimise", "square"),
+            "no parameter has a range: give one, such as --frequency",
+        ),
         (("set-parameter", "C=0.7", "x"), "every NAME needs a VALUE"),
         (("set-parameter", "C", "0.7", "C=0.3"), "C is given twice"),
         (("status", "--endpoint", "nonsense"), "'nonsense' is not an address"),

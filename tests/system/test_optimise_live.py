@@ -11,7 +11,7 @@ from rigs.processes import EXPERIMENT, Daemon, Process, fishctl, one_line, wait_
 def test_an_interrupted_search_rests_the_fish_and_goes_on(daemon: Daemon, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     table = folder / "rows.csv"
-    words = ["--endpoint", daemon.endpoint, "optimise", "square", "--over", "frequency=1:3"]
+    words = ["--endpoint", daemon.endpoint, "optimise", "square", "--frequency", "1:3"]
     words += ["--on", "live", "--folder", str(folder)]
     searching = Process(*EXPERIMENT, *words)
     wait_until(lambda: table.exists() and table.read_text().count("\n") >= 2)
@@ -33,10 +33,13 @@ def test_an_interrupted_search_rests_the_fish_and_goes_on(daemon: Daemon, tmp_pa
 def test_what_the_fish_cannot_do_is_not_begun(daemon: Daemon, tmp_path: Path) -> None:
     folder = tmp_path / "run"
     words = ["optimise", "square", "--on", "live", "--folder", str(folder)]
-    for over, named in (("frequency=1:30", "(0, 10]"), ("amplitude=0.1:0.6", "(0, 0.42]")):
-        refused = daemon.fishctl(*words, "--over", over)
+    for name, range_, named in (
+        ("frequency", "1:30", "(0, 10]"),
+        ("amplitude", "0.1:0.6", "(0, 0.42]"),
+    ):
+        refused = daemon.fishctl(*words, f"--{name}", range_)
         assert refused.returncode == 1
         assert f"is not within {named}" in refused.stderr
     words[1] = "sine"
-    assert "less than 10 Hz" in one_line(daemon.fishctl(*words, "--over", "frequency=1:10"))
+    assert "less than 10 Hz" in one_line(daemon.fishctl(*words, "--frequency", "1:10"))
     assert not folder.exists()

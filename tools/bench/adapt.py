@@ -1,9 +1,9 @@
-"""Quality of the choice and of the claim of `fishctl adapt`, on harsh fish that differ from the
-model.
+"""Quality of the choice and of the claim of `fishctl adapt`, on fish that differ from the model.
 
-The fish are like those of `tools/bench swims swing`, with other seeds and with all effects of a
-real rig, in random sizes. `adapt` runs on each in virtual time, by default for five minutes of tank
-time. The truth is the mean thrust of the simulated fish, which `adapt` does not use.
+The harsh fish are like those of `tools/bench swims swing`, with other seeds and with all effects of
+a real rig, in random sizes. Foreign fish have a servo of another law. `adapt` runs on each in
+virtual time, by default for five minutes of tank time. The truth is the mean thrust of the
+simulated fish, which `adapt` does not use.
 """
 
 import statistics
@@ -15,12 +15,13 @@ from tempfile import TemporaryDirectory
 from msgspec import Struct
 from msgspec.structs import replace
 
+from common.foreign_fish import best_wave, foreign_fish
 from common.report import JOBS, Options, Report, percent, progress, run_cases, table
 from fishd.config import Start, load
 from fishd.lab.compare.survey import harsh
 from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.session import VirtualSession
-from fishd.learning.adapt.adaptation import Adaptation
+from fishd.learning.adapt.adaptation import Adaptation, add_true_thrusts
 from fishd.learning.adapt.state import AdaptFolder, Contender, Verdict
 from fishd.learning.adapt.verdict import SQUARE
 from fishd.virtual.plant.optimum import best_square_wave
@@ -78,21 +79,26 @@ class _Silent:
         """Ignore a warning."""
 
 
-def adapted(task: tuple[int, int, float]) -> Adapted:
-    """Adapt to one fish; task: seed, steps of the training, tank time [s]."""
-    seed, steps, tank_time = task
-    config = replace(load(None, harsh(seed).overrides), start=Start())
+def adapted(task: tuple[str, int, int, float]) -> Adapted:
+    """Adapt to one fish; task: kind, seed, steps of the training, tank time [s]."""
+    kind, seed, steps, tank_time = task
+    if kind == "foreign":
+        config = foreign_fish(seed)
+        best = best_wave(config)
+    else:
+        config = replace(load(None, harsh(seed).overrides), start=Start())
+        best = best_square_wave(config.plant, config.amplitude_limit).thrust
     header = Header(kind="adapt", on="simulation")
     with (
         TemporaryDirectory() as folder,
-        VirtualSession(config) as session,
         open_experiment(Path(folder) / "adapt", header) as experiment,
     ):
         run = AdaptFolder(experiment)
-        state = Adaptation(session, run, tank_time, steps, 0, _Silent()).run()
+        with VirtualSession(config) as session:
+            state = Adaptation(session, run, tank_time, steps, 0, _Silent()).run()
+        add_true_thrusts(run, config)
     assert state.verdict
     progress(f"fish {seed}", state.verdict.claim)
-    best = best_square_wave(config.plant, config.amplitude_limit).thrust
     contenders = {contender.name: contender for contender in state.contenders}
     return Adapted(seed, best, state.verdict, contenders, state.tank_time)
 
@@ -174,6 +180,7 @@ def _middle_and_worst(shares: list[float], worst: Callable[[list[float]], float]
 
 OPTIONS: Options = {
     **JOBS,
+    "--kind": {"choices": ("harsh", "foreign"), "default": "harsh", "help": "kind of the fish"},
     "--first": {"type": int, "default": FIRST_SEED, "help": "seed of the first fish"},
     "--fish": {"type": int, "default": 10, "help": "number of fish"},
     "--steps": {"type": int, "default": 6400, "help": "steps of each training"},
@@ -184,13 +191,13 @@ OPTIONS: Options = {
 def measure(options: Namespace) -> Report:
     """Return two tables; takes half a minute per fish."""
     seeds = range(options.first, options.first + options.fish)
-    tasks = [(seed, options.steps, options.budget) for seed in seeds]
+    tasks = [(options.kind, seed, options.steps, options.budget) for seed in seeds]
     results = run_cases(adapted, tasks, options.jobs)
     head = (
         "fish | best square wave, mN | verdict | true thrust of the chosen gait, % of the best | "
         "of the square wave found, % of the best | chosen gait ÷ square wave found, measured, % | "
         "the same, true, % | tank time, s"
     )
-    sections = {"bench adapt": table(head, map(row, results))}
-    sections["bench adapt summary"] = summary(results)
+    name = "bench adapt" if options.kind == "harsh" else "bench adapt foreign"
+    sections = {name: table(head, map(row, results)), f"{name} summary": summary(results)}
     return Report(sections, results)

@@ -39,7 +39,7 @@ VERBS: dict[str, tuple[str, float]] = {
     "watch": ("watch --for 20", 14.0),
     "measure": ("measure swing --on live --for 21", 17.0),
     "sweep": ("sweep square --frequency 1,1.5 --on live --for 21", 36.0),
-    "optimise": ("optimise square --over frequency --on live --budget 90", 26.0),
+    "optimise": ("optimise square --frequency : --on live --budget 90", 26.0),
     "compare": ("compare swing sine --on live --for 21 --runs 1", 36.0),
     "identify": ("identify --experiment --on live --for 40", 34.0),
     "adapt": ("adapt --on live --budget 150 --steps 640", 130.0),

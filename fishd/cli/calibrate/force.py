@@ -10,7 +10,7 @@ import click
 from fishd.cli.calibrate import load_files
 from fishd.cli.calibrate.force_dialogue import Dialogue
 from fishd.cli.calibrate.load_files import NEWTONS
-from fishd.cli.options import FiniteRange, RenamedOption, endpoint_option, for_option
+from fishd.cli.options import FiniteRange, endpoint_option, for_option
 from fishd.cli.output import echo
 from fishd.cli.prompts import choose, input_interrupted
 from fishd.client import Fish
@@ -63,8 +63,6 @@ _POOR_RESIDUAL = 0.02
 @click.option(
     "--to",
     "record",
-    cls=RenamedOption,
-    former=("--record",),
     type=click.Path(path_type=Path),
     metavar="FILE",
     help="Write each measured load to this CSV file, which --loads reads.",

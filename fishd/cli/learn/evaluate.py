@@ -10,7 +10,8 @@ import click
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.config import fish_options
-from fishd.cli.options import RenamedOption, for_option, json_option, plot_option
+from fishd.cli.controllers_command import ControllersCommand
+from fishd.cli.options import for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress
 from fishd.config import load
@@ -24,7 +25,7 @@ PIPE_COLUMNS = 1000
 """Width of a table in a file or a pipe, so that nothing is wrapped [columns]."""
 
 
-@click.command()
+@click.command(cls=ControllersCommand)
 @click.argument(
     "contestants",
     nargs=-1,
@@ -34,8 +35,6 @@ PIPE_COLUMNS = 1000
 )
 @click.option(
     "--variation",
-    cls=RenamedOption,
-    former=("--fish",),
     type=click.Choice(["changes", "random", "harsh"]),
     default="harsh",
     show_default=True,
@@ -74,12 +73,12 @@ def evaluate(
     """
     from fishd.lab import drawing
     from fishd.lab.compare import figures
-    from fishd.lab.compare.contestants import parse
+    from fishd.lab.compare.contestants import parse_all
     from fishd.lab.compare.survey import CHANGES, harsh_fish, survey
 
     if picture:
         drawing.check(picture)
-    parsed = [parse(text) for text in contestants]
+    parsed = parse_all(contestants)
     fish = list(CHANGES) if variation != "random" else []
     singles = len(fish)
     fish += harsh_fish() if variation != "changes" else ()

@@ -14,7 +14,7 @@ from fishd.config import load
 @click.command()
 @click.argument("policy", metavar="NAME|FILE", shell_complete=complete_policy)
 @plot_option("the heat map over the mean picture")
-@camera_config_option(former=("--camera",))
+@camera_config_option()
 @for_option("Length of the swim [s]; the first 5 s are left out.", default=15.0, kind=click.FLOAT)
 @json_option
 @fish_options

@@ -21,7 +21,6 @@ from fishd.cli.experiment_options import (
     restore_arguments,
 )
 from fishd.cli.options import (
-    RenamedOption,
     camera_config_option,
     endpoint_option,
     json_option,
@@ -108,8 +107,6 @@ class _Training(click.Command):
 @click.option(
     "--fine-tune",
     "parent",
-    cls=RenamedOption,
-    former=("--from",),
     type=click.Path(path_type=Path),
     metavar="FOLDER",
     help="Begin with the best networks of another run, or with those of one of its checkpoints: "

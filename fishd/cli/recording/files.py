@@ -16,6 +16,7 @@ from fishd.core.addresses import control_address, find_control_address
 from fishd.core.process.interruption import raise_on_first_signal
 from fishd.recording import Run, open_run
 from fishd.recording.folder import FOLDER_VARIABLE, check_new_files, find_recording
+from fishd.recording.reader import RECOVERED
 
 folder_option = click.option(
     "--folder",
@@ -32,8 +33,8 @@ def open_recording(name: str, folder: Path | None) -> Run:
     Raises `RecordingError`.
     """
     run = open_run(find_recording(name, folder))
-    if run.is_damaged:
-        echo(f"fishctl: {run.path}: {format_damage(run.damaged, run.damage_reason)}", err=True)
+    if run.problem:
+        echo(f"fishctl: {run.path}: {run.problem}", err=True)
     for step in run.summary.clock_steps:
         echo(f"fishctl: {run.path}: {step}", err=True)
     if not run.is_timed:
@@ -43,11 +44,6 @@ def open_recording(name: str, folder: Path | None) -> Run:
             err=True,
         )
     return run
-
-
-def format_damage(ticks: int, reason: str = "") -> str:
-    """Return the loss of a damaged file, `damaged: 10 ticks lost`, with the reason if known."""
-    return f"damaged: {format_count(ticks, 'tick')} lost" + (f" ({reason})" if reason else "")
 
 
 def _target_option(suffixes: str) -> Callable[[F], F]:
@@ -171,21 +167,16 @@ def recover(file: str, folder: Path | None, as_json: bool) -> None:
     """
     from fishd.recording.recover import recover as finish
 
-    path = find_recording(file, folder)
-    damaged = open_run(path)
-    run = finish(path)
+    run = finish(find_recording(file, folder))
     summary = run.summary
     if as_json:
-        lost = damaged.damaged if damaged.is_damaged else None
-        print_json({"path": run.path, "damaged": lost, **asdict(summary)})
+        print_json({"path": str(run.path), "problem": run.problem, **asdict(summary)})
         return
     frames = f", {format_count(summary.frames, 'frame')}" if summary.frames else ""
-    loss = (
-        f"; {format_damage(damaged.damaged, damaged.damage_reason)}" if damaged.is_damaged else ""
-    )
+    problem = f"; {run.problem.removeprefix(RECOVERED)}" if run.problem else ""
     echo(
         f"{run.path}: {summary.duration:.1f} s, {format_count(summary.ticks, 'tick')}, "
-        f"{summary.lost_ticks} lost, {format_count(summary.events, 'event')}{frames}{loss}"
+        f"{summary.lost_ticks} lost, {format_count(summary.events, 'event')}{frames}{problem}"
     )
 
 

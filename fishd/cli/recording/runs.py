@@ -1,5 +1,6 @@
 """The verb that lists recordings."""
 
+import shlex
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -11,14 +12,14 @@ from msgspec import Struct
 
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, format_count, print_json
-from fishd.cli.recording.files import folder_option, format_damage
+from fishd.cli.recording.files import folder_option
 from fishd.core import text
 from fishd.core.console import format_power
 from fishd.core.errors import ConfigError, RecordingError
 from fishd.lab.experiment import (
     Header,
     count_rows,
-    find_largest_thrust,
+    find_answer,
     is_in_use,
     list_experiments,
 )
@@ -39,7 +40,7 @@ def runs(folder: Path | None, as_json: bool) -> int:
     'thrust' is the mean while the fish swam, in mN unless another unit is shown, with its 95 %
     confidence interval, which includes the calibration where that is known. If the zero of the
     sensor was never known, it is the mean measured force with drift and offset, and its interval is
-    '?'. An experiment shows the largest of its thrusts.
+    '?'. An experiment shows its result or, before its end, the largest thrust so far.
     'power' is the mean power into the servo. 'lost' counts ticks of fishd that are not in the file.
     """
     place = folder or runs_folder()
@@ -80,7 +81,11 @@ class _ExperimentSummary(Struct):
     """Half-width of the 95 % confidence interval of `thrust`, statistical [N]."""
     total_ci95: float | None = None
     """The same with the calibration; None where that is not known [N]."""
+    summary: str = ""
+    """Result other than a thrust, in words."""
     force_unit: str = "N"
+    command: list[str] = []
+    """Arguments of its verb."""
     problem: str = ""
     """Reason why it cannot be read; empty if it can."""
     number: int = 0
@@ -91,7 +96,7 @@ class _ExperimentSummary(Struct):
         """Return the summary of an experiment."""
         if isinstance(header, ConfigError):
             return cls(path.name, str(path), "–", "–", "", None, "", problem=str(header))
-        thrust, statistical, total = find_largest_thrust(path) or (None, None, None)
+        answer = find_answer(path)
         return cls(
             path.name,
             str(path),
@@ -100,11 +105,10 @@ class _ExperimentSummary(Struct):
             header.began,
             count_rows(path),
             _find_state(path, header),
-            thrust,
-            statistical,
-            total,
+            *answer,
             header.force_unit,
             number=header.number,
+            command=header.command,
         )
 
 
@@ -120,20 +124,19 @@ def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
 
     table = Table(box=None, pad_edge=False)
     table.add_column("experiment", overflow="fold")
-    for head in ("began", "kind", "fish"):
-        table.add_column(head, no_wrap=True)
+    table.add_column("began", no_wrap=True)
+    table.add_column("command", overflow="fold")
     for head in ("rows", "thrust"):
         table.add_column(head, justify="right", no_wrap=True)
-    table.add_column("about", no_wrap=True)
+    table.add_column("about", overflow="fold")
     for experiment in experiments:
         table.add_row(
             text.line(experiment.name),
             _format_start(experiment.began),
-            experiment.kind,
-            experiment.on,
+            text.line(f"{experiment.kind} {shlex.join(experiment.command)}".strip()),
             "–" if experiment.rows is None else str(experiment.rows),
             _format_thrust(experiment),
-            "" if experiment.state == "finished" else experiment.state,
+            "; ".join(filter(None, [experiment.state.replace("finished", ""), experiment.summary])),
         )
     Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
 
@@ -144,7 +147,8 @@ def _to_json(glance: Overview) -> dict[str, Any]:
         "name": glance.name,
         "path": str(glance.path),
         "state": _format_state(glance),
-        "damaged": glance.damaged,
+        "problem": glance.problem,
+        "recorded_ticks": glance.recorded_ticks,
         **msgspec.structs.asdict(glance.summary),
         "about": glance.about,
     }
@@ -201,7 +205,7 @@ def _format_remarks(glance: Overview) -> list[str]:
     restarts = glance.summary.restarts
     return [
         *([state] if state != "finished" else []),
-        *([format_damage(glance.damaged)] if glance.damaged is not None else []),
+        *([glance.problem] if glance.problem else []),
         *([format_count(restarts, "restart")] if restarts else []),
         *([_format_frames(glance.summary)] if glance.summary.frames else []),
         *map(str, glance.summary.clock_steps),

@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
 CHECKSUM_KEY = "fishd.sha256"
 """Key of the checksum in the metadata of an ONNX file."""
+SEAL_REMEDY = "call fishd.controllers.policy.checksum.seal as the last step"
 
 _BLANK = "0" * 64
 
@@ -33,8 +34,8 @@ def check(content: bytes, model: "ModelProto") -> None:
     checksums = [entry.value for entry in model.metadata_props if entry.key == CHECKSUM_KEY]
     if not checksums:
         raise PolicyError(
-            f"its metadata lacks {CHECKSUM_KEY}, the checksum; export it again with 'fishctl learn "
-            "export'"
+            f"its metadata lacks {CHECKSUM_KEY}, the checksum; in the program that made the file, "
+            f"{SEAL_REMEDY}"
         )
     if (
         len(checksums) > 1
@@ -42,8 +43,8 @@ def check(content: bytes, model: "ModelProto") -> None:
         or checksums[0] != _digest(content, checksums[0])
     ):
         raise PolicyError(
-            "it is damaged: its content does not match its checksum; copy it again, or export "
-            "it again with 'fishctl learn export'"
+            "it is damaged: its content does not match its checksum; copy it again; in a program "
+            f"that changes it, {SEAL_REMEDY}"
         )
 
 

@@ -5,6 +5,7 @@ is refused, and the remedy.
 """
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from fishd.controllers.policy import checksum, operators
 from fishd.controllers.policy.card import CARD_KEY, Card, decode
+from fishd.controllers.policy.checksum import SEAL_REMEDY
 from fishd.core import files
 from fishd.core.errors import PolicyError
 from fishd.core.text import describe_error, quoted
@@ -19,8 +21,16 @@ from fishd.core.text import describe_error, quoted
 if TYPE_CHECKING:
     from onnx import GraphProto, ModelProto, TensorProto, ValueInfoProto
 
-EXPORT_REMEDY = "export it with 'fishctl learn export'"
+EXPORT_MODEL = "fishd.learning.export.export_model"
+WRITERS = (
+    "policy files are written by 'fishctl learn export' from the folder of a training, by "
+    f"{EXPORT_MODEL} from a model of stable-baselines3, and by "
+    "fishd.controllers.policy.network.to_onnx from weights"
+)
+"""The writers of policy files, for a file that cannot become one."""
 INPUT, FRAMES, OUTPUT = "observation", "frames", "action"
+MAX_NAMED_TENSORS = 4
+"""Maximum number of inputs or outputs in a message."""
 MAX_FILE_BYTES = 16 * 2**20
 """Maximum size of a file; a policy has about ten thousand weights [bytes]."""
 MISSING_PACKAGE = (
@@ -58,7 +68,7 @@ def parse(content: bytes) -> Card:
     try:
         return _check_model(content, model)
     except (AttributeError, TypeError, UnicodeError):  # text that is not UTF-8 is bytes in onnx
-        raise PolicyError(f"this is not a complete ONNX model; {EXPORT_REMEDY}") from None
+        raise PolicyError(f"this is not a complete ONNX model; {WRITERS}") from None
 
 
 def _check_model(content: bytes, model: "ModelProto") -> Card:
@@ -86,11 +96,16 @@ def _why_hidden(path: Path) -> str:
 
 def _refuse_pickles(content: bytes) -> None:
     if content.startswith(b"\x80"):
-        raise PolicyError(f"this is a pickle, which could run any code; {EXPORT_REMEDY}")
+        raise PolicyError(f"this is a pickle, which could run any code; {WRITERS}")
+    if content.startswith(b"PK") and b"_stable_baselines3_version" in content:
+        raise PolicyError(
+            "this is a model of stable-baselines3, with pickles, which could run any code: load it "
+            f"with env=gymnasium.make('fishd/Swim-v0'), and write it with {EXPORT_MODEL}"
+        )
     if content.startswith(b"PK"):
         raise PolicyError(
             "this is a zip archive as torch writes, with a pickle, which could run any code; "
-            f"{EXPORT_REMEDY}"
+            f"{WRITERS}"
         )
 
 
@@ -105,27 +120,38 @@ def _load_model(content: bytes) -> "ModelProto":
         model = None
     # Almost any bytes are a valid protobuf message with unknown fields.
     if model is None or not (model.ir_version and model.opset_import and model.graph.node):
-        raise PolicyError(f"this is not an ONNX model; {EXPORT_REMEDY}")
+        raise PolicyError(f"this is not an ONNX model; {WRITERS}")
     return model
 
 
 def _card_text(model: "ModelProto") -> str:
     cards = [entry.value for entry in model.metadata_props if entry.key == CARD_KEY]
     if not cards:
+        inputs, outputs = _format_forms(_inputs(model.graph)), _format_forms(model.graph.output)
         raise PolicyError(
             "this ONNX file does not contain the observation, tick and Φ of its training: its "
-            f"metadata lacks {CARD_KEY}; {EXPORT_REMEDY}"
+            f"metadata lacks {CARD_KEY}. Its inputs: {inputs}; its outputs: {outputs}. Write a "
+            f"model of stable-baselines3 with {EXPORT_MODEL}; for any other, name the input "
+            f"'{INPUT}' and the output '{OUTPUT}', float32 of shapes [1, N] and [1, 1], add the "
+            f"card, and {SEAL_REMEDY}"
         )
     if len(cards) > 1:
-        raise PolicyError(f"it has {len(cards)} cards that may contradict one another")
+        raise PolicyError(
+            f"its metadata has {len(cards)} entries {CARD_KEY}, which may contradict one another; "
+            f"keep one, and {SEAL_REMEDY}"
+        )
     return str(cards[0])
 
 
 def _check_ends(graph: "GraphProto", card: Card) -> None:
+    _check_values("inputs", _inputs(graph), network_inputs(card))
+    _check_values("outputs", graph.output, [(OUTPUT, "float32", (1, 1))])
+
+
+def _inputs(graph: "GraphProto") -> "list[ValueInfoProto]":
+    """Return the inputs of a network; older files list the weights, too."""
     weights = {tensor.name for tensor in graph.initializer}
-    inputs = [value for value in graph.input if value.name not in weights]
-    _check_values("inputs", inputs, network_inputs(card))
-    _check_values("outputs", list(graph.output), [(OUTPUT, "float32", (1, 1))])
+    return [value for value in graph.input if value.name not in weights]
 
 
 _TensorForm = tuple[str, str, tuple[int | str, ...]]
@@ -142,17 +168,28 @@ def network_inputs(card: Card) -> list[_TensorForm]:
     return inputs
 
 
-def _check_values(what: str, values: "list[ValueInfoProto]", required: list[_TensorForm]) -> None:
+def _check_values(
+    what: str, values: "Sequence[ValueInfoProto]", required: list[_TensorForm]
+) -> None:
     forms = [_tensor_form(value) for value in values]
     if len(forms) == len(required) and set(forms) == set(required):
         return
-    actual = ", ".join(map(_format_form, forms)) or "none"
     needed = " and ".join(
         f"one {kind} {what[:-1]} of shape [{', '.join(map(str, dims))}] named '{name}'"
         for name, kind, dims in required
     )
     verb = "is" if len(required) == 1 else "are"
-    raise PolicyError(f"its {what}: {actual}; {needed} {verb} needed; {EXPORT_REMEDY}")
+    raise PolicyError(
+        f"its {what}: {_format_forms(values)}; {needed} {verb} needed: change them in the program "
+        f"that made the file, and {SEAL_REMEDY}"
+    )
+
+
+def _format_forms(values: "Sequence[ValueInfoProto]") -> str:
+    """Format inputs or outputs, of many only the first."""
+    forms = [_format_form(_tensor_form(value)) for value in values[:MAX_NAMED_TENSORS]]
+    rest = len(values) - len(forms)
+    return ", ".join(forms + [f"{rest} more"] * (rest > 0)) or "none"
 
 
 def _tensor_form(value: "ValueInfoProto") -> _TensorForm:
@@ -180,7 +217,7 @@ def _check_numbers(graph: "GraphProto") -> None:
     for tensor in graph.initializer:
         _check_tensor(tensor)
     if graph.sparse_initializer:
-        raise PolicyError("its weights are sparse; save them as plain ones")
+        raise PolicyError(f"its weights are sparse; save them as plain ones, and {SEAL_REMEDY}")
     for node in graph.node:
         for attribute in node.attribute:
             if not np.isfinite([attribute.f, *attribute.floats]).all():
@@ -192,7 +229,9 @@ def _check_numbers(graph: "GraphProto") -> None:
             for tensor in (attribute.t, *attribute.tensors):
                 _check_tensor(tensor)
             if attribute.HasField("sparse_tensor") or attribute.sparse_tensors:
-                raise PolicyError("its constants are sparse; save them as plain ones")
+                raise PolicyError(
+                    f"its constants are sparse; save them as plain ones, and {SEAL_REMEDY}"
+                )
 
 
 def _check_tensor(tensor: "TensorProto") -> None:
@@ -200,7 +239,10 @@ def _check_tensor(tensor: "TensorProto") -> None:
 
     what = f"weights '{quoted(tensor.name)}'" if tensor.name else "constants"
     if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
-        raise PolicyError(f"its {what} are in another file; save the model as a single file")
+        raise PolicyError(
+            f"its {what} are in another file; save the model as a single file (torch.onnx.export: "
+            f"external_data=False), and {SEAL_REMEDY}"
+        )
     if tensor.data_type == TensorProto.UNDEFINED:  # an attribute without a tensor
         return
     try:

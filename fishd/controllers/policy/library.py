@@ -54,12 +54,14 @@ def find(text: str) -> Path:
 
 
 def describe_training_folder(path: Path) -> str:
-    """Return a message if the path is a folder of a training or of a checkpoint; else empty."""
-    if not (path.is_dir() and any((at / "settings.yaml").is_file() for at in (path, path.parent))):
+    """Return a message if the path is a training's folder, checkpoint or model; else empty."""
+    folder, what = (path.parent, "part") if path.name == "model.zip" else (path, "the folder")
+    parents = folder, folder.parent
+    if not (folder.is_dir() and any((at / "settings.yaml").is_file() for at in parents)):
         return ""
     return (
-        "is the folder of a training, not a policy file; export it first: fishctl learn export "
-        f"{shlex.quote(str(path))}"
+        f"is {what} of a training, not a policy file; export it first: fishctl learn export "
+        f"{shlex.quote(str(folder))}"
     )
 
 

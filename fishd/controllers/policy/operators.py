@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+from fishd.controllers.policy.checksum import SEAL_REMEDY
 from fishd.core.errors import PolicyError
 from fishd.core.text import error_message, quoted
 
@@ -45,13 +46,17 @@ def check(model: "ModelProto") -> None:
     import onnx
 
     if model.functions:
-        raise PolicyError(f"it defines a custom operator, {quoted(model.functions[0].name)}")
+        raise PolicyError(
+            f"it defines a custom operator, {quoted(model.functions[0].name)}; replace it by those "
+            f"of ONNX with onnx.inliner.inline_local_functions, and {SEAL_REMEDY}"
+        )
     versions = [entry.version for entry in model.opset_import if entry.domain in _ONNX_DOMAINS]
     if len(versions) != 1 or versions[0] not in OPSETS:
         version_list = ", ".join(map(str, versions)) or "none"
         raise PolicyError(
             f"its version of ONNX's operators: {version_list}; one from {OPSETS[0]} to "
-            f"{OPSETS[-1]} is needed"
+            f"{OPSETS[-1]} is needed; convert the model with "
+            f"onnx.version_converter.convert_version, and {SEAL_REMEDY}"
         )
     nodes = model.graph.node
     if len(nodes) > MAX_NODES:

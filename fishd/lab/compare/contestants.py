@@ -1,5 +1,7 @@
 """The contestants of a comparison: controllers with parameters, and policies."""
 
+from collections.abc import Iterable
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,11 +14,12 @@ from fishd.controllers.base import Controller, Limits
 from fishd.controllers.policy import file, library, opening
 from fishd.controllers.policy.controller import PpoParameters
 from fishd.controllers.policy.pilot import Pilot
-from fishd.core import files, strict_yaml
+from fishd.core import files
 from fishd.core.errors import FishdError, ParameterError, PolicyError, UnknownController
-from fishd.core.schema import names_file, suggest
+from fishd.core.schema import names_file, parse_value, suggest
 from fishd.core.signals import Observation
 from fishd.lab.simulation import VirtualRun
+from fishd.lab.sweep.grid import expand_values
 from fishd.virtual.plant.optimum import SteadyState, square_wave
 
 _FREQUENCY_RANGE_HZ = (0.2, 10.0)
@@ -101,13 +104,35 @@ def parse(text: str) -> Contestant:
                 f"'{name}' is not a controller, named policy or {library.SUFFIX} file; {hint}"
             )
         return Contestant(text, "ppo", {"policy": text})
+    fields = {field.name: field for field in registry.describe(name).parameters}
     parameters = {}
     for key, value in registry.split_spec(text)[1]:
         try:
-            parameters[key] = strict_yaml.parse(value, key).data
-        except strict_yaml.YamlProblem as problem:
-            raise ParameterError(f"{text}: {problem}") from None
+            parameters[key] = parse_value(fields[key], value) if key in fields else value
+        except ValueError as error:
+            raise ParameterError(f"{text}: {key}: {error}") from None
     return Contestant(text, name, parameters)
+
+
+def parse_all(texts: Iterable[str]) -> list[Contestant]:
+    """Return the contestants for texts, one for each value of a list or a range of numbers.
+
+    `square:frequency=1.2:2:0.4` are three contestants. Raises `ParameterError`.
+    """
+    return [parse(spec) for text in texts for spec in _expand(text)]
+
+
+def _expand(text: str) -> list[str]:
+    """Return the texts of all combinations of the values in a text."""
+    name = text.partition(":")[0]
+    if name not in registry.names():
+        return [text]
+    numbers = {field.name for field in registry.describe(name).parameters if field.kind == "number"}
+    choices = [
+        [f"{key}={item}" for item in (expand_values(value) if key in numbers else [value])]
+        for key, value in registry.split_spec(text)[1]
+    ]
+    return [":".join(filter(None, (name, ",".join(pairs)))) for pairs in product(*choices)]
 
 
 def absolute(contestant: Contestant) -> Contestant:
@@ -146,7 +171,7 @@ def default_contestants(config: Config) -> list[Contestant]:
     """Return the best square wave on the grid of ticks, `swing`, and the fitting named policies."""
     best = best_on_grid(config).frequency
     contestants = [
-        Contestant(f"square {best:.3f} Hz", "square", {"frequency": best}),
+        Contestant(f"square:frequency={best:.6g}", "square", {"frequency": best}),
         Contestant("swing", "swing", {}),
     ]
     policies = (Contestant(name, "ppo", {"policy": name}) for name in library.names())

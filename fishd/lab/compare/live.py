@@ -12,9 +12,10 @@ from fishd.core.signals import Tick
 from fishd.lab.compare.comparison import Standing, Trace, trace
 from fishd.lab.compare.contestants import Contestant, parse
 from fishd.lab.error_budget import budget
-from fishd.lab.measurement import ThrustMeasurement, measure, plan
+from fishd.lab.measurement import ThrustMeasurement, measure
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.statistics import per_watt, weighted_mean
+from fishd.lab.swim_plan import plan
 
 
 class LiveComparison:

@@ -37,6 +37,10 @@ from fishd.virtual.plant.parameters import PlantParameters
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+    from fishd.recording import Run
+
+    Source = DataFrame | Run | str | os.PathLike[str]
+
 DEFAULT = (
     *("omega0", "xi", "quadratic_drag", "coupling", "servo_speed", "servo_lag"),
     *("thrust_coefficient", "lateral_inertia_ratio", "lateral_drag"),
@@ -70,7 +74,7 @@ MIN_CONTINUATION_S = REST_S + _SETTLE_S + 2.0 * MIN_PASSAGE_S
 
 
 def identify(
-    runs: "DataFrame | str | os.PathLike[str] | Sequence[DataFrame | str | os.PathLike[str]]",
+    runs: "Source | Sequence[Source]",
     *,
     start: PlantParameters | None = None,
     rig: SimulationSettings | None = None,
@@ -79,7 +83,7 @@ def identify(
 ) -> Identification:
     """Fit a fish and its rig to recorded runs.
 
-    runs: tables of ticks (`fishd.recording.read`, `experiment`), or paths of recordings
+    runs: tables of ticks (`fishd.recording.read`, `experiment`), recordings, or their paths
     start: start values, and values of the parameters that are not fitted; by default the fish of
         Fu et al.
     rig: the same for `rotation`; by default the sensor is not rotated
@@ -125,18 +129,19 @@ def _to_list(runs: object) -> list[object]:
 
 
 def _to_frame(run: object) -> "DataFrame":
-    if isinstance(run, str | os.PathLike):
-        from fishd.recording import open_run
+    from fishd.recording import Run, open_run
 
-        recorded = open_run(run)
-        unit = recorded.summary.force_unit
+    if isinstance(run, str | os.PathLike):
+        run = open_run(run)
+    if isinstance(run, Run):
+        unit = run.summary.force_unit
         if unit != "N":
             raise Unidentifiable(
-                f"{recorded.path}: its forces are in {text.quoted(unit)}, not in "
+                f"{run.path}: its forces are in {text.quoted(unit)}, not in "
                 "newtons: the force sensor was not calibrated; run 'fishctl calibrate force' and "
                 "record the fish again"
             )
-        return recorded.frame()
+        return run.frame()
     return run  # type: ignore[return-value]
 
 

@@ -79,7 +79,7 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
     if not usable:
         raise Unidentifiable(
             f"there is no passage of {MIN_PASSAGE_S:g} s without a gap in which the servo has "
-            "pulses; a recording of a fish that swims is needed"
+            "pulses and F_x and F_y are trusted; a recording of a fish that swims is needed"
         )
     return usable
 

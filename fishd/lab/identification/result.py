@@ -172,6 +172,13 @@ class Identification:
             lines += ["estimator:", f"  leak: {leak:.4g}  # s, K_y/K_d"]
         return "\n".join(lines) + "\n"
 
+    @property
+    def summary(self) -> str:
+        """Natural frequency, damping and the share of F_x that is explained, in a line."""
+        omega0, xi = (self[name].value for name in ("omega0", "xi"))
+        explained = self.channels[0].explained
+        return f"omega0={omega0:.4g} rad/s, xi={xi:.4g}, {explained:.1%} of F_x explained"
+
     def to_builtins(self) -> dict[str, Any]:
         """Return everything except the series, for JSON."""
         return {

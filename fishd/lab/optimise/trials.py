@@ -13,11 +13,12 @@ from fishd.core.schema import Field
 from fishd.core.signals import Tick
 from fishd.lab.error_budget import visible_rotation
 from fishd.lab.experiment import Experiment
-from fishd.lab.measurement import MEAN_REST_S, Step, evaluate, to_samples
+from fishd.lab.measurement import Step, evaluate, to_samples
 from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.session import Session, refuse_lost
 from fishd.lab.statistics import per_watt
+from fishd.lab.swim_plan import MEAN_REST_S
 
 MIN_STEADY_S = 1.5
 """Shortest measured time of each candidate, after it has settled [s]."""
@@ -181,32 +182,47 @@ def trial_durations(parameters: Mapping[str, Any]) -> tuple[float, float]:
     return SWIM_SETTLE_TIME_S, SWIM_SETTLE_TIME_S + MIN_STEADY_S
 
 
-def default_range(field: Field, session: Session) -> Range | None:
-    """Return the default range of a parameter; None if it is not bounded on both sides.
+def make_range(field: Field, low: float | None, high: float | None, session: Session) -> Range:
+    """Return the range of a searched parameter; None for an end stands for its default.
+
+    The frequencies of a range have half beats of whole ticks.
+    Raise `ParameterError` for a range that the parameter does not permit, and for an end without
+    a default.
+    """
+    default_low, default_high = _default_ends(field, session)
+    low, high = default_low if low is None else low, default_high if high is None else high
+    if math.isinf(low) or math.isinf(high):
+        which = "lower" if math.isinf(low) else "upper"
+        raise ParameterError(f"{field.name}: it has no {which} bound: give it LOW:HIGH")
+    searched = Range(field.name, low, high)
+    searched.check()
+    _check_bounds(searched, field, session)
+    return (
+        restrict_to_whole_ticks(searched, session.tick) if field.name == "frequency" else searched
+    )
+
+
+def _default_ends(field: Field, session: Session) -> tuple[float, float]:
+    """Return the default ends of the range of a parameter; infinite without a bound.
 
     A frequency is searched from `MIN_FREQUENCY_HZ` to half beats of `MIN_HALF_BEAT_TICKS`, an
     amplitude up to that of the rig. An excluded end is moved inwards by a twentieth of the range.
     """
     low, high = _read_bounds(field)
     if field.name == "amplitude":
-        return Range(field.name, session.amplitude / 20.0, session.amplitude)
-    if math.isinf(low) or math.isinf(high):
-        return None
+        return session.amplitude / 20.0, session.amplitude
     if field.name == "frequency":
-        return Range(
-            field.name,
-            max(low, MIN_FREQUENCY_HZ),
-            min(high, 0.5 / (MIN_HALF_BEAT_TICKS * session.tick)),
-        )
+        return max(low, MIN_FREQUENCY_HZ), min(high, 0.5 / (MIN_HALF_BEAT_TICKS * session.tick))
     margin = (high - low) / 20.0
-    return Range(
-        field.name,
+    if math.isinf(margin):
+        return low, high
+    return (
         low + margin * field.interval.startswith("("),
         high - margin * field.interval.endswith(")"),
     )
 
 
-def check_bounds(searched: Range, field: Field, session: Session) -> None:
+def _check_bounds(searched: Range, field: Field, session: Session) -> None:
     """Raise `ParameterError` if a range exceeds the bounds of its parameter."""
     low, high = _read_bounds(field)
     if field.name == "amplitude":

@@ -65,10 +65,18 @@ def simulate_point(task: Task) -> tuple[PointResult, bytes] | None:
     """Return the result and the recording of a simulated fish at a point; None if stopped."""
     if task.stop.make_check()():
         return None
-    with tempfile.TemporaryDirectory() as folder:
+    try:
+        temporary = tempfile.TemporaryDirectory()
+    except OSError:
+        raise FishdError(
+            "no folder of temporary files can be written: free some space in /tmp, or set TMPDIR"
+        ) from None
+    with temporary as folder:
         extra = {name: str(value) for name, value in task.point.columns().items()}
         path = Path(folder) / "point.mcap"
-        with RunWriter(path, source="simulation", note=task.point.label(), extra=extra) as writer:
+        with RunWriter(
+            path, source="simulation", note=task.point.label(), extra=extra, is_temporary=True
+        ) as writer:
             result: PointResult
 
             def describe_run(run: VirtualRun) -> None:

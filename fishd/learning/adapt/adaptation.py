@@ -7,13 +7,15 @@ from typing import Any, NamedTuple
 from msgspec.structs import replace
 
 from fishd.config import Config, Start
-from fishd.core.errors import FishdError
+from fishd.core import text
+from fishd.core.errors import FishdError, RecordingError
 from fishd.lab import error_budget
 from fishd.lab.experiment import Progress
 from fishd.lab.identification import experiment
-from fishd.lab.measurement import MEAN_REST_S, measure
+from fishd.lab.measurement import measure
 from fishd.lab.session import Session, concerns_one_controller
 from fishd.lab.simulation import simulate
+from fishd.lab.swim_plan import MEAN_REST_S
 from fishd.learning.adapt import steps as do
 from fishd.learning.adapt.state import (
     FISH,
@@ -102,11 +104,20 @@ class Adaptation:
         assert state.excitation
         self._show.at(self._session.used, "fitting a model of the fish, which rests")
         path = self._run.path / state.excitation
-        identification, state.fitted = do.fit(path, self._session.amplitude, self._seed)
+        try:
+            identification, state.fitted = do.fit(path, self._session.amplitude, self._seed)
+        except RecordingError as error:
+            state.excitation = None
+            self._save()
+            raise RecordingError(f"{error}; if resumed, the fish swims it again") from None
         self._run.experiment.write(FISH, identification.to_yaml("fishctl adapt"))
         explained = " and ".join(f"{channel.explained:.1%}" for channel in identification.channels)
-        unused = "" if state.fitted.model.standard_error is not None else ": too little to be used"
-        self._done(f"fit: explains {explained} of F_x and F_y{unused}")
+        self._done(f"fit: explains {explained} of F_x and F_y")
+        if state.fitted.model.standard_error is None:
+            self._show.warn(
+                "fishctl: careful: the fit is not used, the gaits are chosen by measurement "
+                f"alone: {identification.headline}"
+            )
         for remark in identification.remarks:
             self._show.warn(f"fishctl: careful: {remark}")
 
@@ -153,8 +164,8 @@ class Adaptation:
     def _train(self, state: State) -> None:
         assert state.fitted
         if state.fitted.model.standard_error is None:
-            state.trained = Trained(steps=0, refusal="the fit explains too little to train on it")
-            self._done("no policy is trained: the fit explains too little")
+            state.trained = Trained(steps=0, refusal="the fit is not used")
+            self._done("no policy is trained: the fit is not used")
             return
 
         def progress(done: int) -> None:
@@ -163,9 +174,13 @@ class Adaptation:
             doing = f"training, {step + 1} of {self._steps} steps{more}; the fish rests"
             self._show.at(self._session.used, doing)
 
-        state.trained = trained = train_policy(
-            self._config, state.fitted, self._run.path, self._steps, self._seed, progress
-        )
+        try:
+            trained = train_policy(
+                self._config, state.fitted, self._run.path, self._steps, self._seed, progress
+            )
+        except Exception as error:  # what the fish has swum is worth more than a training
+            trained = Trained(steps=0, refusal=f"its training failed: {text.describe_error(error)}")
+        state.trained = trained
         if trained.refusal:
             self._save()
             self._show.warn(f"fishctl: careful: no policy takes part: {trained.refusal}")
@@ -236,7 +251,6 @@ class Adaptation:
                 seconds=seconds,
                 remark=measurement.remark,
                 expected_thrusts=self._simulate_thrusts(state, gait),
-                **_true_thrusts(self._config, self._session, gait),
             )
         )
         measured = error_budget.format_with_budget(
@@ -287,9 +301,14 @@ _SIMULATED_FISH = 8
 """Number of fish of the cloud on which a gait is simulated."""
 
 
-def _true_thrusts(config: Config, session: Session, gait: Gait) -> dict[str, float]:
-    """Return the true thrusts of a gait, known only of a simulated fish; else nothing."""
-    if session.source != "simulation":
-        return {}
-    swum = simulate(config, gait.controller, gait.parameters)
-    return {"true_thrust": swum.mean_thrust, "true_relative_thrust": swum.relative_thrust}
+def add_true_thrusts(run: AdaptFolder, config: Config) -> None:
+    """Add the true thrusts of the gaits of a simulated fish to the state.
+
+    The session must have ended: a virtual Pi can be open only once.
+    """
+    for index, gait in enumerate(run.state.contenders):
+        swum = simulate(config, gait.controller, gait.parameters)
+        run.state.contenders[index] = replace(
+            gait, true_thrust=swum.mean_thrust, true_relative_thrust=swum.relative_thrust
+        )
+    run.save()

@@ -20,9 +20,6 @@ from fishd.learning.adapt.state import Model
 
 Array = NDArray[np.float64]
 
-MIN_EXPLAINED = 0.7
-"""Smallest share of the variance of each force, out of sample, that a fit must explain to be used,
-if it fails an assumption."""
 MODEL_ERROR = 0.01
 """Standard error of a thrust of an identified fish that fails no assumption, as a fraction."""
 REJECTED = 0.01
@@ -37,13 +34,14 @@ _CORRELATED = 0.3
 def model_of(identification: Identification) -> Model:
     """Return the quality of the identified fish as a model for the choice among gaits.
 
-    Where it fails an assumption, the standard error of a thrust is as large as the rms of the force
-    that it does not predict, as a fraction of that of the force.
+    A fish that is not identified is not used. Where one fails an assumption, the standard error of
+    a thrust is as large as the rms of the force that it does not predict, as a fraction of that of
+    the force.
     """
     explained = min(channel.explained_out_of_sample for channel in identification.channels)
     if not identification.failed_assumptions:
         return Model(explained_fraction=explained, standard_error=MODEL_ERROR)
-    if not explained >= MIN_EXPLAINED:
+    if not identification.identified:
         return Model(explained_fraction=explained, standard_error=None)
     error = math.hypot(MODEL_ERROR, math.sqrt(max(0.0, 1.0 - explained)))
     return Model(explained_fraction=explained, standard_error=error)

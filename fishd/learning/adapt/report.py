@@ -16,7 +16,16 @@ from fishd.lab.identification.figure import format_estimate
 from fishd.lab.identification.fit import LOGARITHMIC
 from fishd.lab.identification.result import Estimate
 from fishd.lab.ranking import format_ratio
-from fishd.learning.adapt.state import PAGE, PICTURE, TRAINING, AdaptFolder, Fitted, State, Verdict
+from fishd.learning.adapt.state import (
+    PAGE,
+    PICTURE,
+    TRAINING,
+    AdaptFolder,
+    Contender,
+    Fitted,
+    State,
+    Verdict,
+)
 from fishd.learning.adapt.verdict import NAMES, SQUARE
 from fishd.learning.run_folder.figure import draw_training
 from fishd.virtual.plant.optimum import square_wave
@@ -29,7 +38,7 @@ img { max-width: 100%; } .claim { font-size: 1.3em; } code { background: #f3f3f3
 
 
 def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
-    """Draw the picture and write the page; return the paths of both.
+    """Draw the picture, and write the page and the result; return the paths of the first two.
 
     amplitude: Φ [rad]; again: command line that runs the chosen gait
     Raises `FishdError` where one cannot be written.
@@ -37,7 +46,25 @@ def write(run: AdaptFolder, amplitude: float, again: str) -> tuple[Path, Path]:
     picture = run.path / PICTURE
     draw(run, amplitude, picture)
     run.experiment.write(PAGE, page(run.state, picture.read_bytes(), again))
+    run.experiment.write_result(_result(run.state))
     return picture, run.path / PAGE
+
+
+def _result(state: State) -> dict[str, Any]:
+    """Return the measurement of the chosen gait, and the gait in words."""
+    assert state.verdict
+    gait = next(gait for gait in state.contenders if gait.name == state.verdict.chosen_gait)
+    measured = {name: getattr(gait, name) for name in ("thrust", "thrust_ci95", "total_ci95")}
+    return measured | {"summary": " ".join(["chosen:", *gait_words(gait)])}
+
+
+def gait_words(gait: Contender) -> list[str]:
+    """Return a gait as fishctl takes it: its controller, and its parameters as options."""
+    words = [gait.controller]
+    for name, value in gait.parameters.items():
+        shown = f"{value:.6g}" if isinstance(value, float) else str(value)
+        words += [f"--{name.replace('_', '-')}", shown]
+    return words
 
 
 def draw(run: AdaptFolder, amplitude: float, path: Path) -> None:
@@ -54,22 +81,33 @@ def draw(run: AdaptFolder, amplitude: float, path: Path) -> None:
 
 
 def _draw_fit(axis: Any, fitted: Fitted) -> None:
-    """Draw the widths of the intervals of the parameters that are fitted as logarithms.
+    """Draw the intervals of the parameters that are fitted as logarithms, as in the page's table.
 
-    Others may be near zero, so they have no relative error. Intervals are those for a known K_y/K;
-    one that is withheld has no bar.
+    Others may be near zero, so they have no relative error. Where an interval is narrower if K_y/K
+    is the configured one, that is drawn over it. One that is withheld has no bar.
     """
-    shown = []
-    for name, estimate in _read_estimates(fitted):
-        ends = estimate["ci95_low"], estimate["ci95_high"]
-        low, high = estimate.get("if_ratio_holds") or ends
-        if estimate.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio":
-            width = math.nan if low is None or high is None else high - low
-            shown.append((name, 50.0 * width / abs(estimate["value"])))
-    places = np.arange(len(shown))[::-1]
-    axis.barh(places, [width for _, width in shown], color=BLUE, height=0.6)
-    axis.set_yticks(places, [name for name, _ in shown])
-    axis.set_xlabel("half-width of the 95 % interval, % of the value")
+    shown = [
+        (name, estimate)
+        for name, estimate in _read_estimates(fitted)
+        if estimate.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio"
+    ]
+    bars = {}
+    for place, (_, estimate) in enumerate(shown):
+        whole = estimate["ci95_low"], estimate["ci95_high"]
+        narrow = estimate.get("if_ratio_holds") or (None, None)
+        for (low, high), colour, label in (
+            (whole, GREY, "95 %"),
+            (narrow, BLUE, "95 %, if K_y/K is as configured"),
+        ):
+            if low is not None and high is not None:
+                ends = [100.0 * (end / estimate["value"] - 1.0) for end in (low, high)]
+                bars[label] = axis.barh(
+                    -place, ends[1] - ends[0], left=ends[0], color=colour, height=0.6
+                )
+    axis.legend(bars.values(), bars, fontsize="small", loc="upper right")
+    axis.set_yticks([-place for place in range(len(shown))], [name for name, _ in shown])
+    axis.set_xscale("symlog", linthresh=1.0)
+    axis.set_xlabel("95 % interval, % from the value")
     axis.set_title("the fish, as fitted")
 
 

@@ -119,15 +119,15 @@ class Verdict(Struct, frozen=True, kw_only=True):
     """Whether the measurement alone shows that `chosen_gait` is the best gait."""
     undecided_gaits: list[str]
     """Names of the gaits that may be the best according to the measurement, simplest first."""
-    relative_thrust: float
-    """Relative thrust of the chosen gait."""
-    relative_thrust_ci95_low: float
+    relative_thrust: float | None
+    """Relative thrust of the chosen gait; None if the square wave hardly thrusts."""
+    relative_thrust_ci95_low: float | None
     """Lower end of the 95 % interval of `relative_thrust`, valid whichever gait is chosen."""
-    relative_thrust_ci95_high: float
+    relative_thrust_ci95_high: float | None
     relative_thrusts: dict[str, tuple[float, float, float]]
     """Relative thrust, and its interval, of each gait except the square wave."""
     claim: str
-    """The verdict in a sentence."""
+    """The verdict in one or more sentences, without the last full stop."""
 
 
 class State(Struct, kw_only=True, forbid_unknown_fields=True):

@@ -20,8 +20,6 @@ from fishd.core.errors import PolicyError
 from fishd.lab.identification import DEFAULT, Identification, Unidentifiable, identify
 from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC
 from fishd.lab.identification.result import RIG_PARAMETERS
-from fishd.lab.measurement import MEAN_REST_S, MEAN_SWIM_S
-from fishd.lab.measurement import plan as plan_of
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
     Trial,
@@ -30,6 +28,8 @@ from fishd.lab.optimise.trials import (
     trial_durations,
 )
 from fishd.lab.session import Session
+from fishd.lab.swim_plan import MEAN_REST_S, MEAN_SWIM_S
+from fishd.lab.swim_plan import plan as plan_of
 from fishd.learning.adapt.prior import (
     combine,
     correlation_of_waves,
@@ -64,8 +64,10 @@ MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ = 0.3, 8.0
 """Bounds of the search of square waves, whatever the fit [Hz]."""
 BUDGET = {"excitation": 0.2, "swing": 0.14, "search": 0.2}
 """Shares of the tank time; the comparison uses the remainder."""
-CLOUD_SIZE = 32
-"""Number of fish in the cloud."""
+CLOUD_SIZE, MIN_CLOUD_SIZE = 32, 8
+"""Number of fish in the cloud, and the smallest number with which it is used."""
+MAX_DRAWS = 20
+"""Largest number of draws for each fish of the cloud."""
 EPISODE = 128
 """Steps per episode; each episode swims one fish of the cloud."""
 MAX_NOISE = 0.3
@@ -97,14 +99,15 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
             )
     plant = identified_fish(identification)
     model = model_of(identification)
-    if not best_square_wave(plant, amplitude).thrust > 0.0:
+    cloud = draw_cloud(identification, amplitude, seed)
+    if len(cloud) < MIN_CLOUD_SIZE or not best_square_wave(plant, amplitude).thrust > 0.0:
         model = replace(model, standard_error=None)
     offset, drift = identification["offset_y"], identification.channels[1].drift
     fitted = Fitted(
         plant=plant,
         rig=msgspec.convert(identification.simulation, SimulationSettings),
         offset=max(offset.ci95_high - offset.value, 0.5 * drift),
-        cloud=draw_cloud(identification, seed),
+        cloud=cloud,
         model=model,
         identification=identification.to_builtins(),
     )
@@ -216,21 +219,33 @@ def min_measurement_time(parameters: Mapping[str, Any]) -> float:
 
 
 def draw_cloud(
-    identification: Identification, seed: int = 0, count: int = CLOUD_SIZE
+    identification: Identification, amplitude: float, seed: int = 0, count: int = CLOUD_SIZE
 ) -> tuple[PlantParameters, ...]:
     """Return fish that agree with the data; the first is the identified one itself.
 
     They are drawn from the joint normal distribution of the errors, of logarithms for parameters
-    that are fitted as such, within the bounds of the fit. The errors include those of a misfit.
+    that are fitted as such. The errors include those of a misfit. Draws beyond a bound of the fit
+    and fish that no square wave moves forwards are rejected, so there may be fewer than `count`;
+    but a parameter that is 0 or more may be 0.
+    amplitude: Φ [rad]
     K_y/K is that of the identified fish: no force depends on it as long as the parameters that it
     scales change with it.
     """
     centre = [_mean_of_draws(identification, name) for name in identification.names]
-    draws = np.random.default_rng(seed).multivariate_normal(
-        centre, identification.covariance, count - 1, method="eigh", check_valid="ignore"
-    )
+    chance = np.random.default_rng(seed)
     fitted = identified_fish(identification)
-    return (fitted, *(_fish(fitted, identification.names, z.tolist()) for z in draws))
+    fish = [fitted]
+    for _ in range(MAX_DRAWS):
+        draws = chance.multivariate_normal(
+            centre, identification.covariance, count - 1, method="eigh", check_valid="ignore"
+        )
+        drawn = (_fish(fitted, identification.names, z.tolist()) for z in draws)
+        fish += [
+            plant for plant in drawn if plant and best_square_wave(plant, amplitude).thrust > 0.0
+        ]
+        if len(fish) >= count:
+            break
+    return tuple(fish[:count])
 
 
 def identified_fish(identification: Identification) -> PlantParameters:
@@ -244,13 +259,20 @@ def _mean_of_draws(identification: Identification, name: str) -> float:
     return float(np.log(value)) if name in LOGARITHMIC else value
 
 
-def _fish(fitted: PlantParameters, names: tuple[str, ...], z: list[float]) -> PlantParameters:
+def _fish(
+    fitted: PlantParameters, names: tuple[str, ...], z: list[float]
+) -> PlantParameters | None:
+    """Return a drawn fish; None for one beyond the bounds."""
     drawn = {}
     for name, value in zip(names, z, strict=True):
         low, high = BOUNDS[name]
         plain = float(np.exp(value)) if name in LOGARITHMIC else value
+        if low == 0.0:
+            plain = max(low, plain)
+        if not low <= plain <= high:
+            return None
         if name not in RIG_PARAMETERS:
-            drawn[name] = min(high, max(low, plain))
+            drawn[name] = plain
     return replace(fitted, **drawn)
 
 

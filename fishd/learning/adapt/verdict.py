@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fishd.core.errors import FishdError
 from fishd.lab.ranking import (
     Candidate,
     complexity,
@@ -24,8 +23,8 @@ from fishd.learning.adapt.state import Contender, Model, Verdict
 SQUARE = "square"
 NAMES = {
     "policy": "the policy",
-    "swing": "swing with the C of --C auto",
-    SQUARE: "the best square wave found",
+    "swing": "swing",
+    SQUARE: "the best square wave tried",
 }
 
 
@@ -39,13 +38,16 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
     Thrusts are relative to that of the square wave. Their intervals hold together in 95 % of cases
     (Bonferroni). The relative thrust of the square wave itself is 1, without an error.
 
+    There is none where the thrust of the square wave does not differ clearly from zero.
+
     contenders: measured gaits; one is named `square`
-    Raises `FishdError` where the thrust of the square wave is too small to compare with.
     """
     square = next(contender for contender in contenders if contender.name == SQUARE)
     others = [contender for contender in contenders if contender is not square]
     shares = {
-        contender.name: _relative_thrust(contender, square, len(others)) for contender in others
+        contender.name: share
+        for contender in others
+        if (share := _relative_thrust(contender, square, len(others)))
     }
     ranking = rank([_candidate(contender) for contender in contenders])
     names = [candidate.name for candidate in ranking.undecided]
@@ -57,10 +59,13 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
         reason = _explain_choice(ranking.reason, chosen == names[0], len(left), model)
         claim = format_choice([NAMES[name] for name in names], NAMES[chosen], reason)
         if shares:
-            claim += f"; thrust relative to {NAMES[SQUARE]}: {_format_shares(shares)}"
+            claim += f". Thrusts relative to {NAMES[SQUARE]}: {_format_shares(shares)}"
         if disuse := _explain_disuse(model):
-            claim += f"; {disuse}"
-    relative_thrust, low, high = shares.get(chosen, (1.0, 1.0, 1.0))
+            claim += f". {disuse[0].upper()}{disuse[1:]}"
+    if len(shares) < len(others):
+        claim += f". No relative thrust is known, as {NAMES[SQUARE]} hardly thrusts"
+    known = 1.0 if chosen == SQUARE else None
+    relative_thrust, low, high = shares.get(chosen, (known, known, known))
     return Verdict(
         chosen_gait=chosen,
         is_decided=ranking.is_decided,
@@ -81,28 +86,18 @@ def _candidate(contender: Contender) -> Candidate:
 
 def _relative_thrust(
     contender: Contender, square: Contender, comparisons: int
-) -> tuple[float, float, float]:
-    """Return a relative thrust with its interval; raises `FishdError`."""
+) -> tuple[float, float, float] | None:
+    """Return a relative thrust with its interval; None where that of the square is near zero."""
     widths = [half_width(_candidate(gait), comparisons) for gait in (contender, square)]
-    share = ratio(contender.thrust, widths[0], square.thrust, widths[1])
-    if share is None:
-        raise FishdError(
-            f"the best square wave found thrusts {1e3 * square.thrust:.2f} ± "
-            f"{1e3 * square.thrust_ci95:.2f} mN: too little to differ clearly from zero, so no "
-            "relative thrust is known"
-        )
-    return share
+    return ratio(contender.thrust, widths[0], square.thrust, widths[1])
 
 
 def _not_excluded_by(contenders: Sequence[Contender], names: list[str], model: Model) -> list[str]:
     """Return the undecided gaits that the identified fish does not exclude, in their order."""
+    if model.standard_error is None or model.is_rejected:
+        return names
     expected = np.array([contender.expected_thrusts for contender in contenders]).T
-    if (
-        model.standard_error is None
-        or model.is_rejected
-        or not expected.size
-        or expected[0].min() <= 0.0
-    ):
+    if not expected.size or expected[0].min() <= 0.0:
         return names
     places = range(len(contenders))
     measured = np.array([contender.thrust for contender in contenders])
@@ -138,8 +133,8 @@ def _explain_disuse(model: Model) -> str:
     """Return why the identified fish is not used for a choice; empty where it is used."""
     if model.standard_error is None:
         return (
-            f"the identified fish explains {max(0.0, model.explained_fraction):.0%} of its forces "
-            "only, so it is not used"
+            "the fit is not used for this: it explains "
+            f"{max(0.0, model.explained_fraction):.0%} of the forces"
         )
     if model.is_rejected:
         return "the square waves tried disagree with the identified fish, so it is not used"
@@ -148,10 +143,10 @@ def _explain_disuse(model: Model) -> str:
 
 def _format_win(name: str, shares: dict[str, tuple[float, float, float]]) -> str:
     if name in shares:
-        return f"{NAMES[name]} wins: it thrusts {format_ratio(shares[name])} of {NAMES[SQUARE]}"
+        return f"{NAMES[name]} wins: its thrust is {format_ratio(shares[name])} of {NAMES[SQUARE]}"
     if not shares:
-        return f"{NAMES[SQUARE]} wins: it is the only one that could be measured"
-    return f"{NAMES[SQUARE]} wins; thrust relative to it: {_format_shares(shares)}"
+        return f"{NAMES[name]} wins"
+    return f"{NAMES[SQUARE]} wins. Thrusts relative to it: {_format_shares(shares)}"
 
 
 def _format_shares(shares: dict[str, tuple[float, float, float]]) -> str:

@@ -200,7 +200,7 @@ def read_card(checkpoint: Path) -> Card:
     try:
         return decode(_read_text(checkpoint / CARD))
     except PolicyError as error:
-        raise CheckpointError(f"{checkpoint / CARD}: {error}") from None
+        raise CheckpointError(f"{checkpoint / CARD}: {error}; {_ADVICE}") from None
 
 
 def read_state(checkpoint: Path) -> State:

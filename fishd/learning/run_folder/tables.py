@@ -89,7 +89,9 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     except FileProblem as problem:
         raise ConfigError(f"{path}: {problem}") from None
     except ValueError:
-        raise ConfigError(f"{path}: not a table of evaluations") from None
+        raise ConfigError(
+            f"{path}: not a table of evaluations; move it away, and a new one is begun"
+        ) from None
 
 
 def best_so_far(evaluations: Iterable[Evaluation]) -> list[float]:

@@ -13,7 +13,9 @@ from stable_baselines3.common.logger import KVWriter, Logger, TensorBoardOutputF
 
 from fishd.controllers.policy.card import Card
 from fishd.core.errors import ConfigError
+from fishd.core.files import write_atomically
 from fishd.core.process.lockfile import LockHeld, locked
+from fishd.lab.experiment import RESULT
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder import checkpoints, runs
@@ -27,6 +29,8 @@ MIN_FINAL_MERIT = 0.97
 """Smallest merit with which a training may end before its last step."""
 MIN_IMPROVEMENT = 0.001
 """Smallest rise of the merit that counts as a better policy."""
+_FIGURES = ("thrust", "relative_thrust", "frequency", "fullness", "is_stalled")
+"""Columns of evaluations.csv that are in the TensorBoard log, too."""
 
 
 class ProgressWriter(KVWriter):
@@ -86,8 +90,8 @@ class RunRecorder:
                 self._lock_folder(lock)
             progress = self._open_table("progress.csv", tuple(PROGRESS))
             self._evaluations = self._open_table(EVALUATIONS, Evaluation.__struct_fields__)
-            board = TensorBoardOutputFormat(str(job.folder / "tensorboard"))
-            model.set_logger(Logger(None, [board, ProgressWriter(progress)]))
+            self._board = TensorBoardOutputFormat(str(job.folder / "tensorboard"))
+            model.set_logger(Logger(None, [self._board, ProgressWriter(progress)]))
             self.save()  # from now on, there is always a checkpoint to resume from
             self._lock = lock.pop_all()
 
@@ -96,15 +100,27 @@ class RunRecorder:
         logger = self._model.logger
         logger.record("tank/steps", self.steps)
         logger.record("tank/time", self._env.tank_time)
-        if self._job.settings.evaluation.every and self.latest:
-            for name in ("thrust", "relative_thrust", "frequency", "fullness", "is_stalled"):
-                logger.record(f"evaluation/{name}", float(getattr(self.latest, name)))
+        for key, value in self._evaluation_figures().items():
+            logger.record(key, value)
         logger.dump(self.steps)
+
+    def log_evaluation(self) -> None:
+        """Write the latest evaluation to the TensorBoard log, where no update belongs to it."""
+        figures = self._evaluation_figures()
+        self._board.write(figures, dict.fromkeys(figures, ()), self.steps)
+
+    def _evaluation_figures(self) -> dict[str, float]:
+        """Return the figures of the latest evaluation by their keys in TensorBoard."""
+        if not (self._job.settings.evaluation.every and self.latest):
+            return {}
+        return {f"evaluation/{name}": float(getattr(self.latest, name)) for name in _FIGURES}
 
     def add(self, evaluation: Evaluation) -> Evaluation:
         """Write one row of evaluations.csv; return the evaluation with `best` set."""
         is_best = self.best is None or evaluation.merit >= self.best.merit
-        self.unimproved += 1
+        # The additional evaluations at the start must not end a training earlier.
+        every = self._job.settings.evaluation.every
+        self.unimproved += not every or self.rollouts % every == 0
         if evaluation.merit >= self._plateau + MIN_IMPROVEMENT:
             self._plateau, self.unimproved = evaluation.merit, 0
         return self.add_measured(replace(evaluation, best=is_best and not evaluation.is_stalled))
@@ -148,10 +164,21 @@ class RunRecorder:
             ):
                 self._save("best")
             self._kept = best
+            self._write_result(best)
         if policy_changed or (
             due and (self.checkpoint is None or self.checkpoint.name != f"step-{name}")
         ):
             self.checkpoint = self._save("step")
+
+    def _write_result(self, best: Evaluation) -> None:
+        """Write what `fishctl runs` shows of this training."""
+        result = {
+            "thrust": best.thrust,
+            "thrust_ci95": best.thrust_ci95 or 0.0,  # a simulated fish shows its true thrust
+            "summary": f"{best.relative_thrust:.1%} of the best square wave, after {best.policy} "
+            "steps",
+        }
+        write_atomically(self._job.folder / RESULT, msgspec.json.encode(result))
 
     def close(self) -> None:
         """Close the logs and unlock the folder."""
@@ -283,7 +310,8 @@ class RunRecorder:
     def _open_table(self, name: str, columns: tuple[str, ...]) -> Table:
         table = Table(self._job.folder / name, columns)
         if self._job.resume:
-            table.keep_until(self.steps)
+            # The first checkpoint is older than the evaluation of the untrained policy.
+            table.keep_until(self.steps if self.steps or self.latest else -1)
         return table
 
 

@@ -5,6 +5,8 @@ rollout    n_steps of exploration; the fish then waits at neutral
 update     PPO learns from them
 evaluate   without exploration: on a separate simulated fish, or in the tank
 record     a row in the tables, a checkpoint if one is due, another if the policy is the best yet
+
+In simulation the untrained policy, and the policies of the first updates, are evaluated, too.
 """
 
 import shlex
@@ -38,6 +40,9 @@ from fishd.learning.train.progress import NOT_COUNTED, Display, format_minutes
 from fishd.learning.train.recorder import RunRecorder
 from fishd.learning.train.rollouts import Rollouts
 
+FIRST_UPDATES = 16
+"""Number of updates at the start that are all evaluated in simulation, so that the learning curve
+shows how the thrust rises."""
 _WHERE = {"live": "on the fish of fishd", "simulation": "in simulation"}
 
 
@@ -125,6 +130,8 @@ class Training:
                 self._reset()
             if ended == "finished" and self._extractor and not self._extractor.is_fitted:
                 ended, message = self._excite_randomly()
+            if ended == "finished" and not message:
+                self._evaluate_untrained()
             while recorder.steps < job.settings.steps and ended == "finished" and not message:
                 ended, message = self._update()
         except LinkLost as error:
@@ -227,8 +234,9 @@ class Training:
         recorder.steps = model.num_timesteps
         recorder.rollouts += 1
         every, last = settings.evaluation.every, recorder.steps >= settings.steps
+        first = self._job.on == "simulation" and recorder.rollouts <= FIRST_UPDATES
         try:
-            if every and (last or recorder.rollouts % every == 0):
+            if every and (last or first or recorder.rollouts % every == 0):
                 self._evaluate()
         finally:
             recorder.log()
@@ -240,6 +248,14 @@ class Training:
                 "policy (evaluation.patience)"
             )
         return ("interrupted" if self._stop() and not last else "finished"), ""
+
+    def _evaluate_untrained(self) -> None:
+        """Evaluate the policy before the first update, in simulation; in a tank, it costs time."""
+        recorder, every = self._recorder, self._job.settings.evaluation.every
+        if every and self._job.on == "simulation" and recorder.latest is None:
+            self._evaluate()
+            recorder.log_evaluation()
+            recorder.save(due=False)
 
     def _evaluate(self) -> None:
         """Evaluate the policy without exploration; in a tank, evaluate other candidates, too."""

@@ -59,7 +59,6 @@ const receive = {
     charts.marks.length = 0;
     for (const event of state.events) markEvent(event);
     setStatus(payload.status);
-    document.title = `${state.name} · fishd`;
     document.body.classList.remove("waiting");
     changed();
   },
@@ -140,9 +139,13 @@ const receive = {
 function setStatus(status) {
   if (!status) return;
   state.status = status;
+  document.title = `${shownName()} · fishd`;
   charts.setStatus(status, state.controllers.find(({ name }) => name === status.controller));
   changed();
 }
+
+/** Return the name of the fish: that of the window's configuration, else the one that fishd has in its status. */
+const shownName = () => (state.fish.length > 1 || state.name !== "fish" ? state.name : state.status?.name ?? state.name);
 
 /** Return the parameters that are not the defaults. */
 function ownText(name, parameters) {
@@ -355,7 +358,7 @@ function Head() {
     ${state.fish.length > 1
       ? html`<nav class="tabs" aria-label="Fish"><h1 class="unseen">${state.name}</h1>${state.fish.map((name) => html`<a href=${`?fish=${encodeURIComponent(name)}`}
           aria-current=${name === state.name ? "page" : undefined}>${name}</a>`)}</nav>`
-      : html`<h1>${state.name || "fishd"}</h1>`}
+      : html`<h1>${shownName() || "fishd"}</h1>`}
     ${kind !== "not paired" && html`<span class=${`pill mode ${mode}`} id="mode">${kind === "lost" && state.status ? `was ${modeText}` : modeText}</span>`}
     <span class=${`pill connection ${kind}`} id="connection" title=${message ?? ""}>
       <span class="dot"></span>${kind === "live" ? "live" : kind} <span class="age">${kind === "connecting" || kind === "not paired" ? "" : Number.isFinite(age) ? duration(age) : "no tick yet"}</span></span>

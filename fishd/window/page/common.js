@@ -60,12 +60,18 @@ export function numberIn(text) {
   return text.trim() === "" || !Number.isFinite(value) ? text : value;
 }
 
-/** Return parameters as fishctl takes them: C=0.6 amplitude=0.4. */
+/** Return parameters with their names: C=0.6 amplitude=0.4. */
 export function parametersText(parameters) {
   return Object.entries(parameters ?? {})
     .filter(([, value]) => value !== null)
     .map(([name, value]) => `${name}=${typeof value === "number" ? +value.toPrecision(6) : value}`)
     .join(" ");
+}
+
+/** Return a controller with parameters as fishctl takes it: swing:C=0.6,lead=0.1. */
+export function controllerText(name, parameters) {
+  const values = parametersText(parameters).replaceAll(" ", ",");
+  return values ? `${name}:${values}` : name;
 }
 
 /** An answer of the server that is not the result. */

@@ -207,11 +207,5 @@ export function Drive({ state, act, changed, changeRole, experiment }) {
 export const driverName = ({ driver, session }) =>
   (driver.device && driver.device !== session?.device ? driver.device : "another page");
 
-/** Return a controller with parameters as compare takes it: swing:C=0.6,lead=0.1. */
-export function contestant(controller, parameters) {
-  const values = parametersText(parameters).replaceAll(" ", ",");
-  return values ? `${controller.name}:${values}` : controller.name;
-}
-
 /** Send a request for a fish; used by all buttons. */
 export const request = (fish, path, body) => call("POST", `/api/fish/${encodeURIComponent(fish)}/${path}`, body);

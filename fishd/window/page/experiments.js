@@ -1,6 +1,6 @@
 // Experiments as child processes of the server, with the command line that each ran, and kept runs.
-import { call, duration, fetchPicture, forceUnit, html, interval, number, numberIn, parametersText, recall, remember, sentence, useEffect, useState } from "./common.js";
-import { contestant, defaultOf, selectionOf, shownParameters } from "./controls.js";
+import { call, controllerText, duration, fetchPicture, forceUnit, html, interval, number, numberIn, recall, remember, sentence, useEffect, useState } from "./common.js";
+import { defaultOf, selectionOf, shownParameters } from "./controls.js";
 
 const KINDS = {
   measure: { title: "Measure", text: "Swims and rests in turn; thrust with its 95 % interval." },
@@ -87,7 +87,7 @@ export function Experiments(page) {
     </div>
     <form id="experiment" role="tabpanel" aria-labelledby=${`tab-${form.kind}`} onSubmit=${start}>
       <p class="summary">${KINDS[form.kind].text}</p>
-      ${uses && controller && html`<p class="with">With <b>${[controller.name, parametersText(own)].join(" ").trim()}</b><span class="muted">, as in the panel Controller</span></p>`}
+      ${uses && controller && html`<p class="with">With <b>${controllerText(controller.name, own)}</b><span class="muted">, as in the panel Controller</span></p>`}
       <div class="form">
         ${form.kind === "sweep" && html`<label class="row"><span>Parameter</span>
           <select value=${varied} onChange=${(event) => set("parameter")(event.target.value)}>
@@ -106,7 +106,7 @@ export function Experiments(page) {
       <div class="buttons">
         <button class="primary" disabled=${!mayDrive || !controller}>${form.kind === "simulate" ? "Try on a simulated fish" : KINDS[form.kind].title}</button>
         ${form.kind === "compare" && controller && html`<button type="button"
-          onClick=${() => set("contestants")(`${form.contestants.trim()} ${contestant(controller, own)}`.trim())}>Add ${controller.name}</button>`}
+          onClick=${() => set("contestants")(`${form.contestants.trim()} ${controllerText(controller.name, own)}`.trim())}>Add ${controller.name}</button>`}
       </div>
     </form>
     <ul class="jobs" aria-label="Started experiments">
@@ -202,7 +202,7 @@ function Result({ job, status }) {
   if (!Array.isArray(result) || !result.length) return null;
   return html`<table class="result"><thead><tr><th>${job.kind === "sweep" ? "best point" : "controller"}</th>
     <th class="right">thrust</th></tr></thead><tbody>
-    ${result.map((row) => html`<tr><td>${row.contestant ?? row.controller} ${row.contestant ? "" : parametersText(row.parameters)}</td>
+    ${result.map((row) => html`<tr><td>${row.contestant ?? controllerText(row.controller, row.parameters)}</td>
       <td class="right">${thrust(row.thrust, halfWidthOf(row))}</td></tr>`)}
   </tbody></table>`;
 }
@@ -240,8 +240,8 @@ export function Runs(page) {
           const [factor, unit] = forceUnit(run);
           const half = halfWidthOf(run);
           const [middle, error] = run.thrust == null ? ["", ""] : interval(run.thrust * factor, half == null ? NaN : half * factor);
-          return html`<tr key=${run.name} class=${run.damaged ? "damaged" : ""}>
-            <td>${run.name}${run.damaged && html` <span class="pill small" title=${run.damaged}>damaged</span>`}
+          return html`<tr key=${run.name} class=${run.kind === "recording" && run.problem ? "damaged" : ""}>
+            <td>${run.name}
               ${["running", "recording", "unfinished"].includes(run.state) && html` <span class="pill small">${run.state}</span>`}
               ${run.problem && html`<br /><small>${run.problem}</small>`}</td><td>${run.kind === "recording" ? Object.keys(run.swim_ticks ?? {}).join(", ") || "at rest" : run.kind}</td><td>${begin(run) && shortDate.format(new Date(begin(run)))}</td>
             <td class="right">${run.duration !== undefined ? duration(run.duration) : run.kind === "sweep" && run.rows ? `${run.rows} points` : ""}</td>
@@ -261,16 +261,17 @@ function Run({ run, page }) {
   const { controller, own } = selectionWithOwn(state);
   const mayDrive = state.session?.scope === "drive";
   const { subject, note, operator } = run.about ?? {};
-  const about = [subject, note, operator && `by ${operator}`].filter(Boolean).join("; ");
+  const about = [run.summary, subject, note, operator && `by ${operator}`].filter(Boolean).join("; ");
   const rerun = (options) => () => startJob(page, "rerun", { run: run.name, ...options });
   const resumable = run.state === "unfinished" && run.on === "live" && RESUMABLE.includes(run.kind);
   return html`
     ${about && html`<p>${about}</p>`}
+    ${run.command?.length > 0 && html`<p><code>${["fishctl", run.kind, ...run.command].join(" ")}</code></p>`}
     <p class="muted">${run.path}</p>
     ${run.kind === "recording" && html`<div class="buttons">
       <button type="button" disabled=${!mayDrive} onClick=${rerun({})}>Rerun as recorded</button>
       ${controller && html`<button type="button" disabled=${!mayDrive} onClick=${rerun({ controller: controller.name, parameters: own })}>
-        Rerun with ${[controller.name, parametersText(own)].join(" ").trim()}</button>`}
+        Rerun with ${controllerText(controller.name, own)}</button>`}
       <span class="muted">Runs a controller again on the recorded forces, and compares its commands. The fish rests.</span></div>`}
     ${resumable && html`<div class="buttons"><button type="button" class="primary" disabled=${!mayDrive}
       onClick=${() => startJob(page, "resume", { run: run.name })}>Resume</button>

@@ -13,14 +13,15 @@ from rigs.policy_files import write
 from rigs.processes import fishctl, one_line
 
 from fishd.config import Config, load
-from fishd.core.errors import ConfigError, FishdError
+from fishd.core.errors import ConfigError, FishdError, RecordingError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import Header, open_experiment
+from fishd.lab.parallel import Stop
 from fishd.lab.rerun import rerun
 from fishd.lab.session import Disturbed, VirtualSession
 from fishd.lab.sweep.curves import WholeTicks, find_best_of_whole_ticks, make_curves
 from fishd.lab.sweep.grid import MAX_POINTS, Lengths, Point
-from fishd.lab.sweep.measuring import measure_all, swim
+from fishd.lab.sweep.measuring import Task, measure_all, simulate_point, swim
 from fishd.lab.sweep.results import Result, SweepFolder, select_quantity
 from fishd.recording import open_run
 
@@ -182,6 +183,25 @@ def test_a_table_that_cannot_be_read_says_why(tmp_path: Path) -> None:
         open_folder(tmp_path)
 
 
+def test_a_point_without_space_for_its_recording_names_no_file_that_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> int:
+        raise OSError(ENOSPC, "No space left on device")
+
+    task = Task(SQUARES[0], load(), Lengths(1.0, 2), Stop(str(tmp_path / "stop"), False))
+    with monkeypatch.context() as disk:
+        disk.setattr("fishd.recording.part_file.os.write", full)
+        with pytest.raises(RecordingError) as ended:
+            simulate_point(task)
+    assert str(ended.value).endswith(
+        "point.mcap.part: cannot be written: No space left on device; free some space"
+    )
+    monkeypatch.setattr("tempfile.mkdtemp", full)
+    with pytest.raises(FishdError, match="free some space in /tmp, or set TMPDIR"):
+        simulate_point(task)
+
+
 def test_a_curve_tells_the_best_frequency_in_ticks_or_that_it_lacks_one(tmp_path: Path) -> None:
     folder = open_folder(tmp_path)
     thrusts = {1.4: 0.0227, 1.6: 0.0251, 1.8: 0.0252, 2.0: 0.0238, 2.2: 0.0216, 2.5: 0.0176}
@@ -314,7 +334,7 @@ def test_a_sweep_without_a_single_thrust_says_why_and_draws_nothing(tmp_path: Pa
     assert done.stdout.endswith("rows.csv\n")
 
 
-@pytest.mark.parametrize("verb", [("sweep", "square"), ("optimise", "square", "--over=frequency")])
+@pytest.mark.parametrize("verb", [("sweep", "square"), ("optimise", "square", "--frequency=:")])
 def test_what_cannot_be_drawn_here_is_told_before_anything_swims(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: Sequence[str]
 ) -> None:

@@ -12,6 +12,7 @@ from fishd.core.camera_frames import Stack
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Observation
 from fishd.lab.compare.contestants import best_on_grid
+from fishd.lab.experiment import find_answer
 from fishd.lab.simulation import simulate
 from fishd.learning.env.evaluation import evaluate_in_simulation, judge, worst_on_others
 from fishd.learning.env.fish_variation import draw_edge_fish, draw_fish
@@ -135,6 +136,9 @@ def test_training_keeps_the_policy_that_does_best_on_its_worst_fish(tmp_path: Pa
     assert outcome.best_evaluation
     swimming = [float(row["lowest_relative_thrust"]) for row in rows if row["is_stalled"] == "0"]
     assert outcome.best_evaluation.lowest_relative_thrust == max(swimming)
+    answer = find_answer(outcome.folder)
+    assert answer.thrust == outcome.best_evaluation.thrust
+    assert answer.summary.endswith(f" after {outcome.best_evaluation.policy} steps")
 
 
 @pytest.mark.parametrize(

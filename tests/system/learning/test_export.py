@@ -12,6 +12,7 @@ from rigs.harness import Rig, observe
 from rigs.swimming import NOISY, brief_job
 from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize
 
@@ -87,11 +88,11 @@ def test_a_file_with_other_outputs_is_not_written(
     from fishd.learning import export as exporting
 
     to_onnx = exporting.to_onnx
-    monkeypatch.setattr(  # relu where the policy was trained with tanh
+    monkeypatch.setattr(  # relu where the policy has tanh, as by a fault of the runtime
         exporting, "to_onnx", lambda layers, _, card, sight: to_onnx(layers, "relu", card, sight)
     )
     assert by_force.best
-    with pytest.raises(PolicyError, match="outputs of the file differ from those of the"):
+    with pytest.raises(PolicyError, match=r"differ .* wrongly: install another one"):
         export(by_force.best, tmp_path / "policy.onnx")
     assert list(tmp_path.iterdir()) == []
 
@@ -139,7 +140,12 @@ def own_env(**options: Any) -> Any:
 def test_a_model_of_the_user_becomes_a_policy_file(tmp_path: Path, kind: Any) -> None:
     model = kind("MlpPolicy", own_env(), n_steps=64, seed=4, device="cpu")
     model.learn(64)
-    path = export_model(model, str(tmp_path / "own.onnx"), note="tried on a whim")
+    with pytest.warns(UserWarning, match="this policy stalls") as warned:
+        path = export_model(model, str(tmp_path / "own.onnx"), note="tried on a whim")
+    assert str(warned[0].message).startswith(f"{path}: this policy stalls when it swims without ")
+    assert str(warned[0].message).endswith(
+        "; it learned from 1 × 64 steps: more updates help, from more steps or a smaller n_steps"
+    )
     controller = registry.create("ppo", {"policy": str(path)}, Limits(amplitude=0.3, tick=0.05))
     card = read(path).card
     env = model.get_env()
@@ -154,15 +160,29 @@ def test_a_model_of_the_user_becomes_a_policy_file(tmp_path: Path, kind: Any) ->
     assert set(past.settings) == {"environment"}
 
 
+def test_the_defaults_of_stable_baselines3_with_shorter_rollouts_learn_to_swim(
+    tmp_path: Path,
+) -> None:
+    torch.set_num_threads(1)
+    model = PPO("MlpPolicy", "fishd/Swim-v0", n_steps=256, seed=0, device="cpu")
+    model.learn(2048)
+    past = read(export_model(model, tmp_path / "own.onnx")).card.provenance
+    assert past.relative_thrust is not None
+    assert past.relative_thrust > 0.7
+
+
 def test_wrappers_that_change_nothing_that_the_policy_sees_or_does_are_permitted(
     tmp_path: Path,
 ) -> None:
     monitor = Monitor(wrappers.TimeLimit(own_env(), 100))
     env = wrappers.TransformReward(monitor, lambda r: 2.0 * r)
-    model = PPO("MlpPolicy", VecCheckNan(DummyVecEnv([lambda: env])), n_steps=64, device="cpu")
+    rewards = VecNormalize(DummyVecEnv([lambda: env]), norm_obs=False)
+    model = PPO("MlpPolicy", VecCheckNan(rewards), n_steps=64, device="cpu")
     model.learn(64)
     before = monitor.total_steps
-    assert read(export_model(model, tmp_path / "own.onnx")).card.provenance.steps == 64
+    with pytest.warns(UserWarning, match="this policy stalls"):
+        path = export_model(model, tmp_path / "own.onnx")
+    assert read(path).card.provenance.steps == 64
     assert monitor.total_steps == before, "its fish may be a real one"
 
 
@@ -223,6 +243,16 @@ def in_double_precision() -> PPO:
     return model
 
 
+def with_hook() -> PPO:
+    model = own_ppo()
+    model.policy.action_net.register_forward_hook(lambda _net, _inputs, output: output + 0.1)
+    return model
+
+
+class RecurrentActorCriticPolicy(ActorCriticPolicy):
+    """A policy with the name of that of sb3-contrib's RecurrentPPO."""
+
+
 def squashed() -> PPO:
     options = {"squash_output": True}
     return PPO("MlpPolicy", own_env(), use_sde=True, policy_kwargs=options, device="cpu")
@@ -235,7 +265,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "normalised": (
         lambda: PPO("MlpPolicy", VecNormalize(DummyVecEnv([own_env])), device="cpu"),
-        "behind the wrapper VecNormalize",
+        "behind the wrapper VecNormalize, .* without that one or with norm_obs=False; the",
     ),
     "SAC": (lambda: SAC("MlpPolicy", own_env(), device="cpu"), "of PPO or A2C, not SACPolicy"),
     "ELU": (lambda: own_ppo(activation_fn=torch.nn.ELU), "activation ELU cannot be exported"),
@@ -245,6 +275,11 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "norm": (with_norm, "with linear layers and tanh, not with LayerNorm"),
     "double": (in_double_precision, r"is in float64: call model\.policy\.float\(\)"),
+    "hook": (with_hook, "by up to 0.1 of Φ: the model does more than its layers, which a policy"),
+    "recurrent": (
+        lambda: PPO(RecurrentActorCriticPolicy, own_env(), device="cpu"),
+        "the MlpPolicy of PPO or A2C, not RecurrentActorCriticPolicy",
+    ),
     "squashed": (squashed, "without squash_output"),
 }
 

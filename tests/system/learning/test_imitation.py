@@ -107,7 +107,7 @@ def test_a_child_does_not_imitate_again(tmp_path: Path, imitated: tuple[Outcome,
     display.evaluated = evaluations.append  # type: ignore[method-assign]
     more = {**CHANGES, "steps": 64}
     outcome = train(brief_job(tmp_path / "second", **more, parent=parent), display)
-    assert [evaluation.steps for evaluation in evaluations] == [64]
+    assert [evaluation.steps for evaluation in evaluations] == [0, 64]
     assert outcome.checkpoint
     assert checkpoints.read_state(outcome.checkpoint).imitated
 

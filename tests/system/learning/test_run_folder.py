@@ -117,6 +117,15 @@ def test_endlessly_nested_json_is_one_line(run: Path, name: str, message: str, k
         assert message in complaint(reader, run)
 
 
+@pytest.mark.parametrize("text", ["", "{", "[]", "\0" * 99])
+def test_a_damaged_card_is_one_line_with_a_remedy(run: Path, text: str) -> None:
+    card = run / STEP / "card.json"
+    card.write_text(text, encoding="utf-8")
+    message = complaint(READERS[f"{STEP}/card.json"], run)
+    assert message.startswith(f"{card}: its card is not ")
+    assert message.endswith("; move this checkpoint away to resume from the previous one")
+
+
 def test_an_archive_that_would_fill_the_memory_is_refused(run: Path) -> None:
     with ZipFile(run / STEP / "model.zip", "w", ZIP_DEFLATED, compresslevel=1) as archive:
         for number in range(5):
@@ -175,7 +184,8 @@ def test_the_best_is_the_one_that_was_saved_last_whatever_the_clock_was(
 def test_a_table_of_another_kind_is_one_line(run: Path) -> None:
     (run / "evaluations.csv").write_text("a,b\n1,2\n", encoding="utf-8")
     file = run / "evaluations.csv"
-    assert complaint(read_evaluations, run) == f"{file}: not a table of evaluations"
+    remedy = "move it away, and a new one is begun"
+    assert complaint(read_evaluations, run) == f"{file}: not a table of evaluations; {remedy}"
 
 
 def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> None:
@@ -190,8 +200,9 @@ def test_a_kill_between_table_and_checkpoint_leaves_no_gap(tmp_path: Path) -> No
     with pytest.raises(KeyboardInterrupt):
         train(job, Killed())
     train(replace(job, resume=True))
-    for name in ("progress.csv", "evaluations.csv"):
-        assert [row["steps"] for row in rows(job.folder / name)] == ["64", "128", "192", "256"]
+    updates = ["64", "128", "192", "256"]
+    for name, steps in (("progress.csv", updates), ("evaluations.csv", ["0", *updates])):
+        assert [row["steps"] for row in rows(job.folder / name)] == steps
 
 
 def test_a_row_cut_off_by_a_kill_is_dropped_even_if_only_a_digit_is_missing(run: Path) -> None:
@@ -203,7 +214,7 @@ def test_a_row_cut_off_by_a_kill_is_dropped_even_if_only_a_digit_is_missing(run:
     assert table.path.read_text() == "steps,std\n64,0.75\n"
     with (run / "evaluations.csv").open("a", encoding="utf-8") as file:
         file.write("128,0.")
-    assert [evaluation.steps for evaluation in read_evaluations(run)] == [64]
+    assert [evaluation.steps for evaluation in read_evaluations(run)] == [0, 64]
 
 
 def test_a_run_in_progress_is_not_resumed_by_another(tmp_path: Path) -> None:

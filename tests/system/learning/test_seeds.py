@@ -120,7 +120,7 @@ def test_every_seed_has_a_folder_and_all_share_a_table(two: tuple[Path, Done]) -
     assert "latest policies of 2 seeds" in done.stdout
     with (run / "seeds.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert [row["steps"] for row in rows] == ["64", "128"]
+    assert [row["steps"] for row in rows] == ["0", "64", "128"]
     assert (run.parent / "seeds.png").read_bytes().startswith(b"\x89PNG")
     first, second = (read_evaluations(run / f"seed-{index}") for index in (0, 1))
     assert first != second
@@ -146,7 +146,7 @@ def test_a_seed_that_fails_is_reported_and_the_others_continue(tmp_path: Path) -
     outcomes = train_seeds(job, 4, jobs=1, ended=block_folder)
     assert [outcome.ended for outcome in outcomes] == ["finished", "finished", "failed", "finished"]
     assert "seed-2" in outcomes[2].message
-    assert len((folder / "seeds.csv").read_text().splitlines()) == 3
+    assert len((folder / "seeds.csv").read_text().splitlines()) == 4
 
 
 def test_ctrl_c_ends_all_seeds_with_a_checkpoint_each(tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_the_seed_of_a_killed_process_is_resumed(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "latest policies of 2 seeds" in done.stdout
     evaluations = read_evaluations(run / "seed-0")
-    assert [evaluation.steps for evaluation in evaluations] == list(range(64, 257, 64))
+    assert [evaluation.steps for evaluation in evaluations] == list(range(0, 257, 64))
 
 
 def test_a_finished_seed_whose_outcome_was_lost_is_finished(tmp_path: Path) -> None:

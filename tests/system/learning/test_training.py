@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from rigs.processes import Subscriber, running, sets
 from rigs.swimming import BRIEF, NOISY, Failing, Losing, Resting, brief_job, rows
 from stable_baselines3.common.save_util import load_from_zip_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from fishd.controllers.policy.card import Layout
 from fishd.core.errors import ConfigError
@@ -22,7 +23,7 @@ from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import EnvironmentSettings, EvaluationSettings, PpoSettings
 from fishd.learning.train.jobs import Job, Outcome
 from fishd.learning.train.progress import Display
-from fishd.learning.train.training import Training, train
+from fishd.learning.train.training import FIRST_UPDATES, Training, train
 
 
 @dataclass
@@ -99,7 +100,7 @@ def test_a_run_folder_contains_settings_and_progress(brief: tuple[Job, Outcome])
     assert [row["steps"] for row in table] == ["64", "128"]
     assert all(float(row["tank_time"]) > 0.0 for row in table)
     assert all(value for row in table for value in row.values())
-    assert [row["steps"] for row in rows(job.folder / "evaluations.csv")] == ["64", "128"]
+    assert [row["steps"] for row in rows(job.folder / "evaluations.csv")] == ["0", "64", "128"]
     assert list((job.folder / "tensorboard").glob("events.out.tfevents.*"))
     assert outcome.checkpoint == job.folder / "step-000128"
     assert outcome.tank_time == pytest.approx(float(table[-1]["tank_time"]))
@@ -185,11 +186,67 @@ def test_a_training_that_has_converged_ends_before_its_last_step(tmp_path: Path)
     assert again.steps >= outcome.steps + 2 * 64
 
 
+def test_the_learning_curve_begins_at_step_zero_and_has_a_point_for_each_early_update(
+    tmp_path: Path,
+) -> None:
+    quick = replace(BRIEF.ppo, n_epochs=1)
+    evaluation = replace(BRIEF.evaluation, every=6, seconds=2.0, settle=1.0)
+    witness = Witness()
+    job = brief_job(tmp_path / "run", steps=64 * 26, ppo=quick, evaluation=evaluation)
+    train(job, witness)
+    updates = [*range(FIRST_UPDATES + 1), 18, 24, 26]
+    assert [e.steps for e in witness.evaluations] == [64 * update for update in updates]
+    board = EventAccumulator(str(job.folder / "tensorboard")).Reload()
+    curve = board.Scalars("evaluation/relative_thrust")
+    assert [point.step for point in curve] == [64 * update for update in range(27)]
+    assert curve[0].value == pytest.approx(witness.evaluations[0].relative_thrust)
+
+
+def test_early_evaluations_do_not_end_a_training_earlier(tmp_path: Path) -> None:
+    evaluation = EvaluationSettings(every=4, patience=2)
+    job = brief_job(tmp_path / "run", evaluation=evaluation)
+    recorder = Training(job, SimulatedLink(job.config), Display(), lambda: False)._recorder
+    good = Evaluation(
+        thrust=0.02, relative_thrust=0.99, frequency=1.7, fullness=1.0, is_stalled=False
+    )
+    for update in range(1, 13):
+        recorder.rollouts = update
+        recorder.add(good)
+        assert recorder.has_converged == (update >= 8)
+    recorder.close()
+
+
+def test_the_best_policy_may_be_the_one_that_a_training_began_with(
+    tmp_path: Path, by_force: Outcome
+) -> None:
+    spoiling = replace(BRIEF.ppo, learning_rate=1.0, final_learning_rate=1.0)
+    parent = by_force.best
+    assert parent
+    outcome = train(brief_job(tmp_path / "run", steps=64, ppo=spoiling, parent=parent))
+    assert outcome.best == tmp_path / "run" / "best-000000"
+    assert same(parameters(outcome.best), parameters(parent))
+
+
+def test_a_training_that_was_killed_before_its_first_update_is_resumed_with_one_row_for_step_zero(
+    tmp_path: Path,
+) -> None:
+    class Killed(Display):
+        def step(self, tank_time: float) -> None:
+            raise KeyboardInterrupt
+
+    job = brief_job(tmp_path / "run", steps=64)
+    with pytest.raises(KeyboardInterrupt):
+        train(job, Killed())
+    assert [row["steps"] for row in rows(job.folder / "evaluations.csv")] == ["0"]
+    train(replace(job, resume=True))
+    assert [row["steps"] for row in rows(job.folder / "evaluations.csv")] == ["0", "64"]
+
+
 def test_a_policy_that_holds_still_is_marked_and_never_the_best(tmp_path: Path) -> None:
     timid = PpoSettings(n_steps=64, n_epochs=1, learning_rate=1e-9, final_learning_rate=1e-9)
     job = brief_job(tmp_path / "run", ppo=timid)  # hardly learns
     outcome = train(job)
-    assert [row["is_stalled"] for row in rows(job.folder / "evaluations.csv")] == ["1", "1"]
+    assert [row["is_stalled"] for row in rows(job.folder / "evaluations.csv")] == ["1"] * 3
     assert outcome.best is None
 
 

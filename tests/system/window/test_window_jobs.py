@@ -152,6 +152,9 @@ def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: WindowProce
             {"controller": "ppo", "parameters": {"policy": "/etc/passwd"}},
             "bad-arguments",
         ),
+        ("measure", {"controller": "square", "seconds": 3}, "bad-arguments"),
+        ("sweep", {"controller": "square", "seconds": 20}, "bad-arguments"),
+        ("compare", {"contestants": ["swing"], "seconds": 4000}, "bad-arguments"),
         ("record", {"name": "../above"}, "bad-arguments"),
         ("record", {"name": "-x"}, "bad-arguments"),
         ("record", {"name": "line\n"}, "bad-arguments"),
@@ -163,7 +166,7 @@ def test_a_simulated_fish_swims_first_and_its_curve_is_drawn(window: WindowProce
         ("simulate", {"controller": "square", "jobs": 9}, "bad-arguments"),
     ],
 )
-def test_no_words_of_a_command_line_come_from_a_page(
+def test_neither_words_of_a_command_line_nor_impossible_times_come_from_a_page(
     window: WindowProcess, kind: str, options: Any, code: str
 ) -> None:
     async def test() -> None:

@@ -438,7 +438,7 @@ def test_a_stored_run_is_opened_and_another_controller_is_run_on_it(
         expect(page.locator("#runs")).to_contain_text("a; $(b) 'c'")
         expect(page.locator("#runs img")).to_be_visible()
         page.get_by_role("button", name="Rerun with sine").click()
-        expect(page.locator(".job code").first).to_contain_text("--controller sine")
+        expect(page.locator(".job code").first).to_contain_text(" sine")
         expect(page.locator(".job.done")).to_have_count(2)
         expect(page.locator(".job").first).to_contain_text("sine in place of swing")
         assert complaints == []

@@ -10,6 +10,7 @@ from click.testing import CliRunner, Result
 from fishd.cli.main import fishctl
 from fishd.config import load
 from fishd.core.errors import ConfigError, FishdError
+from fishd.lab.experiment import find_answer
 
 
 def invoke(*arguments: str) -> Result:
@@ -29,6 +30,7 @@ def test_an_experiment_becomes_a_configuration_a_recording_and_a_picture(tmp_pat
     assert f"{fish}: written; to swim it: fishctl simulate swing --config {fish}" in done.stdout
     assert load(fish).plant.omega0 == pytest.approx(11.0, rel=0.01)
     assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert find_answer(folder).summary.startswith("omega0=1")
 
     words = ("--fit", "omega0, xi, coupling", "--fix", "coupling", "--set", "plant.omega0=11")
     second = invoke(str(record), *words, "--json")

@@ -37,6 +37,18 @@ def test_a_run_folder_in_place_of_a_policy_is_to_be_exported_first(
     )
 
 
+def test_the_model_of_a_checkpoint_in_place_of_a_policy_is_to_be_exported_first(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "best-256").mkdir()
+    (tmp_path / "settings.yaml").touch()
+    (tmp_path / "best-256" / "model.zip").write_bytes(b"PK")
+    assert one_line(fishctl("compare", f"{tmp_path}/best-256/model.zip")).endswith(
+        f"{tmp_path}/best-256/model.zip: is part of a training, not a policy file; export it "
+        f"first: fishctl learn export {tmp_path}/best-256\n"
+    )
+
+
 def test_the_name_of_a_run_folder_is_known_without_a_slash_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -54,8 +66,8 @@ def eye(tmp_path: Path) -> str:
 
 
 def test_an_address_in_place_of_the_file_of_a_simulated_camera_is_refused(eye: str) -> None:
-    for verb in (("learn", "look"), ("compare",)):
-        done = fishctl(*verb, eye, "--camera", "tcp://127.0.0.1:9875")
+    for *verb, option in (("learn", "look", "--camera-config"), ("compare", "--camera")):
+        done = fishctl(*verb, eye, option, "tcp://127.0.0.1:9875")
         assert one_line(done) == (
             "fishctl: 'tcp://127.0.0.1:9875' is the address of a running fishd-camera, which sees "
             "the fish of a running fishd; in simulation a simulated camera is needed, such as "

@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
@@ -36,7 +37,9 @@ def test_times_and_forces_that_cannot_be_are_listed_in_few_digits(tmp_path: Path
     (tick, *_) = swum(0.2).recorder.ticks
     with RunWriter(tmp_path / "run") as writer:
         writer.tick(tick)
-        writer.tally.tick(replace(tick, seq=tick.seq + 1, thrust=-1e300), 1e300)
+        later = replace(tick, seq=tick.seq + 1, thrust=-1e300)
+        writer._add("tick", later, msgspec.json.encode(later))
+        writer.tally.tick(later, 1e300)
     listed = fishctl("runs", "--folder", str(tmp_path)).stdout
     assert "1e+300 s" in listed
     assert max(map(len, listed.splitlines())) < 120
@@ -72,7 +75,8 @@ def test_a_damaged_recording_is_listed_as_one_and_recovered(damaged: Path) -> No
     folder = str(damaged.parent)
     assert "damaged: 10 ticks lost" in fishctl("runs", "--folder", folder).stdout
     (listed,) = json.loads(fishctl("runs", "--json", "--folder", folder).stdout)
-    assert (listed["damaged"], listed["lost_ticks"]) == (10, 10)
+    assert (listed["ticks"], listed["recorded_ticks"], listed["lost_ticks"]) == (50, 60, 10)
+    assert listed["problem"] == "damaged: 10 ticks lost"
     done = fishctl("recover", "run", "--folder", folder)
     assert done.stdout.startswith(f"{folder}/run-recovered.mcap: ")
     assert done.stdout.endswith("; damaged: 10 ticks lost\n")

@@ -134,7 +134,7 @@ def test_a_signal_rests_the_fish_and_keeps_what_was_measured(
     monkeypatch.setattr(VirtualSession, "_swim", interrupted)
     monkeypatch.setattr(VirtualSession, "__exit__", impatient)
     folder = tmp_path / "run"
-    words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
+    words = ["optimise", "square", "--frequency", "1:3", "--folder", str(folder)]
     done = fishctl(*words)
     assert (done.returncode, left) == (130, 1)
     assert done.stderr == (
@@ -149,7 +149,7 @@ def test_a_signal_rests_the_fish_and_keeps_what_was_measured(
 
 def test_an_experiment_is_resumed_by_its_own_verb_with_its_own_options(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    words = ["optimise", "square:amplitude=0.3", "--over", "frequency=1:3", "--budget", "12"]
+    words = ["optimise", "square:amplitude=0.3", "--frequency", "1:3", "--budget", "12"]
     assert fishctl(*words, "--set", "plant.xi=1.1", "--folder", str(folder)).returncode == 1
     refused = one_line(fishctl("sweep", "--resume", str(folder)))
     assert f"it is of another verb: fishctl optimise --resume {folder}" in refused

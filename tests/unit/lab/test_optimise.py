@@ -11,7 +11,7 @@ import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import load
-from fishd.lab.experiment import Header, find_largest_thrust, open_experiment
+from fishd.lab.experiment import Header, find_answer, open_experiment
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
     Trial,
@@ -83,7 +83,7 @@ def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
 @pytest.mark.slow
 def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     folder = tmp_path / "run"
-    words = ["optimise", "square", "--over", "frequency=1:3"]
+    words = ["optimise", "square", "--frequency", "1:3"]
     done = fishctl(*words, "--folder", str(folder), "--budget", "22")
     assert done.returncode == 1
     assert "the budget of 22 s is used" in done.stderr
@@ -101,7 +101,7 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert f"To continue: fishctl {again} SECONDS" in done.stderr
     answer = json.loads((folder / "result.json").read_text())
     assert f"{1e3 * answer['thrust']:.2f} ± " in done.stdout, "not the luckiest of the candidates"
-    assert find_largest_thrust(folder) == tuple(
+    assert find_answer(folder)[:3] == tuple(
         answer[key] for key in ("thrust", "thrust_ci95", "total_ci95")
     )
     table = (folder / "rows.csv").read_text()
@@ -135,7 +135,7 @@ def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
     monkeypatch.setattr(VirtualRun, "tick", interrupted)
     folder = tmp_path / "run"
     table = folder / "rows.csv"
-    words = ["optimise", "square", "--over", "frequency=1:3", "--folder", str(folder)]
+    words = ["optimise", "square", "--frequency", "1:3", "--folder", str(folder)]
     kept, stops = "", 0
     while True:
         left = int(generator.integers(1, 300)) if stops < 3 else 0
@@ -175,14 +175,16 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--over", "frequencie"], "did you mean 'frequency'?"),
-        (["--over", "frequency=3:1"], "is no range"),
-        (["--over", "frequency=1"], "LOW:HIGH"),
-        (["--over", "frequency=1:30"], "frequency"),
-        (["--over", "frequency=1:8", "--set", "tick=0.1"], "8 Hz is too fast for ticks of 0.1 s"),
-        (["--over", "frequency=1.5:1.9"], "in this range: 1.667; near it: 1.429, 1.667, 2"),
-        (["--over", "frequency", "--frequency", "2"], "is given, too"),
-        (["--over", "frequency", "--budget", "5"], "too short"),
+        (["--frequencie", ":"], "Did you mean one of: '--frequency'"),
+        ([], "no parameter has a range: give one, such as --frequency LOW:HIGH, or --frequency :"),
+        (["--frequency", "1:2:0.1"], "LOW:HIGH is needed, such as 0.5:4, or ':' for all"),
+        (["--frequency", "a:2"], "'a' is not valid: a number"),
+        (["--frequency", "3:1"], "is no range"),
+        (["--frequency", "1"], "no parameter has a range"),
+        (["--frequency", "1:30"], "frequency"),
+        (["--frequency", "1:8", "--set", "tick=0.1"], "8 Hz is too fast for ticks of 0.1 s"),
+        (["--frequency", "1.5:1.9"], "in this range: 1.667; near it: 1.429, 1.667, 2"),
+        (["--frequency", ":", "--budget", "5"], "too short"),
     ],
 )
 def test_what_cannot_be_searched_is_one_line(tmp_path: Path, words: list[str], named: str) -> None:

@@ -90,7 +90,7 @@ def test_without_a_power_meter_there_is_no_search_of_a_power(aim: Aim) -> None:
 
 def _run_optimise(tmp_path: Path, *words: str) -> dict[str, Any]:
     done = fishctl(
-        *("optimise", "square", "--over", "frequency=0.6:2", "--on", "simulation"),
+        *("optimise", "square", "--frequency", "0.6:2", "--on", "simulation"),
         *("--folder", f"{tmp_path}/run", "--json", *words),
     )
     optimum: dict[str, Any] = json.loads(done.stdout)
@@ -117,7 +117,7 @@ def test_optimise_finds_the_slowest_beat_that_gives_a_thrust(tmp_path: Path) -> 
 
 def test_two_aims_are_one_too_many() -> None:
     done = fishctl(
-        *("optimise", "square", "--over", "frequency", "--on", "simulation"),
+        *("optimise", "square", "--frequency", ":", "--on", "simulation"),
         *("--objective", "thrust", "--target-thrust", "15"),
     )
     assert "exclude each other: give one of them" in one_line(done)

@@ -110,13 +110,6 @@ def test_a_swim_of_another_controller_begins_where_one_ended(
     assert (swum[1] / "swim.npz").read_bytes() == before
 
 
-def test_former_names_of_options_are_accepted_and_not_shown(tmp_path: Path) -> None:
-    words = ("sine", "--seconds", "0.3", "--settle", "0.1", "--save", tmp_path / "swim.npz")
-    assert simulate(*words).returncode == 0
-    assert len(checkpoint.load(tmp_path / "swim.npz").track) == 30
-    assert "--save" not in fishctl("simulate", "--help").stdout
-
-
 def test_a_swim_that_is_as_long_already_leaves_its_file_alone(
     swum: tuple[dict[str, Any], Path],
 ) -> None:

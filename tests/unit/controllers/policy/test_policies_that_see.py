@@ -21,7 +21,7 @@ from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.controllers.policy import file, library
 from fishd.controllers.policy.card import CARD_KEY, encode
-from fishd.controllers.policy.checksum import seal
+from fishd.controllers.policy.checksum import SEAL_REMEDY, seal
 from fishd.controllers.policy.network import Sight, to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.camera_frames import StackSettings
@@ -56,7 +56,7 @@ def test_a_card_says_in_a_word_what_is_seen() -> None:
 
 def test_a_file_of_which_frames_are_missing_or_others_is_refused() -> None:
     frames = "one uint8 input of shape [1, 2, 32, 32] named 'frames' is needed"
-    wanted = f"{frames}; export it with 'fishctl learn export'"
+    wanted = f"{frames}: change them in the program that made the file, and {SEAL_REMEDY}"
 
     def refused(change: Any) -> str:
         model = onnx.load_model_from_string(FOLLOWER)

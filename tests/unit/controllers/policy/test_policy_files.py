@@ -3,8 +3,10 @@
 import io
 import os
 import pickle
+import re
 import zipfile
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,14 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
-from rigs.documents import ROOT
+from rigs.documents import FENCE, ROOT, text_of
 from rigs.policy_files import FLIP, card, random_layers, refusal, write
 
 from fishd.controllers.policy import file
 from fishd.controllers.policy.card import CARD_KEY, encode
-from fishd.controllers.policy.checksum import seal
+from fishd.controllers.policy.checksum import SEAL_REMEDY, seal
 from fishd.controllers.policy.network import to_onnx
+from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
 
 Change = Callable[[Any], None]
@@ -75,15 +78,31 @@ def test_an_archive_of_torch_or_baselines_is_refused_and_never_unpickled(tmp_pat
     message = refusal(archive.getvalue())
     assert message == (
         "this is a zip archive as torch writes, with a pickle, which could run any code; "
-        "export it with 'fishctl learn export'"
+        + file.WRITERS
     )
     assert not (tmp_path / "trace").exists()
+    with zipfile.ZipFile(archive, "a") as made:
+        made.writestr("_stable_baselines3_version", "2.9.2")
+    assert refusal(archive.getvalue()) == (
+        "this is a model of stable-baselines3, with pickles, which could run any code: load it "
+        "with env=gymnasium.make('fishd/Swim-v0'), and write it with "
+        "fishd.learning.export.export_model"
+    )
+
+
+def test_the_writers_that_a_refusal_names_exist() -> None:
+    named = re.findall(r"fishd\.[\w.]+", f"{file.WRITERS} {file.EXPORT_MODEL} {SEAL_REMEDY}")
+    assert len(named) == 4
+    for name in named:
+        module, _, function = name.rpartition(".")
+        assert find_spec(module), name
+        source = Path(ROOT, *module.split(".")).with_suffix(".py").read_text(encoding="utf-8")
+        assert f"\ndef {function}(" in source
 
 
 @pytest.mark.parametrize("content", [b"", b"\x00", b"hello fish", b"\x08\x07" * 9, os.urandom(999)])
 def test_what_is_no_onnx_is_refused(content: bytes) -> None:
-    refused = "this is not an ONNX model; export it with 'fishctl learn export'"
-    assert refusal(b"\x01" + content) == refused
+    assert refusal(b"\x01" + content) == f"this is not an ONNX model; {file.WRITERS}"
 
 
 @pytest.mark.parametrize(
@@ -142,6 +161,7 @@ def no_output(model: Any) -> None:
 
 
 _IN = "one float32 input of shape [1, 1] named 'observation' is needed"
+RENAMED = "needed: change them in the program that made the file"
 _OUT = "one float32 output of shape [1, 1] named 'action' is needed"
 
 
@@ -159,6 +179,7 @@ def test_wrong_ends_are_refused_with_right_ones(change: Change, actual: str, wan
     message = refusal(changed(change))
     assert actual in message
     assert wanted in message
+    assert message.endswith(f"{RENAMED}, and {SEAL_REMEDY}")
 
 
 @pytest.mark.parametrize(("bad", "layer"), [(np.nan, 0), (-np.inf, 2)])
@@ -175,10 +196,6 @@ def test_weights_that_are_not_finite_are_refused_behind_a_tanh(bad: float, layer
         f"its weights 'weight_{layer}' are not all finite numbers: the training diverged; "
         "export an earlier checkpoint"
     )
-
-
-def strip(model: Any) -> None:
-    del model.metadata_props[:]
 
 
 def double(model: Any) -> None:
@@ -207,8 +224,7 @@ def constant_number(model: Any) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (strip, "its metadata lacks fishd.card; export it with 'fishctl learn export'"),
-        (double, "it has 2 cards that may contradict one another"),
+        (double, "its metadata has 2 entries fishd.card, which may contradict one another"),
         (move_out, "its weights 'weight_0' are in another file; save the model as a single file"),
         (shorten, "its weights 'weight_0' cannot be read: "),
         (constant_node, "not all finite"),
@@ -218,6 +234,75 @@ def constant_number(model: Any) -> None:
 )
 def test_what_the_model_lacks_or_hides_is_refused(change: Change, words: str) -> None:
     assert words in refusal(changed(change))
+
+
+def of_another_tool(*inputs: Any, outputs: int = 1) -> Any:
+    """A model without a card: the first input, through a tanh."""
+    ends = [
+        helper.make_tensor_value_info(f"out{n}", TensorProto.FLOAT, [1]) for n in range(outputs)
+    ]
+    nodes = [helper.make_node("Tanh", ["obs"], [f"out{n}"]) for n in range(outputs)]
+    graph = helper.make_graph(nodes, "net", list(inputs), ends)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
+
+
+def test_a_file_of_another_tool_is_refused_with_its_ends_and_the_way_to_a_policy_file() -> None:
+    observation = helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["batch", 5])
+    assert refusal(of_another_tool(observation).SerializeToString()) == (
+        "this ONNX file does not contain the observation, tick and Φ of its training: its metadata "
+        "lacks fishd.card. Its inputs: float32 of shape [batch, 5] named 'obs'; its outputs: "
+        "float32 of shape [1] named 'out0'. Write a model of stable-baselines3 with "
+        "fishd.learning.export.export_model; for any other, name the input 'observation' and the "
+        "output 'action', float32 of shapes [1, N] and [1, 1], add the card, and call "
+        "fishd.controllers.policy.checksum.seal as the last step"
+    )
+
+
+def test_of_many_outputs_a_refusal_names_the_first() -> None:
+    observation = helper.make_tensor_value_info("obs", TensorProto.DOUBLE, [1])
+    message = refusal(of_another_tool(observation, outputs=99).SerializeToString())
+    assert "Its inputs: double of shape [1] named 'obs'; its outputs: " in message
+    assert "named 'out3', 95 more. Write" in message
+
+
+def test_a_file_of_another_tool_becomes_a_policy_with_names_card_and_seal(tmp_path: Path) -> None:
+    model = of_another_tool(helper.make_tensor_value_info("obs", TensorProto.FLOAT, [1, 1]))
+    helper.set_model_props(model, {CARD_KEY: encode(card())})
+    unsealed = refusal(model.SerializeToString())
+    assert unsealed.startswith("its metadata lacks fishd.sha256, the checksum; in the program")
+    assert unsealed.endswith(SEAL_REMEDY)
+    assert refusal(seal(model)).startswith("its inputs: float32 of shape [1, 1] named 'obs'; one ")
+    model.graph.input[0].name = model.graph.node[0].input[0] = "observation"
+    assert refusal(seal(model)).startswith("its outputs: float32 of shape [1] named 'out0'; one ")
+    model.graph.output[0].CopyFrom(
+        helper.make_tensor_value_info("action", TensorProto.FLOAT, [1, 1])
+    )
+    model.graph.node[0].output[0] = "action"
+    assert file.read(write(tmp_path, seal(model))).card == card()
+
+
+def test_the_page_shows_how_a_file_of_another_tool_becomes_a_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = [
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, width])]
+        for name, width in (("observation", 2), ("action", 1))
+    ]
+    weights = numpy_helper.from_array(np.float32([[0.5], [-0.25]]), "weights")
+    nodes = [helper.make_node("MatMul", ["observation", "weights"], ["action"])]
+    model = helper.make_model(
+        helper.make_graph(nodes, "main_graph", *ends, [weights]),
+        producer_name="pytorch",
+        opset_imports=[helper.make_opsetid("", 20)],
+    )
+    monkeypatch.chdir(tmp_path)
+    onnx.save(model, "other.onnx")
+    page = ROOT / "docs/reference/policies.md"
+    (example,) = (code for _, code in FENCE.findall(text_of(page)) if "other.onnx" in code)
+    exec(compile(example, page, "exec"), {})
+    network = Network(file.read(tmp_path / "mine.onnx"))
+    network.row[:] = 0.4, 0.2
+    assert network.run() == pytest.approx(0.15)
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 import onnx
+import onnx.inliner
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 from rigs.policy_files import card, of_nodes, random_layers, refusal, write
 
 from fishd.controllers.policy import file, operators
-from fishd.controllers.policy.checksum import seal
+from fishd.controllers.policy.checksum import SEAL_REMEDY, seal
 from fishd.controllers.policy.network import to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
@@ -74,14 +75,20 @@ def test_an_operator_that_the_file_defines_itself_is_refused() -> None:
     sine = make("Sin", ["x"], ["y"])
     own = helper.make_function("", "Tanh", ["x"], ["y"], [sine], [helper.make_opsetid("", 17)])
     model.functions.append(own)
-    assert refusal(seal(model)) == "it defines a custom operator, Tanh"
+    assert refusal(seal(model)) == (
+        "it defines a custom operator, Tanh; replace it by those of ONNX with "
+        f"onnx.inliner.inline_local_functions, and {SEAL_REMEDY}"
+    )
+    assert file.parse(seal(onnx.inliner.inline_local_functions(model))) == card()
 
 
 @pytest.mark.parametrize("opset", [10, 99])
 def test_a_version_of_the_operators_that_is_not_known_is_refused(opset: int) -> None:
     content = of_nodes([make("Tanh", ["observation"], ["action"])], opset=opset)
-    refused = f"its version of ONNX's operators: {opset}; one from 11 to 26 is needed"
-    assert refusal(content) == refused
+    assert refusal(content) == (
+        f"its version of ONNX's operators: {opset}; one from 11 to 26 is needed; convert the model "
+        f"with onnx.version_converter.convert_version, and {SEAL_REMEDY}"
+    )
 
 
 def test_more_operators_than_a_policy_needs_are_refused() -> None:

@@ -97,7 +97,7 @@ def test_a_package_that_is_missing_is_named_with_its_extra(tmp_path: Path, progr
     [
         ("measure", "swing", "--on", "simulation"),
         ("compare", "swing", "square"),
-        ("optimise", "square", "--over", "frequency=1:3"),
+        ("optimise", "square", "--frequency", "1:3"),
         ("optimum",),
         ("identify", "--experiment"),
     ],

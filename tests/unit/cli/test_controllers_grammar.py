@@ -1,0 +1,80 @@
+"""One grammar of controllers: `NAME:key=value,…` and `NAME --key value` are the same everywhere."""
+
+import json
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+from rigs.processes import fishctl, one_line
+
+from fishd.cli.controllers_command import ControllersCommand
+from fishd.controllers import registry
+from fishd.core.errors import ParameterError
+from fishd.lab.compare.contestants import parse, parse_all
+
+
+@click.command(cls=ControllersCommand)
+@click.argument("words", nargs=-1)
+@click.option("--for", "seconds", type=float)
+@click.option("--json", is_flag=True)
+def verb(words: tuple[str, ...], seconds: float | None, json: bool) -> None:
+    """Print the arguments."""
+    click.echo(f"{' '.join(words)} {seconds} {json}")
+
+
+@pytest.mark.parametrize(
+    ("line", "output"),
+    [
+        ("swing --C 0.6", "swing:C=0.6 None False"),
+        ("swing --C=0.6 --for 20 --lead 0.1", "swing:C=0.6,lead=0.1 20.0 False"),
+        ("--for 20 swing --C -1 square", "swing:C=-1 square 20.0 False"),
+        ("swing:C=0.6 --json --lead 0 file.onnx", "swing:C=0.6,lead=0 file.onnx None True"),
+        ("square --frequency 1,1.7 sine --frequency 2", "square:frequency=1,1.7 sine:frequency=2"),
+    ],
+)
+def test_parameters_may_be_options_after_their_controller(line: str, output: str) -> None:
+    assert CliRunner().invoke(verb, line.split()).output.startswith(output)
+
+
+@pytest.mark.parametrize("line", ["--C 0.6 swing", "latest --C 0.6", "swing --frequency 2"])
+def test_an_option_of_no_controller_before_it_is_refused(line: str) -> None:
+    assert "No such option" in CliRunner().invoke(verb, line.split()).output
+
+
+def test_a_list_and_a_range_are_several_contestants() -> None:
+    labels = [contestant.label for contestant in parse_all(["square:frequency=1,1.5", "swing"])]
+    assert labels == ["square:frequency=1", "square:frequency=1.5", "swing"]
+    several = parse_all(["sine:frequency=1:2:0.5,amplitude=0.3,0.4"])
+    assert [tuple(contestant.parameters.values()) for contestant in several] == [
+        (frequency, amplitude) for frequency in (1.0, 1.5, 2.0) for amplitude in (0.3, 0.4)
+    ]
+
+
+def test_a_value_has_the_same_words_for_compare_as_for_other_verbs() -> None:
+    assert parse("square:amplitude=default").parameters == {"amplitude": None}
+    assert parse("swing:C=auto").parameters == {"C": "auto"}
+    with pytest.raises(ParameterError, match="swing:C=fast: C: 'fast' is not valid: a number in"):
+        parse("swing:C=fast")
+
+
+def test_what_has_no_name_continues_the_value_before() -> None:
+    assert registry.split_spec("ppo:policy=a,b.onnx") == ("ppo", [("policy", "a,b.onnx")])
+    with pytest.raises(ParameterError, match="NAME=VALUE is needed"):
+        registry.split_spec("swing:0.6")
+
+
+def test_a_controller_is_named_alike_in_all_verbs(tmp_path: Path) -> None:
+    run, place = str(tmp_path / "run.mcap"), ("--config", "config/simulated.yaml")
+    short = ("--for", "6", "--settle", "2")
+    assert fishctl("simulate", "square:frequency=1.2", "--record", run, *place).returncode == 0
+    for name in (("square:frequency=1.2",), ("square", "--frequency", "1.2")):
+        again = json.loads(fishctl("rerun", run, *name, "--json").stdout)["stretches"]
+        assert all(stretch["equal"] == stretch["ticks"] for stretch in again)
+        compared = json.loads(fishctl("compare", *name, *short, *place, "--json").stdout)
+        assert compared[0]["contestant"] == "square:frequency=1.2"
+        swept = fishctl(
+            "sweep", *name, "--folder", str(tmp_path / str(len(name))), *place, "--json"
+        )
+        assert json.loads(swept.stdout)[0]["parameters"] == {"frequency": 1.2}
+    assert "did you mean 'swing'" in one_line(fishctl("rerun", run, "swin"))
