@@ -15,16 +15,18 @@ from rigs.processes import PATIENCE
 pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
 
 PAGE = ROOT / "docs" / "how-to" / "cluster.md"
-SRUN = '#!/bin/sh\nexec "$@" --host 127.0.0.1\n'
+SRUN = """\
+#!/bin/sh
+while [ "$1" != dask ]; do shift; done
+exec "$@" --host 127.0.0.1
+"""
 """A stand-in that starts one task, here."""
 
 
 def test_the_job_script_sweeps_on_its_own_workers(tmp_path: Path) -> None:
     [script] = [block for kind, block in FENCE.findall(text_of(PAGE)) if kind == "bash"]
-    for words, shorter in (("0.4:4:0.2", "1,2"), ("--port 0", "--port 0 --host 127.0.0.1")):
-        assert words in script
-        script = script.replace(words, shorter)
-    (tmp_path / "job.sh").write_text(script)
+    assert "0.4:4:0.2" in script
+    (tmp_path / "job.sh").write_text(script.replace("0.4:4:0.2", "1,2"))
     (tmp_path / "srun").write_text(SRUN)
     (tmp_path / "srun").chmod(0o755)
     path = [str(tmp_path), str(Path(sys.executable).parent), os.environ["PATH"]]
