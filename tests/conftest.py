@@ -17,6 +17,8 @@ from _pytest.runner import runtestprotocol
 from hypothesis import HealthCheck, settings
 from rigs import forked_workers, own_network
 
+from fishd.core.process import unix_sockets
+
 # Each process computes with one thread; set before numpy or torch is loaded, here or in a child.
 LIBRARIES = "OMP", "OPENBLAS", "MKL", "NUMBA"
 for variable in (f"{library}_NUM_THREADS" for library in LIBRARIES):
@@ -41,6 +43,7 @@ settings.register_profile(
 settings.load_profile("fishd")
 
 UNIT = Path(__file__).parent / "unit"
+SERVICE_SOCKET = Path("/run/fishd/control")
 LONG_MODULES = {
     "test_unknown_keys",
     "test_site",
@@ -71,6 +74,14 @@ def sigint_ignored() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, lambda number, frame: None)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def own_runtime_folder(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Let no test find, and move the fish of, a fishd that this user runs."""
+    folder = tmp_path_factory.mktemp("runtime")
+    folder.chmod(0o700)
+    os.environ["XDG_RUNTIME_DIR"] = str(folder)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -203,6 +214,12 @@ def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> 
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
+    if SERVICE_SOCKET.exists() and not unix_sockets.is_deserted(SERVICE_SOCKET):
+        pytest.exit(
+            "the service fishd runs on this machine, and tests could move its fish: stop it with "
+            "sudo systemctl stop fishd",
+            returncode=1,
+        )
     is_alone = not getattr(session.config.option, "numprocesses", None)
     if is_alone or hasattr(session.config, "workerinput"):  # else it runs no tests itself
         own_network.isolate()

@@ -89,7 +89,7 @@ def test_a_misspelt_path_of_a_policy_is_reported_before_anything_swims() -> None
 
 def test_a_wrong_contestant_is_one_line() -> None:
     done = run("swing:C=2")
-    assert "fishctl: swing: C: 2 is not valid: a number in [0, 1]" in done.stderr
+    assert "fishctl: swing: C: 2.0 is not valid: a number in [0, 1]" in done.stderr
     assert (done.stdout, done.returncode, done.stderr.count("\n")) == ("", 1, 1)
 
 
