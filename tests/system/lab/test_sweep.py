@@ -16,7 +16,7 @@ from fishd.config import Config, load
 from fishd.core.errors import ConfigError, FishdError, RecordingError
 from fishd.core.signals import Tick
 from fishd.lab.experiment import Header, open_experiment
-from fishd.lab.parallel import Stop
+from fishd.lab.parallel import FileStop
 from fishd.lab.rerun import rerun
 from fishd.lab.session import Disturbed, VirtualSession
 from fishd.lab.sweep.curves import WholeTicks, find_best_of_whole_ticks, make_curves
@@ -189,7 +189,7 @@ def test_a_point_without_space_for_its_recording_names_no_file_that_is_gone(
     def full(*_: object) -> int:
         raise OSError(ENOSPC, "No space left on device")
 
-    task = Task(SQUARES[0], load(), Lengths(1.0, 2), Stop(str(tmp_path / "stop"), False))
+    task = Task(SQUARES[0], load(), Lengths(1.0, 2), FileStop(tmp_path / "stop"))
     with monkeypatch.context() as disk:
         disk.setattr("fishd.recording.part_file.os.write", full)
         with pytest.raises(RecordingError) as ended:
