@@ -379,17 +379,18 @@ def _relevant_values(header: Header) -> dict[str, Any]:
     """Return the values on which the rows depend, as JSON has them, by dotted keys."""
     return {
         key: value
-        for key, value in _flatten(msgspec.json.decode(msgspec.json.encode(header))).items()
+        for key, value in flatten(msgspec.json.decode(msgspec.json.encode(header))).items()
         if key.partition(".")[0] not in _NOT_COMPARED
         and key.removeprefix("config.").partition(".")[0] not in IRRELEVANT_KEYS
     }
 
 
-def _flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flatten(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the values in nested tables by their dotted keys."""
     leaves: dict[str, Any] = {}
     for key, value in data.items():
         if isinstance(value, Mapping):
-            leaves |= _flatten(value, f"{prefix}{key}.")
+            leaves |= flatten(value, f"{prefix}{key}.")
         else:
             leaves[prefix + key] = value
     return leaves

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import gymnasium
 import msgspec
@@ -13,6 +13,7 @@ from gymnasium import wrappers
 from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -20,25 +21,29 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
+    SubprocVecEnv,
     VecCheckNan,
-    VecEnv,
     VecEnvWrapper,
     VecMonitor,
     VecNormalize,
     VecVideoRecorder,
 )
+from torch.nn import Linear, ReLU, Sequential, Tanh
 
 from fishd.camera.simulated import SimulatedCameraSettings
 from fishd.config import Config, adopt
-from fishd.controllers.policy.card import Card
+from fishd.controllers.policy.card import Card, History
 from fishd.controllers.policy.file import FRAMES, INPUT, PolicyFile
 from fishd.controllers.policy.network import Sight, to_onnx
 from fishd.controllers.policy.runtime import Network
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import FishdError, PolicyError
 from fishd.core.files import write_atomically
+from fishd.core.text import describe_error, quoted
+from fishd.lab.experiment import flatten
+from fishd.lab.links.link import StepResult
 from fishd.lab.links.simulated_link import Camera, SimulatedLink
-from fishd.learning.env.environment import SwimEnv
+from fishd.learning.env.environment import SwimEnv, features
 from fishd.learning.env.evaluation import Evaluation, evaluate_in_simulation
 from fishd.learning.env.perception import Perception
 from fishd.learning.extractors import random_angles
@@ -46,7 +51,11 @@ from fishd.learning.picture_networks import PictureExtractor, network_nodes
 from fishd.learning.ppo import DeterministicPolicy, MeanAction, activation_of, layers_of
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.runs import make_card
-from fishd.learning.settings import EvaluationSettings, TrainingSettings, from_plain
+from fishd.learning.settings import (
+    EvaluationSettings,
+    TrainingSettings,
+    from_plain,
+)
 
 TOLERANCE = 1e-4
 """Largest difference between the outputs of the file and of the trained policy, as a share of Φ:
@@ -67,9 +76,36 @@ NEUTRAL_WRAPPERS: tuple[type[Any], ...] = (
     wrappers.TimeLimit,
 )
 """Wrappers of environments that change neither observations nor actions."""
+_LOAD_WITH_FISH = (
+    "load the model with env=gymnasium.make('fishd/Swim-v0'), made as it was for the training"
+)
+_ABOUT_1 = "; the observations of a SwimEnv are about 1 already"
+_MORE_REMEDIES: dict[type[Any], str] = {
+    wrappers.NormalizeObservation: _ABOUT_1,
+    VecNormalize: f" or with norm_obs=False{_ABOUT_1}",
+    SubprocVecEnv: ", since environments in other processes cannot be checked",
+}
+"""Additions to the remedy for a part of one of these types."""
+_PASSAGES = ("step", "reset", "unwrapped", "__getattribute__")
+"""Attributes through which observations and actions pass, which a wrapper of rewards inherits."""
+_HARMLESS_METHODS = {"close", "render", "reward"}
+"""Methods through which neither observations nor actions pass."""
 _PROBE_INPUTS = 1000
 _PROBE_STACKS = 100
 """Number of stacks of noise, and of stacks of a moving tail."""
+
+
+class _Proof(NamedTuple):
+    """Inputs on which a file is compared with its policy, and the outputs of the policy."""
+
+    rows: NDArray[np.float32]
+    """Numbers that the file receives, shape (inputs, numbers)."""
+    stacks: list[Stack]
+    """Frames that the file receives; empty without a camera."""
+    given: NDArray[np.float32]
+    """Inputs of the policy, shape (inputs, width)."""
+    expected: NDArray[np.float64]
+    """Outputs of the policy, φ_c/Φ, shape (inputs,)."""
 
 
 class Exported(Struct, frozen=True):
@@ -109,40 +145,38 @@ def export(checkpoint: Path, target: Path, *, force: bool = False, note: str = "
 def export_model(model: BaseAlgorithm, target: str | Path, note: str = "") -> Path:
     """Write the policy of a model of stable-baselines3 that was trained on a `SwimEnv`.
 
-    model: PPO or A2C with an `MlpPolicy` of tanh or relu; its environment has no wrappers but
-        `NEUTRAL_WRAPPERS` and those of rewards
+    model: PPO or A2C with an `MlpPolicy` of tanh or relu; its environments are equal, of this
+        process, and have no wrappers but `NEUTRAL_WRAPPERS` and those of rewards
     note: text for the user, stored in the file
 
-    Warns of a policy that stalls. Raises `PolicyError` for any other model, and where the outputs
-    of the file would differ from those of the policy.
+    Warns of a policy that stalls. Raises `PolicyError` for any other model or subclass, and where
+    the outputs of the file would differ from those of the policy.
     """
     path = Path(target)
-    env = _find_swim_env(model.get_env(), path)
-    if env.extractor:
-        raise PolicyError(
-            f"{path}: a model that sees pictures is not exported from Python; train it with "
-            "'fishctl learn ppo --see camera'"
+    try:
+        env, policy = _check_model(model)
+        seen = TrainingSettings(environment=env.settings)
+        card = make_card(env.config, seen, env.features, "a SwimEnv", 0, None, note)
+        past = replace(
+            card.provenance,
+            algorithm=type(model).__name__,
+            steps=model.num_timesteps,
+            seed=model.seed or 0,
+            settings={"environment": msgspec.to_builtins(env.settings)},
         )
-    policy = _check_network(model.policy, path)
-    seen = TrainingSettings(environment=env.settings)
-    card = make_card(env.config, seen, env.features, "a SwimEnv", 0, None, note)
-    past = replace(
-        card.provenance,
-        algorithm=type(model).__name__,
-        steps=model.num_timesteps,
-        seed=model.seed or 0,
-        settings={"environment": msgspec.to_builtins(env.settings)},
-    )
-    card = replace(card, provenance=past)
+        card = replace(card, provenance=past)
+        proof = _swim(model, env, card)
+    except PolicyError as problem:
+        raise PolicyError(f"{path}: {problem}") from None
     decide = DeterministicPolicy(policy, env.perception, card.amplitude)
     evaluation = evaluate_in_simulation(env.config, decide, EvaluationSettings())
-    _write(path, _complete_card(card, evaluation), policy, env.perception, _observe(env))
+    _write(path, _complete_card(card, evaluation), policy, env.perception, proof)
     if evaluation.is_stalled:
-        rollout = cast(OnPolicyAlgorithm, model).n_steps * model.n_envs
+        rollout = cast(OnPolicyAlgorithm, model).n_steps
         warnings.warn(
-            f"{path}: {_format_stall(evaluation)}; it learned from "
-            f"{model.num_timesteps // rollout} × {rollout} steps: more updates help, from more "
-            "steps or a smaller n_steps",
+            f"{path}: {_format_stall(evaluation)}; it learned from {model.num_timesteps} steps, in "
+            f"rollouts of {rollout} × {model.n_envs}: more updates help, from more steps or a "
+            "smaller n_steps",
             stacklevel=2,
         )
     return path
@@ -156,89 +190,183 @@ def _format_stall(evaluation: Evaluation) -> str:
     )
 
 
-def _find_swim_env(env: VecEnv | None, path: Path) -> SwimEnv:
-    """Return the environment of a model; raise `PolicyError` if a wrapper changes what passes."""
+class _Part(NamedTuple):
+    """A part of a model through which observations or actions pass."""
+
+    role: str
+    part: Any
+    permitted: tuple[type[Any], ...]
+    """Types that do nothing that a policy file lacks; their subclasses may."""
+    remedy: str
+
+
+def _parts(model: Any) -> Iterator[_Part]:
+    """Yield the parts of a model, from which the next one is reached after they are checked."""
+    yield _Part("algorithm", model, (PPO, A2C), "load a model of PPO or A2C itself with PPO.load")
+    policy: Any = getattr(model, "policy", None)
+    yield _Part("policy", policy, (ActorCriticPolicy,), "train one with PPO('MlpPolicy', env)")
+    remedy = "train one with the defaults of MlpPolicy, or other net_arch and activation_fn"
+    for extractor in (policy.features_extractor, policy.pi_features_extractor):
+        yield _Part("extractor of features", extractor, (FlattenExtractor,), remedy)
+    yield _Part("hidden network", policy.mlp_extractor, (MlpExtractor,), remedy)
+    layers = policy.mlp_extractor.policy_net
+    yield _Part("hidden network", layers, (Sequential,), remedy)
+    remedy = "train one with linear layers, each followed by the same Tanh or ReLU"
+    activations: tuple[type[Any], ...] = (Tanh, ReLU)
+    for number, layer in enumerate([*layers, *[None] * (len(layers) % 2)]):
+        yield _Part("hidden layer", layer, activations if number % 2 else (Linear,), remedy)
+        activations = (type(layer),) if number % 2 else activations
+    yield _Part("last layer", policy.action_net, (Linear,), remedy)
+    env = model.get_env()
     while isinstance(env, VecEnvWrapper):
-        _check_wrapper(env, path)
+        yield _wrapper(env)
         env = env.venv
-    inner = env.envs if isinstance(env, DummyVecEnv) else []
-    for layer in (layer for environment in inner for layer in _unwrap(environment)):
-        _check_wrapper(layer, path)
-    innermost = inner[0].unwrapped if inner else None
-    if not isinstance(innermost, SwimEnv):
-        raise PolicyError(
-            f"{path}: the environment of this model, {type(innermost or env).__name__}, is not a "
-            "SwimEnv of this process, so the inputs of the network are not known; load the model "
-            "with env=gymnasium.make('fishd/Swim-v0')"
-        )
-    return innermost
+    yield _Part("vectorised environment", env, (DummyVecEnv,), _LOAD_WITH_FISH)
+    for layer in env.envs:
+        while isinstance(layer, gymnasium.Wrapper):
+            yield _wrapper(layer)
+            layer = layer.env
+        yield _Part("environment", layer, (SwimEnv,), _LOAD_WITH_FISH)
+        yield _Part("perception", layer.perception, (Perception,), _LOAD_WITH_FISH)
 
 
-def _unwrap(env: Any) -> Iterator[Any]:
-    """Yield the wrappers of an environment, from the outside."""
-    while isinstance(env, gymnasium.Wrapper):
-        yield env
-        env = env.env
-
-
-def _check_wrapper(wrapper: Any, path: Path) -> None:
-    """Raise `PolicyError` for a wrapper that may change observations or actions."""
-    kind = type(wrapper)
+def _wrapper(wrapper: Any) -> _Part:
+    """Return the part of a wrapper; those that change only rewards are permitted."""
+    kind, plain = type(wrapper), gymnasium.RewardWrapper
     is_reward = (
-        isinstance(wrapper, gymnasium.RewardWrapper)
-        and kind.step is gymnasium.RewardWrapper.step
-        and kind.reset is gymnasium.Wrapper.reset
+        isinstance(wrapper, plain)
+        and all(getattr(kind, name) is getattr(plain, name) for name in _PASSAGES)
     ) or (kind is VecNormalize and not wrapper.norm_obs)
-    if kind not in NEUTRAL_WRAPPERS and not is_reward:
-        remedy = {
-            wrappers.NormalizeObservation: "; the observations of a SwimEnv are about 1 already",
-            VecNormalize: " or with norm_obs=False; the observations of a SwimEnv are about 1 "
-            "already",
-        }.get(kind, "")
+    permitted = (kind,) if is_reward else NEUTRAL_WRAPPERS
+    return _Part("wrapper", wrapper, permitted, "train one without that wrapper")
+
+
+def _check_model(model: Any) -> tuple[SwimEnv, ActorCriticPolicy]:
+    """Return environment and policy of a model; raise `PolicyError` if they do more than a file."""
+    envs = []
+    for role, part, permitted, remedy in _parts(model):
+        name = "missing" if part is None else type(part).__name__
+        attributes = getattr(part, "__dict__", {})
+        own = {key for key in attributes if callable(getattr(type(part), key, None))}
+        if isinstance(part, torch.nn.Module) and (part._forward_hooks or part._forward_pre_hooks):
+            own.add("hook")
+        own -= _HARMLESS_METHODS
+        if own or type(part) not in permitted:
+            name += "".join(f" with its own {key}" for key in sorted(own)[:1])
+            remedy += _MORE_REMEDIES.get(type(part), "")
+            why = ", which may do more than a policy file, so that the file would swim otherwise"
+            raise PolicyError(
+                f"the {role} of this model is {name}{why if part is not None else ''}: {remedy}"
+            )
+        if type(part) is SwimEnv:
+            envs.append(part)
+    for number, env in enumerate(envs):
+        _check_equal(envs[0], env, number)
+    policy = model.policy
+    _check_numbers(policy)
+    if policy.action_space != envs[0].action_space:
         raise PolicyError(
-            f"{path}: this model was trained behind the wrapper {kind.__name__}, which may change "
-            "observations or actions; a policy file has no wrappers, so the policy would swim "
-            f"otherwise: train it without that one{remedy}"
+            f"the actions of this model are {policy.action_space}, those of a SwimEnv "
+            f"{envs[0].action_space}: load it without custom_objects"
         )
+    return envs[0], policy
 
 
-def _check_network(policy: Any, path: Path) -> ActorCriticPolicy:
-    """Return the policy; raise `PolicyError` for a network that a policy file cannot have."""
-    needed = "a policy file has the MlpPolicy of PPO or A2C"
-    if type(policy) is not ActorCriticPolicy or type(policy.mlp_extractor) is not MlpExtractor:
-        raise PolicyError(f"{path}: {needed}, not {type(policy).__name__}")
-    if type(policy.features_extractor) is not FlattenExtractor:
-        extractor = type(policy.features_extractor).__name__
-        raise PolicyError(f"{path}: {needed} without the extractor of features {extractor}")
+def _check_equal(first: SwimEnv, env: SwimEnv, number: int) -> None:
+    """Raise `PolicyError` if an environment is not equal to the first; noise may differ."""
+    if env.extractor:
+        raise PolicyError(
+            "a model that sees pictures is not exported from Python; train it with 'fishctl learn "
+            "ppo --see camera'"
+        )
+    here, there = _traits(first), _traits(env)
+    here["features"] = here["perception"] = features(first.config, first.settings)
+    for key, value in here.items():
+        if key != "config.simulation.seed" and value != there[key]:
+            raise PolicyError(
+                f"{key} of environment {number} of this model is {quoted(str(there[key]))}, not "
+                f"{quoted(str(value))} as for environment 0 when it was made, and a policy file "
+                "has only one: train one in equal environments"
+            )
+
+
+def _traits(env: SwimEnv) -> dict[str, Any]:
+    """Return configuration, settings and features of an environment, by dotted keys."""
+    settings = {"config": env.config, "settings": env.settings}
+    traits = flatten(msgspec.json.decode(msgspec.json.encode(settings)))
+    return traits | {"features": env.features, "perception": env.perception.features}
+
+
+def _check_numbers(policy: ActorCriticPolicy) -> None:
+    """Raise `PolicyError` for numbers that a policy file cannot have."""
     if policy.squash_output:
-        raise PolicyError(f"{path}: {needed} without squash_output")
-    activation = activation_of(policy)
-    for part in (*policy.mlp_extractor.policy_net, policy.action_net):
-        if type(part) not in (torch.nn.Linear, policy.activation_fn):
-            layers = f"linear layers and {activation}"
-            raise PolicyError(f"{path}: {needed} with {layers}, not with {type(part).__name__}")
-    for parameter in policy.parameters():
+        raise PolicyError("a policy file has no squash_output: train one without it")
+    for name, parameter in policy.named_parameters():
         if parameter.dtype is not torch.float32:
             kind = str(parameter.dtype).removeprefix("torch.")
             raise PolicyError(
-                f"{path}: {needed} in float32, this one is in {kind}: call model.policy.float()"
+                f"a policy file is in float32, this policy is in {kind}: call model.policy.float()"
             )
-    return policy
+        if not bool(torch.isfinite(parameter).all()):
+            raise PolicyError(
+                f"its {name} is not finite: the training diverged; export an earlier checkpoint, "
+                "or train one with a smaller learning_rate"
+            )
 
 
-def _observe(env: SwimEnv) -> NDArray[np.float32]:
-    """Return observations of random swimming in simulation: the model's own fish may be a real one.
+class _RecordingLink(SimulatedLink):
+    """A link that stores the angle it is given."""
 
-    Wrappers that are permitted do not change them.
+    angle = 0.0
+    """Latest angle [rad]."""
+
+    def step(self, angle: float) -> StepResult:
+        """Apply an angle [rad], and return the result one tick later."""
+        self.angle = angle
+        return super().step(angle)
+
+
+def _swim(model: BaseAlgorithm, env: SwimEnv, card: Card) -> _Proof:
+    """Return angles of a simulated fish under the model's control: its own may be a real one.
+
+    Every second action is random. The file receives what the controller `ppo` would compute. The
+    delay of reversals is not that of the policy. Raises `PolicyError` if the model fails.
     """
-    simulated = SwimEnv(SimulatedLink(env.config), env.config, env.settings)
+    link = _RecordingLink(env.config)
+    settings = replace(env.settings, episode=2 * _PROBE_INPUTS, longest_start=0, dwell=False)
+    simulated = SwimEnv(link, env.config, settings)
+    history = History(card.observation, card.window)
     random = np.random.default_rng(2)
-    rows = [simulated.reset(seed=2)[0]]
-    while len(rows) < _PROBE_INPUTS:
-        action = random.uniform(-1.0, 1.0, simulated.action_space.shape).astype(np.float32)
-        observation, _, *ended, _ = simulated.step(action)
-        rows.append(simulated.reset()[0] if any(ended) else observation)
-    return np.array(rows)
+    rows, given, expected = [], [], []
+    observation, _ = simulated.reset(seed=2)
+    for _ in range(_PROBE_INPUTS):
+        history.push(simulated.latest)
+        rows.append(history.row.copy())
+        given.append(observation)
+        try:
+            action, _ = model.predict(observation, deterministic=True)
+            simulated.step(action)
+        except Exception as error:  # those of torch differ
+            raise PolicyError(f"this model computes no action: {describe_error(error)}") from None
+        expected.append(link.angle / card.amplitude)
+        history.push(simulated.latest)
+        action = random.uniform(-1.0, 1.0, action.shape).astype(np.float32)
+        observation, *_ = simulated.step(action)
+    return _Proof(np.array(rows), [], np.array(given), np.array(expected))
+
+
+def _draw(policy: ActorCriticPolicy, perception: Perception, card: Card) -> _Proof:
+    """Return outputs of the policy for random inputs."""
+    stacks = _probe_stacks(card)
+    number = len(stacks) or _PROBE_INPUTS
+    random = np.random.default_rng(0)
+    rows = random.normal(0.0, 1.5, (number, card.numbers)).astype(np.float32)
+    given = rows
+    if perception.extractor:
+        seen = np.array([perception.extractor.see(stack) for stack in stacks])
+        given = np.concatenate((seen, rows), axis=1)
+    expected = policy.predict(given, deterministic=True)[0][:, 0].astype(np.float64)
+    return _Proof(rows, stacks, given, expected)
 
 
 def _write(
@@ -246,15 +374,18 @@ def _write(
     card: Card,
     policy: ActorCriticPolicy,
     perception: Perception,
-    observations: NDArray[np.float32] | None = None,
+    proof: _Proof | None = None,
 ) -> int:
     """Write the file atomically; return its size [bytes]. Raises `PolicyError`.
 
-    observations: inputs on which the file is compared with the policy; None for random ones
+    proof: inputs on which the file is compared with the policy; None for random ones
     """
-    sight = _make_sight(policy, perception)
-    content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
-    _verify(PolicyFile(target, content, card), policy, perception, observations)
+    try:
+        sight = _make_sight(policy, perception)
+        content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
+    except PolicyError as problem:
+        raise PolicyError(f"{target}: {problem}") from None
+    _verify(PolicyFile(target, content, card), policy, proof or _draw(policy, perception, card))
     if not target.name or (target.exists() and not target.is_file()):
         raise PolicyError(f"{target}: exists already, and is not a regular file")
     try:
@@ -344,42 +475,27 @@ def _complete_card(card: Card, evaluation: Evaluation, note: str = "") -> Card:
     return replace(card, provenance=past)
 
 
-def _verify(
-    file: PolicyFile,
-    policy: ActorCriticPolicy,
-    perception: Perception,
-    observations: NDArray[np.float32] | None = None,
-) -> None:
+def _verify(file: PolicyFile, policy: ActorCriticPolicy, proof: _Proof) -> None:
     """Compare the file, run as on the robot, with the policy; raises `PolicyError`."""
     network = Network(file)
-    random = np.random.default_rng(0)
-    stacks = _probe_stacks(file.card)
-    number = len(stacks) or _PROBE_INPUTS
-    rows = observations
-    if rows is None:
-        rows = random.normal(0.0, 1.5, (number, file.card.numbers)).astype(np.float32)
-    given, outputs = [], []
-    for index, row in enumerate(rows):
+    outputs = []
+    for index, row in enumerate(proof.rows):
         network.row[:] = row
-        seen = row
-        if perception.extractor:
-            network.frames[:] = stacks[index]
-            seen = np.concatenate((perception.extractor.see(stacks[index]), row))
-        given.append(seen)
+        if proof.stacks:
+            network.frames[:] = proof.stacks[index]
         outputs.append(network.run())
-    expected = policy.predict(np.array(given), deterministic=True)[0][:, 0]
-    worst = float(np.abs(np.array(outputs) - expected).max())
+    worst = float(np.abs(np.array(outputs) - proof.expected).max())
     if not worst <= TOLERANCE:
         layers = MeanAction(policy)
-        computed = np.clip([layers(row) for row in np.array(given)], -1.0, 1.0)
+        computed = np.clip([layers(row) for row in proof.given], -1.0, 1.0)
         cause = (
             "this version of onnxruntime computes its layers wrongly: install another one"
-            if np.abs(computed - expected).max() <= TOLERANCE
+            if np.abs(computed - proof.expected).max() <= TOLERANCE
             else "the model does more than its layers, which a policy file cannot have"
         )
         raise PolicyError(
-            f"the outputs of the file differ from those of the policy by up to {worst:.2g} of Φ: "
-            f"{cause}"
+            f"{file.path}: the outputs of the file differ from those of the policy by up to "
+            f"{worst:.2g} of Φ: {cause}"
         )
 
 

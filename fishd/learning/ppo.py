@@ -285,8 +285,10 @@ def layers_of(policy: ActorCriticPolicy) -> Layers:
     last = cast(Linear, policy.action_net)
     layers = [
         (
-            linear.weight.detach().numpy().astype(np.float32),
-            linear.bias.detach().numpy().astype(np.float32),
+            linear.weight.detach().cpu().numpy().astype(np.float32),
+            np.zeros(linear.out_features, np.float32)
+            if linear.bias is None
+            else linear.bias.detach().cpu().numpy().astype(np.float32),
         )
         for linear in (*hidden, last)
     ]
@@ -298,12 +300,12 @@ def layers_of(policy: ActorCriticPolicy) -> Layers:
 
 def activation_of(policy: ActorCriticPolicy) -> Literal["tanh", "relu"]:
     """Return the activation function; raises `PolicyError` for any other than these two."""
+    used = {type(part) for part in policy.mlp_extractor.policy_net} - {Linear}
     for name, kind in _ACTIVATIONS.items():
-        if policy.activation_fn is kind:
+        if used <= {kind}:
             return name
-    raise PolicyError(
-        f"activation {policy.activation_fn.__name__} cannot be exported; Tanh or ReLU is needed"
-    )
+    names = ", ".join(sorted(kind.__name__ for kind in used))
+    raise PolicyError(f"activation {names} cannot be exported; Tanh or ReLU is needed")
 
 
 def is_finite(model: PPO) -> bool:
@@ -322,7 +324,7 @@ class MeanAction:
         self._policy = policy
         is_plain = isinstance(policy.features_extractor, FlattenExtractor)
         self._layers = layers_of(policy) if is_plain else []
-        self._tanh = policy.activation_fn is torch.nn.Tanh
+        self._tanh = is_plain and activation_of(policy) == "tanh"
 
     def __call__(self, values: NDArray[np.float32]) -> float:
         """Return the mean, which may be beyond ±1."""

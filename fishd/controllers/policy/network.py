@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fishd.controllers.policy import file
+from fishd.controllers.policy import file, operators
 from fishd.controllers.policy.card import CARD_KEY, Card, encode
 from fishd.controllers.policy.checksum import seal
 from fishd.core.errors import PolicyError
@@ -14,8 +14,10 @@ from fishd.core.errors import PolicyError
 Layer = tuple[NDArray[Any], NDArray[Any]]
 """Weights, shape (outputs, inputs), and biases, shape (outputs,)."""
 
-OPSET, IR_VERSION = 13, 7
-"""Versions that every supported onnxruntime can read."""
+OPSET = 13
+"""Version of the operators, which every supported onnxruntime has."""
+MAX_WEIGHTS_BYTES = file.MAX_FILE_BYTES - 2**20
+"""Maximum size of the weights: the rest is for the card and the operators [bytes]."""
 
 _OPERATORS = {"tanh": "Tanh", "relu": "Relu"}
 
@@ -46,7 +48,8 @@ def to_onnx(
 
     sight: required for a card with pictures
 
-    Raise `PolicyError` if the layers do not fit one another or the card, or are not finite.
+    Raise `PolicyError` if the layers do not fit one another or the card, are too large, or are not
+    finite.
     """
     import onnx
     from onnx import TensorProto, helper, numpy_helper
@@ -55,6 +58,13 @@ def to_onnx(
     sight = sight or Sight([], {}, file.INPUT, card.numbers)
     nodes, constants = list(sight.nodes), dict(sight.constants)
     width = _add_layers(nodes, constants, layers, activation, sight)
+    size = sum(array.nbytes for array in constants.values())
+    if size > MAX_WEIGHTS_BYTES:
+        remedy = "fewer units, or smaller frames" if card.pictures else "fewer units in its layers"
+        raise PolicyError(
+            f"the weights of this policy take {size / 2**20:.0f} MB, and "
+            f"{MAX_WEIGHTS_BYTES // 2**20} are the most; train one with {remedy}"
+        )
     graph = helper.make_graph(
         nodes,
         "policy",
@@ -69,18 +79,12 @@ def to_onnx(
         graph,
         producer_name="fishd",
         producer_version=card.provenance.fishd,
-        ir_version=IR_VERSION,
+        ir_version=operators.IR_VERSION,
         opset_imports=[helper.make_opsetid("", OPSET)],
     )
     helper.set_model_props(model, {CARD_KEY: encode(card)})
     onnx.checker.check_model(model)
     content = seal(model)
-    if len(content) > file.MAX_FILE_BYTES:
-        raise PolicyError(
-            f"this policy takes {len(content) / 2**20:.0f} MB, and {file.MAX_FILE_BYTES // 2**20} "
-            "are the "
-            "most; train one on smaller frames"
-        )
     file.parse(content)
     return content
 

@@ -35,6 +35,8 @@ PERMITTED: Mapping[str, tuple[str, ...]] = {
 
 OPSETS = range(11, 27)
 """Supported versions of these operators."""
+IR_VERSION = 7
+"""Version of the format that every supported onnxruntime can read."""
 MAX_NODES = 1000
 
 _NAMES = frozenset(name for names in PERMITTED.values() for name in names)
@@ -49,6 +51,11 @@ def check(model: "ModelProto") -> None:
         raise PolicyError(
             f"it defines a custom operator, {quoted(model.functions[0].name)}; replace it by those "
             f"of ONNX with onnx.inliner.inline_local_functions, and {SEAL_REMEDY}"
+        )
+    if model.ir_version > onnx.IR_VERSION:
+        raise PolicyError(
+            f"its ir_version is {model.ir_version}; the installed onnx reads up to "
+            f"{onnx.IR_VERSION}: set model.ir_version to {IR_VERSION}, and {SEAL_REMEDY}"
         )
     versions = [entry.version for entry in model.opset_import if entry.domain in _ONNX_DOMAINS]
     if len(versions) != 1 or versions[0] not in OPSETS:
@@ -72,4 +79,7 @@ def check(model: "ModelProto") -> None:
     try:
         onnx.checker.check_model(model, full_check=True)
     except Exception as error:  # onnx's and protobuf's errors, and ValueError
-        raise PolicyError(f"its network contradicts itself: {error_message(error)}") from None
+        raise PolicyError(
+            f"its network contradicts itself: {error_message(error)}; correct it in the program "
+            f"that made the file, and {SEAL_REMEDY}"
+        ) from None

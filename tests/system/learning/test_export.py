@@ -1,3 +1,6 @@
+import functools
+import io
+import operator
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +14,27 @@ from msgspec.structs import replace
 from rigs.harness import Rig, observe
 from rigs.swimming import NOISY, brief_job
 from stable_baselines3 import A2C, PPO, SAC
+from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecCheckNan, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecCheckNan, VecNormalize
 
 from fishd.cli.main import fishctl
+from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.controllers.policy.card import Layout
 from fishd.controllers.policy.file import read
+from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
+from fishd.lab.links.simulated_link import SimulatedLink
+from fishd.learning.env.environment import SwimEnv
 from fishd.learning.export import export, export_model
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError
-from fishd.learning.settings import PpoSettings
+from fishd.learning.settings import EnvironmentSettings, PpoSettings
 from fishd.learning.train.jobs import Outcome
 from fishd.learning.train.training import train
 
@@ -144,7 +152,8 @@ def test_a_model_of_the_user_becomes_a_policy_file(tmp_path: Path, kind: Any) ->
         path = export_model(model, str(tmp_path / "own.onnx"), note="tried on a whim")
     assert str(warned[0].message).startswith(f"{path}: this policy stalls when it swims without ")
     assert str(warned[0].message).endswith(
-        "; it learned from 1 × 64 steps: more updates help, from more steps or a smaller n_steps"
+        "; it learned from 64 steps, in rollouts of 64 × 1: more updates help, from more steps or "
+        "a smaller n_steps"
     )
     controller = registry.create("ppo", {"policy": str(path)}, Limits(amplitude=0.3, tick=0.05))
     card = read(path).card
@@ -217,7 +226,9 @@ def test_a_wrapper_that_a_policy_file_would_lack_is_refused_by_name(
     tmp_path: Path, name: str
 ) -> None:
     model = PPO("MlpPolicy", CHANGES[name](own_env()), n_steps=64, device="cpu")
-    with pytest.raises(PolicyError, match=f"trained behind the wrapper {name}, which may change"):
+    with pytest.raises(
+        PolicyError, match=f"the wrapper of this model is {name}, which may do more"
+    ):
         export_model(model, tmp_path / "a.onnx")
     assert not list(tmp_path.iterdir())
 
@@ -258,37 +269,277 @@ def squashed() -> PPO:
     return PPO("MlpPolicy", own_env(), use_sde=True, policy_kwargs=options, device="cpu")
 
 
+def without_activation() -> PPO:
+    model = own_ppo()
+    model.policy.mlp_extractor.policy_net.append(torch.nn.Linear(64, 64))
+    return model
+
+
+def diverged() -> PPO:
+    model = own_ppo()
+    model.policy.log_std.data.fill_(np.nan)
+    return model
+
+
+def overflowing() -> PPO:
+    model = own_ppo(activation_fn=torch.nn.ReLU)
+    for parameter in model.policy.parameters():
+        parameter.data *= 1e30
+    return model
+
+
+def changed(part: str, name: str, value: Any) -> PPO:
+    """Return a model of which an instance has another method."""
+    model = own_ppo()
+    setattr(operator.attrgetter(part)(model) if part else model, name, value)
+    return model
+
+
+class Mirrored(PPO):
+    """PPO whose actions are mirrored when it is used."""
+
+    def predict(self, *given: Any, **options: Any) -> Any:
+        action, state = super().predict(*given, **options)
+        return -action, state
+
+
+class MirroredEnvs(DummyVecEnv):
+    """Environments that receive the mirrored actions."""
+
+    def step_async(self, actions: Any) -> None:
+        super().step_async(-actions)
+
+
+class MirroredFish(SwimEnv):
+    """An environment that swims to the other side."""
+
+    def step(self, action: Any) -> Any:
+        return super().step(-action)
+
+
+class LoudFish(SwimEnv):
+    """An environment with tenfold observations."""
+
+    def _agent_inputs(self) -> Any:
+        return 10.0 * super()._agent_inputs()
+
+
+class Quiet(gymnasium.RewardWrapper):
+    """Wrapper of rewards, an instance of which mirrors the actions."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.step = lambda action: env.step(-action)  # type: ignore[method-assign]
+
+    def reward(self, reward: Any) -> Any:
+        return reward
+
+
+def fish(kind: type[SwimEnv] = SwimEnv, *overrides: str, **settings: Any) -> SwimEnv:
+    config = load(None, overrides)
+    return kind(SimulatedLink(config), config, EnvironmentSettings(**settings))
+
+
+def several(*envs: SwimEnv) -> PPO:
+    return PPO("MlpPolicy", DummyVecEnv([lambda env=env: env for env in envs]), device="cpu")
+
+
+def features_changed() -> SwimEnv:
+    env = fish()
+    env.features = tuple(replace(feature, scale=2.0) for feature in env.features)
+    return env
+
+
+class TwiceTheMean(DiagGaussianDistribution):
+    """A distribution that is not what the layers compute."""
+
+    def mode(self) -> torch.Tensor:
+        return 2.0 * super().mode()
+
+
+LEAKY = functools.partial(torch.nn.LeakyReLU, 0.3)
 REFUSED: dict[str, tuple[Any, str]] = {
     "elsewhere": (
         lambda: PPO("MlpPolicy", "Pendulum-v1", device="cpu"),
-        "PendulumEnv, is not a SwimEnv of this process",
+        r"the environment of this model is PendulumEnv, .*: load the model with env=gymnasium\.",
     ),
     "normalised": (
         lambda: PPO("MlpPolicy", VecNormalize(DummyVecEnv([own_env])), device="cpu"),
-        "behind the wrapper VecNormalize, .* without that one or with norm_obs=False; the",
+        "wrapper of this model is VecNormalize, .* without that wrapper or with norm_obs=False; th",
     ),
-    "SAC": (lambda: SAC("MlpPolicy", own_env(), device="cpu"), "of PPO or A2C, not SACPolicy"),
-    "ELU": (lambda: own_ppo(activation_fn=torch.nn.ELU), "activation ELU cannot be exported"),
+    "SAC": (lambda: SAC("MlpPolicy", own_env(), device="cpu"), "algorithm of this model is SAC, "),
+    "a text": (lambda: "mine.zip", "algorithm of this model is str, .* PPO or A2C itself with PPO"),
+    "nothing": (lambda: None, "algorithm of this model is missing: load a model of PPO or A2C"),
+    "bare": (
+        lambda: PPO("MlpPolicy", own_env(), _init_setup_model=False),
+        r"policy of this model is missing: train one with PPO\('MlpPolicy', env\)",
+    ),
+    "ELU": (
+        lambda: own_ppo(activation_fn=torch.nn.ELU),
+        "hidden layer of this model is ELU, .* th",
+    ),
+    "partial": (lambda: own_ppo(activation_fn=LEAKY), "hidden layer of this model is LeakyReLU, "),
     "extractor": (
         lambda: own_ppo(features_extractor_class=OwnExtractor),
-        "without the extractor of features OwnExtractor",
+        "extractor of features of this model is OwnExtractor, ",
     ),
-    "norm": (with_norm, "with linear layers and tanh, not with LayerNorm"),
+    "norm": (with_norm, "hidden layer of this model is LayerNorm, .* the same Tanh or ReLU"),
     "double": (in_double_precision, r"is in float64: call model\.policy\.float\(\)"),
-    "hook": (with_hook, "by up to 0.1 of Φ: the model does more than its layers, which a policy"),
+    "hook": (with_hook, "last layer of this model is Linear with its own hook, "),
     "recurrent": (
         lambda: PPO(RecurrentActorCriticPolicy, own_env(), device="cpu"),
-        "the MlpPolicy of PPO or A2C, not RecurrentActorCriticPolicy",
+        "policy of this model is RecurrentActorCriticPolicy, ",
     ),
-    "squashed": (squashed, "without squash_output"),
+    "squashed": (squashed, "a policy file has no squash_output: train one without it"),
+    "more than layers": (
+        lambda: changed("policy", "action_dist", TwiceTheMean(1)),
+        "differ from those of the policy by up to .* the model does more than its layers",
+    ),
+    "too large": (
+        lambda: own_ppo(net_arch={"pi": [2100, 2100], "vf": [8]}, ortho_init=False),
+        "weights of this policy take 17 MB, and 15 are the most; train one with fewer units in its",
+    ),
+    "not a number": (
+        diverged,
+        "its log_std is not finite: the training diverged; ",
+    ),
+    "overflow": (
+        overflowing,
+        "this model computes no action: ValueError: an action of nan is not va",
+    ),
+    "other bounds": (
+        lambda: changed("policy", "action_space", gymnasium.spaces.Box(-0.5, 0.5, (1,))),
+        r"actions of this model are Box\(-0\.5, .*, those of a SwimEnv Box\(-1\.0, ",
+    ),
+    "Mirrored": (
+        lambda: Mirrored("MlpPolicy", own_env(), device="cpu"),
+        "algorithm of this model is Mirrored, .* itself with PPO.load",
+    ),
+    "MirroredEnvs": (
+        lambda: PPO("MlpPolicy", MirroredEnvs([own_env]), device="cpu"),
+        "vectorised environment of this model is MirroredEnvs, ",
+    ),
+    "MirroredFish": (
+        lambda: PPO("MlpPolicy", fish(MirroredFish), device="cpu"),
+        "the environment of this model is MirroredFish, ",
+    ),
+    "LoudFish": (
+        lambda: PPO("MlpPolicy", fish(LoudFish), device="cpu"),
+        "the environment of this model is LoudFish, ",
+    ),
+    "Quiet": (
+        lambda: PPO("MlpPolicy", Quiet(own_env()), device="cpu"),
+        "the wrapper of this model is Quiet with its own step, .* train one without that wrapper",
+    ),
+    "own predict": (
+        lambda: changed("", "predict", print),
+        "of this model is PPO with its own predict",
+    ),
+    "own forward": (
+        lambda: changed("policy.action_net", "forward", print),
+        "the last layer of this model is Linear with its own forward, ",
+    ),
+    "another tick": (
+        lambda: several(fish(), fish(SwimEnv, "tick=0.1")),
+        r"config\.tick of environment 1 of this model is 0\.1, not 0\.05 .* in equal environments",
+    ),
+    "another amplitude": (
+        lambda: several(fish(), fish(), fish(SwimEnv, "amplitude_limit=0.3")),
+        r"config\.amplitude_limit of environment 2 of this model is 0\.3, not 0\.42 ",
+    ),
+    "other settings": (
+        lambda: several(fish(), fish(episode=100)),
+        r"settings\.episode of environment 1 of this model is 100, not 768 ",
+    ),
+    "another class": (
+        lambda: several(fish(), fish(MirroredFish)),
+        "the environment of this model is MirroredFish, ",
+    ),
+    "changed features": (
+        lambda: several(features_changed()),
+        "features of environment 0 of this model is ",
+    ),
+    "no last activation": (
+        without_activation,
+        "hidden layer of this model is missing: train one with linear layers, each followed by",
+    ),
+    "other processes": (
+        lambda: changed("", "env", SubprocVecEnv.__new__(SubprocVecEnv)),
+        r"SubprocVecEnv, .*Swim-v0'\), .*, since environments in other processes cannot be checked",
+    ),
+    "no environment": (
+        lambda: changed("", "env", None),
+        r"vectorised environment of this model is missing: load the model with env=gymnasium\.",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_a_model_that_a_policy_file_cannot_represent_is_refused(tmp_path: Path, name: str) -> None:
     make, message = REFUSED[name]
-    with pytest.raises(PolicyError, match=message):
+    with pytest.raises(PolicyError, match=message) as refused:
         export_model(make(), tmp_path / "a.onnx")
+    assert str(refused.value).startswith(f"{tmp_path / 'a.onnx'}: ")
+    assert str(refused.value).count("a.onnx") == 1
+    assert str(refused.value).isprintable()
+    assert len(str(refused.value)) < 400
+    assert not list(tmp_path.iterdir())
+
+
+def without_bias() -> PPO:
+    model = own_ppo()
+    model.policy.action_net = torch.nn.Linear(64, 1, bias=False)
+    return model
+
+
+def with_large_actions() -> PPO:
+    model = own_ppo(net_arch=[])
+    model.policy.action_net.weight.data *= 100.0
+    return model
+
+
+def loaded_without_steps() -> PPO:
+    stored = io.BytesIO()
+    own_ppo().save(stored)
+    return PPO.load(stored, env=own_env(), custom_objects={"n_steps": 0})
+
+
+EXPORTED: dict[str, Any] = {
+    "last layer without bias": without_bias,
+    "large actions without hidden layers": with_large_actions,
+    "activation made by a function": lambda: own_ppo(
+        activation_fn=functools.partial(torch.nn.ReLU)
+    ),
+    "loaded without steps": loaded_without_steps,
+    "several fish with their own noise": lambda: several(
+        fish(), fish(SwimEnv, "simulation.seed=5")
+    ),
+    "history": lambda: several(fish(history=3)),
+}
+
+
+@pytest.mark.filterwarnings("ignore:.*this policy stalls")
+@pytest.mark.parametrize("name", EXPORTED)
+def test_the_file_of_an_unusual_model_has_the_outputs_of_its_policy(
+    tmp_path: Path, name: str
+) -> None:
+    model = EXPORTED[name]()
+    network = Network(read(export_model(model, tmp_path / "a.onnx")))
+    for row in np.random.default_rng(3).normal(size=(20, len(network.row))).astype(np.float32):
+        network.row[:] = row
+        assert network.run() == pytest.approx(
+            model.predict(row, deterministic=True)[0][0], abs=1e-5
+        )
+
+
+def test_a_file_is_compared_with_the_angles_of_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = own_ppo()
+    step = SwimEnv.step
+    monkeypatch.setattr(SwimEnv, "step", lambda env, action: step(env, -action))
+    with pytest.raises(PolicyError, match="the outputs of the file differ from those of the polic"):
+        export_model(model, tmp_path / "a.onnx")
     assert not list(tmp_path.iterdir())
 
 

@@ -125,7 +125,17 @@ def test_a_network_that_contradicts_itself_is_refused_with_onnx_s_reason(
 ) -> None:
     refused = refusal(of_nodes(nodes, weights))
     assert refused.startswith("its network contradicts itself: ")
+    assert f"; correct it in the program that made the file, and {SEAL_REMEDY}" in refused
     assert message in refused
+
+
+def test_a_newer_format_than_onnx_reads_is_refused_with_the_one_to_set() -> None:
+    model = onnx.load_from_string(of_nodes([make("Tanh", ["observation"], ["action"])], []))
+    model.ir_version = 99
+    assert refusal(seal(model)) == (
+        f"its ir_version is 99; the installed onnx reads up to {onnx.IR_VERSION}: set "
+        f"model.ir_version to {operators.IR_VERSION}, and {SEAL_REMEDY}"
+    )
 
 
 def test_a_network_that_takes_over_half_a_tick_is_refused_with_its_time(tmp_path: Path) -> None:
