@@ -77,7 +77,8 @@ NEUTRAL_WRAPPERS: tuple[type[Any], ...] = (
 )
 """Wrappers of environments that change neither observations nor actions."""
 _LOAD_WITH_FISH = (
-    "load the model with env=gymnasium.make('fishd/Swim-v0'), made as it was for the training"
+    "load the model with env=gymnasium.make('fishd/Swim-v0'), with the config, settings and "
+    "overrides of its training"
 )
 _ABOUT_1 = "; the observations of a SwimEnv are about 1 already"
 _MORE_REMEDIES: dict[type[Any], str] = {
@@ -281,12 +282,13 @@ def _check_equal(first: SwimEnv, env: SwimEnv, number: int) -> None:
         )
     here, there = _traits(first), _traits(env)
     here["features"] = here["perception"] = features(first.config, first.settings)
-    for key, value in here.items():
-        if key != "config.simulation.seed" and value != there[key]:
+    for key in here | there:
+        value, other = here.get(key), there.get(key)
+        if key != "config.simulation.seed" and value != other:
             raise PolicyError(
-                f"{key} of environment {number} of this model is {quoted(str(there[key]))}, not "
-                f"{quoted(str(value))} as for environment 0 when it was made, and a policy file "
-                "has only one: train one in equal environments"
+                f"{key} of environment {number} of this model is {quoted(str(other))}, not "
+                f"{quoted(str(value))} as when environment 0 was made, and a policy file has only "
+                "one: train one in equal environments"
             )
 
 

@@ -451,6 +451,10 @@ REFUSED: dict[str, tuple[Any, str]] = {
         lambda: several(fish(), fish(episode=100)),
         r"settings\.episode of environment 1 of this model is 100, not 768 ",
     ),
+    "another fish": (
+        lambda: several(fish(), fish(SwimEnv, "plant.omega0=20")),
+        r"config\.plant\.omega0 of environment 1 of this model is 20\.0, not ",
+    ),
     "another class": (
         lambda: several(fish(), fish(MirroredFish)),
         "the environment of this model is MirroredFish, ",
@@ -465,7 +469,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     ),
     "other processes": (
         lambda: changed("", "env", SubprocVecEnv.__new__(SubprocVecEnv)),
-        r"SubprocVecEnv, .*Swim-v0'\), .*, since environments in other processes cannot be checked",
+        r"SubprocVecEnv, .*Swim-v0'\), .* training, since environments in other processes cannot",
     ),
     "no environment": (
         lambda: changed("", "env", None),
