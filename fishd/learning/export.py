@@ -244,6 +244,11 @@ def _wrapper(wrapper: Any) -> _Part:
 
 def _check_model(model: Any) -> tuple[SwimEnv, ActorCriticPolicy]:
     """Return environment and policy of a model; raise `PolicyError` if they do more than a file."""
+    if not isinstance(model, BaseAlgorithm):
+        raise PolicyError(
+            "the model of this policy must be a PPO or A2C of stable-baselines3, not "
+            f"{quoted(repr(model))}: load one with PPO.load"
+        )
     envs = []
     for role, part, permitted, remedy in _parts(model):
         name = "missing" if part is None else type(part).__name__

@@ -368,8 +368,11 @@ REFUSED: dict[str, tuple[Any, str]] = {
         "wrapper of this model is VecNormalize, .* without that wrapper or with norm_obs=False; th",
     ),
     "SAC": (lambda: SAC("MlpPolicy", own_env(), device="cpu"), "algorithm of this model is SAC, "),
-    "a text": (lambda: "mine.zip", "algorithm of this model is str, .* PPO or A2C itself with PPO"),
-    "nothing": (lambda: None, "algorithm of this model is missing: load a model of PPO or A2C"),
+    "a text": (
+        lambda: "mine.zip",
+        r"must be a PPO or A2C of stable-baselines3, not 'mine\.zip': load one with PPO\.load",
+    ),
+    "nothing": (lambda: None, "must be a PPO or A2C of stable-baselines3, not None: load one with"),
     "bare": (
         lambda: PPO("MlpPolicy", own_env(), _init_setup_model=False),
         r"policy of this model is missing: train one with PPO\('MlpPolicy', env\)",
