@@ -268,7 +268,7 @@ def _check_model(model: Any) -> tuple[SwimEnv, ActorCriticPolicy]:
             envs.append(part)
     for number, env in enumerate(envs):
         _check_equal(envs[0], env, number)
-    policy = model.policy
+    policy = cast(ActorCriticPolicy, model.policy)
     _check_numbers(policy)
     if policy.action_space != envs[0].action_space:
         raise PolicyError(
@@ -354,7 +354,10 @@ def _swim(model: BaseAlgorithm, env: SwimEnv, card: Card) -> _Proof:
             action, _ = model.predict(observation, deterministic=True)
             simulated.step(action)
         except Exception as error:  # those of torch differ
-            raise PolicyError(f"this model computes no action: {describe_error(error)}") from None
+            raise PolicyError(
+                f"this model computes no action: {describe_error(error)}; export an earlier "
+                "checkpoint"
+            ) from None
         expected.append(link.angle / card.amplitude)
         history.push(simulated.latest)
         action = random.uniform(-1.0, 1.0, action.shape).astype(np.float32)
