@@ -73,6 +73,8 @@ REST_DELAY_S = 2.5
 _WAVE = (CONTROLLER, dict[str, float]())
 
 Array = NDArray[np.float64]
+Line = tuple[int, list[str]]
+"""Number of a line of a file, and its cells."""
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> dict[str, Array]:
@@ -95,21 +97,26 @@ def read_table(path: Path, names: Sequence[str] | None = None) -> dict[str, Arra
         raise RecordingError(f"{path}: not a table: {error}") from None
     if not lines:
         raise RecordingError(f"{path}: it is empty: a table of numbers is needed")
+    if names is None:
+        _drop_empty_cells(lines[0][1], 1)
     named = list(names) if names is not None else lines[0][1]
     columns = [_parse_name(path, name.strip()) for name in named]
     kept = [index for index, (name, _) in enumerate(columns) if name != LEFT_OUT]
     _check_names(path, [columns[index][0] for index in kept], from_file=names is None)
-    lines = _drop_header(lines, kept)
-    for number, cells in lines:
+    table_lines = _drop_header(lines, kept)
+    if doubt := _find_ambiguous_lines(table_lines):
+        raise RecordingError(f"{path}: {doubt}")
+    for number, cells in table_lines:
+        _drop_empty_cells(cells, len(columns))
         if len(cells) != len(columns):
             raise RecordingError(
                 f"{path}: line {number} has {len(cells)} columns, not {len(columns)}: name each "
                 f"with --columns, '{LEFT_OUT}' for one to leave out"
             )
-    if problem := _find_ambiguous_lines(lines) or _find_ambiguous_number(lines, kept):
-        raise RecordingError(f"{path}: {problem}")
+    if doubt := _find_ambiguous_number(table_lines, kept):
+        raise RecordingError(f"{path}: {doubt}")
     rows: list[list[float]] = []
-    for number, cells in lines:
+    for number, cells in table_lines:
         values = [_parse_number(cells[index]) for index in kept]
         for index, value in zip(kept, values, strict=True):
             if value is None:
@@ -284,7 +291,7 @@ def _decode(path: Path, raw: bytes) -> str:
     return raw.decode("utf-8-sig", "replace")
 
 
-def _split_lines(path: Path, content: str) -> Iterator[tuple[int, list[str]]]:
+def _split_lines(path: Path, content: str) -> Iterator[Line]:
     """Yield the number and the cells of each line that is not empty.
 
     Raise `csv.Error`, and `RecordingError` for a line that is too long.
@@ -293,8 +300,8 @@ def _split_lines(path: Path, content: str) -> Iterator[tuple[int, list[str]]]:
     for number, line in enumerate(lines, start=1):
         if len(line) > MAX_LINE_CHARACTERS:
             raise RecordingError(
-                f"{path}: line {number} has more than {MAX_LINE_CHARACTERS} characters: each row "
-                "of the table needs a line of its own"
+                f"{path}: line {number} has more than {MAX_LINE_CHARACTERS} characters: write "
+                "each row of the table in a separate line"
             )
     sample = [line for line in lines[:50] if line.strip()]
     delimiter = _find_delimiter(sample[-1]) if sample else None
@@ -302,8 +309,6 @@ def _split_lines(path: Path, content: str) -> Iterator[tuple[int, list[str]]]:
     if delimiter:
         rows = csv.reader(lines, delimiter=delimiter)
     for number, cells in enumerate(rows, start=1):
-        while len(cells) > 1 and not cells[-1].strip():  # a separator at the end of the line
-            cells.pop()
         if any(cell.strip() for cell in cells):
             yield number, cells
 
@@ -322,9 +327,13 @@ def _find_delimiter(line: str) -> str | None:
     return max((";", "\t", ",", None), key=count)
 
 
-def _drop_header(
-    lines: Sequence[tuple[int, list[str]]], kept: Sequence[int]
-) -> Sequence[tuple[int, list[str]]]:
+def _drop_empty_cells(cells: list[str], count: int) -> None:
+    """Remove empty cells at the end, as of a separator there, while there are more than `count`."""
+    while len(cells) > count and not cells[-1].strip():
+        cells.pop()
+
+
+def _drop_header(lines: Sequence[Line], kept: Sequence[int]) -> Sequence[Line]:
     """Return the lines from the first one with a number in a column that is kept."""
     for begin, (_, cells) in enumerate(lines):
         for cell in (cells[index] for index in kept if index < len(cells)):
@@ -334,7 +343,7 @@ def _drop_header(
     return []
 
 
-def _find_ambiguous_lines(lines: Sequence[tuple[int, list[str]]]) -> str:
+def _find_ambiguous_lines(lines: Sequence[Line]) -> str:
     """Return in words where an empty line separates some rows from others; empty if nowhere.
 
     Programs write a summary there. An empty line after each row means nothing.
@@ -348,7 +357,7 @@ def _find_ambiguous_lines(lines: Sequence[tuple[int, list[str]]]) -> str:
     )
 
 
-def _find_ambiguous_number(lines: Sequence[tuple[int, list[str]]], kept: Sequence[int]) -> str:
+def _find_ambiguous_number(lines: Sequence[Line], kept: Sequence[int]) -> str:
     """Return in words which point or comma may separate thousands; empty if none may."""
     marked: dict[str, str] = {}
     for number, cells in lines:
