@@ -75,8 +75,8 @@ class Appended(NamedTuple):
 
     size: int
     """Number of bytes."""
-    has_recording: bool
-    """Whether another recording is in them, as after `cat a.mcap b.mcap`."""
+    is_recording: bool
+    """Whether another recording begins with them, as after `cat a.mcap b.mcap`."""
 
 
 def read_records(path: Path) -> Iterator[McapRecord | Damaged | Appended]:
@@ -276,8 +276,8 @@ def _read_outer_records(path: Path) -> Iterator[tuple[int, McapRecord | Damaged 
                         end = offset + _HEAD.size + len(body) + len(_MAGIC)
                         if end < size:
                             file.seek(end)
-                            has_recording = _MAGIC in file.read(_MAX_WINDOW_BYTES)
-                            yield offset, Appended(size - end, has_recording)
+                            is_recording = file.read(len(_MAGIC)) == _MAGIC
+                            yield offset, Appended(size - end, is_recording)
                         yield offset, record
                         return
                     if record is not None:

@@ -407,11 +407,9 @@ class Run:
                 self._damages.append(ticks)
                 self._note_damage(record.reason)
             elif isinstance(record, Appended):
-                other = ", with another recording; mcap merge joins two recordings"
-                bytes_ = _format_count(record.size, "byte")
-                self._appended = (
-                    f"{bytes_} after its end are not read{other if record.has_recording else ''}"
-                )
+                self._appended = f"{_format_count(record.size, 'byte')} after its end are not read"
+                if record.is_recording:
+                    self._appended += f": another recording, which tail -c {record.size} extracts"
             elif isinstance(record, Statistics):
                 for number, count in record.channel_message_counts.items():
                     self._indexed[self._topics.get(number, "")] += count

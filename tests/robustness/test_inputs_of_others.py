@@ -35,8 +35,8 @@ LINES = {
     "with-an-unknown-chunk-and-no-end": "not as recorded: 50 ticks instead of 60",
     "half-and-then-zeros": "damaged: an unknown number of ticks lost",
     "whole-chunks-and-then-zeros": "damaged: an unknown number of ticks lost",
-    "followed-by-another": "not as recorded: BYTES bytes after its end are not read, with another "
-    "recording; mcap merge joins two recordings",
+    "followed-by-another": "not as recorded: BYTES bytes after its end are not read: another "
+    "recording, which tail -c BYTES extracts",
     "followed-by-zeros": "not as recorded: 512 bytes after its end are not read",
 }
 """Message of every verb about a file, by name; empty for one that differs in nothing."""
