@@ -10,8 +10,8 @@ from collections.abc import Iterator
 import click
 
 from common.report import table, write_reference
+from fishd.cli.controller_arguments import ControllerGroup
 from fishd.cli.main import fishctl
-from fishd.cli.options import ControllerGroup
 
 SHARED = (
     *("--on", "--for", "--budget", "--folder", "--resume", "--to", "--plot", "--json", "--seed"),

@@ -11,7 +11,7 @@ from msgspec import to_builtins
 from msgspec.structs import replace
 
 from fishd.cli.completion import complete_contestant
-from fishd.cli.controllers_command import ControllersCommand
+from fishd.cli.controller_arguments import ControllersCommand
 from fishd.cli.experiment_options import (
     ChosenFish,
     ExperimentEnding,
@@ -22,12 +22,7 @@ from fishd.cli.experiment_options import (
     live_folder_options,
     record_session,
 )
-from fishd.cli.options import (
-    camera_config_option,
-    for_option,
-    json_option,
-    plot_option,
-)
+from fishd.cli.options import camera_config_option, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress
 from fishd.config import Config, check_tethered

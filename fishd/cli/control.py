@@ -8,7 +8,8 @@ import click
 
 from fishd import client
 from fishd.cli.completion import active_parameters, complete_pair
-from fishd.cli.options import ControllerGroup, ParameterType, Utf8Text, daemon_options
+from fishd.cli.controller_arguments import ControllerGroup, ParameterType
+from fishd.cli.options import Utf8Text, daemon_options
 from fishd.cli.output import echo, format_state, make_printable, print_json, report_detour
 from fishd.cli.plausibility import running_config, warn_of_values
 from fishd.core.protocol import State

@@ -13,7 +13,8 @@ from msgspec import to_builtins
 from msgspec.structs import replace
 
 from fishd.cli.config import config_option, set_option
-from fishd.cli.options import ControllerGroup, F, endpoint_option, take_option, verb_lease
+from fishd.cli.controller_arguments import ControllerGroup
+from fishd.cli.options import F, endpoint_option, take_option, verb_lease
 from fishd.cli.output import echo
 from fishd.config import Config, Start, load
 from fishd.core.addresses import ENDPOINT_VARIABLE, find_control_address, socket_path

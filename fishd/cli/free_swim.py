@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from fishd.cli.controller_arguments import ControllerGroup
 from fishd.cli.experiment_options import RUN_ONLY_OPTIONS, kept_arguments, restore_arguments
-from fishd.cli.options import ControllerGroup, F, FiniteRange
+from fishd.cli.options import F, FiniteRange
 from fishd.cli.output import echo, echo_rows, format_controller, print_json
 from fishd.cli.progress import show_progress
 from fishd.core import files, text

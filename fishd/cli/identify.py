@@ -217,8 +217,8 @@ def _print_result(identification: "Identification") -> None:
             "value"
         )
     for channel, symbol in zip(identification.channels, ("F_x", "F_y"), strict=True):
-        rest = f"noise {channel.noise * 1e3:.2f} mN, drift ±{0.5 * channel.drift * 1e3:.1f} mN"
-        echo(f"{symbol}: {channel.explained:.3%} of it explained; {rest}")
+        noise, drift = channel.noise * 1e3, 0.5 * channel.drift * 1e3
+        echo(f"{symbol}: noise {noise:.2f} mN, drift ±{drift:.1f} mN")
     parts = (
         ""
         if identification.passages == 1

@@ -8,7 +8,8 @@ from typing import Any, TypeVar
 import click
 
 from fishd import client
-from fishd.cli.options import daemon_options, describe_parameter
+from fishd.cli.controller_arguments import describe_parameter
+from fishd.cli.options import daemon_options
 from fishd.cli.output import echo, make_printable, print_json
 from fishd.core import text
 from fishd.core.addresses import ENDPOINT_VARIABLE

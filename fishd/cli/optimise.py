@@ -12,6 +12,7 @@ import click
 from msgspec import Struct
 from msgspec.structs import replace
 
+from fishd.cli.controller_arguments import ParameterType
 from fishd.cli.experiment_options import (
     ChosenFish,
     ExperimentEnding,
@@ -20,7 +21,7 @@ from fishd.cli.experiment_options import (
     fish_choice,
     folder_options,
 )
-from fishd.cli.options import FiniteRange, ParameterType, json_option, plot_option, seed_option
+from fishd.cli.options import FiniteRange, json_option, plot_option, seed_option
 from fishd.cli.output import echo, format_count, print_json, warn_of_fin
 from fishd.cli.progress import show_progress
 from fishd.controllers import registry
@@ -53,7 +54,8 @@ class RangeType(ParameterType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert `1:3`, `1:` or `:` to an `OpenRange`, other texts to a value."""
-        if not isinstance(value, str) or ":" not in value or self.field.kind != "number":
+        is_range = isinstance(value, str) and (":" in value or "," in value)
+        if not is_range or self.field.kind != "number":
             return super().convert(value, param, ctx)
         try:
             low, high = value.split(":")

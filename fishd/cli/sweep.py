@@ -1,5 +1,6 @@
 """The verb `fishctl sweep`, which measures thrust or speed over a grid of parameters."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -8,6 +9,7 @@ import click
 import msgspec
 from msgspec.structs import replace
 
+from fishd.cli.controller_arguments import ValuesType
 from fishd.cli.experiment_options import (
     ChosenFish,
     ExperimentEnding,
@@ -17,7 +19,7 @@ from fishd.cli.experiment_options import (
     folder_options,
 )
 from fishd.cli.free_swim import format_speed
-from fishd.cli.options import FiniteRange, ValuesType, for_option, json_option, plot_option
+from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, warn_of_fin
 from fishd.cli.progress import show_progress
 from fishd.config import Config
@@ -56,13 +58,13 @@ def sweep_options(function: Any) -> Any:
         for_option(f"Live: swimming and resting at each point [s]. [default: {DEFAULT_POINT_S:g}]"),
         click.option(
             "--periods",
-            type=click.IntRange(min=2),
+            type=click.IntRange(2, 10_000),
             help="In simulation: measured tail beats of each point; for a swimmer, the "
             "smallest number. [default: 20; for a swimmer 10]",
         ),
         click.option(
             "--settle",
-            type=FiniteRange(min=0.0),
+            type=FiniteRange(0.0, 100_000.0),
             help="In simulation: time before the measured beats [s]. [default: 10; for a swimmer "
             "4, or until its speed is steady]",
         ),
@@ -120,22 +122,26 @@ def _sweep(
     names = [info.name for info in infos]
     accepted = {info.name: [field.name for field in info.parameters] for info in infos}
     units = {field.name: field.unit for info in infos for field in info.parameters}
-    points = grid.make_points(
-        names, parameters, accepted, dict(_parse_variation(text) for text in vary)
-    )
+    points = grid.make_points(names, parameters, accepted, _parse_variations(vary))
     task = _Sweep(points, units, place, fish, picture, as_json)
     if fish.on == "live":
         return task.measure(DEFAULT_POINT_S if seconds is None else seconds)
     return task.swim({"settle": settle, "periods": periods}, {"jobs": jobs, "cluster": cluster})
 
 
-def _parse_variation(text: str) -> tuple[str, list[Any]]:
+def _parse_variations(texts: Sequence[str]) -> dict[str, list[Any]]:
+    """Return the values of each key; raise `UsageError`."""
     from fishd.lab.sweep.grid import expand_values, parse_value
 
-    key, equals, values = text.partition("=")
-    if not (equals and key.strip()):
-        raise click.UsageError(f"--vary {text}: write KEY=VALUES, such as plant.xi=0.6,1.2,2.4")
-    return key.strip(), list(dict.fromkeys(map(parse_value, expand_values(values))))
+    variations: dict[str, list[Any]] = {}
+    for word in texts:
+        key, equals, values = (part.strip() for part in word.partition("="))
+        if not (equals and key and values):
+            raise click.UsageError(f"--vary {word}: write KEY=VALUES, such as plant.xi=0.6,1.2,2.4")
+        if key in variations:
+            raise click.UsageError(f"--vary {key} is given twice: write {key}=VALUE,VALUE")
+        variations[key] = list(dict.fromkeys(map(parse_value, expand_values(values))))
+    return variations
 
 
 @dataclass
@@ -326,6 +332,8 @@ def _format_best(best: "Best", unit: str, unit_of_value: str) -> str:
     value = text.format_measured(best.value, best.value_ci95, unit_of_value)
     if best.x is None:
         return value
+    if "." in best.x_name:  # a property of the fish, which nobody chooses
+        return f"largest at {best.x_name} {best.x:.4g}{symbol}: {value}"
     if best.at_edge:
         return (
             f"best measured at {best.x_name} {best.x:g}{symbol}, {value}: at the edge of the grid, "

@@ -56,6 +56,8 @@ def split_spec(spec: str) -> tuple[str, list[tuple[str, str]]]:
         key, equals, value = word.partition("=")
         if pairs and not (equals and key.isidentifier()):
             pairs[-1] = (pairs[-1][0], f"{pairs[-1][1]},{word}")
+        elif key in dict(pairs):
+            raise ParameterError(f"{spec}: {key} is given twice")
         elif key and equals and value:
             pairs.append((key, value))
         else:

@@ -38,7 +38,7 @@ class WaveformParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Parameters of `square`, `sine` and `triangle`."""
 
     frequency: Annotated[
-        float, unit("Hz", "Frequency of the waveform.", gt=0, le=10, step=0.05)
+        float, unit("Hz", "Frequency of the waveform.", ge=0.001, le=10, step=0.05)
     ] = 1.8
     amplitude: Annotated[
         Amplitude,

@@ -490,6 +490,8 @@ def parse_value(field: Field, text: str) -> Any:
     try:
         if field.kind == "boolean":
             return _BOOLEANS[text.lower()]
+        if field.kind in ("number", "integer") and "_" in text:  # Python reads 1_0 as 10
+            raise ValueError
         value = {"number": float, "integer": int}.get(field.kind, str)(text)
         if value in (math.inf, -math.inf) or value != value:
             raise ValueError

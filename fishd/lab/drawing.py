@@ -106,12 +106,12 @@ def open_figure(path: str | os.PathLike[str], size: tuple[float, float]) -> Iter
     """
     check(path)
     load_matplotlib()
-    from matplotlib import rc_context, rcdefaults, rcParams
+    from matplotlib import rc_context, rcParamsDefault
     from matplotlib.figure import Figure
 
-    with rc_context():
-        rcdefaults()
-        rcParams.update(_STYLE)
+    # `rcdefaults` would read the style files of the user.
+    defaults = {name: rcParamsDefault[name] for name in rcParamsDefault if name != "backend"}
+    with rc_context(defaults | _STYLE):
         figure = Figure(figsize=size, layout="constrained")
         yield figure
         save(figure, Path(path))

@@ -212,14 +212,16 @@ def open_experiment(path: Path, header: Header, *, resume: bool = False) -> Iter
         raise ConfigError(f"{error.filename}: {error.strerror}") from None
 
 
-def mark_folder(path: Path, kind: str, on: On) -> None:
+def mark_folder(path: Path, kind: str, on: On, command: Sequence[str] = ()) -> None:
     """Create a folder with a header, for an experiment that writes its other files itself.
 
+    command: arguments of its verb
     Raises `ConfigError` where the folder is not empty or cannot be created, and OSError.
     """
     check_free(path)
     _make_folder(path)
-    write_atomically(path / HEADER, _as_json(_with_start(path, Header(kind=kind, on=on))))
+    header = Header(kind=kind, on=on, command=list(command))
+    write_atomically(path / HEADER, _as_json(_with_start(path, header)))
 
 
 def _make_folder(path: Path) -> None:
@@ -300,10 +302,16 @@ class Answer(NamedTuple):
     """The same with the calibration [N]; None where that is not known."""
     summary: str = ""
     """Result other than a thrust, in words."""
+    problem: str = ""
+    """Reason why the result cannot be read; empty if it can, or if there is none."""
 
 
 def find_answer(path: Path) -> Answer:
     """Return what an experiment has found."""
+    try:
+        results = _read_results(path)
+    except FileProblem as problem:
+        return Answer(problem=f"{path / RESULT}: {problem}; delete it, the rows are kept")
     answers = [
         Answer(
             _read_number(result.get("thrust")),
@@ -311,7 +319,7 @@ def find_answer(path: Path) -> Answer:
             _read_number(result.get("total_ci95")),
             text.line(str(result.get("summary", ""))),
         )
-        for result in _read_results(path)
+        for result in results
     ]
     return max(
         answers,
@@ -321,14 +329,18 @@ def find_answer(path: Path) -> Answer:
 
 
 def _read_results(path: Path) -> Iterable[Mapping[str, Any]]:
-    try:
-        if (path / RESULT).exists():
-            content = files.read(path / RESULT, MAX_TABLE_BYTES, "a result")
+    """Return the rows of the result or, before its end, of the table; raise `FileProblem`."""
+    if (path / RESULT).exists():
+        content = files.read(path / RESULT, MAX_TABLE_BYTES, "a result")
+        try:
             results = msgspec.json.decode(content, type=list[dict[str, Any]] | dict[str, Any])
-            return results if isinstance(results, list) else [results]
+        except msgspec.DecodeError as error:
+            raise FileProblem(f"not a result: {text.line(str(error))}") from None
+        return results if isinstance(results, list) else [results]
+    try:
         head, *rows = tables.read(path / ROWS, MAX_TABLE_BYTES) or [[]]
         return [dict(zip(head, row, strict=False)) for row in rows]
-    except (FileProblem, msgspec.DecodeError):
+    except FileProblem:
         return []
 
 

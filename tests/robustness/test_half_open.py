@@ -4,7 +4,6 @@ Nothing waits for ever, and what is lost is counted and said.
 """
 
 import asyncio
-import itertools
 import json
 import logging
 import re
@@ -160,17 +159,21 @@ def test_a_recording_without_a_loss_ends_with_zero(distant: DistantDaemon, tmp_p
 def test_events_arrive_again_after_a_silence_and_the_loss_is_logged(
     distant: DistantDaemon, caplog: pytest.LogCaptureFixture
 ) -> None:
-    heard: list[str] = []
+    heard: list[list[str]] = [[], []]
 
     def listen() -> None:
         with Fish(distant.distant_endpoint) as fish:
-            heard.extend(event.message for event in itertools.islice(fish.events(), 1))
+            for event in fish.events():
+                heard[0].append(event.message)
+                if event.message == "after":
+                    return
 
     async def listen_to_more() -> None:
         async with AsyncFish(distant.distant_endpoint) as fish:
             async for event in fish.events():
-                heard.append(event.message)
-                return
+                heard[1].append(event.message)
+                if event.message == "after":
+                    return
 
     threads = [
         threading.Thread(target=listen, daemon=True),
@@ -182,18 +185,19 @@ def test_events_arrive_again_after_a_silence_and_the_loss_is_logged(
             next(ticks)
             for thread in threads:
                 thread.start()
+            wait_until(lambda: _mark(sender, "before") and all(heard))
             seen = next(ticks).seq
             distant.path.forget(distant.telemetry_port, distant.control_port)
             assert next(tick.seq for tick in ticks if tick.seq > seen + 20)
-        wait_until(lambda: len(caplog.messages) >= 3 or not _mark(sender))
+        wait_until(lambda: len(caplog.messages) >= 3 or not _mark(sender, "during"))
         for thread in threads:
-            wait_until(lambda thread=thread: _mark(sender) and not thread.is_alive())
-    assert set(heard) == {"hello"}
+            wait_until(lambda thread=thread: _mark(sender, "after") and not thread.is_alive())
+    assert [messages[-1] for messages in heard] == ["after", "after"]
     assert any("arrives again" in message for message in caplog.messages)
 
 
-def _mark(sender: Fish) -> bool:
-    return sender.mark("hello").seq > 0
+def _mark(sender: Fish, text: str) -> bool:
+    return sender.mark(text).seq > 0
 
 
 def test_ticks_that_never_return_are_an_error_that_says_that_fishd_answers(

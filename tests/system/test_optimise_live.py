@@ -34,7 +34,7 @@ def test_what_the_fish_cannot_do_is_not_begun(daemon: Daemon, tmp_path: Path) ->
     folder = tmp_path / "run"
     words = ["optimise", "square", "--on", "live", "--folder", str(folder)]
     for name, range_, named in (
-        ("frequency", "1:30", "(0, 10]"),
+        ("frequency", "1:30", "[0.001, 10]"),
         ("amplitude", "0.1:0.6", "(0, 0.42]"),
     ):
         refused = daemon.fishctl(*words, f"--{name}", range_)

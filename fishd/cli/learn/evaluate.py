@@ -10,7 +10,7 @@ import click
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.config import fish_options
-from fishd.cli.controllers_command import ControllersCommand
+from fishd.cli.controller_arguments import ControllersCommand
 from fishd.cli.options import for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress

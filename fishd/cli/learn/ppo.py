@@ -50,7 +50,8 @@ def _read_command(_: click.Context, folder: Path) -> list[str]:
     from fishd.lab.experiment import HEADER, read_header
 
     header = read_header(folder) if (folder / HEADER).exists() else None
-    return header.command if header and header.kind == _KIND else []
+    words = header.command if header and header.kind == _KIND else []
+    return words if any(word.partition("=")[0] == "--seeds" for word in words) else []
 
 
 class _Training(click.Command):
@@ -254,6 +255,7 @@ def _prepare_job(
             err=True,
         )
     return Job(
+        command=kept_arguments(click.get_current_context()),
         config=config,
         settings=settings,
         folder=resume or folder or default_folder("learn ppo"),

@@ -6,10 +6,11 @@ import click
 
 from fishd.cli.completion import complete_contestant
 from fishd.cli.config import set_option
-from fishd.cli.controllers_command import ControllersCommand
+from fishd.cli.controller_arguments import ControllersCommand
 from fishd.cli.options import json_option
 from fishd.cli.output import echo, format_controller, format_count, print_json
 from fishd.cli.recording.files import folder_option, open_recording
+from fishd.core import text
 from fishd.lab.compare.contestants import parse
 from fishd.lab.rerun import Estimates, Stretch
 from fishd.lab.rerun import rerun as choose_again
@@ -44,7 +45,7 @@ def rerun(
         print_json(result)
     else:
         for stretch in result.stretches:
-            _print_stretch(stretch)
+            _print_stretch(stretch, controller)
         _print_estimates(result.estimates)
     if not result.stretches:
         echo(f"fishctl: {recorded.path}: no controller swam, so none can choose again", err=True)
@@ -54,10 +55,11 @@ def rerun(
     return 1 if is_unchanged and differing else 0
 
 
-def _print_stretch(stretch: Stretch) -> None:
-    controller = format_controller(stretch.recorded, stretch.parameters)
-    rerun_by = "" if stretch.controller == stretch.recorded else f", {stretch.controller} again"
-    echo(f"from tick {stretch.seq}: {controller}{rerun_by}")
+def _print_stretch(stretch: Stretch, controller: str | None) -> None:
+    """Print the result of a stretch; controller: the one that chose, if it is another one."""
+    recorded = format_controller(stretch.recorded, stretch.parameters)
+    chosen_by = f"; chosen again by {text.line(controller)}" if controller else ""
+    echo(f"from tick {stretch.seq}: {recorded}{chosen_by}")
     share = f"{stretch.equal} of {format_count(stretch.ticks, 'command')} equal to the last bit"
     if stretch.equal == stretch.ticks:
         echo(f"  all {share}")

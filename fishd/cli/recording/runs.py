@@ -105,10 +105,11 @@ class _ExperimentSummary(Struct):
             header.began,
             count_rows(path),
             _find_state(path, header),
-            *answer,
+            *answer[:4],
             header.force_unit,
             number=header.number,
             command=header.command,
+            problem=answer.problem,
         )
 
 
@@ -136,9 +137,14 @@ def _print_experiments(experiments: list[_ExperimentSummary]) -> None:
             text.line(f"{experiment.kind} {shlex.join(experiment.command)}".strip()),
             "–" if experiment.rows is None else str(experiment.rows),
             _format_thrust(experiment),
-            "; ".join(filter(None, [experiment.state.replace("finished", ""), experiment.summary])),
+            _format_about(experiment),
         )
     Console(width=None if sys.stdout.isatty() else PIPE_COLUMNS, markup=False).print(table)
+
+
+def _format_about(experiment: _ExperimentSummary) -> str:
+    state = "" if experiment.state == "finished" else experiment.state
+    return "; ".join(filter(None, [state, experiment.summary]))
 
 
 def _to_json(glance: Overview) -> dict[str, Any]:

@@ -119,7 +119,8 @@ def parse_all(texts: Iterable[str]) -> list[Contestant]:
 
     `square:frequency=1.2:2:0.4` are three contestants. Raises `ParameterError`.
     """
-    return [parse(spec) for text in texts for spec in _expand(text)]
+    specs = dict.fromkeys(spec for text in texts for spec in _expand(text))
+    return [parse(spec) for spec in specs]
 
 
 def _expand(text: str) -> list[str]:
@@ -128,10 +129,13 @@ def _expand(text: str) -> list[str]:
     if name not in registry.names():
         return [text]
     numbers = {field.name for field in registry.describe(name).parameters if field.kind == "number"}
-    choices = [
-        [f"{key}={item}" for item in (expand_values(value) if key in numbers else [value])]
-        for key, value in registry.split_spec(text)[1]
-    ]
+    choices = []
+    for key, value in registry.split_spec(text)[1]:
+        try:
+            items = expand_values(value) if key in numbers else [value]
+        except ParameterError as error:
+            raise ParameterError(f"{text}: {key}: {error}") from None
+        choices.append([f"{key}={item}" for item in items])
     return [":".join(filter(None, (name, ",".join(pairs)))) for pairs in product(*choices)]
 
 

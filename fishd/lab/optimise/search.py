@@ -68,7 +68,10 @@ class Range(NamedTuple):
     def check(self) -> None:
         """Raise `ParameterError` if the range is empty."""
         if not self.low < self.high or not math.isfinite(self.high - self.low):
-            raise ParameterError(f"{self.name}: from {self.low:g} to {self.high:g} is no range")
+            raise ParameterError(
+                f"{self.name}: from {self.low:g} to {self.high:g} is not a range: the lower end "
+                "comes first"
+            )
 
     @property
     def is_logarithmic(self) -> bool:

@@ -195,9 +195,8 @@ def find_best_of_whole_ticks(folder: SweepFolder, curve: Curve) -> WholeTicks | 
     half = 0.5 / top / tick
     neighbours = [ticks for ticks in (math.floor(half), math.ceil(half)) if ticks > 0]
     nearest = min(neighbours, key=lambda ticks: abs(0.5 / (ticks * tick) - top))
-    return WholeTicks(
-        frequency, thrust, error, None if nearest in by_ticks else 0.5 / (nearest * tick)
-    )
+    is_known = nearest in by_ticks or curve.peak.x_ci95_low is None
+    return WholeTicks(frequency, thrust, error, None if is_known else 0.5 / (nearest * tick))
 
 
 def _is_whole(ticks: float) -> bool:

@@ -95,7 +95,7 @@ def parse_value(text: str) -> int | float | str:
         number = float(text)
     except ValueError:
         return text
-    if not math.isfinite(number):
+    if not math.isfinite(number) or "_" in text:
         return text
     return int(number) if number.is_integer() and abs(number) < _EXACT_INTEGER_LIMIT else number
 

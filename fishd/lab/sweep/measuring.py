@@ -82,14 +82,12 @@ def simulate_point(task: Task) -> tuple[PointResult, bytes] | None:
             def describe_run(run: VirtualRun) -> None:
                 writer.describe(run.config, run.about())
 
-            if task.config.kind.is_tethered:
-                result = swim(task.point, task.config, task.lengths, writer, describe_run)
-            else:
-                arguments = (task.point, task.config, task.lengths, writer)
-                speed = swim_freely(*arguments, describe_run, task.stop.make_check())
-                if speed is None:
-                    return None
-                result = speed
+            arguments = (task.point, task.config, task.lengths, writer, describe_run)
+            measure = swim if task.config.kind.is_tethered else swim_freely
+            measured = measure(*arguments, task.stop.make_check())
+            if measured is None:
+                return None
+            result = measured
         return result, path.read_bytes()
 
 
@@ -99,14 +97,16 @@ def swim(
     lengths: Lengths,
     publisher: Publisher | None,
     on_start: Callable[[VirtualRun], None] = lambda run: None,
-) -> Result:
-    """Return the true thrust of a simulated fish at a point.
+    stop: Callable[[], bool] = lambda: False,
+) -> Result | None:
+    """Return the true thrust of a simulated fish at a point; None if stopped.
 
     The error is that of the mean over the beats. Beats differ because the controller reacts to
     noise, and because half beats are not always whole ticks.
 
     publisher: receives every tick and every event; None to create no messages
     on_start: called before the first tick
+    stop: called once in some ticks; returns whether to stop
     Raises `ParameterError` and `UnknownController`.
     """
     config = replace(config, start=Start())
@@ -131,6 +131,8 @@ def swim(
                 beats.add(angle, window)
             if beats.count >= lengths.periods or run.loop.supervisor.reason:
                 break
+            if index % _STOP_CHECK_TICKS == 0 and stop():
+                return None
         reason, fallback = run.loop.supervisor.reason, run.loop.active.fallback
     seconds = (index + 1) * config.tick
     if trouble := reason or fallback:

@@ -151,7 +151,8 @@ class Adaptation:
             do.search_square_waves(self._session, search, budget, tuple(state.trials), add_trial)
         state.square, used = do.best_of(search, state.trials, state.fitted, self._session.amplitude)
         state.is_fit_rejected = not used and state.fitted.model.standard_error is not None
-        tried = f"{len(state.trials)} square waves tried"
+        waves = len({trial.frequency for trial in state.trials})
+        tried = f"{len(state.trials)} trials of {waves} square waves"
         basis = "in agreement with the fit" if used else "from these waves alone"
         basis = "they contradict the fit, which is not used" if state.is_fit_rejected else basis
         self._done(f"search: {tried}; best at {state.square:.4g} Hz, {basis}")

@@ -149,7 +149,7 @@ def _draw_contest(axis: Any, state: State) -> None:
     )
     axis.set_ylim(0.5 - len(state.contenders), 0.5)
     known = any(contender.true_thrust is not None for contender in state.contenders)
-    axis.set_xlabel("thrust, measured, 95 % (mN)" + ("; ×: true" if known else ""))
+    axis.set_xlabel("thrust, measured, 95 % statistical (mN)" + ("; ×: true" if known else ""))
     axis.set_title("in the tank")
 
 
@@ -181,8 +181,8 @@ def page(state: State, picture: bytes, again: str) -> str:
         f'<img alt="fit, search, training, comparison" src="data:image/png;base64,{image}">',
         "<h2>In the tank</h2>",
         _table(*_contenders(state)),
-        "<p>Relative thrust is the share of that of the best square wave that the search has "
-        "found; the intervals hold together in 95 % of cases. The error of the force sensor's "
+        "<p>Relative thrust is the share of that of the best square wave tried; the "
+        "intervals hold together in 95 % of cases. The error of the force sensor's "
         "calibration is the same fraction of all thrusts, so it does not affect a share.</p>",
         "<h2>The fish</h2>",
         _table(("", "value", "95 % interval", "unit"), _estimates(state.fitted)),

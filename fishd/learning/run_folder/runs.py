@@ -1,6 +1,7 @@
 """The folder of a training: its configuration and settings, written before the first step."""
 
 import platform
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -31,13 +32,15 @@ def create(
     settings: TrainingSettings,
     camera: SimulatedCameraSettings | None = None,
     on: On = "simulation",
+    command: Sequence[str] = (),
 ) -> None:
     """Make a run folder; raises `ConfigError` where it exists already.
 
+    command: arguments of `fishctl learn ppo`
     camera: camera that sees a simulated fish
     """
     try:
-        mark_folder(folder, "learn ppo", on)
+        mark_folder(folder, "learn ppo", on, command)
         write_atomically(folder / CONFIG, configuration.to_yaml(config))
         write_settings(folder, settings)
         if camera:

@@ -38,6 +38,8 @@ class Job(Struct, frozen=True, kw_only=True):
     parent: Path | None = None
     """Checkpoint whose networks a new run begins with."""
 
+    command: tuple[str, ...] = ()
+    """Arguments of `fishctl learn ppo`."""
     camera: SimulatedCameraSettings = SimulatedCameraSettings()
     """Camera that sees a simulated fish, if `settings.see` needs one."""
     camera_endpoint: str | None = None

@@ -86,7 +86,7 @@ class RunRecorder:
                 if job.parent:
                     self._begin_with(job.parent)
                 camera = job.camera if job.simulated_camera and job.on == "simulation" else None
-                runs.create(job.folder, job.config, job.settings, camera, job.on)
+                runs.create(job.folder, job.config, job.settings, camera, job.on, job.command)
                 self._lock_folder(lock)
             progress = self._open_table("progress.csv", tuple(PROGRESS))
             self._evaluations = self._open_table(EVALUATIONS, Evaluation.__struct_fields__)

@@ -23,8 +23,8 @@ export function significant(value, digits = 3) {
 /** Return value and half-width of its interval, rounded to two digits of the half-width. */
 export function interval(value, halfWidth) {
   if (!Number.isFinite(value)) return ["–", ""];
-  if (!Number.isFinite(halfWidth) || halfWidth <= 0) return [significant(value), `±${NBSP}?`];
-  if (halfWidth < 1e-6 * Math.abs(value)) return [significant(value, 4), "(exact)"];
+  if (!Number.isFinite(halfWidth) || halfWidth < 0) return [significant(value), `±${NBSP}?`];
+  if (halfWidth <= 1e-6 * Math.abs(value)) return [significant(value, 4), "(exact)"];
   const decimals = Math.min(8, Math.max(0, 1 - Math.floor(Math.log10(halfWidth))));
   return [number(value, decimals), `±${NBSP}${number(halfWidth, decimals)}`];
 }

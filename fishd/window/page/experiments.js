@@ -100,7 +100,7 @@ export function Experiments(page) {
           ${input("Fish", form.subject, set("subject"), { placeholder: "name or number" })}
           ${input("Note", form.note, set("note"), { placeholder: "purpose" })}`}
         ${input("Seconds", form.seconds, set("seconds"), {
-          inputmode: "decimal", class: "number", placeholder: { record: "until stopped", sweep: "30 each" }[form.kind] ?? "60",
+          inputmode: "decimal", class: "number", placeholder: { record: "until stopped", sweep: "30 each", simulate: "20" }[form.kind] ?? "60",
         })}
       </div>
       <div class="buttons">

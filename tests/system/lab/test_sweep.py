@@ -61,8 +61,15 @@ def test_a_simulated_fish_is_judged_by_its_true_thrust_whatever_its_sensor_says(
         assert result.thrust_ci95 == pytest.approx(0.0, abs=1e-9)
 
 
+def test_a_long_point_stops_within_a_few_ticks() -> None:
+    stops = iter([False, False, True])
+    point = Point("square", {"frequency": 0.001})
+    assert swim(point, Config(), Lengths(periods=10_000), None, stop=lambda: next(stops)) is None
+
+
 def test_half_beats_that_are_no_whole_ticks_show_in_the_error() -> None:
     result = swim(Point("square", {"frequency": 1.709}), Config(), Lengths(), None)
+    assert result
     assert result.thrust is not None
     assert result.thrust_ci95 is not None
     assert 1e-6 < result.thrust_ci95 < 1e-3
@@ -310,7 +317,7 @@ def test_a_curve_over_a_key_of_the_configuration_is_drawn(tmp_path: Path) -> Non
     vary = ("--vary", "plant.servo_speed=8,10,12", "--amplitude", "0.3")
     done = run_sweep(tmp_path / "run", "square", "--frequency", "1.7", *vary)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "\nsquare: best measured at plant.servo_speed 12, " in done.stdout
+    assert "\nsquare: largest at plant.servo_speed 12: " in done.stdout
     assert (tmp_path / "run" / "thrust.png").stat().st_size > 10_000
 
 

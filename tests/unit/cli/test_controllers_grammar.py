@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 from rigs.processes import fishctl, one_line
 
-from fishd.cli.controllers_command import ControllersCommand
+from fishd.cli.controller_arguments import ControllersCommand
 from fishd.controllers import registry
 from fishd.core.errors import ParameterError
 from fishd.lab.compare.contestants import parse, parse_all
@@ -37,9 +37,49 @@ def test_parameters_may_be_options_after_their_controller(line: str, output: str
     assert CliRunner().invoke(verb, line.split()).output.startswith(output)
 
 
-@pytest.mark.parametrize("line", ["--C 0.6 swing", "latest --C 0.6", "swing --frequency 2"])
-def test_an_option_of_no_controller_before_it_is_refused(line: str) -> None:
-    assert "No such option" in CliRunner().invoke(verb, line.split()).output
+@pytest.mark.parametrize(
+    ("line", "remedy"),
+    [
+        ("--C 0.6 swing", ""),
+        ("latest --C 0.6", ""),
+        ("swing --frequency 2", "the parameters are --C,"),
+        ("swing --c 0.4", "Did you mean '--C'"),
+    ],
+)
+def test_an_option_of_no_controller_before_it_is_refused(line: str, remedy: str) -> None:
+    output = CliRunner().invoke(verb, line.split()).output
+    assert "No such option" in output
+    assert remedy in output
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("measure --on simulation", "a controller is needed, as in: fishctl measure swing"),
+        ("simulate square:frequency=1.2 --frequency 1.4", "frequency is given twice"),
+        ("simulate square --frequency 1.2 --frequency=1.4", "frequency is given twice"),
+        ("compare swing:C=0.6 --C 0.4", "swing:C=0.6,C=0.4: C is given twice"),
+        ("sweep square --vary plant.xi=1 --vary plant.xi=2", "plant.xi is given twice"),
+        ("sweep square --vary plant.xi=", "write KEY=VALUES"),
+        ("sweep square sine", "several controllers with one grid are one word: square,sine"),
+        ("simulate sine --C 0.4", "the parameters are --frequency, --amplitude"),
+        ("compare square --frequency 1:2", "frequency: '1:2' is not valid: LOW:HIGH:STEP"),
+        ("optimise square --frequency 1,2", "LOW:HIGH is needed, such as 0.5:4"),
+        ("simulate square --frequency 1_0", "'1_0' is not valid: a number"),
+        ("simulate square --frequency 1e-320", "a number in [0.001, 10] Hz is needed"),
+    ],
+)
+def test_a_wrong_controller_is_one_line_that_says_what_is_right(line: str, message: str) -> None:
+    assert message in one_line(fishctl(*line.split()))
+
+
+def test_options_may_stand_before_the_controller_and_a_policy_is_one() -> None:
+    swims = [
+        json.loads(fishctl("simulate", *words, "--json", "--for", "12").stdout)
+        for words in (("--settle", "2", "ppo", "--policy", "default-fish"), ("default-fish",))
+    ]
+    assert {swim["controller"] for swim in swims} == {"ppo"}
+    assert swims[0]["parameters"] == swims[1]["parameters"]
 
 
 def test_a_list_and_a_range_are_several_contestants() -> None:
@@ -78,3 +118,4 @@ def test_a_controller_is_named_alike_in_all_verbs(tmp_path: Path) -> None:
         )
         assert json.loads(swept.stdout)[0]["parameters"] == {"frequency": 1.2}
     assert "did you mean 'swing'" in one_line(fishctl("rerun", run, "swin"))
+    assert "; chosen again by swing:C=0.4\n" in fishctl("rerun", run, "swing:C=0.4").stdout

@@ -12,11 +12,10 @@ from rigs.documents import DOCS, FENCE, ROOT, code_of, first_cells, prose_of, te
 
 from deb.package import COMMANDS, CONFIGS, HOME, SYSTEM_FILES
 from fishd.camera.main import camera
-from fishd.cli.controllers_command import ControllersCommand, join_parameters
+from fishd.cli.controller_arguments import ControllerGroup, ControllersCommand, join_parameters
 from fishd.cli.doctor import checks
 from fishd.cli.doctor.base import Context
 from fishd.cli.main import fishctl
-from fishd.cli.options import ControllerGroup
 from fishd.config import Config, keys, load
 from fishd.controllers.policy import checksum, file, library, operators
 from fishd.controllers.policy.card import CARD_KEY, FORMAT, Card, Provenance
@@ -86,7 +85,7 @@ def find_mistake(command: click.Command, words: list[str]) -> str | None:
             context = click.Context(command, parent=context)
             flags |= flags_of(command)
             if isinstance(command, ControllersCommand):
-                rest = iter(join_parameters(command, list(rest)))
+                rest = iter(join_parameters(context, list(rest)))
     needed = [param.opts[0] for param in command.params if is_needed(param)]
     if needed and not {*needed, "--resume", "--help"} & {word.partition("=")[0] for word in words}:
         return f"{path} needs {needed[0]}"

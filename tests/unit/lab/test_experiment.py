@@ -7,13 +7,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import load
 from fishd.core.errors import ConfigError
 from fishd.core.signals import Tick
-from fishd.lab.experiment import Header, count_attempts, open_experiment
+from fishd.lab.experiment import (
+    RESULT,
+    Header,
+    count_attempts,
+    mark_folder,
+    open_experiment,
+    read_header,
+)
 from fishd.lab.session import VirtualSession
 from fishd.recording import open_run
 
@@ -31,6 +39,25 @@ def begin(path: Path, header: Header = HEADER) -> None:
 def resume(path: Path, header: Header = HEADER) -> list[dict[str, str]]:
     with open_experiment(path, header, resume=True) as experiment:
         return experiment.read_rows(["x", "y"])
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"null", b"\xff\xfe[", b'[{"thrust": 1}', b'["thrust"]']
+)
+def test_a_damaged_result_is_a_line_of_runs_and_an_unfinished_experiment_is_called_so(
+    tmp_path: Path, content: bytes
+) -> None:
+    mark_folder(tmp_path / "run", "measure", "live", ["swing", "--C", "0.6"])
+    header = msgspec.structs.replace(read_header(tmp_path / "run"), ended="")
+    (tmp_path / "run" / "experiment.json").write_bytes(msgspec.json.encode(header))
+    shown = fishctl("runs", "--folder", str(tmp_path))
+    assert shown.stdout.rstrip().endswith("unfinished")
+    assert "measure swing --C 0.6" in shown.stdout
+    (tmp_path / "run" / RESULT).write_bytes(content)
+    damaged = fishctl("runs", "--folder", str(tmp_path))
+    assert damaged.returncode == 1
+    assert f"fishctl: {tmp_path / 'run' / RESULT}: " in damaged.stderr
+    assert damaged.stderr.endswith("delete it, the rows are kept\n")
 
 
 def test_rows_are_there_again_and_one_that_a_kill_cut_off_is_not(tmp_path: Path) -> None:

@@ -56,5 +56,16 @@ def test_the_settings_of_the_user_are_for_the_figures_of_the_user(
     assert draw(tmp_path, MATPLOTLIBRC=str(settings)) == plain
 
 
+@pytest.mark.parametrize("style", [b"# f\xfcr die Fische\n", b"font.sizee: 10\n"])
+def test_the_style_files_of_the_user_are_not_read(
+    style: bytes, tmp_path: Path, plain: bytes, capfd: pytest.CaptureFixture[str]
+) -> None:
+    styles = tmp_path / "home" / "matplotlib" / "stylelib"
+    styles.mkdir(parents=True)
+    (styles / "lab.mplstyle").write_bytes(style)
+    assert draw(tmp_path, XDG_CONFIG_HOME=str(tmp_path / "home")) == plain
+    assert capfd.readouterr().err == ""
+
+
 def test_a_program_that_has_changed_them_gets_the_same_figure(tmp_path: Path, plain: bytes) -> None:
     assert draw(tmp_path, "imported") == plain

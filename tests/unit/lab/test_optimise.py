@@ -179,7 +179,7 @@ def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
         ([], "no parameter has a range: give one, such as --frequency LOW:HIGH, or --frequency :"),
         (["--frequency", "1:2:0.1"], "LOW:HIGH is needed, such as 0.5:4, or ':' for all"),
         (["--frequency", "a:2"], "'a' is not valid: a number"),
-        (["--frequency", "3:1"], "is no range"),
+        (["--frequency", "3:1"], "is not a range: the lower end comes first"),
         (["--frequency", "1"], "no parameter has a range"),
         (["--frequency", "1:30"], "frequency"),
         (["--frequency", "1:8", "--set", "tick=0.1"], "8 Hz is too fast for ticks of 0.1 s"),
