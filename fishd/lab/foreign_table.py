@@ -328,7 +328,7 @@ def _find_delimiter(line: str) -> str | None:
 
 
 def _drop_empty_cells(cells: list[str], count: int) -> None:
-    """Remove empty cells at the end, as of a separator there, while there are more than `count`."""
+    """Remove empty cells at the end, such as after a last separator, beyond this count of cells."""
     while len(cells) > count and not cells[-1].strip():
         cells.pop()
 
