@@ -4,8 +4,10 @@
 `RunWriter` records them.
 """
 
+import codecs
 import csv
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +21,7 @@ from fishd.config import Config
 from fishd.core import files, text
 from fishd.core.errors import RecordingError
 from fishd.core.signals import Measurement, Tick
+from fishd.lab.limits import find_excess
 
 _FORCES = {"N": 1.0, "mN": 1e-3, "g": 9.80665e-3}
 _ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
@@ -37,8 +40,30 @@ CONTROLLER = "imported"
 """Name of the controller in ticks of another rig."""
 MAX_TABLE_BYTES = 256 * 2**20
 """Largest size of a file [bytes]: 100 columns of an hour at 50 Hz."""
-MAX_VALUE = 1e10
-"""Largest value of a known column [s, N, rad, W]; a larger one is a mistake."""
+MAX_LINE_CHARACTERS = 2**17
+"""Longest line: 5000 columns [characters]."""
+MAX_PERIOD_S = 1.0
+"""Longest time between most rows without a stated rate; a longer one is a mistake [s]."""
+MAX_RATE_ERROR = 0.2
+"""Largest relative difference between a stated rate and the times."""
+_MAX_ROUNDING = 1.2
+"""Largest range of the errors of even times, in units of the last digit: 1, and the fit's error."""
+_SAVE = "save the table as CSV (UTF-8)"
+_OTHER_FORMATS = {
+    b"\x89MCAP": "it is a recording, not a table: fishctl export writes its table",
+    b"PK\3\4": f"it is an Excel workbook or another ZIP archive: {_SAVE}",
+    b"\xd0\xcf\x11\xe0": f"it is an Excel workbook: {_SAVE}",
+    b"\x1f\x8b": "it is compressed (gzip): unpack it first",
+    b"%PDF": f"it is a PDF document: {_SAVE}",
+    **dict.fromkeys((b"<!", b"<?", b"<html", b"<table"), f"it is HTML or XML: {_SAVE}"),
+}
+"""Formats that are not tables of text, by their first bytes, with the remedy."""
+_BINARY = re.compile(rb"[\0-\x08\x0e-\x19\x7f]")
+"""Bytes that no text has."""
+_NUMBER = re.compile(r"\s*[-+]?[\d.,]*\d[\d.,]*(e[-+]?\d+)?\s*", re.IGNORECASE)
+"""Number whose points and commas may be decimal or separate thousands."""
+_GROUPED = re.compile(r"\s*[-+]?\d{1,3}([.,])\d{3}(\1\d{3})*([.,]\d*)?\s*")
+"""Number with separators of thousands, which may have a decimal point or comma, too."""
 MAX_GAP_PERIODS = 1e8
 """Longest time between two rows, in times between most [1]; a longer one is a mistake."""
 MAX_QUANTITIES = 100
@@ -48,46 +73,56 @@ REST_DELAY_S = 2.5
 _WAVE = (CONTROLLER, dict[str, float]())
 
 Array = NDArray[np.float64]
+Line = tuple[int, list[str]]
+"""Number of a line of a file, and its cells."""
 
 
 def read_table(path: Path, names: Sequence[str] | None = None) -> dict[str, Array]:
     """Return the columns of a text file in SI units, by their names without the unit.
 
-    The columns are separated by semicolons, tabs, commas or spaces; a number may have a decimal
-    comma. Lines without a number are those of a header. A cell that is empty or `nan` is NaN.
+    The columns are separated by semicolons, tabs, commas or spaces; numbers may have decimal
+    commas, which then all have. Lines without a number are those of a header. A cell that is empty
+    or `nan` is NaN.
 
     names: names of all columns in order, such as `fx_mN`, `-` to leave one out; by default those in
         the first line of the file. An unknown column keeps its name, and its unit
     Raises `RecordingError` with one line that names the file, and the line where one is wrong.
     """
     try:
-        raw = files.read(path, MAX_TABLE_BYTES, "a table").decode("utf-8-sig", "replace")
-        lines = list(_split_lines(raw))
+        content = _decode(path, files.read(path, MAX_TABLE_BYTES, "a table"))
+        lines = list(_split_lines(path, content))
     except files.FileProblem as problem:
         raise RecordingError(f"{path}: {problem}") from None
     except csv.Error as error:
         raise RecordingError(f"{path}: not a table: {error}") from None
     if not lines:
         raise RecordingError(f"{path}: it is empty: a table of numbers is needed")
+    if names is None:
+        _drop_empty_cells(lines[0][1], 1)
     named = list(names) if names is not None else lines[0][1]
     columns = [_parse_name(path, name.strip()) for name in named]
     kept = [index for index, (name, _) in enumerate(columns) if name != LEFT_OUT]
     _check_names(path, [columns[index][0] for index in kept], from_file=names is None)
-    rows: list[list[float]] = []
-    for number, cells in lines:
-        values = [_parse_number(cells[index]) if index < len(cells) else None for index in kept]
-        if not rows and all(value is None or math.isnan(value) for value in values):
-            continue  # of the header
+    table_lines = _drop_header(lines, kept)
+    if doubt := _find_ambiguous_lines(table_lines):
+        raise RecordingError(f"{path}: {doubt}")
+    for number, cells in table_lines:
+        _drop_empty_cells(cells, len(columns))
         if len(cells) != len(columns):
             raise RecordingError(
                 f"{path}: line {number} has {len(cells)} columns, not {len(columns)}: name each "
                 f"with --columns, '{LEFT_OUT}' for one to leave out"
             )
+    if doubt := _find_ambiguous_number(table_lines, kept):
+        raise RecordingError(f"{path}: {doubt}")
+    rows: list[list[float]] = []
+    for number, cells in table_lines:
+        values = [_parse_number(cells[index]) for index in kept]
         for index, value in zip(kept, values, strict=True):
             if value is None:
                 raise RecordingError(
                     f"{path}: line {number}, {columns[index][0]}: '{text.quoted(cells[index])}' is "
-                    "not a number"
+                    "not a number such as 1000.5; leave the cell empty where one is missing"
                 )
         rows.append([value for value in values if value is not None])
     if not rows:
@@ -126,17 +161,33 @@ def make_ticks(
     if len(rows) < 2:
         raise RecordingError("two rows of numbers or more are needed")
     for name in UNITS.keys() & table.keys():
-        if (largest := np.abs(table[name]).max()) > MAX_VALUE:
-            raise RecordingError(f"{name} is {largest:.3g} {next(iter(UNITS[name]))} somewhere")
+        if problem := find_excess(name, table[name]):
+            raise RecordingError(problem)
     intervals = np.diff(table["time"])
     if not np.all(intervals > 0.0):
         row = int(np.argmin(intervals > 0.0))
         raise RecordingError(
             f"the times do not increase: {table['time'][row]:.10g} s, then "
             f"{table['time'][row + 1]:.10g} s, in rows {rows[row] + 1} and {rows[row + 1] + 1} of "
-            "the numbers"
+            f"the numbers; sort the rows by time, or leave the times out ('{LEFT_OUT}') and state "
+            "--rate HZ"
         )
-    period = 1.0 / rate if rate is not None else float(np.median(intervals))
+    has_gaps = float(intervals.max()) > 1.5 * float(np.median(intervals))
+    even = _find_even_times(table["time"]) if has_gaps else None
+    if even is not None:
+        table["time"], intervals = even, np.diff(even)
+    usual = float(np.median(intervals))
+    if rate is None and usual > MAX_PERIOD_S:
+        raise RecordingError(
+            f"most rows are {usual:.3g} s apart: is the time in milliseconds (time_ms)? If not, "
+            f"state --rate {1.0 / usual:.3g}"
+        )
+    if rate is not None and abs(usual * rate - 1.0) > MAX_RATE_ERROR:
+        raise RecordingError(
+            f"most rows are {usual:.3g} s apart, not {1.0 / rate:.3g} s as --rate {rate:g} states: "
+            f"leave that out, or the times ('{LEFT_OUT}')"
+        )
+    period = usual if even is not None or rate is None else 1.0 / rate
     if (longest := float(intervals.max())) > MAX_GAP_PERIODS * period:
         raise RecordingError(
             f"two rows are {longest:.3g} s apart, most are {period:.3g} s: is the unit of time "
@@ -197,6 +248,21 @@ def _estimate(
         applied, before = angles[index], now
 
 
+def _find_even_times(time: Array) -> Array | None:
+    """Return even times that differ from the given ones by their rounding only; None without such.
+
+    Rounded to 10 ms, the rows of 96 Hz are 10 or 20 ms apart, and none is missing.
+    """
+    since, rows = time - time[0], np.arange(len(time))
+    precision = 1e-7 + 2.0 * float(np.spacing(np.abs(time).max()))
+    for decimals in range(7):
+        if np.allclose(np.round(since, decimals), since, rtol=0.0, atol=precision):
+            even = np.polyval(np.polyfit(rows, since, 1), rows)
+            is_rounding = np.ptp(even - since) <= _MAX_ROUNDING * 10.0**-decimals
+            return time[0] + even if is_rounding else None
+    return None
+
+
 def _find_swims(table: Mapping[str, Array]) -> NDArray[np.bool_]:
     """Return in which rows the fish swims: between two changes of φ_c that are close in time."""
     time = table["time"]
@@ -210,17 +276,39 @@ def _find_swims(table: Mapping[str, Array]) -> NDArray[np.bool_]:
     return swims
 
 
-def _split_lines(content: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield the number and the cells of each line that is not empty; raise `csv.Error`."""
+def _decode(path: Path, raw: bytes) -> str:
+    """Return the text of a table; raise `RecordingError` for a file of another format."""
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return raw.decode("utf-16", "replace")
+    start = raw[:4096]
+    for signature, remedy in _OTHER_FORMATS.items():
+        if start.lstrip().startswith(signature):
+            raise RecordingError(f"{path}: {remedy}")
+    if any(start) and not (start[::2].strip(b"\0") and start[1::2].strip(b"\0")):
+        raise RecordingError(f"{path}: it is UTF-16 without a byte-order mark: {_SAVE}")
+    if _BINARY.search(start):
+        raise RecordingError(f"{path}: it is not a text: {_SAVE}")
+    return raw.decode("utf-8-sig", "replace")
+
+
+def _split_lines(path: Path, content: str) -> Iterator[Line]:
+    """Yield the number and the cells of each line that is not empty.
+
+    Raise `csv.Error`, and `RecordingError` for a line that is too long.
+    """
     lines = content.splitlines()
+    for number, line in enumerate(lines, start=1):
+        if len(line) > MAX_LINE_CHARACTERS:
+            raise RecordingError(
+                f"{path}: line {number} has more than {MAX_LINE_CHARACTERS} characters: write "
+                "each row of the table in a separate line"
+            )
     sample = [line for line in lines[:50] if line.strip()]
     delimiter = _find_delimiter(sample[-1]) if sample else None
     rows: Iterator[list[str]] = (line.split() for line in lines)
     if delimiter:
         rows = csv.reader(lines, delimiter=delimiter)
     for number, cells in enumerate(rows, start=1):
-        while len(cells) > 1 and not cells[-1].strip():  # a separator at the end of the line
-            cells.pop()
         if any(cell.strip() for cell in cells):
             yield number, cells
 
@@ -237,6 +325,67 @@ def _find_delimiter(line: str) -> str | None:
         return len(numbers) / len(cells), len(cells)
 
     return max((";", "\t", ",", None), key=count)
+
+
+def _drop_empty_cells(cells: list[str], count: int) -> None:
+    """Remove empty cells at the end, such as after a last separator, beyond this count of cells."""
+    while len(cells) > count and not cells[-1].strip():
+        cells.pop()
+
+
+def _drop_header(lines: Sequence[Line], kept: Sequence[int]) -> Sequence[Line]:
+    """Return the lines from the first one with a number in a column that is kept."""
+    for begin, (_, cells) in enumerate(lines):
+        for cell in (cells[index] for index in kept if index < len(cells)):
+            value = _parse_number(cell)
+            if _GROUPED.fullmatch(cell) or (value is not None and not math.isnan(value)):
+                return lines[begin:]
+    return []
+
+
+def _find_ambiguous_lines(lines: Sequence[Line]) -> str:
+    """Return in words where an empty line separates some rows from others; empty if nowhere.
+
+    Programs write a summary there. An empty line after each row means nothing.
+    """
+    pairs = list(pairwise(number for number, _ in lines))
+    after = [number for before, number in pairs if number > before + 1]
+    if not after or len(after) == len(pairs):
+        return ""
+    return (
+        f"line {after[0]} follows an empty line: delete that, or what follows it if it is a summary"
+    )
+
+
+def _find_ambiguous_number(lines: Sequence[Line], kept: Sequence[int]) -> str:
+    """Return in words which point or comma may separate thousands; empty if none may."""
+    marked: dict[str, str] = {}
+    for number, cells in lines:
+        for cell in (cells[index] for index in kept):
+            for mark in ".,":
+                if mark in cell and mark not in marked and _NUMBER.fullmatch(cell):
+                    marked[mark] = f"{text.quoted(cell)} in line {number}"
+    if len(marked) > 1:
+        return (
+            f"its numbers have both '.' and ',': {' and '.join(marked.values())}; save it without "
+            "separators of thousands"
+        )
+    for mark in marked:
+        grouped = re.compile(rf"[-+]?[1-9]\d{{0,2}}({re.escape(mark)}\d{{3}})+")
+        columns = [[cells[index].strip() for _, cells in lines] for index in kept]
+        large = [[cell for cell in column if mark in cell] for column in columns]
+        if not all(grouped.fullmatch(cell) for column in large for cell in column):
+            continue
+        for column, cells in zip(columns, large, strict=True):
+            whole = [cell for cell in column if cell.lstrip("+-").isdecimal()]
+            small = [cell for cell in whole if 0.0 < abs(float(cell)) < 1000.0]
+            if cells and small:
+                return (
+                    f"{text.quoted(cells[0])} beside {text.quoted(small[0])}: it is unclear "
+                    f"whether '{mark}' separates thousands or decimals; save it without "
+                    "separators of thousands, or with as many decimals in each number"
+                )
+    return ""
 
 
 def _is_number(word: str) -> bool:
@@ -269,17 +418,17 @@ def _check_names(path: Path, names: Sequence[str], *, from_file: bool) -> None:
             f"{path}: {where} neither force nor angle; name the columns in order, such as "
             "--columns time_s,fx_mN,fy_mN,phi_c_deg"
         )
+    if len(names) - len(known) > MAX_QUANTITIES:
+        raise RecordingError(f"{path}: more than {MAX_QUANTITIES} columns that fishd does not know")
     for name in names:
         if names.count(name) > 1:
             raise RecordingError(f"{path}: two columns are named '{text.quoted(name)}'")
-    if len(names) - len(known) > MAX_QUANTITIES:
-        raise RecordingError(f"{path}: more than {MAX_QUANTITIES} columns that fishd does not know")
 
 
 def _parse_number(cell: str) -> float | None:
     """Return the number in a cell, NaN for an empty one; None for a text."""
     word = cell.strip().replace(",", ".")
     try:
-        return float(word) if word else math.nan
+        return None if "_" in word else float(word) if word else math.nan
     except ValueError:
         return None

@@ -6,7 +6,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from fishd.core import files
+from fishd.core import files, text
 from fishd.core.errors import RecordingError
 from fishd.core.schema import suggest
 from fishd.recording.mcap_file import read_outline
@@ -95,8 +95,9 @@ def recording_path(run: str, folder: Path | None = None) -> Path:
 
     Add `.mcap` if it is missing, and create that folder; raise `RecordingError`.
     """
-    if Path(run).name in ("", ".."):  # such as "/" or "."
-        raise RecordingError(f"'{run}' is not a valid name of a recording")
+    name = Path(run).name
+    if name in ("", "..") or any(ord(letter) < 32 for letter in name):  # such as "/" or "."
+        raise RecordingError(f"'{text.escaped(run)}' is not a valid name of a recording")
     path = files.expand_user(run) if "/" in run else ensure_folder(folder or runs_folder()) / run
     return path.with_name(path.name.removesuffix(SUFFIX) + SUFFIX)
 

@@ -70,7 +70,16 @@ class Damaged(NamedTuple):
     """Description of the damage; empty if unknown."""
 
 
-def read_records(path: Path) -> Iterator[McapRecord | Damaged]:
+class Appended(NamedTuple):
+    """Placeholder, before the footer, of bytes that follow the end and are not read."""
+
+    size: int
+    """Number of bytes."""
+    is_recording: bool
+    """Whether another recording begins with them, as after `cat a.mcap b.mcap`."""
+
+
+def read_records(path: Path) -> Iterator[McapRecord | Damaged | Appended]:
     """Yield all records but chunks and those of the index, and the content of chunks, in order.
 
     A file that was cut off ends with its last complete chunk. Raise `RecordingError` if the file
@@ -108,7 +117,7 @@ def read_outline(path: Path) -> Outline | None:
     """
     outline = Outline({}, Counter())
     topics: dict[int, str] = {}
-    last: McapRecord | Damaged | None = None
+    last: McapRecord | Damaged | Appended | None = None
     expand = _Expander(path)
     for _, last in _read_outer_records(path):
         if isinstance(last, Metadata):
@@ -125,7 +134,7 @@ def read_outline(path: Path) -> Outline | None:
                 raise
             except _PARSE_ERRORS:
                 return None
-        elif isinstance(last, Damaged | Message):
+        elif isinstance(last, Damaged | Appended | Message):
             return None
     return outline if isinstance(last, Footer) else None
 
@@ -233,7 +242,7 @@ def _format_megabytes(size: int) -> str:
     return f"{size / 2**20:.0f} MB"
 
 
-def _read_outer_records(path: Path) -> Iterator[tuple[int, McapRecord | Damaged]]:
+def _read_outer_records(path: Path) -> Iterator[tuple[int, McapRecord | Damaged | Appended]]:
     """Yield position and content of each record outside of chunks, including the chunks."""
     try:
         with path.open("rb") as file:
@@ -263,10 +272,16 @@ def _read_outer_records(path: Path) -> Iterator[tuple[int, McapRecord | Damaged]
                     why = _damage_reason(error)
                     yield offset, Damaged(offset, why)
                 else:
+                    if isinstance(record, Footer):
+                        end = offset + _HEAD.size + len(body) + len(_MAGIC)
+                        if end < size:
+                            file.seek(end)
+                            is_recording = file.read(len(_MAGIC)) == _MAGIC
+                            yield offset, Appended(size - end, is_recording)
+                        yield offset, record
+                        return
                     if record is not None:
                         yield offset, record
-                    if isinstance(record, Footer):
-                        return
                 offset += _HEAD.size + len(body)
     except RecordingError:
         raise

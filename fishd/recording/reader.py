@@ -31,7 +31,7 @@ from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.axis import Axis
 from fishd.recording.images import IMAGE_TOPIC, FrameHead, RecordedFrame, decode_frame, decode_head
-from fishd.recording.mcap_file import Damaged, read_records
+from fishd.recording.mcap_file import Appended, Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 from fishd.recording.summary import Gap, Summary, Tally, from_metadata, place
 from fishd.recording.writer import (
@@ -108,6 +108,8 @@ class Run:
         """Number of ticks before each damaged part that may contain ticks."""
         self._repeated: Counter[str] = Counter()
         """Number of messages by topic that are in the file again, and are left out."""
+        self._appended = ""
+        """Description of bytes that follow the end of the recording; empty if none do."""
         self._topics = dict(TOPICS)
         """Topics by the numbers of their channels."""
         self.damage_reason = ""
@@ -296,6 +298,8 @@ class Run:
         ]
         if self._repeated:
             differences.append("repeated messages are read once")
+        if self._appended:
+            differences.append(self._appended)
         if not self.about:
             differences.append(
                 "its metadata are missing, which mcap filter keeps with --include-metadata and "
@@ -351,7 +355,7 @@ class Run:
             if topic == IMAGE_TOPIC and isinstance(record, Message):
                 yield record.data
 
-    def records(self) -> Iterator[tuple[str, McapRecord | Damaged | Repeated]]:
+    def records(self) -> Iterator[tuple[str, McapRecord | Damaged | Appended | Repeated]]:
         """Yield all records as `read_records` does, messages with their topics.
 
         `Repeated` replaces a message that is in the file again, as after a merge with a copy. Raise
@@ -402,6 +406,10 @@ class Run:
             elif isinstance(record, Damaged):
                 self._damages.append(ticks)
                 self._note_damage(record.reason)
+            elif isinstance(record, Appended):
+                self._appended = f"{_format_count(record.size, 'byte')} after its end are not read"
+                if record.is_recording:
+                    self._appended += f": another recording, which tail -c {record.size} extracts"
             elif isinstance(record, Statistics):
                 for number, count in record.channel_message_counts.items():
                     self._indexed[self._topics.get(number, "")] += count

@@ -201,6 +201,16 @@ def whole_chunks_and_then_zeros(good: Path) -> bytes:
 
 
 @file
+def followed_by_another(good: Path) -> bytes:
+    return good.read_bytes() * 2
+
+
+@file
+def followed_by_zeros(good: Path) -> bytes:
+    return good.read_bytes() + bytes(512)
+
+
+@file
 def empty(_: Path) -> bytes:
     return b""
 

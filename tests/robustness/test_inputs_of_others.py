@@ -35,6 +35,9 @@ LINES = {
     "with-an-unknown-chunk-and-no-end": "not as recorded: 50 ticks instead of 60",
     "half-and-then-zeros": "damaged: an unknown number of ticks lost",
     "whole-chunks-and-then-zeros": "damaged: an unknown number of ticks lost",
+    "followed-by-another": "not as recorded: BYTES bytes after its end are not read: another "
+    "recording, which tail -c BYTES extracts",
+    "followed-by-zeros": "not as recorded: 512 bytes after its end are not read",
 }
 """Message of every verb about a file, by name; empty for one that differs in nothing."""
 HELD_TICKS = {
@@ -48,6 +51,8 @@ HELD_TICKS = {
     "with-records-of-others": TICKS,
     "half-and-then-zeros": 19,
     "whole-chunks-and-then-zeros": 19,
+    "followed-by-another": TICKS,
+    "followed-by-zeros": TICKS,
 }
 """Number of ticks in each file, repeated ones counted once."""
 LOST_TICKS = {"filtered-by-time": 30, **{name: 10 for name in LINES if name.startswith("with-a")}}
@@ -71,6 +76,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_tables_have_every_file() -> None:
     assert {f"{name}.mcap" for name in (*LINES, *REFUSED)} == set(FILES)
     assert set(HELD_TICKS) == set(LINES)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def size_of_what_follows(folder: Path) -> None:
+    size = (folder / "good.mcap").stat().st_size
+    LINES["followed-by-another"] = LINES["followed-by-another"].replace("BYTES", str(size))
 
 
 def test_runs_counts_what_is_in_a_file_and_says_what_was_recorded(folder: Path) -> None:
@@ -125,6 +136,7 @@ def test_records_of_others_cost_neither_ticks_nor_the_configuration(folder: Path
         ("half-and-then-zeros", 19),
         ("with-a-chunk-of-a-private-opcode", 50),
         ("merged-with-a-copy", TICKS),
+        ("followed-by-another", TICKS),
     ],
 )
 def test_a_repaired_file_still_says_what_it_lacks(
@@ -203,6 +215,12 @@ DEGREES = ROWS_OF_A_RIG * [1e3, 1e3, 1e3, 180 / np.pi]
 TABLES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
     "CSV": (as_text(ROWS_OF_A_RIG, head=HEAD), (), ""),
     "CSV of Excel": ("\ufeff" + as_text(ROWS_OF_A_RIG, head=HEAD).replace("\n", "\r\n"), (), ""),
+    "UTF-16": (as_text(ROWS_OF_A_RIG, head=HEAD).encode("utf-16"), (), ""),
+    "an empty line after each row": (
+        as_text(ROWS_OF_A_RIG, head=HEAD).replace("\n", "\r\r\n"),
+        (),
+        "",
+    ),
     "decimal commas": (as_text(ROWS_OF_A_RIG, ";", HEAD.replace(",", ";"), decimal=","), (), ""),
     "decimal commas between tabs": (as_text(ROWS_OF_A_RIG, "\t", decimal=","), NAMES, ""),
     "decimal commas between spaces": (as_text(ROWS_OF_A_RIG, "  ", decimal=","), NAMES, ""),
@@ -229,6 +247,11 @@ TABLES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
         (),
         "1 row left out, in which a number is missing",
     ),
+    "a row without its last number": (
+        as_text(ROWS_OF_A_RIG[:9], head=HEAD) + "0.45,1,1,\n" + as_text(ROWS_OF_A_RIG[10:]),
+        (),
+        "1 row left out, in which a number is missing",
+    ),
     "a column of its own": (
         as_text(ROWS_OF_A_RIG[:, [0, 1, 2, 3, 1]], head=f"{HEAD},tip_x_mm"),
         (),
@@ -246,6 +269,7 @@ TABLES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
     ),
 }
 """Text of a table of another rig, options of import, and what it says on standard error."""
+SAVE = "save the table as CSV (UTF-8)"
 BAD_TABLES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
     "nothing": ("", NAMES, "it is empty: a table of numbers is needed"),
     "no numbers": (f"{HEAD}\n", (), "no line of numbers in the columns that are named"),
@@ -262,6 +286,107 @@ BAD_TABLES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
         (),
         "column 'fx_lbf': its unit must be one of fx_N, fx_mN, fx_g",
     ),
+    "times in ms without their unit": (
+        "time,fx\n0,1\n50,1\n100,1\n",
+        (),
+        "most rows are 50 s apart: is the time in milliseconds (time_ms)? If not, state --rate "
+        "0.02",
+    ),
+    "times of a clock in ms without their unit": (
+        "time,fx\n1.7e12,1\n1.7000001e12,1\n",
+        (),
+        "time is 1.7e+12 s somewhere, more than 1e+10 s: is it in milliseconds (time_ms) or "
+        "microseconds (time_us)?",
+    ),
+    "degrees without their unit": (
+        "time,phi_c\n0,20\n1,-20\n",
+        (),
+        "phi_c is 20 rad somewhere, more than 3.14 rad: is it in degrees (phi_c_deg)?",
+    ),
+    "degrees of a fin without their unit": (
+        "time,alpha\n0,20\n1,-20\n",
+        (),
+        "alpha is 20 rad somewhere, more than 3.14 rad: is it in degrees (alpha_deg)?",
+    ),
+    "mN without their unit": (
+        "time,fx\n0,250\n1,1\n",
+        (),
+        "fx is 250 N somewhere, more than 100 N: is it in mN (fx_mN)?",
+    ),
+    "mW without their unit": (
+        "time,fx,power\n0,1,20000\n1,1,1\n",
+        (),
+        "power is 2e+04 W somewhere, more than 1e+04 W: is it in mW (power_mW)?",
+    ),
+    "thousands beside decimal points": (
+        'time,fx_mN\n0,999.5\n1,"1,000"\n2,"1,234"\n3,998.5\n',
+        (),
+        "its numbers have both '.' and ',': 999.5 in line 2 and 1,000 in line 3; save it without "
+        "separators of thousands",
+    ),
+    "thousands between semicolons": (
+        "time;fx_mN\n0;999.5\n1;1,000\n",
+        (),
+        "its numbers have both '.' and ',': 999.5 in line 2 and 1,000 in line 3",
+    ),
+    "thousands beside decimal commas": (
+        "time;fx_mN\n0;1,5\n1;1.000\n",
+        (),
+        "its numbers have both '.' and ',': 1,5 in line 2 and 1.000 in line 3",
+    ),
+    "thousands and decimals in the first number": (
+        "fx_mN;fy_mN\n1,234.5;2,345.6\n999.5;1\n1;1\n",
+        ("--rate", "10"),
+        "its numbers have both '.' and ',': 1,234.5 in line 2",
+    ),
+    "thousands alone": (
+        "time;fx_mN\n0;999\n1;1,000\n2;1,234\n",
+        (),
+        "1,000 beside 999: it is unclear whether ',' separates thousands or decimals; save it "
+        "without separators of thousands, or with as many decimals in each number",
+    ),
+    "German thousands alone": (
+        "time;fx_mN\n0;999\n1;1.000\n",
+        (),
+        "1.000 beside 999: it is unclear whether '.' separates thousands or decimals",
+    ),
+    "a number of Python": ("time,fx\n0,1_0\n1,1\n", (), "line 2, fx: '1_0' is not a number"),
+    "a rate that the times contradict": (
+        "time,fx\n0,1\n0.05,1\n0.1,1\n",
+        ("--rate", "1"),
+        "most rows are 0.05 s apart, not 1 s as --rate 1 states: leave that out, or the times "
+        "('-')",
+    ),
+    "a summary after an empty line": (
+        "time,fx,fy\n0,1,1\n0.05,1,1\n0.1,1,1\n\n4,3\n",
+        (),
+        "line 6 follows an empty line: delete that, or what follows it if it is a summary",
+    ),
+    "a row of empty cells before a summary": (
+        "time,fx\n0,1\n0.05,1\n,\n4,3\n",
+        (),
+        "line 5 follows an empty line",
+    ),
+    "one line": (
+        f"{HEAD}," + "1," * 2**17,
+        (),
+        "line 1 has more than 131072 characters: write each row of the table in a separate line",
+    ),
+    "a workbook": (b"PK\3\4\x14\0", (), f"it is an Excel workbook or another ZIP archive: {SAVE}"),
+    "an old workbook": (b"\xd0\xcf\x11\xe0\xa1\xb1", (), f"it is an Excel workbook: {SAVE}"),
+    "a compressed table": (b"\x1f\x8b\x08", (), "it is compressed (gzip): unpack it first"),
+    "a document": (b"%PDF-1.7", (), f"it is a PDF document: {SAVE}"),
+    "a page": ("\n<!DOCTYPE html>", (), f"it is HTML or XML: {SAVE}"),
+    "a recording": (
+        b"\x89MCAP0\r\n",
+        (),
+        "it is a recording, not a table: fishctl export writes its table",
+    ),
+    "UTF-16 without its mark": (
+        f"{HEAD}\n".encode("utf-16-le"),
+        (),
+        f"it is UTF-16 without a byte-order mark: {SAVE}",
+    ),
     "a name twice": ("fx,FX\n0,1\n1,1\n", ("--rate", "10"), "two columns are named 'fx'"),
     "neither times nor a rate": (
         "fx,fy\n0,1\n1,1\n",
@@ -271,7 +396,8 @@ BAD_TABLES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
     "times that do not increase": (
         as_text(ROWS_OF_A_RIG[[0, 1, 2, 1]], head=HEAD),
         (),
-        "the times do not increase: 0.1 s, then 0.05 s, in rows 3 and 4 of the numbers",
+        "the times do not increase: 0.1 s, then 0.05 s, in rows 3 and 4 of the numbers; sort the "
+        "rows by time, or leave the times out ('-') and state --rate HZ",
     ),
     "a time of another clock": (
         "time,fx\n0,1\n1e-6,1\n2e-6,1\n1e9,1\n",
@@ -281,15 +407,20 @@ BAD_TABLES: dict[str, tuple[str | bytes, tuple[str, ...], str]] = {
     "a text": (
         "time,fx\n0,1\n1,n/a\n",
         (),
-        "line 3, fx: 'n/a' is not a number",
+        "line 3, fx: 'n/a' is not a number such as 1000.5; leave the cell empty where one is "
+        "missing",
     ),
     "a column too few": (
         "0,1\n1,1\n",
         NAMES,
         "line 1 has 2 columns, not 4: name each with --columns, '-' for one to leave out",
     ),
-    "a force of no fish": ("time,fx\n0,1\n1,1e300\n", (), "fx is 1e+300 N somewhere"),
-    "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(99), NAMES, "no line of numbers"),
+    "a force of no fish": (
+        "time,fx\n0,1\n1,1e300\n",
+        (),
+        "fx is 1e+300 N somewhere, more than 100 N",
+    ),
+    "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(99), NAMES, f"it is not a text: {SAVE}"),
 }
 """The same for tables that are refused."""
 
@@ -311,7 +442,8 @@ def test_a_table_of_another_rig_becomes_a_recording(tmp_path: Path, case: str) -
     for number, (time, fx, fy, phi_c) in enumerate(ROWS_OF_A_RIG, start=1):
         tick = rows.get(number)
         if tick is None:
-            assert (case, number) == ("a row without a number", 10)
+            assert number == 10
+            assert case.startswith("a row without")
             continue
         if "rate" not in case:
             assert tick.time == pytest.approx(time)
@@ -322,7 +454,7 @@ def test_a_table_of_another_rig_becomes_a_recording(tmp_path: Path, case: str) -
         assert tick.phi_c == pytest.approx(0.0 if case == "no servo" else phi_c, rel=1e-7)
     (listed,) = json.loads(fishctl("runs", "--folder", str(tmp_path), "--json").stdout)
     assert (listed["problem"], listed["about"]["source"]) == ("", "import")
-    assert listed["lost_ticks"] == ("without a number" in case)
+    assert listed["lost_ticks"] == case.startswith("a row without")
 
 
 @pytest.mark.parametrize("case", BAD_TABLES)
@@ -333,6 +465,30 @@ def test_a_table_that_cannot_be_used_is_one_line(tmp_path: Path, case: str) -> N
     line = one_line(done)
     assert line.startswith(f"fishctl: {path}: ")
     assert said in line
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_rounded_times_are_not_gaps(tmp_path: Path) -> None:
+    rows = "".join(f"{row / 96:.2f},1\n" for row in range(960))
+    path = write_table(tmp_path / "rig.csv", f"time,fx\n{rows}")
+    for rate in ((), ("--rate", "96")):
+        done = fishctl("import", str(path), f"{tmp_path}/run{len(rate)}", *rate, "--json")
+        assert json.loads(done.stdout)["lost_ticks"] == 0
+        times = [tick.time for tick in open_run(tmp_path / f"run{len(rate)}.mcap").ticks]
+        assert np.diff(times) == pytest.approx(1 / 96, rel=1e-3)
+
+
+def test_a_missing_row_of_rounded_times_is_a_gap(tmp_path: Path) -> None:
+    rows = "".join(f"{row / 48:.2f},1\n" for row in range(960) if row != 3)
+    path = write_table(tmp_path / "rig.csv", f"time,fx\n{rows}")
+    done = fishctl("import", str(path), "--folder", str(tmp_path), "--json")
+    assert json.loads(done.stdout)["lost_ticks"] >= 1
+
+
+def test_a_name_with_a_line_break_is_refused(tmp_path: Path) -> None:
+    path = write_table(tmp_path / "rig.csv", "time,fx\n0,1\n1,1\n")
+    line = one_line(fishctl("import", str(path), "a\nb", "--folder", str(tmp_path)))
+    assert line == "fishctl: 'a\\nb' is not a valid name of a recording\n"
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -30,6 +30,7 @@ from fishd.lab.identification.misfit import all_white, find_missing_parameters
 from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifiable, passages
 from fishd.lab.identification.result import Identification
 from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, summarise
+from fishd.lab.limits import find_excess
 from fishd.lab.session import Session, refuse_lost
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
@@ -101,8 +102,7 @@ def identify(
     further = tuple(name for name in FURTHER if fit is None and name not in fix)
     names = check((*DEFAULT, *filter(given_values.get, FURTHER)) if fit is None else fit, fix)
     parts = passages([_to_frame(run) for run in _to_list(runs)])
-    if not any(part.commands.any() for part in parts):
-        raise Unidentifiable("φ_c is zero all the time: a recording of a fish that swims is needed")
+    _refuse_unusable(parts)
     values = {name: float(given_values[name]) for name in POSSIBLE}
     scale_is_free = _scale_is_free(names, values)
     if scale_is_free:
@@ -115,6 +115,22 @@ def identify(
         problem = Problem(parts, problem.names, settle)
         values = solve(problem, values)
     return summarise(parts, problem, values, given_values, scale_is_free)
+
+
+def _refuse_unusable(parts: Sequence[Passage]) -> None:
+    """Raise `Unidentifiable` for values that no fish has, and for a quantity that never changes."""
+    for name, symbol, arrays, skip_s in (
+        ("phi_c", "φ_c", [part.commands for part in parts], 0.0),
+        ("fx", "F_x", [part.forces[0] for part in parts], _SETTLE_S),
+        ("fy", "F_y", [part.forces[1] for part in parts], _SETTLE_S),
+    ):
+        if problem := find_excess(name, np.concatenate(arrays)):
+            raise Unidentifiable(problem)
+        skips = [int(np.searchsorted(part.ends[1:] * part.tick, skip_s)) for part in parts]
+        if all(np.ptp(array[skip:]) == 0.0 for array, skip in zip(arrays, skips, strict=True)):
+            raise Unidentifiable(
+                f"{symbol} is the same in every row: a recording of a fish that swims is needed"
+            )
 
 
 def _scale_is_free(names: Sequence[str], values: dict[str, float]) -> bool:

@@ -24,6 +24,8 @@ _MAX_SAMPLES = 40
 """Largest number of samples in a period; more would not change the mean force."""
 _MAX_ITERATIONS = 100
 """Largest number of iterations for quadratic drag."""
+_MAX_LAGS = 700.0
+"""Largest distance of the servo from its command, in lags Δ, as sinh overflows beyond it."""
 _TOLERANCE = 1e-7
 """Largest change of the fin's speed in the last iteration, relative to its largest speed."""
 _SLOTS_BEFORE = 2
@@ -169,7 +171,7 @@ def _wheel_motion(drive: Drive, commands: Array, steps: int, tick: float) -> tup
             gap = command - phi
             command = phi if abs(gap) <= dead else command - math.copysign(dead, gap)
         targets.append(command)
-        size = sinh((command - phi) / lag)
+        size = sinh(max(-_MAX_LAGS, min(_MAX_LAGS, (command - phi) / lag)))
         sinhs.append(size)
         tails.append(tail)
         phi = command - lag * asinh(size * decay)

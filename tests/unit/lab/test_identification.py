@@ -296,7 +296,12 @@ def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
         (lambda t: t.drop(columns=["fy"]), "not a table of ticks: the column fy is missing"),
         (lambda t: t.iloc[:0], "there is no passage of 5 s without a gap"),
         (lambda t: t.iloc[:90], "there is no passage of 5 s without a gap"),
-        (lambda t: t.assign(phi_c=0.0), "φ_c is zero all the time"),
+        (lambda t: t.assign(phi_c=0.0), "φ_c is the same in every row"),
+        (lambda t: t.assign(phi_c=0.3), "φ_c is the same in every row"),
+        (lambda t: t.assign(phi_c=20.0 * t.phi_c), "phi_c is .* is it in degrees"),
+        (lambda t: t.assign(fx=0.0), "F_x is the same in every row"),
+        (lambda t: t.assign(fy=0.1), "F_y is the same in every row"),
+        (lambda t: t.assign(fx=1e300), "fx is 1e\\+300 N somewhere, more than 100 N"),
         (lambda t: t.assign(time=1.0), "the times of the ticks do not increase"),
         (lambda t: t.assign(servo_on=False), "there is no passage of 5 s without a gap"),
     ],
@@ -304,6 +309,12 @@ def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
 def test_nothing_to_fit_is_refused(table: pd.DataFrame, spoil: object, complaint: str) -> None:
     with pytest.raises(Unidentifiable, match=complaint):
         identify(spoil(table))  # type: ignore[operator]
+
+
+def test_a_large_step_of_a_fast_servo_has_a_response() -> None:
+    commands = np.repeat([-3.1, 3.1, -3.1], 20)
+    drive = Drive(omega0=12.5, xi=1.2, servo_speed=5.8, servo_lag=5e-3)
+    assert np.all(np.isfinite(response(drive, commands, np.arange(61), TICK, 10)))
 
 
 @pytest.mark.parametrize(
