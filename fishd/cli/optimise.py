@@ -2,9 +2,8 @@
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -120,7 +119,8 @@ def optimise() -> None:
     is permitted. A parameter with a value has this value.
 
     The fish swims with a candidate, rests, and swims with the next. A Gaussian process chooses
-    the candidates from all measurements and their errors.
+    the candidates from all measurements and their errors. At the end the best one swims for
+    longer, and this measurement is the result.
     --resume continues an interrupted search; --budget may then be larger.
     """
 
@@ -206,14 +206,14 @@ class _Optimisation:
     as_json: bool
 
     def __post_init__(self) -> None:
+        from fishd.lab.optimise.choice import Choice
         from fishd.lab.optimise.trials import read_trials
 
         self.units = units_of(_controller_fields().values())
         self.trials = read_trials(
             self.experiment, (searched.name for searched in self.search.ranges)
         )
-        for trial in self.trials:
-            self.aim.observe(self.search, trial)
+        self.choice = Choice(self.search, self.aim, self.fixed, self.min_gain, self.trials)
 
     def run(self, picture: Path | None) -> int:
         """Search, print and draw; return the exit status."""
@@ -244,7 +244,7 @@ class _Optimisation:
                 echo(f"picture: {', '.join(map(str, paths))}")
         if ending.is_interrupted:
             return ending.interrupted(f"{format_count(len(self.trials), 'candidate')} are kept")
-        if not self._is_done(proposal):
+        if not self.choice.is_done(proposal):
             echo(
                 f"fishctl: the budget of {self.budget:g} s is used up: another candidate is "
                 f"expected to give {proposal.improvement:.1%} more, --min-gain is "
@@ -254,9 +254,6 @@ class _Optimisation:
             )
             return 1
         return 0
-
-    def _is_done(self, proposal: "Proposal") -> bool:
-        return self.search.is_warm and proposal.improvement <= self.min_gain
 
     def _measure(self, ending: ExperimentEnding) -> float:
         """Measure candidates until the search is done; those in the table are kept.
@@ -271,10 +268,9 @@ class _Optimisation:
         if last:
             count = format_count(len(self.trials), "candidate")
             echo(f"{experiment.path}: {count} measured already", err=self.as_json)
-            if self._is_done(search.propose()):
+            if self.choice.next(self.budget - before) is None:
                 return 0.0
         begin = time.monotonic()
-        observe = partial(self.aim.observe, search)
         with (
             ending.measuring(),
             session,
@@ -283,16 +279,14 @@ class _Optimisation:
         ):
             session.progress = show.at
             for trial in measure_trials(
-                session, self.controller, self.fixed, search, self.budget, last, observe
+                session, self.controller, self.fixed, self.choice.next, self.budget, last
             ):
                 write_trial(experiment, trial)
                 self.trials.append(trial)
-                proposal = search.propose()
-                best = proposal if search.is_warm else None
+                self.choice.add(trial)
+                best = search.propose() if search.is_warm else None
                 line = _format_trial(search.trials, trial, best, session.unit, self.units)
                 show.done(line, trial.tank_time)
-                if self._is_done(proposal):
-                    break
         passed = (self.trials[-1].tank_time if self.trials else 0.0) - before
         return max(0.0, time.monotonic() - begin - passed)
 
@@ -302,11 +296,11 @@ class _Optimisation:
 
         optimum = _make_optimum(
             self.controller, self.trials, self.search, proposal, self.aim,
-            self.session.calibration,
+            self.session.calibration, self.choice.final,
         )  # fmt: skip
         if self.fish.on == "live":
             return replace(optimum, choice_time=waited)
-        parameters = {**self.fixed, **proposal.parameters}
+        parameters = {**self.fixed, **optimum.parameters}
         truth = simulate(self.fish.load(), self.controller, parameters)
         warn_of_fin(truth.fin_amplitude)
         return replace(
@@ -371,8 +365,10 @@ class Optimum(Struct, frozen=True):
     """Lower end of the 95 % interval of each parameter."""
     parameters_ci95_high: dict[str, float]
     """Upper end of that interval."""
+    is_measured: bool
+    """Whether thrust and power are a measurement of these parameters, not a prediction."""
     thrust: float
-    """Predicted thrust [N]."""
+    """Thrust with these parameters [N]."""
     thrust_ci95: float
     """Half-width of the 95 % confidence interval of `thrust` [N]."""
     improvement: float
@@ -424,10 +420,11 @@ def _format_trial(
     unit: unit of the force; units: units of the parameters
     """
     thrust = text.format_measured(trial.thrust, trial.thrust_ci95, unit)
-    measured = f"{number}: {_format_parameters(trial.parameters, units)}: {thrust}"
+    kind = ", the best for longer" if trial.is_final else ""
+    measured = f"{number}{kind}: {_format_parameters(trial.parameters, units)}: {thrust}"
     if math.isfinite(trial.power):
         measured += f" for {format_power(trial.power)}"
-    if best is None:
+    if best is None or trial.is_final:
         return measured
     more = f"another may give {best.improvement:.1%} more"
     return f"{measured}; best so far {_format_parameters(best.parameters, units)}, {more}"
@@ -444,21 +441,32 @@ def _make_optimum(
     proposal: "Proposal",
     aim: "Aim",
     calibration: "ForceCalibration",
+    final: "Trial | None",
 ) -> Optimum:
-    """Return the result of a search; calibration: that of the force sensor."""
+    """Return the result of a search.
+
+    calibration: that of the force sensor
+    final: measurement of the best candidate; None if there was no time for one, so that thrust and
+        power are those that are expected there
+    """
     from fishd.lab.error_budget import budget
     from fishd.lab.statistics import per_watt
 
     last_trial = trials[-1]
-    thrusts = [(trial.parameters, trial.thrust, trial.thrust_ci95) for trial in trials]
-    thrust, error = search.with_observations(thrusts).predict(proposal.parameters)
     power = power_ci95 = None
-    if all(math.isfinite(trial.power) for trial in trials):
-        powers = [(trial.parameters, trial.power, trial.power_ci95) for trial in trials]
-        power, power_ci95 = search.with_observations(powers).predict(proposal.parameters)
+    has_power = all(math.isfinite(trial.power) for trial in trials)
+    if final:
+        parameters, thrust, error = final.parameters, final.thrust, final.thrust_ci95
+        if has_power:
+            power, power_ci95 = final.power, final.power_ci95
+    else:
+        parameters = proposal.parameters
+        thrusts = [(trial.parameters, trial.thrust, trial.thrust_ci95) for trial in trials]
+        thrust, error = search.with_observations(thrusts).predict(parameters)
+        if has_power:
+            powers = [(trial.parameters, trial.power, trial.power_ci95) for trial in trials]
+            power, power_ci95 = search.with_observations(powers).predict(parameters)
     per_watt_value, per_watt_ci95 = per_watt(thrust, error, power, power_ci95)
-    if aim.objective == "thrust-per-watt" and aim.target is None:
-        per_watt_value, per_watt_ci95 = proposal.value, proposal.value_ci95
     rotations = [trial.rotation for trial in trials if trial.rotation]
     rotation = sum(rotations) / len(rotations) if rotations else 0.0
     error_parts = budget(calibration, thrust, error, rotation=rotation)
@@ -469,9 +477,10 @@ def _make_optimum(
     )
     return Optimum(
         controller=name,
-        parameters=proposal.parameters,
-        parameters_ci95_low=proposal.parameters_ci95_low,
-        parameters_ci95_high=proposal.parameters_ci95_high,
+        is_measured=final is not None,
+        parameters=parameters,
+        parameters_ci95_low=_combine_ends(min, parameters, proposal.parameters_ci95_low),
+        parameters_ci95_high=_combine_ends(max, parameters, proposal.parameters_ci95_high),
         thrust=thrust,
         thrust_ci95=error,
         improvement=proposal.improvement,
@@ -492,6 +501,13 @@ def _make_optimum(
     )
 
 
+def _combine_ends(
+    choose: Callable[[float, float], float], best: dict[str, float], ends: dict[str, float]
+) -> dict[str, float]:
+    """Return the ends of intervals, moved so that they include the best values."""
+    return {name: choose(best[name], end) for name, end in ends.items()}
+
+
 def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
     """Print the result; unit: unit of the force, units: units of the parameters."""
     from fishd.lab import error_budget
@@ -510,7 +526,7 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
         unit,
         optimum.rotation,
     )
-    echo(f"thrust there: {thrust}")
+    echo(f"thrust there{'' if optimum.is_measured else ', as expected'}: {thrust}")
     if optimum.power is not None and optimum.power_ci95 is not None:
         per_watt_text = error_budget.format_with_budget(
             optimum.thrust_per_watt or 0.0,
@@ -520,7 +536,7 @@ def _print_optimum(optimum: Optimum, unit: str, units: dict[str, str]) -> None:
             f"{unit} per W",
         )
         echo(
-            f"power there: {optimum.power * 1e3:.0f} ± {optimum.power_ci95 * 1e3:.0f} mW, "
+            f"power there: {text.format_measured(optimum.power, optimum.power_ci95, 'W')}, "
             f"{per_watt_text}"
         )
     if line := error_budget.unknown_calibration(optimum.calibration_ci95, unit):

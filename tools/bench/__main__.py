@@ -7,7 +7,17 @@ sys.path[0] = str(Path(__file__).resolve().parents[1])  # tools/
 
 from common.report import run  # noqa: E402
 
-NAMES = ("tick", "swims", "coverage", "identification", "adapt", "learning", "swimmer", "window")
+NAMES = (
+    "tick",
+    "swims",
+    "coverage",
+    "identification",
+    "adapt",
+    "optimise",
+    "learning",
+    "swimmer",
+    "window",
+)
 
 if __name__ == "__main__":
     sys.exit(run("bench", NAMES))

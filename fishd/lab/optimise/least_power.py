@@ -35,6 +35,11 @@ class LeastPower:
         return self._thrust.trials
 
     @property
+    def is_filled(self) -> bool:
+        """Whether the candidates that fill the ranges were measured."""
+        return self._thrust.is_filled
+
+    @property
     def is_warm(self) -> bool:
         """Whether enough was measured to judge an expected improvement."""
         return self._thrust.is_warm

@@ -31,6 +31,9 @@ MIN_CANDIDATES = 4
 """Smallest number of candidates of a search, for one parameter; each further one adds 2."""
 LENGTH_SCALE = 0.3
 """Correlation length of the thrust before it is fitted, as a fraction of the range."""
+MIN_AMPLITUDE = 0.3
+"""Smallest standard deviation of the objective over the range before it is measured, as a fraction
+of its mean: a few measurements that are equal by chance must not pass for a flat curve."""
 LENGTH_SCALE_FIT_TRIALS = 8
 """Number of trials from which on it is fitted, for one parameter; each further one adds 4."""
 _SAMPLE_COUNT, _GRID_POINTS = 400, 400
@@ -279,9 +282,12 @@ class Search:
 
     def _fit_noise(self) -> None:
         """Set the noise of each measurement, and the kernel, of the Gaussian process."""
-        scale = float(np.std(self._library.space.target)) or 1.0  # the process normalises by it
+        targets = self._library.space.target
+        scale = float(np.std(targets)) or 1.0  # the process normalises by it
+        least = (MIN_AMPLITUDE * float(np.mean(targets)) / scale) ** 2
         is_fitted = self.trials >= LENGTH_SCALE_FIT_TRIALS + 4 * (len(self.ranges) - 1)
-        amplitude = ConstantKernel(1.0, (0.3, 10.0) if is_fitted else "fixed")
+        variance = max(1.0, least)
+        amplitude = ConstantKernel(variance, (variance, 10.0 * variance) if is_fitted else "fixed")
         bounds = (LENGTH_SCALE / 2.0, LENGTH_SCALE * 4.0) if is_fitted else "fixed"
         self._library.set_gp_params(
             alpha=np.array(self._variances) / scale**2,

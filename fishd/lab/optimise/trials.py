@@ -18,12 +18,16 @@ from fishd.lab.optimise.least_power import LeastPower
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.session import Session, refuse_lost
 from fishd.lab.statistics import per_watt
-from fishd.lab.swim_plan import MEAN_REST_S
+from fishd.lab.swim_plan import MEAN_REST_S, MEAN_SWIM_S
 
-MIN_STEADY_S = 1.5
+MIN_STEADY_S = 3.0
 """Shortest measured time of each candidate, after it has settled [s]."""
-MIN_BEATS = 2.0
-"""Smallest number of measured beats of each candidate; at least one of them is whole."""
+MIN_BEATS, SETTLE_BEATS = 3.0, 1.0
+"""Smallest number of measured beats of each candidate, and of beats before them."""
+UNKNOWN_BEAT_S = 1.0
+"""Beat of a controller that chooses it, before one was measured [s]."""
+FINAL_SWIMS = 2
+"""Number of swims of the best candidate at the end, each of `MEAN_SWIM_S`."""
 WAVE_SETTLE_S = 0.75
 """Time until a wave of fixed frequency is steady [s]; no estimator has to converge."""
 MIN_FREQUENCY_HZ = 0.4
@@ -34,6 +38,25 @@ MIN_VALUES = 3
 """Smallest number of frequencies of a search; fewer can all be measured by `compare`."""
 MIN_HALF_BEAT_TICKS = 2
 """Default shortest half beat of a search [ticks]."""
+
+
+class Candidate(NamedTuple):
+    """Parameters to measure."""
+
+    parameters: dict[str, float]
+    """Searched parameters."""
+    is_final: bool = False
+    """Whether they are the best known ones, whose measurement is the result."""
+
+    def durations(self, fixed: Mapping[str, Any], beat: float) -> tuple[float, float, int]:
+        """Return the time until it is steady [s], the length of a swim [s], and their number.
+
+        fixed: parameters that are not searched; beat: as for `trial_durations`
+        """
+        settles, length = trial_durations({**fixed, **self.parameters}, beat)
+        if self.is_final:
+            return settles, max(length, settles + MEAN_SWIM_S), FINAL_SWIMS
+        return settles, length, 1
 
 
 class Trial(NamedTuple):
@@ -53,11 +76,18 @@ class Trial(NamedTuple):
     """Ticks of swimming from the beginning of the search."""
     tank_time: float
     """Tank time from the beginning of the search, rests included [s]."""
+    beat: float = 0.0
+    """Period of its beat [s]; 0 without beats."""
+    is_final: float = 0.0
+    """1 for a measurement of the best candidate that is longer and may be the result, else 0."""
     rotation: float = 0.0
     """Rotation of the sensor visible in this swim; 0 for a trial read from a table [rad]."""
 
 
-TRIAL_COLUMNS = ("thrust", "thrust_ci95", "power", "power_ci95", "swim_ticks", "tank_time")
+TRIAL_COLUMNS = (
+    *("thrust", "thrust_ci95", "power", "power_ci95"),
+    *("swim_ticks", "tank_time", "beat", "is_final"),
+)
 """Columns of a table of trials, after the columns of the searched parameters."""
 
 
@@ -90,64 +120,62 @@ def measure_trials(
     session: Session,
     controller: str,
     fixed: Mapping[str, Any],
-    search: Search | LeastPower,
+    choose: Callable[[float], Candidate | None],
     budget: float,
     before: Trial | None = None,
-    observe: Callable[[Trial], None] | None = None,
 ) -> Iterator[Trial]:
-    """Measure candidates on a rig for as long as the budget lasts.
+    """Measure candidates on a rig until there is none, or for as long as the budget lasts.
 
     The fish swims with a candidate, then rests. The thrust is the force while swimming minus the
     drift, which the rests before and after determine (`fishd.lab.measurement`).
 
     fixed: parameters that are not searched
+    choose: returns the next candidate for the time left [s]; the one before was yielded
     budget: time in the tank [s]
-    before: last trial of a resumed search, which `search` has observed already
-    observe: called with each trial to add it to `search`; by default its thrust is added
+    before: last trial of a resumed search
     Raises `ParameterError`, `Refused` and `Disturbed`.
     """
     rest: list[Tick] = []
     steps: list[Step] = []
-    swim_ticks, tank_time = (before.swim_ticks, before.tank_time) if before else (0, 0.0)
+    swim_ticks, tank_time, beat = (
+        (before.swim_ticks, before.tank_time, before.beat) if before else (0, 0.0, 0.0)
+    )
     tank_time += MEAN_REST_S
-    while True:
-        candidate = search.suggest()
-        parameters = {**fixed, **candidate}
-        settles, length = trial_durations(parameters)
-        if tank_time + length + MEAN_REST_S > budget:
+    while candidate := choose(budget - tank_time):
+        parameters = {**fixed, **candidate.parameters}
+        settles, length, swims = candidate.durations(fixed, beat)
+        duration = swims * (length + MEAN_REST_S)
+        if tank_time + duration > budget:
             return
-        if not rest:
+        rest = rest or session.rest(MEAN_REST_S)
+        ticks, swum = [*rest], 0
+        for _ in range(swims):
+            swim = session.swim(controller, parameters, length)
             rest = session.rest(MEAN_REST_S)
-        swim = session.swim(controller, parameters, length)
-        after = session.rest(MEAN_REST_S)
-        ticks = [*rest, *swim, *after]
-        refuse_lost(ticks, (MEAN_REST_S, length, MEAN_REST_S), session.tick)
+            ticks += [*swim, *rest]
+            swum += len(swim)
+        refuse_lost(ticks, (MEAN_REST_S, *(length, MEAN_REST_S) * swims), session.tick)
         evaluation = evaluate(to_samples(ticks), session.tick, settles, other_steps=steps)
         steps += evaluation.steps
-        swim_ticks += len(swim)
-        tank_time += length + MEAN_REST_S
+        swim_ticks += swum
+        tank_time += duration
+        beat = 1.0 / evaluation.frequency if evaluation.frequency else 0.0
         power, power_ci95 = (
             math.nan if value is None else value
             for value in (evaluation.watts, evaluation.watts_ci95)
         )
-        rotation = visible_rotation(swim, settles)
-        trial = Trial(
-            candidate,
+        yield Trial(
+            candidate.parameters,
             evaluation.thrust,
             evaluation.thrust_ci95,
             power,
             power_ci95,
             swim_ticks,
             tank_time,
-            rotation,
+            beat,
+            float(candidate.is_final),
+            visible_rotation(swim, settles),
         )
-        if observe:
-            observe(trial)
-        else:
-            assert isinstance(search, Search)
-            search.observe(candidate, trial.thrust, trial.thrust_ci95)
-        yield trial
-        rest = after
 
 
 def restrict_to_whole_ticks(frequencies: Range, tick: float) -> Range:
@@ -174,12 +202,19 @@ def restrict_to_whole_ticks(frequencies: Range, tick: float) -> Range:
     return Range(name, low, high, tuple(values))
 
 
-def trial_durations(parameters: Mapping[str, Any]) -> tuple[float, float]:
-    """Return the time until a candidate is steady, and the whole time of its swim [s]."""
+def trial_durations(parameters: Mapping[str, Any], beat: float = 0.0) -> tuple[float, float]:
+    """Return the time until a candidate is steady, and the whole time of its swim [s].
+
+    A swim contains `MIN_BEATS` whole beats after as many beats as a fin needs to be steady.
+    beat: beat of the trial before [s], for controllers that choose their own; 0 if unknown
+    """
     frequency = parameters.get("frequency")
     if isinstance(frequency, int | float) and frequency > 0.0:
-        return WAVE_SETTLE_S, WAVE_SETTLE_S + max(MIN_STEADY_S, MIN_BEATS / frequency)
-    return SWIM_SETTLE_TIME_S, SWIM_SETTLE_TIME_S + MIN_STEADY_S
+        beat, settles = 1.0 / frequency, WAVE_SETTLE_S
+    else:
+        beat, settles = beat or UNKNOWN_BEAT_S, SWIM_SETTLE_TIME_S
+    settles = max(settles, SETTLE_BEATS * beat)
+    return settles, settles + max(MIN_STEADY_S, MIN_BEATS * beat)
 
 
 def make_range(field: Field, low: float | None, high: float | None, session: Session) -> Range:

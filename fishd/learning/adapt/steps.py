@@ -22,6 +22,7 @@ from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC
 from fishd.lab.identification.result import RIG_PARAMETERS
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
+    Candidate,
     Trial,
     measure_trials,
     restrict_to_whole_ticks,
@@ -166,7 +167,12 @@ def search_square_waves(
             tried.tank_time,
         )
         search.observe(last.parameters, last.thrust, last.thrust_ci95)
-    for trial in measure_trials(session, "square", {}, search, budget, last):
+
+    def choose(_: float) -> Candidate:
+        return Candidate(search.suggest())
+
+    for trial in measure_trials(session, "square", {}, choose, budget, last):
+        search.observe(trial.parameters, trial.thrust, trial.thrust_ci95)
         frequency = trial.parameters["frequency"]
         add_trial(
             Tried(frequency, trial.thrust, trial.thrust_ci95, trial.swim_ticks, trial.tank_time)

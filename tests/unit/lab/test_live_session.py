@@ -11,8 +11,9 @@ from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.errors import NoDaemon
 from fishd.core.protocol import Calibrations, State
 from fishd.lab.measurement import measure
+from fishd.lab.optimise.choice import Choice
 from fishd.lab.optimise.search import Range, Search
-from fishd.lab.optimise.trials import measure_trials
+from fishd.lab.optimise.trials import Aim, measure_trials
 from fishd.lab.session import Disturbed, LiveSession
 
 
@@ -133,8 +134,9 @@ def test_a_few_ticks_may_be_lost_but_not_many() -> None:
     assert daemon.status().mode == "idle"
 
     daemon.lost = set(range(500, 600, 10))
+    choice = Choice(Search([Range("frequency", 1.0, 2.0)]), Aim(), {}, 0.01)
     with rig_of(daemon) as rig, pytest.raises(Disturbed, match="ticks were lost"):
-        list(measure_trials(rig, "square", {}, Search([Range("frequency", 1.0, 2.0)]), 30.0))
+        list(measure_trials(rig, "square", {}, choice.next, 40.0))
 
 
 def test_a_swim_of_which_nothing_came_is_told() -> None:

@@ -12,12 +12,15 @@ from rigs.processes import fishctl, one_line
 
 from fishd.config import load
 from fishd.lab.experiment import Header, find_answer, open_experiment
+from fishd.lab.optimise.choice import Choice
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
+    Aim,
     Trial,
     measure_trials,
     read_trials,
     restrict_to_whole_ticks,
+    trial_durations,
     write_trial,
 )
 from fishd.lab.rerun import rerun
@@ -68,16 +71,65 @@ def test_what_is_proposed_is_a_frequency_of_whole_ticks_as_it_is_measured() -> N
 def test_a_search_on_a_rig_that_drifts_ends_by_itself_near_the_best() -> None:
     config = load("config/simulated.yaml")
     search = Search([restrict_to_whole_ticks(Range("frequency", 0.4, 5.0), config.tick)], seed=1)
-    swum = 0
+    choice = Choice(search, Aim(), {}, 0.01)
     with VirtualSession(config) as rig:
-        for trial in measure_trials(rig, "square", {}, search, 300.0):
-            swum, proposal = trial.swim_ticks, search.propose()
-            if search.is_warm and proposal.improvement < 0.01:
-                break
-    assert swum <= 360
-    truth = simulate(config, "square", proposal.parameters).mean_thrust
+        for trial in measure_trials(rig, "square", {}, choice.next, 300.0):
+            choice.add(trial)
+    assert trial.tank_time < 100.0
+    assert choice.final == trial
+    truth = simulate(config, "square", trial.parameters).mean_thrust
     assert truth >= 0.97 * BEST
-    assert proposal.value == pytest.approx(truth, abs=2.0 * proposal.value_ci95)
+    assert trial.thrust == pytest.approx(truth, abs=2.0 * trial.thrust_ci95)
+
+
+@pytest.mark.parametrize("thrusts", [(7.60, 7.87, 7.73, 7.53), (20.0, 20.1, 19.9, 20.0)])
+def test_a_few_thrusts_that_are_equal_by_chance_do_not_end_a_search(
+    thrusts: tuple[float, ...],
+) -> None:
+    search = Search([Range("C", 0.05, 0.95)])
+    for thrust in thrusts:
+        search.observe(search.suggest(), thrust * 1e-3, 1.6e-3)
+    proposal = search.propose()
+    assert proposal.value_ci95 > 1e-3
+    assert proposal.improvement > 0.01
+
+
+def test_the_best_is_swum_last_and_its_neighbours_before() -> None:
+    search = Search([restrict_to_whole_ticks(Range("frequency", 0.4, 5.0), 0.05)])
+    choice, frequencies = Choice(search, Aim(), {}, 0.01), []
+    while candidate := choice.next(300.0):
+        frequency = candidate.parameters["frequency"]
+        frequencies.append(frequency)
+        thrust = 0.0257 - 0.02 * (frequency - 1.74) ** 2
+        time = 7.0 * len(frequencies)
+        choice.add(
+            Trial(candidate.parameters, thrust, 1e-4, 0.6, 0.01, 90, time, 0.6, candidate.is_final)
+        )
+    assert choice.final
+    assert frequencies[-1] == pytest.approx(10 / 6)
+    assert {round(frequency, 3) for frequency in frequencies} >= {1.429, 1.667, 2.0}
+    assert choice.next(300.0) is None
+
+
+def test_without_time_for_more_the_best_so_far_is_swum() -> None:
+    search = Search([Range("C", 0.05, 0.95)])
+    choice = Choice(search, Aim(), {}, 0.0)
+    for _ in range(3):
+        candidate = choice.next(300.0)
+        assert candidate
+        assert not candidate.is_final
+        trial = Trial(candidate.parameters, 0.02, 1e-3, 0.6, 0.01, 90, 7.0, 0.6, 0.0)
+        choice.add(trial)
+    last = choice.next(22.0)
+    assert last
+    assert last.is_final
+    choice.add(trial._replace(parameters=last.parameters, is_final=1.0))
+    assert choice.next(2.0) is None
+
+
+def test_a_slow_beat_is_settled_and_measured_for_three_beats() -> None:
+    assert trial_durations({"frequency": 0.5}) == (2.0, 8.0)
+    assert trial_durations({}, beat=1.6) == pytest.approx((1.6, 6.4))
 
 
 @pytest.mark.slow
@@ -89,8 +141,10 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
     assert "the budget of 22 s is used" in done.stderr
     assert "true thrust there" in done.stdout
     rows = (folder / "rows.csv").read_text().splitlines()
-    assert rows[0] == "frequency,thrust,thrust_ci95,power,power_ci95,swim_ticks,tank_time"
-    passed = float(rows[-1].rpartition(",")[2])
+    assert rows[0] == (
+        "frequency,thrust,thrust_ci95,power,power_ci95,swim_ticks,tank_time,beat,is_final"
+    )
+    passed = float(rows[-1].split(",")[6])
     run = open_run(folder / "search.mcap")
     assert len(run.ticks) == round(passed / 0.05)
     again = rerun(run).stretches
@@ -105,8 +159,8 @@ def test_a_search_is_a_table_a_recording_and_a_picture(tmp_path: Path) -> None:
         answer[key] for key in ("thrust", "thrust_ci95", "total_ci95")
     )
     table = (folder / "rows.csv").read_text()
-    more = fishctl(*again.split(), "40")
-    assert f"{folder}: 3 candidates measured already" in more.stdout
+    more = fishctl(*again.split(), "60")
+    assert f"{folder}: 2 candidates measured already" in more.stdout
     assert (folder / "rows.csv").read_text().startswith(table)
     second = open_run(folder / "search-2.mcap").ticks
     assert len(second) > 100
