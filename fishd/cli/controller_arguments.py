@@ -3,7 +3,7 @@
 The options are generated from the parameters of the controllers.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -198,30 +198,34 @@ class ControllerGroup(click.Group):
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Parse `square:frequency=1.7,amplitude=0.3`, the name of a policy, and any order."""
-        args = self._move_controller_first(ctx, args)
-        if args and not args[0].startswith("-"):
-            from fishd.controllers import registry
-
-            others = [word for word in args[1:] if word.partition(":")[0] in registry.names()]
-            if self._several and others:
-                names = [word.partition(":")[0] for word in (args[0], *others)]
-                message = f"several controllers with one grid are one word: {','.join(names)}"
-                raise click.UsageError(message, ctx)
-            args = [*self._split(ctx, args[0]), *args[1:]]
+        places = list(self._find_words(ctx, args))
+        if places:
+            self._refuse_several(ctx, [args[place] for place in places])
+            first = places[0]
+            args = [*self._split(ctx, args[first]), *args[:first], *args[first + 1 :]]
+        elif args and not set(args) & set(ctx.help_option_names):
+            raise click.UsageError(f"a controller is needed, as in: {ctx.command_path} swing", ctx)
         return super().parse_args(ctx, args)
 
-    def _move_controller_first(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Return the arguments with the controller before the options."""
+    def _find_words(self, ctx: click.Context, args: list[str]) -> Iterator[int]:
+        """Yield the places of the arguments that are neither options nor their values."""
         params = getattr(self._options(cast(Any, lambda: None)), "__click_params__", [])
         flags = {*ctx.help_option_names, *(n for p in params if p.is_flag for n in p.opts)}
         is_value = False
-        for index, word in enumerate(args):
+        for place, word in enumerate(args):
             if not word.startswith("-") and not is_value:
-                return [word, *args[:index], *args[index + 1 :]]
-            is_value = not is_value and word not in flags and "=" not in word
-        if args and not set(args) & set(ctx.help_option_names):
-            raise click.UsageError(f"a controller is needed, as in: {ctx.command_path} swing", ctx)
-        return args
+                yield place
+            takes_value = word.startswith("-") and "=" not in word and word not in flags
+            is_value = takes_value and not is_value
+
+    def _refuse_several(self, ctx: click.Context, words: list[str]) -> None:
+        """Raise `UsageError` if a verb that takes `square,sine` has these as two words."""
+        from fishd.controllers import registry
+
+        names = [word.partition(":")[0] for word in words]
+        if self._several and names[1:] and set(names[1:]) <= set(registry.names()):
+            message = f"several controllers with one grid are one word: {','.join(names)}"
+            raise click.UsageError(message, ctx)
 
     def _split(self, ctx: click.Context, word: str) -> list[str]:
         """Return a controller and its parameters as options."""

@@ -1,17 +1,14 @@
-"""Options that verbs share, and options that are generated from the parameters of controllers."""
+"""Options that verbs share."""
 
 import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import click
 
 from fishd.core import text
-
-if TYPE_CHECKING:
-    pass
 
 F = TypeVar("F", bound=Callable[..., Any])
 

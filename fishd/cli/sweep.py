@@ -332,7 +332,7 @@ def _format_best(best: "Best", unit: str, unit_of_value: str) -> str:
     value = text.format_measured(best.value, best.value_ci95, unit_of_value)
     if best.x is None:
         return value
-    if "." in best.x_name:  # a property of the fish, which nobody chooses
+    if "." in best.x_name:  # a property of the fish is not chosen
         return f"largest at {best.x_name} {best.x:.4g}{symbol}: {value}"
     if best.at_edge:
         return (

@@ -292,7 +292,7 @@ def count_attempts(path: Path) -> int:
 
 
 class Answer(NamedTuple):
-    """What an experiment has found so far, as far as one line can hold it."""
+    """Result of an experiment or, before its end, of its rows, for one line of a list."""
 
     thrust: float | None = None
     """Largest thrust of its result or, before its end, of its table [N]."""
@@ -307,7 +307,7 @@ class Answer(NamedTuple):
 
 
 def find_answer(path: Path) -> Answer:
-    """Return what an experiment has found."""
+    """Return the result of an experiment."""
     try:
         results = _read_results(path)
     except FileProblem as problem:

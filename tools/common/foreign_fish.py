@@ -118,7 +118,7 @@ class ForeignFish(Plant[ForeignParameters]):
 
 
 def register() -> None:
-    """Make this plant known to the present process."""
+    """Make this plant known to the present process, without a package and its entry point."""
     PLANTS._built_in[MODEL] = f"{__name__}:ForeignFish"  # type: ignore[index]
 
 

@@ -58,7 +58,7 @@ class Choice:
         return self.search.is_warm and proposal.improvement <= self._min_gain
 
     def next(self, time_left: float) -> Candidate | None:
-        """Return the next candidate; None where there is no better one, or no time for one."""
+        """Return the next candidate; None at the end of the search, or of the time."""
         if not self.search.is_filled:
             return Candidate(self.search.suggest())
         proposal = self.search.propose()

@@ -271,14 +271,13 @@ def _fish(
     """Return a drawn fish; None for one beyond the bounds."""
     drawn = {}
     for name, value in zip(names, z, strict=True):
-        low, high = BOUNDS[name]
-        plain = float(np.exp(value)) if name in LOGARITHMIC else value
-        if low == 0.0:
-            plain = max(low, plain)
-        if not low <= plain <= high:
+        is_logarithm = name in LOGARITHMIC
+        low, high = map(math.log, BOUNDS[name]) if is_logarithm else BOUNDS[name]
+        bounded = max(low, value) if low == 0.0 and not is_logarithm else value
+        if not low <= bounded <= high:
             return None
         if name not in RIG_PARAMETERS:
-            drawn[name] = plain
+            drawn[name] = math.exp(bounded) if is_logarithm else bounded
     return replace(fitted, **drawn)
 
 

@@ -86,6 +86,34 @@ def test_a_cloud_has_the_errors_of_the_fit_and_their_correlation() -> None:
     assert np.corrcoef(logs.T)[0, 1] == pytest.approx(-0.9, abs=0.02)
 
 
+def test_draws_beyond_the_bounds_of_the_fit_are_rejected_and_few_may_be_left() -> None:
+    at_a_bound = dataclasses.replace(
+        identification(),
+        covariance=np.diag([1e-6, 100.0]),  # ξ by a factor of e¹⁰ either way
+    )
+    fish = draw_cloud(at_a_bound, PHI, count=32)
+    assert all(1e-3 < plant.xi < 10.0 for plant in fish)
+    assert len({plant.xi for plant in fish}) == len(fish)
+    hopeless = dataclasses.replace(identification(), covariance=np.diag([1e6, 1e6]))
+    assert len(draw_cloud(hopeless, PHI)) < steps.MIN_CLOUD_SIZE
+
+
+def test_a_training_that_fails_is_left_out_and_loses_no_measurement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any) -> Trained:
+        raise ValueError("low >= high")
+
+    monkeypatch.setattr(adaptation, "train_policy", fail)
+    run, show = folder(tmp_path / "run"), StoringDisplay()
+    run.state.fitted = fitted(GOOD)
+    with VirtualSession(Config()) as rig:
+        Adaptation(rig, run, 150.0, 640, 0, show)._train(run.state)
+    trained = folder(run.path).state.trained
+    assert trained
+    assert trained.refusal == "its training failed: ValueError: low >= high"
+
+
 def test_each_episode_of_a_training_swims_a_fish_of_the_cloud() -> None:
     fish = draw_cloud(identification(), PHI, count=5)
     spread = Randomisation(fish=fish)

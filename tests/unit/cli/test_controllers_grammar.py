@@ -73,6 +73,16 @@ def test_a_wrong_controller_is_one_line_that_says_what_is_right(line: str, messa
     assert message in one_line(fishctl(*line.split()))
 
 
+def test_a_folder_may_be_named_like_a_controller(tmp_path: Path) -> None:
+    words = ("square", "--frequency", "1.2", "--periods", "2", "--settle", "0")
+    done = fishctl("sweep", *words, "--folder", str(tmp_path / "run"), "--on", "simulation")
+    assert done.returncode == 0
+    refused = fishctl("sweep", "--resume", "sine", "--jobs", "1")
+    assert "sine: no experiment to resume: there is no such folder" in one_line(refused)
+    refused = fishctl("sweep", "square", "--folder", "sine", "--periods", "1")
+    assert "1 is not in the range" in one_line(refused)
+
+
 def test_options_may_stand_before_the_controller_and_a_policy_is_one() -> None:
     swims = [
         json.loads(fishctl("simulate", *words, "--json", "--for", "12").stdout)
