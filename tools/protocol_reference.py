@@ -14,7 +14,6 @@ from common.report import table, write_reference
 from fishd.camera import messages
 from fishd.control.faults import FAULTS
 from fishd.core import protocol, signals
-from fishd.core.old_names import OLD_NAMES
 from fishd.core.schema import fields_of
 from fishd.virtual.swimmer.track import COLUMNS
 
@@ -30,24 +29,6 @@ TYPES = {
     inspect.RawType: "any",
     inspect.AnyType: "any",
 }
-PLACES = {
-    "tick": "[tick](#tick)",
-    "status": "[status](#status)",
-    "timing": "`timing` in status",
-    "distribution": "each distribution of `timing`",
-    "event overrun": "`data` of an event `overrun`",
-    "calibration": "calibration of the force sensor, also in its files",
-    "daemon": "metadata `fishd.daemon` of a recording",
-    "frame": "frame of a camera in a recording",
-    "summary": "summary of a recording: `fishctl runs --json`",
-    "sweep": "`rows.csv` of `fishctl sweep`",
-    "camera of a training": "section `camera` of the settings of a training",
-    "training": "`evaluations.csv` and `progress.csv` of a training",
-    "estimate": "estimates of `fishctl identify --json`, also in the folder of `fishctl adapt`",
-    "controller excitation": "parameters of `excitation` in a recording",
-    "optimise": "`rows.csv` of `fishctl optimise`",
-}
-"""Places of the names in `OLD_NAMES`."""
 STRUCTS: dict[str, type[Struct]] = {
     "tick": signals.Tick,
     "event": signals.Event,
@@ -78,12 +59,6 @@ def references() -> Iterator[tuple[str, str, str]]:
         yield "reference/protocol.md", name, _fields(struct)
     for name, struct in CAMERA.items():
         yield "how-to/camera.md", name, _fields(struct)
-    old_names = [
-        [PLACES[kind], f"`{old}`", f"`{new}`"]
-        for kind, names in OLD_NAMES.items()
-        for old, new in names.items()
-    ]
-    yield "reference/protocol.md", "old names", table("where | before | now", old_names)
     conditions = [[f"`{name}`", meaning] for name, meaning in messages.CONDITIONS.items()]
     yield "how-to/camera.md", "conditions", table("state | what it means", conditions)
     kinds = [[f"`{kind}`", *cells] for kind, *cells in signals.EVENTS]

@@ -161,10 +161,6 @@ def _load(data: Any, kind: type[C]) -> C:
         raise Problem((), "the file is empty")
     if not isinstance(data, dict):
         raise Problem((), "a mapping of keys to values is needed")
-    if not set(data) <= set(kind.__struct_fields__):
-        from fishd.core.old_names import rename_keys  # seldom needed
-
-        data = rename_keys("calibration", data)
     missing = [key for key in _REQUIRED[kind] if key not in data]
     if missing:
         raise Problem((), f"{', '.join(missing)} missing: fishd fills in no default")

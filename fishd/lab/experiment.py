@@ -20,7 +20,6 @@ from fishd import __version__
 from fishd.core import files, text
 from fishd.core.errors import ConfigError, FishdError
 from fishd.core.files import FileProblem, write_atomically
-from fishd.core.old_names import rename_columns
 from fishd.core.process.lockfile import LockHeld, NotALock, find_lock_holder, locked
 from fishd.lab import tables
 from fishd.lab.tables import Table
@@ -110,7 +109,6 @@ class Experiment:
                     f"{_OTHER_FOLDER}"
                 )
             head, *rows = table
-            head = rename_columns(self.header.kind, head)
             if head != expected:
                 raise ConfigError(
                     f"{path}: {_describe_difference(head, expected)}; {_OTHER_FOLDER}"

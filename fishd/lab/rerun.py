@@ -20,7 +20,6 @@ from fishd.controllers.base import Controller
 from fishd.core import text
 from fishd.core.errors import FishdError, RecordingError
 from fishd.core.foreign_code import call_foreign
-from fishd.core.old_names import rename_parameters
 from fishd.core.signals import Event, Measurement, Observation, Status, Tick
 from fishd.recording.reader import Run
 from fishd.recording.summary import Tally
@@ -288,7 +287,6 @@ class _Rerun:
         self, tick: Tick, recorded: str, parameters: dict[str, Any], *, from_start: bool
     ) -> None:
         name = self._name or recorded
-        parameters = rename_parameters(recorded, parameters)
         given = {**parameters, **self._parameters} if name == recorded else self._parameters
         limits = replace(self._config.limits, virtual=self._run.about.get("source") == "simulation")
         try:
@@ -305,7 +303,7 @@ class _Rerun:
         """Apply a recorded change of parameters where the recorded controller runs again."""
         stretch, swims = self.stretches[-1], self._swims
         if swims is not None and stretch.controller == stretch.recorded:
-            values = {**rename_parameters(stretch.recorded, parameters), **self._parameters}
+            values = {**parameters, **self._parameters}
             try:
                 checked = registry.check(stretch.controller, values, swims.limits)
             except FishdError as error:

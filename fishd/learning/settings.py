@@ -11,7 +11,6 @@ from fishd.controllers.policy.card import COMMAND_FEATURES, MAX_HISTORY_TICKS, F
 from fishd.core import strict_yaml
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import ConfigError
-from fishd.core.old_names import rename_keys
 from fishd.core.schema import Problem, convert, drop_empty_sections, note, unit
 from fishd.virtual.plant.parameters import PlantParameters
 
@@ -331,9 +330,7 @@ def load(path: str | os.PathLike[str] | None) -> TrainingSettings:
 
 
 def from_plain(data: dict[str, Any]) -> TrainingSettings:
-    """Return settings from plain data, also with old names of keys; raises `Problem`."""
-    if isinstance(data.get("camera"), dict):
-        data = {**data, "camera": rename_keys("camera of a training", data["camera"])}
+    """Return settings from plain data; raises `Problem`."""
     return convert(data, TrainingSettings)
 
 

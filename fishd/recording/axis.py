@@ -103,8 +103,6 @@ def _choose_interval(
         is_confirmed = any(abs(elapsed - time) <= AGREEMENT_S for time in witnesses)
         if lowest <= elapsed and (elapsed <= highest or is_confirmed):
             return elapsed
-    elif seq is None and abs(by_wall) > AGREEMENT_S:  # an event of an older fishd, after a step
-        return 0.0
     return next((time for time in witnesses if time >= 0.0), 0.0)
 
 

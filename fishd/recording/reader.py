@@ -26,20 +26,17 @@ from fishd.core import strict_yaml, text
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, RecordingError
-from fishd.core.old_names import rename_keys, rename_message
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
-from fishd.recording.axis import Axis
 from fishd.recording.images import IMAGE_TOPIC, FrameHead, RecordedFrame, decode_frame, decode_head
 from fishd.recording.mcap_file import Appended, Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
-from fishd.recording.summary import Gap, Summary, Tally, from_metadata, place
+from fishd.recording.provenance import FORMAT
+from fishd.recording.summary import Gap, Summary, Tally, from_metadata
 from fishd.recording.writer import (
-    AXIS_FORMAT,
     CALIBRATIONS_ATTACHMENT,
     CHANNELS,
     CONFIG_ATTACHMENT,
-    PRESENT_NAMES_FORMAT,
 )
 
 if TYPE_CHECKING:
@@ -69,7 +66,7 @@ class Entry(NamedTuple):
     topic: str
     """`tick`, `event` or `status`."""
     payload: bytes
-    """JSON, exactly as fishd sent it; that of an older fishd has the present names."""
+    """JSON, exactly as fishd sent it."""
     log_time: int
     """Time of the message in the file [ns]."""
 
@@ -116,8 +113,6 @@ class Run:
         """Description of the first damage; empty if unknown."""
         self.entries: list[Entry] = []
         """All messages of fishd, in the order of arrival, each once."""
-        self.is_timed = True
-        """Whether ticks that have been read have monotonic times; else its times are unix times."""
         self.frame_heads: list[FrameHead] = []
         """Metadata of the frames of a camera, in the order of arrival."""
         self._scan()
@@ -179,13 +174,8 @@ class Run:
 
     @cached_property
     def ticks(self) -> list[Tick]:
-        """All ticks, in the order of arrival; raises `RecordingError`.
-
-        If an older fishd gave them no monotonic time, their `time` is their unix time.
-        """
-        ticks = self._decoded("tick", Tick)
-        self.is_timed = len(ticks) < 2 or any(tick.time for tick in ticks)
-        return ticks if self.is_timed else [replace(tick, time=tick.t) for tick in ticks]
+        """All ticks, in the order of arrival; raises `RecordingError`."""
+        return self._decoded("tick", Tick)
 
     @cached_property
     def events(self) -> list[Event]:
@@ -214,12 +204,8 @@ class Run:
         It is that of fishd's monotonic clock, which no step of the unix clock moves. Raises
         `RecordingError`.
         """
-        if self._format < AXIS_FORMAT:
-            axis = Axis()
-            times = [place(axis, message) for message in self.messages()]
-        else:
-            begin = self.entries[0].log_time if self.entries else 0
-            times = [(entry.log_time - begin) * 1e-9 for entry in self.entries]
+        begin = self.entries[0].log_time if self.entries else 0
+        times = [(entry.log_time - begin) * 1e-9 for entry in self.entries]
         topics = [entry.topic for entry in self.entries]
         first = times[topics.index("tick")] if "tick" in topics else 0.0
         return [time - first for time in times]
@@ -396,10 +382,9 @@ class Run:
             self.finished = isinstance(record, Footer)
             if isinstance(record, Message):
                 if topic == IMAGE_TOPIC:
-                    self._take_frame(self._with_present_names("frame", record.data))
+                    self._take_frame(record.data)
                 elif topic in CHANNELS:
-                    payload = self._with_present_names(topic, record.data)
-                    self.entries.append(Entry(topic, payload, record.log_time))
+                    self.entries.append(Entry(topic, record.data, record.log_time))
                     ticks += topic == "tick"
             elif isinstance(record, Repeated):
                 self._repeated[topic] += 1
@@ -428,16 +413,6 @@ class Run:
         self.is_damaged = True
         self.damage_reason = self.damage_reason or reason
 
-    def _with_present_names(self, kind: str, payload: bytes) -> bytes:
-        """Return a message; one with old names gets the present ones."""
-        return payload if self._format >= PRESENT_NAMES_FORMAT else rename_message(kind, payload)
-
-    @property
-    def _format(self) -> int:
-        """Version of the layout; 0 if it is not known."""
-        number = self.about.get("format", "")
-        return int(number) if number.isdecimal() and len(number) <= MAX_DIGITS else 0
-
     def _take_frame(self, payload: bytes) -> None:
         try:
             self.frame_heads.append(decode_head(payload))
@@ -449,8 +424,14 @@ class Run:
     def _take_metadata(self, name: str, data: dict[str, str]) -> None:
         if name == "fishd.run":
             self.about = data
+            if (layout := data.get("format", str(FORMAT))) != str(FORMAT):
+                raise RecordingError(
+                    f"{self.path}: its layout is {text.quoted(layout)}, and this fishd reads "
+                    f"layout {FORMAT}: it was recorded by another version, "
+                    f"{text.quoted(data.get('version', ''))}"
+                )
         elif name == "fishd.daemon":
-            self.daemons.append(rename_keys("daemon", data))
+            self.daemons.append(data)
         elif name == "fishd.end":
             self.reason, end = data.get("reason", ""), from_metadata(data)
             if end is not None and end not in self._ends:
@@ -463,8 +444,7 @@ class Run:
                 raise ValueError("the number of its fishd is unknown")
             self._yaml[int(number)] = data
         elif name == CALIBRATIONS_ATTACHMENT:
-            payload = self._with_present_names("calibrations", data)
-            self.calibrations.append(decoder(Calibrations)(payload))
+            self.calibrations.append(decoder(Calibrations)(data))
 
     def _decoded(self, topic: str, kind: type[T]) -> list[T]:
         decode = decoder(kind)

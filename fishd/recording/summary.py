@@ -7,7 +7,6 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
 from fishd.core.decoding import decoder
-from fishd.core.old_names import rename_keys
 from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.axis import Axis, ClockStep, ClockSteps
@@ -288,7 +287,6 @@ _decode = decoder(Any)
 
 def from_metadata(data: dict[str, str]) -> Summary | None:
     """Return the summary in the metadata of a recording; None if it has none."""
-    data = rename_keys("summary", data)
     known = {name: data[name] for name in Summary.__struct_fields__ if name in data}
     try:
         raw = {name: _decode(value.encode()) for name, value in known.items()}

@@ -53,10 +53,6 @@ MAX_TIME_S = 1e10
 """Largest time of a message, before or after 1970: MCAP counts nanoseconds in 64 bits [s]."""
 CONFIG_ATTACHMENT, CALIBRATIONS_ATTACHMENT = "config.yaml", "calibrations.json"
 """Names of attachments."""
-AXIS_FORMAT = 3
-"""First version in which log times follow fishd's monotonic clock; before, the unix clock."""
-PRESENT_NAMES_FORMAT = 2
-"""First version with the present names of fields; before, they have those of `OLD_NAMES`."""
 
 
 class RunWriter:

@@ -37,12 +37,6 @@ def open_recording(name: str, folder: Path | None) -> Run:
         echo(f"fishctl: {run.path}: {run.problem}", err=True)
     for step in run.summary.clock_steps:
         echo(f"fishctl: {run.path}: {step}", err=True)
-    if not run.is_timed:
-        echo(
-            f"fishctl: {run.path}: its fishd recorded no monotonic time: lengths follow the unix "
-            "clock",
-            err=True,
-        )
     return run
 
 

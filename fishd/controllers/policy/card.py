@@ -154,10 +154,7 @@ class Provenance(Struct, frozen=True, kw_only=True):
     libraries: dict[str, str]
     """Versions of the libraries of the training."""
     relative_thrust: float | None = None
-    """Thrust over that of the best square wave, in a deterministic evaluation; None if unknown.
-
-    Files of an older version have it under the key `efficiency`.
-    """
+    """Thrust over that of the best square wave, in a deterministic evaluation; None if unknown."""
     frequency: float | None = None
     """Tail-beat frequency in that evaluation [Hz]."""
     note: str = ""
@@ -240,9 +237,6 @@ def decode(text: str) -> Card:
             f"its card has format {format_literal(version)[:60]}; this fishd reads format "
             f"{FORMAT}{advice}"
         )
-    provenance = data.get("provenance")
-    if isinstance(provenance, dict) and "efficiency" in provenance:  # key of older files
-        provenance["relative_thrust"] = provenance.pop("efficiency")
     try:
         card = convert(data, Card)
     except Problem as problem:

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fishd.core.errors import FishdError
-from fishd.core.old_names import OLD_NAMES
 from fishd.lab.identification.response import Array
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
     """
     usable = []
     begin = 0.0
-    for table in (table.rename(columns=OLD_NAMES["tick"]) for table in tables):
+    for table in tables:
         missing = [name for name in COLUMNS if name not in table]
         if missing:
             raise Unidentifiable(

@@ -2,14 +2,13 @@
 
 import base64
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fishd.core.old_names import rename_keys
 from fishd.lab import error_budget
 from fishd.lab.drawing import BLACK, BLUE, GREEN, GREY, ORANGE, open_figure
 from fishd.lab.identification.figure import format_estimate
@@ -88,7 +87,7 @@ def _draw_fit(axis: Any, fitted: Fitted) -> None:
     """
     shown = [
         (name, estimate)
-        for name, estimate in _read_estimates(fitted)
+        for name, estimate in fitted.identification["estimates"].items()
         if estimate.get("fitted", True) and name in LOGARITHMIC and name != "lateral_inertia_ratio"
     ]
     bars = {}
@@ -240,16 +239,10 @@ def _role(name: str, verdict: Verdict) -> str:
     return ", chosen" if name == verdict.chosen_gait else ", undecided"
 
 
-def _read_estimates(fitted: Fitted) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the fitted parameters, also those of an older fishd."""
-    for name, values in fitted.identification["estimates"].items():
-        yield name, rename_keys("estimate", values)
-
-
 def _estimates(fitted: Fitted) -> list[tuple[str, ...]]:
     """Return the rows of the fitted parameters, as `fishctl identify` prints them."""
     rows = []
-    for name, values in _read_estimates(fitted):
+    for name, values in fitted.identification["estimates"].items():
         if values.get("fitted", True):
             # JSON has no infinity: null stands for an end that the data do not determine.
             low = -math.inf if values["ci95_low"] is None else values["ci95_low"]

@@ -22,7 +22,6 @@ from msgspec import Meta, Struct
 from fishd.controllers.policy.card import Card, decode, encode
 from fishd.core import files
 from fishd.core.errors import FishdError, PolicyError
-from fishd.core.old_names import rename_keys
 from fishd.lab.experiment import On
 from fishd.learning import extractors
 from fishd.learning.env.evaluation import Evaluation
@@ -206,11 +205,7 @@ def read_card(checkpoint: Path) -> Card:
 def read_state(checkpoint: Path) -> State:
     """Read the state of a checkpoint; raises `CheckpointError`."""
     try:
-        state = msgspec.json.decode(_read_text(checkpoint / STATE), type=dict[str, Any])
-        for name in ("latest", "best"):
-            if isinstance(state.get(name), dict):
-                state[name] = rename_keys("training", state[name])
-        return msgspec.convert(state, State)
+        return msgspec.json.decode(_read_text(checkpoint / STATE), type=State)
     except (ValueError, RecursionError) as error:
         raise CheckpointError(f"{checkpoint / STATE}: {_format_error(error)}; {_ADVICE}") from None
 

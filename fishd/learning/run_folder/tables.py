@@ -9,7 +9,6 @@ import msgspec
 
 from fishd.core.errors import ConfigError
 from fishd.core.files import FileProblem, NoFile, write_atomically
-from fishd.core.old_names import rename_columns
 from fishd.lab import tables
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.run_folder.checkpoints import CheckpointError
@@ -61,7 +60,6 @@ class Table(tables.Table):
         try:
             head, *rows = tables.read(self.path)
             at = head.index("steps")
-            head = rename_columns("training", head)
             if tuple(head) != self.columns:
                 raise ValueError(head)
             complete = [row for row in rows if len(row) == len(head)]
@@ -81,7 +79,6 @@ def read_evaluations(folder: Path) -> list[Evaluation]:
     path = folder / EVALUATIONS
     try:
         head, *rows = tables.read(path)
-        head = rename_columns("training", head)
         given = [{key: text for key, text in zip(head, row, strict=True) if text} for row in rows]
         return msgspec.convert(given, list[Evaluation], strict=False)
     except NoFile:

@@ -71,25 +71,6 @@ def test_rows_are_there_again_and_one_that_a_kill_cut_off_is_not(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("kind", "before", "now"),
-    [
-        ("sweep", "speed,error,settled,trouble", "speed,speed_ci95,settled_time,failure"),
-        ("optimise", "thrust,error,swum,passed", "thrust,thrust_ci95,swim_ticks,tank_time"),
-    ],
-)
-def test_a_table_with_columns_of_an_older_fishd_is_read_and_renamed(
-    tmp_path: Path, kind: str, before: str, now: str
-) -> None:
-    header = Header(kind=kind, on="live")
-    with open_experiment(tmp_path / "run", header) as experiment:
-        experiment.write("rows.csv", f"{before}\n1,2,3,4\n")
-    with open_experiment(tmp_path / "run", header, resume=True) as experiment:
-        rows = experiment.read_rows(now.split(","))
-    assert rows == [dict(zip(now.split(","), "1234", strict=True))]
-    assert (tmp_path / "run" / "rows.csv").read_text() == f"{now}\n1,2,3,4\n"
-
-
-@pytest.mark.parametrize(
     ("changes", "named"),
     [
         ({"settings": {"seed": 2}}, "began with seed = 1, now it is 2"),

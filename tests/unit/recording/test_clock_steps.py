@@ -1,7 +1,6 @@
 """Steps of the unix clock: no length and no axis of a recording follows them; they are listed."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -12,7 +11,6 @@ from msgspec.structs import replace
 from rigs.processes import fishctl
 from rigs.recordings import status, swum, write
 
-from fishd.core.decoding import decoder
 from fishd.core.signals import Event, Tick
 from fishd.lab.run_traces import traces
 from fishd.recording import RunWriter, open_run
@@ -164,42 +162,13 @@ def test_events_and_statuses_are_placed_beside_the_ticks(tmp_path: Path) -> None
     assert run.times_of("status") == pytest.approx([1.97])
 
 
-_fields = decoder(dict)
-
-
-def write_older(path: Path, ticks: Sequence[Tick], *, with_time: bool) -> Path:
-    """Write a recording of format 2, whose log times are unix times."""
+def test_a_recording_of_another_layout_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "old.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="fishd")
         writer.add_metadata("fishd.run", {"run": path.stem, "format": "2", "version": "0.1"})
-        channel = writer.register_channel("tick", "json", 0)
-        for tick in ticks:
-            fields = _fields(msgspec.json.encode(tick))
-            if not with_time:
-                del fields["time"]
-            nanoseconds = round(tick.t * 1e9)
-            writer.add_message(channel, nanoseconds, msgspec.json.encode(fields), nanoseconds)
-        end = {"begins": f"{ticks[0].t}", "ends": f"{ticks[-1].t}", "ticks": f"{len(ticks)}"}
-        writer.add_metadata("fishd.end", {**end, "reason": "ended"})
         writer.finish()
-    return path
-
-
-def test_an_older_recording_gets_its_axis_from_its_ticks(tmp_path: Path) -> None:
-    path = write_older(tmp_path / "old.mcap", stepped(), with_time=True)
-    for summary in (open_run(path).summary, read_overview(path).summary):
-        assert summary.duration == pytest.approx(2.95)
-        assert [step.by for step in summary.clock_steps] == pytest.approx([STEP_S])
-
-
-def test_a_recording_without_monotonic_times_follows_the_unix_clock_and_says_so(
-    tmp_path: Path,
-) -> None:
-    path = write_older(tmp_path / "old.mcap", stepped(), with_time=False)
-    run = open_run(path)
-    assert all(later >= earlier for earlier, later in pairwise(run.times))
-    assert run.summary.duration == pytest.approx(2.9)  # the time until the step, and after it
     done = fishctl("export", str(path), "--csv", "--to", str(tmp_path))
-    note = "its fishd recorded no monotonic time: lengths follow the unix clock"
-    assert done.stderr == f"fishctl: {path}: {note}\n"
+    why = "its layout is 2, and this fishd reads layout 3: it was recorded by another version"
+    assert done.stderr == f"fishctl: {path}: {why}, 0.1\n"

@@ -52,14 +52,6 @@ class Trap:
         return os.mkdir, (str(self.trace),)
 
 
-def test_a_sealed_file_of_an_older_fishd_still_tells_its_relative_thrust() -> None:
-    older = ROOT / "docs/figures/policies/amplitude-0.42.onnx"
-    assert b'"efficiency":' in older.read_bytes()
-    share = file.read(older).card.provenance.relative_thrust
-    assert share is not None
-    assert 0.9 < share < 1.0
-
-
 @pytest.mark.parametrize("protocol", [0, 2, pickle.HIGHEST_PROTOCOL])
 def test_a_pickle_is_refused_and_never_unpickled(tmp_path: Path, protocol: int) -> None:
     path = write(tmp_path, pickle.dumps(Trap(tmp_path / "trace"), protocol))
