@@ -26,7 +26,6 @@ _EXTRAS = {
     "onnx": "policy",
     "onnxruntime": "policy",
     "pandas": "lab",
-    "plotly": "lab",
     "pyarrow": "lab",
     "scipy": "lab",
     "segno": "window",

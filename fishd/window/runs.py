@@ -98,7 +98,7 @@ class Runs:
                 stamp = await asyncio.to_thread(_read_stamp, self.folder / f"{name}.mcap")
                 if stamp is None or stamp != self._drawn.get(name):
                     where = (f"--folder={self.folder}", f"--to={cache}")
-                    words = ["plot", name, "--png", "--force", *where, "--json"]
+                    words = ["plot", name, "--force", *where, "--json"]
                     await call(words, self.folder, self._scratch.descriptor)
                     self._drawn[name] = stamp
                 return await asyncio.to_thread(open_picture, picture, f"the picture of {name}")

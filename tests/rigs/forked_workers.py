@@ -19,7 +19,7 @@ from pathlib import Path
 
 LIBRARIES = (
     "aiohttp", "bluesky.plans", "gymnasium", "matplotlib.figure", "numba", "onnx", "pandas",
-    "plotly.graph_objects", "pyarrow.parquet", "scipy.optimize", "scipy.signal", "scipy.stats",
+    "pyarrow.parquet", "scipy.optimize", "scipy.signal", "scipy.stats",
     "stable_baselines3", "torch.export",
 )  # fmt: skip
 """Modules that take long to load and start no thread."""

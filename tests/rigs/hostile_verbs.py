@@ -26,12 +26,9 @@ FILES_OF = {
         *TEXTS_AND_NUMBERS,
         *LARGE_RECORDINGS,
     },
-    "plot --html": {*TEXTS_AND_NUMBERS, *LARGE_RECORDINGS},
-    "plot --png": TEXTS_AND_NUMBERS,
+    "plot": {*TEXTS_AND_NUMBERS, *LARGE_RECORDINGS},
 }
 """Files for a verb; it reads the others like `export --csv`.
-
-The number of drawn quantities and events is decided for page and picture at once.
 """
 
 

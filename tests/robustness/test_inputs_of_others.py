@@ -106,7 +106,7 @@ def test_every_verb_says_in_one_line_how_a_file_differs(
     folder: Path, tmp_path: Path, name: str
 ) -> None:
     file = folder / f"{name}.mcap"
-    for verb in VERBS.keys() - {"runs", "runs --json", "plot --png", "recover"}:
+    for verb in VERBS.keys() - {"runs", "runs --json", "plot", "recover"}:
         outcome = run_verb(verb, file, tmp_path)
         assert find_mistakes(outcome) == []
         lines = [line.removeprefix(f"fishctl: {file}") for line in outcome.err.splitlines()]

@@ -162,7 +162,7 @@ def _try_verb(outcome: Outcome, chance: random.Random, folder: Path) -> None:
     if outcome.verb in ("record", "black box", "measure") and outcome.listed != outcome.steps:
         outcome.mistakes.append("a step is not listed")
     for path in paths[:1]:
-        drawn = call(FISHCTL, "plot", path, "--png", "--to", folder, env=environment)
+        drawn = call(FISHCTL, "plot", path, "--to", folder, env=environment)
         if drawn.returncode:
             outcome.mistakes.append(f"plot: {drawn.stderr.strip()[-200:]}")
 

@@ -53,7 +53,7 @@ MAX_ADDRESSES = 8 * 2**30
 """Limit of allocations, at which a file that claims 8 GB would end in a MemoryError [bytes]."""
 OFTEN = "runs", "export --csv", "rerun", "replay", "recover"
 SELDOM = "runs --json", "export --parquet"
-DRAWN = "plot --html", "plot --png"
+DRAWN = ("plot",)
 SELDOM_PERIOD, DRAWING_PERIOD = 10, 100
 """Number of files of which one is read by the verbs of `SELDOM`, and of `DRAWN`."""
 GOOD_SECONDS = 2.0

@@ -110,9 +110,7 @@ def export(
 @click.option(
     "--until", "end", type=FiniteRange(min=0), help="End at this time [s]; default: the end."
 )
-@_target_option(".png, .svg, .pdf, .html")
-@click.option("--png", "only", flag_value="png", help="Draw only the picture.")
-@click.option("--html", "only", flag_value="html", help="Draw only the interactive page.")
+@_target_option(".png, .svg, .pdf")
 @click.option("--force", is_flag=True, help="Replace existing files.")
 @folder_option
 @json_option
@@ -122,30 +120,22 @@ def plot(
     begin: float,
     end: float | None,
     target: Path | None,
-    only: str | None,
     force: bool,
     folder: Path | None,
     as_json: bool,
 ) -> None:
     """Draw forces, command, thrust, the controller's own quantities, and a phase portrait.
 
-    RUN is a path, a name in the folder of recordings, or 'latest'. NAME.png is a picture; NAME.html
-    is a page to zoom into, which needs no network.
+    RUN is a path, a name in the folder of recordings, or 'latest'.
     """
     from fishd.lab.run_figure import draw_run
     from fishd.lab.run_traces import traces
 
     recorded = open_recording(run, folder)
     run_traces = traces(recorded, begin, math.inf if end is None else end)
-    paths = _target_paths(target, recorded, ("png", "html"), only)
+    paths = _target_paths(target, recorded, ("png",), None)
     check_new_files(paths, replace=force)
-    for path in paths:
-        if path.suffix == ".html":
-            from fishd.lab.run_page import write_page
-
-            write_page(run_traces, path)
-        else:
-            draw_run(run_traces, path)
+    draw_run(run_traces, paths[0])
     print_paths(paths, as_json)
 
 

@@ -13,7 +13,6 @@ from rigs.processes import fishctl, one_line
 from rigs.recordings import record_run, swum, write
 
 from fishd.lab.run_figure import draw_run
-from fishd.lab.run_page import write_page
 from fishd.lab.run_traces import MIN_FORCE_SPAN, limits, mean_beat, spectrum, traces
 from fishd.recording import open_run
 
@@ -46,15 +45,10 @@ def test_a_table_has_every_bit_of_every_tick(path: Path, tmp_path: Path, form: s
         assert about["configs"]["0"]["tick"] == 0.05
 
 
-@pytest.mark.slow  # to load matplotlib and plotly takes seconds
-def test_a_recording_is_drawn_as_picture_and_as_page(path: Path, tmp_path: Path) -> None:
+@pytest.mark.slow  # to load matplotlib takes seconds
+def test_a_recording_is_drawn_as_a_picture(path: Path, tmp_path: Path) -> None:
     done = fishctl("plot", str(path), "--to", str(tmp_path), "--from", "0.5")
-    picture, page = map(Path, done.stdout.split())
-    assert picture.read_bytes().startswith(b"\x89PNG")
-    html = page.read_text()
-    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", html)
-    assert "Plotly.newPlot" in html
-    assert "<b>stiff</b>" not in html
+    assert Path(done.stdout.strip()).read_bytes().startswith(b"\x89PNG")
     drawn = fishctl("plot", str(path), "--to", str(tmp_path / "only.svg"), "--json")
     assert json.loads(drawn.stdout) == [str(tmp_path / "only.svg")]
     refused = fishctl("plot", str(path), "--to", str(tmp_path))
@@ -72,10 +66,8 @@ def test_an_interval_is_in_the_legend_where_there_is_one(tmp_path: Path) -> None
     for rig, expected in ((swum(), False), (known, True)):
         name = f"known-{expected}"
         drawn = traces(open_run(record_run(rig, tmp_path / name)))
-        write_page(drawn, tmp_path / f"{name}.html")
-        assert ("95 %" in (tmp_path / f"{name}.html").read_text()) == expected
-    draw_run(drawn, tmp_path / "known.svg")
-    assert "95 %" in (tmp_path / "known.svg").read_text()
+        draw_run(drawn, tmp_path / f"{name}.svg")
+        assert ("95 %" in (tmp_path / f"{name}.svg").read_text()) == expected
 
 
 def test_a_curve_has_breaks_and_events_and_units_are_said(path: Path, tmp_path: Path) -> None:
