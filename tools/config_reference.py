@@ -17,7 +17,7 @@ from fishd.config import Config
 from fishd.config.drivers import CHOICES
 from fishd.core.schema import Field, fields_of, format_permitted
 
-MARKER = "keys"
+PAGE = "reference/configuration.md"
 HEAD = "key | unit | permitted | default | description"
 ANY = {
     "number": "any number",
@@ -30,13 +30,11 @@ ANY = {
 """Texts for permitted values of types without bounds."""
 
 
-def references() -> dict[str, str]:
-    """Return the tables of the sections, by document."""
-    whole: dict[str, Struct] = {
-        "reference/configuration.md": Config(),
-        "how-to/camera.md": CameraSettings(),
-    }
-    return {name: "\n\n".join(_sections(struct, "")) for name, struct in whole.items()}
+def references() -> Iterator[tuple[str, str, str]]:
+    """Yield documents, names of markers, and the tables between them."""
+    structs: dict[str, Struct] = {"keys": Config(), "camera keys": CameraSettings()}
+    for marker, struct in structs.items():
+        yield PAGE, marker, "\n\n".join(_sections(struct, ""))
 
 
 def _sections(section: Struct, prefix: str) -> Iterator[str]:
@@ -104,5 +102,4 @@ def _to_yaml(value: object) -> str:
 
 
 if __name__ == "__main__":
-    pages = references().items()
-    sys.exit(write_reference("config_reference", [(page, MARKER, text) for page, text in pages]))
+    sys.exit(write_reference("config_reference", references()))

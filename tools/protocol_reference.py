@@ -42,23 +42,18 @@ STRUCTS: dict[str, type[Struct]] = {
     "lease": protocol.Grant,
     "lease holder": signals.LeaseHolder,
     "calibrations": protocol.Calibrations,
-}
-"""Structs by the name of their markers."""
-CAMERA: dict[str, type[Struct]] = {
     "frame": messages.FrameHeader,
     "view": messages.ViewHeader,
     "camera-state": messages.CameraState,
     "until": messages.Until,
 }
-"""Structs of docs/how-to/camera.md, by the name of their markers."""
+"""Structs by the name of their markers."""
 
 
 def references() -> Iterator[tuple[str, str, str]]:
     """Yield documents, names of markers, and the tables between them."""
     for name, struct in STRUCTS.items():
         yield "reference/protocol.md", name, _fields(struct)
-    for name, struct in CAMERA.items():
-        yield "how-to/camera.md", name, _fields(struct)
     conditions = [[f"`{name}`", meaning] for name, meaning in messages.CONDITIONS.items()]
     yield "how-to/camera.md", "conditions", table("state | what it means", conditions)
     kinds = [[f"`{kind}`", *cells] for kind, *cells in signals.EVENTS]
@@ -87,18 +82,15 @@ def references() -> Iterator[tuple[str, str, str]]:
 
 def _fields(struct: type[Struct]) -> str:
     types = {field.encode_name: field.type for field in _info(struct)}
-    fields = fields_of(struct)
-    units = any(field.unit for field in fields)
     rows = [
         [
             f"`{field.name}`",
-            _type(types[field.name]),
-            *(["–" if field.unit == "1" else field.unit] if units else []),
+            _type(types[field.name]) + (f" [{field.unit}]" if field.unit not in ("", "1") else ""),
             field.description[:1].lower() + field.description[1:].rstrip("."),
         ]
-        for field in fields
+        for field in fields_of(struct)
     ]
-    return table("field | type | unit | meaning" if units else "field | type | meaning", rows)
+    return table("field | type | meaning", rows)
 
 
 def _arguments(struct: type[Struct]) -> str:

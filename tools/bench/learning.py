@@ -5,7 +5,6 @@ chosen with. Relative thrust is the thrust over that of the best square wave of 
 
     curves     several fish and settings, from forces; draws learning-curves.png
     pictures   several feature extractors and cameras; draws camera-learning.png
-    optimum    frequency and thrust that are learned at four amplitudes, from forces and pictures
     transfer   policies for one fish on sixteen others
     speed      steps of the environment, and inference, on one core
 """
@@ -25,7 +24,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.learning_curves import learning_curves
-from common.report import DOCS, Options, Report, progress, spread, table
+from common.report import DOCS, Options, Report, percent, progress, spread, table
 from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config, load
 from fishd.controllers import registry
@@ -46,16 +45,12 @@ from fishd.learning.train.training import train
 CONFIG = DOCS.parent / "config"
 SEEDS, PICTURE_SEEDS = range(240, 250), range(230, 240)
 """Seeds of the trainings from forces and from pictures."""
-PAPER_STEPS, PICTURE_STEPS, PAPER_PICTURE_STEPS, LONG_STEPS = 20_000, 4096, 15_360, 8064
+PAPER_STEPS, PICTURE_STEPS, PAPER_PICTURE_STEPS = 20_000, 4096, 15_360
 """Control steps of trainings whose length is not the default one."""
-MILESTONES = (500, 1000, 2000, 4000, 8000, 20_000)
-"""Numbers of control steps at which learning curves are reported."""
 MIN_STEPS = 512
 """Number of control steps after which also a training with pictures has an evaluation."""
 NEARLY, GOOD = 0.95, 0.97
-"""Relative thrusts whose steps are reported."""
-AMPLITUDES = (0.2, 0.31, 0.42, 0.8)
-"""Amplitudes Φ of the part `optimum` [rad]."""
+"""Relative thrusts that every fish, and a training, should reach."""
 PARAMETER_CHANGE = 0.15
 """Relative change of each of four parameters of a fish, up or down."""
 SECONDS, SETTLE = 60.0, 10.0
@@ -86,11 +81,6 @@ class Trained(NamedTuple):
         """Return the steps until the first evaluation with that relative thrust; inf without."""
         reached = zip(self.points, self.best, strict=True)
         return next((point.steps for point, best in reached if best >= relative_thrust), math.inf)
-
-    @property
-    def exported(self) -> Evaluation:
-        """Evaluation of its best policy."""
-        return max(self.points, key=lambda point: point.relative_thrust)
 
 
 def rig(amplitude: float = 0.42) -> Config:
@@ -234,89 +224,26 @@ def draw(
 
 
 def summary(rows: Mapping[str, Row], trainings: Mapping[str, list[Trained]]) -> str:
-    """Return tables of the steps to a good policy, of the best policies, and of their commands."""
-    reached, best, commands = [], [], []
+    """Return a table of the steps to a good policy, and of the best policies."""
+    lines = []
     for name, runs in trainings.items():
         config = rows[name].config
-        reached.append([name, *steps_to(runs, NEARLY), *steps_to(runs, GOOD)])
-        reached[-1].append(f"{statistics.median(run.cost for run in runs):.1f}")
-        best.append([name, str(len(runs)), *curve(runs)])
-        grid = best_on_grid(config)
-        ends = [run.exported for run in runs]
-        commands.append(
+        steps = [run.steps_to(GOOD) for run in runs]
+        lines.append(
             [
                 name,
-                spread([end.relative_thrust for end in ends]),
-                spread([end.fullness for end in ends], 1.0, 3),
-                spread([end.frequency for end in ends], 1.0, 3),
-                f"{grid.frequency:.3f}",
-                f"{100.0 * grid.thrust / best_thrust(config):.1f}",
+                spread(steps, 1.0, 0).replace("inf", "never"),
+                f"{sum(map(math.isfinite, steps))} of {len(runs)}",
+                spread([run.best[-1] for run in runs]),
+                percent(best_on_grid(config).thrust / best_thrust(config)),
+                f"{statistics.median(run.cost for run in runs):.1f}",
             ]
         )
-    goals = " | ".join(f"{100 * share:.0f} % | seeds" for share in (NEARLY, GOOD))
-    milestones = " | ".join(f"{steps} steps" for steps in MILESTONES)
-    return "\n\n".join(
-        (
-            "Steps until the best policy so far has that relative thrust, median [lowest – "
-            "highest] of the seeds, and processor time for 1000 steps:",
-            table(f" | {goals} | s", reached),
-            "Relative thrust (%) of the best policy of a seed so far, the one that `export` takes:",
-            table(f" | seeds | {milestones}", best),
-            "The best policies:",
-            table(
-                "fish | relative thrust (%) | mean \\|φ_c\\|/Φ | frequency (Hz) | best whole-tick "
-                "wave (Hz) | its relative thrust (%)",
-                commands,
-            ),
-        )
+    heads = (
+        f"training | steps to {100 * GOOD:.0f} % | seeds | best policy (%) | "
+        "best whole-tick wave (%) | processor (s for 1000 steps)"
     )
-
-
-def steps_to(runs: list[Trained], share: float) -> list[str]:
-    """Return the cells of a row: steps to that relative thrust, and number of seeds with it."""
-    steps = [run.steps_to(share) for run in runs]
-    reached = sum(map(math.isfinite, steps))
-    return [spread(steps, 1.0, 0).replace("inf", "never"), f"{reached} of {len(runs)}"]
-
-
-def curve(runs: list[Trained]) -> list[str]:
-    """Return the cells of a row: one for each milestone until the training's end."""
-    cells = []
-    for steps in MILESTONES:
-        counts = [sum(point.steps <= steps for point in run.points) for run in runs]
-        is_over = steps > max(run.points[-1].steps for run in runs)
-        shares = [run.best[count - 1] for run, count in zip(runs, counts, strict=True) if count]
-        cells.append("" if is_over or not shares else spread(shares))
-    return cells
-
-
-def optimum(options: Namespace) -> Report:
-    """Return frequency and thrust of the best policies, from forces and from pictures."""
-    long = settings_of(None, LONG_STEPS)
-    kinds = {
-        "force": long,
-        "`modes`": replace(long, see="camera"),
-        "`cnn`": settings_of("learning-cnn.yaml", PICTURE_STEPS),
-    }
-    rows = {f"{phi} {name}": Row(rig(phi), kinds[name]) for phi in AMPLITUDES for name in kinds}
-    trainings = train_all(rows, PICTURE_SEEDS[: few(options)], options)
-    lines = []
-    for phi in AMPLITUDES:
-        config = rig(phi)
-        grid = best_on_grid(config)
-        share = 100.0 * grid.thrust / best_thrust(config)
-        cells = [f"{phi}", f"{grid.frequency:.2f} / {share:.1f}"]
-        for name in kinds:
-            ends = [run.exported for run in trainings[f"{phi} {name}"]]
-            share = statistics.median(100.0 * end.relative_thrust for end in ends)
-            cells.append(f"{spread([end.frequency for end in ends], 1.0, 2)} / {share:.1f}")
-        lines.append(cells)
-    heads = " | ".join(("Φ (rad)", "best whole-tick wave", *kinds))
-    about = (
-        f"Frequency (Hz), median [lowest – highest] of {few(options)} seeds, and relative thrust "
-        f"(%), of the best policy of {LONG_STEPS} steps, `cnn` {PICTURE_STEPS}:"
-    )
-    return Report({"bench pictures optimum": f"{about}\n\n{table(heads, lines)}"}, None)
+    return f"Median [lowest – highest] of the seeds:\n\n{table(heads, lines)}"
 
 
 def transfer(options: Namespace) -> Report:
@@ -410,7 +337,6 @@ def parse_steps(text: str) -> int:
 PARTS = {
     "curves": curves,
     "pictures": pictures,
-    "optimum": optimum,
     "transfer": transfer,
     "speed": speed,
 }
