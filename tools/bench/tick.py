@@ -24,7 +24,6 @@ from common.daemon import Fishd
 from common.machine import load, machine, priorities, scheduling, stress
 from common.processes import BIN
 from common.report import Options, Report, progress, quantile, table
-from fishd.control.statistics import PHASES
 from fishd.core.signals import Percentiles, Timing
 
 TICK = 0.05
@@ -159,47 +158,33 @@ def _show_progress(what: str, stressed: bool, priority: int) -> None:
 
 
 def markdown(results: Results) -> str:
-    """Return all tables, goals first."""
-    rounds = results.rounds
-    late = [
+    """Return the machine, the goals, and a row for each round."""
+    heads = ["tick", "machine", "scheduling"]
+    heads += [late.contestant for late in results.rounds[0].lateness]
+    heads += ["missed", "whole tick", "until written", "CPU"]
+    rows = [
         [
             *_conditions(round_),
-            late.contestant,
-            *(f"{value:.0f}" for value in (late.p50, late.p99, late.worst)),
-            f"{late.missed:.3%}",
-        ]
-        for round_ in rounds
-        for late in round_.lateness
-    ]
-    phases = [
-        [
-            *_conditions(round_),
-            *(_percentiles(round_.fishd.timing.phases[phase]) for phase in PHASES),
+            *(f"{o.p50:.0f}/{o.p99:.0f}/{o.worst:.0f}" for o in round_.lateness),
+            "/".join(f"{late.missed:.3%}" for late in round_.lateness),
             _percentiles(round_.fishd.timing.duration),
             _percentiles(round_.fishd.sealed),
+            f"{round_.fishd.cpu:.1%}",
         ]
-        for round_ in rounds
+        for round_ in results.rounds
     ]
-    costs = [
-        [*_conditions(round_), f"{f.cpu:.1%}", f"{f.rss:.0f}", f"{f.peak:.0f}"]
-        for round_ in rounds
-        for f in [round_.fishd]
-    ]
-    head = "tick | machine | scheduling"
-    sections = {
-        "The machine": (" | ", results.machine.items()),
-        "Goals": ("goal | idle | met | under load | met", goals(results)),
-        f"Lateness over {results.seconds:g} s [µs]": (
-            f"{head} | loop | p50 | p99 | worst | missed",
-            late,
-        ),
-        "Time per phase of a fishd tick, p50 / p99 [µs]": (
-            " | ".join((head, *PHASES, "whole tick", "until written")),
-            phases,
-        ),
-        "What fishd costs": (f"{head} | CPU | RSS [MB] | peak RSS [MB]", costs),
-    }
-    return "\n\n".join(f"### {title}\n\n{table(*content)}" for title, content in sections.items())
+    about = (
+        f"Lateness over {results.seconds:g} s, p50/p99/worst, and duration of a fishd tick, "
+        "p50/p99 [µs]:"
+    )
+    return "\n\n".join(
+        (
+            "; ".join(f"{name}: {value}" for name, value in results.machine.items()) + ".",
+            table("goal | idle | met | under load | met", goals(results)),
+            about,
+            table(" | ".join(heads), rows),
+        )
+    )
 
 
 def goals(results: Results) -> list[list[str]]:
@@ -263,7 +248,7 @@ def _conditions(round_: Round) -> list[str]:
 
 
 def _percentiles(times: Percentiles) -> str:
-    return f"{times.p50:.0f} / {times.p99:.0f}"
+    return f"{times.p50:.0f}/{times.p99:.0f}"
 
 
 OPTIONS: Options = {
