@@ -25,10 +25,8 @@ from fishd.config import load
 from fishd.lab.compare.survey import CHANGES, OtherFish, harsh, harsh_fish, longest_chatter, mild
 from fishd.lab.simulation import KeepingPublisher, VirtualRun, simulate
 
-RATIOS = (0.1, 0.25, 0.5, 0.9, 1.5, 2, 3)
-"""Values of ω₀Φ/Ω."""
-OMEGA0, SERVO_SPEED, AMPLITUDE = 12.5, 5.8, 0.42
-"""ω₀ [rad/s], Ω [rad/s] and Φ [rad] of the default fish."""
+OMEGA0, SERVO_SPEED = 12.5, 5.8
+"""ω₀ and Ω of the default fish [rad/s]."""
 REST_S = 3.0
 """Time at rest before a swim of the part `lateral_sign` [s]."""
 POLICY = {"policy": "default-fish"}
@@ -96,16 +94,12 @@ def swim(case: tuple[OtherFish, int | None, Way]) -> Swum:
 
 def swing() -> tuple[list[Row], Sequence[Way]]:
     """Return rows and columns of the part `swing`; nothing was chosen with these seeds."""
-    ratios = [
-        OtherFish(f"ω₀Φ/Ω = {ratio:g}", (f"plant.servo_speed={OMEGA0 * AMPLITUDE / ratio}",))
-        for ratio in RATIOS
-    ]
     groups = [
         Row("20 harsh fish", harsh_fish()),
         Row("40 other harsh fish (seeds 720 to 759)", tuple(map(harsh, range(720, 760)))),
         Row("40 mild fish (seeds 300 to 339)", tuple(map(mild, range(300, 340)))),
     ]
-    return [*map(_single, (*CHANGES, *ratios)), *groups], AUTO
+    return [*map(_single, CHANGES), *groups], AUTO
 
 
 def harsh_rig() -> tuple[list[Row], Sequence[Way]]:

@@ -135,44 +135,16 @@ def verdicts(median: Array) -> tuple[str, str]:
     )
 
 
-def percent(value: float, exact: float = np.nan) -> str:
-    """Format a fraction in %, with its goal in brackets; a dash if unknown."""
-    known = "" if np.isnan(exact) else f" ({percent(exact)})"
-    return "–" if np.isnan(value) else f"{100 * value:.1f}{known}"
+def percent(value: float) -> str:
+    """Format a fraction in %."""
+    return f"{100 * value:.1f}"
 
 
 def sections() -> list[tuple[str, str, str]]:
     """Return document, name of the markers, and the text between them."""
-    median, exact, perfect = _map("median"), _map("continuous_time"), _map("perfect_sensor")
-    spread = _map("highest") - _map("lowest")
-    widest = np.unravel_index(np.argmax(spread), spread.shape)
-    row = CRITERIA.index(RECOMMENDED)
-    ratios = [f"{ratio:g}" for ratio in RATIOS]
-    everything = table(
-        " | ".join(["C \\ ω₀Φ/Ω", *ratios]),
-        (
-            [f"{c:g}", *map(percent, *both)]
-            for c, *both in zip(CRITERIA, median, exact, strict=True)
-        ),
-    )
+    maps = map(_map, ("median", "perfect_sensor", "continuous_time"))
     claims = table(
         "the paper | imperfect sensor | perfect sensor | continuous time",
-        zip(CLAIMS, *map(verdicts, (median, perfect, exact)), strict=True),
+        zip(CLAIMS, *map(verdicts, maps), strict=True),
     )
-    details = table(
-        " | ".join(["ω₀Φ/Ω", *ratios]),
-        [
-            ["amplitude Φ, rad", *(f"{x * saturation_amplitude(PLANT):.3f}" for x in RATIOS)],
-            ["imperfect sensor, median", *map(percent, median[row])],
-            ["imperfect sensor, worst seed", *map(percent, _map("lowest")[row])],
-            ["perfect sensor", *map(percent, perfect[row])],
-            ["continuous time", *map(percent, exact[row])],
-        ],
-    )
-    every = (
-        f"{everything}\n\nEach cell is the median of {SEEDS} runs; two runs of one cell differ by "
-        f"no more than {percent(spread[widest])} points "
-        f"(C = {CRITERIA[widest[0]]:g} and ω₀Φ/Ω = {RATIOS[widest[1]]:g})."
-    )
-    detailed = f"{claims}\n\nC = {RECOMMENDED:g} in detail, in %:\n\n{details}"
-    return [(DOCUMENT, "swing map", every), (DOCUMENT, "swing claims", detailed)]
+    return [(DOCUMENT, "swing claims", claims)]
