@@ -48,12 +48,17 @@ STRUCTS: dict[str, type[Struct]] = {
     "until": messages.Until,
 }
 """Structs by the name of their markers."""
+LIKE: dict[str, tuple[str, type[Struct]]] = {
+    "state": ("status", signals.Status),
+    **dict.fromkeys(("view", "camera-state", "until"), ("frame", messages.FrameHeader)),
+}
+"""Tables that omit the fields of another table, with its name and struct."""
 
 
 def references() -> Iterator[tuple[str, str, str]]:
     """Yield documents, names of markers, and the tables between them."""
     for name, struct in STRUCTS.items():
-        yield "reference/protocol.md", name, _fields(struct)
+        yield "reference/protocol.md", name, _fields(struct, *LIKE.get(name, ("", Struct)))
     conditions = [[f"`{name}`", meaning] for name, meaning in messages.CONDITIONS.items()]
     yield "how-to/camera.md", "conditions", table("state | what it means", conditions)
     kinds = [[f"`{kind}`", *cells] for kind, *cells in signals.EVENTS]
@@ -80,8 +85,10 @@ def references() -> Iterator[tuple[str, str, str]]:
     yield "explanation/swimmer.md", "columns", table("column | unit | meaning", columns)
 
 
-def _fields(struct: type[Struct]) -> str:
+def _fields(struct: type[Struct], other_name: str, other: type[Struct]) -> str:
     types = {field.encode_name: field.type for field in _info(struct)}
+    known = {(field.name, field.description) for field in fields_of(other)}
+    same = [f for f in fields_of(struct) if (f.name, f.description) in known]
     rows = [
         [
             f"`{field.name}`",
@@ -89,7 +96,10 @@ def _fields(struct: type[Struct]) -> str:
             field.description[:1].lower() + field.description[1:].rstrip("."),
         ]
         for field in fields_of(struct)
+        if field not in same
     ]
+    if same:
+        rows.append([", ".join(f"`{field.name}`" for field in same), "", f"as in `{other_name}`"])
     return table("field | type | meaning", rows)
 
 
