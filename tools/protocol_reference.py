@@ -49,6 +49,7 @@ STRUCTS: dict[str, type[Struct]] = {
 }
 """Structs by the name of their markers."""
 LIKE: dict[str, tuple[str, type[Struct]]] = {
+    "status": ("tick", signals.Tick),
     "state": ("status", signals.Status),
     **dict.fromkeys(("view", "camera-state", "until"), ("frame", messages.FrameHeader)),
 }
@@ -87,7 +88,8 @@ def references() -> Iterator[tuple[str, str, str]]:
 
 def _fields(struct: type[Struct], other_name: str, other: type[Struct]) -> str:
     types = {field.encode_name: field.type for field in _info(struct)}
-    known = {(field.name, field.description) for field in fields_of(other)}
+    like = f"as in `{other_name}`"
+    known = {(f.name, text) for f in fields_of(other) for text in (f.description, f"A{like[1:]}.")}
     same = [f for f in fields_of(struct) if (f.name, f.description) in known]
     rows = [
         [
@@ -99,7 +101,7 @@ def _fields(struct: type[Struct], other_name: str, other: type[Struct]) -> str:
         if field not in same
     ]
     if same:
-        rows.append([", ".join(f"`{field.name}`" for field in same), "", f"as in `{other_name}`"])
+        rows.append([", ".join(f"`{field.name}`" for field in same), "", like])
     return table("field | type | meaning", rows)
 
 
@@ -109,11 +111,14 @@ def _arguments(struct: type[Struct]) -> str:
 
 
 def _argument(field: inspect.Field, limits: str) -> str:
-    text = f"`{field.name}`: {_type(field.type)}{f' {limits}' if limits else ''}"
+    type_ = _type(field.type).removesuffix(" or null")
+    text = f"`{field.name}`: {type_}{f' {limits}' if limits else ''}"
     if field.required:
         return text
-    default = msgspec.json.encode(field.default).decode() if field.default is not NODEFAULT else ""
-    return f"{text}, optional" + (f" (`{default}`)" if default else "")
+    default = None if field.default is NODEFAULT else field.default
+    return f"{text}, optional" + (
+        f" (`{msgspec.json.encode(default).decode()}`)" if default else ""
+    )
 
 
 def _info(struct: type[Struct]) -> tuple[inspect.Field, ...]:
