@@ -18,7 +18,7 @@ from fishd.config.drivers import CHOICES
 from fishd.core.schema import Field, fields_of, format_permitted
 
 PAGE = "reference/configuration.md"
-HEAD = "key | unit | permitted | default | description"
+HEAD = "key | permitted | default | description"
 ANY = {
     "number": "any number",
     "integer": "any number",
@@ -66,7 +66,7 @@ def _choice_section(section: str) -> Iterator[str]:
     choice, *rows = [
         _row(field, getattr(common, field.name), f"{section}.") for field in fields_of(type(common))
     ]
-    choice[2] = f"{', '.join(f'`{name}`' for name in mine)}, or [another](../how-to/{page})"
+    choice[1] = f"{', '.join(f'`{name}`' for name in mine)}, or [another](../how-to/{page})"
     yield table(HEAD, [choice, *rows])
     for name in mine:
         plugin_class = plugins.find(name)
@@ -84,14 +84,15 @@ def _choice_section(section: str) -> Iterator[str]:
 
 def _row(field: Field, default: object, prefix: str) -> list[str]:
     permitted = format_permitted(field) or ANY[field.kind]
+    if field.unit not in ("", "1"):
+        permitted += f" {field.unit}"
     if field.kind == "integer":
         permitted += ", whole"
     permitted += "".join(f", or `{word}`" for word in field.words)
     if field.optional:
         permitted += ", or `null`"
-    unit = "" if field.unit == "1" else field.unit
     value = f"`{_to_yaml(default)}`"
-    cells = (f"`{prefix}{field.name}`", unit, permitted, value, field.description)
+    cells = (f"`{prefix}{field.name}`", permitted, value, field.description)
     return [cell.replace("|", r"\|") for cell in cells]
 
 

@@ -17,7 +17,7 @@ SHARED = (
     *("--on", "--for", "--budget", "--folder", "--resume", "--to", "--plot", "--json", "--seed"),
     *("--config", "--endpoint", "--take"),
 )
-"""Options with the same meaning for all verbs, in the order of the columns."""
+"""Options with the same meaning for all verbs, in the order of the table."""
 
 
 def commands(
@@ -51,13 +51,13 @@ def options(command: click.Command) -> set[str]:
 
 
 def reference() -> str:
-    """Return the table: a row for each verb, a column for each shared option."""
+    """Return the table: a row for each verb with a shared option, and these options."""
     rows = []
     for verb, command in commands(fishctl):
-        named = options(command)
-        rows.append([f"`{verb}`", *("✓" if option in named else "" for option in SHARED)])
-    head = " | ".join(("verb", *(f"`{option}`" for option in SHARED)))
-    return table(head, rows)
+        shared = [f"`{option}`" for option in SHARED if option in options(command)]
+        if shared:
+            rows.append([f"`{verb}`", " ".join(shared)])
+    return table("verb | shared options", rows)
 
 
 if __name__ == "__main__":
