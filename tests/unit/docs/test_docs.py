@@ -189,7 +189,8 @@ def test_the_table_of_faults_has_each_fault_of_the_virtual_pi_in_its_order() -> 
 def test_the_table_of_checks_names_checks_of_doctor() -> None:
     table = first_cells(ROOT / "docs" / "how-to" / "troubleshooting.md", "Lines of doctor")
     checked = checks(Context(load(None, ["robot=pi"])))
-    assert table and {name for name in table if " " not in name} <= {c.name for c in checked}
+    assert table
+    assert {name for name in table if " " not in name} <= {check.name for check in checked}
 
 
 DOCUMENT = ROOT / "docs" / "reference" / "policies.md"

@@ -177,7 +177,6 @@ NEGATIONS = (
 )  # fmt: skip
 
 
-
 def falsify(line: str) -> Iterator[str]:
     """Yield a line with one word dropped that is not a value, or with its meaning negated."""
     for word in re.finditer(r"(?<!\S)[a-zA-Z]{2,}(?!\S) ", line):
