@@ -46,33 +46,11 @@ def sections() -> list[tuple[str, str, str]]:
 
 def section(name: str) -> str:
     """Return the text between the markers of this name."""
-    if name == REFINEMENT:
-        cells = " | ".join(f"{cell:g} mm" for cell in figure_6.TABLE.cells)
-        return table(f"speed ± averaging ± grid (mm/s), cells of | {cells}", refinement())
     words = {True: "yes", False: "**no**", None: "–"}
     return table(
         "the paper | computed here | agrees",
         ((claim.paper, claim.computed, words[claim.agrees]) for claim in GROUPS[name]()),
     )
-
-
-def constants() -> Iterator[Claim]:
-    """Return the claims on the fish's constants, the defaults of the configuration."""
-    stated = (
-        ("ω₀", 12.5, "omega0", "rad/s"),
-        ("ξ", 1.2, "xi", ""),
-        ("λ", 0.46, "coupling", ""),
-        ("Ω", 5.8, "servo_speed", "rad/s"),
-        ("Δ", 0.29, "servo_lag", "rad"),
-        ("K", 12.9e-3, "thrust_coefficient", "N s²/rad²"),
-    )
-    for symbol, value, name, unit in stated:
-        mine = getattr(PLANT, name)
-        yield Claim(
-            f"{symbol} = {value:g} {unit}".rstrip(), f"`plant.{name}` {mine:g}", mine == value
-        )
-    tick = Config().tick
-    yield Claim("one control step every 50 ms", f"`tick` {tick:g} s", tick == 0.05)
 
 
 def equations() -> Iterator[Claim]:
@@ -315,18 +293,6 @@ def swimming() -> Iterator[Claim]:
     )
 
 
-def refinement() -> Iterator[tuple[str, str, str, str]]:
-    """Return the table of swims, with their speeds on cells of each size."""
-    stored = figure_6.TABLE
-    for controller, setting in figure_6.REFINED + figure_6.FINE_SWIMS:
-        what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
-        rows = [stored.row(figure_6.Case(controller, setting, cell)) for cell in stored.cells]
-        yield (
-            f"{controller}, {what}",
-            *(_speed(row) if row else "–" for row in rows),
-        )
-
-
 def _speed(row: dict[str, Any]) -> str:
     """Return speed ± averaging, and ± grid where that is known."""
     text = f"{row['speed_mm_per_s']:.2f} ± {row['ci95_mm_per_s']:.2f}"
@@ -364,7 +330,6 @@ def _close(value: float, stated: float) -> bool:
 
 
 GROUPS: dict[str, Callable[[], Iterator[Claim]]] = {
-    "constants": constants,
     "equations": equations,
     "optimal control": control,
     "waveforms": waveforms,
@@ -372,5 +337,4 @@ GROUPS: dict[str, Callable[[], Iterator[Claim]]] = {
     "learning": learning,
     "free swimming": swimming,
 }
-REFINEMENT = "refinement"
-SECTIONS = (*GROUPS, REFINEMENT)
+SECTIONS = tuple(GROUPS)
