@@ -15,7 +15,7 @@ from common.report import table, write_reference
 from fishd.camera.settings import CameraSettings
 from fishd.config import Config
 from fishd.config.drivers import CHOICES
-from fishd.core.schema import Field, fields_of
+from fishd.core.schema import Field, fields_of, format_permitted
 
 MARKER = "keys"
 HEAD = "key | unit | permitted | default | description"
@@ -85,7 +85,7 @@ def _choice_section(section: str) -> Iterator[str]:
 
 
 def _row(field: Field, default: object, prefix: str) -> list[str]:
-    permitted = field.interval or ANY[field.kind]
+    permitted = format_permitted(field) or ANY[field.kind]
     if field.kind == "integer":
         permitted += ", whole"
     permitted += "".join(f", or `{word}`" for word in field.words)

@@ -14,7 +14,7 @@ from common.report import table, write_reference
 from fishd.camera import messages
 from fishd.control.faults import FAULTS
 from fishd.core import protocol, signals
-from fishd.core.schema import fields_of
+from fishd.core.schema import fields_of, format_permitted
 from fishd.virtual.swimmer.track import COLUMNS
 
 TYPES = {
@@ -95,7 +95,7 @@ def _fields(struct: type[Struct]) -> str:
 
 
 def _arguments(struct: type[Struct]) -> str:
-    limits = {field.name: field.interval for field in fields_of(struct)}
+    limits = {field.name: format_permitted(field) for field in fields_of(struct)}
     return "; ".join(_argument(field, limits[field.name]) for field in _info(struct)) or "none"
 
 

@@ -95,7 +95,7 @@ def complete_policy(_: click.Context, __: click.Parameter, incomplete: str) -> l
 def complete_value(field: Field, incomplete: str) -> list[CompletionItem]:
     """Return values of a parameter: choices, named policies, files; nothing for numbers."""
     if field.kind == "choice":
-        return _match_words(field.interval.split(" | "), incomplete)
+        return _match_words(field.choices, incomplete)
     if field.kind == "boolean":
         return _match_words(("true", "false"), incomplete)
     if not field.file:

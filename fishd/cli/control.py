@@ -12,6 +12,7 @@ from fishd.cli.controller_arguments import ControllerGroup, ParameterType
 from fishd.cli.options import Utf8Text, daemon_options
 from fishd.cli.output import echo, format_state, make_printable, print_json, report_detour
 from fishd.cli.plausibility import running_config, warn_of_values
+from fishd.core.errors import Refused
 from fishd.core.protocol import State
 from fishd.core.schema import Field
 
@@ -25,7 +26,18 @@ def set_controller() -> None:
 def _set_controller(
     name: str, parameters: dict[str, Any], endpoint: str | None, as_json: bool
 ) -> None:
-    _change(endpoint, as_json, lambda fish: fish.set_controller(name, **parameters))
+    def start(fish: client.Fish) -> State:
+        try:
+            return fish.set_controller(name, **parameters)
+        except Refused as error:
+            if error.code != "unknown-controller":
+                raise
+            # This machine has it, so it was probably installed after fishd had started.
+            raise Refused(
+                error.code, f"{error}; if {name} was installed since, restart fishd"
+            ) from None
+
+    _change(endpoint, as_json, start)
 
 
 @click.command(context_settings={"ignore_unknown_options": True})  # -1 is a value

@@ -64,7 +64,7 @@ def controllers(name: str | None, endpoint: str | None, as_json: bool) -> None:
         names = [info.name for info in infos]
         infos = [info for info in infos if info.name == name]
         if not infos and name in registry.names():
-            echo(f"fishctl: {name} was installed after fishd had started", err=True)
+            echo(f"fishctl: {name} was installed after fishd had started: restart fishd", err=True)
             infos = [registry.describe(name)]
         if not infos:
             hint = suggest(name, names)

@@ -58,12 +58,11 @@ def real_number(value: Any, what: str) -> float:
     raise ValueError(f"{what} is of type {kind}, not one real number")
 
 
-class GivenUp(BaseException):
-    """Raised in the thread of an `Attempt` that was given up."""
-
-
 class Attempt(Generic[T]):
-    """A call in a separate thread that can be given up; the process does not wait for it to end."""
+    """A call in a separate thread that can be given up; the process does not wait for it to end.
+
+    A call that never ends keeps its thread until the process ends.
+    """
 
     def __init__(
         self,
@@ -71,20 +70,14 @@ class Attempt(Generic[T]):
         *,
         done: Callable[[], None] = lambda: None,
         late: Callable[[T], Any] = lambda result: None,
-        interrupt: bool = True,
     ) -> None:
         """
         done: called in that thread when there is a result, unless the call was given up
         late: receives the result of a call that returns after it was given up
-        interrupt: end a loop in Python when the call is given up; False where that is unsafe
         """
         self._function = function
         self._done = done
         self._late = late
-        self._interrupt = interrupt
-        self._begun = False
-        """Whether the thread is in code that `GivenUp` may end, past the start code of
-        `threading`."""
         self._result: list[T] = []
         self._error: Exception | None = None
         self._settling = threading.Lock()
@@ -114,62 +107,25 @@ class Attempt(Generic[T]):
             del error
 
     def give_up(self) -> bool:
-        """Give up the call, and end a loop in Python; return False if the call has finished."""
+        """Give up the call; return False if it has finished."""
         with self._settling:
-            if self._settled.is_set():
-                return False
-            if not self._given_up:
-                self._given_up = True
-                if self._interrupt and self._begun:
-                    _raise_in(self._thread)
-        return True
+            self._given_up = not self._settled.is_set()
+            return self._given_up
 
     def _run(self) -> None:
-        try:
-            in_time = self._attempt()
-        except GivenUp:
-            in_time = False
-        if in_time:
-            self._done()
-        elif self._result:
-            with suppress(Exception):
-                call_foreign(self._late, self._result[0])
-
-    def _attempt(self) -> bool:
-        """Call the function; return False if the call was given up before or during it."""
-        with self._settling:
-            if self._given_up and self._interrupt:
-                return False
-            self._begun = True
+        if self._given_up:
+            return
         try:
             self._result.append(call_foreign(self._function))
         except Exception as error:
             self._error = error
         with self._settling:
-            if self._given_up:
-                self._error = None  # no caller will read it
-                if self._interrupt:
-                    _receive_pending()
-            else:
+            if not self._given_up:
                 self._settled.set()
-            return not self._given_up
-
-
-def _raise_in(thread: threading.Thread) -> None:
-    """Raise `GivenUp` in a thread at its next Python code."""
-    import ctypes  # slow to import, and only needed when a call is given up
-
-    ident = ctypes.c_ulong(thread.ident or 0)
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ident, ctypes.py_object(GivenUp))
-
-
-def _receive_pending() -> None:
-    """Receive a `GivenUp` that may still be pending in this thread, or one like it.
-
-    A pending error that is only cancelled leaves Python in a state in which each call of a function
-    takes longer, and one that is traced never ends (Python 3.11).
-    """
-    with suppress(GivenUp):
-        _raise_in(threading.current_thread())
-        while True:
-            pass
+        if self._settled.is_set():
+            self._done()
+            return
+        self._error = None  # no caller will read it
+        if self._result:
+            with suppress(Exception):
+                call_foreign(self._late, self._result[0])

@@ -1,7 +1,7 @@
 """Registry of classes that fishd or other packages offer by name: controllers, drivers.
 
 fishd's classes are in a table in the code. Those of other packages are entry points of a group,
-which are read again after an installation: a running fishd finds new ones without a restart.
+which are read once: a running fishd finds new ones after a restart.
 """
 
 import importlib
@@ -11,8 +11,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from functools import reduce
-from importlib.machinery import PathFinder
+from functools import cached_property, reduce
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import msgspec
@@ -58,28 +57,26 @@ class Plugins(Generic[T]):
         self._unknown = unknown
         self._of = of
         self._found: dict[str, type[T]] = {}
-        self._entries: dict[str, EntryPoint] = {}
-        self._stamps: list[int] = []
         self.problems: dict[str, str] = {}
         """Reasons why plug-ins are unavailable, by name of the plug-in, or of the package if its
         entry points cannot be read."""
 
     def names(self) -> list[str]:
         """Return all names, sorted, whether they load or not."""
-        return sorted({*self._built_in, *self._offered()})
+        return sorted({*self._built_in, *self._offered})
 
     def has(self, name: str) -> bool:
         """Return whether a plug-in of that name exists, whether it loads or not."""
-        return name in self._built_in or name in self._offered()
+        return name in self._built_in or name in self._offered
 
     def package(self, name: str) -> str:
         """Return the source of a plug-in: `fishd`, or the name and version of another package."""
-        distribution = None if name in self._built_in else self._offered()[name].dist
+        distribution = None if name in self._built_in else self._offered[name].dist
         return f"{distribution.name} {distribution.version}" if distribution else "fishd"
 
     def requirements(self, name: str) -> list[str]:
         """Return the requirements of the package that offers a plug-in; empty for fishd."""
-        distribution = None if name in self._built_in else self._offered()[name].dist
+        distribution = None if name in self._built_in else self._offered[name].dist
         return (distribution.requires or []) if distribution else []
 
     def find(self, name: str) -> type[T]:
@@ -101,7 +98,7 @@ class Plugins(Generic[T]):
         timeout: longest time of the import; None for that of `trial_import` [s]
         Raise `unknown` if the import ends or crashes its process, or does not end.
         """
-        entry = None if name in self._built_in else self._offered().get(name)
+        entry = None if name in self._built_in else self._offered.get(name)
         if entry is None or name in self._found:
             return
         module = entry.value.partition(":")[0].strip()
@@ -123,18 +120,18 @@ class Plugins(Generic[T]):
         try:
             yield
         except self._unknown as error:
-            if name in self._built_in or name in self._entries:
+            if name in self._built_in or name in self._offered:
                 self.problems[name] = text.error_message(error)
             raise
 
     def _where(self, name: str) -> str:
         """Return the name and origin of a plug-in that exists, for messages."""
-        value = self._built_in.get(name) or self._offered()[name].value
+        value = self._built_in.get(name) or self._offered[name].value
         return f"{self.kind} '{name}' ({value} in {self.package(name)})"
 
     def _load(self, name: str) -> type[T]:
         # Entry points only if they are needed: finding them takes tens of milliseconds.
-        value = self._built_in.get(name) or getattr(self._offered().get(name), "value", "")
+        value = self._built_in.get(name) or getattr(self._offered.get(name), "value", "")
         if not value:
             hint = suggest(name, self.names())
             raise self._unknown(f"no {self.kind} is named '{text.quoted(name)}'; {hint}")
@@ -165,20 +162,9 @@ class Plugins(Generic[T]):
             ) from error
         return plugin
 
+    @cached_property
     def _offered(self) -> "dict[str, EntryPoint]":
-        """Return the entry points of other packages, by name."""
-        stamps = _stamps()
-        if stamps != self._stamps:
-            importlib.invalidate_caches()
-            if trials := sys.modules.get("fishd.core.trial_import"):
-                trials.forget()
-            self._entries = self._read_entry_points()
-            self._stamps = stamps
-        return self._entries
-
-    def _read_entry_points(self) -> "dict[str, EntryPoint]":
-        if not _mentioned(self._group):
-            return {}
+        """Entry points of other packages, by name."""
         from importlib.metadata import distributions  # slow to import
 
         entries: dict[str, EntryPoint] = {}
@@ -226,39 +212,3 @@ def _load_class(name: str) -> Any:
     """Return the object that `module:class` names."""
     module, _, attributes = name.partition(":")
     return reduce(getattr, filter(None, attributes.split(".")), importlib.import_module(module))
-
-
-def _mentioned(group: str) -> bool:
-    """Return whether a package may offer entry points of this group; only then all are read."""
-    finders = [finder for finder in sys.meta_path if hasattr(finder, "find_distributions")]
-    return finders != [PathFinder] or any(_mentions(path, group.encode()) for path in sys.path)
-
-
-def _mentions(path: str, group: bytes) -> bool:
-    """Return whether a package in this folder of sys.path mentions the group; True for an archive.
-
-    Without pathlib, which takes twice as long for hundreds of files.
-    """
-    try:
-        names = os.listdir(path or ".")  # noqa: PTH208
-    except NotADirectoryError:
-        return True
-    except OSError:
-        return False
-    for name in names:
-        if name.lower().endswith((".dist-info", "egg-info")):
-            with suppress(OSError), open(f"{path or '.'}/{name}/entry_points.txt", "rb") as file:  # noqa: PTH123
-                if group in file.read():
-                    return True
-    return False
-
-
-def _stamps() -> list[int]:
-    """Return when each folder of sys.path was last changed, such as by an installation [ns]."""
-    stamps = []
-    for path in sys.path:
-        try:
-            stamps.append(os.stat(path or ".").st_mtime_ns)  # noqa: PTH116
-        except OSError:
-            stamps.append(0)
-    return stamps

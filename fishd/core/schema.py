@@ -68,10 +68,19 @@ class Field(Struct, frozen=True, omit_defaults=True):
     unit: str
     description: str
     default: Scalar
-    interval: str
-    """Permitted values: an interval such as `(0, 2]`, or choices such as `a | b`; empty for any."""
     optional: bool
     """True if null is permitted."""
+    low: float | None = None
+    """Least value of a number, or of the numbers of a list, or least length of a text."""
+    high: float | None = None
+    """Largest value or length, as for `low`."""
+    low_open: bool = False
+    """True if `low` itself is not permitted."""
+    high_open: bool = False
+    choices: tuple[str, ...] = ()
+    """Permitted values of a choice, or of the entries of a list."""
+    items: str = ""
+    """Kind of the entries of a list, as in `kind`."""
     required: bool = False
     """True if the field has no default."""
     file: str = ""
@@ -222,12 +231,28 @@ def describe_permitted(field: Field) -> str:
         "list": "a list",
     }[field.kind]
     preposition = {"choice": "", "text": "of ", "list": "of "}.get(field.kind, "in ")
-    range_words = preposition + field.interval
-    words = (kind, range_words if field.interval else "", field.unit if field.unit != "1" else "")
+    permitted = format_permitted(field)
+    symbol = "" if field.unit == "1" else field.unit
+    words = (kind, preposition + permitted if permitted else "", symbol)
     alternatives = [*field.words, *(["null"] if field.optional else [])]
     return " ".join(filter(None, words)) + (
         f" (or {' or '.join(alternatives)})" if alternatives else ""
     )
+
+
+def format_permitted(field: Field) -> str:
+    """Return the permitted values: `(0, 2]`, `a | b`, `1 to 40 printable characters`, or empty."""
+    if field.choices:
+        return " | ".join(field.choices)
+    kind = field.items or field.kind
+    if kind == "text":
+        shortest = f"{field.low:g}" if field.low else "up"
+        return "" if field.high is None else f"{shortest} to {field.high:g} printable characters"
+    if field.low is None and field.high is None:
+        return ""
+    low = "(-inf" if field.low is None else f"{'(' if field.low_open else '['}{field.low:g}"
+    high = "inf)" if field.high is None else f"{field.high:g}{')' if field.high_open else ']'}"
+    return f"{'whole numbers in ' if field.items == 'integer' else ''}{low}, {high}"
 
 
 def names_file(text: str, suffix: str) -> bool:
@@ -310,8 +335,8 @@ def _describe(field: inspect.Field) -> Field:
         unit=extra.get("unit", ""),
         description=extra.get("description", ""),
         default=field.default if isinstance(field.default, Scalar) else None,
-        interval=_format_interval(kind),
         optional=optional,
+        **_permitted(kind),
         required=field.required,
         file=extra.get("file", ""),
         words=_literal_words(field.type) if isinstance(kind, inspect.FloatType) else (),
@@ -335,22 +360,22 @@ def _derive_step(kind: inspect.Type, default: Any) -> float:
     return float(10.0 ** math.floor(math.log10(size))) if size > 0.0 else 0.0
 
 
-def _format_interval(kind: inspect.Type) -> str:
-    if isinstance(kind, inspect.StrType) and kind.max_length is not None:
-        shortest = f"{kind.min_length}" if kind.min_length else "up"
-        return f"{shortest} to {kind.max_length} printable characters"
+def _permitted(kind: inspect.Type) -> dict[str, Any]:
+    """Return the permitted values of a type, as fields of `Field`."""
+    if isinstance(kind, inspect.StrType):
+        return {"low": kind.min_length, "high": kind.max_length}
     if isinstance(kind, inspect.LiteralType):
-        return " | ".join(str(value) for value in kind.values)
+        return {"choices": tuple(map(str, kind.values))}
     if isinstance(kind, inspect.VarTupleType):
-        prefix = "whole numbers in " if isinstance(kind.item_type, inspect.IntType) else ""
-        return prefix + _format_interval(kind.item_type)
+        return {"items": _KINDS.get(type(kind.item_type), "text"), **_permitted(kind.item_type)}
     if not isinstance(kind, inspect.FloatType | inspect.IntType):
-        return ""
-    low = f"({kind.gt:g}" if kind.gt is not None else f"[{kind.ge:g}" if kind.ge is not None else ""
-    high = (
-        f"{kind.lt:g})" if kind.lt is not None else f"{kind.le:g}]" if kind.le is not None else ""
-    )
-    return f"{low or '(-inf'}, {high or 'inf)'}" if low or high else ""
+        return {}
+    return {
+        "low": kind.ge if kind.gt is None else kind.gt,
+        "high": kind.le if kind.lt is None else kind.lt,
+        "low_open": kind.gt is not None,
+        "high_open": kind.lt is not None,
+    }
 
 
 def _explain(
@@ -508,15 +533,10 @@ def is_valid_number(values: Mapping[str, Any], field: Field) -> bool:
     value = values.get(field.name)
     if not _is_number(value):
         return False
-    ends = re.fullmatch(r"([\[(])(\S+), (\S+)([\])])", field.interval)
-    if not ends:
-        return True
-    low, high = float(ends[2]), float(ends[3])
-    return (
-        low <= value <= high
-        and not (ends[1] == "(" and value == low)
-        and not (ends[4] == ")" and value == high)
-    )
+    low, high = field.low, field.high
+    above = low is None or value > low or (value == low and not field.low_open)
+    below = high is None or value < high or (value == high and not field.high_open)
+    return above and below
 
 
 def format_quantity(value: Any, symbol: str) -> str:

@@ -27,11 +27,6 @@ os._exit(0)
 _verdicts: dict[str, str] = {}
 
 
-def forget() -> None:
-    """Forget the results of all trials, since the packages have changed."""
-    _verdicts.clear()
-
-
 def find_danger(module: str, timeout: float | None = None) -> str:
     """Return what the import of a module does to its process; empty if it survives.
 

@@ -47,14 +47,11 @@ class BackgroundCalls:
         complaint: str,
         function: Callable[[], T],
         late: Callable[[T], Any] = lambda result: None,
-        *,
-        interrupt: bool = True,
     ) -> T:
         """Call a function in a thread; return what it returns, or raise what it raises.
 
         complaint: start of the message if it takes too long, such as `'chirp' has not loaded`
         late: function that takes the result of an abandoned call that returns after all
-        interrupt: that of `Attempt`
         Raises `Refused`: busy as in `check_busy`, too-slow for a call that takes too long. Such a
         call is abandoned, and so is a call whose coroutine is cancelled.
         """
@@ -67,7 +64,7 @@ class BackgroundCalls:
                 events.call_soon_threadsafe(is_done.set)
 
         work = partial(_run_with_priority, function)
-        attempt = Attempt(work, done=done, late=late, interrupt=interrupt)
+        attempt = Attempt(work, done=done, late=late)
         self._running += 1
         try:
             async with asyncio.timeout(self.timeout):

@@ -233,7 +233,6 @@ class CalibrationRequests:
                 "the calibration has not been written",
                 partial(self._folder.save, calibration, self._now()),
                 late=lambda saved: saved[1].unlink(),  # the next start must not use it
-                interrupt=False,  # an interrupt could leave a file whose path is not returned
             )
         except ConfigError as error:
             raise Refused("not-saved", str(error)) from None

@@ -81,7 +81,6 @@ class Operations:
         """Number of the newest of them that was carried out."""
         self._calls = BackgroundCalls(protocol.LOADING_TIMEOUT_S)
         self._controllers = controllers
-        self._at_start = set(registry.names())
         self._handlers: Handlers = {
             "status": self._status,
             "controllers": self._list_controllers,
@@ -262,19 +261,10 @@ class Operations:
 
     async def _load(self, request: protocol.SetController) -> Controller[Any]:
         create = partial(_create, request.name, request.parameters, self._loop.limits)
-        is_new = request.name not in self._at_start
-        if is_new:
-            create = partial(_create_newly_installed, request.name, create)
         try:
-            controller = await self._calls.call(
-                f"'{request.name}' has not loaded", create, late=_close
-            )
+            return await self._calls.call(f"'{request.name}' has not loaded", create, late=_close)
         except Exception as error:
             raise _refusal(request.name, "cannot start", error) from error
-        if is_new and request.name not in (info.name for info in self._controllers):
-            self._controllers.append(registry.describe(request.name))
-            self._controllers.sort(key=lambda info: info.name)
-        return controller
 
     async def _set_parameter(self, request: protocol.SetParameter) -> State:
         loop = self._loop
@@ -359,20 +349,6 @@ _TRIAL_TIMEOUT_S = 0.8 * protocol.LOADING_TIMEOUT_S
 def _create(name: str, values: Mapping[str, Any], limits: Limits) -> Controller[Any]:
     registry.try_import(name, _TRIAL_TIMEOUT_S)
     return registry.create(name, values, limits)
-
-
-def _create_newly_installed(name: str, create: Callable[[], Controller[Any]]) -> Controller[Any]:
-    """Create a controller that was not installed when fishd started."""
-    try:
-        return create()
-    except UnknownController as error:
-        # Its package is there but cannot be imported, for example from a new folder.
-        if name in registry.names():
-            raise UnknownController(
-                f"{text.error_message(error)}; it was installed after fishd had started: restart "
-                "fishd"
-            ) from error
-        raise
 
 
 def _close(controller: Controller[Any]) -> None:

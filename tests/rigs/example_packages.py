@@ -54,6 +54,7 @@ def forget_drivers() -> None:
     """Reload the drivers, plants and controllers of other packages."""
     for plugins in (FORCE_SENSORS, SERVOS, PLANTS, registry._plugins):
         plugins._found.clear()
+        vars(plugins).pop("_offered", None)
 
 
 class LoadCellRig(LockstepRig):

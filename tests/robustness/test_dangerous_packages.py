@@ -5,9 +5,11 @@ and names them.
 import os
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from rigs.example_packages import forget_drivers
 from rigs.processes import PATIENCE, START, call, install, one_line, running
 
 from fishd.controllers import registry
@@ -83,16 +85,12 @@ def test_one_that_the_configuration_names_is_named_in_its_refusal(
     assert "Traceback" not in ended.stderr
 
 
-def test_a_package_that_is_repaired_is_tried_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    file = tmp_path / "repaired.py"
-    file.write_text(DANGERS["exiting"][0])
-    assert trial_import.find_danger("repaired") == DANGERS["exiting"][1]
-    file.write_text("repaired = True\n")
-    trial_import.forget()  # as an installation does
-    assert trial_import.find_danger("repaired") == ""
+@pytest.fixture
+def new_packages() -> Iterator[None]:
+    """Let the registry of controllers read the packages again, before and after a test."""
+    forget_drivers()
+    yield
+    forget_drivers()
 
 
 SLOW_IN_ITS_TRIAL = """
@@ -102,13 +100,12 @@ if "pytest" not in sys.modules:
 """
 
 
+@pytest.mark.usefixtures("new_packages")
 def test_the_trial_takes_no_time_from_the_import_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install(tmp_path, {"slow_trial": SLOW_IN_ITS_TRIAL + CHANGING}, slow="slow_trial:Harmless")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
-    # Its compiled module would be a change of its folder, like an installation.
-    monkeypatch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(trial_import, "TIMEOUT_S", PATIENCE)
     monkeypatch.setattr(registry, "IMPORT_TIMEOUT_S", 8.5)
@@ -138,6 +135,7 @@ def test_every_signal_that_ends_an_import_is_named(
     assert trial_import.find_danger("real_time") == line
 
 
+@pytest.mark.usefixtures("new_packages")
 def test_a_trial_that_is_not_possible_is_a_reason_not_to_load(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

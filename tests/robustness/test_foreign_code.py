@@ -10,7 +10,7 @@ from contextlib import suppress
 
 import pytest
 from fishd_zoo import RAISED
-from rigs.processes import PATIENCE, call, wait_until
+from rigs.processes import PATIENCE, wait_until
 
 from fishd.core.errors import Escaped
 from fishd.core.foreign_code import Attempt, call_foreign
@@ -70,33 +70,14 @@ def test_what_a_failed_call_had_read_is_freed_without_a_garbage_collection() -> 
         gc.enable()
 
 
-def test_a_loop_in_python_ends_when_it_is_given_up() -> None:
-    begun = threading.Event()
-
-    def loop() -> None:
-        begun.set()
-        while True:
-            pass
-
-    attempt = Attempt(loop)
-    assert begun.wait(PATIENCE)
-    assert attempt.give_up()
-    wait_until(lambda: not attempt.alive)
-    assert not attempt.wait(0.0)
-
-
 def test_what_comes_too_late_is_handed_to_whoever_takes_it_away() -> None:
     begun, go, taken = threading.Event(), threading.Event(), threading.Event()
     results: list[str] = []
 
     def deliver() -> str:
-        while True:
-            try:
-                begun.set()
-                go.wait(PATIENCE)
-            except BaseException:  # the exception that abandons it
-                continue
-            return "late"
+        begun.set()
+        go.wait(PATIENCE)
+        return "late"
 
     def take(result: str) -> None:
         results.append(result)
@@ -111,35 +92,6 @@ def test_what_comes_too_late_is_handed_to_whoever_takes_it_away() -> None:
     assert not attempt.wait(0.0)
 
 
-TRACED = """
-import sys, threading
-from fishd.core.foreign_code import Attempt
-
-begun, go = threading.Event(), threading.Event()
-attempt = Attempt(lambda: (begun.set(), go.wait()), late=lambda result: print("late"))
-begun.wait()
-attempt.give_up()
-go.set()
-while attempt.alive:
-    pass
-for count in range(300):
-    attempt = Attempt(lambda: 1)
-    for _ in range(count):
-        pass
-    attempt.give_up()
-    while attempt.alive:
-        pass
-sys.setprofile(lambda *event: None)
-(lambda: None)()
-print("traced", flush=True)
-"""
-"""Program that traces a function after calls that were given up too late, or at any moment."""
-
-
-def test_a_function_can_be_traced_after_calls_that_were_given_up() -> None:
-    assert call(sys.executable, "-c", TRACED, check=True).stdout.endswith("traced\n")
-
-
 def test_many_that_are_given_up_just_when_they_are_done_are_either_taken_or_thrown_away() -> None:
     """A call that is abandoned at any moment never loses or duplicates its result."""
     for number in range(400):
@@ -151,7 +103,6 @@ def test_many_that_are_given_up_just_when_they_are_done_are_either_taken_or_thro
         deadline = time.monotonic() + PATIENCE
         while attempt.alive and time.monotonic() < deadline:
             time.sleep(0)
-        # A call that was ended before its return has no result.
         assert attempt.wait(0.0) == done
         assert len(late) <= (0 if done else 1)
 

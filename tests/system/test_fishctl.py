@@ -92,7 +92,8 @@ def test_controllers_are_listed_with_parameters_units_ranges_and_defaults(daemon
         "description": "Reverse when the fin's speed falls to C times its last maximum; auto: "
         "begin with 0.6, and search for the largest thrust.",
         "default": 0.6,
-        "interval": "[0, 1]",
+        "low": 0.0,
+        "high": 1.0,
         "step": 0.05,
         "optional": False,
         "words": ["auto"],

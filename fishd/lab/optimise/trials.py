@@ -7,9 +7,11 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
+from msgspec.structs import replace
+
 from fishd.core.errors import ConfigError, ParameterError
 from fishd.core.estimation import SWIM_SETTLE_TIME_S
-from fishd.core.schema import Field
+from fishd.core.schema import Field, format_permitted, is_valid_number
 from fishd.core.signals import Tick
 from fishd.lab.error_budget import visible_rotation
 from fishd.lab.experiment import Experiment
@@ -243,7 +245,7 @@ def _default_ends(field: Field, session: Session) -> tuple[float, float]:
     A frequency is searched from `MIN_FREQUENCY_HZ` to half beats of `MIN_HALF_BEAT_TICKS`, an
     amplitude up to that of the rig. An excluded end is moved inwards by a twentieth of the range.
     """
-    low, high = _read_bounds(field)
+    low, high = _bounds(field)
     if field.name == "amplitude":
         return session.amplitude / 20.0, session.amplitude
     if field.name == "frequency":
@@ -251,32 +253,29 @@ def _default_ends(field: Field, session: Session) -> tuple[float, float]:
     margin = (high - low) / 20.0
     if math.isinf(margin):
         return low, high
-    return (
-        low + margin * field.interval.startswith("("),
-        high - margin * field.interval.endswith(")"),
-    )
+    return low + margin * field.low_open, high - margin * field.high_open
 
 
 def _check_bounds(searched: Range, field: Field, session: Session) -> None:
     """Raise `ParameterError` if a range exceeds the bounds of its parameter."""
-    low, high = _read_bounds(field)
+    low, high = _bounds(field)
     if field.name == "amplitude":
         high = min(high, session.amplitude)
-    is_open = field.interval.startswith("(") and searched.low == low
-    is_open |= field.interval.endswith(")") and searched.high == high
-    if searched.low < low or searched.high > high or is_open:
-        bounds = f"{field.interval[:1] or '['}{low:g}, {high:g}{field.interval[-1:] or ']'}"
+    field = replace(field, low=low, high=high)
+    values = {"low": searched.low, "high": searched.high}
+    if not all(is_valid_number(values, replace(field, name=end)) for end in values):
         raise ParameterError(
-            f"{searched.name}: from {searched.low:g} to {searched.high:g} is not within {bounds}"
+            f"{searched.name}: from {searched.low:g} to {searched.high:g} is not within "
+            f"{format_permitted(field)}"
         )
 
 
-def _read_bounds(field: Field) -> tuple[float, float]:
+def _bounds(field: Field) -> tuple[float, float]:
     """Return the bounds of a parameter; infinite if it has none."""
-    parts = field.interval.strip("()[]").split(", ")
-    if len(parts) != 2:
-        return -math.inf, math.inf
-    return float(parts[0]), float(parts[1])
+    return (
+        -math.inf if field.low is None else field.low,
+        math.inf if field.high is None else field.high,
+    )
 
 
 class Aim(NamedTuple):

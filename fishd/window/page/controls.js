@@ -4,11 +4,10 @@ import { call, html, numberIn, parametersText, recall, remember, unitText, useRe
 const SEND_MS = 150;
 const STEPS = 200;
 
-/** Return bounds and step of a slider, or null if the interval is not one of finite numbers. */
+/** Return bounds and step of a slider, or null if the field is not a number between two bounds. */
 export function sliderOf(field, status) {
-  const match = /^([[(])\s*([^,]+),\s*([^\])]+)([\])])$/.exec(field.interval);
-  if (!match || !["number", "integer"].includes(field.kind)) return null;
-  let low = Number(match[2]), high = Number(match[3]);
+  if (!["number", "integer"].includes(field.kind)) return null;
+  let low = field.low ?? NaN, high = field.high ?? NaN;
   if (field.usual) [low, high] = [Math.max(low, -field.usual), Math.min(high, field.usual)];
   if (field.unit === "rad" && status) {
     [low, high] = [Math.max(low, -status.amplitude_limit), Math.min(high, status.amplitude_limit)];
@@ -17,7 +16,7 @@ export function sliderOf(field, status) {
   const rough = (high - low) / STEPS, power = 10 ** Math.floor(Math.log10(rough));
   let step = [1, 2, 5, 10].find((factor) => factor * power >= rough * 0.999) * power;
   if (field.kind === "integer") step = Math.max(1, Math.round(step));
-  if (match[1] === "(" && low === Number(match[2])) low = low + step;
+  if (field.low_open && low === field.low) low = low + step;
   return { low, high, step };
 }
 
@@ -38,7 +37,6 @@ function Text({ value, commit, ...more }) {
 }
 
 const short = (value) => String(+value.toPrecision(3)).replace("-", "−");
-const choicesOf = (field) => field.interval.split("|").map((word) => word.trim());
 
 function Field({ field, value, disabled, status, edit }) {
   const id = `parameter-${field.name}`;
@@ -56,7 +54,7 @@ function Field({ field, value, disabled, status, edit }) {
       onChange=${(event) => edit(field.name, event.target.checked)} />`;
   } else if (field.kind === "choice") {
     input = html`<select id=${id} disabled=${disabled} value=${value} onChange=${(event) => send(event.target.value)}>
-      ${choicesOf(field).map((word) => html`<option value=${word}>${word}</option>`)}
+      ${field.choices.map((word) => html`<option value=${word}>${word}</option>`)}
     </select>`;
   } else {
     input = html`<${Text} id=${id} class=${numeric ? "number" : "text"} inputmode=${numeric ? "decimal" : "text"}

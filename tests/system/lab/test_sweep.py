@@ -131,7 +131,7 @@ def test_a_point_that_is_refused_is_trouble_and_the_next_is_measured(tmp_path: P
 @pytest.mark.parametrize(
     ("head", "named"),
     [
-        ("controller,parameters.frequency,thrust,error,recording", "has no column beat_freq"),
+        ("controller,parameters.frequency,thrust,thrust_ci95,recording", "has no column beat_freq"),
         (f"controller,parameters.C,{','.join(MEASURED)},recording", "no column parameters.freq"),
     ],
 )

@@ -26,7 +26,7 @@ def test_a_page_begins_with_all_that_it_needs(new_window: WindowProcess) -> None
             frequency = next(
                 field for field in square["parameters"] if field["name"] == "frequency"
             )
-            assert (frequency["interval"], frequency["unit"]) == ("[0.001, 10]", "Hz")
+            assert (frequency["low"], frequency["high"], frequency["unit"]) == (0.001, 10, "Hz")
             assert frequency["step"] == 0.05
 
     run(test())

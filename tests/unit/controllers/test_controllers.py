@@ -12,6 +12,7 @@ from rigs.harness import LIMITS, commands, observe
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError, UnknownController
+from fishd.core.schema import format_permitted
 
 frequencies = st.floats(0.1, 5.0)
 in_force = st.floats(-0.42, 0.42)
@@ -156,4 +157,4 @@ def test_every_installed_controller_describes_itself_and_its_parameters() -> Non
         for field in info.parameters:
             assert field.description.endswith(".")
             assert field.unit
-            assert field.interval
+            assert format_permitted(field)
