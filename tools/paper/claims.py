@@ -226,11 +226,6 @@ def learning() -> Iterator[Claim]:
         f"figure 3; 10⁵ steps are {1e5 * Config().tick / 60:.0f} min",
         None,
     )
-    yield Claim(
-        "an update every 768 steps, policy and value saved every 5000 steps",
-        "settings of [learning-paper.yaml](../../config/learning-paper.yaml)",
-        None,
-    )
     seen = read(figure_3.NAME, source=figure_3.SEEN)
     amplitudes = column(seen, "amplitude_rad")
     forces = [read(figure_3.NAME, source=figure_3.LEARNT, amplitude_rad=a)[0] for a in amplitudes]
@@ -246,13 +241,6 @@ def learning() -> Iterator[Claim]:
         f"frequencies {max(apart):.2f} Hz apart at most, thrust {min(ratios):.1%} to "
         f"{max(ratios):.1%} of that from forces, over {len(seen)} amplitudes",
         max(apart) <= NEAR * max(column(forces, "frequency_Hz")) and min(ratios) > 1.0 - NEAR,
-    )
-    yield Claim(
-        "from images: 4 frames of 84 × 84, compressed to 512 numbers",
-        "settings of [learning-camera-paper.yaml](../../config/learning-camera-paper.yaml); the "
-        "points of figure 3 have the feature extractor `modes`, see "
-        "[the camera](../how-to/camera.md)",
-        None,
     )
 
 
