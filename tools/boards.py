@@ -89,4 +89,4 @@ def reference(reports: Iterable[BenchReport]) -> str:
 
 if __name__ == "__main__":
     text = reference(read(DOCS / "boards"))
-    sys.exit(write_reference("boards", [("reference/boards.md", "boards", text)]))
+    sys.exit(write_reference("boards", [("how-to/bench.md", "boards", text)]))

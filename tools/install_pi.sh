@@ -8,7 +8,7 @@ set -euo pipefail
 DIST=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)/dist
 DISK=${DISK:-}
 BOOT_CONFIG=$DISK/boot/firmware/config.txt
-MANUAL=docs/how-to/installing.md
+MANUAL=docs/how-to/install.md
 
 step() { printf '%s\n' "$*"; }
 

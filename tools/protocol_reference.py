@@ -70,15 +70,8 @@ def references() -> Iterator[tuple[str, str, str]]:
     ]
     head = "op | arguments | what it does | result"
     yield "reference/protocol.md", "operations", table(head, operations)
-    faults = [
-        [
-            f"[`{code}`](../how-to/troubleshooting.md#{code})",
-            _times(row.in_a_row) + row.text,
-            row.remedy,
-        ]
-        for code, row in FAULTS.items()
-    ]
-    yield "explanation/concepts.md", "faults", table("code | what triggers it | what to do", faults)
+    codes = [f"[`{code}`](../how-to/troubleshooting.md#{code})" for code in FAULTS]
+    yield "explanation/concepts.md", "faults", ",\n".join(codes)
     columns = [
         [f"`{name}`", "–" if unit == "1" else unit, about]
         for name, (unit, about) in COLUMNS.items()
@@ -135,10 +128,6 @@ def _type(kind: inspect.Type) -> str:
     if isinstance(kind, inspect.VarTupleType):
         return f"list of {_type(kind.item_type)}s"
     return TYPES[type(kind)]
-
-
-def _times(in_a_row: int) -> str:
-    return f"{in_a_row} times in a row: " if in_a_row > 1 else ""
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
-"""Flows around bodies whose motion is given, and the cost of a step, for `tools/bench swimmer`.
+"""Flows around bodies whose motion is given, for `tools/bench swimmer`.
 
     impulsive     cylinder that starts at once, Re 550 and 3000
     anguilliform  swimmer that undulates like an eel, and swims freely
     rigid         fish at rest in a stream, Re 10 000
-    cost          time of a step, and of its parts beside the bandwidth and the matrix products
 
 Impulsive start: Koumoutsakos and Leonard, J. Fluid Mech. 296, 1995, pp. 1–38,
 doi:10.1017/S0022112095002059, digitised in PetIBM (examples/data, in its repository). Undulation:
@@ -13,18 +12,13 @@ FishSwimmingCase, in its repository).
 """
 
 import math
-import time
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 import numpy as np
 
 from common.report import progress, table
 from fishd.config import load
 from fishd.core import files
-from fishd.virtual.swimmer import flow as flow_module
-from fishd.virtual.swimmer import threads
 from fishd.virtual.swimmer.beam import Beam
 from fishd.virtual.swimmer.body import build_beam
 from fishd.virtual.swimmer.fish import FOLLOW_TIME, RECENTRE_RATE, Fish
@@ -41,8 +35,6 @@ PERIODS = 8
 UNDULATION_VISCOSITY = 1.4e-4
 """Kinematic viscosity in lengths² per period."""
 SWIMMER = files.shipped_folder("config") / "swimmer.yaml"
-OPERATIONS = 62
-"""Operations of `flow._advance` for each value."""
 STREAM = 0.1
 """Speed of the stream past the rigid fish [m/s]."""
 
@@ -95,15 +87,16 @@ def impulsive_drag(reynolds: int, cells: int, end: float) -> tuple[Array, Array]
     return 2.0 * dt * (np.arange(len(drag)) + 0.5), np.array(drag)
 
 
-def impulsive(finest: float) -> str:
-    """Return the table of drag coefficients after an impulsive start."""
-    rows = []
+def impulsive(finest: float) -> tuple[str, str]:
+    """Return the table of drag coefficients after an impulsive start, and their deviations."""
+    rows, deviations = [], []
     for reynolds, (cells, published) in IMPULSIVE.items():
         count = round(cells / finest)
         times, drag = impulsive_drag(reynolds, count, published[-1][0] + 0.1)
         for moment, value in published:
             here = float(np.interp(moment, times, drag))
             off = here / value - 1.0
+            deviations.append(off)
             rows.append(
                 [
                     str(reynolds),
@@ -115,7 +108,9 @@ def impulsive(finest: float) -> str:
                 ]
             )
             progress(*rows[-1])
-    return table("Re | cells across | Ut/R | published | here | deviation", rows)
+    count = sum(abs(off) <= 0.03 for off in deviations)
+    number = f"{min(deviations):+.1%} to {max(deviations):+.1%}, {count} of {len(rows)} within 3%"
+    return table("Re | cells across | Ut/R | published | here | deviation", rows), number
 
 
 def undulate(cells: int, periods: float = PERIODS) -> Array:
@@ -161,15 +156,16 @@ def undulate(cells: int, periods: float = PERIODS) -> Array:
     return -np.diff(starts)
 
 
-def anguilliform(finest: float) -> str:
-    """Return the table of speeds in each period."""
+def anguilliform(finest: float) -> tuple[str, str]:
+    """Return the table of speeds in each period, and the last one."""
     rows = []
     for cells in (100, 200, 400):
         cells = round(cells / finest)
         rows.append([str(cells), *(f"{speed:.3f}" for speed in undulate(cells))])
         progress(*rows[-1])
     heads = " | ".join(f"period {k}" for k in range(1, PERIODS + 1))
-    return table(f"cells along the body | {heads}", rows)
+    number = f"{rows[-1][0]} cells: {rows[-1][-1]}"
+    return table(f"cells along the body | {heads}", rows), number
 
 
 def rigid_drag(cell: float, step: float, end: float) -> float:
@@ -198,8 +194,8 @@ def numerics(cell: float, step: float) -> list[str]:
     return [f"tick={10 * step:g}", *keys]
 
 
-def rigid(finest: float) -> str:
-    """Return the table of drag coefficients of the rigid fish."""
+def rigid(finest: float) -> tuple[str, str]:
+    """Return the table of drag coefficients of the rigid fish, and their last change."""
     rows: list[list[str]] = []
     before = None
     for cell, step in ((1e-3, 5e-4), (5e-4, 4e-4), (2.5e-4, 2e-4)):
@@ -208,98 +204,7 @@ def rigid(finest: float) -> str:
         rows.append([f"{1e3 * finest * cell:g} mm", f"{drag:.4f}", change])
         before = drag
         progress(*rows[-1])
-    return table("cells | drag coefficient | change", rows)
+    return table("cells | drag coefficient | change", rows), rows[-1][-1]
 
 
-def cost(finest: float) -> str:
-    """Return the table of the time of a step beside its floor.
-
-    The floor of the fluxes is one pass over each of their 14 fields at the bandwidth of fields of
-    this size, or their operations at the speed of a large matrix product, whichever is longer; that
-    of the pressure is its matrix products at that speed, and eight passes. Both speeds are measured
-    in this run, on one core. On a busy machine, the shortest step shows the cost on a quiet one.
-    """
-    rows = []
-    for cell, step in ((5e-4, 4e-4), (2.5e-4, 2e-4)):
-        rows.append(measure_cost(finest * cell, finest * step))
-        progress(*rows[-1])
-    heads = (
-        "cells | grid | CPU time of a simulated second | from the shortest step | time with two "
-        "threads | parts of a step"
-    )
-    return table(heads, rows)
-
-
-def measure_cost(cell: float, step: float) -> list[str]:
-    """Return the row of one grid."""
-    settings = load(SWIMMER, numerics(cell, step)).swimmer
-    with_threads = Fish(settings)
-    together = time_of_second(with_threads) if with_threads.flow.pairs.has_two_threads else None
-    available, threads.config.NUMBA_NUM_THREADS = threads.config.NUMBA_NUM_THREADS, 1
-    fish = Fish(settings)
-    threads.config.NUMBA_NUM_THREADS = available
-    flow, grid = fish.flow, fish.flow.grid
-    swim = partial(beat, fish)
-    for _ in range(40):
-        swim()
-    fields = [np.ones(grid.cells, np.float32) for _ in range(15)]
-    triples = list(zip(fields[::3], fields[1::3], fields[2::3], strict=True))
-    a_pass = shortest(lambda: [np.add(a, b, out=c) for a, b, c in triples]) / 15.0
-    square = np.ones((512, 512), np.float32)
-    per_operation = shortest(lambda: square @ square, 200) / (2.0 * 512**3)
-    begin, start = fish.time, time.process_time()
-    fastest = shortest(swim, 200)
-    mean = (time.process_time() - start) / (fish.time - begin)
-    solver, source = flow._poisson, flow.p.copy()
-    operations = OPERATIONS * 2.0 * grid.nx * grid.ny
-    floors = (
-        max(14.0 * a_pass, operations * per_operation),
-        2.0 * grid.nx * grid.ny**2 * per_operation + 8.0 * a_pass,
-    )
-    took = shortest(partial(advance, flow, step)), shortest(lambda: solver.solve(source))
-    parts = ", ".join(
-        f"{name} {1e3 * time:.2f} ms, {time / floor:.1f} × the floor"
-        for name, time, floor in zip(("fluxes", "pressure"), took, floors, strict=True)
-    )
-    speeds = f"{4e-9 * grid.cells / a_pass:.0f} GB/s, {1e-9 / per_operation:.0f} Gflop/s"
-    sizes = [f"{1e3 * cell:g} mm", f"{grid.nx} × {grid.ny}"]
-    two = "–" if together is None else f"{together:.1f} s"
-    return [*sizes, f"{mean:.1f} s", f"{fastest / step:.1f} s", two, f"{parts}; {speeds}"]
-
-
-def time_of_second(fish: Fish) -> float:
-    """Return how long a simulated second takes on the clock, from 200 steps [s]."""
-    for _ in range(40):
-        beat(fish)
-    begin, start = fish.time, time.perf_counter()
-    for _ in range(200):
-        beat(fish)
-    return (time.perf_counter() - start) / (fish.time - begin)
-
-
-def beat(fish: Fish) -> None:
-    """Advance a fish by a step of a square wave."""
-    fish.step(1.0 if fish.time * 3.0 % 1.0 < 0.5 else -1.0)
-
-
-def advance(flow: Flow, step: float) -> None:
-    """Compute the fluxes of u and v."""
-    weights = flow_module.ADAMS_BASHFORTH[2]
-    numbers = *flow.grid_velocity, flow.viscosity, step, *weights
-    for k in (0, 1):
-        own, rates = (flow._u, flow._v)[k], (flow._rates_u, flow._rates_v)[k]
-        fields = own, flow._u, flow._v, flow.p, *rates, (flow.predicted_u, flow.predicted_v)[k]
-        flow_module._advance(k, *fields, flow._stencils[k], *numbers)
-
-
-def shortest(call: Callable[[], Any], repeats: int = 30) -> float:
-    """Return the shortest CPU time of a call [s]."""
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        call()
-        times.append(time.process_time() - start)
-    return min(times)
-
-
-FLOWS = {"impulsive": impulsive, "anguilliform": anguilliform, "rigid": rigid, "cost": cost}
+FLOWS = {"impulsive": impulsive, "anguilliform": anguilliform, "rigid": rigid}

@@ -2,15 +2,13 @@
 
 A row is a fish, or a group of fish with their median and worst value; a column is a way to swim.
 
-    swing         C = 0.6 and C = auto, on fish that differ from the model as real rigs do
-    harsh         the same for each imperfection of config/harsh.yaml, alone and all together
-    lateral_sign  a reversed F_y, with and without its correction
-    estimators    `swing` with the model-free estimator and with the observer
-    chatter       a policy that reverses too fast, with and without the shortest dwell
+    swing       C = 0.6 and C = auto, on fish that differ from the model as real rigs do
+    harsh       the same for each imperfection of config/harsh.yaml, alone and all together
+    estimators  `swing` with the model-free estimator and with the observer
+    chatter     a policy that reverses too fast, with and without the shortest dwell
 """
 
 import logging
-import math
 import statistics
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
@@ -20,15 +18,12 @@ from typing import Any, NamedTuple
 import yaml
 
 from common.report import DOCS, JOBS, QUICK, Options, Report, percent, run_cases, table
-from common.reversed_force import reversed_robot
 from fishd.config import load
 from fishd.lab.compare.survey import CHANGES, OtherFish, harsh, harsh_fish, longest_chatter, mild
-from fishd.lab.simulation import KeepingPublisher, VirtualRun, simulate
+from fishd.lab.simulation import KeepingPublisher, simulate
 
 OMEGA0, SERVO_SPEED = 12.5, 5.8
 """ω₀ and Ω of the default fish [rad/s]."""
-REST_S = 3.0
-"""Time at rest before a swim of the part `lateral_sign` [s]."""
 POLICY = {"policy": "default-fish"}
 
 
@@ -42,8 +37,6 @@ class Way(NamedTuple):
     seconds: float = 60.0
     settle: float = 10.0
     """Length of the start that does not count [s]."""
-    reversed_fy: bool | None = None
-    """Whether F_y is reversed, after a rest; None for no rest."""
 
 
 class Row(NamedTuple):
@@ -70,22 +63,12 @@ class Swum(NamedTuple):
 def swim(case: tuple[OtherFish, int | None, Way]) -> Swum:
     """Run one fish in virtual time."""
     fish, seed, way = case
-    logging.getLogger("fishd").setLevel(logging.ERROR)  # each reversed F_y causes a warning
+    logging.getLogger("fishd").setLevel(logging.ERROR)
     seeds = () if seed is None else (f"simulation.seed={seed}",)
     config = load(None, (*fish.overrides, *seeds, *way.overrides))
     publisher = KeepingPublisher()
 
-    def rest(run: VirtualRun) -> None:
-        if way.reversed_fy is None:
-            return
-        if way.reversed_fy:
-            run.loop.robot = reversed_robot(run.loop.robot)
-        for _ in range(math.ceil(REST_S / config.tick)):
-            run.tick()
-
-    report = simulate(
-        config, way.controller, way.parameters, way.seconds, way.settle, publisher, rest
-    )
+    report = simulate(config, way.controller, way.parameters, way.seconds, way.settle, publisher)
     share = 0.0 if report.reason else report.relative_thrust
     troubled = bool(report.reason or report.fallback)
     longest_chatter_s = longest_chatter(publisher.ticks, 1.5 * config.tick)
@@ -117,38 +100,8 @@ def harsh_rig() -> tuple[list[Row], Sequence[Way]]:
     rows = [_single(OtherFish("none", ()))]
     for name, keys in {**IMPERFECTIONS, "all of them": tuple(values)}.items():
         overrides = tuple(f"{key}={values[key]!r}" for key in keys)
-        words = ", ".join(f"`{key} {values[key]}`" for key in keys) if len(keys) <= 2 else ""
-        rows.append(_single(OtherFish(f"{name}{words and f' ({words})'}", overrides)))
-    return rows, AUTO
-
-
-def lateral_sign() -> tuple[list[Row], Sequence[Way]]:
-    """Return rows and columns of the part `lateral_sign`; C = auto still searches."""
-    rows = [
-        Row("the default fish", CHANGES[:1]),
-        Row("20 mild fish (seeds 340 to 359)", tuple(map(mild, range(340, 360)))),
-        Row("20 harsh fish", harsh_fish()),
-    ]
-    controllers: dict[str, tuple[str, dict[str, Any]]] = {
-        "swing": ("swing", {}),
-        "swing --C auto": ("swing", {"C": "auto"}),
-        "default-fish": ("ppo", POLICY),
-    }
-    treatments = ((False, "correct"), (True, "correct"), (True, "warn"))
-    ways = [
-        Way(
-            f"`{name}`, {f'reversed, `{treatment}`' if is_reversed else 'F_y right'}",
-            parameters,
-            (f"estimator.reversed_fy={treatment}",),
-            controller,
-            40.0,
-            10.0,
-            is_reversed,
-        )
-        for name, (controller, parameters) in controllers.items()
-        for is_reversed, treatment in treatments
-    ]
-    return rows, ways
+        rows.append(_single(OtherFish(name, overrides)))
+    return rows, (AUTO[0], AUTO[2])
 
 
 def estimators() -> tuple[list[Row], Sequence[Way]]:
@@ -287,7 +240,6 @@ def _cell(row: Row, swims: list[Swum]) -> str:
 CASES = {
     "swing": swing,
     "harsh": harsh_rig,
-    "lateral_sign": lateral_sign,
     "estimators": estimators,
     "chatter": chatter,
 }

@@ -67,30 +67,30 @@ def run(package: str, names: Sequence[str]) -> int:
             command.add_argument("--write", action="store_true", help="put the result into docs/")
     options = parser.parse_args()
     try:
-        report = _measure_parts(parts, options) if parts else module.measure(options)
+        reports = _measure_parts(parts, options) if parts else [module.measure(options)]
     except BrokenPromise as broken:
         print(f"{package} {options.name}: BROKEN: {broken}", file=sys.stderr)
         return 1
-    text = "\n\n".join(report.sections.values())
-    print(msgspec.json.encode(report.figures).decode() if options.json else text)
-    if options.write:
-        for marker, section in report.sections.items():
-            put(_page_with(marker), marker, report.number or section, in_line=bool(report.number))
-    return int(report.broken)
+    for report in reports:
+        text = "\n\n".join(report.sections.values())
+        print(msgspec.json.encode(report.figures).decode() if options.json else text)
+        if options.write:
+            for marker, section in report.sections.items():
+                number = report.number
+                put(_page_with(marker), marker, number or section, in_line=bool(number))
+    return int(any(report.broken for report in reports))
 
 
 def _measure_parts(
     parts: dict[str, Callable[[argparse.Namespace], Report]], options: argparse.Namespace
-) -> Report:
-    """Return the results of the requested parts together."""
-    reports = {}
+) -> list[Report]:
+    """Return the result of each requested part."""
+    reports = []
     for name in parts if options.part == "all" else (options.part,):
         start = time.perf_counter()
-        reports[name] = parts[name](options)
+        reports.append(parts[name](options))
         progress(name, f"{time.perf_counter() - start:.0f} s")
-    sections = {k: text for report in reports.values() for k, text in report.sections.items()}
-    figures = {name: report.figures for name, report in reports.items()}
-    return Report(sections, figures, any(report.broken for report in reports.values()))
+    return reports
 
 
 def run_cases(function: Callable[[Any], Any], cases: Iterable[Any], jobs: int | None) -> list[Any]:

@@ -46,33 +46,11 @@ def sections() -> list[tuple[str, str, str]]:
 
 def section(name: str) -> str:
     """Return the text between the markers of this name."""
-    if name == REFINEMENT:
-        cells = " | ".join(f"{cell:g} mm" for cell in figure_6.TABLE.cells)
-        return table(f"speed ± averaging ± grid (mm/s), cells of | {cells}", refinement())
     words = {True: "yes", False: "**no**", None: "–"}
     return table(
         "the paper | computed here | agrees",
         ((claim.paper, claim.computed, words[claim.agrees]) for claim in GROUPS[name]()),
     )
-
-
-def constants() -> Iterator[Claim]:
-    """Return the claims on the fish's constants, the defaults of the configuration."""
-    stated = (
-        ("ω₀", 12.5, "omega0", "rad/s"),
-        ("ξ", 1.2, "xi", ""),
-        ("λ", 0.46, "coupling", ""),
-        ("Ω", 5.8, "servo_speed", "rad/s"),
-        ("Δ", 0.29, "servo_lag", "rad"),
-        ("K", 12.9e-3, "thrust_coefficient", "N s²/rad²"),
-    )
-    for symbol, value, name, unit in stated:
-        mine = getattr(PLANT, name)
-        yield Claim(
-            f"{symbol} = {value:g} {unit}".rstrip(), f"`plant.{name}` {mine:g}", mine == value
-        )
-    tick = Config().tick
-    yield Claim("one control step every 50 ms", f"`tick` {tick:g} s", tick == 0.05)
 
 
 def equations() -> Iterator[Claim]:
@@ -248,11 +226,6 @@ def learning() -> Iterator[Claim]:
         f"figure 3; 10⁵ steps are {1e5 * Config().tick / 60:.0f} min",
         None,
     )
-    yield Claim(
-        "an update every 768 steps, policy and value saved every 5000 steps",
-        "settings of [learning-paper.yaml](../../config/learning-paper.yaml)",
-        None,
-    )
     seen = read(figure_3.NAME, source=figure_3.SEEN)
     amplitudes = column(seen, "amplitude_rad")
     forces = [read(figure_3.NAME, source=figure_3.LEARNT, amplitude_rad=a)[0] for a in amplitudes]
@@ -268,13 +241,6 @@ def learning() -> Iterator[Claim]:
         f"frequencies {max(apart):.2f} Hz apart at most, thrust {min(ratios):.1%} to "
         f"{max(ratios):.1%} of that from forces, over {len(seen)} amplitudes",
         max(apart) <= NEAR * max(column(forces, "frequency_Hz")) and min(ratios) > 1.0 - NEAR,
-    )
-    yield Claim(
-        "from images: 4 frames of 84 × 84, compressed to 512 numbers",
-        "settings of [learning-camera-paper.yaml](../../config/learning-camera-paper.yaml); the "
-        "points of figure 3 have the feature extractor `modes`, see "
-        "[the camera](../how-to/camera.md)",
-        None,
     )
 
 
@@ -315,18 +281,6 @@ def swimming() -> Iterator[Claim]:
     )
 
 
-def refinement() -> Iterator[tuple[str, str, str, str]]:
-    """Return the table of swims, with their speeds on cells of each size."""
-    stored = figure_6.TABLE
-    for controller, setting in figure_6.REFINED + figure_6.FINE_SWIMS:
-        what = f"C = {setting:g}" if controller == "swing" else f"{setting:g} Hz"
-        rows = [stored.row(figure_6.Case(controller, setting, cell)) for cell in stored.cells]
-        yield (
-            f"{controller}, {what}",
-            *(_speed(row) if row else "–" for row in rows),
-        )
-
-
 def _speed(row: dict[str, Any]) -> str:
     """Return speed ± averaging, and ± grid where that is known."""
     text = f"{row['speed_mm_per_s']:.2f} ± {row['ci95_mm_per_s']:.2f}"
@@ -364,7 +318,6 @@ def _close(value: float, stated: float) -> bool:
 
 
 GROUPS: dict[str, Callable[[], Iterator[Claim]]] = {
-    "constants": constants,
     "equations": equations,
     "optimal control": control,
     "waveforms": waveforms,
@@ -372,5 +325,4 @@ GROUPS: dict[str, Callable[[], Iterator[Claim]]] = {
     "learning": learning,
     "free swimming": swimming,
 }
-REFINEMENT = "refinement"
-SECTIONS = (*GROUPS, REFINEMENT)
+SECTIONS = tuple(GROUPS)

@@ -24,7 +24,7 @@ _TOO_SLOW_PROCESSOR = "brcm,bcm2835"
 """Processor of a Pi 1, Zero and Zero W, with one slow core, in the device tree."""
 _HEADER_OF_PI_5 = "1f000*"
 """Devices of the RP1, the chip of the header of a Pi 5, if the kernel supports it."""
-_RASPBERRY_PI_OS = "use Raspberry Pi OS, or see 'Which system' in docs/how-to/installing.md"
+_RASPBERRY_PI_OS = "use Raspberry Pi OS, or see 'Which system' in docs/how-to/install.md"
 
 
 def model(context: Context) -> Result:

@@ -109,9 +109,7 @@ def test_the_kernel_drives_the_servo_where_pigpiod_cannot(
     done = pi.install(POLICY=policy)
     assert (done.returncode, done.stderr) == (0, "")
     assert pi.commands() == [f"apt-get install --yes {package}", "raspi-config nonint do_i2c 0"]
-    assert "the kernel drives the servo, as step 2b of docs/how-to/installing.md says" in (
-        done.stdout
-    )
+    assert "the kernel drives the servo, as step 2b of docs/how-to/install.md says" in (done.stdout)
 
 
 def test_a_speed_of_the_bus_that_is_set_stays(pi: Pi) -> None:

@@ -11,8 +11,8 @@ import pytest
 from msgspec import UNSET, UnsetType
 from msgspec.structs import replace
 from rigs.harness import Rig, Scripted, fragile_rig, observe
+from rigs.reversed_force import ReversedSensor, reversed_robot
 
-from common.reversed_force import ReversedSensor, reversed_robot
 from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.core.errors import Refused
 from fishd.core.signals import Measurement, Observation, Tick

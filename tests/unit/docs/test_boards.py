@@ -26,7 +26,7 @@ REPORT = BenchReport(
 
 def test_the_page_has_a_row_for_each_report_in_the_folder() -> None:
     text = boards.reference(boards.read(DOCS / "boards"))
-    assert between(DOCS / "reference" / "boards.md", "boards") == text
+    assert between(DOCS / "how-to" / "bench.md", "boards") == text
 
 
 def test_a_report_fills_the_row_of_its_board_and_the_others_are_untested(tmp_path: Path) -> None:

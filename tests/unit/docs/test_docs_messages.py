@@ -177,31 +177,12 @@ NEGATIONS = (
 )  # fmt: skip
 
 
-IN_GAPS = (
-    "another fishd (pid 812)",
-    "not connected: Connection",
-    "not connected: no answer",
-    "cannot start",
-    "load 2",
-    "servo driver",
-)
-"""Phrases that fill gaps, where other words would be as correct."""
-
-
 def falsify(line: str) -> Iterator[str]:
     """Yield a line with one word dropped that is not a value, or with its meaning negated."""
-    gaps = {
-        place
-        for phrase in IN_GAPS
-        for match in re.finditer(re.escape(phrase), line)
-        for place in range(match.start(), match.end())
-    }
     for word in re.finditer(r"(?<!\S)[a-zA-Z]{2,}(?!\S) ", line):
-        if word.start() not in gaps:
-            yield line[: word.start()] + line[word.end() :]
+        yield line[: word.start()] + line[word.end() :]
     for said, contrary in NEGATIONS:
-        place = line.find(said)
-        if place >= 0 and place not in gaps:
+        if said in line:
             yield line.replace(said, contrary, 1)
 
 

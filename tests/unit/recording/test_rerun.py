@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 from rigs.harness import Rig, fragile_rig
 from rigs.recordings import record_run, status
+from rigs.reversed_force import reversed_robot
 
-from common.reversed_force import reversed_robot
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError, RecordingError

@@ -136,7 +136,7 @@ def run(bench: Bench, output: Path, print_line: Print | None) -> int:
         write_atomically(stem.with_suffix(".json"), data + b"\n", new=True)
         write_atomically(stem.with_suffix(".md"), page(report), new=True)
     if print_line:
-        echo(f"{stem}.json and {stem}.md: written; send both, see docs/reference/boards.md")
+        echo(f"{stem}.json and {stem}.md: written; send both, see docs/how-to/bench.md")
     else:
         print_json(report)
     return int(any(finding.level == "FAIL" for finding in report.findings))

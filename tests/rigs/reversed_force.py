@@ -1,4 +1,4 @@
-"""Robot with reversed F_y, for tests and measurements."""
+"""Robot with reversed F_y."""
 
 import dataclasses
 
