@@ -239,4 +239,9 @@ def measure(options: Namespace) -> Report:
     )
     name = "bench adapt" if options.kind == "harsh" else "bench adapt foreign"
     sections = {name: table(head, map(row, results)), f"{name} summary": summary(results)}
-    return Report(sections, results)
+    errors = [
+        (gait.thrust - (gait.true_thrust or 0.0)) / (gait.total_ci95 or gait.thrust_ci95)
+        for result in results
+        for gait in result.contenders.values()
+    ]
+    return Report(sections, results, errors={f"adapt, {options.kind} fish": errors})
