@@ -40,6 +40,8 @@ class Measurement(Struct, frozen=True, gc=False):
     """Extremes of the samples in the means, if the sensor provides them."""
     fin_velocity: float | None = None
     """Fin angular velocity at the newest sample, if a sensor measures it [rad/s]."""
+    mean_time: float | None = None
+    """Mean time of the samples in the means [s, monotonic]; None if unknown."""
 
 
 class Observation(Struct, frozen=True, gc=False):
@@ -225,6 +227,14 @@ class Tick(Struct, frozen=True, gc=False):
         note(
             "Reason not to trust `fx` and `fy`; absent if there is none. Estimators and "
             "controllers then get the values of the previous tick."
+        ),
+    ] = UNSET
+    force_age_ms: Annotated[
+        float | UnsetType,
+        unit(
+            "ms",
+            "Mean age of the samples of `fx` and `fy` at `time`, to which age the forces belong; "
+            "absent before the first sample.",
         ),
     ] = UNSET
 

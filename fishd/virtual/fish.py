@@ -57,7 +57,7 @@ class SimulatedFish:
             for watch in self._watches:
                 watch.add([Pair(now - duration, now, fx, fy)], "")
         fx, fy = self.calibration.forces(fx, fy)
-        return Measurement(time=now - 0.5 * duration / samples, fx=fx, fy=fy, samples=samples)
+        return Measurement(now, fx, fy, samples, mean_time=now - 0.5 * duration)
 
     def prepare(self) -> None:
         """Compute in advance what the next read needs, as far as that is possible."""

@@ -27,8 +27,9 @@ class WindowEvaluation:
 
     def measure(self, pairs: Sequence[Pair], calibration: ForceCalibration) -> Measurement:
         """Return the mean forces of at least one pair, with a reason if they are suspect."""
-        _, times, vxs, vys, clipped = zip(*pairs, strict=True)
+        begins, times, vxs, vys, clipped = zip(*pairs, strict=True)
         count = len(pairs)
+        mean_time = 0.5 * (sum(begins) + sum(times)) / count
         fx, fy = calibration.forces(sum(vxs) / count, sum(vys) / count)
         newest = times[-1]
         # Both detectors need every window, even if another reason makes this one suspect.
@@ -40,7 +41,7 @@ class WindowEvaluation:
             or frozen_y
             or self._beyond_limit(extremes, calibration)
         )
-        return Measurement(newest, fx, fy, count, suspect, extremes)
+        return Measurement(newest, fx, fy, count, suspect, extremes, mean_time=mean_time)
 
     def interrupt(self) -> None:
         """Restart the detection of frozen codes, because samples stopped arriving."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from fishd.core import text
 from fishd.core.dataframes import ticks_to_frame
-from fishd.core.errors import ParameterError
+from fishd.core.errors import ParameterError, RecordingError
 from fishd.core.schema import suggest
 from fishd.lab.identification.fit import (
     BOUNDS,
@@ -28,6 +28,7 @@ from fishd.lab.identification.fit import (
 )
 from fishd.lab.identification.misfit import all_white, find_missing_parameters
 from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifiable, passages
+from fishd.lab.identification.pulses import place_pulses
 from fishd.lab.identification.result import Identification
 from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, summarise
 from fishd.lab.limits import find_excess
@@ -81,6 +82,7 @@ def identify(
     rig: SimulationSettings | None = None,
     fit: Sequence[str] | None = None,
     fix: Sequence[str] = (),
+    pulse_period: float | None = None,
 ) -> Identification:
     """Fit a fish and its rig to recorded runs.
 
@@ -93,6 +95,8 @@ def identify(
     fix: parameters that are excluded from the fit. With `lateral_inertia_ratio`, K_y/K is as in
         `start`, and the intervals of K, λ and K_d are much narrower; likewise with `coupling`, if
         λ was measured
+    pulse_period: period of the servo's pulses [s], 0 for none; by default that of the servo in the
+        configuration of a recording, and none for a table
 
     Raises `Unidentifiable` for runs without usable data, `ParameterError` for a name that cannot
     be fitted, and the errors of `fishd.recording.read`.
@@ -101,13 +105,24 @@ def identify(
     given_values["rotation"] = (rig or SimulationSettings()).rotation
     further = tuple(name for name in FURTHER if fit is None and name not in fix)
     names = check((*DEFAULT, *filter(given_values.get, FURTHER)) if fit is None else fit, fix)
-    parts = passages([_to_frame(run) for run in _to_list(runs)])
+    opened = [_open(run) for run in _to_list(runs)]
+    periods = [_pulse_period(run) if pulse_period is None else pulse_period for run in opened]
+    parts = passages([_to_frame(run) for run in opened], periods)
     _refuse_unusable(parts)
     values = {name: float(given_values[name]) for name in POSSIBLE}
     scale_is_free = _scale_is_free(names, values)
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
+    if any(part.pulse_period for part in parts):
+        rough = Problem(parts, names, _SETTLE_S)
+        first = solve(rough, _start_values(values, names, *_STARTS[0]), 1, _ROUGH_STEPS)
+        parts = place_pulses(parts, rough, first, _SETTLE_S)
     problem, values = _solve_from_starts(parts, names, values, further)
+    placed = place_pulses(parts, problem, values, _SETTLE_S)
+    if any(new is not old for new, old in zip(placed, parts, strict=True)):
+        parts = placed
+        problem = Problem(parts, problem.names, _SETTLE_S)
+        values = solve(problem, values)
     settle = _settling_time(values)
     if settle > _SETTLE_S:
         longer = [part for part in parts if part.duration > settle + MIN_PASSAGE_S]
@@ -144,11 +159,27 @@ def _to_list(runs: object) -> list[object]:
     return list(runs) if is_list else [runs]  # type: ignore[call-overload]
 
 
-def _to_frame(run: object) -> "DataFrame":
-    from fishd.recording import Run, open_run
+def _open(run: object) -> object:
+    from fishd.recording import open_run
 
-    if isinstance(run, str | os.PathLike):
-        run = open_run(run)
+    return open_run(run) if isinstance(run, str | os.PathLike) else run
+
+
+def _pulse_period(run: object) -> float:
+    """Return the period of the pulses of the servo of a recording [s]; 0 for another run."""
+    from fishd.recording import Run
+
+    if not isinstance(run, Run):
+        return 0.0
+    try:
+        return run.config.pulse_period
+    except RecordingError:  # without a configuration, or with a driver that is not installed here
+        return 0.0
+
+
+def _to_frame(run: object) -> "DataFrame":
+    from fishd.recording import Run
+
     if isinstance(run, Run):
         unit = run.summary.force_unit
         if unit != "N":

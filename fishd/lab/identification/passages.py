@@ -1,7 +1,8 @@
 """Passages: recorded ticks without a gap, each of which can be simulated from its start."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,13 +10,17 @@ from numpy.typing import NDArray
 
 from fishd.core.errors import FishdError
 from fishd.core.old_names import OLD_NAMES
-from fishd.lab.identification.response import Array
+from fishd.lab.identification.response import Array, Timing, even_timing
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 COLUMNS = ("time", "seq", "missed_slots", "fx", "fy", "phi_c", "servo_on", "samples")
 """Columns of a table of ticks that an identification reads."""
+_AGES = ("sample_age_ms", "force_age_ms", "lateness_us")
+"""Columns that say when the force was sampled; they are not in tables of other rigs."""
+_MAX_SAMPLES = 40
+"""Largest number of samples in a period; more would not change the mean force."""
 MIN_PASSAGE_S = 5.0
 """Length of the shortest passage that is used [s]."""
 _MAX_WINDOW_SLOTS = 20
@@ -32,8 +37,8 @@ class Passage:
 
     tick: float
     """Period of the loop [s]."""
-    samples: int
-    """Samples of the force in each period."""
+    timing: Timing
+    """Times of commands and samples."""
     commands: Array
     """φ_c in each slot of one period [rad], shape (slots,)."""
     ends: NDArray[np.int_]
@@ -42,6 +47,8 @@ class Passage:
     """Mean F_x and F_y of each window as measured [N], shape (2, windows)."""
     times: Array
     """End of each window, as time since the first tick of all [s], shape (windows,)."""
+    pulse_period: float
+    """Period of the servo's pulses [s]; 0 if commands need not wait for one."""
 
     @property
     def duration(self) -> float:
@@ -49,14 +56,16 @@ class Passage:
         return float(self.ends[-1] * self.tick)
 
 
-def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
+def passages(tables: "Sequence[DataFrame]", pulse_periods: Sequence[float] = ()) -> list[Passage]:
     """Return the passages of runs, in order.
 
+    pulse_periods: period of the servo's pulses of each run [s]; 0, the default, for none
     Raises `Unidentifiable` where no passage is long enough, or a column is missing.
     """
     usable = []
     begin = 0.0
-    for table in (table.rename(columns=OLD_NAMES["tick"]) for table in tables):
+    for table, pulse_period in zip_longest(tables, pulse_periods, fillvalue=0.0):
+        table = table.rename(columns=OLD_NAMES["tick"])
         missing = [name for name in COLUMNS if name not in table]
         if missing:
             raise Unidentifiable(
@@ -65,14 +74,15 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
             )
         if len(table) < 2:
             continue
-        columns = {name: table[name].to_numpy() for name in COLUMNS}
+        ages = _AGES if all(name in table for name in _AGES) else ()
+        columns = {name: table[name].to_numpy() for name in (*COLUMNS, *ages)}
         if "elapsed" in table:  # of a recording: it increases across restarts of fishd, too
             columns["time"] = table["elapsed"].to_numpy()
         if "suspect" in table:  # a suspect force counts as missing
             columns["samples"] = np.where(table["suspect"].fillna("") == "", columns["samples"], 0)
         tick = _period(columns)
         for rows in _unbroken_rows(columns):
-            passage = _passage(columns, rows, tick, begin)
+            passage = _passage(columns, rows, tick, begin, pulse_period)
             if passage.duration >= MIN_PASSAGE_S:
                 usable.append(passage)
         begin += float(columns["time"][-1] - columns["time"][0])
@@ -113,7 +123,9 @@ def _unbroken_rows(columns: dict[str, Array]) -> Iterator[slice]:
             yield slice(int(start), int(stop))
 
 
-def _passage(columns: dict[str, Array], rows: slice, tick: float, begin: float) -> Passage:
+def _passage(
+    columns: dict[str, Array], rows: slice, tick: float, begin: float, pulse_period: float
+) -> Passage:
     """Return the passage of these rows; begin: time of the first tick of the table [s]."""
     slots = 1 + np.diff(columns["missed_slots"][rows]).astype(int)
     phi_c = columns["phi_c"][rows].astype(float)
@@ -121,11 +133,33 @@ def _passage(columns: dict[str, Array], rows: slice, tick: float, begin: float) 
     commands = np.repeat(phi_c[:-1], slots)
     forces = np.stack((columns["fx"][rows], columns["fy"][rows])).astype(float)[:, 1:]
     times = begin + (columns["time"][rows][1:] - columns["time"][0]).astype(float)
+    ends = np.concatenate(([0], np.cumsum(slots)))
+    samples = max(1, round(float(np.median(columns["samples"][rows][1:] / slots))))
+    timing = even_timing(ends, tick, min(samples, _MAX_SAMPLES))
+    if _AGES[0] in columns:
+        timing = _with_spans(timing, *(columns[name][rows][1:].astype(float) for name in _AGES))
     return Passage(
         tick=tick,
-        samples=max(1, round(float(np.median(columns["samples"][rows][1:] / slots)))),
+        timing=timing,
         commands=commands,
-        ends=np.concatenate(([0], np.cumsum(slots))),
+        ends=ends,
         forces=forces,
         times=times,
+        pulse_period=pulse_period,
     )
+
+
+def _with_spans(timing: Timing, newest_ms: Array, mean_ms: Array, lateness_us: Array) -> Timing:
+    """Return a timing with the true spans of samples, where their ages are plausible.
+
+    newest_ms: age of the newest sample of each window at the start of its tick
+    mean_ms: mean age of its samples at the deadline of that tick, `lateness_us` earlier
+    """
+    begins, ends = timing.spans
+    last = ends + 1e-6 * lateness_us - 1e-3 * newest_ms
+    first = 2.0 * (ends - 1e-3 * mean_ms) - last
+    with np.errstate(invalid="ignore", over="ignore"):
+        plausible = (
+            (np.abs(first - begins) < timing.tick) & (np.abs(last - ends) < timing.tick)
+        ) & (first < last)
+    return replace(timing, spans=np.where(plausible, (first, last), timing.spans))

@@ -297,7 +297,8 @@ class Restless(Wrapped):
         extremes = Extremes(*self.next_values(4))
         # A drift, so that the zero is known
         forces = (1e-3 * force for force in self.next_values(2))
-        return Measurement(now - self.reads * 1e-6, *forces, self.reads, "", extremes)
+        time = now - self.reads * 1e-6
+        return Measurement(time, *forces, self.reads, "", extremes, mean_time=time - 0.02)
 
 
 ABSENT = {"x", "y", "speed", "heading", "leak", "suspect", "fy_corrected"}
