@@ -264,11 +264,6 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
         return find_kind(self.robot)
 
     @property
-    def pulse_period(self) -> float:
-        """Period of the servo's pulses [s]; 0 for a fish without a servo driver."""
-        return self.servo.pulse_period if self.kind.has_hardware else 0.0
-
-    @property
     def driver_settings(self) -> DriverSettings:
         """Settings of the drivers."""
         return DriverSettings(self.force_sensor, self.servo, self.power_meter)

@@ -65,6 +65,11 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         return 0.02
 
     @property
+    def pulse_steps(self) -> tuple[float, ...]:
+        """Steps [µs] to one of which a pulse of whole µs is rounded down; empty for exact pulses."""
+        return ()
+
+    @property
     def calibration(self) -> ServoCalibration:
         """Calibration that the settings themselves contain."""
         return ServoCalibration(**_calibration_values(self))

@@ -18,6 +18,7 @@ from fishd.core import text
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError, RecordingError
 from fishd.core.schema import suggest
+from fishd.hardware.settings import ServoSettings
 from fishd.lab.identification.fit import (
     BOUNDS,
     FURTHER,
@@ -82,7 +83,7 @@ def identify(
     rig: SimulationSettings | None = None,
     fit: Sequence[str] | None = None,
     fix: Sequence[str] = (),
-    pulse_period: float | None = None,
+    servo: ServoSettings | None = None,
 ) -> Identification:
     """Fit a fish and its rig to recorded runs.
 
@@ -95,8 +96,8 @@ def identify(
     fix: parameters that are excluded from the fit. With `lateral_inertia_ratio`, K_y/K is as in
         `start`, and the intervals of K, λ and K_d are much narrower; likewise with `coupling`, if
         λ was measured
-    pulse_period: period of the servo's pulses [s], 0 for none; by default that of the servo in the
-        configuration of a recording, and none for a table
+    servo: calibrated settings of the servo whose pulses carried the commands of tables; that of a
+        recording of a robot is known
 
     Raises `Unidentifiable` for runs without usable data, `ParameterError` for a name that cannot
     be fitted, and the errors of `fishd.recording.read`.
@@ -106,14 +107,14 @@ def identify(
     further = tuple(name for name in FURTHER if fit is None and name not in fix)
     names = check((*DEFAULT, *filter(given_values.get, FURTHER)) if fit is None else fit, fix)
     opened = [_open(run) for run in _to_list(runs)]
-    periods = [_pulse_period(run) if pulse_period is None else pulse_period for run in opened]
-    parts = passages([_to_frame(run) for run in opened], periods)
+    servos = [_servo(run, servo) for run in opened]
+    parts = passages([_to_frame(run) for run in opened], servos)
     _refuse_unusable(parts)
     values = {name: float(given_values[name]) for name in POSSIBLE}
     scale_is_free = _scale_is_free(names, values)
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
-    if any(part.pulse_period for part in parts):
+    if any(part.servo for part in parts):
         rough = Problem(parts, names, _SETTLE_S)
         first = solve(rough, _start_values(values, names, *_STARTS[0]), 1, _ROUGH_STEPS)
         parts = place_pulses(parts, rough, first, _SETTLE_S)
@@ -165,16 +166,19 @@ def _open(run: object) -> object:
     return open_run(run) if isinstance(run, str | os.PathLike) else run
 
 
-def _pulse_period(run: object) -> float:
-    """Return the period of the pulses of the servo of a recording [s]; 0 for another run."""
+def _servo(run: object, given: ServoSettings | None) -> ServoSettings | None:
+    """Return the calibrated settings of the servo of a recording, or those given for a table."""
     from fishd.recording import Run
 
     if not isinstance(run, Run):
-        return 0.0
+        return given
     try:
-        return run.config.pulse_period
-    except RecordingError:  # without a configuration, or with a driver that is not installed here
-        return 0.0
+        config = run.config
+    except RecordingError:  # there is none, or it has a driver that is not installed here
+        return None
+    if not config.kind.has_hardware:
+        return None
+    return config.servo.calibrated(run.calibrations[0].servo) if run.calibrations else config.servo
 
 
 def _to_frame(run: object) -> "DataFrame":

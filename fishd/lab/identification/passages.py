@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fishd.core.errors import FishdError
 from fishd.core.old_names import OLD_NAMES
+from fishd.hardware.settings import ServoSettings
 from fishd.lab.identification.response import Array, Timing, even_timing
 
 if TYPE_CHECKING:
@@ -47,8 +48,10 @@ class Passage:
     """Mean F_x and F_y of each window as measured [N], shape (2, windows)."""
     times: Array
     """End of each window, as time since the first tick of all [s], shape (windows,)."""
-    pulse_period: float
-    """Period of the servo's pulses [s]; 0 if commands need not wait for one."""
+    servo: ServoSettings | None
+    """Calibrated settings of the servo; None if no pulses carry its commands."""
+    angles: Array
+    """Angles that the pulses stand for, in each slot [rad], shape (slots,)."""
 
     @property
     def duration(self) -> float:
@@ -56,15 +59,17 @@ class Passage:
         return float(self.ends[-1] * self.tick)
 
 
-def passages(tables: "Sequence[DataFrame]", pulse_periods: Sequence[float] = ()) -> list[Passage]:
+def passages(
+    tables: "Sequence[DataFrame]", servos: Sequence[ServoSettings | None] = ()
+) -> list[Passage]:
     """Return the passages of runs, in order.
 
-    pulse_periods: period of the servo's pulses of each run [s]; 0, the default, for none
+    servos: calibrated settings of the servo of each run; None, the default, for no pulses
     Raises `Unidentifiable` where no passage is long enough, or a column is missing.
     """
     usable = []
     begin = 0.0
-    for table, pulse_period in zip_longest(tables, pulse_periods, fillvalue=0.0):
+    for table, servo in zip_longest(tables, servos):
         table = table.rename(columns=OLD_NAMES["tick"])
         missing = [name for name in COLUMNS if name not in table]
         if missing:
@@ -82,7 +87,7 @@ def passages(tables: "Sequence[DataFrame]", pulse_periods: Sequence[float] = ())
             columns["samples"] = np.where(table["suspect"].fillna("") == "", columns["samples"], 0)
         tick = _period(columns)
         for rows in _unbroken_rows(columns):
-            passage = _passage(columns, rows, tick, begin, pulse_period)
+            passage = _passage(columns, rows, tick, begin, servo)
             if passage.duration >= MIN_PASSAGE_S:
                 usable.append(passage)
         begin += float(columns["time"][-1] - columns["time"][0])
@@ -124,7 +129,7 @@ def _unbroken_rows(columns: dict[str, Array]) -> Iterator[slice]:
 
 
 def _passage(
-    columns: dict[str, Array], rows: slice, tick: float, begin: float, pulse_period: float
+    columns: dict[str, Array], rows: slice, tick: float, begin: float, servo: ServoSettings | None
 ) -> Passage:
     """Return the passage of these rows; begin: time of the first tick of the table [s]."""
     slots = 1 + np.diff(columns["missed_slots"][rows]).astype(int)
@@ -145,7 +150,8 @@ def _passage(
         ends=ends,
         forces=forces,
         times=times,
-        pulse_period=pulse_period,
+        servo=servo,
+        angles=commands,
     )
 
 
