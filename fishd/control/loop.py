@@ -525,4 +525,5 @@ class ControlLoop:
             fy_corrected=True if corrected else UNSET,
             suspect=text.line(measurement.suspect) if measurement.suspect else UNSET,
             force_age_ms=UNSET if mean_time is None else (slot.deadline - mean_time) * 1e3,
+            force_span_ms=UNSET if mean_time is None else measurement.span * 1e3,
         )

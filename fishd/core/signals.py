@@ -42,6 +42,8 @@ class Measurement(Struct, frozen=True, gc=False):
     """Fin angular velocity at the newest sample, if a sensor measures it [rad/s]."""
     mean_time: float | None = None
     """Mean time of the samples in the means [s, monotonic]; None if unknown."""
+    span: float = 0.0
+    """Time over which the samples are spread evenly, half of it after `mean_time` [s]."""
 
 
 class Observation(Struct, frozen=True, gc=False):
@@ -233,9 +235,13 @@ class Tick(Struct, frozen=True, gc=False):
         float | UnsetType,
         unit(
             "ms",
-            "Mean age of the samples of `fx` and `fy` at `time`, to which age the forces belong; "
-            "absent before the first sample.",
+            "Mean age of the samples of `fx` and `fy` at `time`, so the forces are those of so "
+            "long ago; absent before the first sample.",
         ),
+    ] = UNSET
+    force_span_ms: Annotated[
+        float | UnsetType,
+        unit("ms", "Time over which these samples are spread, half of it before their mean age."),
     ] = UNSET
 
 

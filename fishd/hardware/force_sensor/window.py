@@ -41,7 +41,12 @@ class WindowEvaluation:
             or frozen_y
             or self._beyond_limit(extremes, calibration)
         )
-        return Measurement(newest, fx, fy, count, suspect, extremes, mean_time=mean_time)
+        # Each pair stands for the time from one to the next.
+        spacing = (newest - times[0]) / (count - 1) if count > 1 else newest - begins[0]
+        span = count * spacing
+        return Measurement(
+            newest, fx, fy, count, suspect, extremes, mean_time=mean_time, span=span
+        )
 
     def interrupt(self) -> None:
         """Restart the detection of frozen codes, because samples stopped arriving."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 COLUMNS = ("time", "seq", "missed_slots", "fx", "fy", "phi_c", "servo_on", "samples")
 """Columns of a table of ticks that an identification reads."""
-_AGES = ("sample_age_ms", "force_age_ms", "lateness_us")
+_AGES = ("force_age_ms", "force_span_ms")
 """Columns that say when the force was sampled; they are not in tables of other rigs."""
 _MAX_SAMPLES = 40
 """Largest number of samples in a period; more would not change the mean force."""
@@ -155,17 +155,14 @@ def _passage(
     )
 
 
-def _with_spans(timing: Timing, newest_ms: Array, mean_ms: Array, lateness_us: Array) -> Timing:
-    """Return a timing with the true spans of samples, where their ages are plausible.
+def _with_spans(timing: Timing, age_ms: Array, span_ms: Array) -> Timing:
+    """Return a timing with the true spans of samples, where they are plausible.
 
-    newest_ms: age of the newest sample of each window at the start of its tick
-    mean_ms: mean age of its samples at the deadline of that tick, `lateness_us` earlier
+    age_ms: mean age of the samples of each window at its end; span_ms: length of their span
     """
     begins, ends = timing.spans
-    last = ends + 1e-6 * lateness_us - 1e-3 * newest_ms
-    first = 2.0 * (ends - 1e-3 * mean_ms) - last
-    with np.errstate(invalid="ignore", over="ignore"):
-        plausible = (
-            (np.abs(first - begins) < timing.tick) & (np.abs(last - ends) < timing.tick)
-        ) & (first < last)
-    return replace(timing, spans=np.where(plausible, (first, last), timing.spans))
+    middles, halves = ends - 1e-3 * age_ms, 0.5e-3 * span_ms
+    spans = np.stack((middles - halves, middles + halves))
+    with np.errstate(invalid="ignore"):
+        plausible = np.all(np.abs(spans - timing.spans) < timing.tick, axis=0) & (halves > 0.0)
+    return replace(timing, spans=np.where(plausible, spans, timing.spans))
