@@ -24,6 +24,7 @@ from fishd.lab.session import VirtualSession
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.pi.pulse_train import SERVO_FRAME
 from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.pi.tank import STEP
 from fishd.virtual.plant.parameters import PlantParameters
 
 RIG = SimulationSettings(noise=1e-3, rotation=radians(5), offset_x=0.02, offset_y=0.02, drift=5e-3)
@@ -102,7 +103,8 @@ def fish(kind: str, seed: int) -> Config:
     plant = PlantParameters(**varied)
     if kind != "pi":
         return Config(plant=plant, simulation=rig)
-    pi = VirtualPiSettings(pulse_lead=chance.uniform(0.0, SERVO_FRAME))
+    # The virtual Pi computes in whole steps.
+    pi = VirtualPiSettings(pulse_lead=chance.randrange(round(SERVO_FRAME / STEP)) * STEP)
     return Config(robot="virtual-pi", plant=plant, simulation=rig, virtual_pi=pi)
 
 

@@ -66,6 +66,8 @@ _SETTLE_TIME_CONSTANTS = 7.0
 """Time, in time constants of the fin, after which its initial state has no effect."""
 _ROUGH_STEPS = 12
 """Largest number of steps of a rough fit, which compares start values."""
+_MAX_PLACINGS = 4
+"""Largest number of rough fits that find the pulses of the servo."""
 _STARTS = tuple(product((1.0, 0.5, 2.0), (0.01, 0.06, 0.12)))
 """Start values: natural frequency, as a multiple of that of the given fish, and delay [s]."""
 REST_S = 4.0
@@ -115,15 +117,8 @@ def identify(
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
     if any(part.servo for part in parts):
-        rough = Problem(parts, names, _SETTLE_S)
-        first = solve(rough, _start_values(values, names, *_STARTS[0]), 1, _ROUGH_STEPS)
-        parts = place_pulses(parts, rough, first, _SETTLE_S)
+        parts = _with_pulses(parts, names, _start_values(values, names, *_STARTS[0]))
     problem, values = _solve_from_starts(parts, names, values, further)
-    placed = place_pulses(parts, problem, values, _SETTLE_S)
-    if any(new is not old for new, old in zip(placed, parts, strict=True)):
-        parts = placed
-        problem = Problem(parts, problem.names, _SETTLE_S)
-        values = solve(problem, values)
     settle = _settling_time(values)
     if settle > _SETTLE_S:
         longer = [part for part in parts if part.duration > settle + MIN_PASSAGE_S]
@@ -131,6 +126,20 @@ def identify(
         problem = Problem(parts, problem.names, settle)
         values = solve(problem, values)
     return summarise(parts, problem, values, given_values, scale_is_free)
+
+
+def _with_pulses(
+    parts: Sequence[Passage], names: tuple[str, ...], values: dict[str, float]
+) -> Sequence[Passage]:
+    """Return the passages with the likeliest pulses, which rough fits from `values` find."""
+    for _ in range(_MAX_PLACINGS):
+        problem = Problem(parts, names, _SETTLE_S)
+        values = solve(problem, values, rounds=1, steps=_ROUGH_STEPS)
+        placed = place_pulses(parts, problem, values, _SETTLE_S)
+        if all(new is old for new, old in zip(placed, parts, strict=True)):
+            break
+        parts = placed
+    return parts
 
 
 def _refuse_unusable(parts: Sequence[Passage]) -> None:
