@@ -235,13 +235,13 @@ class Tick(Struct, frozen=True, gc=False):
         float | UnsetType,
         unit(
             "ms",
-            "Mean age of the samples of `fx` and `fy` at `time`, so the forces are those of so "
-            "long ago; absent before the first sample.",
+            "Mean age of the samples of `fx` and `fy` at `time`: the forces are those at `time` "
+            "minus this; absent before the first sample.",
         ),
     ] = UNSET
     force_span_ms: Annotated[
         float | UnsetType,
-        unit("ms", "Time over which these samples are spread, half of it before their mean age."),
+        unit("ms", "Time over which these samples are spread evenly, from before to after that instant."),
     ] = UNSET
 
 

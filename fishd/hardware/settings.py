@@ -66,7 +66,7 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     @property
     def pulse_steps(self) -> tuple[float, ...]:
-        """Steps [µs] to one of which a pulse of whole µs is rounded down; empty for exact pulses."""
+        """Possible steps [µs] to which pulses are rounded down; empty for exact pulses."""
         return ()
 
     @property

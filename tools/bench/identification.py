@@ -127,7 +127,7 @@ def one(run: tuple[str, int]) -> Outcome:
     # Nearly three whole periods of the drift, so that its mean is almost zero.
     intervals = {
         each.name: Interval(
-            truth[each.name], each.value, each.ci95_low, each.ci95_high, *each.narrowest_interval
+            truth[each.name], each.value, each.low, each.high, *each.narrowest_interval
         )
         for each in identification.estimates
         if each.fitted
@@ -170,18 +170,16 @@ def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
     errors, worst = [], 0.0
     for outcome in outcomes:
         for name, each in outcome.intervals.items():
-            if not np.isfinite(each.ci95_high):
+            if not np.isfinite(each.high):
                 withheld += 1
                 continue
             count += 1
-            holds = each.ci95_low <= each.truth <= each.ci95_high
+            holds = each.low <= each.truth <= each.high
             held += holds
             if name not in SCALED:
                 own, own_held = own + 1, own_held + holds
             narrow += each.known_low <= each.truth <= each.known_high
-            off = abs(each.truth - 0.5 * (each.ci95_low + each.ci95_high)) / (
-                0.5 * (each.ci95_high - each.ci95_low)
-            )
+            off = abs(each.truth - 0.5 * (each.low + each.high)) / (0.5 * (each.high - each.low))
             worst = max(worst, off)
             astray += outcome.trusted and off > 2.0
             if known and name in VARIED:

@@ -29,8 +29,8 @@ class WindowEvaluation:
         """Return the mean forces of at least one pair, with a reason if they are suspect."""
         begins, times, vxs, vys, clipped = zip(*pairs, strict=True)
         count, newest = len(pairs), times[-1]
-        # That many samples at equal distances over `span` have the variance in time of these,
-        # which are a quarter of the spacing from the middle of their pair.
+        # Evenly spread over `span`, that many samples have the same variance in time as the true
+        # ones, which are a quarter of the spacing from the middle of their pair.
         spacing = (newest - times[0]) / (count - 1) if count > 1 else newest - begins[0]
         span, weight = spacing * math.sqrt(count**2 + 0.75), 1.0 / count
         vx, vy, mean_time = sum(vxs), sum(vys), 0.5 * (sum(begins) + sum(times))

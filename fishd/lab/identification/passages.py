@@ -160,8 +160,7 @@ def _with_spans(timing: Timing, age_ms: Array, span_ms: Array) -> Timing:
 
     age_ms: mean age of the samples of each window at its end; span_ms: length of their span
     """
-    begins, ends = timing.spans
-    middles, halves = ends - 1e-3 * age_ms, 0.5e-3 * span_ms
+    middles, halves = timing.spans[1] - 1e-3 * age_ms, 0.5e-3 * span_ms
     spans = np.stack((middles - halves, middles + halves))
     with np.errstate(invalid="ignore"):
         plausible = np.all(np.abs(spans - timing.spans) < timing.tick, axis=0) & (halves > 0.0)

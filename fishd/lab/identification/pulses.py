@@ -1,4 +1,4 @@
-"""Wait of commands for a pulse of the servo, and widths of the pulses, found from the forces.
+"""Wait of commands for a pulse of the servo, and widths of the pulses, estimated from forces.
 
 A servo takes a new angle with its next pulse. Pulses come in a fixed period that usually does not
 divide that of the loop: with 20 ms and a tick of 50 ms, two waits that differ by 10 ms alternate.
@@ -35,7 +35,7 @@ def place_pulses(
 
 
 def _place(part: Passage, problem: Problem, values: dict[str, float], settle: float) -> Passage:
-    """Return the best candidate, each with the parameters of a fit of its own, to first order."""
+    """Return the candidate with the best fit; each is fitted to first order."""
     own = Problem([part], problem.names, settle)
     own.noise = problem.noise
     basis, _ = np.linalg.qr(own.jacobian(values).reshape(-1, len(problem.names)))

@@ -72,8 +72,8 @@ class VirtualPiSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         float,
         unit(
             "s",
-            "Time by which the frames of its pulses, 20 ms each, begin before the ticks do: the "
-            "first frame of a run in virtual time is so long under way at the first tick.",
+            "Time of the first tick of a run in virtual time after the begin of a frame of the "
+            "pulses, which is 20 ms long.",
             ge=0,
             lt=0.02,
         ),

@@ -303,7 +303,9 @@ class Restless(Wrapped):
         # A drift, so that the zero is known
         forces = (1e-3 * force for force in self.next_values(2))
         time = now - self.reads * 1e-6
-        return Measurement(time, *forces, self.reads, "", extremes, mean_time=time - 0.02, span=time)
+        return Measurement(
+            time, *forces, self.reads, "", extremes, mean_time=time - 0.02, span=time
+        )
 
 
 ABSENT = {"x", "y", "speed", "heading", "leak", "suspect", "fy_corrected"}

@@ -324,7 +324,9 @@ def swim_with_pulses(settings: ServoSettings, phase: float, step: float) -> pd.D
     phase: begin of a pulse after the first tick [s]; step: pulses are rounded down to it [µs]
     """
     chance = np.random.default_rng(3)
-    commands = np.repeat(chance.choice([-0.42, -0.168, 0.168, 0.42], 90), chance.integers(4, 12, 90))
+    commands = np.repeat(
+        chance.choice([-0.42, -0.168, 0.168, 0.42], 90), chance.integers(4, 12, 90)
+    )
     commands[:40] = 0.0
     fish = TetheredFish(FISH)
     rows, active = [], 0.0
