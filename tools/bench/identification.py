@@ -127,7 +127,7 @@ def one(run: tuple[str, int]) -> Outcome:
     # Nearly three whole periods of the drift, so that its mean is almost zero.
     intervals = {
         each.name: Interval(
-            truth[each.name], each.value, each.low, each.high, *each.narrowest_interval
+            truth[each.name], each.value, each.ci95_low, each.ci95_high, *each.narrowest_interval
         )
         for each in identification.estimates
         if each.fitted

@@ -129,8 +129,8 @@ def identify(
 
 
 def _with_pulses(
-    parts: Sequence[Passage], names: tuple[str, ...], values: dict[str, float]
-) -> Sequence[Passage]:
+    parts: list[Passage], names: tuple[str, ...], values: dict[str, float]
+) -> list[Passage]:
     """Return the passages with the likeliest pulses, which rough fits from `values` find."""
     for _ in range(_MAX_PLACINGS):
         problem = Problem(parts, names, _SETTLE_S)

@@ -109,7 +109,8 @@ def even_timing(ends: NDArray[np.int_], tick: float, samples: int) -> Timing:
     """
     steps = math.ceil(tick / MAX_STEP_S - 1e-9)
     spans = np.stack((ends[:-1], ends[1:])) * tick
-    return Timing(tick, np.arange(ends[-1]) * tick, spans, samples * np.diff(ends), steps)
+    begins: Array = np.arange(ends[-1]) * tick
+    return Timing(tick, begins, spans, samples * np.diff(ends), steps)
 
 
 def response(
