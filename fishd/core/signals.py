@@ -241,7 +241,7 @@ class Tick(Struct, frozen=True, gc=False):
     ] = UNSET
     force_span_ms: Annotated[
         float | UnsetType,
-        unit("ms", "Time over which these samples are spread evenly, from before to after that instant."),
+        unit("ms", "Time over which these samples are spread evenly, around that instant."),
     ] = UNSET
 
 

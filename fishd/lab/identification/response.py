@@ -108,7 +108,7 @@ def even_timing(ends: NDArray[np.int_], tick: float, samples: int) -> Timing:
     samples: number of samples in each period
     """
     steps = math.ceil(tick / MAX_STEP_S - 1e-9)
-    spans = np.stack((ends[:-1], ends[1:])) * tick
+    spans: Array = np.stack((ends[:-1], ends[1:])).astype(float) * tick
     begins: Array = np.arange(ends[-1]) * tick
     return Timing(tick, begins, spans, samples * np.diff(ends), steps)
 
