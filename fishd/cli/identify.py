@@ -28,6 +28,7 @@ from fishd.core.errors import FishdError
 from fishd.recording.reader import open_run
 
 if TYPE_CHECKING:
+    from fishd.hardware.settings import ServoSettings
     from fishd.lab.experiment import Experiment
     from fishd.lab.identification import Identification
 
@@ -109,16 +110,16 @@ def identify(
         swum = _swim_experiment(fish, seconds or DEFAULT_EXPERIMENT_S, place, as_json)
         if isinstance(swum, int):
             return swum
-        config, tables, kept = swum
+        config, tables, servo, kept = swum
         origin = f"an experiment with {fish}"
     else:
-        config, kept = load(fish.file, fish.overrides), None
+        config, servo, kept = load(fish.file, fish.overrides), None, None
         check_tethered(config.robot, "identify")
         tables = [open_recording(run, None) for run in runs]
         origin = ", ".join(run.path.name for run in tables)
     with show_waiting("fitting the model to the forces"):
         identification = lab.identify(
-            tables, start=config.plant, rig=config.simulation, fit=names, fix=fixed
+            tables, start=config.plant, rig=config.simulation, fit=names, fix=fixed, servo=servo
         )
     result = identification.to_builtins() | {"origin": origin}
     if kept:
@@ -145,11 +146,11 @@ def _parse_names(listed: str) -> tuple[str, ...]:
 
 def _swim_experiment(
     fish: ChosenFish, seconds: float, place: ExperimentFolder, as_json: bool
-) -> "tuple[Config, list[Any], Experiment | None] | int":
+) -> "tuple[Config, list[Any], ServoSettings | None, Experiment | None] | int":
     """Swim an experiment, or the rest of one that is resumed.
 
-    Return the start configuration of the fit, the tables of ticks and the folder that is kept; the
-    exit status if it was interrupted.
+    Return the start configuration of the fit, the tables of ticks, the settings of the servo and
+    the folder that is kept; the exit status if it was interrupted.
     """
     from fishd.lab.identification import continue_experiment
     from fishd.recording.folder import list_recordings
@@ -177,7 +178,8 @@ def _swim_experiment(
             show_progress(seconds, "s", err=as_json) as bar,
         ):
             session.progress = bar.at
-            return config, continue_experiment(session, before, seconds), experiment
+            tables = continue_experiment(session, before, seconds)
+            return config, tables, session.servo, experiment
     return ending.interrupted("before the fit")
 
 

@@ -485,7 +485,7 @@ class ControlLoop:
         factor_ci95 = observation.thrust_factor_ci95 if swims else None
         truth = self.robot.truth() if self.robot.truth else None
         course = truth.course if truth else None
-        corrected = self.fy_corrected
+        corrected, mean_time = self.fy_corrected, measurement.mean_time
         return Tick(
             t=self._wall(),
             seq=self.seq,
@@ -524,4 +524,6 @@ class ControlLoop:
             leak=UNSET if self.found_leak is None else self.found_leak,
             fy_corrected=True if corrected else UNSET,
             suspect=text.line(measurement.suspect) if measurement.suspect else UNSET,
+            force_age_ms=UNSET if mean_time is None else (slot.deadline - mean_time) * 1e3,
+            force_span_ms=UNSET if mean_time is None else measurement.span * 1e3,
         )

@@ -40,6 +40,10 @@ class Measurement(Struct, frozen=True, gc=False):
     """Extremes of the samples in the means, if the sensor provides them."""
     fin_velocity: float | None = None
     """Fin angular velocity at the newest sample, if a sensor measures it [rad/s]."""
+    mean_time: float | None = None
+    """Mean time of the samples in the means [s, monotonic]; None if unknown."""
+    span: float = 0.0
+    """Time over which the samples are spread evenly, half of it after `mean_time` [s]."""
 
 
 class Observation(Struct, frozen=True, gc=False):
@@ -226,6 +230,18 @@ class Tick(Struct, frozen=True, gc=False):
             "Reason not to trust `fx` and `fy`; absent if there is none. Estimators and "
             "controllers then get the values of the previous tick."
         ),
+    ] = UNSET
+    force_age_ms: Annotated[
+        float | UnsetType,
+        unit(
+            "ms",
+            "Mean age of the samples of `fx` and `fy` at `time`: the forces are those at `time` "
+            "minus this; absent before the first sample.",
+        ),
+    ] = UNSET
+    force_span_ms: Annotated[
+        float | UnsetType,
+        unit("ms", "Time over which these samples are spread evenly, around that instant."),
     ] = UNSET
 
 

@@ -60,6 +60,16 @@ class ServoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     highest: Highest = 1.2
 
     @property
+    def pulse_period(self) -> float:
+        """Period of the pulses [s]: a new width waits for the next one."""
+        return 0.02
+
+    @property
+    def pulse_steps(self) -> tuple[float, ...]:
+        """Possible steps [µs] to which pulses are rounded down; empty for exact pulses."""
+        return ()
+
+    @property
     def calibration(self) -> ServoCalibration:
         """Calibration that the settings themselves contain."""
         return ServoCalibration(**_calibration_values(self))

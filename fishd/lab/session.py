@@ -27,6 +27,7 @@ from fishd.core.errors import (
 )
 from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Publisher, Reason, Tick
+from fishd.hardware.settings import ServoSettings
 from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:
@@ -102,6 +103,8 @@ class Session(ABC):
     """Unit of its forces: `N`, or that of the sensor until it is calibrated."""
     calibration: ForceCalibration
     """Calibration of its force sensor, for how well the gains are known."""
+    servo: ServoSettings | None = None
+    """Calibrated settings of its servo; None for a fish whose commands need no pulses."""
     source: "Source"
     """Source of the ticks, as a recording names it."""
     config: dict[str, Any]
@@ -257,6 +260,8 @@ class VirtualSession(Session):
         saved = robot.calibrated.sensor.calibration if robot.calibrated else EXACT
         self.calibration = calibration or saved
         self.unit = robot.force_unit
+        if robot.calibrated:
+            self.servo = config.servo.calibrated(robot.calibrated.servo.calibration)
 
     def _begin(self, config: Config) -> VirtualRun:
         run = VirtualRun(config, self._queue)
@@ -326,11 +331,14 @@ class LiveSession(Session):
         self.name = status.robot
         self.unit = status.force_unit
         has_hardware = find_kind(status.robot).has_hardware
-        self.calibration = fish.calibrations().force if has_hardware else EXACT
+        calibrations = fish.calibrations() if has_hardware else None
+        self.calibration = calibrations.force if calibrations else EXACT
         self.tick = status.tick
         self.amplitude = status.amplitude_limit
         self.source: Source = "fishd"
         self.config = fish.config()
+        if calibrations:
+            self.servo = self.read_config().servo.calibrated(calibrations.servo)
         self.fish = fish
         self._messages = fish.ticks_and_events()
         self._first_status = status

@@ -57,7 +57,8 @@ class SimulatedFish:
             for watch in self._watches:
                 watch.add([Pair(now - duration, now, fx, fy)], "")
         fx, fy = self.calibration.forces(fx, fy)
-        return Measurement(time=now - 0.5 * duration / samples, fx=fx, fy=fy, samples=samples)
+        newest, mean_time = now - 0.5 * duration / samples, now - 0.5 * duration
+        return Measurement(newest, fx, fy, samples, mean_time=mean_time, span=duration)
 
     def prepare(self) -> None:
         """Compute in advance what the next read needs, as far as that is possible."""

@@ -1,7 +1,8 @@
 """Errors of `fishctl identify` and coverage of its intervals, on known fish.
 
 Each fish swims one experiment of three minutes in virtual time, measured with noise, a rotated
-sensor, offsets and drift. Every fit begins with the default fish.
+sensor, offsets and drift. Every fit begins with the default fish. With `--on virtual-pi`, the true
+drivers measure and move the fish; the phase of the servo's pulses differs from fish to fish.
 """
 
 import random
@@ -15,11 +16,15 @@ import numpy as np
 
 from common.report import JOBS, Options, Report, run_cases, table
 from fishd.config import Config, load
+from fishd.core.calibration import EXACT
 from fishd.lab.compare.survey import harsh
 from fishd.lab.identification import experiment, identify
 from fishd.lab.identification.summary import SCALED
 from fishd.lab.session import VirtualSession
 from fishd.virtual.imperfections import SimulationSettings
+from fishd.virtual.pi.pulse_train import SERVO_FRAME
+from fishd.virtual.pi.settings import VirtualPiSettings
+from fishd.virtual.pi.tank import STEP
 from fishd.virtual.plant.parameters import PlantParameters
 
 RIG = SimulationSettings(noise=1e-3, rotation=radians(5), offset_x=0.02, offset_y=0.02, drift=5e-3)
@@ -30,11 +35,13 @@ VARIED = (
 )  # fmt: skip
 MAX_DELAY_S, MAX_BACKLASH_RAD = 0.1, 0.05
 """Largest delay of the servo [s], and largest backlash [rad]."""
+MAX_PI_DELAY_S = 0.03
+"""Largest delay of the servo on a virtual Pi, without the wait for a pulse [s]."""
 MAX_DRAG, MAX_LATERAL_DRAG = 2.0, 0.01
 """Largest quadratic drag of the fin [1/rad], and in F_y [N s²/rad²]."""
 RATIOS = (0.6, 0.85, 1.15, 1.6)
 """Ranges of K_y/K: between the first two, or between the last two."""
-FIRST_SEED = {"other": 51000, "outside": 52000, "harsh": 900}
+FIRST_SEED = {"other": 51000, "outside": 52000, "harsh": 900, "pi": 53000}
 """Seed of the first fish of each kind, and of its sensor."""
 SECONDS = 180.0
 ABSOLUTE = {
@@ -50,10 +57,11 @@ KINDS = {
     "other": "other fish, with delay and backlash",
     "outside": "the same with quadratic drag and K_y ≠ K",
     "harsh": "harsh fish: dead zone and reaction, too; K_y = K",
+    "pi": "other fish behind the drivers of a virtual Pi",
 }
 """Kinds of fish, with their names in the table."""
 
-EQUALLY_FITTED = ("other", "outside")
+EQUALLY_FITTED = ("other", "outside", "pi")
 """Kinds whose fits all have the same parameters, except those that the data require."""
 
 
@@ -85,23 +93,36 @@ def fish(kind: str, seed: int) -> Config:
     chance = random.Random(FIRST_SEED[kind] + seed)
     plain = msgspec.structs.asdict(PlantParameters())
     varied = {name: plain[name] * chance.uniform(1 - SPREAD, 1 + SPREAD) for name in VARIED}
-    varied["servo_delay"] = chance.uniform(0.0, MAX_DELAY_S)
+    varied["servo_delay"] = chance.uniform(0.0, MAX_PI_DELAY_S if kind == "pi" else MAX_DELAY_S)
     varied["backlash"] = chance.uniform(0.0, MAX_BACKLASH_RAD)
     if kind == "outside":
         varied["quadratic_drag"] = chance.uniform(0.0, MAX_DRAG)
         varied["lateral_quadratic_drag"] = chance.uniform(0.0, MAX_LATERAL_DRAG)
         side = chance.choice((RATIOS[:2], RATIOS[2:]))
         varied["lateral_inertia_ratio"] = chance.uniform(*side)
-    return Config(plant=PlantParameters(**varied), simulation=rig)
+    plant = PlantParameters(**varied)
+    if kind != "pi":
+        return Config(plant=plant, simulation=rig)
+    # The virtual Pi computes in whole steps.
+    pi = VirtualPiSettings(pulse_lead=chance.randrange(round(SERVO_FRAME / STEP)) * STEP)
+    return Config(robot="virtual-pi", plant=plant, simulation=rig, virtual_pi=pi)
+
+
+def mean_wait(config: Config) -> float:
+    """Return the mean time from a tick until the next pulse of a virtual Pi [s]."""
+    ticks = np.arange(round(SECONDS / config.tick)) * config.tick
+    waits = np.mod(-config.virtual_pi.pulse_lead - ticks, SERVO_FRAME)
+    return float(waits.mean()) if config.robot == "virtual-pi" else 0.0
 
 
 def one(run: tuple[str, int]) -> Outcome:
     """Run one fish, and identify it."""
     kind, seed = run
     config = fish(kind, seed)
-    with VirtualSession(config) as swum:
-        identification = identify(experiment(swum, SECONDS))
+    with VirtualSession(config, EXACT) as swum:
+        identification = identify(experiment(swum, SECONDS), servo=swum.servo)
     truth: dict[str, Any] = msgspec.structs.asdict(config.plant)
+    truth["servo_delay"] += mean_wait(config)
     truth |= msgspec.structs.asdict(config.simulation)
     # Nearly three whole periods of the drift, so that its mean is almost zero.
     intervals = {
@@ -149,18 +170,16 @@ def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
     errors, worst = [], 0.0
     for outcome in outcomes:
         for name, each in outcome.intervals.items():
-            if not np.isfinite(each.ci95_high):
+            if not np.isfinite(each.high):
                 withheld += 1
                 continue
             count += 1
-            holds = each.ci95_low <= each.truth <= each.ci95_high
+            holds = each.low <= each.truth <= each.high
             held += holds
             if name not in SCALED:
                 own, own_held = own + 1, own_held + holds
             narrow += each.known_low <= each.truth <= each.known_high
-            off = abs(each.truth - 0.5 * (each.ci95_low + each.ci95_high)) / (
-                0.5 * (each.ci95_high - each.ci95_low)
-            )
+            off = abs(each.truth - 0.5 * (each.low + each.high)) / (0.5 * (each.high - each.low))
             worst = max(worst, off)
             astray += outcome.trusted and off > 2.0
             if known and name in VARIED:
@@ -193,6 +212,11 @@ OPTIONS: Options = {
         "default": 10,
         "help": "experiments of each kind, half as many harsh ones; default 10",
     },
+    "--on": {
+        "choices": ("simulation", "virtual-pi"),
+        "default": "simulation",
+        "help": "where the fish swim; default simulation",
+    },
     **JOBS,
 }
 
@@ -200,13 +224,15 @@ OPTIONS: Options = {
 def measure(options: Namespace) -> Report:
     """Return the tables; each experiment takes some seconds."""
     sections, figures, whole = {}, {}, []
-    for kind in KINDS:
+    kinds = ["pi"] if options.on == "virtual-pi" else [kind for kind in KINDS if kind != "pi"]
+    for kind in kinds:
         seeds = options.seeds if kind in EQUALLY_FITTED else (options.seeds + 1) // 2
         outcomes = run_cases(one, [(kind, seed) for seed in range(seeds)], options.jobs)
         whole.append(summary(kind, outcomes))
         figures[kind] = [outcome._asdict() for outcome in outcomes]
         if kind in EQUALLY_FITTED:
-            lines = rows(outcomes, known=kind == "other")
+            lines = rows(outcomes, known=kind != "outside")
             sections[f"bench identification {kind}"] = table(HEAD, lines)
-    sections["bench identification summary"] = table(SUMMARY, whole)
+    part = "virtual-pi" if kinds == ["pi"] else "summary"
+    sections[f"bench identification {part}"] = table(SUMMARY, whole)
     return Report(sections, figures)

@@ -56,6 +56,11 @@ class Pca9685Settings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw
         unit("Hz", "Frequency of the oscillator, about 25 MHz; measure a pulse to correct it."),
     ] = 25e6
 
+    @property
+    def pulse_period(self) -> float:
+        """Period of the pulses [s]."""
+        return 1.0 / self.frequency
+
 
 class Pca9685(ServoDriver[Pca9685Settings]):
     """Driver of a servo on a PCA9685 board."""

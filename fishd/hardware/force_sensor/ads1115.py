@@ -144,9 +144,8 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
             first = None
             self._chip.check_idle()
         self._in_doubt = True  # until the conversion has ended
-        started = self.clock.monotonic()
         code = (self._y if self._y_first == (first is None) else self._x).value
-        self._in_doubt = False
+        self._in_doubt, started = False, self._chip.started
         if first is None:
             self._first = started, code
             return None

@@ -29,6 +29,8 @@ class SingleShot(ADS1115):  # type: ignore[misc]
         data_rate: number of conversions per second
         """
         self._clock = clock
+        self.started = 0.0
+        """Time at which the latest conversion began [s, monotonic]."""
         self._sleep = _WAKE_UP_S + MAX_CONVERSION_PERIODS / data_rate
         self._limit = CONVERSION_TIMEOUT_PERIODS / data_rate
         self._pointer = bytearray(1)
@@ -69,6 +71,7 @@ class SingleShot(ADS1115):  # type: ignore[misc]
         self._write_config(pin)
         settings = (self.buf[1] << 8 | self.buf[2]) & ~_IDLE_BIT
         started = clock.monotonic()
+        self.started = started + _WAKE_UP_S
         clock.sleep(self._sleep)
         while True:
             now = clock.monotonic()

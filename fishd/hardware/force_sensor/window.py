@@ -27,10 +27,21 @@ class WindowEvaluation:
 
     def measure(self, pairs: Sequence[Pair], calibration: ForceCalibration) -> Measurement:
         """Return the mean forces of at least one pair, with a reason if they are suspect."""
-        _, times, vxs, vys, clipped = zip(*pairs, strict=True)
-        count = len(pairs)
-        fx, fy = calibration.forces(sum(vxs) / count, sum(vys) / count)
-        newest = times[-1]
+        begins, times, vxs, vys, clipped = zip(*pairs, strict=True)
+        count, newest = len(pairs), times[-1]
+        # Evenly spread over `span`, that many samples have the same variance in time as the true
+        # ones, which are a quarter of the spacing from the middle of their pair.
+        spacing = (newest - times[0]) / (count - 1) if count > 1 else newest - begins[0]
+        span, weight = spacing * math.sqrt(count**2 + 0.75), 1.0 / count
+        vx, vy, mean_time = sum(vxs), sum(vys), 0.5 * (sum(begins) + sum(times))
+        if count % 2 and count > 1:
+            # Pairs begin with x and y in turn. With half the weight of the first and of the last
+            # pair, as in the trapezoidal rule, neither is later in the mean.
+            span, weight = spacing * math.sqrt((count - 1) ** 2 + 3.6), 1.0 / (count - 1)
+            vx -= 0.5 * (vxs[0] + vxs[-1])
+            vy -= 0.5 * (vys[0] + vys[-1])
+            mean_time -= 0.25 * (begins[0] + begins[-1] + times[0] + newest)
+        fx, fy = calibration.forces(weight * vx, weight * vy)
         # Both detectors need every window, even if another reason makes this one suspect.
         frozen_x, frozen_y = self._x.check(vxs, newest), self._y.check(vys, newest)
         extremes = _extremes(vxs, vys, calibration)
@@ -40,7 +51,9 @@ class WindowEvaluation:
             or frozen_y
             or self._beyond_limit(extremes, calibration)
         )
-        return Measurement(newest, fx, fy, count, suspect, extremes)
+        return Measurement(
+            newest, fx, fy, count, suspect, extremes, mean_time=weight * mean_time, span=span
+        )
 
     def interrupt(self) -> None:
         """Restart the detection of frozen codes, because samples stopped arriving."""

@@ -50,6 +50,11 @@ class PigpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw_
         ),
     ] = 0.2
 
+    @property
+    def pulse_steps(self) -> tuple[float, ...]:
+        """Possible steps of pigpiod, its option -s [µs]."""
+        return (1.0, 2.0, 4.0, 5.0, 8.0, 10.0)
+
 
 class Pigpio(ServoDriver[PigpioSettings]):
     """A servo on any pin, through pigpiod."""

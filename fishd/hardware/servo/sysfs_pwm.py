@@ -36,6 +36,11 @@ class SysfsPwmSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, k
     ] = None
 
     @property
+    def pulse_period(self) -> float:
+        """Period of the pulses [s]."""
+        return 1.0 / self.frequency
+
+    @property
     def wires(self) -> Wires:
         """Pin, chip and channel of the servo."""
         return Wires(self.gpio, self.root, self.chip, self.channel)

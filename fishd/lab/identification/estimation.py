@@ -16,8 +16,9 @@ import numpy as np
 
 from fishd.core import text
 from fishd.core.dataframes import ticks_to_frame
-from fishd.core.errors import ParameterError
+from fishd.core.errors import ParameterError, RecordingError
 from fishd.core.schema import suggest
+from fishd.hardware.settings import ServoSettings
 from fishd.lab.identification.fit import (
     BOUNDS,
     FURTHER,
@@ -28,6 +29,7 @@ from fishd.lab.identification.fit import (
 )
 from fishd.lab.identification.misfit import all_white, find_missing_parameters
 from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifiable, passages
+from fishd.lab.identification.pulses import place_pulses
 from fishd.lab.identification.result import Identification
 from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, summarise
 from fishd.lab.limits import find_excess
@@ -64,6 +66,8 @@ _SETTLE_TIME_CONSTANTS = 7.0
 """Time, in time constants of the fin, after which its initial state has no effect."""
 _ROUGH_STEPS = 12
 """Largest number of steps of a rough fit, which compares start values."""
+_MAX_PLACINGS = 4
+"""Largest number of rough fits that find the pulses of the servo."""
 _STARTS = tuple(product((1.0, 0.5, 2.0), (0.01, 0.06, 0.12)))
 """Start values: natural frequency, as a multiple of that of the given fish, and delay [s]."""
 REST_S = 4.0
@@ -81,6 +85,7 @@ def identify(
     rig: SimulationSettings | None = None,
     fit: Sequence[str] | None = None,
     fix: Sequence[str] = (),
+    servo: ServoSettings | None = None,
 ) -> Identification:
     """Fit a fish and its rig to recorded runs.
 
@@ -93,6 +98,8 @@ def identify(
     fix: parameters that are excluded from the fit. With `lateral_inertia_ratio`, K_y/K is as in
         `start`, and the intervals of K, λ and K_d are much narrower; likewise with `coupling`, if
         λ was measured
+    servo: calibrated settings of the servo whose pulses carried the commands of tables; that of a
+        recording of a robot is known
 
     Raises `Unidentifiable` for runs without usable data, `ParameterError` for a name that cannot
     be fitted, and the errors of `fishd.recording.read`.
@@ -101,12 +108,16 @@ def identify(
     given_values["rotation"] = (rig or SimulationSettings()).rotation
     further = tuple(name for name in FURTHER if fit is None and name not in fix)
     names = check((*DEFAULT, *filter(given_values.get, FURTHER)) if fit is None else fit, fix)
-    parts = passages([_to_frame(run) for run in _to_list(runs)])
+    opened = [_open(run) for run in _to_list(runs)]
+    servos = [_servo(run, servo) for run in opened]
+    parts = passages([_to_frame(run) for run in opened], servos)
     _refuse_unusable(parts)
     values = {name: float(given_values[name]) for name in POSSIBLE}
     scale_is_free = _scale_is_free(names, values)
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
+    if any(part.servo for part in parts):
+        parts = _with_pulses(parts, names, _start_values(values, names, *_STARTS[0]))
     problem, values = _solve_from_starts(parts, names, values, further)
     settle = _settling_time(values)
     if settle > _SETTLE_S:
@@ -115,6 +126,20 @@ def identify(
         problem = Problem(parts, problem.names, settle)
         values = solve(problem, values)
     return summarise(parts, problem, values, given_values, scale_is_free)
+
+
+def _with_pulses(
+    parts: list[Passage], names: tuple[str, ...], values: dict[str, float]
+) -> list[Passage]:
+    """Return the passages with the likeliest pulses, which rough fits from `values` find."""
+    for _ in range(_MAX_PLACINGS):
+        problem = Problem(parts, names, _SETTLE_S)
+        values = solve(problem, values, rounds=1, steps=_ROUGH_STEPS)
+        placed = place_pulses(parts, problem, values, _SETTLE_S)
+        if all(new is old for new, old in zip(placed, parts, strict=True)):
+            break
+        parts = placed
+    return parts
 
 
 def _refuse_unusable(parts: Sequence[Passage]) -> None:
@@ -144,11 +169,30 @@ def _to_list(runs: object) -> list[object]:
     return list(runs) if is_list else [runs]  # type: ignore[call-overload]
 
 
-def _to_frame(run: object) -> "DataFrame":
-    from fishd.recording import Run, open_run
+def _open(run: object) -> object:
+    from fishd.recording import open_run
 
-    if isinstance(run, str | os.PathLike):
-        run = open_run(run)
+    return open_run(run) if isinstance(run, str | os.PathLike) else run
+
+
+def _servo(run: object, given: ServoSettings | None) -> ServoSettings | None:
+    """Return the calibrated settings of the servo of a recording, or those given for a table."""
+    from fishd.recording import Run
+
+    if not isinstance(run, Run):
+        return given
+    try:
+        config = run.config
+    except RecordingError:  # there is none, or it has a driver that is not installed here
+        return None
+    if not config.kind.has_hardware:
+        return None
+    return config.servo.calibrated(run.calibrations[0].servo) if run.calibrations else config.servo
+
+
+def _to_frame(run: object) -> "DataFrame":
+    from fishd.recording import Run
+
     if isinstance(run, Run):
         unit = run.summary.force_unit
         if unit != "N":

@@ -216,7 +216,7 @@ class Problem:
             return self._cached[1]
         model = Drive(**drive)
         responses = [
-            respond(model, passage.commands, passage.ends, passage.tick, passage.samples, near)
+            respond(model, passage.angles, passage.timing, near)
             for (passage, _), near in zip(self._passages, self._latest_motions, strict=True)
         ]
         moved = [forces for forces, _ in responses]

@@ -1,20 +1,26 @@
 """Passages: recorded ticks without a gap, each of which can be simulated from its start."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fishd.core.errors import FishdError
-from fishd.lab.identification.response import Array
+from fishd.hardware.settings import ServoSettings
+from fishd.lab.identification.response import Array, Timing, even_timing
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 COLUMNS = ("time", "seq", "missed_slots", "fx", "fy", "phi_c", "servo_on", "samples")
 """Columns of a table of ticks that an identification reads."""
+_AGES = ("force_age_ms", "force_span_ms")
+"""Columns that say when the force was sampled; they are not in tables of other rigs."""
+_MAX_SAMPLES = 40
+"""Largest number of samples in a period; more would not change the mean force."""
 MIN_PASSAGE_S = 5.0
 """Length of the shortest passage that is used [s]."""
 _MAX_WINDOW_SLOTS = 20
@@ -31,8 +37,8 @@ class Passage:
 
     tick: float
     """Period of the loop [s]."""
-    samples: int
-    """Samples of the force in each period."""
+    timing: Timing
+    """Times of commands and samples."""
     commands: Array
     """φ_c in each slot of one period [rad], shape (slots,)."""
     ends: NDArray[np.int_]
@@ -41,6 +47,10 @@ class Passage:
     """Mean F_x and F_y of each window as measured [N], shape (2, windows)."""
     times: Array
     """End of each window, as time since the first tick of all [s], shape (windows,)."""
+    servo: ServoSettings | None
+    """Calibrated settings of the servo; None if no pulses carry its commands."""
+    angles: Array
+    """Angles that the pulses stand for, in each slot [rad], shape (slots,)."""
 
     @property
     def duration(self) -> float:
@@ -48,14 +58,17 @@ class Passage:
         return float(self.ends[-1] * self.tick)
 
 
-def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
+def passages(
+    tables: "Sequence[DataFrame]", servos: Sequence[ServoSettings | None] = ()
+) -> list[Passage]:
     """Return the passages of runs, in order.
 
+    servos: calibrated settings of the servo of each run; None, the default, for no pulses
     Raises `Unidentifiable` where no passage is long enough, or a column is missing.
     """
     usable = []
     begin = 0.0
-    for table in tables:
+    for table, servo in zip_longest(tables, servos):
         missing = [name for name in COLUMNS if name not in table]
         if missing:
             raise Unidentifiable(
@@ -64,14 +77,15 @@ def passages(tables: "Sequence[DataFrame]") -> list[Passage]:
             )
         if len(table) < 2:
             continue
-        columns = {name: table[name].to_numpy() for name in COLUMNS}
+        ages = _AGES if all(name in table for name in _AGES) else ()
+        columns = {name: table[name].to_numpy() for name in (*COLUMNS, *ages)}
         if "elapsed" in table:  # of a recording: it increases across restarts of fishd, too
             columns["time"] = table["elapsed"].to_numpy()
         if "suspect" in table:  # a suspect force counts as missing
             columns["samples"] = np.where(table["suspect"].fillna("") == "", columns["samples"], 0)
         tick = _period(columns)
         for rows in _unbroken_rows(columns):
-            passage = _passage(columns, rows, tick, begin)
+            passage = _passage(columns, rows, tick, begin, servo)
             if passage.duration >= MIN_PASSAGE_S:
                 usable.append(passage)
         begin += float(columns["time"][-1] - columns["time"][0])
@@ -112,7 +126,9 @@ def _unbroken_rows(columns: dict[str, Array]) -> Iterator[slice]:
             yield slice(int(start), int(stop))
 
 
-def _passage(columns: dict[str, Array], rows: slice, tick: float, begin: float) -> Passage:
+def _passage(
+    columns: dict[str, Array], rows: slice, tick: float, begin: float, servo: ServoSettings | None
+) -> Passage:
     """Return the passage of these rows; begin: time of the first tick of the table [s]."""
     slots = 1 + np.diff(columns["missed_slots"][rows]).astype(int)
     phi_c = columns["phi_c"][rows].astype(float)
@@ -120,11 +136,30 @@ def _passage(columns: dict[str, Array], rows: slice, tick: float, begin: float) 
     commands = np.repeat(phi_c[:-1], slots)
     forces = np.stack((columns["fx"][rows], columns["fy"][rows])).astype(float)[:, 1:]
     times = begin + (columns["time"][rows][1:] - columns["time"][0]).astype(float)
+    ends = np.concatenate(([0], np.cumsum(slots)))
+    samples = max(1, round(float(np.median(columns["samples"][rows][1:] / slots))))
+    timing = even_timing(ends, tick, min(samples, _MAX_SAMPLES))
+    if _AGES[0] in columns:
+        timing = _with_spans(timing, *(columns[name][rows][1:].astype(float) for name in _AGES))
     return Passage(
         tick=tick,
-        samples=max(1, round(float(np.median(columns["samples"][rows][1:] / slots)))),
+        timing=timing,
         commands=commands,
-        ends=np.concatenate(([0], np.cumsum(slots))),
+        ends=ends,
         forces=forces,
         times=times,
+        servo=servo,
+        angles=commands,
     )
+
+
+def _with_spans(timing: Timing, age_ms: Array, span_ms: Array) -> Timing:
+    """Return a timing with the true spans of samples, where they are plausible.
+
+    age_ms: mean age of the samples of each window at its end; span_ms: length of their span
+    """
+    middles, halves = timing.spans[1] - 1e-3 * age_ms, 0.5e-3 * span_ms
+    spans = np.stack((middles - halves, middles + halves))
+    with np.errstate(invalid="ignore"):
+        plausible = np.all(np.abs(spans - timing.spans) < timing.tick, axis=0) & (halves > 0.0)
+    return replace(timing, spans=np.where(plausible, spans, timing.spans))

@@ -1,13 +1,13 @@
 """Fast simulation of the response of a fish to recorded commands, for a fit.
 
-The same equations as fishd.virtual.plant, for a whole run at once: the servo in closed form, tick
-by tick; the fin, which is linear, by its exact discrete filter on a grid that is shifted by the
-delay, so that every step of the command is at a grid point.
+The same equations as fishd.virtual.plant, for a whole run at once: the servo in closed form,
+command by command; the fin, which is linear, by its exact discrete filter on a grid that is shifted
+by the delay, so that every step of the command is at a grid point.
 """
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +18,8 @@ from fishd.virtual.plant.tethered import REACTION_TIME
 
 Array = NDArray[np.float64]
 
-_MAX_STEP_S = 0.0025
+MAX_STEP_S = 0.0025
 """Largest step of the grid [s]."""
-_MAX_SAMPLES = 40
-"""Largest number of samples in a period; more would not change the mean force."""
 _MAX_ITERATIONS = 100
 """Largest number of iterations for quadratic drag."""
 _MAX_LAGS = 700.0
@@ -70,41 +68,75 @@ class Motion:
     """Speed of the fin [rad/s]."""
 
 
+@dataclass(frozen=True)
+class Timing:
+    """Times of a passage [s], since the start of its first slot."""
+
+    tick: float
+    """Period of the loop."""
+    begins: Array
+    """Begin of each command, without the delay of the servo, shape (slots,)."""
+    spans: Array
+    """Begin of the first and end of the last sample of each window, shape (2, windows)."""
+    sizes: NDArray[np.int_]
+    """Number of samples in each window, which share its span evenly, shape (windows,)."""
+    steps: int
+    """Number of steps of the grid in a period; a command begins at the nearest grid point."""
+
+    @cached_property
+    def samples(self) -> Array:
+        """Times of all samples [s]: the middles of equal parts of the spans."""
+        numbers = np.arange(self.sizes.sum()) - np.repeat(self.first_samples, self.sizes)
+        begins, ends = self.spans
+        spacing = (ends - begins) / self.sizes
+        times: Array = np.repeat(begins, self.sizes) + (numbers + 0.5) * np.repeat(
+            spacing, self.sizes
+        )
+        return times
+
+    @cached_property
+    def first_samples(self) -> NDArray[np.int_]:
+        """Index in `samples` of the first one of each window, shape (windows,)."""
+        return np.concatenate(([0], np.cumsum(self.sizes)[:-1]))
+
+
+def even_timing(ends: NDArray[np.int_], tick: float, samples: int) -> Timing:
+    """Return the timing of commands at the starts of slots, with samples all over each window.
+
+    ends: slots at whose starts windows end; the first one begins where the first window does
+    tick: one period [s]
+    samples: number of samples in each period
+    """
+    steps = math.ceil(tick / MAX_STEP_S - 1e-9)
+    spans: Array = np.stack((ends[:-1], ends[1:])).astype(float) * tick
+    begins: Array = np.arange(ends[-1]) * tick
+    return Timing(tick, begins, spans, samples * np.diff(ends), steps)
+
+
 def response(
     drive: Drive, commands: Array, ends: NDArray[np.int_], tick: float, samples: int
 ) -> Array:
-    """Return the forces of `respond`."""
-    return respond(drive, commands, ends, tick, samples)[0]
+    """Return the forces of `respond`, with the timing of `even_timing`."""
+    return respond(drive, commands, even_timing(ends, tick, samples))[0]
 
 
 def respond(
-    drive: Drive,
-    commands: Array,
-    ends: NDArray[np.int_],
-    tick: float,
-    samples: int,
-    near: Motion | None = None,
+    drive: Drive, commands: Array, timing: Timing, near: Motion | None = None
 ) -> tuple[Array, Motion]:
     """Return the forces on the sensor, and the motion.
 
-    The forces are window means of [−α α̈, −α̈, −α̇, −φ̈, −|α̇| α̇] for λ = 1, of shape
-    (5, len(ends) − 1).
+    The forces are window means of [−α α̈, −α̈, −α̇, −φ̈, −|α̇| α̇] for λ = 1, of shape (5, windows).
 
     With coupling λ, F_x = K λ² · row 0, and F_y = K_y λ · row 1 + K_d λ · row 2 + J · row 3 +
     K_q λ² · row 4. Row 3 is smoothed as by the mount of the servo.
 
     commands: φ_c in each slot of one period [rad], from the start on
-    ends: slots at whose starts windows end; the first one begins where the first window does
-    tick: one period [s]
-    samples: number of samples in each mean, evenly spaced over each period
     near: motion for the same commands and a similar drive, to save time
     """
-    samples = min(samples, _MAX_SAMPLES)
-    stride = math.ceil(tick / (samples * _MAX_STEP_S))
-    steps = stride * samples
-    h = tick / steps
-    slots_before = _SLOTS_BEFORE + math.ceil(drive.servo_delay / tick - 1e-9)
-    held_commands = np.concatenate((np.full(slots_before, commands[0]), commands))
+    steps = timing.steps
+    h = timing.tick / steps
+    before = drive.servo_delay - min(0.0, float(timing.begins[0]))
+    slots_before = _SLOTS_BEFORE + math.ceil(before / timing.tick - 1e-9)
     servo = (
         *(drive.servo_speed, drive.servo_lag, drive.backlash, drive.cable_slack),
         *(drive.servo_dead_zone, float(slots_before)),
@@ -112,34 +144,30 @@ def respond(
     if near and near.servo == servo:
         pull, turned = near.pull, near.turned
     else:
-        pull, turned = _wheel_motion(drive, held_commands, steps, tick)
+        begins = slots_before * steps + np.rint(timing.begins / h).astype(int)
+        end = max(int(begins[-1]), (slots_before + commands.size) * steps)
+        lengths = np.diff(begins, prepend=0, append=end)
+        held_commands = np.concatenate((commands[:1], commands))
+        pull, turned = _wheel_motion(drive, held_commands, lengths, h)
     similar = near.rate if near and near.pull.size == pull.size else None
     alpha, rate = _fin(drive, pull, h, similar)
-    # Slot k of the commands begins at k·tick; its command applies from grid point
-    # (k + slots_before)·steps on, which is servo_delay later. So its first sample is here:
-    position = slots_before * steps - drive.servo_delay / h + 0.5 * stride
-    first = math.floor(position)
-    fraction = position - first
-    slots = int(ends[-1])
-
-    def sample_grid(values: Array, later: int = 0, factor: int = 1) -> Array:
-        return values[factor * first + later :: factor * stride][: slots * samples]
-
     acceleration = _acceleration(drive, alpha, rate, pull[::2])
-    rates, next_rates = sample_grid(rate), sample_grid(rate, 1)
-    a = _hermite(sample_grid(alpha), sample_grid(alpha, 1), rates, next_rates, fraction, h)
-    v = _hermite(
-        rates, next_rates, sample_grid(acceleration), sample_grid(acceleration, 1), fraction, h
-    )
-    pulls = sample_grid(pull, 0, 2), sample_grid(pull, 1, 2), sample_grid(pull, 2, 2)
-    pulled = np.tensordot(_parabola(fraction), np.stack(pulls), 1)
+    # A command acts at a grid point, which is servo_delay after its begin.
+    start = slots_before * steps - drive.servo_delay / h
+    position = np.clip(start + timing.samples / h, 0.0, alpha.size - 1.001)
+    cell = position.astype(int)
+    fraction = position - cell
+    rates, next_rates = rate[cell], rate[cell + 1]
+    a = _hermite(alpha[cell], alpha[cell + 1], rates, next_rates, fraction, h)
+    v = _hermite(rates, next_rates, acceleration[cell], acceleration[cell + 1], fraction, h)
+    pulls = np.stack([pull[2 * cell + later] for later in range(3)])
+    pulled = np.einsum("kn,kn->n", np.stack(_parabola(fraction)), pulls)
     minus = -_acceleration(drive, a, v, pulled)
     sums = np.stack((a * minus, minus, -v, -np.abs(v) * v))
-    sums = sums.reshape(4, slots, samples).sum(axis=2)
-    means: Array = np.add.reduceat(sums, ends[:-1], axis=1) / (samples * np.diff(ends))
-    edges = 2.0 * (slots_before * steps - drive.servo_delay / h + ends * steps)
+    means: Array = np.add.reduceat(sums, timing.first_samples, axis=1) / timing.sizes
+    edges = 2.0 * (start + timing.spans / h)
     mount_rates = np.interp(edges, np.arange(turned.size), _smoothed_speed(turned, 0.5 * h))
-    reaction = -np.diff(mount_rates) / (tick * np.diff(ends))
+    reaction = -np.diff(mount_rates, axis=0) / np.diff(timing.spans, axis=0)
     forces = np.vstack((means[:3], reaction, means[3]))
     return forces, Motion(servo, pull, turned, rate)
 
@@ -155,18 +183,22 @@ def _smoothed_speed(angles: Array, step: float) -> Array:
     return smoothed
 
 
-def _wheel_motion(drive: Drive, commands: Array, steps: int, tick: float) -> tuple[Array, Array]:
+def _wheel_motion(
+    drive: Drive, commands: Array, lengths: NDArray[np.int_], h: float
+) -> tuple[Array, Array]:
     """Return the wheel angle that drives the fin, and the angle of the wheel itself [rad].
 
     Both are at the grid points and half way between them.
+
+    lengths: number of steps for which each command applies; h: one step [s]
     """
     speed, lag = drive.servo_speed, drive.servo_lag
     dead, play = drive.servo_dead_zone, drive.backlash
-    decay = math.exp(-speed * tick / lag)
+    decays = np.exp(lengths * (-speed * h / lag)).tolist()
     sinh, asinh = math.sinh, math.asinh
     targets, sinhs, tails = [], [], []
     phi = tail = float(commands[0])
-    for command in commands.tolist():
+    for command, decay in zip(commands.tolist(), decays, strict=True):
         if dead:
             gap = command - phi
             command = phi if abs(gap) <= dead else command - math.copysign(dead, gap)
@@ -177,13 +209,16 @@ def _wheel_motion(drive: Drive, commands: Array, steps: int, tick: float) -> tup
         phi = command - lag * asinh(size * decay)
         if play:
             tail = max(phi - play, min(phi + play, tail))
-    times = np.arange(2 * steps) * (0.5 * tick / steps)
-    lag_angle = np.arcsinh(np.multiply.outer(np.array(sinhs), np.exp(times * (-speed / lag))))
-    wheel = np.array(targets)[:, None] - lag * lag_angle
-    turned = np.append(wheel.ravel(), phi)
-    if play:  # within a slot the wheel turns one way only
-        wheel = np.clip(np.array(tails)[:, None], wheel - play, wheel + play)
-    pull = np.append(wheel.ravel(), tail if play else phi)
+    points = 2 * lengths
+    elapsed = np.arange(points.sum()) - np.repeat(np.cumsum(points) - points, points)
+    falls = np.exp(np.arange(points.max()) * (-0.5 * h * speed / lag))[elapsed]
+    wheel = np.repeat(np.array(targets), points) - lag * np.arcsinh(
+        np.repeat(np.array(sinhs), points) * falls
+    )
+    turned = np.append(wheel, phi)
+    if play:  # for one command the wheel turns one way only
+        wheel = np.clip(np.repeat(np.array(tails), points), wheel - play, wheel + play)
+    pull = np.append(wheel, tail if play else phi)
     if drive.cable_slack:
         pull = np.sign(pull) * np.maximum(np.abs(pull) - drive.cable_slack, 0.0)
     return pull, turned
@@ -264,7 +299,7 @@ def _discretise(omega0: float, xi: float, h: float) -> tuple[Array, Array]:
 
 
 def _hermite(
-    values: Array, next_values: Array, slopes: Array, next_slopes: Array, fraction: float, h: float
+    values: Array, next_values: Array, slopes: Array, next_slopes: Array, fraction: Array, h: float
 ) -> Array:
     """Return cubic interpolations in cells of length h, at `fraction` of each, 0 ≤ fraction < 1."""
     s, t = fraction, 1.0 - fraction
@@ -275,6 +310,6 @@ def _hermite(
     )
 
 
-def _parabola(s: float) -> tuple[float, float, float]:
+def _parabola(s: Array) -> tuple[Array, Array, Array]:
     """Return the weights at `s` of the values at start, middle and end of a cell."""
     return (1.0 - s) * (1.0 - 2.0 * s), 4.0 * s * (1.0 - s), s * (2.0 * s - 1.0)

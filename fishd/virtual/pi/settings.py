@@ -68,6 +68,16 @@ class VirtualPiSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
     pigpio_port: Annotated[
         int, note("TCP port of its pigpiod; 0: any free port.", ge=0, le=65535)
     ] = 8888
+    pulse_lead: Annotated[
+        float,
+        unit(
+            "s",
+            "Time of the first tick of a run in virtual time after the begin of a frame of the "
+            "pulses, which is 20 ms long.",
+            ge=0,
+            lt=0.02,
+        ),
+    ] = 0.0
     servo_gpio: Annotated[Gpio, note("Pin to which the servo's signal is wired.")] = 18
     servo_centre: Annotated[
         float, unit("us", "Pulse at which the fin is straight.", ge=500, le=2500)

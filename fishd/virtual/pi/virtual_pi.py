@@ -86,7 +86,7 @@ class VirtualPi:
         self.settings = settings
         self.faults = Faults(clock, seed + 1)
         self.bus = I2cBus(clock, settings.bus_speed, self.faults)
-        self.pigpiod = Pigpiod(clock, self.faults, settings.pigpio_port)
+        self.pigpiod = Pigpiod(clock, self.faults, settings.pigpio_port, settings.pulse_lead)
         pulse = partial(self.pigpiod.width, settings.servo_gpio)
         self.tank = Tank(settings, plant, imperfections, tick, pulse, clock.monotonic())
         self._filter: RcFilter | None = None

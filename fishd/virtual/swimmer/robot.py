@@ -101,6 +101,8 @@ class Swimmer:
             fy=side_force / step_count,
             samples=step_count,
             fin_velocity=self._sensed_rate,
+            mean_time=now - 0.5 * self.window.duration,
+            span=self.window.duration,
         )
 
     def _advance(self) -> Motion:

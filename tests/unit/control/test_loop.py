@@ -191,6 +191,11 @@ def test_a_suspect_force_that_a_slow_sensor_repeats_reaches_no_estimator() -> No
     assert tick.sample_age_ms < 10.0
 
 
+def test_a_tick_says_when_its_force_was_sampled() -> None:
+    tick = Rig().run(3)[-1]
+    assert (tick.force_age_ms, tick.force_span_ms) == pytest.approx((25.0, 50.0))
+
+
 def test_a_release_that_fails_is_tried_again_until_it_works() -> None:
     rig, robot = fragile_rig()
     rig.start("square")
@@ -297,7 +302,10 @@ class Restless(Wrapped):
         extremes = Extremes(*self.next_values(4))
         # A drift, so that the zero is known
         forces = (1e-3 * force for force in self.next_values(2))
-        return Measurement(now - self.reads * 1e-6, *forces, self.reads, "", extremes)
+        time = now - self.reads * 1e-6
+        return Measurement(
+            time, *forces, self.reads, "", extremes, mean_time=time - 0.02, span=time
+        )
 
 
 ABSENT = {"x", "y", "speed", "heading", "leak", "suspect", "fy_corrected"}

@@ -11,8 +11,12 @@ from msgspec.structs import asdict
 from rigs.harness import Rig
 
 from fishd.config import load
+from fishd.core.calibration import EXACT
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
+from fishd.hardware.servo.pigpio import PigpioSettings
+from fishd.hardware.servo.sysfs_pwm import SysfsPwmSettings
+from fishd.hardware.settings import ServoSettings
 from fishd.lab.identification import (
     DEFAULT,
     Estimate,
@@ -309,6 +313,87 @@ def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
 def test_nothing_to_fit_is_refused(table: pd.DataFrame, spoil: object, complaint: str) -> None:
     with pytest.raises(Unidentifiable, match=complaint):
         identify(spoil(table))  # type: ignore[operator]
+
+
+PULSED = ("omega0", "servo_speed", "servo_delay", "rotation")
+
+
+def swim_with_pulses(settings: ServoSettings, phase: float, step: float) -> pd.DataFrame:
+    """Return ticks of a fish whose servo takes each angle with its next pulse.
+
+    phase: begin of a pulse after the first tick [s]; step: pulses are rounded down to it [µs]
+    """
+    chance = np.random.default_rng(3)
+    commands = np.repeat(
+        chance.choice([-0.42, -0.168, 0.168, 0.42], 90), chance.integers(4, 12, 90)
+    )
+    commands[:40] = 0.0
+    fish = TetheredFish(FISH)
+    rows, active = [], 0.0
+    for number, command in enumerate(commands):
+        wait = (phase - number * TICK) % settings.pulse_period
+        width = round(settings.centre + settings.scale * command) // step * step
+        before, active = active, (width - settings.centre) / settings.scale
+        parts = [(before, wait), (active, TICK - wait)]
+        windows = [(fish.advance(angle, time, 10), time) for angle, time in parts if time > 1e-9]
+        fx = sum(w.thrust * time for w, time in windows) / TICK
+        fy = sum(w.lateral_force * time for w, time in windows) / TICK
+        rows.append((fx, fy))
+    forces = np.array(rows[-1:] + rows[:-1]) + chance.normal(0.0, 1e-3, (len(rows), 2))
+    ticks = np.arange(len(rows))
+    columns = {"time": ticks * TICK, "seq": ticks, "missed_slots": 0, "servo_on": True}
+    columns |= {"fx": forces[:, 0], "fy": forces[:, 1], "phi_c": commands, "samples": 40}
+    return pd.DataFrame(columns)
+
+
+@pytest.mark.parametrize(
+    ("settings", "phase", "step"),
+    [
+        (PigpioSettings(), 3e-3, 5),  # waits of 3 and 13 ms in turn, the shorter one first
+        (PigpioSettings(), 17e-3, 1),  # the longer one first
+        (SysfsPwmSettings(frequency=60.0), 12e-3, 1e-9),  # each command waits 12 ms
+    ],
+)
+def test_waits_for_pulses_and_their_rounding_are_found(
+    settings: ServoSettings, phase: float, step: float
+) -> None:
+    table = swim_with_pulses(settings, phase, step)
+    identification = identify(table, start=FISH, fit=PULSED, servo=settings)
+    assert identification.headline.startswith("identified")
+    waits = np.mod(phase - np.arange(len(table)) * TICK, settings.pulse_period)
+    delay = FISH.servo_delay + waits.mean()
+    for name, truth, error in (("omega0", FISH.omega0, 0.03), ("rotation", 0.0, 1.5e-3)):
+        assert identification[name].value == pytest.approx(truth, abs=error), name
+    assert identification["servo_delay"].value == pytest.approx(delay, abs=5e-4)
+
+
+def test_forces_sampled_earlier_are_not_a_shorter_delay(table: pd.DataFrame) -> None:
+    """The same forces, as if measured 3 ms earlier, are those of a servo with 3 ms more delay."""
+    earlier = table.assign(force_age_ms=table.force_age_ms + 3.0)
+    fits = [identify(runs, start=FISH, fit=NEARLY_KNOWN) for runs in (table, earlier)]
+    delays = [fit["servo_delay"].value for fit in fits]
+    assert delays[0] - delays[1] == pytest.approx(3e-3, abs=1e-4)
+
+
+def test_implausible_ages_of_forces_do_not_count(table: pd.DataFrame) -> None:
+    spoiled = table.assign(force_age_ms=1e308, force_span_ms=math.nan)
+    fits = [identify(runs, start=FISH, fit=NEARLY_KNOWN) for runs in (table, spoiled)]
+    assert fits[1]["servo_delay"].value == pytest.approx(fits[0]["servo_delay"].value, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_a_fish_behind_the_drivers_of_the_robot_is_identified() -> None:
+    config = load(
+        None,
+        ["robot=virtual-pi", "virtual_pi.pulse_lead=0.0123", "plant.servo_delay=0.02", QUIET],
+    )
+    with VirtualSession(config, EXACT) as session:
+        ticks = experiment(session, 60.0)
+        identification = identify(ticks, start=config.plant, fit=PULSED, servo=session.servo)
+    assert identification.headline.startswith("identified")
+    assert identification["omega0"].value == pytest.approx(12.5, abs=0.05)
+    # Pulses begin 7.7 and 17.7 ms after the ticks, in turn.
+    assert identification["servo_delay"].value == pytest.approx(0.0327, abs=1e-3)
 
 
 def test_a_large_step_of_a_fast_servo_has_a_response() -> None:

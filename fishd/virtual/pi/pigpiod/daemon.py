@@ -107,9 +107,13 @@ class Connection:
 class Pigpiod:
     """Emulated daemon; call `start` before use and `close` after. Safe for use from any thread."""
 
-    def __init__(self, clock: Clock, faults: Faults, port: int = 0) -> None:
-        """`port`: 0 for any free port."""
+    def __init__(self, clock: Clock, faults: Faults, port: int = 0, lead: float = 0.0) -> None:
+        """
+        port: 0 for any free port
+        lead: time by which its own clock, which starts the frames of pulses, is ahead [s]
+        """
         self._clock = clock
+        self._lead = lead
         self._faults = faults
         self._address = ("127.0.0.1", port)
         self._commands = Commands()
@@ -156,19 +160,22 @@ class Pigpiod:
         """Return the pulse width [µs] at a time up to now [s]; 0 without pulses."""
         with self._lock:
             self._catch_up()
-            return self._commands.pins.pins[gpio].train.width(time)
+            return self._commands.pins.pins[gpio].train.width(time + self._lead)
 
     def history(self, gpio: int) -> list[tuple[float, float]]:
         """Return the latest changes of the pulses: time of the effect [s] and width [µs]."""
         with self._lock:
             self._catch_up()
-            return self._commands.pins.pins[gpio].train.history
+            history = self._commands.pins.pins[gpio].train.history
+        return [(time - self._lead, width) for time, width in history]
 
     def edges(self, gpio: int, begin: float, end: float) -> list[Edge]:
         """Return the edges of a pin from `begin` to before `end` [s], at most until now."""
         with self._lock:
             self._catch_up()
-            return list(self._commands.pins.pins[gpio].train.edges(begin, end))
+            train, lead = self._commands.pins.pins[gpio].train, self._lead
+            edges = list(train.edges(begin + lead, end + lead))
+        return [Edge(edge.time - lead, edge.level) for edge in edges]
 
     def connect(self, gpio: int, source: int) -> None:
         """Connect a pin to another one, which drives it while it is an input."""
@@ -184,7 +191,7 @@ class Pigpiod:
         with self._lock:
             remaining = self._faults.listing().get("pigpiod-frozen")
             self._frozen_until = (
-                math.inf if remaining is None else self._clock.monotonic() + remaining
+                math.inf if remaining is None else self._clock.monotonic() + self._lead + remaining
             )
             self._catch_up()
         self._wake()
@@ -199,7 +206,7 @@ class Pigpiod:
 
     def _catch_up(self) -> float:
         """Advance to the current time and check the faults; return the time [s]."""
-        now = self._clock.monotonic()
+        now = self._clock.monotonic() + self._lead
         if not self._running:
             return now
         faults = self._faults

@@ -153,10 +153,45 @@ def test_the_force_of_a_window_is_the_mean_of_the_forces_of_its_pairs(
     evaluation = WindowEvaluation(ForceSensorSettings(force_limit=1e4), ("F_x", "F_y"), "V")
     measured = evaluation.measure(as_pairs(window), calibration)
     forces = [calibration.forces(x * STEP, y * STEP) for x, y in window]
-    assert measured.fx == pytest.approx(sum(fx for fx, _ in forces) / len(window), abs=1e-9)
-    assert measured.fy == pytest.approx(sum(fy for _, fy in forces) / len(window), abs=1e-9)
+    weights = [1.0] * len(window)
+    if len(window) % 2 and len(window) > 1:
+        weights[0] = weights[-1] = 0.5
+    for mean, values in zip((measured.fx, measured.fy), zip(*forces, strict=True), strict=True):
+        weighted = sum(w * force for w, force in zip(weights, values, strict=True))
+        assert mean == pytest.approx(weighted / sum(weights), abs=1e-9)
     assert measured.samples == len(window)
     assert measured.suspect == ""
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 13, 14])
+@pytest.mark.parametrize("y_first", [False, True])
+def test_the_forces_of_a_window_are_those_at_its_mean_time(count: int, y_first: bool) -> None:
+    """A force that rises by 1 N/s, in pairs that begin with x and y in turn, 3.6 ms apart."""
+    pairs = []
+    for index in range(count):
+        first, second = 3.6e-3 * index + 0.5e-3, 3.6e-3 * index + 2.3e-3
+        x, y = (second, first) if y_first != bool(index % 2) else (first, second)
+        pairs.append(Pair(first - 0.5e-3, second + 0.5e-3, x, y))
+    evaluation = WindowEvaluation(ForceSensorSettings(), ("F_x", "F_y"), "V")
+    measured = evaluation.measure(pairs, ForceCalibration())
+    assert measured.mean_time is not None
+    assert (measured.fx, measured.fy) == pytest.approx((measured.mean_time,) * 2, abs=1e-9)
+    # Without the weights, an odd number would shift them by a quarter of a pair.
+    assert measured.mean_time == pytest.approx(0.5 * (pairs[0].begun + pairs[-1].time))
+
+
+@pytest.mark.parametrize("count", [3, 4, 13, 14])
+def test_the_span_of_a_window_has_the_curvature_of_its_samples(count: int) -> None:
+    """The mean of t² over the samples is that over as many equally spaced ones in the span."""
+    times = [3.6e-3 * index for index in range(count)]
+    pairs = [Pair(t - 1.4e-3, t + 1.4e-3, (t - 0.9e-3) ** 2, (t + 0.9e-3) ** 2) for t in times]
+    evaluation = WindowEvaluation(ForceSensorSettings(), ("F_x", "F_y"), "V")
+    measured = evaluation.measure(pairs, ForceCalibration())
+    middle, span = measured.mean_time, measured.span
+    assert middle is not None
+    even = [middle + span * ((k + 0.5) / count - 0.5) for k in range(count)]
+    wanted = sum(t * t for t in even) / count
+    assert 0.5 * (measured.fx + measured.fy) == pytest.approx(wanted, rel=5e-3)
 
 
 @given(windows, calibrations, st.floats(0.1, 100))
