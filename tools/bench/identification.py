@@ -1,7 +1,8 @@
 """Errors of `fishctl identify` and coverage of its intervals, on known fish.
 
 Each fish swims one experiment of three minutes in virtual time, measured with noise, a rotated
-sensor, offsets and drift. Every fit begins with the default fish.
+sensor, offsets and drift. Every fit begins with the default fish. With `--kind foreign`, the fish
+are those of `common/foreign_fish.py`, another implementation of the equations with other servos.
 """
 
 import random

@@ -34,6 +34,7 @@ from fishd.lab.limits import find_excess
 from fishd.lab.session import Session, refuse_lost
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.servo_law import LAWS, ServoLaw
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -107,12 +108,15 @@ def identify(
     scale_is_free = _scale_is_free(names, values)
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
-    problem, values = _solve_from_starts(parts, names, values, further)
+    law: ServoLaw = (start or PlantParameters()).servo_law
+    laws = LAWS if fit is None and "servo_lag" not in fix else (law,)
+    problem = Problem(parts, names, _SETTLE_S, law)
+    problem, values = _solve_from_starts(problem, values, further, laws)
     settle = _settling_time(values)
     if settle > _SETTLE_S:
         longer = [part for part in parts if part.duration > settle + MIN_PASSAGE_S]
         parts, settle = (longer, settle) if longer else (parts, _SETTLE_S)
-        problem = Problem(parts, problem.names, settle)
+        problem = Problem(parts, problem.names, settle, problem.law)
         values = solve(problem, values)
     return summarise(parts, problem, values, given_values, scale_is_free)
 
@@ -176,40 +180,45 @@ def check(fit: Sequence[str], fix: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def _solve_from_starts(
-    parts: Sequence[Passage],
-    names: tuple[str, ...],
-    first: dict[str, float],
-    further: Sequence[str],
+    problem: Problem, first: dict[str, float], further: Sequence[str], laws: Sequence[ServoLaw]
 ) -> tuple[Problem, dict[str, float]]:
-    """Return the best fit from several start values, or the first if its residual is white.
+    """Return the best fit of several laws of the servo and start values, or the first white one.
 
-    From the others, rough fits are made without quadratic drag; the best of them is completed.
+    From other start values, rough fits are made without quadratic drag; the best is completed.
 
     further: parameters that are fitted too where the residual resembles their effect
+    laws: laws of the servo among which the best is chosen if the residual is not white
     """
+    names = problem.names
     starts = [_start_values(first, names, *start) for start in _STARTS]
-    problem = Problem(parts, names, _SETTLE_S)
     values = solve(problem, starts[0])
-    problem, values = _add_required(parts, problem, values, further)
-    if all_white(problem, values):
-        return problem, values
-    rough_fits = []
+    fits = [_add_required(problem, values, further)]
+    if all_white(*fits[0]):
+        return fits[0]
+    reset = {**fits[0][1], **{name: first[name] for name in further}}
+    candidates = [problem.changed(names, law) for law in laws if law != problem.law]
+    if candidates:
+        rough_fits = [(solve(each, reset, rounds=1, steps=_ROUGH_STEPS), each) for each in candidates]
+        best, candidate = min(rough_fits, key=lambda fit: fit[1].unexplained)
+        if candidate.unexplained < fits[0][0].unexplained:
+            fits.append(_add_required(candidate, solve(candidate, best), further))
+            if all_white(*fits[1]):
+                return fits[1]
+    law = fits[-1][0].law
     rough_names = tuple(name for name in names if name not in QUADRATIC) or names
-    for start in starts[1:]:
-        candidate = Problem(parts, rough_names, _SETTLE_S)
-        rough_fits.append((solve(candidate, start, rounds=1, steps=_ROUGH_STEPS), candidate))
+    rough_fits = [
+        (solve(each, start, rounds=1, steps=_ROUGH_STEPS), each)
+        for start in starts[1:]
+        for each in (problem.changed(rough_names, law),)
+    ]
     best, _ = min(rough_fits, key=lambda fit: fit[1].unexplained)
-    candidate = Problem(parts, names, _SETTLE_S)
-    best = solve(candidate, best)
-    candidate, best = _add_required(parts, candidate, best, further)
-    return (candidate, best) if candidate.unexplained < problem.unexplained else (problem, values)
+    candidate = problem.changed(names, law)
+    fits.append(_add_required(candidate, solve(candidate, best), further))
+    return min(fits, key=lambda fit: fit[0].unexplained)
 
 
 def _add_required(
-    parts: Sequence[Passage],
-    problem: Problem,
-    values: dict[str, float],
-    further: Sequence[str],
+    problem: Problem, values: dict[str, float], further: Sequence[str]
 ) -> tuple[Problem, dict[str, float]]:
     """Return the fit with those of `further` that the data require, added one by one.
 
@@ -222,7 +231,7 @@ def _add_required(
         if not missing or missing[0][1] < (_MIN_FALL if white else MIN_CLEAR_FALL):
             break
         name, _, size = missing[0]
-        wider = Problem(parts, check((*problem.names, name)), _SETTLE_S)
+        wider = problem.changed(check((*problem.names, name)), problem.law)
         wider_values = {**values, name: float(np.clip(size, *BOUNDS[name]))}
         wider_values = solve(wider, wider_values)
         if not white and wider.unexplained > problem.unexplained - 0.5 * _MIN_SHARE:

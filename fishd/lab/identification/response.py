@@ -8,12 +8,14 @@ delay, so that every step of the command is at a grid point.
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
+from fishd.virtual.plant.servo_law import Approach, ServoLaw
 from fishd.virtual.plant.tethered import REACTION_TIME
 
 Array = NDArray[np.float64]
@@ -54,13 +56,15 @@ class Drive:
     """Dead zone of the servo [rad]."""
     quadratic_drag: float = 0.0
     """Quadratic drag times coupling, cλ, as the fin here has λ = 1 [1/rad]."""
+    servo_law: ServoLaw = "tanh"
+    """Law by which the wheel approaches its instruction."""
 
 
 @dataclass(frozen=True)
 class Motion:
     """Motion of the wheel and of a fin with λ = 1, at the points of a grid."""
 
-    servo: tuple[float, ...]
+    servo: tuple[float | str, ...]
     """Parameters of the drive that determine the motion of the wheel."""
     pull: Array
     """Wheel angle that drives the fin, at the points and half way between them [rad]."""
@@ -107,7 +111,7 @@ def respond(
     held_commands = np.concatenate((np.full(slots_before, commands[0]), commands))
     servo = (
         *(drive.servo_speed, drive.servo_lag, drive.backlash, drive.cable_slack),
-        *(drive.servo_dead_zone, float(slots_before)),
+        *(drive.servo_dead_zone, float(slots_before), drive.servo_law),
     )
     if near and near.servo == servo:
         pull, turned = near.pull, near.turned
@@ -160,6 +164,9 @@ def _wheel_motion(drive: Drive, commands: Array, steps: int, tick: float) -> tup
 
     Both are at the grid points and half way between them.
     """
+    if drive.servo_law != "tanh":
+        turned = _approaches(drive, commands, 0.5 * tick / steps, 2 * steps)
+        return _take_up_slack(drive, _follow_with_play(turned, drive.backlash)), turned
     speed, lag = drive.servo_speed, drive.servo_lag
     dead, play = drive.servo_dead_zone, drive.backlash
     decay = math.exp(-speed * tick / lag)
@@ -184,9 +191,50 @@ def _wheel_motion(drive: Drive, commands: Array, steps: int, tick: float) -> tup
     if play:  # within a slot the wheel turns one way only
         wheel = np.clip(np.array(tails)[:, None], wheel - play, wheel + play)
     pull = np.append(wheel.ravel(), tail if play else phi)
-    if drive.cable_slack:
-        pull = np.sign(pull) * np.maximum(np.abs(pull) - drive.cable_slack, 0.0)
-    return pull, turned
+    return _take_up_slack(drive, pull), turned
+
+
+def _approaches(drive: Drive, commands: Array, step: float, steps: int) -> Array:
+    """Return the angle of a wheel with another law than tanh [rad].
+
+    step: time between two angles [s]; steps: number of them in a slot
+    """
+    lag, dead = drive.servo_lag, drive.servo_dead_zone
+    phi, speed = float(commands[0]), 0.0
+    begins = [0, *(np.flatnonzero(np.diff(commands)) + 1).tolist(), len(commands)]
+    angles = [np.array([phi])]
+    for begin, end in pairwise(begins):
+        gap = float(commands[begin]) - phi
+        if dead:
+            gap = math.copysign(max(0.0, abs(gap) - dead), gap)
+        approach = Approach(drive.servo_law, gap / lag, speed)
+        times = np.arange(1, (end - begin) * steps + 1) * (step * drive.servo_speed / lag)
+        lags, speeds, _ = approach.at(times)
+        angles.append(phi + gap - lag * lags)
+        phi, speed = float(angles[-1][-1]), float(speeds[-1])
+    return np.concatenate(angles)
+
+
+def _follow_with_play(wheel: Array, play: float) -> Array:
+    """Return the angle of a tail with backlash [rad]: between two turns, it is a bound."""
+    if not play:
+        return wheel
+    steps = np.diff(wheel)
+    moving = np.flatnonzero(steps)
+    turns = moving[1:][steps[moving[1:]] * steps[moving[:-1]] < 0.0] + 1
+    tail, pieces = float(wheel[0]), []
+    for piece in np.split(wheel, turns):
+        pieces.append(np.clip(tail, piece - play, piece + play))
+        tail = float(pieces[-1][-1])
+    return np.concatenate(pieces)
+
+
+def _take_up_slack(drive: Drive, pull: Array) -> Array:
+    """Return the angle of the tail behind slack cables [rad]."""
+    if not drive.cable_slack:
+        return pull
+    slack: Array = np.sign(pull) * np.maximum(np.abs(pull) - drive.cable_slack, 0.0)
+    return slack
 
 
 def _acceleration(drive: Drive, angle: Array, rate: Array, pull: Array) -> Array:

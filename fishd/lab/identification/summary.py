@@ -151,6 +151,7 @@ def summarise(
         inflation=inflation,
         failed_assumptions=tuple(failed),
         fit=_to_fit(problem, values, drifts),
+        servo_law=problem.law,
     )
 
 
