@@ -266,8 +266,8 @@ def solve(
             jac=jacobian,
             bounds=(low, high),
             x_scale="jac",
-            xtol=1e-6,
-            ftol=1e-8,
+            xtol=1e-5,
+            ftol=1e-6,
             max_nfev=steps,
         )
         values = problem.to_values(solution.x, fixed)

@@ -10,12 +10,13 @@ The distance e to the instruction is in units of Δ, a speed in units of Ω, and
 """
 
 import math
-from typing import Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Literal, TypeAlias, get_args
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-Vector: TypeAlias = NDArray[np.float64]
+    Vector: TypeAlias = NDArray[np.float64]
 ServoLaw: TypeAlias = Literal["tanh", "linear", "square-root", "accelerating"]
 LAWS: tuple[ServoLaw, ...] = get_args(ServoLaw)
 _MIN_SPEED = 1e-9
@@ -70,8 +71,10 @@ class Approach:
             return (self._slows,)
         return (self._gained, self._slows, self._slows + 2.0 * self._top)
 
-    def at(self, times: Vector) -> tuple[Vector, Vector, Vector]:
+    def at(self, times: "Vector") -> tuple["Vector", "Vector", "Vector"]:
         """Return distances, speeds and the derivatives of the speeds at these times."""
+        import numpy as np  # the configuration imports this module, and needs no numpy
+
         late = np.maximum(times - self._slows, 0.0)
         if self._is_linear:
             speeds = self._top * np.exp(-late)
@@ -84,9 +87,7 @@ class Approach:
         if self._gained:
             early = times < self._gained
             gain = self._speed + 0.5 * times
-            distances = np.where(
-                early, self._start + self._speed**2 - gain * gain, distances
-            )
+            distances = np.where(early, self._start + self._speed**2 - gain * gain, distances)
             speeds, changes = np.where(early, gain, speeds), np.where(early, 0.5, changes)
         return self._sign * distances, self._sign * speeds, self._sign * changes
 
