@@ -1,19 +1,24 @@
 """Errors of `fishctl identify` and coverage of its intervals, on known fish.
 
 Each fish swims one experiment of three minutes in virtual time, measured with noise, a rotated
-sensor, offsets and drift. Every fit begins with the default fish. With `--on virtual-pi`, the true
-drivers measure and move the fish; the phase of the servo's pulses differs from fish to fish.
+sensor, offsets and drift. Every fit begins with the default fish. With `--kind foreign`, the fish
+are those of `common/foreign_fish.py`, another implementation of the equations with other servos.
+With `--on virtual-pi`, the true drivers measure and move the fish; the phase of the servo's pulses
+differs from fish to fish.
 """
 
 import random
+import time
 from argparse import Namespace
+from collections import Counter
 from collections.abc import Sequence
-from math import radians
+from math import isfinite, radians
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
+from common.foreign_fish import LAWS, MODEL, ForeignParameters, register
 from common.report import JOBS, Options, Report, run_cases, table
 from fishd.config import Config, load
 from fishd.core.calibration import EXACT
@@ -41,8 +46,19 @@ MAX_DRAG, MAX_LATERAL_DRAG = 2.0, 0.01
 """Largest quadratic drag of the fin [1/rad], and in F_y [N s²/rad²]."""
 RATIOS = (0.6, 0.85, 1.15, 1.6)
 """Ranges of K_y/K: between the first two, or between the last two."""
-FIRST_SEED = {"other": 51000, "outside": 52000, "harsh": 900, "pi": 53000}
+FIRST_SEED = {"other": 51000, "outside": 52000, "harsh": 900, "foreign": 53000, "pi": 54000}
 """Seed of the first fish of each kind, and of its sensor."""
+FOREIGN_KINDS = (
+    *LAWS, "backlash", "dead zone", "delay", "asymmetry", "backlash and dead zone", "all of these",
+    "quadratic drag", "K_y/K from 0.25 to 0.5", "K_y/K from 2 to 4", "all, K_y/K from 2 to 4",
+)  # fmt: skip
+"""Kinds of foreign fish, in turn; those that are not named after a law have each in turn."""
+FOREIGN_COUNT = 40
+"""Number of foreign fish."""
+HELD = 1.0 + 1e-9
+"""Largest error of a true value in its interval, whose end may be zero, in half-widths."""
+FAR = 2.5
+"""Error that the first line of the output must warn of, in half-widths of the interval."""
 SECONDS = 180.0
 ABSOLUTE = {
     "servo_delay": (1e3, "ms"),
@@ -81,8 +97,25 @@ class Outcome(NamedTuple):
     """Result of one experiment."""
 
     intervals: dict[str, Interval]
-    trusted: bool
-    """Whether the first line of the output has no warning."""
+    verdict: str
+    """First words of the output: identified, careful or not identified."""
+    seconds: float
+    """Processor time of the fit [s]."""
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the first line of the output has no warning."""
+        return self.verdict == "identified"
+
+    @property
+    def errors(self) -> list[float]:
+        """Errors of all intervals that are not withheld, from their middles, in half-widths."""
+        return [
+            abs(each.truth - 0.5 * (each.low + each.high))
+            / max(0.5 * (each.high - each.low), np.finfo(float).tiny)
+            for each in self.intervals.values()
+            if isfinite(each.high)
+        ]
 
 
 def fish(kind: str, seed: int) -> Config:
@@ -115,24 +148,89 @@ def mean_wait(config: Config) -> float:
     return float(waits.mean()) if config.robot == "virtual-pi" else 0.0
 
 
+def foreign_fish(seed: int) -> Config:
+    """Return a fish of one of `FOREIGN_KINDS`, and its rig."""
+    register()
+    kind = FOREIGN_KINDS[seed % len(FOREIGN_KINDS)]
+    chance = random.Random(FIRST_SEED["foreign"] + seed)
+    plain = msgspec.structs.asdict(PlantParameters())
+    has_all = kind.startswith("all")
+    ratio = chance.uniform(2.0, 4.0)
+    varied = {
+        name: plain[name] * chance.uniform(1 - SPREAD, 1 + SPREAD)
+        for name in VARIED
+        if name != "servo_lag"
+    }
+    imperfections = {
+        "servo_asymmetry": (
+            "asymmetry" in kind,
+            chance.choice((-1, 1)) * chance.uniform(0.05, 0.2),
+        ),
+        "servo_dead_zone": ("dead zone" in kind, chance.uniform(0.01, 0.03)),
+        "backlash": ("backlash" in kind, chance.uniform(0.01, 0.05)),
+        "servo_delay": (kind == "delay", chance.uniform(0.005, 0.03)),
+    }
+    drag = chance.uniform(0.5, 2.0)
+    ratios = {"K_y/K from 0.25 to 0.5": 1.0 / ratio}
+    plant = ForeignParameters(
+        model=MODEL,
+        **varied,
+        servo_law=kind if kind in LAWS else LAWS[(seed + seed // len(FOREIGN_KINDS)) % len(LAWS)],
+        servo_lag=chance.uniform(0.05, 0.3),
+        servo_acceleration=chance.uniform(60.0, 300.0),
+        **{name: value for name, (is_on, value) in imperfections.items() if is_on or has_all},
+        quadratic_drag=drag if kind == "quadratic drag" else 0.0,
+        lateral_inertia_ratio=ratios.get(kind, ratio if "from 2 to 4" in kind else 1.0),
+    )
+    rig = SimulationSettings(
+        noise=1e-3 * chance.uniform(0.5, 2.0),
+        rotation=radians(chance.uniform(-5.0, 5.0)),
+        offset_x=chance.uniform(-0.02, 0.02),
+        offset_y=chance.uniform(-0.02, 0.02),
+        drift=5e-3 * chance.random(),
+        seed=FIRST_SEED["foreign"] + seed,
+    )
+    return Config(plant=plant, simulation=rig)
+
+
+def true_values(config: Config, law: str) -> dict[str, Any]:
+    """Return the true values of a fish and its rig, without those that the model does not have.
+
+    law: law of the servo in the fit; only the same one has the same Δ
+    """
+    truth: dict[str, Any] = msgspec.structs.asdict(config.plant)
+    truth |= msgspec.structs.asdict(config.simulation)
+    if isinstance(config.plant, ForeignParameters):
+        truth["backlash"] *= 0.5  # its whole width
+        if law == "accelerating":
+            truth["servo_lag"] = config.plant.servo_speed**2 / (2.0 * truth["servo_acceleration"])
+    if law != truth["servo_law"]:
+        del truth["servo_lag"]
+    if truth["servo_law"] == "accelerating":  # it coasts through the zone to its middle
+        del truth["servo_dead_zone"]
+    return truth
+
+
 def one(run: tuple[str, int]) -> Outcome:
     """Run one fish, and identify it."""
     kind, seed = run
-    config = fish(kind, seed)
+    config = foreign_fish(seed) if kind == "foreign" else fish(kind, seed)
     with VirtualSession(config, EXACT) as swum:
-        identification = identify(experiment(swum, SECONDS), servo=swum.servo)
-    truth: dict[str, Any] = msgspec.structs.asdict(config.plant)
+        ticks = experiment(swum, SECONDS)
+    begin = time.process_time()
+    identification = identify(ticks, servo=swum.servo)
+    took = time.process_time() - begin
+    truth = true_values(config, identification.servo_law)
     truth["servo_delay"] += mean_wait(config)
-    truth |= msgspec.structs.asdict(config.simulation)
     # Nearly three whole periods of the drift, so that its mean is almost zero.
     intervals = {
         each.name: Interval(
             truth[each.name], each.value, each.ci95_low, each.ci95_high, *each.narrowest_interval
         )
         for each in identification.estimates
-        if each.fitted
+        if each.fitted and each.name in truth
     }
-    return Outcome(intervals, identification.headline.startswith("identified"))
+    return Outcome(intervals, identification.headline.partition(":")[0], took)
 
 
 def rows(outcomes: Sequence[Outcome], *, known: bool) -> list[list[str]]:
@@ -166,8 +264,8 @@ def rows(outcomes: Sequence[Outcome], *, known: bool) -> list[list[str]]:
 def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
     """Return the row of one kind of fish."""
     known = kind != "outside"
-    held = narrow = count = astray = withheld = own = own_held = 0
-    errors, worst = [], 0.0
+    held = narrow = count = withheld = own = own_held = 0
+    errors: list[float] = []
     for outcome in outcomes:
         for name, each in outcome.intervals.items():
             if not np.isfinite(each.high):
@@ -179,9 +277,6 @@ def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
             if name not in SCALED:
                 own, own_held = own + 1, own_held + holds
             narrow += each.known_low <= each.truth <= each.known_high
-            off = abs(each.truth - 0.5 * (each.low + each.high)) / (0.5 * (each.high - each.low))
-            worst = max(worst, off)
-            astray += outcome.trusted and off > 2.0
             if known and name in VARIED:
                 errors.append(100.0 * abs(each.value / each.truth - 1.0))
     return [
@@ -192,11 +287,51 @@ def summary(kind: str, outcomes: Sequence[Outcome]) -> list[str]:
         f"{narrow} of {count}" if known else "–",
         f"{np.median(errors):.2g} %" if known else "–",
         f"{sum(not outcome.trusted for outcome in outcomes)} of {len(outcomes)}",
-        f"{worst:.2g}",
-        str(astray),
+        f"{max(error for outcome in outcomes for error in outcome.errors):.2g}",
+        str(
+            sum(error > 2.0 for outcome in outcomes if outcome.trusted for error in outcome.errors)
+        ),
     ]
 
 
+def foreign_row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
+    """Return the row of some foreign fish."""
+    errors = [error for outcome in outcomes for error in outcome.errors]
+    held = sum(error <= HELD for error in errors)
+    verdicts = Counter(outcome.verdict for outcome in outcomes)
+    far = [e for outcome in outcomes if outcome.trusted for e in outcome.errors if e > FAR]
+    return [
+        name,
+        ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items())),
+        f"{held} of {len(errors)} ({held / max(1, len(errors)):.0%})",
+        f"{max(errors, default=0.0):.2g}",
+        str(len(far)),
+        f"{np.median([outcome.seconds for outcome in outcomes]):.0f} s",
+    ]
+
+
+def foreign(options: Namespace) -> Report:
+    """Return the table of foreign fish."""
+    count = options.seeds or FOREIGN_COUNT
+    outcomes = run_cases(one, [("foreign", seed) for seed in range(count)], options.jobs)
+    kinds = [
+        foreign_row(kind, outcomes[place :: len(FOREIGN_KINDS)])
+        for place, kind in enumerate(FOREIGN_KINDS[:count])
+    ]
+    verdicts = {
+        verdict: [outcome for outcome in outcomes if outcome.verdict == verdict]
+        for verdict in ("identified", "careful", "not identified")
+    }
+    whole = [foreign_row(f"all, {v}", found) for v, found in verdicts.items() if found]
+    lines = table(FOREIGN_HEAD, [*kinds, *whole])
+    figures = [msgspec.to_builtins(outcome._asdict()) for outcome in outcomes]
+    return Report({"bench identification foreign": lines}, figures)
+
+
+FOREIGN_HEAD = (
+    "fish | first words | intervals that contain the true value | largest error, half-widths | "
+    "errors above 2.5 half-widths, identified | median processor time of a fit"
+)
 SUMMARY = (
     "fish | intervals that contain the true value | the same, not scaled by K_y/K | withheld | "
     "the same, K_y/K known | median error | fits with a warning | largest error, half-widths | "
@@ -207,10 +342,11 @@ HEAD = (
     "contains the true value"
 )
 OPTIONS: Options = {
+    "--kind": {"choices": ("known", "foreign"), "default": "known", "help": "kinds of fish"},
     "--seeds": {
         "type": int,
-        "default": 10,
-        "help": "experiments of each kind, half as many harsh ones; default 10",
+        "help": "experiments of each kind, half as many harsh ones, default 10; or number of "
+        "foreign fish, default 40",
     },
     "--on": {
         "choices": ("simulation", "virtual-pi"),
@@ -223,10 +359,13 @@ OPTIONS: Options = {
 
 def measure(options: Namespace) -> Report:
     """Return the tables; each experiment takes some seconds."""
+    if options.kind == "foreign":
+        return foreign(options)
     sections, figures, whole = {}, {}, []
     kinds = ["pi"] if options.on == "virtual-pi" else [kind for kind in KINDS if kind != "pi"]
+    count = options.seeds or 10
     for kind in kinds:
-        seeds = options.seeds if kind in EQUALLY_FITTED else (options.seeds + 1) // 2
+        seeds = count if kind in EQUALLY_FITTED else (count + 1) // 2
         outcomes = run_cases(one, [(kind, seed) for seed in range(seeds)], options.jobs)
         whole.append(summary(kind, outcomes))
         figures[kind] = [outcome._asdict() for outcome in outcomes]

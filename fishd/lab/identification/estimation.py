@@ -9,7 +9,7 @@ import math
 import os
 from collections.abc import Sequence
 from itertools import product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 import numpy as np
@@ -31,11 +31,12 @@ from fishd.lab.identification.misfit import all_white, find_missing_parameters
 from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifiable, passages
 from fishd.lab.identification.pulses import place_pulses
 from fishd.lab.identification.result import Identification
-from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, summarise
+from fishd.lab.identification.summary import MIN_CLEAR_FALL, SCALED, OtherLaw, summarise
 from fishd.lab.limits import find_excess
 from fishd.lab.session import Session, refuse_lost
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.servo_law import LAWS, ServoLaw
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 
     Source = DataFrame | Run | str | os.PathLike[str]
 
+Fitted: TypeAlias = tuple[Problem, dict[str, float]]
+"""A problem and the values that solve it."""
 DEFAULT = (
     *("omega0", "xi", "quadratic_drag", "coupling", "servo_speed", "servo_lag"),
     *("thrust_coefficient", "lateral_inertia_ratio", "lateral_drag"),
@@ -68,6 +71,12 @@ _ROUGH_STEPS = 12
 """Largest number of steps of a rough fit, which compares start values."""
 _MAX_PLACINGS = 4
 """Largest number of rough fits that find the pulses of the servo."""
+_LAW_STEPS = 6
+"""Largest number of steps of a fit with another law."""
+_GOOD_SHARE = 0.98
+"""Explained share of both forces above which no other start values are tried."""
+_MIN_START_LAG, _ACCELERATING_SHARE = 0.03, 0.8
+"""Smallest Δ [rad], and share of a delay, with which a fit of an accelerating wheel begins."""
 _STARTS = tuple(product((1.0, 0.5, 2.0), (0.01, 0.06, 0.12)))
 """Start values: natural frequency, as a multiple of that of the given fish, and delay [s]."""
 REST_S = 4.0
@@ -116,24 +125,27 @@ def identify(
     scale_is_free = _scale_is_free(names, values)
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
+    law: ServoLaw = (start or PlantParameters()).servo_law
+    laws = LAWS if fit is None and "servo_lag" not in fix else (law,)
     if any(part.servo for part in parts):
-        parts = _with_pulses(parts, names, _start_values(values, names, *_STARTS[0]))
-    problem, values = _solve_from_starts(parts, names, values, further)
+        parts = _with_pulses(parts, names, _start_values(values, names, *_STARTS[0]), law)
+    problem = Problem(parts, names, _SETTLE_S, law)
+    (problem, values), others = _solve_from_starts(problem, values, further, laws)
     settle = _settling_time(values)
     if settle > _SETTLE_S:
         longer = [part for part in parts if part.duration > settle + MIN_PASSAGE_S]
         parts, settle = (longer, settle) if longer else (parts, _SETTLE_S)
-        problem = Problem(parts, problem.names, settle)
+        problem = Problem(parts, problem.names, settle, problem.law)
         values = solve(problem, values)
-    return summarise(parts, problem, values, given_values, scale_is_free)
+    return summarise(parts, problem, values, given_values, scale_is_free, others)
 
 
 def _with_pulses(
-    parts: list[Passage], names: tuple[str, ...], values: dict[str, float]
+    parts: list[Passage], names: tuple[str, ...], values: dict[str, float], law: ServoLaw
 ) -> list[Passage]:
     """Return the passages with the likeliest pulses, which rough fits from `values` find."""
     for _ in range(_MAX_PLACINGS):
-        problem = Problem(parts, names, _SETTLE_S)
+        problem = Problem(parts, names, _SETTLE_S, law)
         values = solve(problem, values, rounds=1, steps=_ROUGH_STEPS)
         placed = place_pulses(parts, problem, values, _SETTLE_S)
         if all(new is old for new, old in zip(placed, parts, strict=True)):
@@ -220,41 +232,77 @@ def check(fit: Sequence[str], fix: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def _solve_from_starts(
-    parts: Sequence[Passage],
-    names: tuple[str, ...],
-    first: dict[str, float],
-    further: Sequence[str],
-) -> tuple[Problem, dict[str, float]]:
+    problem: Problem, first: dict[str, float], further: Sequence[str], laws: Sequence[ServoLaw]
+) -> tuple[Fitted, list[OtherLaw]]:
     """Return the best fit from several start values, or the first if its residual is white.
 
     From the others, rough fits are made without quadratic drag; the best of them is completed.
+    The result is as that of `_choose_law`.
 
     further: parameters that are fitted too where the residual resembles their effect
+    laws: laws of the servo among which the best is chosen
     """
-    starts = [_start_values(first, names, *start) for start in _STARTS]
-    problem = Problem(parts, names, _SETTLE_S)
-    values = solve(problem, starts[0])
-    problem, values = _add_required(parts, problem, values, further)
-    if all_white(problem, values):
-        return problem, values
+    starts = [_start_values(first, problem.names, *start) for start in _STARTS]
+    choice = _choose_law((problem, solve(problem, starts[0])), further, laws)
+    if all_white(*choice[0]) or _explained_share(*choice[0]) > _GOOD_SHARE:
+        return choice
+    rough_names = tuple(name for name in problem.names if name not in QUADRATIC) or problem.names
+    rough = problem.changed(rough_names, choice[0][0].law)
     rough_fits = []
-    rough_names = tuple(name for name in names if name not in QUADRATIC) or names
     for start in starts[1:]:
-        candidate = Problem(parts, rough_names, _SETTLE_S)
-        rough_fits.append((solve(candidate, start, rounds=1, steps=_ROUGH_STEPS), candidate))
-    best, _ = min(rough_fits, key=lambda fit: fit[1].unexplained)
-    candidate = Problem(parts, names, _SETTLE_S)
-    best = solve(candidate, best)
-    candidate, best = _add_required(parts, candidate, best, further)
-    return (candidate, best) if candidate.unexplained < problem.unexplained else (problem, values)
+        values = solve(rough, start, rounds=1, steps=_ROUGH_STEPS)
+        rough_fits.append((rough.unexplained, values))
+    _, best = min(rough_fits, key=lambda fit: fit[0])
+    candidate = problem.changed(problem.names, rough.law)
+    later = _choose_law((candidate, solve(candidate, best)), further, laws)
+    return min(choice, later, key=lambda choice: choice[0][0].unexplained)
 
 
-def _add_required(
-    parts: Sequence[Passage],
-    problem: Problem,
-    values: dict[str, float],
-    further: Sequence[str],
-) -> tuple[Problem, dict[str, float]]:
+def _explained_share(problem: Problem, values: dict[str, float]) -> float:
+    """Return the smaller explained share of both forces, without drift."""
+    left, whole = problem.residuals(values), problem.measured
+    shares = (problem.whitened(left) ** 2).sum(axis=1) / (problem.whitened(whole) ** 2).sum(axis=1)
+    return float(1.0 - shares.max())
+
+
+def _choose_law(
+    fitted: Fitted, further: Sequence[str], laws: Sequence[ServoLaw]
+) -> tuple[Fitted, list[OtherLaw]]:
+    """Return the fit with the most likely law of the servo, with those of `further` it requires.
+
+    The second result are rough fits with the other laws, which begin with its values.
+    """
+    names, first = fitted[0].names, fitted[1]
+    while True:
+        fitted = problem, values = _add_required(*fitted, further)
+        others = []
+        for law in laws:
+            if law != problem.law:
+                other = problem.changed(problem.names, law)
+                start = _as_start(values, problem.law, law)
+                others.append((other, solve(other, start, rounds=1, steps=_LAW_STEPS)))
+        best = min((fitted, *others), key=lambda fit: fit[0].unexplained)
+        if best is fitted:
+            return fitted, [(o.unexplained - problem.unexplained, values) for o, values in others]
+        simple = problem.changed(names, best[0].law)
+        fitted = simple, solve(simple, {**best[1], **{name: first[name] for name in further}})
+
+
+def _as_start(values: dict[str, float], former: ServoLaw, law: ServoLaw) -> dict[str, float]:
+    """Return start values for a law from a fit of another one.
+
+    A wheel that has to gain its speed is late by Δ/Ω, which the others take for a delay.
+    """
+    delay, speed = values["servo_delay"], values["servo_speed"]
+    if law == "accelerating":
+        lag = max(_MIN_START_LAG, _ACCELERATING_SHARE * delay * speed)
+        return {**values, "servo_lag": lag, "servo_delay": max(0.0, delay - lag / speed)}
+    if former == "accelerating":
+        return {**values, "servo_delay": delay + values["servo_lag"] / speed}
+    return values
+
+
+def _add_required(problem: Problem, values: dict[str, float], further: Sequence[str]) -> Fitted:
     """Return the fit with those of `further` that the data require, added one by one.
 
     A parameter is added at a small effect already, even if the residual is white: it biases the
@@ -266,7 +314,7 @@ def _add_required(
         if not missing or missing[0][1] < (_MIN_FALL if white else MIN_CLEAR_FALL):
             break
         name, _, size = missing[0]
-        wider = Problem(parts, check((*problem.names, name)), _SETTLE_S)
+        wider = problem.changed(check((*problem.names, name)), problem.law)
         wider_values = {**values, name: float(np.clip(size, *BOUNDS[name]))}
         wider_values = solve(wider, wider_values)
         if not white and wider.unexplained > problem.unexplained - 0.5 * _MIN_SHARE:

@@ -17,6 +17,7 @@ from scipy.signal import lfilter
 
 from fishd.lab.identification.passages import Passage
 from fishd.lab.identification.response import Array, Drive, Motion, respond
+from fishd.virtual.plant.servo_law import ServoLaw
 
 DRIVE = (
     *("omega0", "xi", "quadratic_drag", "servo_speed", "servo_lag"),
@@ -92,19 +93,32 @@ class Problem:
     Attributes:
         names: names of the fitted parameters, in the order of the vector z, which holds the
             logarithms of those in `LOGARITHMIC`.
+        law: law by which the servo approaches its instruction.
         noise: noise models of F_x and F_y.
     """
 
-    def __init__(self, passages: Sequence[Passage], names: Sequence[str], settle: float) -> None:
-        """settle: time at the start of a passage that is left out [s]"""
+    def __init__(
+        self,
+        passages: Sequence[Passage],
+        names: Sequence[str],
+        settle: float,
+        law: ServoLaw = "tanh",
+    ) -> None:
+        """settle: time at the start of a passage that is left out [s]; law: that of the servo"""
         self.names = tuple(names)
+        self.law = law
         self.noise = (Noise(1.0, 0.1, 0.005), Noise(1.0, 0.1, 0.005))
+        self._settle = settle
         self._passages = [
             (passage, int(np.searchsorted(passage.ends[1:] * passage.tick, settle)))
             for passage in passages
         ]
         self._cached: tuple[dict[str, float], list[Array]] | None = None
         self._latest_motions: list[Motion | None] = [None for _ in passages]
+
+    def changed(self, names: Sequence[str], law: ServoLaw) -> "Problem":
+        """Return the problem of the same passages with other parameters and another law."""
+        return Problem([passage for passage, _ in self._passages], names, self._settle, law)
 
     def to_z(self, values: dict[str, float]) -> Array:
         """Return the vector z of the fitted parameters, clipped to their bounds."""
@@ -214,7 +228,7 @@ class Problem:
         drive["quadratic_drag"] *= values["coupling"]
         if self._cached and self._cached[0] == drive:
             return self._cached[1]
-        model = Drive(**drive)
+        model = Drive(**drive, servo_law=self.law)
         responses = [
             respond(model, passage.angles, passage.timing, near)
             for (passage, _), near in zip(self._passages, self._latest_motions, strict=True)
@@ -252,8 +266,8 @@ def solve(
             jac=jacobian,
             bounds=(low, high),
             x_scale="jac",
-            xtol=1e-6,
-            ftol=1e-8,
+            xtol=1e-5,
+            ftol=1e-6,
             max_nfev=steps,
         )
         values = problem.to_values(solution.x, fixed)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
+from scipy.stats import f as f_distribution
 
 from fishd.lab.identification.fit import BOUNDS, LOGARITHMIC, SIGNED, Problem
 from fishd.lab.identification.passages import Passage
@@ -23,6 +24,8 @@ _TIME_GROUPS = 8
 """Number of groups where data are grouped by time."""
 _MIN_GROUP_SHARE = 1.0 / 24.0
 """Smallest share of all windows in a group."""
+_STEP_LAGS = 10
+"""Number of windows after a step of the command in which its effect on a residual is tested."""
 LAGS = 20
 """Largest lag at which the correlation of residuals is considered [ticks]."""
 _PROBE_SIZE_RAD = 0.01
@@ -62,6 +65,25 @@ def _kinds(part: Passage) -> Labels:
     kinds = np.stack((lengths * part.tick, np.maximum(heights, 1e-3)))
     whole = np.round(2.0 * np.log2(kinds)).astype(np.int_)
     return np.repeat(whole, lengths, axis=1)[:, part.ends[1:] - 1]
+
+
+def _step_columns(part: Passage) -> Array:
+    """Return by window whether a large or small step, up or down, was 0, 1, … windows before.
+
+    The shape is (windows, 4 × `_STEP_LAGS`).
+    """
+    held = np.concatenate((part.commands[:1], part.commands[part.ends[1:] - 1]))
+    steps = np.diff(held)
+    sizes = np.abs(steps)
+    large = sizes > 0.5 * sizes.max(initial=0.0)
+    kinds = [(steps > 0.0) & large, (steps < 0.0) & large, (steps > 0.0) & ~large,
+             (steps < 0.0) & ~large]  # fmt: skip
+    columns = [
+        np.concatenate((np.zeros(lag), kind[: kind.size - lag]))
+        for kind in kinds
+        for lag in range(min(_STEP_LAGS, steps.size))
+    ]
+    return np.stack(columns, axis=1)
 
 
 def predict_groups(jacobian: Array, innovations: Array, labels: Labels) -> Array:
@@ -172,6 +194,30 @@ def is_white(innovations: Array) -> bool:
     correlations = [float(innovations[lag:] @ innovations[:-lag]) / squares for lag in lags]
     total = sum(r * r / (count - lag) for lag, r in zip(lags, correlations, strict=True))
     return bool(chi2.sf(count * (count + 2) * total, len(correlations)) > 1e-3)
+
+
+def follows_commands(parts: Sequence[Passage], skips: Sequence[int], innovations: Array) -> bool:
+    """Return whether innovations of a force depend on recent steps of the command.
+
+    A regression on large and small steps, and on their directions, at each of the last windows
+    explains more than noise would, once in a thousand. It sees errors of the model that are far
+    below the noise of one tick.
+
+    skips: number of windows at the start of each passage that are left out
+    """
+    columns = np.concatenate(
+        [_step_columns(part)[skip:] for part, skip in zip(parts, skips, strict=True)]
+    )
+    left = np.linalg.lstsq(columns, innovations)[0]
+    explained = float(np.sum((columns @ left) ** 2))
+    rank = columns.shape[1]
+    noise = float(innovations @ innovations) - explained
+    return bool(
+        f_distribution.sf(
+            explained / rank / (noise / (len(innovations) - rank)), rank, len(innovations) - rank
+        )
+        < 1e-3
+    )
 
 
 def is_at_bound(name: str, value: float) -> bool:

@@ -8,12 +8,14 @@ by the delay, so that every step of the command is at a grid point.
 import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
+from fishd.virtual.plant.servo_law import Approach, ServoLaw
 from fishd.virtual.plant.tethered import REACTION_TIME
 
 Array = NDArray[np.float64]
@@ -52,13 +54,15 @@ class Drive:
     """Dead zone of the servo [rad]."""
     quadratic_drag: float = 0.0
     """Quadratic drag times coupling, cλ, as the fin here has λ = 1 [1/rad]."""
+    servo_law: ServoLaw = "tanh"
+    """Law by which the wheel approaches its instruction."""
 
 
 @dataclass(frozen=True)
 class Motion:
     """Motion of the wheel and of a fin with λ = 1, at the points of a grid."""
 
-    servo: tuple[float, ...]
+    servo: tuple[float | str, ...]
     """Parameters of the drive that determine the motion of the wheel."""
     pull: Array
     """Wheel angle that drives the fin, at the points and half way between them [rad]."""
@@ -139,7 +143,7 @@ def respond(
     slots_before = _SLOTS_BEFORE + math.ceil(before / timing.tick - 1e-9)
     servo = (
         *(drive.servo_speed, drive.servo_lag, drive.backlash, drive.cable_slack),
-        *(drive.servo_dead_zone, float(slots_before)),
+        *(drive.servo_dead_zone, float(slots_before), drive.servo_law),
     )
     if near and near.servo == servo:
         pull, turned = near.pull, near.turned
@@ -192,6 +196,9 @@ def _wheel_motion(
 
     lengths: number of steps for which each command applies; h: one step [s]
     """
+    if drive.servo_law != "tanh":
+        turned = _approaches(drive, commands, 2 * lengths, 0.5 * h)
+        return _take_up_slack(drive, _follow_with_play(turned, drive.backlash)), turned
     speed, lag = drive.servo_speed, drive.servo_lag
     dead, play = drive.servo_dead_zone, drive.backlash
     decays = np.exp(lengths * (-speed * h / lag)).tolist()
@@ -219,9 +226,52 @@ def _wheel_motion(
     if play:  # for one command the wheel turns one way only
         wheel = np.clip(np.repeat(np.array(tails), points), wheel - play, wheel + play)
     pull = np.append(wheel, tail if play else phi)
-    if drive.cable_slack:
-        pull = np.sign(pull) * np.maximum(np.abs(pull) - drive.cable_slack, 0.0)
-    return pull, turned
+    return _take_up_slack(drive, pull), turned
+
+
+def _approaches(drive: Drive, commands: Array, lengths: NDArray[np.int_], step: float) -> Array:
+    """Return the angle of a wheel with another law than tanh [rad].
+
+    lengths: number of angles for which each command applies; step: time between two angles [s]
+    """
+    lag, dead = drive.servo_lag, drive.servo_dead_zone
+    commands, lengths = commands[lengths > 0], lengths[lengths > 0]
+    phi, speed = float(commands[0]), 0.0
+    begins = [0, *(np.flatnonzero(np.diff(commands)) + 1).tolist(), len(commands)]
+    angles = [np.array([phi])]
+    for begin, end in pairwise(begins):
+        gap = float(commands[begin]) - phi
+        if dead:
+            gap = math.copysign(max(0.0, abs(gap) - dead), gap)
+        approach = Approach(drive.servo_law, gap / lag, speed)
+        count = int(lengths[begin:end].sum())
+        times: Array = np.arange(1, count + 1) * (step * drive.servo_speed / lag)
+        lags, speeds, _ = approach.at(times)
+        angles.append(phi + gap - lag * lags)
+        phi, speed = float(angles[-1][-1]), float(speeds[-1])
+    return np.concatenate(angles)
+
+
+def _follow_with_play(wheel: Array, play: float) -> Array:
+    """Return the angle of a tail with backlash [rad]: between two turns, it is a bound."""
+    if not play:
+        return wheel
+    steps = np.diff(wheel)
+    moving = np.flatnonzero(steps)
+    turns = moving[1:][steps[moving[1:]] * steps[moving[:-1]] < 0.0] + 1
+    tail, pieces = float(wheel[0]), []
+    for piece in np.split(wheel, turns):
+        pieces.append(np.clip(tail, piece - play, piece + play))
+        tail = float(pieces[-1][-1])
+    return np.concatenate(pieces)
+
+
+def _take_up_slack(drive: Drive, pull: Array) -> Array:
+    """Return the angle of the tail behind slack cables [rad]."""
+    if not drive.cable_slack:
+        return pull
+    slack: Array = np.sign(pull) * np.maximum(np.abs(pull) - drive.cable_slack, 0.0)
+    return slack
 
 
 def _acceleration(drive: Drive, angle: Array, rate: Array, pull: Array) -> Array:

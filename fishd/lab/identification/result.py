@@ -6,6 +6,7 @@ from typing import Any
 
 from fishd.core.estimation import MAX_LEAK_S
 from fishd.lab.identification.response import Array
+from fishd.virtual.plant.servo_law import ServoLaw
 
 UNITS = {
     "omega0": "rad/s",
@@ -129,6 +130,8 @@ class Identification:
     of section `plant`, or `rotation`, explains a part of the residual.
     """
     fit: Fit
+    servo_law: ServoLaw
+    """Law of the servo with which the forces are explained best."""
 
     def __getitem__(self, name: str) -> Estimate:
         """Return the estimate of this name; raises KeyError."""
@@ -138,9 +141,10 @@ class Identification:
         raise KeyError(name)
 
     @property
-    def plant(self) -> dict[str, float]:
+    def plant(self) -> dict[str, float | str]:
         """Values of the section `plant` of a configuration."""
-        return {e.name: e.value for e in self.estimates if e.name not in RIG_PARAMETERS}
+        fish = {e.name: e.value for e in self.estimates if e.name not in RIG_PARAMETERS}
+        return {"servo_law": self.servo_law, **fish}
 
     @property
     def simulation(self) -> dict[str, float]:
@@ -184,6 +188,7 @@ class Identification:
         return {
             "headline": self.headline,
             "identified": self.identified,
+            "servo_law": self.servo_law,
             "failed_assumptions": list(self.failed_assumptions),
             "inflation": self.inflation,
             "estimates": {e.name: _to_builtins(e) for e in self.estimates},
@@ -203,7 +208,9 @@ class Identification:
             "remarks": list(self.remarks),
         }
 
-    def _line(self, name: str, value: float) -> str:
+    def _line(self, name: str, value: float | str) -> str:
+        if isinstance(value, str):
+            return f"  {name}: {value}"
         if name not in UNITS:
             return f"  {name}: {_format_number(value)}"
         estimate = self[name]

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
@@ -12,6 +13,7 @@ from fishd.lab.identification.misfit import (
     LAGS,
     are_free,
     find_missing_parameters,
+    follows_commands,
     group_windows,
     is_at_bound,
     is_white,
@@ -30,7 +32,10 @@ from fishd.lab.identification.result import (
 )
 from fishd.lab.statistics import Z95, student95
 
-LATERAL_INERTIA_FACTOR = 2.0
+OtherLaw: TypeAlias = tuple[float, dict[str, float]]
+"""Fit with another law of the servo: its `Problem.unexplained` above that of the best one, and its
+values."""
+LATERAL_INERTIA_FACTOR = 4.0
 """Factor that contains K_y/K over the configured value in 95 % of cases, if it is not fitted."""
 SCALED = {
     "coupling": 1.0,
@@ -44,7 +49,10 @@ SCALED = {
 MISFIT_FACTOR = 2.0
 """Factor on the errors from the disagreement of groups, as these are few and may share an error."""
 MIN_EXPLAINED = 0.9
-"""Smallest explained share of each force, out of sample, for which intervals are given at all."""
+"""Smallest explained share of each force, out of sample, for which an incomplete model is given
+intervals."""
+_MIN_EXPLAINED_OF_NOISE = 0.05
+"""The same for a model whose residual is noise."""
 _MAX_PREDICTION_RATIO = 1.1
 """Largest ratio of the sums of squared residuals out of sample and in sample."""
 MIN_CLEAR_FALL = 25.0
@@ -74,8 +82,13 @@ def summarise(
     values: dict[str, float],
     known: dict[str, float],
     scale_is_free: bool,
+    others: Sequence[OtherLaw] = (),
 ) -> Identification:
-    """Return the identification; `known` holds also the values of unused parameters."""
+    """Return the identification.
+
+    known: values of all parameters, also of unused ones
+    others: fits of the same parameters with other laws of the servo
+    """
     all_values = {**known, **values}
     residuals = problem.residuals(values)
     innovations = problem.whitened(residuals)
@@ -93,7 +106,7 @@ def summarise(
             explained_out_of_sample=_explained_share(unseen, whole),
             noise=noise.white,
             drift=float(max(d[k].max() for d in drifts) - min(d[k].min() for d in drifts)),
-            white=is_white(left),
+            white=is_white(left) and not follows_commands(parts, problem.skips, left),
         )
         for k, (name, left, unseen, whole, noise) in enumerate(
             zip(("fx", "fy"), innovations, predicted, measured, problem.noise, strict=True)
@@ -105,14 +118,18 @@ def summarise(
         covariance = statistical + MISFIT_FACTOR**2 * misfit_covariance(
             jacobian, innovations, labels
         )
-        inflation = float(np.median(np.sqrt(np.diag(covariance) / np.diag(statistical))))
+        inflation = _inflation(covariance, statistical)
+    covariance = covariance + _spread_of_laws(problem, values, others, inflation)
+    if failed:
+        inflation = _inflation(covariance, statistical)
         rest = [name for name in (*FURTHER, *QUADRATIC, "rotation") if name not in problem.names]
         candidates = find_missing_parameters(problem, values, rest)
         failed = [
             *(f"{name} = 0" for name, fall, _ in candidates[:1] if fall > MIN_CLEAR_FALL),
             *failed,
         ]
-    identified = not failed or all(c.explained_out_of_sample >= MIN_EXPLAINED for c in channels)
+    share = MIN_EXPLAINED if failed else _MIN_EXPLAINED_OF_NOISE
+    identified = all(channel.explained_out_of_sample >= share for channel in channels)
     deviations = np.sqrt(np.diag(covariance))
     half_widths = dict(zip(problem.names, (Z95 * deviations).tolist(), strict=True))
     if not identified:
@@ -138,7 +155,8 @@ def summarise(
         value = float(channel_residual.mean())
         estimates.append(Estimate(name, value, value - error, value + error))
     return Identification(
-        headline=_headline(channels, failed, identified, inflation),
+        headline=_headline(channels, failed, identified, inflation)
+        + (_assumed_ratio(all_values) if scale_is_free and identified else ""),
         identified=identified,
         estimates=tuple(estimates),
         products=_products(problem.names, all_values, covariance, identified),
@@ -151,7 +169,33 @@ def summarise(
         inflation=inflation,
         failed_assumptions=tuple(failed),
         fit=_to_fit(problem, values, drifts),
+        servo_law=problem.law,
     )
+
+
+def _inflation(covariance: Array, statistical: Array) -> float:
+    """Return the median ratio of errors to those from noise alone."""
+    return float(np.median(np.sqrt(np.diag(covariance) / np.diag(statistical))))
+
+
+def _spread_of_laws(
+    problem: Problem,
+    values: dict[str, float],
+    others: Sequence[OtherLaw],
+    inflation: float,
+) -> Array:
+    """Return the covariance of z from not knowing the law of the servo.
+
+    Each law counts with its likelihood relative to that of the best one. Where the model is
+    incomplete, a difference in likelihood is less certain, by the square of the inflation.
+    """
+    z = problem.to_z(values)
+    count = sum(measured.shape[1] for measured in problem.measured)
+    spread = np.zeros((len(z), len(z)))
+    for excess, other_values in others:
+        difference = problem.to_z(other_values) - z
+        spread += np.exp(-count * excess / inflation**2) * np.outer(difference, difference)
+    return spread
 
 
 def _failed_assumptions(
@@ -221,8 +265,10 @@ def _headline(
         f"{_percent(channel.explained_out_of_sample)} of {_SYMBOLS[channel.name]}"
         for channel in channels
     )
-    if not failed:
+    if not failed and identified:
         return f"identified: the model explains {explained}"
+    if not failed:
+        return f"not identified: the model explains {explained}: the rest is noise"
     causes = [assumption for assumption in failed if assumption.endswith(" = 0")]
     reasons = "; ".join(
         clause.format(" and ".join(symbols))
@@ -239,6 +285,13 @@ def _headline(
         return f"not identified: the model explains {explained}: {reasons}"
     widening = f"intervals are {inflation:.2g} times as wide as noise alone makes them"
     return f"careful: the model is incomplete and explains {explained}: {reasons}; {widening}"
+
+
+def _assumed_ratio(values: dict[str, float]) -> str:
+    """Return the clause of the headline about the ratio that the data do not determine."""
+    ratio = values["lateral_inertia_ratio"]
+    low, high = ratio / LATERAL_INERTIA_FACTOR, ratio * LATERAL_INERTIA_FACTOR
+    return f"; λ, K and K_d hold for K_y/K from {low:.3g} to {high:.3g}"
 
 
 def _percent(share: float) -> str:

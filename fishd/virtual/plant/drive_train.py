@@ -10,6 +10,7 @@ from collections import deque
 from typing import NamedTuple
 
 from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.servo_law import Approach
 
 _LN2 = math.log(2.0)
 _MIN_PLAY_RAD = 1e-12
@@ -143,7 +144,12 @@ def shortest_dwell(parameters: PlantParameters, amplitude: float) -> float:
     """
     p = parameters
     lag = 2.0 * amplitude / p.servo_lag
-    turn = p.servo_lag / p.servo_speed * time_between(lag, (1.0 - REVERSAL_FRACTION) * lag)
+    left = (1.0 - REVERSAL_FRACTION) * lag
+    if p.servo_law == "tanh":
+        time = time_between(lag, left)
+    else:
+        time = Approach(p.servo_law, lag, 0.0).time_to(left)
+    turn = p.servo_lag / p.servo_speed * time
     half_beat = max(math.pi / p.omega0, 2.0 * amplitude / p.servo_speed)
     dwell = max(p.servo_delay + turn, MIN_HALF_BEAT_FRACTION * half_beat)
     return min(dwell, MAX_HALF_BEAT_FRACTION * half_beat)

@@ -7,8 +7,6 @@ R = U/i_stall, k_e = (U − R i₀)/Ω and k_t = τ_stall/i_stall. A braking mot
 to the supply.
 """
 
-import math
-
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
@@ -27,6 +25,8 @@ class Stretch(Struct, frozen=True, eq=False):
     """lag/Δ of the wheel at the nodes, shape (N,), or (n, N) for n segments of equal length."""
     pulls: bool
     """Whether the wheel moves the tail."""
+    motion: tuple[Vector, Vector] | None = None
+    """Speed/Ω of the wheel at the nodes, and its derivative by time in Δ/Ω; None for tanh."""
 
 
 class Motor:
@@ -57,19 +57,22 @@ class Motor:
     def jump(self, before: float, after: float) -> float:
         """Return the energy of a jump of the wheel's speed at an instruction [J].
 
-        before, after: lag/Δ immediately before and after the instruction
+        before, after: speed/Ω immediately before and after the instruction
         """
-        rate = self._speed * math.tanh(after)
-        return max(0.0, self._jump * rate * (rate - self._speed * math.tanh(before)))
+        return max(0.0, self._jump * self._speed**2 * after * (after - before))
 
     def energy(self, stretch: Stretch) -> NDArray[np.float64]:
         """Return the energy of a motion, or of each of several, without the idle current [J]."""
         response = stretch.response
-        speeds = np.tanh(stretch.lags)  # relative to the highest speed
-        current = speeds * speeds
-        current *= self._braking
-        current += self._moving
-        current *= speeds
+        if stretch.motion:
+            speeds, changes = stretch.motion[0].copy(), stretch.motion[1]
+            current = (self._moving + self._braking) * speeds + self._braking * changes
+        else:
+            speeds = np.tanh(stretch.lags)  # relative to the highest speed
+            current = speeds * speeds
+            current *= self._braking
+            current += self._moving
+            current *= speeds
         if stretch.pulls:
             current += self._tail * response[..., 2 * N : 3 * N]
             current += self._drag * response[..., N : 2 * N]

@@ -1,7 +1,8 @@
 """Best periodic square wave from the equations, the reference for every controller.
 
 The periodic state of the tethered fish is computed directly, without the simulation of a transient.
-A fin with quadratic drag, and a plant of another package, are simulated until the beats are equal.
+A fin with quadratic drag, a servo with another law than tanh, and a plant of another package are
+simulated until the beats are equal.
 """
 
 import cmath
@@ -110,7 +111,8 @@ def best_square_wave(parameters: PlantParameters, amplitude: float) -> SteadySta
 
 def _is_linear(parameters: PlantParameters) -> bool:
     """Return whether half a period is an affine map of the fin's state."""
-    return parameters.model == TETHERED and not parameters.quadratic_drag
+    p = parameters
+    return p.model == TETHERED and p.servo_law == "tanh" and not p.quadratic_drag
 
 
 class _SimulatedFish:

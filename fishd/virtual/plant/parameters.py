@@ -5,6 +5,7 @@ from typing import Annotated
 from msgspec import Struct
 
 from fishd.core.schema import note, unit
+from fishd.virtual.plant.servo_law import ServoLaw
 
 TETHERED = "tethered"
 """Name of fishd's built-in model."""
@@ -43,6 +44,14 @@ class PlantParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             le=10.0,
         ),
     ] = 0.29
+    servo_law: Annotated[
+        ServoLaw,
+        note(
+            "Law by which the wheel approaches its instruction: its speed is Ω tanh(lag/Δ); or Ω, "
+            "and below a lag Δ `linear` in it or proportional to its `square-root`; or with an "
+            "acceleration of Ω²/2Δ at most (`accelerating`)."
+        ),
+    ] = "tanh"
     thrust_coefficient: Annotated[
         float, unit("N s^2/rad^2", "Thrust coefficient K, in F_x = −K α α̈.", gt=0.0, le=10.0)
     ] = 12.9e-3

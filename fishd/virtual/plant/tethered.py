@@ -16,10 +16,18 @@ from msgspec import Struct
 
 from fishd.virtual.plant.base import REST, Plant, PlantState
 from fishd.virtual.plant.collocation import NODES, WEIGHTS, N, Segment, Vector
-from fishd.virtual.plant.drive_train import Cables, DelayLine, log_sinh, relax, time_between
+from fishd.virtual.plant.drive_train import (
+    Cables,
+    DelayLine,
+    Part,
+    log_sinh,
+    relax,
+    time_between,
+)
 from fishd.virtual.plant.held import WINDOW_COUNT, HeldWindow, HeldWindowMatrices, HeldWindows
 from fishd.virtual.plant.motor import Motor, Stretch
 from fishd.virtual.plant.parameters import MotorSettings, PlantParameters
+from fishd.virtual.plant.servo_law import Approach
 
 # Times around |sinh(lag/Δ)| = 1, in units of Δ/Ω. Before the first, the wheel runs at Ω, and after
 # the last it stands, both to the last digit; in between, segments shorten towards the transition.
@@ -32,6 +40,8 @@ _MAX_SINH_LAG = 300.0
 """Largest lag for sinh [Δ]; above it, the wheel runs at Ω during the whole segment."""
 _ROUNDING = 1e-9
 """Tolerance that keeps a window of exactly one servo time constant as one segment."""
+_DIGITS = 12
+"""Digits of the times at which a segment is cut [s]: two closer ones are the same."""
 _MIN_HELD_WINDOWS = 4
 """Duration of an instruction from which several windows are computed at once [windows]."""
 _MAX_DRAG_SEGMENT_S = 0.05
@@ -46,8 +56,8 @@ class FinWindow(Struct, frozen=True, eq=False):
     Attributes:
         course: segments of the window, with the motion of wheel and fin.
         motor: motor of the servo; None if its power is not needed.
-        drives: lag/Δ before and after the instruction, and the course, for each part of the window
-            with pulses.
+        drives: speed/Ω of the wheel before and after the instruction, and the course, for each part
+            of the window with pulses.
     """
 
     duration: float
@@ -114,13 +124,17 @@ class TetheredFish(Plant[PlantParameters]):
         self._momentum = 0.0
         """Momentum that the servo's reaction has transmitted to the sensor, −J φ̇ smoothed [N s]."""
         self._motor = Motor(motor, parameters) if motor else None
-        self._lag = 0.0
-        """lag/Δ at the end of the latest window; 0 where the servo had no pulses."""
+        self._speed = 0.0
+        """Speed/Ω of the wheel at the end of the latest window; 0 where the servo had no pulses."""
+        self._is_tanh = parameters.servo_law == "tanh"
         self._pulls = True
         """Whether the wheel moved the tail in the latest segment."""
         self._graded_from = _GRADED_FROM * self._servo_time
-        self._is_plain = self.cables.taut and not (
-            self._line or self._brakes or parameters.servo_dead_zone or parameters.servo_reaction
+        self._is_plain = (
+            self._is_tanh
+            and self.cables.taut
+            and not (self._line or self._brakes)
+            and not (parameters.servo_dead_zone or parameters.servo_reaction)
         )
         self._request: tuple[float | None, float, int] = (None, 0.0, 0)
         self._request_windows, self._mean_request_windows = 0, 0.0
@@ -148,15 +162,17 @@ class TetheredFish(Plant[PlantParameters]):
             held = self._held if self._is_known(request) else self._hold(*request)
             if held:
                 return self._next_held_window(held, instruction_angle, duration)
-        if self._line is None:
-            return self._advance_part(instruction_angle, duration, samples, (0.0, duration))
-        parts = self._line.advance(instruction_angle, duration)
-        if len(parts) == 1:
-            return self._advance_part(parts[0].angle, duration, samples, (0.0, duration))
-        windows = [
-            self._advance_part(part.angle, duration, samples, (part.begin, part.end))
-            for part in parts
-        ]
+        parts = [Part(instruction_angle, 0.0, duration)]
+        if self._line:
+            parts = self._line.advance(instruction_angle, duration)
+        windows = []
+        for part in parts:
+            turn = part.begin + self._time_to_turn(part.angle)
+            ends = (turn, part.end) if part.begin < turn < part.end else (part.end,)
+            for begin, end in pairwise((part.begin, *ends)):
+                windows.append(self._advance_part(part.angle, duration, samples, (begin, end)))
+        if len(windows) == 1:
+            return windows[0]
         return FinWindow(
             duration,
             sum(w.thrust * w.duration for w in windows) / duration,
@@ -217,7 +233,7 @@ class TetheredFish(Plant[PlantParameters]):
         )
         self._expected = state
         if self._motor:
-            held.jump = self._motor.jump(self._lag, lag)
+            held.jump = self._motor.jump(self._speed, math.tanh(lag))
         return held
 
     def _next_held_window(self, held: HeldWindows, angle: float, duration: float) -> HeldWindow:
@@ -229,7 +245,8 @@ class TetheredFish(Plant[PlantParameters]):
         alpha, rate, side_force, sampled_side_force = held.ends[k]
         thrust, sampled_thrust = held.thrusts[k]
         lag = math.sinh((angle - self.state.phi) / p.servo_lag)
-        self._lag = lag = math.asinh(held.stretch.segment.decay * lag)
+        lag = math.asinh(held.stretch.segment.decay * lag)
+        self._speed = math.tanh(lag)
         self.state = self._expected = PlantState(angle - p.servo_lag * lag, alpha, rate)
         return HeldWindow(
             duration, thrust, side_force, sampled_thrust, sampled_side_force, held, k, self._motor
@@ -249,10 +266,19 @@ class TetheredFish(Plant[PlantParameters]):
         command = phi if angle is None else angle
         if p.servo_dead_zone:
             command = self._apply_dead_zone(command, phi)
-        begin = lag = (command - phi) / p.servo_lag
+        lag = (command - phi) / p.servo_lag
         cuts: Sequence[float] = ()
-        if lag and (duration > self._graded_from or not self.cables.taut):
-            cuts = self._cuts(command, phi, lag, duration)
+        before = self._speed
+        if self._is_tanh:
+            after = math.tanh(lag)
+            if lag and (duration > self._graded_from or not self.cables.taut):
+                cuts = self._cuts(command, phi, lag, duration)
+        else:
+            if angle is None:
+                self._speed = 0.0
+            approach = Approach(p.servo_law, lag, self._speed)
+            after = approach.first_speed
+            cuts = self._cuts_of(approach, command, phi, duration)
         segments: Sequence[Segment] = (
             self._segments(window_length, samples, part, cuts)
             if cuts
@@ -269,10 +295,10 @@ class TetheredFish(Plant[PlantParameters]):
         momentum = self._momentum
         for segment in segments:
             cause[0], cause[1] = alpha, rate
-            lags, lag = self._drive(segment, command, lag)
+            lags, lag, motion = self._drive(segment, command, lag)
             # dot() has half the overhead of @.
             response = responses[len(course)] if responses else segment.response.dot(cause)
-            course.append(Stretch(segment, response, lags, self._pulls))
+            course.append(Stretch(segment, response, lags, self._pulls, motion))
             integral, total = segment.sums.dot(response[:N] * response[2 * N : 3 * N]).tolist()
             alpha, rate, total_acceleration, total_rate = response[3 * N :].tolist()
             thrust -= integral
@@ -286,8 +312,9 @@ class TetheredFish(Plant[PlantParameters]):
                 sampled_braking += total
 
         pulsed = angle is not None
-        drives = ((self._lag, begin, course),) if pulsed else ()
-        self._lag = lag if pulsed else 0.0
+        drives = ((before, after, course),) if pulsed else ()
+        if self._is_tanh or not pulsed:
+            self._speed = math.tanh(lag) if pulsed else 0.0
         self.state = PlantState(command - p.servo_lag * lag, alpha, rate)
         inertia, drag = p.thrust_coefficient, p.lateral_drag
         side_inertia = p.lateral_inertia_ratio * inertia
@@ -318,7 +345,7 @@ class TetheredFish(Plant[PlantParameters]):
 
         Quadratic drag has a kink there, which a polynomial cannot follow.
         """
-        cause, before = self._cause, (self.cables.tail, self._momentum)
+        cause, before = self._cause, (self.cables.tail, self._momentum, self._speed)
         _, alpha, rate = self.state
         pieces: list[Segment] = []
         responses: list[Vector] = []
@@ -326,13 +353,13 @@ class TetheredFish(Plant[PlantParameters]):
         while to_do:
             segment = to_do.pop()
             cause[0], cause[1] = alpha, rate
-            tail = self.cables.tail
-            _, later = self._drive(segment, command, lag)
+            tail, speed = self.cables.tail, self._speed
+            _, later, _ = self._drive(segment, command, lag)
             response = (
                 segment.braked(cause, self._drag) if self._drag else segment.response.dot(cause)
             )
             if turn := segment.turn(response):
-                self.cables.tail = tail
+                self.cables.tail, self._speed = tail, speed
                 later_instants = tuple(t - turn for t in segment.instants if t >= turn)
                 to_do.append(self._segment(segment.length - turn, later_instants))
                 to_do.append(self._segment(turn, tuple(t for t in segment.instants if t < turn)))
@@ -341,7 +368,7 @@ class TetheredFish(Plant[PlantParameters]):
                 responses.append(response)
                 lag = later
                 alpha, rate = response[3 * N : 3 * N + 2].tolist()
-        self.cables.tail, self._momentum = before
+        self.cables.tail, self._momentum, self._speed = before
         return pieces, responses
 
     def _apply_dead_zone(self, angle: float, phi: float) -> float:
@@ -349,32 +376,55 @@ class TetheredFish(Plant[PlantParameters]):
         dead = self.parameters.servo_dead_zone
         return phi if abs(angle - phi) <= dead else angle - math.copysign(dead, angle - phi)
 
-    def _drive(self, segment: Segment, command: float, lag: float) -> tuple[Vector, float]:
-        """Write the drive of the fin into the cause; return lag/Δ at the nodes and at the end."""
+    def _time_to_turn(self, angle: float | None) -> float:
+        """Return the time until an accelerating wheel turns that moves away from its angle [s]."""
+        p = self.parameters
+        if p.servo_law != "accelerating" or angle is None:
+            return 0.0
+        gap = self._apply_dead_zone(angle, self.state.phi) - self.state.phi
+        return Approach(p.servo_law, gap / p.servo_lag, self._speed).turn * self._servo_time
+
+    def _drive(
+        self, segment: Segment, command: float, lag: float
+    ) -> tuple[Vector, float, tuple[Vector, Vector] | None]:
+        """Write the drive of the fin into the cause.
+
+        Return lag/Δ at the nodes and at the end, and `Stretch.motion`.
+        """
         p = self.parameters
         cause = self._cause
-        if -_MAX_SINH_LAG < lag < _MAX_SINH_LAG:
+        motion = None
+        length = segment.length / self._servo_time
+        if not self._is_tanh:
+            times = np.append(segment.node_times, (0.5 * length, length))
+            lags, speeds, changes = Approach(p.servo_law, lag, self._speed).at(times)
+            halfway, later = lags[N:].tolist()
+            lags, motion = lags[:N], (speeds[:N], changes[:N])
+            self._speed = float(speeds[-1])
+        elif -_MAX_SINH_LAG < lag < _MAX_SINH_LAG:
             sinh = math.sinh(lag)
             lags = np.arcsinh(segment.node_decay * sinh)
             later = math.asinh(segment.decay * sinh)
         else:
             lags = lag - math.copysign(1.0, lag) * segment.node_times
-            later = relax(lag, segment.length / self._servo_time)
+            later = relax(lag, length)
         if p.servo_reaction:
-            self._react(segment, lags)
+            self._react(segment, motion[0] if motion else np.tanh(lags))
         cause[2] = p.coupling * command
         if self.cables.taut:
             cause[3:] = lags
         else:
-            self._pull(segment, command, lag, lags, later)
-        return lags, later
+            if self._is_tanh:
+                halfway = relax(lag, 0.5 * length)
+            self._pull(command, halfway, lags, later)
+        return lags, later, motion
 
-    def _pull(
-        self, segment: Segment, command: float, lag: float, lags: Vector, later: float
-    ) -> None:
-        """Apply backlash and slack to the drive of the fin during the segment."""
+    def _pull(self, command: float, halfway: float, lags: Vector, later: float) -> None:
+        """Apply backlash and slack to the drive of the fin during a segment.
+
+        lags, halfway, later: lag/Δ of the wheel at the nodes, at the middle and at the end
+        """
         p, cause = self.parameters, self._cause
-        halfway = relax(lag, 0.5 * segment.length / self._servo_time)
         moves, angle = self.cables.pull(
             command - p.servo_lag * halfway, command - p.servo_lag * later
         )
@@ -384,11 +434,11 @@ class TetheredFish(Plant[PlantParameters]):
         else:
             cause[2], cause[3:] = p.coupling * angle, 0.0
 
-    def _react(self, segment: Segment, lags: Vector) -> None:
-        """Add the reaction to the wheel's acceleration in a segment; lags: lag/Δ at its nodes."""
+    def _react(self, segment: Segment, speeds: Vector) -> None:
+        """Add the reaction to the wheel's acceleration in a segment; speeds: in Ω at its nodes."""
         p = self.parameters
         weights = np.exp((NODES - 1.0) * (segment.length / REACTION_TIME))
-        pushed = float((WEIGHTS * weights).dot(np.tanh(lags))) * segment.length / REACTION_TIME
+        pushed = float((WEIGHTS * weights).dot(speeds)) * segment.length / REACTION_TIME
         self._momentum *= math.exp(-segment.length / REACTION_TIME)
         self._momentum -= p.servo_reaction * p.servo_speed * pushed
 
@@ -404,6 +454,22 @@ class TetheredFish(Plant[PlantParameters]):
                 if min(phi, command) < edge < max(phi, command):
                     cuts.append(unit * time_between(lag, (command - edge) / p.servo_lag))
         return sorted({cut for cut in cuts if 0.0 < cut < duration}) if cuts else cuts
+
+    def _cuts_of(
+        self, approach: Approach, command: float, phi: float, duration: float
+    ) -> list[float]:
+        """Return the times (s) at which segments must end, for another law than tanh."""
+        p, unit = self.parameters, self._servo_time
+        times = list(approach.kinks)
+        if p.servo_law == "linear" and duration > self._graded_from:
+            times += [times[0] + time for time in _TRANSITION if time > 0.0]
+        if not self.cables.taut:
+            end = command - p.servo_lag * float(approach.at(np.array([duration / unit]))[0][0])
+            for edge in self.cables.edges(phi, end - phi):
+                if min(phi, end) < edge < max(phi, end):
+                    times.append(approach.time_to((command - edge) / p.servo_lag))
+        cuts = {round(unit * time, _DIGITS) for time in times}
+        return sorted(cut for cut in cuts if 0.0 < cut < round(duration, _DIGITS))
 
     def _segments(
         self,

@@ -29,6 +29,7 @@ from fishd.lab.identification.passages import passages
 from fishd.lab.identification.response import Drive, response
 from fishd.lab.session import VirtualSession
 from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.servo_law import LAWS
 from fishd.virtual.plant.tethered import TetheredFish
 
 TICK = 0.05
@@ -83,6 +84,7 @@ def test_it_finds_fish_and_rig_from_forces_and_commands(identification: Identifi
     assert identification.remarks == ()
     assert identification.failed_assumptions == ()
     assert identification.headline.startswith("identified: the model explains 9")
+    assert identification.headline.endswith("; λ, K and K_d hold for K_y/K from 0.25 to 4")
 
 
 @pytest.mark.slow
@@ -94,7 +96,7 @@ def test_products_are_told_and_factors_have_any_ratio(identification: Identifica
     for product, value in zip(identification.products, products, strict=True):
         assert product.value == pytest.approx(scale * value, rel=0.01)
         assert product.ci95_high < 1.02 * product.ci95_low
-    for name, factor in (("coupling", 2.0), ("thrust_coefficient", 4.0), ("lateral_drag", 2.0)):
+    for name, factor in (("coupling", 4.0), ("thrust_coefficient", 16.0), ("lateral_drag", 4.0)):
         low, high = identification[name].narrowest_interval
         interval = identification[name].ci95_low, identification[name].ci95_high
         assert interval == pytest.approx((low / factor, high * factor))
@@ -116,6 +118,28 @@ def test_quadratic_drag_and_another_lateral_inertia_are_found() -> None:
     assert identification.failed_assumptions == ()
     assert identification["quadratic_drag"].value > 0.4
     assert identification["lateral_inertia_ratio"].value == pytest.approx(0.7, rel=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", LAWS[1:])
+def test_the_law_of_the_servo_is_found_from_the_forces(law: str) -> None:
+    changes = (f"plant.servo_law={law}", "plant.servo_lag=0.15", "plant.omega0=11", QUIET)
+    identification = identify(swim_experiment(*changes, seconds=30.0))
+    assert identification.servo_law == law
+    assert f"servo_law: {law}" in identification.to_yaml()
+    assert identification.failed_assumptions == ()
+    for name, value in (("omega0", 11.0), ("servo_speed", 5.8), ("servo_lag", 0.15)):
+        assert identification[name].value == pytest.approx(value, rel=0.02), name
+
+
+def test_a_law_that_is_wrong_is_noticed_far_below_the_noise(table: pd.DataFrame) -> None:
+    # The force of each tick that follows a step is wrong by a third of the noise.
+    steps = np.abs(np.diff(table["phi_c"], prepend=0.0)) > 0.0
+    late = pd.Series(steps).shift(3, fill_value=False).to_numpy()
+    for size, is_noticed in ((0.0, False), (3.3e-4, True)):
+        wrong = table.assign(fy=table["fy"] + size * late)
+        failed = identify(wrong, start=FISH, fit=NEARLY_KNOWN).failed_assumptions
+        assert ("white residual of fy" in failed) == is_noticed
 
 
 @pytest.mark.slow
@@ -411,6 +435,9 @@ def test_a_large_step_of_a_fast_servo_has_a_response() -> None:
         PlantParameters(servo_delay=0.03, servo_reaction=5e-3),
         PlantParameters(quadratic_drag=2.0, lateral_quadratic_drag=0.01, lateral_inertia_ratio=0.7),
         PlantParameters(quadratic_drag=20.0, xi=0.2, backlash=0.02),
+        PlantParameters(servo_law="linear", cable_slack=0.03, servo_dead_zone=0.02),
+        PlantParameters(servo_law="square-root", servo_delay=0.03, servo_reaction=5e-3),
+        PlantParameters(servo_law="accelerating", servo_lag=0.15, backlash=0.02),
     ],
 )
 def test_the_response_is_that_of_the_simulated_fish(plant: PlantParameters) -> None:

@@ -1,4 +1,5 @@
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -28,6 +29,14 @@ FISHES = {
     "no damping": Fish(xi=0.0),
     "heavy damping": Fish(xi=15.0),
     "stiff fin": Fish(omega0=60.0, xi=4.0),
+    "linear servo": Fish(servo_law="linear"),
+    "fast linear servo, backlash": Fish(
+        servo_law="linear", servo_speed=200.0, servo_lag=0.05, backlash=0.1, servo_dead_zone=0.02
+    ),
+    "square-root servo, slack cables": Fish(servo_law="square-root", cable_slack=0.08),
+    "square-root servo, quadratic drag": Fish(
+        servo_law="square-root", servo_reaction=-0.002, quadratic_drag=3.0, backlash=0.05
+    ),
 }
 
 REACTION_TIME = 0.01
@@ -53,8 +62,17 @@ def integrate(
     if command is not None:  # the wheel stops at the edge of the dead zone
         command = state.phi + dead_band(command - state.phi, p.servo_dead_zone)
 
+    shares: dict[str, Callable[[float], float]] = {
+        "tanh": math.tanh,
+        "linear": lambda lags: min(1.0, lags),
+        "square-root": lambda lags: min(1.0, math.sqrt(lags)),
+    }
+
     def turn(phi: float) -> float:
-        return 0.0 if command is None else math.tanh((command - phi) / p.servo_lag) * p.servo_speed
+        if command is None:
+            return 0.0
+        lags = (command - phi) / p.servo_lag
+        return math.copysign(shares[p.servo_law](abs(lags)), lags) * p.servo_speed
 
     def acceleration(phi: float, alpha: float, rate: float) -> float:
         # The wheel turns one way during the whole window, and the tail starts at its place.
