@@ -245,7 +245,7 @@ def _approaches(drive: Drive, commands: Array, lengths: NDArray[np.int_], step: 
             gap = math.copysign(max(0.0, abs(gap) - dead), gap)
         approach = Approach(drive.servo_law, gap / lag, speed)
         count = int(lengths[begin:end].sum())
-        times: Array = np.arange(1, count + 1) * (step * drive.servo_speed / lag)
+        times = np.arange(1.0, count + 1.0) * (step * drive.servo_speed / lag)
         lags, speeds, _ = approach.at(times)
         angles.append(phi + gap - lag * lags)
         phi, speed = float(angles[-1][-1]), float(speeds[-1])
