@@ -22,13 +22,12 @@ from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, print_json
 from fishd.cli.progress import show_progress, show_waiting
 from fishd.cli.recording.files import open_recording
-from fishd.config import Config, adopt, check_tethered, load
+from fishd.config import Config, ServoSettings, adopt, check_tethered, load
 from fishd.core import files
 from fishd.core.errors import FishdError
 from fishd.recording.reader import open_run
 
 if TYPE_CHECKING:
-    from fishd.hardware.settings import ServoSettings
     from fishd.lab.experiment import Experiment
     from fishd.lab.identification import Identification
 

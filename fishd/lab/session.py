@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from fishd.client import Fish
 from fishd.client.lease import LeaseRenewal
-from fishd.config import Config, adopt, check_tethered
+from fishd.config import Config, ServoSettings, adopt, check_tethered
 from fishd.core import text
 from fishd.core.calibration import EXACT, ForceCalibration
 from fishd.core.errors import (
@@ -27,7 +27,6 @@ from fishd.core.errors import (
 )
 from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Publisher, Reason, Tick
-from fishd.hardware.settings import ServoSettings
 from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, TypeAlias
 import msgspec
 import numpy as np
 
+from fishd.config import ServoSettings
 from fishd.core import text
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError, RecordingError
 from fishd.core.schema import suggest
-from fishd.hardware.settings import ServoSettings
 from fishd.lab.identification.fit import (
     BOUNDS,
     FURTHER,

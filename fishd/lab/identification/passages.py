@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from fishd.config import ServoSettings
 from fishd.core.errors import FishdError
-from fishd.hardware.settings import ServoSettings
 from fishd.lab.identification.response import Array, Timing, even_timing
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from fishd.hardware.settings import ServoSettings
+from fishd.config import ServoSettings
 from fishd.lab.identification.fit import Problem
 from fishd.lab.identification.passages import Passage
 from fishd.lab.identification.response import MAX_STEP_S, Array, Timing
