@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from common.foreign_fish import LAWS, MODEL, ForeignParameters, register
+from common.foreign_fish import MODEL, ForeignParameters, register
 from common.report import JOBS, Options, Report, run_cases, table
 from fishd.config import Config, load
 from fishd.lab.compare.survey import harsh
@@ -25,6 +25,7 @@ from fishd.lab.identification.summary import SCALED
 from fishd.lab.session import VirtualSession
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.servo_law import LAWS
 
 RIG = SimulationSettings(noise=1e-3, rotation=radians(5), offset_x=0.02, offset_y=0.02, drift=5e-3)
 SPREAD = 0.3
@@ -300,7 +301,7 @@ def foreign(options: Namespace) -> Report:
         verdict: [outcome for outcome in outcomes if outcome.verdict == verdict]
         for verdict in ("identified", "careful", "not identified")
     }
-    whole = [foreign_row(f"all, {v}", found) for v, found in verdicts.items() if found]
+    whole = [foreign_row(f"all, {v}", fits) for v, fits in verdicts.items() if fits]
     lines = table(FOREIGN_HEAD, [*kinds, *whole])
     figures = [msgspec.to_builtins(outcome._asdict()) for outcome in outcomes]
     return Report({"bench identification foreign": lines}, figures)

@@ -208,7 +208,7 @@ def _approaches(drive: Drive, commands: Array, step: float, steps: int) -> Array
         if dead:
             gap = math.copysign(max(0.0, abs(gap) - dead), gap)
         approach = Approach(drive.servo_law, gap / lag, speed)
-        times = np.arange(1, (end - begin) * steps + 1) * (step * drive.servo_speed / lag)
+        times = np.arange(1.0, (end - begin) * steps + 1.0) * (step * drive.servo_speed / lag)
         lags, speeds, _ = approach.at(times)
         angles.append(phi + gap - lag * lags)
         phi, speed = float(angles[-1][-1]), float(speeds[-1])
