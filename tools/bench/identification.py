@@ -289,22 +289,26 @@ def foreign_row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     ]
 
 
-def foreign(options: Namespace) -> Report:
-    """Return the table of foreign fish."""
-    count = options.seeds or FOREIGN_COUNT
-    outcomes = run_cases(one, [("foreign", seed) for seed in range(count)], options.jobs)
+def report_foreign(outcomes: Sequence[Outcome]) -> Report:
+    """Return the table of foreign fish, one of each of `FOREIGN_KINDS` in turn."""
     kinds = [
         foreign_row(kind, outcomes[place :: len(FOREIGN_KINDS)])
-        for place, kind in enumerate(FOREIGN_KINDS[:count])
+        for place, kind in enumerate(FOREIGN_KINDS[: len(outcomes)])
     ]
     verdicts = {
         verdict: [outcome for outcome in outcomes if outcome.verdict == verdict]
         for verdict in ("identified", "careful", "not identified")
     }
-    whole = [foreign_row(f"all, {v}", fits) for v, fits in verdicts.items() if fits]
+    verdicts = {verdict: fits for verdict, fits in verdicts.items() if fits}
+    whole = [foreign_row(f"all, {verdict}", fits) for verdict, fits in verdicts.items()]
+    errors = {
+        f"identify, foreign fish, {verdict}": [error for fit in fits for error in fit.errors]
+        for verdict, fits in verdicts.items()
+        if verdict != "not identified"
+    }
     lines = table(FOREIGN_HEAD, [*kinds, *whole])
-    figures = [msgspec.to_builtins(outcome._asdict()) for outcome in outcomes]
-    return Report({"bench identification foreign": lines}, figures)
+    figures = [outcome._asdict() for outcome in outcomes]
+    return Report({"bench identification foreign": lines}, figures, errors=errors)
 
 
 FOREIGN_HEAD = (
@@ -334,7 +338,8 @@ OPTIONS: Options = {
 def measure(options: Namespace) -> Report:
     """Return the tables; each experiment takes some seconds."""
     if options.kind == "foreign":
-        return foreign(options)
+        runs = [("foreign", seed) for seed in range(options.seeds or FOREIGN_COUNT)]
+        return report_foreign(run_cases(one, runs, options.jobs))
     sections, figures, whole = {}, {}, []
     count = options.seeds or 10
     for kind in KINDS:
