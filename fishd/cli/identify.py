@@ -217,6 +217,7 @@ def _print_result(identification: "Identification") -> None:
             "the forces do not determine K_y/K: --fix lateral_inertia_ratio keeps the configured "
             "value"
         )
+    echo(f"servo_law: {identification.servo_law}")
     for channel, symbol in zip(identification.channels, ("F_x", "F_y"), strict=True):
         noise, drift = channel.noise * 1e3, 0.5 * channel.drift * 1e3
         echo(f"{symbol}: noise {noise:.2f} mN, drift ±{drift:.1f} mN")

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from common.foreign_fish import LAWS, MODEL, ForeignParameters, register
+from common.foreign_fish import MODEL, ForeignParameters, register
 from common.report import JOBS, Options, Report, run_cases, table
 from fishd.config import Config, load
 from fishd.core.calibration import EXACT
@@ -31,6 +31,7 @@ from fishd.virtual.pi.pulse_train import SERVO_FRAME
 from fishd.virtual.pi.settings import VirtualPiSettings
 from fishd.virtual.pi.tank import STEP
 from fishd.virtual.plant.parameters import PlantParameters
+from fishd.virtual.plant.servo_law import LAWS
 
 RIG = SimulationSettings(noise=1e-3, rotation=radians(5), offset_x=0.02, offset_y=0.02, drift=5e-3)
 SPREAD = 0.3
@@ -310,22 +311,26 @@ def foreign_row(name: str, outcomes: Sequence[Outcome]) -> list[str]:
     ]
 
 
-def foreign(options: Namespace) -> Report:
-    """Return the table of foreign fish."""
-    count = options.seeds or FOREIGN_COUNT
-    outcomes = run_cases(one, [("foreign", seed) for seed in range(count)], options.jobs)
+def report_foreign(outcomes: Sequence[Outcome]) -> Report:
+    """Return the table of foreign fish, one of each of `FOREIGN_KINDS` in turn."""
     kinds = [
         foreign_row(kind, outcomes[place :: len(FOREIGN_KINDS)])
-        for place, kind in enumerate(FOREIGN_KINDS[:count])
+        for place, kind in enumerate(FOREIGN_KINDS[: len(outcomes)])
     ]
     verdicts = {
         verdict: [outcome for outcome in outcomes if outcome.verdict == verdict]
         for verdict in ("identified", "careful", "not identified")
     }
-    whole = [foreign_row(f"all, {v}", found) for v, found in verdicts.items() if found]
+    verdicts = {verdict: fits for verdict, fits in verdicts.items() if fits}
+    whole = [foreign_row(f"all, {verdict}", fits) for verdict, fits in verdicts.items()]
+    errors = {
+        f"identify, foreign fish, {verdict}": [error for fit in fits for error in fit.errors]
+        for verdict, fits in verdicts.items()
+        if verdict != "not identified"
+    }
     lines = table(FOREIGN_HEAD, [*kinds, *whole])
-    figures = [msgspec.to_builtins(outcome._asdict()) for outcome in outcomes]
-    return Report({"bench identification foreign": lines}, figures)
+    figures = [outcome._asdict() for outcome in outcomes]
+    return Report({"bench identification foreign": lines}, figures, errors=errors)
 
 
 FOREIGN_HEAD = (
@@ -360,7 +365,8 @@ OPTIONS: Options = {
 def measure(options: Namespace) -> Report:
     """Return the tables; each experiment takes some seconds."""
     if options.kind == "foreign":
-        return foreign(options)
+        runs = [("foreign", seed) for seed in range(options.seeds or FOREIGN_COUNT)]
+        return report_foreign(run_cases(one, runs, options.jobs))
     sections, figures, whole = {}, {}, []
     kinds = ["pi"] if options.on == "virtual-pi" else [kind for kind in KINDS if kind != "pi"]
     count = options.seeds or 10

@@ -27,7 +27,11 @@ from fishd.lab.identification.fit import (
     Problem,
     solve,
 )
-from fishd.lab.identification.misfit import all_white, find_missing_parameters
+from fishd.lab.identification.misfit import (
+    all_white,
+    find_missing_parameters,
+    follows_commands,
+)
 from fishd.lab.identification.passages import MIN_PASSAGE_S, Passage, Unidentifiable, passages
 from fishd.lab.identification.pulses import place_pulses
 from fishd.lab.identification.result import Identification
@@ -168,6 +172,14 @@ def _refuse_unusable(parts: Sequence[Passage]) -> None:
             raise Unidentifiable(
                 f"{symbol} is the same in every row: a recording of a fish that swims is needed"
             )
+    changes = [np.diff(part.forces, prepend=part.forces[:, :1]) for part in parts]
+    if not any(
+        follows_commands(parts, [0] * len(parts), np.concatenate([c[force] for c in changes]))
+        for force in range(2)
+    ):
+        raise Unidentifiable(
+            "neither F_x nor F_y follows φ_c: a recording of a fish that swims is needed"
+        )
 
 
 def _scale_is_free(names: Sequence[str], values: dict[str, float]) -> bool:

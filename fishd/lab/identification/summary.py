@@ -52,7 +52,7 @@ MIN_EXPLAINED = 0.9
 """Smallest explained share of each force, out of sample, for which an incomplete model is given
 intervals."""
 _MIN_EXPLAINED_OF_NOISE = 0.05
-"""The same for a model whose residual is noise."""
+"""Smallest explained share of the better force for a model whose residual is noise."""
 _MAX_PREDICTION_RATIO = 1.1
 """Largest ratio of the sums of squared residuals out of sample and in sample."""
 MIN_CLEAR_FALL = 25.0
@@ -128,8 +128,8 @@ def summarise(
             *(f"{name} = 0" for name, fall, _ in candidates[:1] if fall > MIN_CLEAR_FALL),
             *failed,
         ]
-    share = MIN_EXPLAINED if failed else _MIN_EXPLAINED_OF_NOISE
-    identified = all(channel.explained_out_of_sample >= share for channel in channels)
+    shares = [channel.explained_out_of_sample for channel in channels]
+    identified = min(shares) >= MIN_EXPLAINED if failed else max(shares) >= _MIN_EXPLAINED_OF_NOISE
     deviations = np.sqrt(np.diag(covariance))
     half_widths = dict(zip(problem.names, (Z95 * deviations).tolist(), strict=True))
     if not identified:

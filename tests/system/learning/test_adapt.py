@@ -75,6 +75,7 @@ def identification() -> Identification:
         inflation=1.0,
         failed_assumptions=(),
         fit=Fit(np.zeros(0), empty, empty, empty),
+        servo_law="linear",
     )
 
 
