@@ -158,3 +158,16 @@ def test_a_watched_gait_that_becomes_much_weaker_or_stronger_restarts_the_search
         seen.append(search.phase)
     assert seen[29] is Phase.WATCH
     assert (Phase.TRIAL in seen[30:]) is restarts
+
+
+def test_a_ripple_below_the_noise_chooses_no_criterion_and_says_so_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    weak = load(None, ("amplitude_limit=0.05", "simulation.noise=2.3e-3", "simulation.seed=3"))
+    quantities = simulate(weak, "swing", {"C": "auto"}, 120.0).quantities
+    assert (quantities["criterion"], quantities["halfway"], quantities["clear"]) == (0.6, 0.0, 0.0)
+    assert caplog.text.count("the ripple of F_x does not rise above the noise") == 1
+
+
+def test_a_ripple_above_the_noise_is_clear() -> None:
+    assert simulate(load(None), "swing", {"C": "auto"}, 60.0).quantities["clear"] == 1.0
