@@ -293,8 +293,7 @@ class CriterionSearch:
         """Take the tried rung, keep the current one, or repeat the trial."""
         before, self._reference = self._reference, after
         is_clear = self._trial.is_clear
-        is_lost = before.is_clear and after.ripple < LOST_RATIO * before.ripple
-        if is_lost and self._trial.ripple < before.ripple:
+        if after.ripple < LOST_RATIO * before.ripple and self._trial.ripple < before.ripple:
             self._avoided.add(self._place + self._trials.pop(0))
             self._launch(before.ripple)
             return
@@ -354,7 +353,7 @@ class CriterionSearch:
         if not self._trials:
             self._known, self._watched = self._reference.ripple, 0.0
             self._note_clear(self._reference.is_clear)
-            if not self.is_clear and self._may_try(2 * START_INDEX):
+            if not self.is_clear:
                 self._place = 2 * START_INDEX
         self._gains = []
         self._begin(Phase.TRIAL if self._trials else Phase.WATCH)
@@ -373,10 +372,10 @@ class CriterionSearch:
     def _watch(self, gait: Judgement) -> None:
         """Restart the search if the fish has changed; try one neighbour from time to time."""
         self._reference = gait
-        if not (self.is_clear or gait.is_clear):
-            self._start_sums()
-        elif gait.ripple < LOST_RATIO * self._known:
+        if gait.ripple < LOST_RATIO * self._known:
             self._launch(self._known)
+        elif not (self.is_clear or gait.is_clear):
+            self._start_sums()
         elif abs(gait.ripple - self._known) > max(
             MIN_CHANGE * self._known, MIN_CHANGE_STANDARD_ERRORS * gait.error
         ):

@@ -58,8 +58,8 @@ class LiveThrust:
     def __init__(self, zero_drift: float) -> None:
         """Start with nothing known.
 
-        zero_drift: standard deviation of the change of the zero after a second [N/√s]; where the
-        forces show a faster drift, that is taken instead
+        zero_drift: standard deviation of the change of the zero after a second, until the forces
+            have shown how fast it drifts [N/√s]
         """
         self.thrust: float | None = None
         """Thrust of the latest beats; at rest, of its latest piece [N]. None while not known."""
@@ -289,12 +289,7 @@ class LiveThrust:
         elif block.begin - blocks[-1].end < 0.5 * block.duration:
             size = abs(block.size - blocks[-1].size) if block.size and blocks[-1].size else 0.0
             self._noise.add(self._difference(block, blocks[-1]), size)
-        for other in blocks:
-            lag = block.end - other.end
-            if lag <= DRIFT_LAG_S + 1e-9:
-                if lag >= MIN_DRIFT_LAG_S:
-                    self._drift.add(self._difference(block, other), lag, self._noise.variance)
-                break
+        self._compare(block)
         blocks.append(block)
         if block.size is not None:
             run.size = (
@@ -302,6 +297,15 @@ class LiveThrust:
             )
         if not run.started:
             run.first.append(block)
+
+    def _compare(self, block: "_Block") -> None:
+        """Take in the change of the force from an earlier block of the run as a drift."""
+        for other in self._run.blocks:
+            lag = block.end - other.end
+            if lag <= DRIFT_LAG_S + 1e-9:
+                if lag >= MIN_DRIFT_LAG_S:
+                    self._drift.add(self._difference(block, other), lag, self._noise.variance)
+                break
 
     def _size(self) -> complex | None:
         """Return the size of the shown beats; None where there are none."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pytest
 
 from fishd.control.estimators.live_thrust import LiveThrust
-from fishd.control.estimators.thrust_factor import DRIFT_LAG_S, Drift
+from fishd.control.estimators.thrust_factor import DRIFT_LAG_S, NOISE_PART, Drift, Level
 from fishd.core.signals import Observation
 
 TICK = 0.3
@@ -128,4 +128,23 @@ def test_only_a_change_that_is_clear_of_the_noise_counts_as_a_drift_that_goes_on
     drift, noise, lag = Drift(0.0), 1e-6, 0.5
     change = sigmas * math.sqrt(2.0 * noise)
     drift.add(change, lag, noise)
-    assert drift.rate == pytest.approx((change**2 - 2.0 * noise) * lasts / lag**2)
+    assert drift.rate == pytest.approx((change**2 - NOISE_PART * noise) * lasts / lag**2)
+
+
+def test_a_sensor_that_does_not_drift_is_believed_after_some_comparisons() -> None:
+    drift = Drift(1e-6)
+    rates = []
+    for _ in range(100):
+        rates.append(drift.rate)
+        drift.add(0.0, DRIFT_LAG_S, 0.0)
+    assert rates[0] == 1e-6
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] < 0.15e-6
+
+
+def test_a_drift_that_goes_on_moves_the_zero_in_proportion_to_the_time() -> None:
+    rest = Level(force=0.0, variance=0.0, power=0.0, size=None, begin=0.0, end=2.0)
+    swim = rest._replace(begin=4.0, end=8.0)
+    slope = 0.4e-3
+    rate = (slope * DRIFT_LAG_S) ** 2 / DRIFT_LAG_S
+    assert math.sqrt(rest.drift_variance(swim, rate)) == pytest.approx(slope * 5.0)

@@ -12,7 +12,7 @@ from fishd.controllers import registry
 from fishd.controllers.criterion_search import LADDER, START_INDEX, CriterionSearch, Phase
 from fishd.core.errors import ParameterError
 from fishd.lab.compare.survey import harsh
-from fishd.lab.simulation import simulate
+from fishd.lab.simulation import KeepingPublisher, simulate
 
 
 def relative_thrust(
@@ -164,8 +164,13 @@ def test_a_ripple_below_the_noise_chooses_no_criterion_and_says_so_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     weak = load(None, ("amplitude_limit=0.05", "simulation.noise=2.3e-3", "simulation.seed=3"))
-    quantities = simulate(weak, "swing", {"C": "auto"}, 120.0).quantities
-    assert (quantities["criterion"], quantities["halfway"], quantities["clear"]) == (0.6, 0.0, 0.0)
+    publisher = KeepingPublisher()
+    simulate(weak, "swing", {"C": "auto"}, 180.0, publisher=publisher)
+    shown = [tick.quantities for tick in publisher.ticks if tick.time > 90.0]
+    criteria = [quantities["criterion"] for quantities in shown if not quantities["searching"]]
+    assert criteria == [0.6] * len(criteria)
+    assert len(criteria) > 0.5 * len(shown)
+    assert not any(quantities["clear"] for quantities in shown)
     assert caplog.text.count("the ripple of F_x does not rise above the noise") == 1
 
 
