@@ -88,8 +88,6 @@ def _criterion_rows(status: Status) -> list[tuple[str, str]]:
     if status.parameters.get("C") != "auto" or "criterion" not in quantities:
         return []
     when = "on trial, or the best yet" if quantities.get("searching") else "chosen"
-    if not quantities.get("clear", 1.0):
-        when = "in use, not chosen: the ripple of F_x does not rise above the noise"
     return [("C auto", format_criterion(quantities, when))]
 
 

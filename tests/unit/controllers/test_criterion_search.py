@@ -7,6 +7,7 @@ import pytest
 from msgspec.structs import replace
 from rigs.harness import LIMITS, Rig, observe
 
+from fishd.cli.output import format_criterion
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.criterion_search import LADDER, START_INDEX, CriterionSearch, Phase
@@ -171,6 +172,8 @@ def test_a_ripple_below_the_noise_chooses_no_criterion_and_says_so_once(
     assert criteria == [0.6] * len(criteria)
     assert len(criteria) > 0.5 * len(shown)
     assert not any(quantities["clear"] for quantities in shown)
+    line = format_criterion(publisher.ticks[-1].quantities, "chosen")
+    assert line.endswith("; the ripple of F_x does not rise above the noise")
     assert caplog.text.count("the ripple of F_x does not rise above the noise") == 1
 
 
