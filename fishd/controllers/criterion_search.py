@@ -11,8 +11,7 @@ others the ripple.
 
 The part of F_y that a turned sensor adds is subtracted first, so the sign of F_y does not matter.
 
-A C whose ripple does not rise above the noise replaces no other one. Where no ripple does, C stays
-at 0.6.
+A C whose ripple does not rise above the noise is not taken; if none does, C stays at 0.6.
 """
 
 import logging
@@ -64,8 +63,8 @@ MAX_ROUNDS = 3
 MIN_TRIAL_RATIO = 0.8
 """Ratio of the ripple to the reference below which a trial ends after one beat."""
 CLEAR_RATIO, NOISE_MEMORY = 2.0, 40
-"""Ratio of the mean square of the ripple to that of the noise in it above which it is clear, and
-number of measurements over which the noise is averaged."""
+"""Ratio of the mean squares of a clear ripple and of its noise, and number of measurements over
+which that noise is averaged."""
 LOST_RATIO = 0.5
 """Ratio of the ripple to its former value below which a gait is lost: the tail only trembles."""
 LAUNCH_HALF_BEATS = 4
@@ -352,19 +351,13 @@ class CriterionSearch:
             self._trials.pop(0)
         if not self._trials:
             self._known, self._watched = self._reference.ripple, 0.0
-            self._note_clear(self._reference.is_clear)
+            was_clear, self.is_clear = self.is_clear, self._reference.is_clear
             if not self.is_clear:
                 self._place = 2 * START_INDEX
+            if was_clear > self.is_clear:
+                log.warning("C auto stays at 0.6: the ripple of F_x does not rise above the noise")
         self._gains = []
         self._begin(Phase.TRIAL if self._trials else Phase.WATCH)
-
-    def _note_clear(self, is_clear: bool) -> None:
-        """Set `is_clear`, and log that the noise begins to hide the ripple."""
-        if self.is_clear and not is_clear:
-            log.warning(
-                "swing: C auto chooses no C: the ripple of F_x does not rise above the noise"
-            )
-        self.is_clear = is_clear
 
     def _may_try(self, place: int) -> bool:
         return 0 <= place <= 2 * (len(LADDER) - 1) and place not in self._avoided

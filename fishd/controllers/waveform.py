@@ -16,10 +16,8 @@ from fishd.core.schema import unit
 from fishd.core.signals import Observation
 
 START_SPREAD_S = 14.0
-"""Time in which the fraction of a tick at which a square wave starts goes once from 0 to 1 [s].
-
-The mean time between two swims of a measurement, 8.75 s, is near 0.62 of it: the golden ratio, of
-which a few multiples are already spread evenly."""
+"""Time in which the fraction of a tick at which a square wave starts goes once from 0 to 1 [s]. The
+swims of a measurement are 0.62 of it apart, the golden ratio, so that few are spread evenly."""
 _ROUNDING = 1e-5
 """Relative rounding of a highest frequency with few digits, such as 7.14286 Hz for 0.07 s."""
 
@@ -99,10 +97,7 @@ class Square(Waveform):
     """A square wave between plus and minus the amplitude: the waveform with the largest thrust."""
 
     def activate(self, observation: Observation) -> None:
-        """Start on the side of the current angle, at a fraction of a tick that differs each time.
-
-        Otherwise each swim of a measurement would repeat the same few beats of a dithered wave.
-        """
+        """Start on the side of the current angle, in each swim elsewhere in the dither."""
         fraction = observation.time / START_SPREAD_S % 1.0
         self.phase = fraction * self.parameters.frequency * self.limits.tick
         if observation.instruction_angle < 0:
