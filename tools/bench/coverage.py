@@ -3,7 +3,8 @@
     measure      `fishctl measure`, under drifts of the force sensor; some minutes
     calibration  `fishctl measure`, with a sensor that was calibrated with wrong loads; some minutes
     dither       `fishctl measure` of square waves with half beats between whole ticks; some minutes
-    shown        the thrust that is shown during swims of minutes and hours; a quarter of an hour
+    shown        the thrust that is shown during swims of minutes; some minutes
+    hours        the thrust that is shown during swims of hours; ten minutes
 
 Each row of a table is a case, swum with several seeds with which nothing was chosen.
 """
@@ -19,7 +20,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.disturbances import Disturbance, Force, follow_swimming, outliers, steps
-from bench.shown_thrust import report_shown
+from bench.shown_thrust import report_hours, report_shown
 from common.foreign_fish import MODEL, ForeignParameters, register
 from common.report import JOBS, Options, Report, run_cases, table
 from fishd.cli.calibrate.force_dialogue import PLAN
@@ -264,6 +265,7 @@ PARTS = {
     ),
     "dither": report_dither,
     "shown": report_shown,
+    "hours": report_hours,
 }
 OPTIONS: Options = {
     **JOBS,

@@ -36,6 +36,8 @@ from fishd.virtual.plant.base import TrueWindow
 
 SEED = 7000
 """Seed of the first run."""
+QUIET_RUNS = 6
+"""Largest number of runs of each wave without a drift."""
 REST_S = 3.0
 """Length of each rest [s]."""
 SKIPPED_S = 30.0
@@ -237,23 +239,41 @@ def _shown(tick: Tick, is_held: bool) -> tuple[float, float] | None:
 
 
 def report_shown(options: Namespace) -> Report:
-    """Swim every case, and return the tables."""
+    """Swim every case of some minutes, and return the tables."""
     seeds = range(SEED, SEED + options.runs)
-    hours, hour = seeds[: options.hours], 60.0 * options.minutes
+    return _report(
+        [
+            *(Swim("thrust quiet", n, w, 300.0, seed) for n, w in WAVES.items()
+              for seed in seeds[:QUIET_RUNS]),
+            *(Swim("thrust drifts", n, WAVES["swing"], 300.0, seed, drift=n)
+              for n in DRIFTS for seed in seeds),
+            *(_swim_with_two_rests(n, seed) for n in ("none", *DRIFTS) for seed in seeds),
+        ],
+        options,
+    )  # fmt: skip
+
+
+def report_hours(options: Namespace) -> Report:
+    """Swim every case of up to an hour, and return the tables."""
+    seeds, hour = range(SEED, SEED + options.hours), 60.0 * options.minutes
     own = {"offset_y": 0.01, "drift": 0.005, "rotation": 0.05}
-    cases = [
-        *(Swim("thrust quiet", n, w, 300.0, seed) for n, w in WAVES.items() for seed in seeds),
-        *(Swim("thrust drifts", n, WAVES["swing"], 300.0, seed, drift=n)
-          for n in DRIFTS for seed in seeds),
-        *(_swim_with_two_rests(n, seed) for n in ("none", *DRIFTS) for seed in seeds),
-        *(Swim("thrust hour measured", n, WAVES[n], hour, seed, rig=own, is_measured=True)
-          for n in ("swing", "square 1.8 Hz") for seed in hours),
-        *(Swim("thrust hour", n, w, hour, seed, rig=own)
-          for n, w in WAVES.items() for seed in hours),
-        *(Swim("thrust hour rests", n, w, hour, seed, hour / 6.0, own)
-          for n, w in WAVES.items() for seed in hours),
-        *(Swim("thrust held", n, w, 0.5 * hour, seed) for n, w in HELD.items() for seed in hours),
-    ]  # fmt: skip
+    return _report(
+        [
+            *(Swim("thrust hour measured", n, WAVES[n], hour, seed, rig=own, is_measured=True)
+              for n in ("swing", "square 1.8 Hz") for seed in seeds),
+            *(Swim("thrust hour", n, w, hour, seed, rig=own)
+              for n, w in WAVES.items() for seed in seeds),
+            *(Swim("thrust hour rests", n, w, hour, seed, hour / 6.0, own)
+              for n, w in WAVES.items() for seed in seeds),
+            *(Swim("thrust held", n, w, 0.5 * hour, seed) for n, w in HELD.items()
+              for seed in seeds),
+        ],
+        options,
+    )  # fmt: skip
+
+
+def _report(cases: list[Swim], options: Namespace) -> Report:
+    """Swim some cases, and return a table of each marker."""
     results = run_cases(swim, cases, options.jobs)
     rows: dict[str, dict[str, list[Shown]]] = {}
     for case, shown in zip(cases, results, strict=True):
