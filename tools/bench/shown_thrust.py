@@ -34,7 +34,7 @@ from fishd.lab.session import VirtualSession
 from fishd.lab.simulation import VirtualRun
 from fishd.virtual.plant.base import TrueWindow
 
-SEED = 7000
+SEED = 7500
 """Seed of the first run."""
 QUIET_RUNS = 6
 """Largest number of runs of each wave without a drift."""

@@ -48,6 +48,8 @@ MIN_DRIFT_LAG_S = 1.0
 """Shortest time over which the drift is observed [s]."""
 INITIAL_NOISE_N = 1e-3
 """Standard deviation of the force of a block until two blocks have been compared [N]."""
+MAX_NOISE_LAG = 4
+"""Largest distance at which blocks are compared for their noise [blocks]."""
 NOISE_MEMORY = 10
 """Number of comparisons over which the variance of blocks is averaged."""
 
@@ -288,7 +290,7 @@ class LiveThrust:
             run.wave = self._wave
         elif block.begin - blocks[-1].end < 0.5 * block.duration:
             size = abs(block.size - blocks[-1].size) if block.size and blocks[-1].size else 0.0
-            self._noise.add(self._difference(block, blocks[-1]), size)
+            self._noise.add([self._difference(block, other) for other in reversed(blocks)], size)
         self._compare(block)
         blocks.append(block)
         if block.size is not None:
@@ -304,7 +306,7 @@ class LiveThrust:
             lag = block.end - other.end
             if lag <= DRIFT_LAG_S + 1e-9:
                 if lag >= MIN_DRIFT_LAG_S:
-                    self._drift.add(self._difference(block, other), lag, self._noise.variance)
+                    self._drift.add(self._difference(block, other), lag, self._noise.least)
                 break
 
     def _size(self) -> complex | None:
@@ -451,10 +453,18 @@ class _Noise:
     def __init__(self) -> None:
         self.variance = INITIAL_NOISE_N**2
         self.size_variance = 0.0
+        self._variances = [self.variance] * MAX_NOISE_LAG
         self._count = 1
 
-    def add(self, force: float, size: float) -> None:
-        """Take in the differences between a block and the one before it."""
+    @property
+    def least(self) -> float:
+        """Least variance of the force over some blocks: less where the beats repeat a pattern."""
+        return min(self._variances)
+
+    def add(self, forces: Sequence[float], size: float) -> None:
+        """Take in the differences between a block and those before it, the latest first."""
         self._count = min(self._count + 1, NOISE_MEMORY)
-        self.variance += (0.5 * force**2 - self.variance) / self._count
+        for lag, force in enumerate(forces[:MAX_NOISE_LAG]):
+            self._variances[lag] += (0.5 * force**2 - self._variances[lag]) / self._count
+        self.variance = self._variances[0]
         self.size_variance += (0.5 * size**2 - self.size_variance) / self._count

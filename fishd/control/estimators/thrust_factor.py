@@ -31,9 +31,8 @@ MEMORY_COMPARISONS = 64
 PRIOR_COMPARISONS = 12
 """Number of comparisons for which the configured drift counts: as many others halve it, if they
 show none."""
-NOISE_PART = 0.5
-"""Part of the noise between successive blocks that is subtracted from each comparison. White noise
-would be 2, but beats that take turns repeat themselves, and have less noise over some beats."""
+NOISE_PART = 1.5
+"""Part of the noise of a block that is subtracted from each comparison; white noise would be 2."""
 DRIFT_LAG_S = 2.5
 """Time over which the drift is observed, about that from a rest to a steady swim [s]."""
 

@@ -87,6 +87,23 @@ def test_a_steady_swim_of_5_000_beats_changes_no_factor() -> None:
     assert after.ci95 > before.ci95
 
 
+def ci95_with_pattern(pattern: float) -> float:
+    """Return the half-width after a swim on a zero that drifts by 0.6 mN/s.
+
+    pattern: by which the force of each second beat is larger [N]
+    """
+    rig = Rig(0, force_noise=1e-4, power_noise=0.0, walk=0.0)
+    rig.rest()
+    for beat in range(40):
+        rig.zero += 0.36e-3 + (pattern if beat % 2 else -pattern)
+        rig.beats(1)
+    return factor_error(rig).ci95
+
+
+def test_a_pattern_of_the_beats_hides_no_drift() -> None:
+    assert ci95_with_pattern(2e-3) > 0.8 * ci95_with_pattern(0.0) > 0.05
+
+
 def random_swims(rig: Rig, beats: int) -> Iterator[FactorError]:
     """Rest and swim waves of several sizes at random; yield the error after each."""
     swum = 0
