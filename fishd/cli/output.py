@@ -165,4 +165,6 @@ def format_criterion(quantities: Mapping[str, float], when: str) -> str:
     lead = quantities.get("lead")
     ahead = f", of the speed that is predicted {lead:g} s ahead" if lead else ""
     turns = ", in turn with another one" if quantities.get("halfway") else ""
-    return f"C = {quantities['criterion']:g} {when}{ahead}{turns}"
+    hidden = "; the ripple of F_x does not rise above the noise"
+    reason = "" if quantities.get("clear", 1.0) else hidden
+    return f"C = {quantities['criterion']:g} {when}{ahead}{turns}{reason}"

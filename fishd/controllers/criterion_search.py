@@ -10,12 +10,17 @@ drift. Each measure is weighted by its uncertainty: on a rig with little drift t
 others the ripple.
 
 The part of F_y that a turned sensor adds is subtracted first, so the sign of F_y does not matter.
+
+A C whose ripple does not rise above the noise is not taken; if none does, C stays at 0.6.
 """
 
+import logging
 import math
 from collections import deque
 from enum import Enum
 from typing import NamedTuple
+
+log = logging.getLogger(__name__)
 
 Forces = tuple[float, float]
 """F_x and F_y [N]."""
@@ -57,6 +62,9 @@ MAX_ROUNDS = 3
 """Maximum number of repetitions of a trial."""
 MIN_TRIAL_RATIO = 0.8
 """Ratio of the ripple to the reference below which a trial ends after one beat."""
+CLEAR_RATIO, NOISE_MEMORY = 2.0, 40
+"""Ratio of the mean squares of a clear ripple and of its noise, and number of measurements over
+which that noise is averaged."""
 LOST_RATIO = 0.5
 """Ratio of the ripple to its former value below which a gait is lost: the tail only trembles."""
 LAUNCH_HALF_BEATS = 4
@@ -90,6 +98,8 @@ class Judgement(NamedTuple):
     """Mean of F_x: the thrust plus the zero of the sensor [N]."""
     level_error: float
     """Standard error of `level` without drift [N]."""
+    is_clear: bool
+    """Whether the ripple rises above the noise."""
 
 
 class Gain(NamedTuple):
@@ -139,12 +149,16 @@ class CriterionSearch:
         self._ripples = compute_ripples
         self.ripple = 0.0
         """Ripple of the latest beats [N]."""
+        self.is_clear = True
+        """Whether the ripple rose above the noise at the end of the latest search."""
+        self._noise = 0.0  # mean square of the noise in the ripple [N²]
+        self._noise_count = 0
         self._place = self._former = 2 * START_INDEX  # current and previous place [half steps]
         self._avoided: set[int] = set()  # places where a gait was lost, or is much worse
         self._lost = 0.0  # former ripple of a lost gait
         self._trials = list(NEIGHBOUR_STEPS)
         self._turn = 0
-        self._reference = self._trial = Judgement(0.0, 0.0, 0.0, 0.0, 0.0)
+        self._reference = self._trial = Judgement(0.0, 0.0, 0.0, 0.0, 0.0, False)
         self._gains: list[Gain] = []  # gain of this trial in each round
         self._moves: deque[float] = deque(maxlen=MAX_MOVES)  # changes of the zero [N]
         self._known = 0.0
@@ -212,7 +226,7 @@ class CriterionSearch:
 
     def _gait(self) -> Judgement:
         """Return the measurement over the half beats since the phase began."""
-        squares, levels = self._ripples(self._halves)
+        squares, noises, levels = self._ripples(self._halves)
         middle = _median(squares)
         half_beat = self._lasted / len(self._halves)
         self.ripple = math.sqrt(middle)
@@ -228,7 +242,10 @@ class CriterionSearch:
         # The gait is not settled, which disturbs a turned sensor.
         if len(self._halves) < 2 * TRIAL_BEATS:
             level_error = self.ripple
-        return Judgement(self.ripple, error, half_beat, level, level_error)
+        self._noise_count = min(self._noise_count + 1, NOISE_MEMORY)
+        self._noise += (_mean(noises) - self._noise) / self._noise_count
+        is_clear = middle > CLEAR_RATIO * self._noise
+        return Judgement(self.ripple, error, half_beat, level, level_error, is_clear)
 
     def _judge(self, gait: Judgement) -> None:
         """Continue with the next phase after a measurement."""
@@ -274,6 +291,7 @@ class CriterionSearch:
     def _decide(self, after: Judgement) -> None:
         """Take the tried rung, keep the current one, or repeat the trial."""
         before, self._reference = self._reference, after
+        is_clear = self._trial.is_clear
         if after.ripple < LOST_RATIO * before.ripple and self._trial.ripple < before.ripple:
             self._avoided.add(self._place + self._trials.pop(0))
             self._launch(before.ripple)
@@ -282,11 +300,12 @@ class CriterionSearch:
         self._gains.append(compare_gaits(before, self._trial, after))
         gain, error = self._mean_gain()
         excess = gain - MIN_GAIN
-        if abs(excess) < MIN_STANDARD_ERRORS * error and len(self._gains) < MAX_ROUNDS:
+        is_even = abs(excess) < MIN_STANDARD_ERRORS * error
+        if is_clear and is_even and len(self._gains) < MAX_ROUNDS:
             self._begin(Phase.TRIAL)
             return
         step = self._trials.pop(0)
-        if excess > 0.0:
+        if is_clear and excess > 0.0:
             if MIN_TRIAL_RATIO * (1.0 + gain) > 1.0:
                 self._avoided.add(self._place)
             self._former = self._place
@@ -332,6 +351,11 @@ class CriterionSearch:
             self._trials.pop(0)
         if not self._trials:
             self._known, self._watched = self._reference.ripple, 0.0
+            was_clear, self.is_clear = self.is_clear, self._reference.is_clear
+            if not self.is_clear:
+                self._place = 2 * START_INDEX
+            if was_clear > self.is_clear:
+                log.warning("C auto stays at 0.6: the ripple of F_x does not rise above the noise")
         self._gains = []
         self._begin(Phase.TRIAL if self._trials else Phase.WATCH)
 
@@ -343,6 +367,8 @@ class CriterionSearch:
         self._reference = gait
         if gait.ripple < LOST_RATIO * self._known:
             self._launch(self._known)
+        elif not (self.is_clear or gait.is_clear):
+            self._start_sums()
         elif abs(gait.ripple - self._known) > max(
             MIN_CHANGE * self._known, MIN_CHANGE_STANDARD_ERRORS * gait.error
         ):

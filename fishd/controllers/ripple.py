@@ -11,19 +11,24 @@ LARGE_SPIKE_DEVIATIONS = 2.0
 """Number of standard deviations of F_x that a spike must exceed, too, for the mean of F_x."""
 
 
-def compute_ripples(halves: list[list[tuple[float, float]]]) -> tuple[list[float], list[float]]:
-    """Return mean squares of the ripple [N²] and means [N] of F_x, one for each two half beats.
+def compute_ripples(
+    halves: list[list[tuple[float, float]]],
+) -> tuple[list[float], list[float], list[float]]:
+    """Return mean squares of the ripple and of the noise in it [N²], and means of F_x [N].
+
+    Each list has one value for each two half beats.
 
     halves: F_x and F_y of each tick of two or more half beats, from reversal to reversal [N]
     """
     forces = _remove_lateral_force(halves)
-    squares = [
+    powers = [
         _ripple_power(np.concatenate(beat)) for beat in pairwise(_replace_spikes(forces, 0.0))
     ]
+    squares, noises = map(list, zip(*powers, strict=True))
     # In half beats of different length, a large deviation may be thrust.
     large_spike = LARGE_SPIKE_DEVIATIONS * float(np.concatenate(forces).std())
     cleaned = _replace_spikes(forces, large_spike)
-    return squares, [float(np.concatenate(beat).mean()) for beat in pairwise(cleaned)]
+    return squares, noises, [float(np.concatenate(beat).mean()) for beat in pairwise(cleaned)]
 
 
 def _remove_lateral_force(halves: list[list[tuple[float, float]]]) -> list[NDArray[np.float64]]:
@@ -58,9 +63,15 @@ def _replace_spikes(
     return [row[:length] for row, length in zip(cleaned, lengths, strict=True)]
 
 
-def _ripple_power(beat: NDArray[np.float64]) -> float:
-    """Return the mean square of the components at 2, 4 and 6 times the beat frequency [N²]."""
-    powers = np.abs(np.fft.rfft(beat)[2:7:2] / len(beat)) ** 2
-    if len(beat) in (4, 8, 12):
+def _ripple_power(beat: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the mean square of the components at 2, 4 and 6 times the beat frequency [N²].
+
+    The second value is the part of it that is noise, from the components in between: an equal
+    beat to either side has no thrust there.
+    """
+    powers = 2.0 * np.abs(np.fft.rfft(beat) / len(beat)) ** 2
+    if len(beat) % 2 == 0:
         powers[-1] *= 0.5  # the highest frequency has only one term
-    return 2.0 * float(powers.sum())
+    ripple, between = powers[2:7:2], powers[3:8:2]
+    noise = between.mean() if len(between) else 0.0
+    return float(ripple.sum()), float(noise * len(ripple))

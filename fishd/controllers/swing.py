@@ -80,6 +80,9 @@ class Swing(Controller[SwingParameters]):
     )
     searching: float | None = quantity("1", "With C auto: 1 while other values are tried, else 0.")
     ripple: float | None = quantity("N", "With C auto: ripple of F_x in the latest beats.")
+    clear: float | None = quantity(
+        "1", "With C auto: 1; 0 while the ripple does not rise above the noise, so that C stays."
+    )
 
     def __init__(self, parameters: SwingParameters, limits: Limits) -> None:
         super().__init__(parameters, limits)
@@ -122,6 +125,7 @@ class Swing(Controller[SwingParameters]):
         if parameters.C != "auto":
             self._search = None
             self.criterion = self.lead = self.halfway = self.searching = self.ripple = None
+            self.clear = None
         elif self._search is None:
             self._search = CriterionSearch()
 
@@ -154,5 +158,5 @@ class Swing(Controller[SwingParameters]):
         self.criterion, self.lead = rung = search.rung
         self.halfway = float(search.halfway)
         self.searching = float(search.phase is not Phase.WATCH)
-        self.ripple = search.ripple
+        self.ripple, self.clear = search.ripple, float(search.is_clear)
         return rung

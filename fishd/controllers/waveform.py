@@ -15,6 +15,9 @@ from fishd.core.errors import ParameterError
 from fishd.core.schema import unit
 from fishd.core.signals import Observation
 
+START_SPREAD_S = 14.0
+"""Time in which the fraction of a tick at which a square wave starts goes once from 0 to 1 [s]. The
+swims of a measurement are 0.62 of it apart, the golden ratio, so that few are spread evenly."""
 _ROUNDING = 1e-5
 """Relative rounding of a highest frequency with few digits, such as 7.14286 Hz for 0.07 s."""
 
@@ -94,8 +97,11 @@ class Square(Waveform):
     """A square wave between plus and minus the amplitude: the waveform with the largest thrust."""
 
     def activate(self, observation: Observation) -> None:
-        """Start on the side of the current angle."""
-        self.phase = 0.0 if observation.instruction_angle >= 0 else 0.5
+        """Start on the side of the current angle, in each swim elsewhere in the dither."""
+        fraction = observation.time / START_SPREAD_S % 1.0
+        self.phase = fraction * self.parameters.frequency * self.limits.tick
+        if observation.instruction_angle < 0:
+            self.phase += 0.5
 
     def shape(self, phase: float) -> float:
         """Return +1 in the first half of the period, −1 in the second."""

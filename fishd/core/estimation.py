@@ -48,8 +48,8 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         float,
         unit(
             "N/√s",
-            "How fast the zero of F_x drifts: standard deviation of its change in a second, by "
-            "which the interval of the thrust grows.",
+            "How fast the zero of F_x drifts, until rests and swims have shown it: standard "
+            "deviation of its change in a second.",
             ge=0,
             le=1,
         ),

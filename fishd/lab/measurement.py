@@ -20,7 +20,8 @@ from fishd.lab.statistics import Z95, per_watt
 from fishd.lab.swim_plan import plan, rest_settle_time
 
 MAX_POWER_CHANGE, MAX_REST_POWER = 0.05, 0.01
-"""Largest change of the fin's power within a swim, and largest power at rest, as fractions."""
+"""Largest change of the fin's power within a swim, and largest decay of it within a rest, as
+fractions."""
 SETTLE_REMEDY = "measure again with a longer --settle"
 DISTURBED_REMARK = (
     "the zero of F_x was disturbed too often for the interval to be trusted; measure again"
@@ -388,9 +389,13 @@ def _merge(blocks: Sequence["Block"]) -> "Block":
 
 
 def _find_remark(blocks_of_phases: Sequence[Sequence["Block"]]) -> str:
-    """Return why a measurement may be wrong, from its blocks by swim and rest; else empty."""
+    """Return why a measurement may be wrong, from its blocks by swim and rest; else empty.
+
+    The swing of a fin that does not rest decays within each rest. A drift of F_y, which the fin
+    velocity contains, too, does not.
+    """
     swims = [blocks for blocks in blocks_of_phases if len(blocks) > 1 and blocks[0].swims]
-    rests = [block.power for blocks in blocks_of_phases[1:] for block in blocks if not block.swims]
+    rests = [blocks for blocks in blocks_of_phases[1:] if len(blocks) > 1 and not blocks[0].swims]
     begins = sum(block.power for blocks in swims for block in blocks[: len(blocks) // 2])
     ends = sum(block.power for blocks in swims for block in blocks[-(len(blocks) // 2) :])
     if begins and abs(ends / begins - 1.0) > MAX_POWER_CHANGE:
@@ -399,9 +404,11 @@ def _find_remark(blocks_of_phases: Sequence[Sequence["Block"]]) -> str:
             f"the fin was not steady: its power changed by {change:+.0%} in a swim; {SETTLE_REMEDY}"
         )
     count = sum(len(blocks) // 2 for blocks in swims)
-    if begins and rests and np.mean(rests) > MAX_REST_POWER * begins / count:
-        share = np.mean(rests) * count / begins
-        return f"the fin did not rest: it had {share:.0%} of its power left; {SETTLE_REMEDY}"
+    if begins and rests:
+        decay = np.mean([rest[0].power - rest[-1].power for rest in rests]) * count / begins
+        if decay > MAX_REST_POWER:
+            share = np.mean([rest[0].power for rest in rests]) * count / begins
+            return f"the fin did not rest: it had {share:.0%} of its power left; {SETTLE_REMEDY}"
     return ""
 
 

@@ -2,7 +2,9 @@
 
     measure      `fishctl measure`, under drifts of the force sensor; some minutes
     calibration  `fishctl measure`, with a sensor that was calibrated with wrong loads; some minutes
-    shown        the thrust that is shown during swims of minutes and hours; a quarter of an hour
+    dither       `fishctl measure` of square waves with half beats between whole ticks; some minutes
+    shown        the thrust that is shown during swims of minutes; some minutes
+    hours        the thrust that is shown during swims of hours; ten minutes
 
 Each row of a table is a case, swum with several seeds with which nothing was chosen.
 """
@@ -18,7 +20,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.disturbances import Disturbance, Force, follow_swimming, outliers, steps
-from bench.shown_thrust import report_shown
+from bench.shown_thrust import report_hours, report_shown
+from common.foreign_fish import MODEL, ForeignParameters, register
 from common.report import JOBS, Options, Report, run_cases, table
 from fishd.cli.calibrate.force_dialogue import PLAN
 from fishd.config import Config
@@ -31,8 +34,10 @@ from fishd.lab.simulation import simulate
 from fishd.virtual.imperfections import SimulationSettings
 
 RIG = SimulationSettings(noise=1e-3, offset_y=0.01, rotation=0.05)
-MEASURE_SEED, CALIBRATION_SEED = 31_000, 1000
-"""Seeds of the first run of the parts `measure` and `calibration`."""
+MEASURE_SEED, CALIBRATION_SEED, DITHER_SEED = 31_000, 1000, 5000
+"""Seeds of the first run of the parts `measure`, `calibration` and `dither`."""
+LONG_SWIM_S = 610.0
+"""Length of the swim that gives the true thrust of a dithered wave [s]."""
 LOAD_N, LOAD_S = 0.2, 5.0
 """Force of a load [N], and time for which it is measured [s]."""
 CONFIGURED: dict[str, dict[str, Any]] = {
@@ -165,6 +170,52 @@ def measure_calibrated(case: tuple[str, float, int]) -> Measured:
     return measure_session(VirtualSession(config, calibrate(LOADS[name], seed)), seconds)
 
 
+def measure_dithered(case: tuple[float, int]) -> tuple[float, float, float]:
+    """Measure a square wave; case: asymmetry of the servo, seed of frequency and noise.
+
+    Return the errors without and with noise, and the half-width with noise, as fractions.
+    """
+    asymmetry, seed = case
+    register()
+    parameters = {"frequency": random.Random(f"dither {seed}").uniform(1.0, 2.6)}
+    plant = ForeignParameters(model=MODEL, servo_law="tanh", servo_asymmetry=asymmetry)
+    still = Config(plant=plant, simulation=SimulationSettings(noise=0.0))
+    truth = simulate(still, "square", parameters, LONG_SWIM_S).mean_thrust
+    results = []
+    for noise in (0.0, RIG.noise):
+        config = replace(still, simulation=SimulationSettings(noise=noise, seed=seed))
+        with VirtualSession(config) as rig:
+            results.append(measure_thrust(rig, "square", parameters, 60.0))
+    errors = [result.thrust / truth - 1.0 for result in results]
+    return *errors, results[1].thrust_ci95 / truth
+
+
+def report_dither(options: Namespace) -> Report:
+    """Measure square waves of random frequencies, and return the table."""
+    seeds = range(DITHER_SEED, DITHER_SEED + options.runs)
+    cases = [(asymmetry, seed) for asymmetry in (0.0, 0.2) for seed in seeds]
+    results = run_cases(measure_dithered, cases, options.jobs)
+    rows = []
+    for start in range(0, len(cases), len(seeds)):
+        still, noisy, ci95 = np.array(results[start : start + len(seeds)]).T
+        rows.append(
+            [
+                f"{cases[start][0]:.0%}",
+                f"{np.sqrt(np.mean(still**2)):.2%}",
+                f"{np.abs(still).max():.1%}",
+                f"{np.sqrt(np.mean(noisy**2)):.2%}",
+                f"± {ci95.mean():.1%}",
+                f"{np.mean(np.abs(noisy) < ci95):.0%}",
+            ]
+        )
+    head = (
+        "asymmetry of the servo | rms error without noise | largest | rms error with noise | "
+        "mean interval | it contains the thrust"
+    )
+    about = f"{options.runs} square waves of 1 to 2.6 Hz of each kind, seeds from {DITHER_SEED}."
+    return Report({"dither": f"{about}\n\n{table(head, rows)}"}, results)
+
+
 def report_measurements(
     marker: str,
     function: Callable[[Any], Measured],
@@ -217,7 +268,9 @@ PARTS = {
         report_measurements,
         *("calibration", measure_calibrated, tuple(LOADS), (60.0,), CALIBRATION_SEED),
     ),
+    "dither": report_dither,
     "shown": report_shown,
+    "hours": report_hours,
 }
 OPTIONS: Options = {
     **JOBS,

@@ -40,6 +40,25 @@ def steps(size: float, per_minute: float | None = None) -> Disturbance:
     return disturb
 
 
+def line(rate: float) -> Disturbance:
+    """Return a steady drift [N/s]."""
+    return lambda chance, seconds: lambda time, swims: rate * time
+
+
+def walk(deviation: float) -> Disturbance:
+    """Return a random walk with a standard deviation after one second [N/√s]."""
+
+    def disturb(chance: random.Random, seconds: float) -> Force:
+        step = 0.05
+        changes = np.random.default_rng(chance.getrandbits(32)).standard_normal(
+            int(seconds / step) + 2
+        )
+        level = deviation * math.sqrt(step) * np.cumsum(changes)
+        return lambda time, swims: float(level[int(time / step)])
+
+    return disturb
+
+
 def flicker(chance: random.Random, seconds: float) -> Force:
     """Return noise with a 1/f spectrum from the inverse length of the run to 10 Hz, 5 mN rms."""
     step, count = 0.05, int(seconds / 0.05) + 2

@@ -81,8 +81,21 @@ def swing() -> tuple[list[Row], Sequence[Way]]:
         Row("20 harsh fish", harsh_fish()),
         Row("40 other harsh fish (seeds 720 to 759)", tuple(map(harsh, range(720, 760)))),
         Row("40 mild fish (seeds 300 to 339)", tuple(map(mild, range(300, 340)))),
+        *(
+            Row(
+                f"20 weak mild fish (seeds 360 to 379), {amplitude} rad, 2.3 mN noise, a walk",
+                tuple(_weak(mild(seed), amplitude) for seed in range(360, 380)),
+            )
+            for amplitude in (0.15, 0.08)
+        ),
     ]
     return [*map(_single, CHANGES), *groups], AUTO
+
+
+def _weak(fish: OtherFish, amplitude: float) -> OtherFish:
+    """Return a fish with a small amplitude [rad] on a bad sensor."""
+    sensor = ("simulation.noise=2.3e-3", "simulation.drift_walk=5e-4")
+    return OtherFish(fish.name, (*fish.overrides, f"amplitude_limit={amplitude}", *sensor))
 
 
 def harsh_rig() -> tuple[list[Row], Sequence[Way]]:

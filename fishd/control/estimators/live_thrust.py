@@ -48,6 +48,8 @@ MIN_DRIFT_LAG_S = 1.0
 """Shortest time over which the drift is observed [s]."""
 INITIAL_NOISE_N = 1e-3
 """Standard deviation of the force of a block until two blocks have been compared [N]."""
+MAX_NOISE_LAG = 4
+"""Largest distance at which blocks are compared for their noise [blocks]."""
 NOISE_MEMORY = 10
 """Number of comparisons over which the variance of blocks is averaged."""
 
@@ -58,8 +60,8 @@ class LiveThrust:
     def __init__(self, zero_drift: float) -> None:
         """Start with nothing known.
 
-        zero_drift: standard deviation of the change of the zero after a second [N/√s]; where the
-        forces show a faster drift, that is taken instead
+        zero_drift: standard deviation of the change of the zero after a second, until the forces
+            have shown how fast it drifts [N/√s]
         """
         self.thrust: float | None = None
         """Thrust of the latest beats; at rest, of its latest piece [N]. None while not known."""
@@ -288,13 +290,8 @@ class LiveThrust:
             run.wave = self._wave
         elif block.begin - blocks[-1].end < 0.5 * block.duration:
             size = abs(block.size - blocks[-1].size) if block.size and blocks[-1].size else 0.0
-            self._noise.add(self._difference(block, blocks[-1]), size)
-        for other in blocks:
-            lag = block.end - other.end
-            if lag <= DRIFT_LAG_S + 1e-9:
-                if lag >= MIN_DRIFT_LAG_S:
-                    self._drift.add(self._difference(block, other), lag, self._noise.variance)
-                break
+            self._noise.add([self._difference(block, other) for other in reversed(blocks)], size)
+        self._compare(block)
         blocks.append(block)
         if block.size is not None:
             run.size = (
@@ -302,6 +299,15 @@ class LiveThrust:
             )
         if not run.started:
             run.first.append(block)
+
+    def _compare(self, block: "_Block") -> None:
+        """Take in the change of the force from an earlier block of the run as a drift."""
+        for other in self._run.blocks:
+            lag = block.end - other.end
+            if lag <= DRIFT_LAG_S + 1e-9:
+                if lag >= MIN_DRIFT_LAG_S:
+                    self._drift.add(self._difference(block, other), lag, self._noise.least)
+                break
 
     def _size(self) -> complex | None:
         """Return the size of the shown beats; None where there are none."""
@@ -447,10 +453,18 @@ class _Noise:
     def __init__(self) -> None:
         self.variance = INITIAL_NOISE_N**2
         self.size_variance = 0.0
+        self._variances = [self.variance] * MAX_NOISE_LAG
         self._count = 1
 
-    def add(self, force: float, size: float) -> None:
-        """Take in the differences between a block and the one before it."""
+    @property
+    def least(self) -> float:
+        """Least variance of the force over some blocks: less where the beats repeat a pattern."""
+        return min(self._variances)
+
+    def add(self, forces: Sequence[float], size: float) -> None:
+        """Take in the differences between a block and those before it, the latest first."""
         self._count = min(self._count + 1, NOISE_MEMORY)
-        self.variance += (0.5 * force**2 - self.variance) / self._count
+        for lag, force in enumerate(forces[:MAX_NOISE_LAG]):
+            self._variances[lag] += (0.5 * force**2 - self._variances[lag]) / self._count
+        self.variance = self._variances[0]
         self.size_variance += (0.5 * size**2 - self.size_variance) / self._count

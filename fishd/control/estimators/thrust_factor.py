@@ -8,9 +8,9 @@ on the factor but not on the zero. `Factor.after_step` updates it from one such 
 import math
 from typing import Any, NamedTuple
 
-FACTOR_WALK = 0.001
-"""Standard deviation by which the true factor changes in a second, as a fraction of it [1/√s]: 6 %
-in an hour."""
+FACTOR_WALK = 0.00025
+"""Standard deviation by which the true factor changes in a second, as a fraction of it [1/√s]:
+1.5 % in an hour."""
 WAVE_SCATTER = 0.3
 """Standard deviation of the factor from one wave to another, as a fraction of it. It is as large as
 that where `estimator.leak` is not that of the fish."""
@@ -28,6 +28,11 @@ CLEAR_DRIFT_SIGMAS = 2.0
 """Number of standard deviations of the noise beyond which a change of the force is a drift."""
 MEMORY_COMPARISONS = 64
 """Number of comparisons that the drift is averaged over: about 40 s."""
+PRIOR_COMPARISONS = 12
+"""Number of comparisons for which the configured drift counts: as many others halve it, if they
+show none."""
+NOISE_PART = 1.5
+"""Part of the noise of a block that is subtracted from each comparison; white noise would be 2."""
 DRIFT_LAG_S = 2.5
 """Time over which the drift is observed, about that from a rest to a steady swim [s]."""
 
@@ -56,12 +61,14 @@ class Level(NamedTuple):
     """Variance of `thrust` [N²]."""
 
     def drift_variance(self, later: "Level", rate: float) -> float:
-        """Return the variance of the change of a random-walk zero between two levels [N²].
+        """Return the variance of the change of the zero between two levels [N²].
 
-        rate: variance of the walk after a second [N²/s]
+        It is that of a random walk, or that of a steady drift where it is larger.
+        rate: variance of the change after `DRIFT_LAG_S`, per second of it [N²/s]
         """
         widths = self.end - self.begin + later.end - later.begin
-        return rate * (max(0.0, later.begin - self.end) + widths / 3.0)
+        gap = max(0.0, later.begin - self.end)
+        return rate * max(gap + widths / 3.0, (gap + 0.5 * widths) ** 2 / DRIFT_LAG_S)
 
 
 class Factor(NamedTuple):
@@ -147,9 +154,9 @@ class Factor(NamedTuple):
 class Drift:
     """How fast the zero drifts: mean square of its change over some seconds, per second."""
 
-    def __init__(self, min_rate: float) -> None:
-        """min_rate: smallest rate, as configured [N²/s]"""
-        self._min_rate = min_rate
+    def __init__(self, prior_rate: float) -> None:
+        """prior_rate: rate without any comparison, as configured [N²/s]"""
+        self._prior_rate = prior_rate
         self._sum = 0.0
         self._count = self._fresh = self._total = 0
         self._recent_rate = 0.0
@@ -168,7 +175,7 @@ class Drift:
         lag: time of that change, at most `DRIFT_LAG_S` [s]
         noise: variance of either force by noise [N²]
         """
-        rate = (change**2 - 2.0 * noise) / lag
+        rate = (change**2 - NOISE_PART * noise) / lag
         if change**2 > CLEAR_DRIFT_SIGMAS**2 * 2.0 * noise:  # it may go on at this speed
             rate *= DRIFT_LAG_S / lag
         self._sum += rate
@@ -183,9 +190,10 @@ class Drift:
     def rate(self) -> float:
         """Variance of the change of the zero after a second [N²/s].
 
-        The largest of the configured one, of the means over the latest comparisons and since the
-        swim or rest began, and of that near its begin: a drift that has ended since still counts
-        for the change that began it.
+        The largest of what the comparisons have left of the configured one, of the means over the
+        latest comparisons and since the swim or rest began, and of that near its begin: a drift
+        that has ended since still counts for the change that began it.
         """
         mean = self._sum / self._count if self._count else 0.0
-        return max(self._min_rate, self._recent_rate, mean, self._near_rate)
+        prior = self._prior_rate * PRIOR_COMPARISONS / (PRIOR_COMPARISONS + self._total)
+        return max(prior, self._recent_rate, mean, self._near_rate)

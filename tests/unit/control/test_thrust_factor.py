@@ -8,7 +8,7 @@ from typing import NamedTuple
 import pytest
 
 from fishd.control.estimators.live_thrust import LiveThrust
-from fishd.control.estimators.thrust_factor import DRIFT_LAG_S, Drift
+from fishd.control.estimators.thrust_factor import DRIFT_LAG_S, NOISE_PART, Drift, Level
 from fishd.core.signals import Observation
 
 TICK = 0.3
@@ -87,6 +87,23 @@ def test_a_steady_swim_of_5_000_beats_changes_no_factor() -> None:
     assert after.ci95 > before.ci95
 
 
+def ci95_with_pattern(pattern: float) -> float:
+    """Return the half-width after a swim on a zero that drifts by 0.6 mN/s.
+
+    pattern: by which the force of each second beat is larger [N]
+    """
+    rig = Rig(0, force_noise=1e-4, power_noise=0.0, walk=0.0)
+    rig.rest()
+    for beat in range(40):
+        rig.zero += 0.36e-3 + (pattern if beat % 2 else -pattern)
+        rig.beats(1)
+    return factor_error(rig).ci95
+
+
+def test_a_pattern_of_the_beats_hides_no_drift() -> None:
+    assert ci95_with_pattern(2e-3) > 0.8 * ci95_with_pattern(0.0) > 0.05
+
+
 def random_swims(rig: Rig, beats: int) -> Iterator[FactorError]:
     """Rest and swim waves of several sizes at random; yield the error after each."""
     swum = 0
@@ -128,4 +145,23 @@ def test_only_a_change_that_is_clear_of_the_noise_counts_as_a_drift_that_goes_on
     drift, noise, lag = Drift(0.0), 1e-6, 0.5
     change = sigmas * math.sqrt(2.0 * noise)
     drift.add(change, lag, noise)
-    assert drift.rate == pytest.approx((change**2 - 2.0 * noise) * lasts / lag**2)
+    assert drift.rate == pytest.approx((change**2 - NOISE_PART * noise) * lasts / lag**2)
+
+
+def test_a_sensor_that_does_not_drift_is_believed_after_some_comparisons() -> None:
+    drift = Drift(1e-6)
+    rates = []
+    for _ in range(100):
+        rates.append(drift.rate)
+        drift.add(0.0, DRIFT_LAG_S, 0.0)
+    assert rates[0] == 1e-6
+    assert rates == sorted(rates, reverse=True)
+    assert rates[-1] < 0.15e-6
+
+
+def test_a_drift_that_goes_on_moves_the_zero_in_proportion_to_the_time() -> None:
+    rest = Level(force=0.0, variance=0.0, power=0.0, size=None, begin=0.0, end=2.0)
+    swim = rest._replace(begin=4.0, end=8.0)
+    slope = 0.4e-3
+    rate = (slope * DRIFT_LAG_S) ** 2 / DRIFT_LAG_S
+    assert math.sqrt(rest.drift_variance(swim, rate)) == pytest.approx(slope * 5.0)

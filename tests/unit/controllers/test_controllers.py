@@ -1,7 +1,7 @@
 """The controllers: waveforms, take-over without a bump, and their registry."""
 
 import math
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import pytest
 from hypothesis import given
@@ -32,6 +32,26 @@ def test_a_frequency_off_the_grid_is_right_on_average(frequency: float) -> None:
     given_ = commands(create("square", frequency=frequency), 1000)
     reversals = sum(a != b for a, b in pairwise(given_))
     assert reversals / 2 / (999 * 0.05) == pytest.approx(frequency, abs=0.5 / (999 * 0.05))
+
+
+def test_square_waves_that_start_at_other_times_begin_at_other_places_of_their_dither() -> None:
+    patterns = set()
+    for swim in range(6):
+        square = create("square", frequency=10 / 4.5)
+        square.activate(replace(observe(), time=8.75 * swim))
+        angles = [square.update(observe()) for _ in range(100)]
+        lengths = [len(list(side)) for _, side in groupby(angles)]
+        assert set(lengths[1:-1]) == {4, 5}
+        patterns.add(lengths[0])
+    assert patterns == {4, 5}
+
+
+@given(st.floats(0.0, 1e6))
+def test_a_square_wave_of_whole_ticks_is_the_same_whenever_it_starts(time: float) -> None:
+    square = create("square", frequency=2.5)
+    square.activate(replace(observe(), time=time))
+    sides = [len(list(side)) for _, side in groupby(square.update(observe()) for _ in range(99))]
+    assert set(sides[1:-1]) == {4}
 
 
 def test_sine_and_triangle_have_the_shapes_of_their_names() -> None:

@@ -7,12 +7,13 @@ import pytest
 from msgspec.structs import replace
 from rigs.harness import LIMITS, Rig, observe
 
+from fishd.cli.output import format_criterion
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.criterion_search import LADDER, START_INDEX, CriterionSearch, Phase
 from fishd.core.errors import ParameterError
 from fishd.lab.compare.survey import harsh
-from fishd.lab.simulation import simulate
+from fishd.lab.simulation import KeepingPublisher, simulate
 
 
 def relative_thrust(
@@ -158,3 +159,23 @@ def test_a_watched_gait_that_becomes_much_weaker_or_stronger_restarts_the_search
         seen.append(search.phase)
     assert seen[29] is Phase.WATCH
     assert (Phase.TRIAL in seen[30:]) is restarts
+
+
+def test_a_ripple_below_the_noise_chooses_no_criterion_and_says_so_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    weak = load(None, ("amplitude_limit=0.05", "simulation.noise=2.3e-3", "simulation.seed=3"))
+    publisher = KeepingPublisher()
+    simulate(weak, "swing", {"C": "auto"}, 180.0, publisher=publisher)
+    shown = [tick.quantities for tick in publisher.ticks if tick.time > 90.0]
+    criteria = [quantities["criterion"] for quantities in shown if not quantities["searching"]]
+    assert criteria == [0.6] * len(criteria)
+    assert len(criteria) > 0.5 * len(shown)
+    assert not any(quantities["clear"] for quantities in shown)
+    line = format_criterion(publisher.ticks[-1].quantities, "chosen")
+    assert line.endswith("; the ripple of F_x does not rise above the noise")
+    assert caplog.text.count("the ripple of F_x does not rise above the noise") == 1
+
+
+def test_a_ripple_above_the_noise_is_clear() -> None:
+    assert simulate(load(None), "swing", {"C": "auto"}, 60.0).quantities["clear"] == 1.0

@@ -245,6 +245,28 @@ def test_a_fin_that_takes_its_time_is_told_and_measured_right_with_more_of_it() 
     assert abs(measurement.thrust - truth) < measurement.total_ci95 < 0.02 * truth
 
 
+def swim_and_rest(config: Config) -> ThrustMeasurement:
+    """Return a measurement of two long swims, with the usual time for a fin to hang still."""
+    with VirtualSession(config) as rig:
+        ticks = rig.rest(3.0)
+        for _ in range(2):
+            ticks += rig.swim("swing", {}, 20.0) + rig.rest(3.0)
+    return evaluate(to_samples(ticks), config.tick, 10.0)
+
+
+def test_a_fin_that_still_swings_in_the_rests_is_told() -> None:
+    slow = replace(RIG, plant=replace(RIG.plant, xi=0.1))
+    assert "the fin did not rest: it had 2" in swim_and_rest(slow).remark
+
+
+@pytest.mark.parametrize("seed", [2, 3])
+def test_a_drift_of_the_lateral_force_is_not_taken_for_a_fin_that_swings_in_the_rests(
+    seed: int,
+) -> None:
+    rig = replace(RIG.simulation, drift=20e-3, drift_period=20.0, seed=seed)
+    assert "did not rest" not in measure_swim(replace(RIG, simulation=rig), 60.0).remark
+
+
 def test_a_beat_that_is_longer_than_a_swim_is_told() -> None:
     slow = {"smaller": 1.0, "lowest_frequency": 0.15, "highest_frequency": 0.15}
     with VirtualSession(RIG) as rig, pytest.raises(ParameterError, match="no whole beat is left"):
