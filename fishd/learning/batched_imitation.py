@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from fishd.config import Config
-from fishd.control.estimators.base import MAX_SIDE_TIME_S
+from fishd.core.signals import MAX_SIDE_TIME_S
 from fishd.learning.env.environment import features
 from fishd.learning.imitation import MAX_HALF_BEAT_S, Imitation, LabelledTicks, advise_side
 from fishd.learning.settings import TrainingSettings

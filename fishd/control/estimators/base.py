@@ -5,10 +5,7 @@ from abc import ABC, abstractmethod
 
 from msgspec.structs import replace
 
-from fishd.core.signals import Measurement, Observation
-
-MAX_SIDE_TIME_S = 2.0
-"""Largest `side_time`; a tail that stays longer on one side does not beat [s]."""
+from fishd.core.signals import MAX_SIDE_TIME_S, Measurement, Observation
 
 
 class TailBeat:
