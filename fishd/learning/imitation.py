@@ -35,7 +35,7 @@ RANDOM_START_RATIO = 3
 """Smallest ratio of all ticks of a fish to its initial ticks, which are swum by random waves."""
 NARROWED_SHARE = 0.3
 """Share of the fish that are from a part of the randomisation; the others are from all of it."""
-RIG_RANGES = ("servo_delay", "servo_dead_zone", "backlash", "servo_reaction")
+RIG_RANGES = ("servo_delay", "servo_dead_zone", "backlash", "servo_reaction", "cable_slack")
 """Names of the ranges of a randomisation that are smaller for a clean rig."""
 SLOW_PLACES = -1.0, -0.3
 """Lowest and highest place of ω₀ and ξ of slow fish in their ranges, from -1 to 1."""
@@ -63,6 +63,20 @@ def narrow(spread: Randomisation, share: float, rig_share: float = 1.0) -> Rando
     names = [name for name in Randomisation.__struct_fields__ if name != "fish"]
     ranges = {name: share * getattr(spread, name) for name in names}
     return replace(spread, **ranges | {name: rig_share * ranges[name] for name in RIG_RANGES})
+
+
+def slow_down(
+    fish: Config, nominal: PlantParameters, spread: Randomisation, draw: np.random.Generator
+) -> Config:
+    """Return a fish with another ω₀ and ξ, from the lower third of their ranges.
+
+    nominal: fish in the middle of the ranges
+    """
+    omega0, xi = (
+        float(getattr(nominal, name) * (1.0 + getattr(spread, name)) ** place)
+        for name, place in zip(("omega0", "xi"), draw.uniform(*SLOW_PLACES, 2), strict=True)
+    )
+    return replace(fish, plant=replace(fish.plant, omega0=omega0, xi=xi))
 
 
 def half_beat_thrusts(config: Config) -> NDArray[np.float64]:
@@ -147,11 +161,7 @@ class Imitation:
         fish = draw_fish(self._config, narrowed, int(draw.integers(2**31)))
         if settings.slow_fish == 0.0 or draw.uniform() >= settings.slow_fish:
             return fish
-        omega0, xi = (
-            getattr(self._config.plant, name) * (1.0 + getattr(spread, name)) ** place
-            for name, place in zip(("omega0", "xi"), draw.uniform(*SLOW_PLACES, 2), strict=True)
-        )
-        return replace(fish, plant=replace(fish.plant, omega0=float(omega0), xi=float(xi)))
+        return slow_down(fish, self._config.plant, spread, draw)
 
     def _fit(self, given: LabelledTicks) -> float:
         """Fit the network to all ticks from a high learning rate to a low one."""

@@ -161,6 +161,9 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     rotation: Annotated[
         float, unit("rad", "Uniform in ±this about the configured one.", ge=0, le=1.5)
     ] = 0.0
+    cable_slack: Annotated[
+        float, unit("rad", "Uniform, from the configured value to this much more.", ge=0, le=0.5)
+    ] = 0.0
     fish: Annotated[
         tuple[PlantParameters, ...],
         note(
