@@ -18,6 +18,8 @@ if TYPE_CHECKING:  # numpy and onnxruntime are imported with the first policy
     from fishd.controllers.policy.runtime import Network
 
 _WARM_UPS = 3
+ROUNDING = 1e-5
+"""Largest output of a network that counts as zero, since its sums are rounded."""
 
 
 class PpoParameters(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -61,6 +63,9 @@ class Ppo(Controller[PpoParameters]):
         self.limits = limits
         card, self._network = _open(parameters, limits)
         self._history = History(card.observation, card.window, self._network.row)
+        names = [feature.name for feature in card.observation] * card.history
+        self._odd = [index for index, name in enumerate(names) if name != "fx"]
+        """Indices of the inputs that change sign for a mirrored fish."""
         self._amplitude = card.amplitude
         self._limit = DwellLimit(limits.dwell, limits, card.amplitude)
         self._latest = Observation(0.0, limits.tick, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -92,14 +97,14 @@ class Ppo(Controller[PpoParameters]):
     def update(self, observation: Observation) -> float:
         """Return Φ times the network's output, clipped to ±1 [rad].
 
-        A network with left-right symmetry returns zero if all its inputs are zero, such as at rest
-        without noise; the fish is then pushed to plus. An output that is not finite is returned
-        unchanged, which causes the fault `controller-error`.
+        A network with left-right symmetry returns zero if all its inputs but F_x are zero, such as
+        at rest without noise; the fish is then pushed to plus. An output that is not finite is
+        returned unchanged, which causes the fault `controller-error`.
         Raise `ControllerFault` with the code `chatter`; see `DwellLimit`.
         """
         self._latest = observation
         self.action = action = self._choose(observation)
-        if action == 0.0 and not self._network.row.any():
+        if abs(action) < ROUNDING and not self._network.row[self._odd].any():
             action = 1.0
         elif math.isfinite(action):
             action = max(-1.0, min(1.0, action))
