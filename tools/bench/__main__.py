@@ -17,6 +17,7 @@ NAMES = (
     "learning",
     "swimmer",
     "window",
+    "accuracy",
 )
 
 if __name__ == "__main__":

@@ -6,6 +6,8 @@ virtual time, by default for five minutes of tank time. The truth is the mean th
 simulated fish, which `adapt` does not use.
 """
 
+import math
+import random
 import statistics
 from argparse import Namespace
 from collections.abc import Callable
@@ -17,17 +19,19 @@ from msgspec.structs import replace
 
 from common.foreign_fish import best_wave, foreign_fish
 from common.report import JOBS, Options, Report, percent, progress, run_cases, table
-from fishd.config import Start, load
+from fishd.config import Config, Start, load
 from fishd.lab.compare.survey import harsh
-from fishd.lab.experiment import Header, open_experiment
+from fishd.lab.experiment import Header, count_attempts, open_experiment
 from fishd.lab.session import VirtualSession
 from fishd.learning.adapt.adaptation import Adaptation, add_true_thrusts
-from fishd.learning.adapt.state import AdaptFolder, Contender, Verdict
+from fishd.learning.adapt.state import AdaptFolder, Contender, State, Verdict
 from fishd.learning.adapt.verdict import SQUARE
 from fishd.virtual.plant.optimum import best_square_wave
 
 FIRST_SEED = 900
 """First seed of the harsh fish; other seeds were used during development."""
+MAX_INTERVAL = 4000
+"""Largest number of ticks and steps of training before an interruption."""
 EQUAL = 0.9999
 """Ratio of thrusts from which two gaits count as equal."""
 
@@ -66,37 +70,66 @@ class Adapted(Struct, frozen=True):
         return low <= self.truth(gait) / self.truth(SQUARE) <= high
 
 
-class _Silent:
-    """Progress display without output."""
+class _Interruption(BaseException):
+    """An end of the process, which no part of an adaptation may catch."""
+
+
+class _Display:
+    """Progress display without output, which may interrupt the adaptation."""
+
+    def __init__(self, end: int | None) -> None:
+        """end: number of ticks and of steps of training after which to interrupt"""
+        self._left = math.inf if end is None else end
 
     def done(self, line: str, amount: float) -> None:
         """Ignore the end of a step."""
 
     def at(self, amount: float, outcome: str = "") -> None:
-        """Ignore progress."""
+        """Count a tick or a step; raise `_Interruption` at the end."""
+        self._left -= 1
+        if self._left <= 0:
+            raise _Interruption
 
     def warn(self, line: str) -> None:
         """Ignore a warning."""
 
 
-def adapted(task: tuple[str, int, int, float]) -> Adapted:
-    """Adapt to one fish; task: kind, seed, steps of the training, tank time [s]."""
-    kind, seed, steps, tank_time = task
+def _adapt(config: Config, path: Path, steps: int, tank_time: float, ends: list[int]) -> State:
+    """Adapt to a fish, interrupted after each of these numbers of ticks, and resumed."""
+    header = Header(kind="adapt", on="simulation")
+    for attempt, end in enumerate([*ends, None]):
+        try:
+            with open_experiment(path, header, resume=attempt > 0) as experiment:
+                run = AdaptFolder(experiment)
+                session = VirtualSession(config)
+                session.resume(count_attempts(path) if attempt else 0)
+                with session:
+                    # What interrupted steps swam is swum again, beyond the tank time of one run.
+                    budget = tank_time + run.state.tank_time if attempt else tank_time
+                    Adaptation(session, run, budget, steps, 0, _Display(end)).run()
+                add_true_thrusts(run, config)
+                return run.state
+        except _Interruption:
+            continue
+    raise AssertionError("the last attempt is not interrupted")
+
+
+def adapted(task: tuple[str, int, int, float, int]) -> Adapted:
+    """Adapt to one fish.
+
+    task: kind, seed, steps of the training, tank time [s], number of interruptions
+    """
+    kind, seed, steps, tank_time, interruptions = task
+    chance = random.Random(seed)
+    ends = [chance.randrange(1, MAX_INTERVAL) for _ in range(interruptions)]
     if kind == "foreign":
         config = foreign_fish(seed)
         best = best_wave(config)
     else:
         config = replace(load(None, harsh(seed).overrides), start=Start())
         best = best_square_wave(config.plant, config.amplitude_limit).thrust
-    header = Header(kind="adapt", on="simulation")
-    with (
-        TemporaryDirectory() as folder,
-        open_experiment(Path(folder) / "adapt", header) as experiment,
-    ):
-        run = AdaptFolder(experiment)
-        with VirtualSession(config) as session:
-            state = Adaptation(session, run, tank_time, steps, 0, _Silent()).run()
-        add_true_thrusts(run, config)
+    with TemporaryDirectory() as folder:
+        state = _adapt(config, Path(folder) / "adapt", steps, tank_time, ends)
     assert state.verdict
     progress(f"fish {seed}", state.verdict.claim)
     contenders = {contender.name: contender for contender in state.contenders}
@@ -185,13 +218,19 @@ OPTIONS: Options = {
     "--fish": {"type": int, "default": 10, "help": "number of fish"},
     "--steps": {"type": int, "default": 6400, "help": "steps of each training"},
     "--budget": {"type": float, "default": 300.0, "help": "tank time of each fish [s]"},
+    "--interruptions": {
+        "type": int,
+        "default": 0,
+        "help": "number of interruptions of each adaptation at random ticks; it is resumed",
+    },
 }
 
 
 def measure(options: Namespace) -> Report:
     """Return two tables; takes half a minute per fish."""
     seeds = range(options.first, options.first + options.fish)
-    tasks = [(options.kind, seed, options.steps, options.budget) for seed in seeds]
+    shared = options.steps, options.budget, options.interruptions
+    tasks = [(options.kind, seed, *shared) for seed in seeds]
     results = run_cases(adapted, tasks, options.jobs)
     head = (
         "fish | best square wave, mN | verdict | true thrust of the chosen gait, % of the best | "
@@ -200,4 +239,9 @@ def measure(options: Namespace) -> Report:
     )
     name = "bench adapt" if options.kind == "harsh" else "bench adapt foreign"
     sections = {name: table(head, map(row, results)), f"{name} summary": summary(results)}
-    return Report(sections, results)
+    errors = [
+        (gait.thrust - (gait.true_thrust or 0.0)) / (gait.total_ci95 or gait.thrust_ci95)
+        for result in results
+        for gait in result.contenders.values()
+    ]
+    return Report(sections, results, errors={f"adapt, {options.kind} fish": errors})

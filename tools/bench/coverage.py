@@ -52,6 +52,10 @@ ADDED: dict[str, Disturbance] = {
 """Further disturbances of F_x, for the part `measure`."""
 
 
+KINDS = {"coverage": "measure, drifts", "calibration": "measure, wrong loads"}
+"""Names of the errors of the parts, by the markers of their tables."""
+
+
 class DisturbedSession(VirtualSession):
     """Session on a simulated fish with a force added to F_x that is unknown to fishd."""
 
@@ -200,7 +204,8 @@ def report_measurements(
     about = f"True thrust {1e3 * truth:.2f} mN, {options.runs} runs of each kind, seeds from"
     text = f"{about} {first_seed}.\n\n{table(head, rows)}"
     figures = [[*case, *run] for case, run in zip(cases, results, strict=True)]
-    return Report({marker: text}, figures)
+    errors = {KINDS[marker]: [(run.thrust - truth) / run.total for run in results]}
+    return Report({marker: text}, figures, errors=errors)
 
 
 PARTS = {

@@ -2,20 +2,24 @@
 
 import argparse
 import ast
+import csv
 import importlib
 import os
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from importlib.util import find_spec
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import msgspec
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
+ERRORS = DOCS / "figures" / "accuracy.csv"
+"""Errors of all results that have an interval, which the benches keep; see `Report.errors`."""
 Options = dict[str, dict[str, Any]]
 """Options of a command line: arguments of `ArgumentParser.add_argument`, by name."""
 JOBS: Options = {"--jobs": {"type": int, "default": os.cpu_count(), "help": "number of processes"}}
@@ -35,6 +39,8 @@ class Report(NamedTuple):
     number: str = ""
     """The result in one line, for a cell of a table in docs/; it is written instead of the only
     section, which is for people."""
+    errors: Mapping[str, list[float]] = MappingProxyType({})
+    """Errors of results with an interval, by kind of result [half-widths of their intervals]."""
 
 
 class BrokenPromise(BaseException):
@@ -76,6 +82,8 @@ def run(package: str, names: Sequence[str]) -> int:
     if options.write:
         for marker, section in report.sections.items():
             put(_page_with(marker), marker, report.number or section, in_line=bool(report.number))
+        if report.errors:
+            _write_errors({**read_errors(), **report.errors})
     return int(report.broken)
 
 
@@ -90,7 +98,25 @@ def _measure_parts(
         progress(name, f"{time.perf_counter() - start:.0f} s")
     sections = {k: text for report in reports.values() for k, text in report.sections.items()}
     figures = {name: report.figures for name, report in reports.items()}
-    return Report(sections, figures, any(report.broken for report in reports.values()))
+    errors = {kind: e for report in reports.values() for kind, e in report.errors.items()}
+    broken = any(report.broken for report in reports.values())
+    return Report(sections, figures, broken, errors=errors)
+
+
+def read_errors() -> dict[str, list[float]]:
+    """Return the errors that benches have kept, by kind of result [half-widths]."""
+    errors: dict[str, list[float]] = {}
+    if ERRORS.exists():
+        with ERRORS.open(encoding="utf-8", newline="") as file:
+            for kind, error in csv.reader(file):
+                errors.setdefault(kind, []).append(float(error))
+    return errors
+
+
+def _write_errors(errors: dict[str, list[float]]) -> None:
+    with ERRORS.open("w", encoding="utf-8", newline="") as file:
+        rows = ((kind, f"{error:.3f}") for kind, values in errors.items() for error in values)
+        csv.writer(file, lineterminator="\n").writerows(rows)
 
 
 def run_cases(function: Callable[[Any], Any], cases: Iterable[Any], jobs: int | None) -> list[Any]:

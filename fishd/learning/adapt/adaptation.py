@@ -88,6 +88,7 @@ class Adaptation:
             self._train(state)
         if state.verdict is None:
             self._compare(state)
+            self._simulate(state)
             state.verdict = judge(state.contenders, self._model(state))
             self._save()
         return state
@@ -110,14 +111,19 @@ class Adaptation:
             state.excitation = None
             self._save()
             raise RecordingError(f"{error}; if resumed, the fish swims it again") from None
+        except FishdError:
+            raise
+        except (ArithmeticError, ValueError) as error:  # the numerics of a fit
+            reason = f"the fit failed: {text.describe_error(error)}"
+            state.fitted = do.without_fit(reason)
+            self._done("fit: none")
+            self._show.warn(f"fishctl: careful: {_BY_MEASUREMENT}: {reason}")
+            return
         self._run.experiment.write(FISH, identification.to_yaml("fishctl adapt"))
         explained = " and ".join(f"{channel.explained:.1%}" for channel in identification.channels)
         self._done(f"fit: explains {explained} of F_x and F_y")
         if state.fitted.model.standard_error is None:
-            self._show.warn(
-                "fishctl: careful: the fit is not used, the gaits are chosen by measurement "
-                f"alone: {identification.headline}"
-            )
+            self._show.warn(f"fishctl: careful: {_BY_MEASUREMENT}: {identification.headline}")
         for remark in identification.remarks:
             self._show.warn(f"fishctl: careful: {remark}")
 
@@ -251,7 +257,6 @@ class Adaptation:
                 frequency=measurement.frequency,
                 seconds=seconds,
                 remark=measurement.remark,
-                expected_thrusts=self._simulate_thrusts(state, gait),
             )
         )
         measured = error_budget.format_with_budget(
@@ -265,16 +270,30 @@ class Adaptation:
         if measurement.remark:
             self._show.warn(f"fishctl: {gait.name}: {measurement.remark}")
 
-    def _simulate_thrusts(self, state: State, gait: Gait) -> list[float]:
-        """Return the thrusts of a gait on the first fish of the cloud [N]; empty if unused."""
+    def _simulate(self, state: State) -> None:
+        """Simulate the measured gaits on the first fish of the cloud, if the fit is used."""
         assert state.fitted
         if state.fitted.model.standard_error is None:
-            return []
+            return
         identified = simulated_config(self._config, state.fitted)
-        return [
-            simulate(replace(identified, plant=plant), gait.controller, gait.parameters).mean_thrust
-            for plant in state.fitted.cloud[:_SIMULATED_FISH]
-        ]
+        fish = [replace(identified, plant=plant) for plant in state.fitted.cloud[:_SIMULATED_FISH]]
+        try:
+            state.contenders = [
+                replace(
+                    gait,
+                    expected_thrusts=[
+                        simulate(config, gait.controller, gait.parameters).mean_thrust
+                        for config in fish
+                    ],
+                )
+                for gait in state.contenders
+            ]
+        except Exception as error:  # what the fish has swum is worth more than a simulation
+            self._show.warn(
+                f"fishctl: careful: {_BY_MEASUREMENT}: a simulation of the identified fish "
+                f"failed: {text.describe_error(error)}"
+            )
+        self._save()
 
     @contextmanager
     def _count_tank_time(self, step: str, doing: str) -> Iterator[None]:
@@ -298,6 +317,7 @@ class Adaptation:
 
 
 _NOTE = "fishctl adapt"
+_BY_MEASUREMENT = "the fit is not used, the gaits are chosen by measurement alone"
 _SIMULATED_FISH = 8
 """Number of fish of the cloud on which a gait is simulated."""
 

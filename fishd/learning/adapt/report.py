@@ -122,7 +122,8 @@ def _draw_search(axis: Any, state: State, amplitude: float) -> None:
     ]
     for curve in curves[1:]:
         axis.plot(frequencies, curve, color=GREY, linewidth=0.6)
-    axis.plot(frequencies, curves[0], color=BLACK, label="identified fish, and its cloud")
+    if curves:
+        axis.plot(frequencies, curves[0], color=BLACK, label="identified fish, and its cloud")
     axis.errorbar(
         tried, [1e3 * trial.thrust for trial in state.trials],
         yerr=[1e3 * trial.thrust_ci95 for trial in state.trials], fmt="o", color=ORANGE,

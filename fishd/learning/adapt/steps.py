@@ -38,7 +38,7 @@ from fishd.learning.adapt.prior import (
     is_rejected,
     model_of,
 )
-from fishd.learning.adapt.state import POLICY, TRAINING, Fitted, Rung, Trained, Tried
+from fishd.learning.adapt.state import POLICY, TRAINING, Fitted, Model, Rung, Trained, Tried
 from fishd.learning.export import export
 from fishd.learning.settings import (
     EnvironmentSettings,
@@ -58,7 +58,7 @@ from fishd.virtual.plant.parameters import PlantParameters
 FITTED = (*DEFAULT, "lateral_quadratic_drag", "servo_dead_zone", "servo_reaction")
 """Fitted parameters: all that a fit can find except slack, which backlash represents."""
 MIN_EXPLAINED = 0.1
-"""Smallest explained share of a force; below it the force is mostly noise: the fit is rejected."""
+"""Smallest explained share of a force; below it for both, `adapt` ends: they are mostly noise."""
 SEARCH_RATIO = 2.0
 """Factor of the search range of square waves, below and above the best of the identified fish."""
 MIN_FREQUENCY_HZ, MAX_FREQUENCY_HZ = 0.3, 8.0
@@ -88,16 +88,16 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
     """Fit a fish to a recorded excitation, without prior knowledge; return it and its cloud.
 
     amplitude: Φ [rad]
-    Raises `Unidentifiable`, also where the fit explains less than `MIN_EXPLAINED` of a force.
+    Raises `Unidentifiable`, also where the fit explains less than `MIN_EXPLAINED` of both forces.
     """
     identification = identify([recording], fit=FITTED)
-    for channel, symbol in zip(identification.channels, ("F_x", "F_y"), strict=True):
-        if not channel.explained >= MIN_EXPLAINED:
-            raise Unidentifiable(
-                f"the best fit explains {max(0.0, channel.explained):.0%} of {symbol} only: the "
-                "forces are mostly noise, or do not follow the commands; see "
-                "fishctl plot and fishctl identify with --plot"
-            )
+    explained = max(channel.explained for channel in identification.channels)
+    if not explained >= MIN_EXPLAINED:
+        raise Unidentifiable(
+            f"the best fit explains {max(0.0, explained):.0%} of the forces only: they are mostly "
+            "noise, or do not follow the commands; see fishctl plot and fishctl identify with "
+            "--plot"
+        )
     plant = identified_fish(identification)
     model = model_of(identification)
     cloud = draw_cloud(identification, amplitude, seed)
@@ -113,6 +113,18 @@ def fit(recording: Path, amplitude: float, seed: int) -> tuple[Identification, F
         identification=identification.to_builtins(),
     )
     return identification, fitted
+
+
+def without_fit(reason: str) -> Fitted:
+    """Return the result of a fit that failed, which is not used; reason: why it failed."""
+    return Fitted(
+        plant=PlantParameters(),
+        rig=SimulationSettings(),
+        offset=0.0,
+        cloud=(),
+        model=Model(explained_fraction=0.0, standard_error=None),
+        identification={"estimates": {}, "remarks": [reason]},
+    )
 
 
 def settle_swing(session: Session, seconds: float) -> Rung:

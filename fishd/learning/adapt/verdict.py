@@ -132,10 +132,8 @@ def _explain_choice(simplest: str, is_simplest: bool, left: int, model: Model) -
 def _explain_disuse(model: Model) -> str:
     """Return why the identified fish is not used for a choice; empty where it is used."""
     if model.standard_error is None:
-        return (
-            "the fit is not used for this: it explains "
-            f"{max(0.0, model.explained_fraction):.0%} of the forces"
-        )
+        explained = max(0.0, model.explained_fraction)
+        return f"the fit, which explains {explained:.0%} of the forces, is not used for this"
     if model.is_rejected:
         return "the square waves tried disagree with the identified fish, so it is not used"
     return ""

@@ -79,11 +79,11 @@ def identification() -> Identification:
 
 
 def test_a_cloud_has_the_errors_of_the_fit_and_their_correlation() -> None:
-    fish = draw_cloud(identification(), PHI, count=4000)
+    fish = draw_cloud(identification(), PHI, count=400)
     assert (fish[0].omega0, fish[0].xi, fish[0].coupling) == (12.5, 1.2, 0.46)
     logs = np.log([[plant.omega0 / 12.5, plant.xi / 1.2] for plant in fish])
-    assert logs.std(axis=0) == pytest.approx(np.log([1.02, 1.04]) / 1.96, rel=0.05)
-    assert np.corrcoef(logs.T)[0, 1] == pytest.approx(-0.9, abs=0.02)
+    assert logs.std(axis=0) == pytest.approx(np.log([1.02, 1.04]) / 1.96, rel=0.1)
+    assert np.corrcoef(logs.T)[0, 1] == pytest.approx(-0.9, abs=0.03)
 
 
 def test_draws_beyond_the_bounds_of_the_fit_are_rejected_and_few_may_be_left() -> None:
@@ -112,6 +112,40 @@ def test_a_training_that_fails_is_left_out_and_loses_no_measurement(
     trained = folder(run.path).state.trained
     assert trained
     assert trained.refusal == "its training failed: ValueError: low >= high"
+
+
+def test_a_fit_that_fails_is_left_out_and_the_gaits_are_chosen_by_measurement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> Identification:
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    monkeypatch.setattr(steps, "identify", fail)
+    run, show = folder(tmp_path / "run"), StoringDisplay()
+    with VirtualSession(Config()) as rig:
+        state = Adaptation(rig, run, 160.0, 640, 0, show).run()
+    assert any("the fit failed: LinAlgError: SVD did not converge" in line for line in show.lines)
+    assert {gait.name for gait in state.contenders} == {"swing", "square"}
+    assert state.verdict
+    _, page = report.write(run, PHI, "fishctl simulate")
+    assert "the fit failed: LinAlgError: SVD did not converge" in page.read_text(encoding="utf-8")
+
+
+def test_a_simulation_that_fails_loses_no_measurement(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: Any, **__: Any) -> None:
+        raise ValueError("low >= high")
+
+    monkeypatch.setattr(adaptation, "simulate", fail)
+    run, show = folder(tmp_path / "run"), StoringDisplay()
+    run.state.fitted = fitted(GOOD)
+    run.state.contenders = [contender("square", 0.02, 1e-4), contender("swing", 0.03, 1e-4)]
+    with VirtualSession(Config()) as rig:
+        Adaptation(rig, run, 160.0, 640, 0, show)._simulate(run.state)
+    assert [gait.expected_thrusts for gait in folder(run.path).state.contenders] == [[], []]
+    assert judge(run.state.contenders, GOOD).chosen_gait == "swing"
+    assert any("failed: ValueError: low >= high" in line for line in show.lines)
 
 
 def test_each_episode_of_a_training_swims_a_fish_of_the_cloud() -> None:
@@ -153,7 +187,7 @@ def test_without_a_decisive_measurement_the_simplest_is_chosen_and_nothing_wins(
         "undecided between the best square wave tried, swing and the policy; the best square "
         "wave tried is chosen because it is the simplest. Thrusts relative to the best square "
     )
-    assert "The fit is not used for this: it explains 61% of the forces" in three.claim
+    assert "The fit, which explains 61% of the forces, is not used for this" in three.claim
     assert not any("wins" in verdict.claim for verdict in (two, three))
 
 
@@ -397,7 +431,7 @@ def test_a_fish_that_is_only_noise_is_refused_in_one_line(
     run = folder(tmp_path / "run")
     with (
         VirtualSession(config) as rig,
-        pytest.raises(Unidentifiable, match=r"the best fit explains .* of F_x only"),
+        pytest.raises(Unidentifiable, match=r"the best fit explains .* of the forces only"),
     ):
         Adaptation(rig, run, 150.0, 640, 0, StoringDisplay()).run()
     assert folder(run.path).state.excitation == "excitation.mcap"

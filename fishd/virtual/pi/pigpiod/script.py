@@ -67,12 +67,12 @@ def parse(text: str) -> tuple[Instruction, ...]:
     while words:
         name = words.pop(0)
         if name not in _OPERANDS:
-            emulated = ", ".join(_OPERANDS)
-            log.warning(
-                "emulated pigpiod: script refused: '%s' is not one of the emulated instructions: "
-                "%s",
-                *(name, emulated),
-            )
+            if name.isalpha():  # fishd stores "?" to see whether pigpiod knows scripts at all
+                log.warning(
+                    "emulated pigpiod: script refused: '%s' is not one of the emulated "
+                    "instructions: %s",
+                    *(name, ", ".join(_OPERANDS)),
+                )
             raise PigpioError(errors.BAD_SCRIPT_CMD)
         operands = tuple(_operand(words.pop(0) if words else "", k) for k in _OPERANDS[name])
         if name == "tag":
