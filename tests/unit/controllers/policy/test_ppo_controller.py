@@ -57,7 +57,7 @@ def test_what_the_network_sees_is_each_feature_over_its_scale(tmp_path: Path) ->
 
 @pytest.mark.parametrize("bias", [0.0, 1e-7])
 def test_an_offset_of_fx_does_not_keep_a_fish_at_rest(tmp_path: Path, bias: float) -> None:
-    # As a network with left-right symmetry: no push where fy is zero, up to rounding.
+    # The network has left-right symmetry: its output is zero, up to rounding, where fy is zero.
     content = to_onnx(linear(0.0, 1.0, bias=bias), "tanh", card(("fx", 0.026), ("fy", 0.4)))
     rig = Rig("simulation.noise=0", "simulation.offset_x=0.01", "slew_limit=null")
     rig.start("ppo", policy=str(write(tmp_path, content)))
