@@ -46,6 +46,10 @@ class Measurement(Struct, frozen=True, gc=False):
     """Time over which the samples are spread evenly, half of it after `mean_time` [s]."""
 
 
+MAX_SIDE_TIME_S = 2.0
+"""Largest `side_time`; a tail that stays longer on one side does not beat [s]."""
+
+
 class Observation(Struct, frozen=True, gc=False):
     """Input of a controller for the choice of the next instruction angle."""
 

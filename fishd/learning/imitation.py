@@ -35,8 +35,10 @@ RANDOM_START_RATIO = 3
 """Smallest ratio of all ticks of a fish to its initial ticks, which are swum by random waves."""
 NARROWED_SHARE = 0.3
 """Share of the fish that are from a part of the randomisation; the others are from all of it."""
-RIG_RANGES = ("servo_delay", "servo_dead_zone", "backlash", "servo_reaction")
+RIG_RANGES = ("servo_delay", "servo_dead_zone", "backlash", "servo_reaction", "cable_slack")
 """Names of the ranges of a randomisation that are smaller for a clean rig."""
+SLOW_PLACES = -1.0, -0.3
+"""Lowest and highest place of ω₀ and ξ of slow fish in their ranges, from -1 to 1."""
 MIN_WEIGHT = 0.02
 """Weight of a tick in which both sides are equally good, as a share of the best thrust."""
 
@@ -61,6 +63,20 @@ def narrow(spread: Randomisation, share: float, rig_share: float = 1.0) -> Rando
     names = [name for name in Randomisation.__struct_fields__ if name != "fish"]
     ranges = {name: share * getattr(spread, name) for name in names}
     return replace(spread, **ranges | {name: rig_share * ranges[name] for name in RIG_RANGES})
+
+
+def slow_down(
+    fish: Config, nominal: PlantParameters, spread: Randomisation, draw: np.random.Generator
+) -> Config:
+    """Return a fish with another ω₀ and ξ, from the lower third of their ranges.
+
+    nominal: fish in the middle of the ranges
+    """
+    omega0, xi = (
+        float(getattr(nominal, name) * (1.0 + getattr(spread, name)) ** place)
+        for name, place in zip(("omega0", "xi"), draw.uniform(*SLOW_PLACES, 2), strict=True)
+    )
+    return replace(fish, plant=replace(fish.plant, omega0=omega0, xi=xi))
 
 
 def half_beat_thrusts(config: Config) -> NDArray[np.float64]:
@@ -113,10 +129,7 @@ class Imitation:
     def _swim_fish(self) -> LabelledTicks:
         """Swim one fish: first random half beats, then, after the first round, the learner."""
         config, draw, ticks = self._config, self._draw, self._settings.ticks
-        share = min(1.0, float(draw.uniform()) / NARROWED_SHARE)
-        is_clean = self._settings.clean_rigs > 0.0 and draw.uniform() < self._settings.clean_rigs
-        spread = narrow(self._spread, share, float(draw.uniform()) if is_clean else 1.0)
-        fish = draw_fish(config, spread, int(draw.integers(2**31)))
+        fish = self._draw_fish()
         env = SwimEnv(SimulatedLink(fish), config, self._environment)
         seen, _ = env.reset(seed=int(draw.integers(2**31)))
         learner = DeterministicPolicy(self._policy, env.perception, env.link.amplitude)
@@ -130,8 +143,8 @@ class Imitation:
             elapsed = round(abs(env.latest.side_time) / config.tick)
             right, weight = advise_side(relative_thrust, elapsed)
             rows.append(seen)
-            sides.append(right * side)
-            weights.append(weight)
+            sides.append(float(right) * side)
+            weights.append(float(weight))
             share = learner(env.latest) / config.amplitude_limit
             if tick < at_random:
                 share = -side if elapsed >= half else side
@@ -139,35 +152,63 @@ class Imitation:
             seen = env.step(np.full(1, share, np.float32))[0]
         return LabelledTicks(np.array(rows), *np.array((sides, weights), np.float32))
 
+    def _draw_fish(self) -> Config:
+        """Return a fish and rig of the randomisation; some are from a part of it."""
+        settings, draw, spread = self._settings, self._draw, self._spread
+        share = min(1.0, float(draw.uniform()) / NARROWED_SHARE)
+        is_clean = settings.clean_rigs > 0.0 and draw.uniform() < settings.clean_rigs
+        narrowed = narrow(spread, share, float(draw.uniform()) if is_clean else 1.0)
+        fish = draw_fish(self._config, narrowed, int(draw.integers(2**31)))
+        if settings.slow_fish == 0.0 or draw.uniform() >= settings.slow_fish:
+            return fish
+        return slow_down(fish, self._config.plant, spread, draw)
+
     def _fit(self, given: LabelledTicks) -> float:
+        """Fit the network to all ticks from a high learning rate to a low one."""
+        settings = self._settings
+        optimiser = torch.optim.Adam(self._policy.parameters(), settings.learning_rate)
+        batches = settings.epochs * math.ceil(len(given.seen) / settings.batch_size)
+        rate = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, batches)
+        return self._learn(given, optimiser, rate.step)
+
+    def _learn(
+        self,
+        given: LabelledTicks,
+        optimiser: torch.optim.Adam,
+        after_batch: Callable[[], None] = lambda: None,
+    ) -> float:
+        """Pass over the ticks `epochs` times; return the weighted share of right sides."""
         settings, policy = self._settings, self._policy
         seen, sides, weights = (torch.from_numpy(array) for array in given)
-        weights = weights / weights.mean()
-        optimiser = torch.optim.Adam(policy.parameters(), settings.learning_rate)
+        weights = weights / weights.sum()
         batches = math.ceil(len(seen) / settings.batch_size)
-        rate = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs * batches)
+        share = 0.0
         for _ in range(settings.epochs):
+            share = 0.0
             for batch in torch.from_numpy(self._draw.permutation(len(seen))).chunk(batches):
-                actions = policy.get_distribution(seen[batch]).mode()[:, 0]
-                loss = (weights[batch] * softplus(-sides[batch] * actions)).mean()
+                good = sides[batch] * policy.get_distribution(seen[batch]).mode()[:, 0]
+                loss = batches * (weights[batch] * softplus(-good)).sum()
                 optimiser.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
                 optimiser.step()
-                rate.step()
-        with torch.no_grad():
-            right = sides * policy.get_distribution(seen).mode()[:, 0] > 0.0
-        return float((weights * right).mean())
+                after_batch()
+                share += float((weights[batch] * (good > 0.0)).sum())
+        return share
 
 
-def advise_side(relative_thrust: NDArray[np.float64], elapsed: int) -> tuple[float, float]:
-    """Return 1 to stay or -1 to reverse, and the cost of the other choice.
+def advise_side(
+    relative_thrust: NDArray[np.float64], elapsed: NDArray[np.int64] | int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return 1 to stay or -1 to reverse, and the cost of the other choice, for one fish or many.
 
-    relative_thrust: as returned by `half_beat_thrusts`
-    elapsed: ticks since the last reversal
+    relative_thrust: as returned by `half_beat_thrusts`, shape (..., ticks)
+    elapsed: ticks since the last reversal, shape (...)
     """
-    now = min(elapsed, len(relative_thrust) - 2)
-    cost = abs(float(relative_thrust[now] - relative_thrust[now + 1])) + MIN_WEIGHT
-    return (-1.0 if now >= relative_thrust.argmax() else 1.0), cost
+    now = np.minimum(elapsed, relative_thrust.shape[-1] - 2)
+    places = np.stack((now, now + 1), axis=-1)
+    stay, wait = np.moveaxis(np.take_along_axis(relative_thrust, places, axis=-1), -1, 0)
+    cost = np.abs(stay - wait) + MIN_WEIGHT
+    return np.where(now >= relative_thrust.argmax(axis=-1), -1.0, 1.0), cost
 
 
 def _join(parts: list[LabelledTicks]) -> LabelledTicks:

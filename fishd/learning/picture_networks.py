@@ -1,6 +1,7 @@
 """Networks for pictures, and hidden layers with left-right symmetry."""
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import gymnasium
@@ -115,7 +116,19 @@ class PictureExtractor(BaseFeaturesExtractor):
 
 
 class SymmetricExtractor(MlpExtractor):
-    """Hidden layers that are odd in their input for the policy, even for the value."""
+    """Hidden layers whose output changes sign for a mirrored fish; that for the value does not.
+
+    Attributes:
+        mirror: factors, 1 or -1, from the features of a fish to those of its mirror image.
+    """
+
+    def __init__(self, feature_dim: int, *, even: Sequence[int] = (), **arguments: Any) -> None:
+        """even: indices of the features that are the same for the mirrored fish"""
+        super().__init__(feature_dim, **arguments)
+        mirror = -torch.ones(feature_dim)
+        mirror[list(even)] = 1.0
+        self.mirror: torch.Tensor
+        self.register_buffer("mirror", mirror, persistent=False)
 
     def forward_actor(self, features: torch.Tensor) -> torch.Tensor:
         """Return f(x) − f(mirrored x), over √2."""
@@ -131,7 +144,7 @@ class SymmetricExtractor(MlpExtractor):
 
     def _both(self, features: torch.Tensor) -> torch.Tensor:
         """Return the features of all fish, then those of their mirror images."""
-        return torch.cat((features, -features))
+        return torch.cat((features, features * self.mirror))
 
 
 class PairExtractor(SymmetricExtractor):

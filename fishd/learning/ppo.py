@@ -1,6 +1,6 @@
 """PPO of stable-baselines3 as configured by fishd, with its optimiser and its policy as layers."""
 
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterable, Sequence
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -116,14 +116,20 @@ class SymmetricPolicy(ActorCriticPolicy):
     """PPO's networks with left-right symmetry: a mirrored fish gets the mirrored action.
 
     All inputs (F_y, its rate, the fin velocity, φ_c) change sign when left and right are swapped,
-    and so does the action; the value of a state does not. The networks have this symmetry by
-    construction, so it need not be learned, and no policy can favour one side. F_x, whose sign does
-    not change, must not be among the inputs. The bias of the policy's last layer stays zero.
+    and so does the action; the value of a state and F_x do not. The networks have this symmetry by
+    construction, so it need not be learned, and no policy can favour one side. The bias of the
+    policy's last layer stays zero.
     """
+
+    def __init__(self, *arguments: Any, even: Sequence[int] = (), **options: Any) -> None:
+        """even: indices of the inputs that are the same for the mirrored fish, such as F_x"""
+        self._even = even
+        super().__init__(*arguments, **options)
 
     def _build_mlp_extractor(self) -> None:
         self.mlp_extractor = SymmetricExtractor(
             self.features_dim,
+            even=self._even,
             net_arch=self.net_arch,
             activation_fn=self.activation_fn,
             device=self.device,
@@ -146,13 +152,15 @@ class SymmetricPicturePolicy(SymmetricPolicy):
         )
 
 
-def plain_layers(layers: Layers) -> Layers:
+def plain_layers(layers: Layers, mirror: NDArray[np.float32]) -> Layers:
     """Return the layers of a `SymmetricPolicy` as those of an ordinary network of twice the width.
 
     Its upper half receives the input, its lower half the mirrored input.
+
+    mirror: factors from the input to the mirrored one, shape (inputs,)
     """
     (first, bias), *inner, (last, last_bias) = layers
-    doubled = [(np.vstack((first, -first)), np.tile(bias, 2))]
+    doubled = [(np.vstack((first, first * mirror)), np.tile(bias, 2))]
     for weight, bias in inner:
         zero = np.zeros_like(weight)
         doubled.append((np.block([[weight, zero], [zero, weight]]), np.tile(bias, 2)))
@@ -226,23 +234,33 @@ def make_learner(
         max_grad_norm=ppo.max_grad_norm,
         target_kl=ppo.target_kl,
         rollout_buffer_class=Rollout,
-        policy_kwargs=_policy_arguments(ppo, extractor),
+        policy_kwargs=_policy_arguments(ppo, extractor, even_inputs(settings)),
         seed=settings.seed,
         device="cpu",
     )
 
 
 def make_policy(
-    ppo: PpoSettings, numbers: int, extractor: FeatureExtractor | None = None
+    ppo: PpoSettings,
+    numbers: int,
+    extractor: FeatureExtractor | None = None,
+    even: Sequence[int] = (),
 ) -> ActorCriticPolicy:
     """Return the networks alone, as in `make_learner`.
 
     numbers: number of inputs beside the outputs of the feature extractor
+    even: indices of the inputs that are the same for the mirrored fish
     """
     observation, action = spaces(numbers + (extractor.outputs if extractor else 0))
     return _policy_class(ppo, extractor)(
-        observation, action, lambda _: ppo.learning_rate, **_policy_arguments(ppo, extractor)
+        observation, action, lambda _: ppo.learning_rate, **_policy_arguments(ppo, extractor, even)
     )
+
+
+def even_inputs(settings: TrainingSettings) -> list[int]:
+    """Return the indices of the inputs that are the same for the mirrored fish: F_x."""
+    names = settings.seen.observation * settings.seen.history
+    return [index for index, name in enumerate(names) if name == "fx"]
 
 
 def _policy_class(ppo: PpoSettings, extractor: FeatureExtractor | None) -> type[ActorCriticPolicy]:
@@ -251,13 +269,17 @@ def _policy_class(ppo: PpoSettings, extractor: FeatureExtractor | None) -> type[
     return SymmetricPicturePolicy if extractor and extractor.shape else SymmetricPolicy
 
 
-def _policy_arguments(ppo: PpoSettings, extractor: FeatureExtractor | None) -> dict[str, Any]:
-    arguments = {
+def _policy_arguments(
+    ppo: PpoSettings, extractor: FeatureExtractor | None, even: Sequence[int]
+) -> dict[str, Any]:
+    arguments: dict[str, Any] = {
         "net_arch": {"pi": list(ppo.hidden), "vf": list(ppo.hidden)},
         "activation_fn": _ACTIVATIONS[ppo.activation],
         "log_std_init": ppo.log_std_init,
         "optimizer_class": Adam,
     }
+    if ppo.symmetric and even:
+        arguments["even"] = even
     if extractor and extractor.shape:
         arguments["features_extractor_class"] = PictureExtractor
         arguments["features_extractor_kwargs"] = {
@@ -295,7 +317,9 @@ def layers_of(policy: ActorCriticPolicy) -> Layers:
     if isinstance(policy, SymmetricPicturePolicy):
         *inner, (weight, bias) = layers
         return [*inner, (np.float32(HALF) * np.hstack((weight, -weight)), bias)]
-    return plain_layers(layers) if isinstance(policy, SymmetricPolicy) else layers
+    if isinstance(policy.mlp_extractor, SymmetricExtractor):
+        return plain_layers(layers, policy.mlp_extractor.mirror.numpy())
+    return layers
 
 
 def activation_of(policy: ActorCriticPolicy) -> Literal["tanh", "relu"]:

@@ -19,6 +19,12 @@ MIN_FRAME_SIZES_PX = {"modes": 16, "cnn": 68, "nature": 36}
 Share = Annotated[float, Meta(ge=0, le=9)]
 
 
+BATCH_FEATURES: tuple[FeatureName, ...] = (
+    *("fx", "fy", "instruction_angle", "previous_angle", "side_time"),
+)
+"""Features of an observation that fish of a batch have."""
+
+
 class EnvironmentSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The observation and the reward of the agent."""
 
@@ -154,6 +160,9 @@ class Randomisation(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     rotation: Annotated[
         float, unit("rad", "Uniform in ±this about the configured one.", ge=0, le=1.5)
     ] = 0.0
+    cable_slack: Annotated[
+        float, unit("rad", "Uniform, from the configured value to this much more.", ge=0, le=0.5)
+    ] = 0.0
     fish: Annotated[
         tuple[PlantParameters, ...],
         note(
@@ -173,7 +182,7 @@ class ImitationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             "randomisation, more of them like the configured one, and learns when the best square "
             "wave of each would reverse. Only in simulation: that wave of a real fish is unknown.",
             ge=0,
-            le=100,
+            le=10_000,
         ),
     ] = 0
     fish: Annotated[int, note("Number of fish in a round.", ge=1, le=100_000)] = 500
@@ -186,6 +195,24 @@ class ImitationSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
             le=1,
         ),
     ] = 0.0
+    slow_fish: Annotated[
+        float,
+        note(
+            "Fraction of the fish with both ω₀ and ξ in the lower third of their ranges, where a "
+            "wrong beat costs most.",
+            ge=0,
+            le=1,
+        ),
+    ] = 0.0
+    batched: Annotated[
+        bool,
+        note(
+            "Whether all fish of a round swim at once, hundreds of times as fast. Then the network "
+            "learns only from the fish of that round, and the learning rate falls over all rounds. "
+            f"The observation may have {', '.join(BATCH_FEATURES)}. Thrust and delay have an error "
+            "of a per cent, and F_x has a random offset, too."
+        ),
+    ] = False
     ticks: Annotated[int, unit("ticks", "Length of the swim of each fish.", ge=8, le=100_000)] = 120
     epochs: Annotated[
         int, note("Passes over the ticks of all previous rounds, after each round.", ge=1, le=1000)
@@ -228,7 +255,8 @@ class PpoSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
         ),
     ] = True
     symmetric: Annotated[
-        bool, note("Whether the networks are symmetric in left and right; not possible with fx.")
+        bool,
+        note("Whether the networks are symmetric in left and right; not with pictures and fx."),
     ] = True
     hidden: Annotated[
         tuple[Annotated[int, Meta(ge=1, le=1024)], ...],
@@ -360,6 +388,13 @@ def _check(settings: TrainingSettings) -> None:
             f"{settings.imitation.rounds} is not valid with see: {settings.see}; imitation is for "
             "policies that see forces only: 0 is needed",
         )
+    unseen = set(settings.environment.observation) - set(BATCH_FEATURES)
+    if settings.imitation.rounds and settings.imitation.batched and unseen:
+        raise Problem(
+            ("imitation", "batched"),
+            f"true is not valid with {', '.join(sorted(unseen))} in environment.observation; only "
+            f"{', '.join(BATCH_FEATURES)} are possible",
+        )
     if evaluation.others and settings.randomisation == Randomisation():
         raise Problem(
             ("evaluation", "others"),
@@ -371,11 +406,11 @@ def _check(settings: TrainingSettings) -> None:
             ("ppo", "batch_size"),
             f"{ppo.batch_size} is not valid: n_steps, {ppo.n_steps}, must be a multiple of it",
         )
-    if ppo.symmetric and "fx" in settings.seen.observation:
+    if ppo.symmetric and settings.see != "force" and "fx" in settings.seen.observation:
         raise Problem(
             ("ppo", "symmetric"),
-            "true is not valid where environment.observation has fx, which is the same for a "
-            "mirrored fish; false is needed",
+            "true is not valid with pictures and fx in environment.observation, which is the same "
+            "for a mirrored fish; false is needed",
         )
     seen = settings.environment.observation
     if len(set(seen)) < len(seen):

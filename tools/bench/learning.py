@@ -6,6 +6,7 @@ chosen with. Relative thrust is the thrust over that of the best square wave of 
     curves     several fish and settings, from forces; draws learning-curves.png
     pictures   several feature extractors and cameras; draws camera-learning.png
     transfer   policies for one fish on sixteen others
+    unknown    a shipped policy, policies for one fish, and `swing`, on 80 fish of each kind
     speed      steps of the environment, and inference, on one core
 """
 
@@ -24,16 +25,28 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.learning_curves import learning_curves
-from common.report import DOCS, Options, Report, percent, progress, spread, table
+from common.report import (
+    DOCS,
+    Options,
+    Report,
+    percent,
+    progress,
+    quantile,
+    run_cases,
+    spread,
+    table,
+)
 from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config, load
 from fishd.controllers import registry
-from fishd.lab.compare.contestants import best_on_grid, parse
+from fishd.lab.compare.contestants import Contestant, best_on_grid, parse
+from fishd.lab.compare.survey import FishResult, OtherFish, harsh, mild, survey
 from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.lab.simulation import simulate
 from fishd.learning import settings as training
 from fishd.learning.env.environment import SwimEnv, best_thrust
 from fishd.learning.env.evaluation import Evaluation, judge
+from fishd.learning.export import export
 from fishd.learning.extractors import make_extractor
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder.checkpoints import load_policy
@@ -53,6 +66,11 @@ NEARLY, GOOD = 0.95, 0.97
 """Relative thrusts that every fish, and a training, should reach."""
 PARAMETER_CHANGE = 0.15
 """Relative change of each of four parameters of a fish, up or down."""
+UNKNOWN_FISH = {
+    "mild": [mild(seed) for seed in range(70_000, 70_080)],
+    "harsh": [harsh(seed) for seed in range(71_000, 71_080)],
+}
+"""Fish of the part `unknown`; nothing was chosen with them."""
 SECONDS, SETTLE = 60.0, 10.0
 """Length of an evaluation on other fish, and of its ignored start [s]."""
 
@@ -272,6 +290,66 @@ def transfer(options: Namespace) -> Report:
     return Report({"bench learning transfer": f"{about}\n\n{table(heads, lines)}"}, shares)
 
 
+def unknown(options: Namespace) -> Report:
+    """Return results of a shipped policy, of others, and of `swing`, on random fish."""
+    with tempfile.TemporaryDirectory() as temporary:
+        trainings = [(Path(temporary), seed) for seed in SEEDS[: few(options)]]
+        trained = run_cases(train_default, trainings, options.jobs)
+        texts = [options.policy, "swing:C=0.6", "swing:C=auto", *trained]
+        contestants = [parse(text) for text in texts]
+        cases = [(fish, contestants) for kind in UNKNOWN_FISH.values() for fish in kind]
+        swims = iter(run_cases(swim_unknown, cases, options.jobs))
+    names = [f"`{Path(options.policy).name}`", "`swing:C=0.6`", "`swing:C=auto`"]
+    names += [f"default training, seed {seed}" for _, seed in trainings]
+    lines, figures = [], {}
+    for kind, fish in UNKNOWN_FISH.items():
+        bests, surveys = zip(*itertools.islice(swims, len(fish)), strict=True)
+        lines.append([kind, "best whole-tick wave", *shares_of(bests), "", ""])
+        for name, results in zip(names, zip(*surveys, strict=True), strict=True):
+            figures[f"{kind}, {name}"] = results
+            lines.append(
+                [
+                    kind,
+                    name,
+                    *shares_of([result.relative_thrust for result in results]),
+                    str(sum(result.fallback is not None for result in results)),
+                    f"{max(result.longest_chatter_s for result in results):.1f}",
+                ]
+            )
+    heads = (
+        "fish | controller | median | 10 % quantile | worst | fish below 90 % | fallbacks | "
+        "longest chatter, s"
+    )
+    about = f"Relative thrust in %, on {len(fish)} fish of each kind:"
+    return Report({"bench learning unknown": f"{about}\n\n{table(heads, lines)}"}, figures)
+
+
+def train_default(case: tuple[Path, int]) -> str:
+    """Train with the default settings on the default fish; return the path of the policy."""
+    folder, seed = case
+    job = Job(config=rig(), settings=TrainingSettings(seed=seed), folder=folder / f"seed-{seed}")
+    best = train(job).best
+    assert best
+    return str(export(best, folder / f"{seed}.onnx").path)
+
+
+def swim_unknown(
+    case: tuple[OtherFish, list[Contestant]],
+) -> tuple[float, list[FishResult]]:
+    """Return the relative thrust of the best whole-tick wave, and the results of contestants."""
+    fish, contestants = case
+    config = load(None, fish.overrides)
+    surveys = survey([(fish, config)], contestants, SECONDS, SETTLE)
+    share = best_on_grid(config).thrust / best_thrust(config)
+    return share, [surveyed.fish[0] for surveyed in surveys]
+
+
+def shares_of(shares: Sequence[float]) -> list[str]:
+    """Return cells with median, 10 % quantile and worst value, and the number below 90 %."""
+    cells = [statistics.median(shares), quantile(shares, 0.1), min(shares)]
+    return [*map(percent, cells), str(sum(share < 0.9 for share in shares))]
+
+
 def speed(options: Namespace) -> Report:
     """Return the steps of the environment per second and the time of an inference, on one core."""
     plain, cnn = settings_of(), settings_of("learning-cnn.yaml")
@@ -338,6 +416,7 @@ PARTS = {
     "curves": curves,
     "pictures": pictures,
     "transfer": transfer,
+    "unknown": unknown,
     "speed": speed,
 }
 OPTIONS: Options = {
@@ -346,6 +425,7 @@ OPTIONS: Options = {
         "type": parse_steps,
         "help": "control steps of each training, as a trial; 512 or more",
     },
+    "--policy": {"default": "default-fish", "help": "policy of `unknown`: name or file"},
     "--jobs": {
         "type": int,
         "default": max(1, joblib.cpu_count() - 1),

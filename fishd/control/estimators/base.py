@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 
 from msgspec.structs import replace
 
-from fishd.core.signals import Measurement, Observation
+from fishd.core.signals import MAX_SIDE_TIME_S, Measurement, Observation
 
 
 class TailBeat:
@@ -16,8 +16,6 @@ class TailBeat:
 
     _REST_TIME_S = 1.0
     """Time constant of the mean force while the tail does not beat [s]."""
-    _MAX_SIDE_TIME_S = 2.0
-    """Largest `side_time`; a tail that stays longer on one side does not beat [s]."""
 
     def __init__(self, span: float = 4.0) -> None:
         """span: time that the means cover at most [s]; they cover at least one beat"""
@@ -50,9 +48,7 @@ class TailBeat:
             elapsed = duration
             if side * self.side_time > 0.0:
                 elapsed += side * self.side_time
-            self.side_time = side * (
-                elapsed if elapsed < self._MAX_SIDE_TIME_S else self._MAX_SIDE_TIME_S
-            )
+            self.side_time = side * (elapsed if elapsed < MAX_SIDE_TIME_S else MAX_SIDE_TIME_S)
         else:
             self.side_time = 0.0
         if side != self._side:

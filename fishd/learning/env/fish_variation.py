@@ -63,6 +63,7 @@ def _vary(
         changed[name] = getattr(plant, name) + 0.5 * (1.0 + place()) * getattr(spread, name)
     changed["servo_reaction"] = plant.servo_reaction + spread.servo_reaction * place()
     rotation = rig.rotation + spread.rotation * place()
+    changed["cable_slack"] = plant.cable_slack + 0.5 * (1.0 + place()) * spread.cable_slack
     return replace(
         config,
         plant=replace(plant, **changed),

@@ -227,7 +227,7 @@ def read_parameters(checkpoint: Path) -> dict[str, Any]:
 
 def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
     """Return the networks of a checkpoint, and their perception; raises `CheckpointError`."""
-    from fishd.learning.ppo import make_policy
+    from fishd.learning.ppo import even_inputs, make_policy
 
     card = read_card(checkpoint)
     settings = from_plain(card.provenance.settings)
@@ -235,7 +235,7 @@ def load_policy(checkpoint: Path) -> tuple["ActorCriticPolicy", Perception]:
     if extractor:
         load_extractor(extractor, checkpoint)
     with _open_model(checkpoint / MODEL) as parameters:
-        policy = make_policy(settings.ppo, card.numbers, extractor)
+        policy = make_policy(settings.ppo, card.numbers, extractor, even_inputs(settings))
         policy.load_state_dict(parameters["policy"])
     policy.set_training_mode(False)
     return policy, Perception(card.observation, extractor, card.window)

@@ -13,6 +13,7 @@ from fishd.lab.experiment import On
 from fishd.lab.links.simulated_link import Camera
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.settings import Randomisation, TrainingSettings
+from fishd.virtual.plant.batch import is_possible
 
 Ended = Literal["finished", "interrupted", "lost", "diverged", "failed"]
 
@@ -63,6 +64,13 @@ class Job(Struct, frozen=True, kw_only=True):
             raise ConfigError(
                 "imitation.rounds: the best beat of a robot's fish is not known: learn from "
                 "simulated ones, and go on here with --fine-tune; or set it to 0"
+            )
+        imitation = self.settings.imitation
+        plants = self.settings.randomisation.fish or (self.config.plant,)
+        if imitation.rounds and imitation.batched and not all(map(is_possible, plants)):
+            raise ConfigError(
+                "imitation.batched: true is not valid for a fish of another model or with "
+                "quadratic drag; false is needed"
             )
 
     @property

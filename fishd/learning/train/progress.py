@@ -47,8 +47,9 @@ class ShownDisplay(Display):
         self._show.done(text, steps)
 
     def imitated(self, number: int, rounds: int, right: float) -> None:
-        """Print one line."""
-        self._show.done(format_imitation(number, rounds, right), self._steps)
+        """Print one line, but only for about ten of many rounds."""
+        if number == rounds or number % max(1, rounds // 10) == 0:
+            self._show.done(format_imitation(number, rounds, right), self._steps)
 
     def step(self, tank_time: float) -> None:
         """Advance the bar by one step."""

@@ -25,6 +25,7 @@ from fishd.lab.links.fishd_link import FishdLink
 from fishd.lab.links.link import Link, LinkLost
 from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning import extractors
+from fishd.learning.batched_imitation import BatchedImitation
 from fishd.learning.env import evaluation
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
@@ -200,7 +201,8 @@ class Training:
     def _imitate(self) -> Ended:
         """Learn from the best waves of other fish first; an interrupted imitation is repeated."""
         rounds = self._job.settings.imitation.rounds
-        imitation = Imitation(self._job.config, self._job.settings, self._model.policy)
+        kind = BatchedImitation if self._job.settings.imitation.batched else Imitation
+        imitation = kind(self._job.config, self._job.settings, self._model.policy)
         for number in range(1, rounds + 1):
             right = imitation.round(self._stop)
             if right is None:

@@ -14,8 +14,9 @@ from fishd.config import load
 from fishd.controllers.policy.file import read
 from fishd.core.errors import ConfigError
 from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.env.fish_variation import draw_fish
 from fishd.learning.export import export
-from fishd.learning.imitation import advise_side, half_beat_thrusts, narrow
+from fishd.learning.imitation import advise_side, half_beat_thrusts, narrow, slow_down
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.settings import EnvironmentSettings, ImitationSettings, Randomisation
 from fishd.learning.train.jobs import Outcome
@@ -57,6 +58,22 @@ def test_a_clean_rig_keeps_the_fish_and_has_less_delay_and_play() -> None:
     assert (clean.omega0, clean.noise) == (0.3, 0.5)
     assert (clean.servo_delay, clean.backlash) == pytest.approx((0.01, 0.0125))
     assert narrow(spread, 1.0) == spread
+
+
+def test_a_slow_fish_has_small_omega0_and_xi_of_the_range_and_is_the_same_otherwise() -> None:
+    spread = Randomisation(omega0=0.6, xi=1.0, servo_speed=0.5)
+    fish = draw_fish(load(None), spread, 1)
+    slow = slow_down(fish, load(None).plant, spread, np.random.default_rng(1))
+    assert 12.5 / 1.6 <= slow.plant.omega0 <= 12.5 / 1.6**0.3
+    assert 1.2 / 2.0 <= slow.plant.xi <= 1.2 / 2.0**0.3
+    assert replace(slow.plant, omega0=fish.plant.omega0, xi=fish.plant.xi) == fish.plant
+
+
+def test_advice_for_many_fish_is_that_for_each() -> None:
+    relative_thrust = np.array([[0.0, 0.5, 1.0, 0.9, 0.3], [0.0, 1.0, 0.8, 0.4, 0.1]])
+    sides, costs = advise_side(relative_thrust, np.array([1, 7]))
+    alone = [advise_side(relative_thrust[0], 1), advise_side(relative_thrust[1], 7)]
+    assert [(float(s), float(c)) for s, c in alone] == list(zip(sides, costs, strict=True))
 
 
 def test_the_advice_is_to_stay_until_the_best_half_beat_is_over() -> None:

@@ -64,7 +64,14 @@ def test_written_settings_can_be_read_back(tmp_path: Path) -> None:
             "see: both\nimitation: {rounds: 2}",
             "imitation.rounds: 2 is not valid with see: both; ",
         ),
-        ("environment: {observation: [fx, fy]}", "ppo.symmetric: true is not valid where"),
+        (
+            "see: both\nenvironment: {observation: [fx, fy]}",
+            "ppo.symmetric: true is not valid with pictures and fx",
+        ),
+        (
+            "environment: {observation: [fy, fin_velocity]}\nimitation: {rounds: 1, batched: true}",
+            "imitation.batched: true is not valid with fin_velocity",
+        ),
         ("evaluation:\n  seconds: 4.0\n", "evaluation.settle: 5 s is not valid: less than "),
     ],
 )

@@ -35,6 +35,7 @@ HARSH = Randomisation(
     backlash=0.1,
     servo_reaction=3e-3,
     rotation=0.17,
+    cable_slack=0.2,
 )
 SEEN = ("fy", "instruction_angle")
 REMEMBERING = EnvironmentSettings(observation=SEEN, history=4, longest_start=0)
@@ -89,7 +90,8 @@ def test_a_training_begins_only_with_a_policy_of_the_same_history(tmp_path: Path
 
 def test_the_rigs_of_a_randomisation_are_anywhere_in_its_range() -> None:
     fish = [draw_fish(CONFIG, HARSH, seed) for seed in range(40)]
-    for name, limit in (("servo_delay", 0.08), ("servo_dead_zone", 0.05), ("backlash", 0.1)):
+    largest = {"servo_delay": 0.08, "servo_dead_zone": 0.05, "backlash": 0.1, "cable_slack": 0.2}
+    for name, limit in largest.items():
         values = [getattr(config.plant, name) for config in fish]
         assert 0.0 < min(values) < 0.2 * limit < 0.8 * limit < max(values) < limit
     for name, limit in (("servo_lag", 1.6), ("thrust_coefficient", 1.6), ("lateral_drag", 3.0)):

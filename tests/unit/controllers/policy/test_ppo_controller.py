@@ -55,6 +55,15 @@ def test_what_the_network_sees_is_each_feature_over_its_scale(tmp_path: Path) ->
         assert tick.phi_c == pytest.approx(0.42 * wanted, abs=1e-6)
 
 
+@pytest.mark.parametrize("bias", [0.0, 1e-7])
+def test_an_offset_of_fx_does_not_keep_a_fish_at_rest(tmp_path: Path, bias: float) -> None:
+    # The network has left-right symmetry: its output is zero, up to rounding, where fy is zero.
+    content = to_onnx(linear(0.0, 1.0, bias=bias), "tanh", card(("fx", 0.026), ("fy", 0.4)))
+    rig = Rig("simulation.noise=0", "simulation.offset_x=0.01", "slew_limit=null")
+    rig.start("ppo", policy=str(write(tmp_path, content)))
+    assert next(tick.phi_c for tick in rig.run(1)) == 0.42
+
+
 def test_a_policy_for_a_smaller_amplitude_stays_within_it(tmp_path: Path) -> None:
     path = write(tmp_path, to_onnx(linear(-9.0, bias=9.0), "tanh", card(amplitude=0.2)))
     rig = Rig().start("ppo", policy=str(path))
