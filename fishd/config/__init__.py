@@ -13,13 +13,12 @@ from fishd.config.configuration import (
     service_file,
     to_yaml,
 )
-from fishd.hardware.settings import ServoSettings
+from fishd.hardware.settings import ServoSettings as ServoSettings
 
 __all__ = [
     "FILE_VARIABLE",
     "SERVICE_FILE",
     "Config",
-    "ServoSettings",
     "Start",
     "adopt",
     "check_tethered",

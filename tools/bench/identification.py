@@ -145,7 +145,9 @@ def fish(kind: str, seed: int) -> Config:
 def mean_wait(config: Config) -> float:
     """Return the mean time from a tick until the next pulse of a virtual Pi [s]."""
     ticks = np.arange(round(SECONDS / config.tick)) * config.tick
-    waits = np.mod(-config.virtual_pi.pulse_lead - ticks, SERVO_FRAME)
+    # In whole steps, so that no rounding makes a wait of 0 one of a whole frame.
+    steps = np.rint((config.virtual_pi.pulse_lead + ticks) / STEP).astype(int)
+    waits = STEP * np.mod(-steps, round(SERVO_FRAME / STEP))
     return float(waits.mean()) if config.robot == "virtual-pi" else 0.0
 
 
