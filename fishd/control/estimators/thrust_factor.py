@@ -155,7 +155,7 @@ class Drift:
     """How fast the zero drifts: mean square of its change over some seconds, per second."""
 
     def __init__(self, prior_rate: float) -> None:
-        """prior_rate: rate without any comparison, as configured [N²/s]"""
+        """prior_rate: rate before the first comparison, as configured [N²/s]"""
         self._prior_rate = prior_rate
         self._sum = 0.0
         self._count = self._fresh = self._total = 0
