@@ -107,7 +107,8 @@ def identify(
         Fu et al.
     rig: the same for `rotation`; by default the sensor is not rotated
     fit: parameters to fit: keys of section `plant` among `POSSIBLE`, and `rotation`; by default
-        `DEFAULT` and those of `FURTHER` that the data require
+        `DEFAULT` and those of `FURTHER` that the data require. With `servo_lag`, the law of the
+        servo is chosen, too
     fix: parameters that are excluded from the fit. With `lateral_inertia_ratio`, K_y/K is as in
         `start`, and the intervals of K, λ and K_d are much narrower; likewise with `coupling`, if
         λ was measured
@@ -130,7 +131,7 @@ def identify(
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
     law: ServoLaw = (start or PlantParameters()).servo_law
-    laws = LAWS if fit is None and "servo_lag" not in fix else (law,)
+    laws = LAWS if "servo_lag" in names else (law,)
     if any(part.servo for part in parts):
         parts = _with_pulses(parts, names, _start_values(values, names, *_STARTS[0]), law)
     problem = Problem(parts, names, _SETTLE_S, law)

@@ -36,12 +36,12 @@ def place_pulses(
 
 def _place(part: Passage, problem: Problem, values: dict[str, float], settle: float) -> Passage:
     """Return the candidate with the best fit; each is fitted to first order."""
-    own = Problem([part], problem.names, settle)
+    own = Problem([part], problem.names, settle, problem.law)
     own.noise = problem.noise
     basis, _ = np.linalg.qr(own.jacobian(values).reshape(-1, len(problem.names)))
 
     def cost(candidate: Passage) -> float:
-        residuals = Problem([candidate], problem.names, settle).residuals(values)
+        residuals = Problem([candidate], problem.names, settle, problem.law).residuals(values)
         innovations = problem.whitened(residuals).ravel()
         explained = basis.T @ innovations
         return float(innovations @ innovations - explained @ explained)
