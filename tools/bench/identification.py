@@ -369,7 +369,7 @@ def measure(options: Namespace) -> Report:
     if options.kind == "foreign":
         runs = [("foreign", seed) for seed in range(options.seeds or FOREIGN_COUNT)]
         return report_foreign(run_cases(one, runs, options.jobs))
-    sections, figures, whole = {}, {}, []
+    sections, figures, whole, errors = {}, {}, [], []
     kinds = ["pi"] if options.on == "virtual-pi" else [kind for kind in KINDS if kind != "pi"]
     count = options.seeds or 10
     for kind in kinds:
@@ -377,9 +377,11 @@ def measure(options: Namespace) -> Report:
         outcomes = run_cases(one, [(kind, seed) for seed in range(seeds)], options.jobs)
         whole.append(summary(kind, outcomes))
         figures[kind] = [outcome._asdict() for outcome in outcomes]
+        errors += [error for outcome in outcomes for error in outcome.errors]
         if kind in EQUALLY_FITTED:
             lines = rows(outcomes, known=kind != "outside")
             sections[f"bench identification {kind}"] = table(HEAD, lines)
     part = "virtual-pi" if kinds == ["pi"] else "summary"
     sections[f"bench identification {part}"] = table(SUMMARY, whole)
-    return Report(sections, figures)
+    where = "virtual Pi" if kinds == ["pi"] else "the model's fish"
+    return Report(sections, figures, errors={f"identify, {where}": errors})
