@@ -84,10 +84,3 @@ def test_a_wrong_value_is_one_line_that_names_file_line_key_and_what_is_needed(
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml: no such file"):
         load(tmp_path / "none.yaml")
-
-
-def test_settings_with_the_keys_of_an_older_fishd_are_read(tmp_path: Path) -> None:
-    path = tmp_path / "settings.yaml"
-    path.write_text("camera: {eye: cnn, babble: 128}\n")
-    camera = load(path).camera
-    assert (camera.feature_extractor, camera.random_excitation) == ("cnn", 128)

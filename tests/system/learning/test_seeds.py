@@ -284,7 +284,7 @@ def test_a_cluster_that_does_not_answer_is_one_line_with_the_command_to_resume(
 
 
 def test_a_summary_repeats_the_last_figures_of_a_seed_that_ended_early(tmp_path: Path) -> None:
-    table = "steps,thrust,relative_thrust,frequency,fullness,stalled,best\n"
+    table = "steps,thrust,relative_thrust,frequency,fullness,is_stalled,best\n"
     rows = [f"{steps},0.02,0.{steps},1.7,1,0,1\n" for steps in (64, 72, 80)]
     for name, lines in (("short", rows[:1]), ("long", rows)):
         (tmp_path / name).mkdir()

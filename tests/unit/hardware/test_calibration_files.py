@@ -73,15 +73,6 @@ def error_message(folder: Path, kind: type[ForceCalibration | ServoCalibration],
     return line
 
 
-def test_a_file_of_an_older_fishd_is_read_and_its_uncertainty_is_unknown(tmp_path: Path) -> None:
-    old = {**FORCE, "load_error": 0.02, "tared": "2026-11-20"}
-    (tmp_path / "force-2027-01-01T000000.000000Z.yaml").write_text(yaml.safe_dump(old))
-    newest = CalibrationFolder(tmp_path).newest(ForceCalibration)
-    assert newest is not None
-    assert (newest[0].load_ci95, newest[0].tare_date) == (0.02, "2026-11-20")
-    assert newest[0].thrust_ci95(0.025) is None
-
-
 @pytest.mark.parametrize("key", ["xy", "date", "scale"])
 def test_a_file_without_one_of_its_keys_is_not_filled_in(tmp_path: Path, key: str) -> None:
     kind, whole = (ForceCalibration, FORCE) if key in FORCE else (ServoCalibration, SERVO)

@@ -13,7 +13,7 @@ from fishd.virtual.plant.parameters import PlantParameters
 FILE = ROOT / "config" / "harsh.yaml"
 KEYS_AS_DEFAULT = {
     "plant": {
-        *("model", "omega0", "xi", "coupling", "servo_speed", "servo_lag"),
+        *("model", "omega0", "xi", "coupling", "servo_speed", "servo_lag", "servo_law"),
         *("thrust_coefficient", "lateral_inertia_ratio"),
     },
     "simulation": {"drift_period", "drift_rate", "hum_frequency", "motor", "sample_rate", "seed"},
