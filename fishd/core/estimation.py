@@ -32,7 +32,7 @@ class EstimatorSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only
         unit(
             "s",
             "Of lateral_force: time constant with which the integral of the lateral force decays; "
-            "best is K/K_d. auto: start with 0.3, and search for the leak that fits F_x.",
+            "best is K_y/K_d. auto: start with 0.3, and search for the leak that fits F_x.",
         ),
     ] = DEFAULT_LEAK_S
     bias_time: Annotated[
