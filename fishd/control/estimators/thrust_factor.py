@@ -17,8 +17,9 @@ that where `estimator.leak` is not that of the fish."""
 SIZE_SCATTER = 0.12
 """Standard deviation of the factor for each e-fold of the fin's speed or of the frequency, as a
 fraction of it: root mean square of 40 random simulated fish."""
-CONTRADICTION_SIGMAS = 3.0
-"""Number of standard deviations beyond which a change of the force contradicts the factor."""
+CONTRADICTION_SIGMAS = 1.5
+"""Number of standard deviations beyond which a change of the force contradicts the factor of the
+same wave; twice as many contradict that of another wave, which is rougher."""
 UNKNOWN_THRUST_SD_N = 1.0
 """Standard deviation of a thrust of which nothing is known [N]."""
 NEAR_COMPARISONS = 8
@@ -135,7 +136,8 @@ class Factor(NamedTuple):
             other = 0.0
         surprise = change + before.thrust - value * step
         total = variance * step**2 + other * power**2 + noise
-        excess = max(0.0, surprise**2 - CONTRADICTION_SIGMAS**2 * total)
+        limit = CONTRADICTION_SIGMAS * (2.0 if moves else 1.0)
+        excess = max(0.0, surprise**2 - limit**2 * total)
         if excess:  # the zero has moved, or the factor is another: either is possible
             total += excess
             if power:
