@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 
 _MAX_AMPLITUDE = 1.57
 """Largest amplitude, as for amplitude_limit [rad]."""
-_IGNORED_PARAMETERS = ("model", "quadratic_drag", "cable_slack", "backlash", "servo_dead_zone")
+_IGNORED_PARAMETERS = (
+    *("model", "servo_law", "quadratic_drag", "cable_slack", "backlash", "servo_dead_zone"),
+)
 """Parameters that the closed forms and the optimal control ignore."""
 
 
@@ -117,7 +119,7 @@ def _format_optimum(optima: "Optima", k: int) -> str:
 def _control_rows(control: "OptimalControl") -> list[tuple[str, str]]:
     return [
         ("control", f"{1e3 * control.thrust:.3f} mN at {control.frequency:.3f} Hz"),
-        ("", f"{control.ratio:.2%} of the best square wave"),
+        ("", f"{control.ratio:.2%} of the best square wave of the same equations"),
         ("", f"|φ_c| = Φ in {control.saturated_fraction:.1%} of the time"),
         ("", f"on the side of the costate in {control.costate_agreement:.1%} of the time"),
     ]

@@ -212,9 +212,18 @@ def check_estimator(robot: str, kind: str, plant: PlantParameters) -> None:
         )
 
 
-def check_swimmer(swimmer: SwimmerSettings, tick: float) -> None:
-    """Check that a swimmer can be computed; tick: period of the loop [s]"""
+def check_swimmer(swimmer: SwimmerSettings, tick: float, servo_law: str) -> None:
+    """Check that a swimmer can be computed.
+
+    tick: period of the loop [s]; servo_law: law of the servo that its muscle may follow
+    """
     from fishd.virtual.swimmer import feasibility  # only this robot needs it
+
+    if swimmer.muscle.servo and servo_law != "tanh":
+        raise Problem(
+            ("plant", "servo_law"),
+            f"'{servo_law}' is not possible with swimmer.muscle.servo, which follows tanh",
+        )
 
     feasibility.check(swimmer)
     step = swimmer.numerics.step

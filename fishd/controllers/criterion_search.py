@@ -62,6 +62,8 @@ MAX_ROUNDS = 3
 """Maximum number of repetitions of a trial."""
 MIN_TRIAL_RATIO = 0.8
 """Ratio of the ripple to the reference below which a trial ends after one beat."""
+MIN_CLEAR = 8
+"""Number of clear ripples in a row after which a search begins again that found none."""
 CLEAR_RATIO, NOISE_MEMORY = 2.0, 40
 """Ratio of the mean squares of a clear ripple and of its noise, and number of measurements over
 which that noise is averaged."""
@@ -150,6 +152,7 @@ class CriterionSearch:
         self.ripple = 0.0
         """Ripple of the latest beats [N]."""
         self.is_clear = True
+        self._clear_in_a_row = 0
         """Whether the ripple rose above the noise at the end of the latest search."""
         self._noise = 0.0  # mean square of the noise in the ripple [N²]
         self._noise_count = 0
@@ -274,6 +277,7 @@ class CriterionSearch:
     def _resume(self, gait: Judgement) -> None:
         """Continue with trials if the gait is back; if it stays lost, look for another one."""
         self._reference = gait
+        self._clear_in_a_row = self._clear_in_a_row + 1 if gait.is_clear else 0
         if gait.ripple < LOST_RATIO * self._lost:
             if self._place != self._former:
                 self._avoided.add(self._place)
@@ -367,7 +371,7 @@ class CriterionSearch:
         self._reference = gait
         if gait.ripple < LOST_RATIO * self._known:
             self._launch(self._known)
-        elif not (self.is_clear or gait.is_clear):
+        elif not self.is_clear and self._clear_in_a_row < MIN_CLEAR:
             self._start_sums()
         elif abs(gait.ripple - self._known) > max(
             MIN_CHANGE * self._known, MIN_CHANGE_STANDARD_ERRORS * gait.error

@@ -59,6 +59,8 @@ DEFAULT = (
 """Parameters that are fitted by default; residuals may then require some of `FURTHER` too."""
 POSSIBLE = tuple(BOUNDS)
 """Parameters that can be fitted."""
+LAW = "servo_law"
+"""Key of the law of the servo, which is chosen with Δ unless it is among the fixed parameters."""
 
 _MIN_FALL = 4.0
 """Smallest fall of the sum of squares, in units of noise², for which a further parameter is fitted
@@ -131,7 +133,7 @@ def identify(
     if scale_is_free:
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
     law: ServoLaw = (start or PlantParameters()).servo_law
-    laws = LAWS if "servo_lag" in names else (law,)
+    laws = LAWS if "servo_lag" in names and LAW not in fix else (law,)
     if any(part.servo for part in parts):
         parts = _with_pulses(parts, names, _start_values(values, names, *_STARTS[0]), law)
     problem = Problem(parts, names, _SETTLE_S, law)
@@ -236,7 +238,7 @@ def check(fit: Sequence[str], fix: Sequence[str] = ()) -> tuple[str, ...]:
     Raises `ParameterError` for a name that cannot be fitted, and where no name is left.
     """
     for name in (*fit, *fix):
-        if name not in POSSIBLE:
+        if name not in POSSIBLE and not (name == LAW and name in fix):
             raise ParameterError(f"'{name}' cannot be fitted; {suggest(name, list(POSSIBLE))}")
     names = tuple(name for name in POSSIBLE if name in fit and name not in fix)
     if not names:

@@ -19,6 +19,8 @@ COLUMNS = ("time", "seq", "missed_slots", "fx", "fy", "phi_c", "servo_on", "samp
 """Columns of a table of ticks that an identification reads."""
 _AGES = ("force_age_ms", "force_span_ms")
 """Columns that say when the force was sampled; they are not in tables of other rigs."""
+_MAX_SPAN_ERROR_MS, _MAX_AGE_MS = 1.0, 500.0
+"""Largest time by which samples may seem to be later than their tick, and earlier [ms]."""
 _MAX_SAMPLES = 40
 """Largest number of samples in a period; more would not change the mean force."""
 MIN_PASSAGE_S = 5.0
@@ -78,7 +80,7 @@ def passages(
         if len(table) < 2:
             continue
         ages = _AGES if all(name in table for name in _AGES) else ()
-        columns = {name: table[name].to_numpy() for name in (*COLUMNS, *ages)}
+        columns = {name: _numbers(table, name) for name in (*COLUMNS, *ages)}
         if "elapsed" in table:  # of a recording: it increases across restarts of fishd, too
             columns["time"] = table["elapsed"].to_numpy()
         if "suspect" in table:  # a suspect force counts as missing
@@ -95,6 +97,14 @@ def passages(
             "pulses and F_x and F_y are trusted; a recording of a fish that swims is needed"
         )
     return usable
+
+
+def _numbers(table: "DataFrame", name: str) -> Array:
+    """Return a column; raise `Unidentifiable` if it does not contain numbers."""
+    try:
+        return table[name].to_numpy(dtype=float)
+    except (TypeError, ValueError):
+        raise Unidentifiable(f"not a table of ticks: the column {name} has no numbers") from None
 
 
 def _period(columns: dict[str, Array]) -> float:
@@ -154,12 +164,21 @@ def _passage(
 
 
 def _with_spans(timing: Timing, age_ms: Array, span_ms: Array) -> Timing:
-    """Return a timing with the true spans of samples, where they are plausible.
+    """Return a timing with the true spans of samples, where they are known.
 
     age_ms: mean age of the samples of each window at its end; span_ms: length of their span
+    Raises `Unidentifiable` for spans in the future or long ago.
     """
+    known = np.isfinite(age_ms) & np.isfinite(span_ms) & (span_ms > 0.0)
+    latest, oldest = age_ms - 0.5 * span_ms, age_ms + 0.5 * span_ms
+    wrong = known & ((latest < -_MAX_SPAN_ERROR_MS) | (oldest > _MAX_AGE_MS))
+    if wrong.any():
+        first = int(np.argmax(wrong))
+        raise Unidentifiable(
+            f"force_age_ms is {age_ms[first]:g} and force_span_ms {span_ms[first]:g} somewhere: "
+            f"samples of the {_MAX_AGE_MS:g} ms before a tick are needed; without these columns, "
+            "samples all over each tick are assumed"
+        )
     middles, halves = timing.spans[1] - 1e-3 * age_ms, 0.5e-3 * span_ms
     spans = np.stack((middles - halves, middles + halves))
-    with np.errstate(invalid="ignore"):
-        plausible = np.all(np.abs(spans - timing.spans) < timing.tick, axis=0) & (halves > 0.0)
-    return replace(timing, spans=np.where(plausible, spans, timing.spans))
+    return replace(timing, spans=np.where(known, spans, timing.spans))

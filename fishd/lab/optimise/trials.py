@@ -248,6 +248,8 @@ def _default_ends(field: Field, session: Session) -> tuple[float, float]:
     low, high = _bounds(field)
     if field.name == "amplitude":
         return session.amplitude / 20.0, session.amplitude
+    if field.unit == "rad":
+        return max(low, -session.amplitude), min(high, session.amplitude)
     if field.name == "frequency":
         return max(low, MIN_FREQUENCY_HZ), min(high, 0.5 / (MIN_HALF_BEAT_TICKS * session.tick))
     margin = (high - low) / 20.0
@@ -259,8 +261,8 @@ def _default_ends(field: Field, session: Session) -> tuple[float, float]:
 def _check_bounds(searched: Range, field: Field, session: Session) -> None:
     """Raise `ParameterError` if a range exceeds the bounds of its parameter."""
     low, high = _bounds(field)
-    if field.name == "amplitude":
-        high = min(high, session.amplitude)
+    if field.unit == "rad":
+        low, high = max(low, -session.amplitude), min(high, session.amplitude)
     field = replace(field, low=low, high=high)
     values = {"low": searched.low, "high": searched.high}
     if not all(is_valid_number(values, replace(field, name=end)) for end in values):

@@ -69,8 +69,8 @@ class Job(Struct, frozen=True, kw_only=True):
         plants = self.settings.randomisation.fish or (self.config.plant,)
         if imitation.rounds and imitation.batched and not all(map(is_possible, plants)):
             raise ConfigError(
-                "imitation.batched: true is not valid for a fish of another model or with "
-                "quadratic drag; false is needed"
+                "imitation.batched: true is not valid for a fish of another model, with another "
+                "servo_law than tanh or with quadratic drag; false is needed"
             )
 
     @property

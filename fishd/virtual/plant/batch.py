@@ -33,7 +33,7 @@ _NAMES = (
 def is_possible(plant: PlantParameters) -> bool:
     """Return whether the equations of this fish are those of a batch."""
     drag = plant.quadratic_drag or plant.lateral_quadratic_drag
-    return plant.model == TETHERED and not drag
+    return plant.model == TETHERED and plant.servo_law == "tanh" and not drag
 
 
 class FishBatch:

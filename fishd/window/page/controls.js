@@ -16,7 +16,8 @@ export function sliderOf(field, status) {
   const rough = (high - low) / STEPS, power = 10 ** Math.floor(Math.log10(rough));
   let step = [1, 2, 5, 10].find((factor) => factor * power >= rough * 0.999) * power;
   if (field.kind === "integer") step = Math.max(1, Math.round(step));
-  if (field.low_open && low === field.low) low = low + step;
+  if (field.low_open && low === field.low) low += step;
+  if (field.high_open && high === field.high) high -= step;
   return { low, high, step };
 }
 

@@ -1,6 +1,7 @@
 """Imitation of the best waves of many fish that swim at once."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -48,9 +49,12 @@ def test_a_training_stops_within_a_round(tmp_path: Path) -> None:
     assert outcome.ended == "interrupted"
 
 
-def test_a_fish_with_quadratic_drag_is_refused_before_the_training(tmp_path: Path) -> None:
+@pytest.mark.parametrize("changes", [{"quadratic_drag": 1.0}, {"servo_law": "linear"}])
+def test_a_fish_with_other_equations_is_refused_before_the_training(
+    changes: dict[str, Any], tmp_path: Path
+) -> None:
     job = brief_job(tmp_path / "run", **CHANGES)
-    fish = replace(job.config, plant=replace(job.config.plant, quadratic_drag=1.0))
+    fish = replace(job.config, plant=replace(job.config.plant, **changes))
     with pytest.raises(ConfigError, match=r"imitation\.batched: true is not valid for a fish"):
         train(replace(job, config=fish))
     assert not (tmp_path / "run").exists()

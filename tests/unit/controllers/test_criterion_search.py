@@ -177,5 +177,13 @@ def test_a_ripple_below_the_noise_chooses_no_criterion_and_says_so_once(
     assert caplog.text.count("the ripple of F_x does not rise above the noise") == 1
 
 
+def test_a_ripple_that_is_seldom_clear_begins_no_search() -> None:
+    noisy = load(None, ("simulation.noise=0.05", "simulation.seed=2"))
+    publisher = KeepingPublisher()
+    simulate(noisy, "swing", {"C": "auto"}, 400.0, publisher=publisher)
+    shown = [tick.quantities for tick in publisher.ticks if tick.time > 150.0]
+    assert not any(quantities["clear"] or quantities["searching"] for quantities in shown)
+
+
 def test_a_ripple_above_the_noise_is_clear() -> None:
     assert simulate(load(None), "swing", {"C": "auto"}, 60.0).quantities["clear"] == 1.0

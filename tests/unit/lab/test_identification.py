@@ -335,6 +335,9 @@ def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
         (lambda t: t.assign(fy=0.1), "F_y is the same in every row"),
         (lambda t: t.assign(fx=noise(t, 1), fy=noise(t, 2)), "neither F_x nor F_y follows φ_c"),
         (lambda t: t.assign(fx=1e300), "fx is 1e\\+300 N somewhere, more than 100 N"),
+        (lambda t: t.assign(fx=t.fx.map(str) + " N"), "the column fx has no numbers"),
+        (lambda t: t.assign(force_age_ms=-20.0, force_span_ms=20.0), "force_age_ms is -20 and"),
+        (lambda t: t.assign(force_age_ms=2e3, force_span_ms=50.0), "samples of the 500 ms before"),
         (lambda t: t.assign(time=1.0), "the times of the ticks do not increase"),
         (lambda t: t.assign(servo_on=False), "there is no passage of 5 s without a gap"),
     ],
@@ -342,6 +345,13 @@ def test_of_a_slow_fin_it_tells_only_the_passages_that_it_fitted() -> None:
 def test_nothing_to_fit_is_refused(table: pd.DataFrame, spoil: object, complaint: str) -> None:
     with pytest.raises(Unidentifiable, match=complaint):
         identify(spoil(table))  # type: ignore[operator]
+
+
+def test_the_law_of_the_servo_may_be_fixed(table: pd.DataFrame) -> None:
+    given = PlantParameters(servo_law="linear")
+    fit = ("omega0", "servo_lag")
+    assert identify(table, start=given, fit=fit, fix=("servo_law",)).servo_law == "linear"
+    assert identify(table, start=given, fit=fit).servo_law != "linear"
 
 
 PULSED = ("omega0", "servo_speed", "servo_delay", "rotation")
