@@ -52,8 +52,11 @@ class PigpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def pulse_steps(self) -> tuple[float, ...]:
-        """Possible steps of pigpiod, its option -s [µs]."""
-        return (1.0, 2.0, 4.0, 5.0, 8.0, 10.0)
+        """Likely steps of pigpiod, its option -s [µs]: that of fishd's service, and the default.
+
+        Forces do not tell 5 from 10 for certain, so the unusual steps are not considered.
+        """
+        return (1.0, 5.0)
 
 
 class Pigpio(ServoDriver[PigpioSettings]):

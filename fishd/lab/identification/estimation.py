@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Sequence
 from itertools import product
+from operator import itemgetter
 from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
@@ -75,7 +76,9 @@ _SETTLE_TIME_CONSTANTS = 7.0
 """Time, in time constants of the fin, after which its initial state has no effect."""
 _ROUGH_STEPS = 12
 """Largest number of steps of a rough fit, which compares start values."""
-_MAX_PLACINGS = 4
+_MAX_UNLIKELINESS = 10.0
+"""Largest logarithm of the ratio of likelihoods at which other pulses are considered, too."""
+_MAX_PLACINGS = 5
 """Largest number of rough fits that find the pulses of the servo."""
 _LAW_STEPS = 6
 """Largest number of steps of a fit with another law."""
@@ -134,10 +137,16 @@ def identify(
         names = tuple(name for name in names if name != "lateral_inertia_ratio")
     law: ServoLaw = (start or PlantParameters()).servo_law
     laws = LAWS if "servo_lag" in names and LAW not in fix else (law,)
+    placings = [parts]
     if any(part.servo for part in parts):
-        parts = _with_pulses(parts, names, _start_values(values, names, *_STARTS[0]), law)
+        placings = _place_pulses(parts, names, _start_values(values, names, *_STARTS[0]), law)
+    parts = placings[0]
     problem = Problem(parts, names, _SETTLE_S, law)
     (problem, values), others = _solve_from_starts(problem, values, further, laws)
+    for placed in placings[1:]:
+        other = Problem(placed, problem.names, _SETTLE_S, problem.law)
+        other_values = solve(other, values)
+        others.append((max(0.0, other.unexplained - problem.unexplained), other_values))
     settle = _settling_time(values)
     if settle > _SETTLE_S:
         longer = [part for part in parts if part.duration > settle + MIN_PASSAGE_S]
@@ -147,18 +156,28 @@ def identify(
     return summarise(parts, problem, values, given_values, scale_is_free, others)
 
 
-def _with_pulses(
+def _place_pulses(
     parts: list[Passage], names: tuple[str, ...], values: dict[str, float], law: ServoLaw
-) -> list[Passage]:
-    """Return the passages with the likeliest pulses, which rough fits from `values` find."""
+) -> list[list[Passage]]:
+    """Return the passages with the likeliest pulses, and with others that are nearly as likely.
+
+    Rough fits find them, which begin with `values`.
+    """
+    fits: dict[bytes, tuple[float, list[Passage]]] = {}
     for _ in range(_MAX_PLACINGS):
         problem = Problem(parts, names, _SETTLE_S, law)
         values = solve(problem, values, rounds=1, steps=_ROUGH_STEPS)
+        key = b"".join(part.angles.tobytes() + part.timing.begins.tobytes() for part in parts)
+        fits[key] = problem.unexplained, parts
         placed = place_pulses(parts, problem, values, _SETTLE_S)
         if all(new is old for new, old in zip(placed, parts, strict=True)):
             break
-        parts = placed
-    return parts
+        parts = placed  # two placings may lead to each other
+    count = sum(forces.shape[1] for forces in problem.measured)
+    ordered = sorted(fits.values(), key=itemgetter(0))
+    return [
+        parts for excess, parts in ordered if count * (excess - ordered[0][0]) < _MAX_UNLIKELINESS
+    ]
 
 
 def _refuse_unusable(parts: Sequence[Passage]) -> None:

@@ -33,8 +33,8 @@ from fishd.lab.identification.result import (
 from fishd.lab.statistics import Z95, student95
 
 OtherLaw: TypeAlias = tuple[float, dict[str, float]]
-"""Fit with another law of the servo: its `Problem.unexplained` above that of the best one, and its
-values."""
+"""Fit with another law of the servo or other pulses: its `Problem.unexplained` above that of the
+best one, and its values."""
 LATERAL_INERTIA_FACTOR = 4.0
 """Factor that contains K_y/K over the configured value in 95 % of cases, if it is not fitted."""
 SCALED = {
@@ -184,9 +184,9 @@ def _spread_of_laws(
     others: Sequence[OtherLaw],
     inflation: float,
 ) -> Array:
-    """Return the covariance of z from not knowing the law of the servo.
+    """Return the covariance of z from not knowing the law of the servo and the size of its steps.
 
-    Each law counts with its likelihood relative to that of the best one. Where the model is
+    Each fit counts with its likelihood relative to that of the best one. Where the model is
     incomplete, a difference in likelihood is less certain, by the square of the inflation.
     """
     z = problem.to_z(values)
