@@ -63,7 +63,7 @@ MAX_ROUNDS = 3
 MIN_TRIAL_RATIO = 0.8
 """Ratio of the ripple to the reference below which a trial ends after one beat."""
 MIN_CLEAR = 8
-"""Number of clear ripples in a row after which a search begins again that found none."""
+"""Number of consecutive clear ripples after which a search that found none begins again."""
 CLEAR_RATIO, NOISE_MEMORY = 2.0, 40
 """Ratio of the mean squares of a clear ripple and of its noise, and number of measurements over
 which that noise is averaged."""

@@ -29,6 +29,7 @@ from fishd.lab.identification.fit import (
     solve,
 )
 from fishd.lab.identification.misfit import (
+    MIN_TESTED_WINDOWS,
     all_white,
     find_missing_parameters,
     follows_commands,
@@ -195,7 +196,7 @@ def _refuse_unusable(parts: Sequence[Passage]) -> None:
                 f"{symbol} is the same in every row: a recording of a fish that swims is needed"
             )
     changes = [np.diff(part.forces, prepend=part.forces[:, :1]) for part in parts]
-    if not any(
+    if sum(len(part.times) for part in parts) >= MIN_TESTED_WINDOWS and not any(
         follows_commands(parts, [0] * len(parts), np.concatenate([c[force] for c in changes]))
         for force in range(2)
     ):

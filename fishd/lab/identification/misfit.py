@@ -24,6 +24,8 @@ _TIME_GROUPS = 8
 """Number of groups where data are grouped by time."""
 _MIN_GROUP_SHARE = 1.0 / 24.0
 """Smallest share of all windows in a group."""
+MIN_TESTED_WINDOWS = 80
+"""Number of windows from which `follows_commands` sees the force of a fish that swims."""
 _STEP_LAGS = 10
 """Number of windows after a step of the command in which its effect on a residual is tested."""
 LAGS = 20
@@ -211,6 +213,8 @@ def follows_commands(parts: Sequence[Passage], skips: Sequence[int], innovations
     left = np.linalg.lstsq(columns, innovations)[0]
     explained = float(np.sum((columns @ left) ** 2))
     rank = columns.shape[1]
+    if len(innovations) <= rank:
+        return False  # too few windows to tell
     noise = float(innovations @ innovations) - explained
     return bool(
         f_distribution.sf(
