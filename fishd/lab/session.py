@@ -5,7 +5,7 @@ import os
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from copy import deepcopy
 from typing import TYPE_CHECKING, Any, Self
 
@@ -18,6 +18,7 @@ from fishd.config import Config, ServoSettings, adopt, check_tethered
 from fishd.core import text
 from fishd.core.calibration import EXACT, ForceCalibration
 from fishd.core.errors import (
+    ConfigError,
     FishdError,
     LeaseLost,
     ParameterError,
@@ -103,7 +104,8 @@ class Session(ABC):
     calibration: ForceCalibration
     """Calibration of its force sensor, for how well the gains are known."""
     servo: ServoSettings | None = None
-    """Calibrated settings of its servo; None for a fish whose commands need no pulses."""
+    """Calibrated settings of its servo; None where commands need no pulses, or where its driver
+    is unknown here."""
     source: "Source"
     """Source of the ticks, as a recording names it."""
     config: dict[str, Any]
@@ -337,7 +339,8 @@ class LiveSession(Session):
         self.source: Source = "fishd"
         self.config = fish.config()
         if calibrations:
-            self.servo = self.read_config().servo.calibrated(calibrations.servo)
+            with suppress(ConfigError):  # its driver may not be installed on this machine
+                self.servo = self.read_config().servo.calibrated(calibrations.servo)
         self.fish = fish
         self._messages = fish.ticks_and_events()
         self._first_status = status

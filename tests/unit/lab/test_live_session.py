@@ -165,3 +165,13 @@ def test_a_thrust_on_a_robot_has_the_uncertainty_of_its_calibration() -> None:
     assert measurement.calibration_ci95 == pytest.approx(0.02 * measurement.thrust)
     both = math.hypot(measurement.thrust_ci95, 0.02 * measurement.thrust)
     assert measurement.total_ci95 == pytest.approx(both)
+
+
+def test_a_robot_whose_servo_driver_is_not_installed_here_can_be_measured() -> None:
+    class Foreign(Calibrated):
+        """Robot with a servo driver of a package that this machine lacks."""
+
+        def config(self) -> dict[str, Any]:
+            return {**super().config(), "servo": {"driver": "unknown", "pin": 3}}
+
+    assert rig_of(Foreign()).servo is None
