@@ -166,7 +166,7 @@ class TrialCalibration:
     def _apply(self, calibration: ServoCalibration) -> None:
         parts = calibrated_parts(self._loop)
         if parts.servo.calibration.direction != calibration.direction:
-            self._loop.lateral_sign.forget()
+            self._loop.perception.lateral_sign.forget()
         parts.servo.recalibrate(calibration)
         parts.recalibrated(calibration)
         self._loop.guard.restrict(*parts.servo.reach)
