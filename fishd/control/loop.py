@@ -87,7 +87,7 @@ class ControlLoop:
         self.power = ServoPower(robot, self.reporter, settings.tick)
         self.seq = 0
         """Sequence number of the latest tick."""
-        self.applied = 0.0
+        self.instruction_angle = 0.0
         """Instruction angle that was sent last, after the guard [rad]."""
         self.neutral_for = 0.0
         """Time since the instruction angle became zero [s]."""
@@ -138,15 +138,18 @@ class ControlLoop:
         measurement = self.perception.read(slot)
         power = self.power.read(slot.deadline) if self.power.metered else None
         read = self._now()
-        observation = self.perception.observe(measurement, slot, dt, self.applied)
+        observation = self.perception.observe(measurement, slot, dt, self.instruction_angle)
         return TickInputs(slot, measurement, observation, (started, read, self._now()), power)
 
     def act(self, inputs: TickInputs) -> None:
         """Run the second half of a tick: let the controller choose, drive the servo, publish."""
         slot, observation = inputs.slot, inputs.observation
         started, read, estimated = inputs.marks
-        before, self.applied = self.applied, self._update(observation, estimated)
-        moved = before or self.applied
+        before, self.instruction_angle = (
+            self.instruction_angle,
+            self._update(observation, estimated),
+        )
+        moved = before or self.instruction_angle
         self.neutral_for = 0.0 if moved else self.neutral_for + observation.dt
         updated = self._now()
         self._write(neutral=not moved and self.has_settled)
@@ -279,19 +282,19 @@ class ControlLoop:
     def _update(
         self, observation: Observation, began: float, *, may_hand_over: bool = True
     ) -> float:
-        """Return the angle to apply: that of the controller, guarded, or a step to neutral [rad].
+        """Return the instruction angle to send [rad]: the controller's, or a step to neutral.
 
         began: start of the time that the controller may take [s, monotonic]
         may_hand_over: whether a controller that gives up may name a successor: once in a tick
         """
         if self.supervisor.mode is Mode.ESTOP:
-            return self.applied
+            return self.instruction_angle
         if self.supervisor.mode is not Mode.RUNNING:
-            return self.guard.fade(self.applied)
+            return self.guard.fade(self.instruction_angle)
         name = self.active.name
         try:
-            command = call_foreign(self.active.update, observation)
-            applied = self.guard.apply(command, self.applied)
+            chosen = call_foreign(self.active.update, observation)
+            permitted = self.guard.apply(chosen, self.instruction_angle)
         except ControllerFault as error:
             code, successor = fault_and_successor(error)
             if successor and may_hand_over:
@@ -304,7 +307,7 @@ class ControlLoop:
             seconds = self._now() - began
             if seconds > self._budget or self.supervisor.failures:
                 self._check_budget(name, seconds)
-            return applied
+            return permitted
         return self._update(observation, self._now(), may_hand_over=False)
 
     def _hand_over(self, error: ControllerFault, code: str, successor: Successor) -> None:
@@ -324,14 +327,14 @@ class ControlLoop:
         self.supervisor.check("controller-slow", problem)
 
     def _write(self, neutral: bool) -> None:
-        """Send the applied angle, or release the servo, as the mode demands."""
+        """Send the instruction angle, or release the servo, as the mode demands."""
         if self.servo.counts_down and (problem := self.servo.why_at_rest()):
-            self.applied = 0.0  # the servo is there; another start would make it jump
+            self.instruction_angle = 0.0  # the servo is there; another start would make it jump
             neutral = True
             self.supervisor.fail("overrun", problem)
         latched, lost = self.supervisor.reason, self.servo.lost
         try:
-            self.servo.command(self.supervisor.mode, self.applied, neutral)
+            self.servo.drive(self.supervisor.mode, self.instruction_angle, neutral)
             if lost:
                 self.reporter.event("servo", "the servo can be reached again")
         except Exception as error:
@@ -372,7 +375,7 @@ class ControlLoop:
             seq=self.seq,
             mode=self._mode,
             controller=self.active.name,
-            phi_c=self.applied,
+            phi_c=self.instruction_angle,
             servo_on=self.servo.on,
             sample_age_ms=(slot.now - measurement.time) * 1e3,
             lateness_us=(slot.now - slot.deadline) * 1e6,

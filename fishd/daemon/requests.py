@@ -147,7 +147,7 @@ class Operations:
             sensor_lost=loop.supervisor.sensor_lost,
             calibrating=self._calibrations.calibrating,
             name=self._name,
-            phi_c=loop.applied,
+            phi_c=loop.instruction_angle,
             force_unit=loop.robot.force_unit,
             quantities=loop.active.quantities,
             quantity_units=loop.active.quantity_units,

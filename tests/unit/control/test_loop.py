@@ -352,4 +352,4 @@ def test_only_the_active_controller_warms_up_and_the_angle_stays() -> None:
     rig.start(controller)
     rig.run()
     rig.loop.warm_up()
-    assert (ticks, rig.loop.applied, rig.loop.seq) == ([1], 0.1, 1)
+    assert (ticks, rig.loop.instruction_angle, rig.loop.seq) == ([1], 0.1, 1)
