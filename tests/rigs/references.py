@@ -1,4 +1,4 @@
-"""What every controller commands and what fishd answers, as `tests/reference` keeps it.
+"""Ticks of every controller and replies of fishd, of which `tests/reference` keeps a copy.
 
 `PYTHONPATH=tests python -m rigs.references` writes both files again after a change that is meant.
 """
