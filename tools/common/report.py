@@ -139,8 +139,8 @@ def progress(*words: str) -> None:
 
 def table(head: str, rows: Iterable[Iterable[str]]) -> str:
     """Return a table in Markdown; the cells of its head are separated by " | "."""
-    rule = " | ".join("---" for _ in head.split(" | "))
-    return "\n".join(f"| {line} |" for line in (head, rule, *map(" | ".join, rows)))
+    rule = "|" + "---|" * len(head.split(" | "))
+    return "\n".join((f"| {head} |", rule, *(f"| {' | '.join(row)} |" for row in rows)))
 
 
 def put(document: Path, name: str, text: str, *, in_line: bool = False) -> None:
