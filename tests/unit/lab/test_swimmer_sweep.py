@@ -101,8 +101,10 @@ def test_a_table_of_speeds_is_resumed_and_swing_is_drawn(tmp_path: Path, config:
     points = [Point("square", {"frequency": value}) for value in (1.0, 2.0, 3.0, 4.0, 5.0)]
     points += [Point("swing", {"C": value}) for value in (0.0, 0.6)]
     speeds = (0.02, 0.05, 0.07, 0.06, 0.03, 0.06, 0.07)
-    for point, speed in zip(points, speeds, strict=True):
-        result = SpeedResult(speed, speed_ci95=1e-3, beat_frequency=2.9, settled_time=4.0, beats=10)
+    for point, mean_speed in zip(points, speeds, strict=True):
+        result = SpeedResult(
+            mean_speed, speed_ci95=1e-3, beat_frequency=2.9, settled_time=4.0, beats=10
+        )
         folder.add_result(point, result, b"a recording")
     assert open_folder(tmp_path, config).results == folder.results
     curves = make_curves(folder, points)
