@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 from torch.optim.adam import adam
 
-from fishd.controllers.policy.pilot import HOLD_TIME_S
+from fishd.controllers.policy.runtime import HOLD_TIME_S
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation
