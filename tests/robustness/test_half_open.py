@@ -27,8 +27,8 @@ from rigs.processes import (
     wait_until,
 )
 
-from common import half_open
-from common.half_open import HOST, PATH_HOST
+from rigs import half_open
+from rigs.half_open import HOST, PATH_HOST
 from fishd.camera.requests import CameraLost, CameraRequests
 from fishd.cli.recording.record import INCOMPLETE
 from fishd.client import AsyncFish, Fish, NoDaemon

@@ -1,7 +1,6 @@
 """An emergency stop of a page while others attack the window, its disk fails, or fishd is dead.
 
-A short run of `tools/reliability window_estop`, which judges the times; here an attack goes on
-until the stop is confirmed.
+An attack goes on until the stop is confirmed.
 """
 
 import asyncio
@@ -13,12 +12,7 @@ from pathlib import Path
 
 import pytest
 from rigs.processes import Daemon, wait_until
-from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
-
-from common.daemon import list_children
-from fishd.window.devices import Devices
-from fishd.window.places import PLACES
-from reliability.window_attacks import (
+from rigs.window_attacks import (
     DISK_TROUBLES,
     FLOODS,
     HISTORIES,
@@ -33,6 +27,11 @@ from reliability.window_attacks import (
     stalled,
     unsee,
 )
+from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
+
+from common.daemon import list_children
+from fishd.window.devices import Devices
+from fishd.window.places import PLACES
 
 EVERYWHERE = ("--listen", "0.0.0.0:0")
 PATIENT = """

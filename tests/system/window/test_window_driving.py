@@ -3,6 +3,7 @@
 import asyncio
 import os
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,8 +11,11 @@ import pytest
 from rigs.processes import FISHCTL, Daemon, wait_until
 from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
 
-from bench.window import MAX_STOP_S, measure_stops
+from common.daemon import Fishd, virtual_pi
+from fishd.client import Fish
 
+GPIO = 18
+"""Pin of the servo on a virtual Pi."""
 HASTE = """
 import signal
 from fishd.window import live
@@ -170,4 +174,25 @@ def daemon_measure(daemon: Daemon) -> list[str]:
 
 @pytest.mark.realtime
 def test_an_emergency_stop_ends_the_pulses_within_a_fifth_of_a_second(tmp_path: Path) -> None:
-    assert max(measure_stops(3, tmp_path)) <= MAX_STOP_S
+    with (
+        virtual_pi(tmp_path) as (pi, settings),
+        Fishd(*settings) as fishd,
+        running_window(tmp_path, fish=fishd.endpoint) as window,
+        Fish(fishd.endpoint) as fish,
+    ):
+
+        def width() -> float:
+            return pi.pigpiod.width(GPIO, time.monotonic())
+
+        async def press() -> None:
+            async with Browser(window.url) as browser:
+                await browser.post("/api/fish/fish/estop")
+
+        for _ in range(3):
+            fish.clear_fault()
+            fish.set_controller("square")
+            wait_until(lambda: fish.status().mode == "running" and width() > 0.0)
+            start = time.monotonic()
+            run(press())
+            wait_until(lambda: not width())
+            assert pi.pigpiod.history(GPIO)[-1][0] - start <= 0.2
