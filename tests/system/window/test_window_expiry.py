@@ -16,7 +16,6 @@ from rigs.window_process import (
     Browser,
     WindowProcess,
     open_page,
-    run,
     running_window,
 )
 
@@ -74,18 +73,15 @@ def content_of(folder: Path) -> dict[str, Any]:
     return content
 
 
-def test_a_link_that_has_expired_leaves_the_file_and_pairs_nothing_though_the_clock_steps_back(
+async def test_a_link_that_has_expired_leaves_the_file_and_pairs_nothing_after_a_step_back(
     stepped_window: WindowProcess,
 ) -> None:
     token = Devices(stepped_window.state).invite("drive", seconds=0.5)
     stepped_window.process.send_signal(signal.SIGUSR1)
     wait_until(lambda: content_of(stepped_window.state)["invitations"] == [])
 
-    async def test() -> None:
-        async with Browser(stepped_window.url, NETWORK_HOST) as browser:
-            assert await browser.refusal("/api/pair", {"token": token}) == (403, "device")
-
-    run(test())
+    async with Browser(stepped_window.url, NETWORK_HOST) as browser:
+        assert await browser.refusal("/api/pair", {"token": token}) == (403, "device")
 
 
 @pytest.mark.parametrize("seconds", [-86400.0, 86400.0])
@@ -112,22 +108,19 @@ def test_a_link_from_before_the_machine_was_started_again_has_expired(tmp_path: 
     assert content_of(tmp_path)["invitations"] == []
 
 
-def test_a_device_that_has_expired_loses_its_page_its_fish_and_its_place_in_the_file(
+async def test_a_device_that_has_expired_loses_its_page_its_fish_and_its_place_in_the_file(
     stepped_window: WindowProcess, daemon: Daemon
 ) -> None:
-    async def test() -> None:
-        token = Devices(stepped_window.state).invite("drive")
-        async with Browser(stepped_window.url, NETWORK_HOST) as browser:
-            await browser.post("/api/pair", {"token": token, "name": "tablet"})
-            async with open_page(browser) as page:
-                await page.swim()
-                stepped_window.process.send_signal(signal.SIGUSR1)
-                stepped_window.process.send_signal(signal.SIGUSR2)
-                while (await page.sock.receive()).type is aiohttp.WSMsgType.TEXT:
-                    pass
-            assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
-
-    run(test())
+    token = Devices(stepped_window.state).invite("drive")
+    async with Browser(stepped_window.url, NETWORK_HOST) as browser:
+        await browser.post("/api/pair", {"token": token, "name": "tablet"})
+        async with open_page(browser) as page:
+            await page.swim()
+            stepped_window.process.send_signal(signal.SIGUSR1)
+            stepped_window.process.send_signal(signal.SIGUSR2)
+            while (await page.sock.receive()).type is aiohttp.WSMsgType.TEXT:
+                pass
+        assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
     assert len(content_of(stepped_window.state)["devices"]) == 1  # this clock may be wrong
     stepped_window.process.send_signal(signal.SIGUSR1)
     wait_until(lambda: content_of(stepped_window.state)["devices"] == [])

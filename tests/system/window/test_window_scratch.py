@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from rigs.processes import Daemon, wait_until
-from rigs.window_process import Browser, WindowProcess, open_page, run, running_window
+from rigs.window_process import Browser, WindowProcess, open_page, running_window
 
 START = {
     "idle": None,
@@ -41,40 +41,34 @@ def children_of(pid: int) -> list[int]:
 
 @pytest.mark.parametrize("kind", START)
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP])
-def test_a_window_that_ends_leaves_no_folder_behind(
+async def test_a_window_that_ends_leaves_no_folder_behind(
     window: WindowProcess, temporary: Path, kind: str, number: signal.Signals
 ) -> None:
-    async def end_at_work() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.until("ticks")
-            await page.drive()
-            if options := START[kind]:
-                body = {"fish": "fish", "kind": kind, "options": options}
-                await page.post("/api/jobs", body)
-                (folder,) = temporary.iterdir()
-                assert folder.stat().st_mode & 0o777 == 0o700
-                wait_until(lambda: len(children_of(window.pid)) == 2)
-            os.kill(window.pid, number)
-
-    run(end_at_work())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.until("ticks")
+        await page.drive()
+        if options := START[kind]:
+            body = {"fish": "fish", "kind": kind, "options": options}
+            await page.post("/api/jobs", body)
+            (folder,) = temporary.iterdir()
+            assert folder.stat().st_mode & 0o777 == 0o700
+            wait_until(lambda: len(children_of(window.pid)) == 2)
+        os.kill(window.pid, number)
     wait_until(lambda: not any(temporary.iterdir()))
 
 
-def test_a_job_that_outlives_its_window_keeps_the_folder_until_it_ends(
+async def test_a_job_that_outlives_its_window_keeps_the_folder_until_it_ends(
     window: WindowProcess, temporary: Path
 ) -> None:
     children: list[int] = []
 
-    async def kill_at_work() -> None:
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            body = {"fish": "fish", "kind": "simulate", "options": START["simulate"]}
-            await page.post("/api/jobs", body)
-            wait_until(lambda: len(children_of(window.pid)) == 2)
-            children.extend(children_of(window.pid))
-            os.kill(children[1], signal.SIGSTOP)
-            os.kill(window.pid, signal.SIGKILL)
-
-    run(kill_at_work())
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        body = {"fish": "fish", "kind": "simulate", "options": START["simulate"]}
+        await page.post("/api/jobs", body)
+        wait_until(lambda: len(children_of(window.pid)) == 2)
+        children.extend(children_of(window.pid))
+        os.kill(children[1], signal.SIGSTOP)
+        os.kill(window.pid, signal.SIGKILL)
     window.process.wait()
     remover, job = children
     awaited = Path(f"/proc/{remover}/fd/0").readlink()
