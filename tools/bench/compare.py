@@ -23,7 +23,6 @@ from common.report import Report, progress, quantile, table
 SETTLE = 2.0
 """Time that a fishd ticks before it is measured [s]."""
 VIRTUAL_SECONDS = 300.0
-RESAMPLES = 10_000
 Turn = dict[str, float]
 """Results of one checkout in one turn: quantities with their units, larger is worse for each."""
 
@@ -108,7 +107,7 @@ def virtual_time(bin_folder: Path) -> tuple[float, float]:
 def interval(ratios: Sequence[float]) -> tuple[float, float]:
     """Return the 95 % confidence interval of the median of ratios."""
     draw = np.random.default_rng(0)
-    medians = np.median(draw.choice(ratios, (RESAMPLES, len(ratios))), axis=1)
+    medians = np.median(draw.choice(ratios, (10_000, len(ratios))), axis=1)
     low, high = np.percentile(medians, (2.5, 97.5))
     return float(low), float(high)
 

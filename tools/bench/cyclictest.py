@@ -1,7 +1,4 @@
-"""The program cyclictest, which ticks beside fishd in `tick`: the best that this machine allows.
-
-It is a separate process, so that none warms a cache or holds an interpreter for the other.
-"""
+"""The program cyclictest, which ticks beside fishd in `tick`: the best that this machine allows."""
 
 import shutil
 import subprocess
