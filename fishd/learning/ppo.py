@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import RolloutBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 
-from fishd.controllers.policy.pilot import HOLD_TIME_S
+from fishd.controllers.policy.runtime import HOLD_TIME_S
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
 from fishd.core.signals import Observation

@@ -43,8 +43,7 @@ class PigpioSettings(ServoSettings, frozen=True, forbid_unknown_fields=True, kw_
         unit(
             "s",
             "Time without a tick, at least three ticks, after which pigpiod takes the servo to "
-            "neutral and ends its pulses; fishd is then in fault if it continues. A longer time "
-            "tolerates a busy machine.",
+            "neutral and ends its pulses. A longer time tolerates a busy machine.",
             ge=0.1,
             le=2.0,
         ),

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from gymnasium import wrappers
 from msgspec.structs import replace
 from rigs.harness import Rig, observe
+from rigs.policy_files import vector
 from rigs.swimming import NOISY, brief_job
 from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.distributions import DiagGaussianDistribution
@@ -24,7 +25,6 @@ from fishd.cli.main import fishctl
 from fishd.config import load
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
-from fishd.controllers.policy.card import Layout
 from fishd.controllers.policy.file import read
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
@@ -161,7 +161,7 @@ def test_a_model_of_the_user_becomes_a_policy_file(tmp_path: Path, kind: Any) ->
     assert env
     env.reset()
     seen = env.envs[0].unwrapped.latest
-    action, _ = model.predict(Layout(card.observation).vector(seen), deterministic=True)
+    action, _ = model.predict(vector(card.observation, seen), deterministic=True)
     assert controller.update(seen) == pytest.approx(0.3 * float(action[0]), abs=1e-5)
     past = card.provenance
     assert (past.algorithm, past.steps, past.seed) == (kind.__name__, 64, 4)

@@ -17,8 +17,7 @@ from fishd.config import Config
 from fishd.controllers.policy import file
 from fishd.controllers.policy.file import PolicyFile
 from fishd.controllers.policy.network import to_onnx
-from fishd.controllers.policy.pilot import Pilot
-from fishd.controllers.policy.runtime import Network
+from fishd.controllers.policy.runtime import Network, Pilot
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
 from fishd.lab.compare import compare
