@@ -171,7 +171,7 @@ def _open_client(address: str) -> Any:
         _check_versions(outcome)
     except Unfinished:
         for client in clients:
-            client.close(_CLOSE_TIMEOUT_S)
+            _close(client)
         raise
     return clients[0]
 
@@ -195,7 +195,12 @@ def connect(address: str, stop_timeout: float) -> Iterator[Cluster]:
         try:
             yield Cluster(client, address, stop_timeout)
         finally:
-            client.close(_CLOSE_TIMEOUT_S)
+            _close(client)
+
+
+def _close(client: Any) -> None:
+    with suppress(Exception):  # the scheduler may have ended
+        client.close(_CLOSE_TIMEOUT_S)
 
 
 def read_versions() -> dict[str, str]:
