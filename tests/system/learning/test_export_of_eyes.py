@@ -58,10 +58,7 @@ CASES = [
 
 def network_of(settings: TrainingSettings) -> tuple[Network, Any]:
     card, policy, perception = randomly_excited(settings)
-    sight = exporting._make_sight(policy, perception)
-    content = to_onnx(layers_of(policy), activation_of(policy), card, sight)
-    drawn = exporting._draw(policy, perception, card)
-    exporting._verify(PolicyFile(Path("eye.onnx"), content, card), policy, drawn)
+    content = exporting._build(Path("eye.onnx"), card, policy, perception)
     return Network(PolicyFile(Path("eye.onnx"), content, card)), perception
 
 
