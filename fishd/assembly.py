@@ -272,8 +272,8 @@ def assemble(
 
     if permitted := pulses.format_reach(settings, config.amplitude_limit):
         log.info("servo.lowest and servo.highest permit %s, amplitude_limit", permitted)
-    if line := _calibration_warning(config, servo):
-        log.warning("%s", line)
+    if warning := _calibration_warning(config, servo):
+        log.warning("%s", warning)
 
     def limitations() -> tuple[str, ...]:
         lines = (
@@ -359,11 +359,11 @@ def open_sensor(
     )
 
 
-def _calibration_warning(config: Config, servo: CalibratedServo) -> str:
-    """Return a line if the calibration of the servo does not permit ±Φ; empty if it does."""
+def _calibration_warning(config: Config, servo: CalibratedServo) -> str | None:
+    """Return a line if the calibration of the servo does not permit ±Φ; None if it does."""
     permitted = servo.format_reach(config.amplitude_limit)
     if not permitted or servo.calibration == config.servo.calibration:
-        return ""
+        return None
     return (
         f"the servo's calibration of {servo.calibration.date or 'no date'} permits {permitted}, "
         "amplitude_limit: fishctl calibrate servo"

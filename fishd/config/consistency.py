@@ -58,7 +58,8 @@ def check_addresses(telemetry: str, control: str | None) -> None:
     if control is None:
         return
     complaint = find_listen_problem(control)
-    if complaint.startswith(ADDRESS_FORM) or not (complaint or is_local(control)):
+    is_unbound = complaint is not None and complaint.startswith(ADDRESS_FORM)
+    if is_unbound or not (complaint or is_local(control)):
         complaint = (
             "ipc://PATH or tcp://127.0.0.1:PORT is needed; requests can move the fish, so they are "
             "accepted only from this machine"

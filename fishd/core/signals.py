@@ -34,8 +34,8 @@ class Measurement(Struct, frozen=True, gc=False):
     """Mean lateral force of the window [N]."""
     samples: int
     """Number of sample pairs in the means."""
-    suspect: str = ""
-    """Reason not to trust these forces, such as a clipped sample; empty if there is none."""
+    suspect: str | None = None
+    """Reason not to trust these forces, such as a clipped sample; None if there is none."""
     extremes: Extremes | None = None
     """Extremes of the samples in the means, if the sensor provides them."""
     fin_velocity: float | None = None

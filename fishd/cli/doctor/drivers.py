@@ -153,7 +153,7 @@ def _judge_rate(per_tick: float, context: Context, details: str) -> Result:
     return ok(message)
 
 
-def _trial_windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str]]:
+def _trial_windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str | None]]:
     """Yield samples and suspicion of each window, without the first, when the sampler starts."""
     latest: SensorError | None = None
     start = time.monotonic()
