@@ -91,7 +91,7 @@ class Controller(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[Struct]]
-    swims_like: ClassVar[Likeness | None] = None
+    same_wave_as: ClassVar[Likeness | None] = None
     """The other controller whose known thrust applies to the wave of this one, too."""
 
     uses_lateral_force: ClassVar[bool] = True
