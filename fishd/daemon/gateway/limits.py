@@ -1,4 +1,4 @@
-"""Limits of a gateway's process. When it exceeds one, it ends, and a new process starts."""
+"""Limits of a gateway. When it exceeds one, it starts again."""
 
 import ctypes
 import os
@@ -10,7 +10,7 @@ from typing import IO, Literal
 _PAGE_BYTES = resource.getpagesize()
 _NICE = 5
 """Nice value of a gateway; for a fishd with a negative nice value, the difference to it."""
-_CHECK_PERIOD_S = 0.1
+_CHECK_PERIOD_S = 0.2
 """Time between two checks of the limits [s]."""
 _MAX_FILES = 4096
 """Largest number of file descriptors, if the system permits it.
@@ -74,8 +74,9 @@ class ResourceLimits:
 
 
 def _lower_priority() -> None:
-    """Lower the priority of this process below that of fishd, which it inherited."""
-    os.setpriority(os.PRIO_PROCESS, 0, _nice_value(os.getpriority(os.PRIO_PROCESS, 0)))
+    """Lower the priority of this process below that of fishd."""
+    fishd = os.getpriority(os.PRIO_PROCESS, os.getppid())
+    os.setpriority(os.PRIO_PROCESS, 0, _nice_value(fishd))
 
 
 def _nice_value(fishd: int) -> int:

@@ -1,38 +1,19 @@
-"""Gateway of the control channel: a ROUTER socket that limits the requests to fishd."""
+"""Requests from a ROUTER socket to fishd, in a limited number, and the replies to them."""
 
 import socket
 import time
 from collections import deque
-from contextlib import suppress
 from typing import TYPE_CHECKING
 
 import zmq
 
 from fishd.core import protocol
 from fishd.core.errors import Refused
-from fishd.daemon.gateway.limits import ResourceLimits
-from fishd.daemon.gateway.link import (
-    END,
-    LISTEN,
-    MAX_MESSAGE_BYTES,
-    PING,
-    PONG,
-    Replies,
-    listen,
-    request,
-)
+from fishd.daemon.gateway.link import Replies, request
 
 if TYPE_CHECKING:
     from fishd.daemon.gateway.keys import KnownKeys
 
-SOCKET = zmq.ROUTER
-MAX_MEMORY_BYTES = 48 * 2**20
-"""Largest memory in addition to that at the start [bytes]."""
-MAX_CONNECTIONS = 1500
-"""Largest number of connections, of clients and of other programs."""
-
-MAX_QUEUED_REQUESTS, MAX_QUEUED_REPLIES = 8, 64
-"""Requests and replies that ZeroMQ queues for one client; further replies are dropped."""
 MAX_OPEN_REQUESTS = 16
 """Largest number of requests that fishd has not answered yet; further requests wait here."""
 MAX_WAITING_REQUESTS = 600
@@ -43,10 +24,6 @@ MAX_EXTRA_URGENT = 2
 """Number of urgent requests that may be open in addition to MAX_OPEN_REQUESTS."""
 MAX_REFUSAL_RATE, MAX_REFUSAL_BURST = 20.0, 50.0
 """Refusals to one client: largest rate [1/s] and burst; further requests get no reply."""
-HANDSHAKE_TIMEOUT_MS = 2000
-"""Longest time for the handshake of a connection [ms]."""
-_CHECK_PERIOD_MS = 100
-"""Longest time between two checks of the limits [ms]."""
 _REQUESTS_PER_TURN = 20
 """Number of requests that are read before replies are read."""
 _CLIENT_TIMEOUT_S = 10.0
@@ -81,12 +58,10 @@ class Router:
         self,
         link: socket.socket,
         server: "zmq.Socket[bytes]",
-        limits: ResourceLimits,
         known: "KnownKeys | None",
     ) -> None:
         self._link = link
         self._server = server
-        self._limits = limits
         self._known = known
         self._clients: dict[bytes, _Client] = {}
         self._urgent: deque[bytes] = deque()
@@ -99,50 +74,18 @@ class Router:
         self._number = 0
         """Time when the latest request arrived [ns, monotonic], made unique."""
         self._next_purge = 0.0
-        self._ended = False
 
-    def run(self) -> str:
-        """Pass on requests and replies until fishd ends; return the exceeded limit, if any."""
-        poller = zmq.Poller()
-        poller.register(self._link, zmq.POLLIN)
-        poller.register(self._server, zmq.POLLIN)
-        while not (self._ended or (why := self._limits.exceeded())):
-            ready = dict(poller.poll(_CHECK_PERIOD_MS))
-            if self._link.fileno() in ready:
-                self._take_replies()
-            if self._server in ready:
-                self._take_requests()
-            self._pass_on()
-            self._forget_silent_clients()
-        return "" if self._ended else why
+    def take_reply(self, message: bytes) -> None:
+        """Pass a reply of fishd, or a part of one, on to its client."""
+        if reply := self._replies.take(message):
+            number, payload = reply
+            envelope = self._envelopes.pop(number, None)
+            if envelope:  # otherwise the request came through an earlier gateway
+                self._open -= 1
+                self._answer(envelope, payload)
 
-    def _take_replies(self) -> None:
-        while not self._ended:
-            try:
-                message, listeners, _, _ = socket.recv_fds(self._link, 2 * MAX_MESSAGE_BYTES, 1)
-            except BlockingIOError:
-                return
-            except ConnectionResetError:  # fishd was killed
-                message = b""
-            if message in (b"", END):
-                self._ended = True
-                return
-            if message == PING:
-                with suppress(OSError):  # the next `recv` notices that fishd was killed
-                    self._link.send(PONG)
-                continue
-            if message.startswith(LISTEN):
-                listen(self._server, message, *listeners)
-                continue
-            reply = self._replies.take(message)
-            if reply:
-                number, payload = reply
-                envelope = self._envelopes.pop(number, None)
-                if envelope:  # otherwise the request came through an earlier gateway
-                    self._open -= 1
-                    self._answer(envelope, payload)
-
-    def _take_requests(self) -> None:
+    def take_requests(self) -> None:
+        """Read some of the waiting requests; refuse those that are wrong or too many."""
         for _ in range(_REQUESTS_PER_TURN):
             try:
                 if self._known:
@@ -186,7 +129,9 @@ class Router:
             self._turns.append(client)
         client.waiting.append(message)
 
-    def _pass_on(self) -> None:
+    def pass_on(self) -> None:
+        """Send waiting requests to fishd, as many as may be open at a time."""
+        self._forget_silent_clients()
         while self._urgent or self._turns:
             if self._open >= MAX_OPEN_REQUESTS + MAX_EXTRA_URGENT * bool(self._urgent):
                 return
@@ -194,9 +139,6 @@ class Router:
             try:
                 self._link.send(waiting[0])
             except BlockingIOError:
-                return
-            except OSError:
-                self._ended = True
                 return
             self._open += 1
             waiting.popleft()
@@ -218,21 +160,3 @@ class Router:
                 for name, client in self._clients.items()
                 if client.waiting or now - client.seen < _CLIENT_TIMEOUT_S
             }
-
-
-def configure(server: "zmq.Socket[bytes]") -> None:
-    """Set the limits for each client."""
-    server.set(zmq.RCVHWM, MAX_QUEUED_REQUESTS)
-    server.set(zmq.SNDHWM, MAX_QUEUED_REPLIES)
-    server.set(zmq.MAXMSGSIZE, protocol.MAX_MESSAGE)
-    server.set(zmq.HANDSHAKE_IVL, HANDSHAKE_TIMEOUT_MS)
-
-
-def run(
-    link: socket.socket,
-    server: "zmq.Socket[bytes]",
-    limits: ResourceLimits,
-    known: "KnownKeys | None",
-) -> str:
-    """Pass on requests and replies until fishd ends; return the exceeded limit, if any."""
-    return Router(link, server, limits, known).run()
