@@ -1,4 +1,4 @@
-"""The servo as the loop drives it: its command in each mode, its pulses, and its power."""
+"""The servo as the loop drives it: what it gets in each mode, its pulses, and its power."""
 
 import math
 from collections import deque
@@ -31,31 +31,32 @@ class ServoOutput:
         self._now = now
         self._written = now()
 
-    def why_at_rest(self) -> str:
-        """Return a line if writes stopped for longer than the countdown of a driven servo; else "".
+    def why_at_rest(self) -> str | None:
+        """Return a line if writes stopped for longer than the countdown of a driven servo.
 
         The servo then is at neutral, or has no pulses any more; it must not start again by itself.
         """
-        return self.why_silent() if self.on and not self.lost else ""
+        return self.why_silent() if self.on and not self.lost else None
 
-    def why_silent(self) -> str:
-        """Return a line if the latest write began longer ago than the countdown lasts; else ""."""
+    def why_silent(self) -> str | None:
+        """Return a line if the latest write began longer ago than the countdown lasts."""
         if not self.counts_down:
-            return ""
+            return None
         silence = self._now() - self._written
         if silence <= self._countdown:
-            return ""
+            return None
         return (
             f"fishd stood still for {silence * 1e3:.0f} ms, and the servo has gone to neutral by "
             "itself, its pulses end within half a second: the machine is overloaded or was "
             "suspended"
         )
 
-    def command(self, mode: Mode, angle: float, neutral: bool) -> None:
-        """Send an angle [rad], or release the servo: at once in estop, once `neutral` in fault.
+    def drive(self, mode: Mode, instruction_angle: float, neutral: bool) -> None:
+        """Send an instruction angle [rad], or release the servo.
 
-        In fault, pulses never begin: a servo that was lost is released when it can be reached
-        again. Raises what the driver raises; then `lost` is True.
+        It is released at once in estop, and once `neutral` in fault. In fault, pulses never begin:
+        a servo that was lost is released when it can be reached again. Raises what the driver
+        raises; then `lost` is True.
         """
         fading = self.on and not self.lost and not neutral
         try:
@@ -65,7 +66,7 @@ class ServoOutput:
             else:
                 if self.counts_down:
                     self._written = self._now()
-                self._servo.write(angle)
+                self._servo.write(instruction_angle)
                 self.on = True
         except Exception:
             self.lost = True

@@ -62,7 +62,7 @@ class Daemon:
         self._print_status = print_status
         self._slow: SlowMotion | None = None
         if not config.kind.is_real_time:
-            self._slow = SlowMotion(config.tick, config.swimmer.slow_motion)
+            self._slow = SlowMotion(config.tick, config.kind.slow_motion(config))
         self._clock = SlowClock() if self._slow else _clock(config)
         self._virtual = isinstance(self._clock, VirtualClock)
         self._events = asyncio.get_running_loop()
@@ -234,7 +234,7 @@ class Daemon:
 
     def _move_to_neutral(self) -> None:
         """Send neutral and wait until the servo is there, if fishd failed and could not fade."""
-        if self._loop.servo.on and self._loop.applied != 0.0:
+        if self._loop.servo.on and self._loop.instruction_angle != 0.0:
             with suppress(Exception):  # closing the servo comes later, and reports errors
                 servo = self._loop.robot.servo
                 servo.write(0.0)

@@ -83,7 +83,7 @@ class SlowMotion:
         """Return the line about slow motion for the status."""
         line = f"slow motion: a second of the fish takes {self.pace:.3g} s"
         if self.pace > MAX_PACE_RATIO * self._factor:
-            line += f", since this machine is too slow for swimmer.slow_motion: {self._factor:g}"
+            line += f", since this machine is too slow for the configured {self._factor:g} s"
         return line
 
 
@@ -130,11 +130,11 @@ class Lockstep:
         An invalid answer of the agent ends the wait, with a fault.
         poll: function called repeatedly during the wait; may select another controller
         """
-        turn = self._loop.observe(slot)
-        while (agent := self._agent()) and not agent.ready(turn.observation):
+        inputs = self._loop.observe(slot)
+        while (agent := self._agent()) and not agent.ready(inputs.observation):
             await self._wait_for(agent)
             poll()
-        self._loop.act(turn)
+        self._loop.act(inputs)
 
     def _agent(self) -> Remote | None:
         """Return the active controller if it waits for an agent, else None."""

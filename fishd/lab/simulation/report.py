@@ -130,7 +130,7 @@ def judge(
 
     publisher: receiver of every tick and event; None to create no messages
     on_start: called before the first tick
-    Raises `ParameterError` where `settle` is too long, and `ConfigError` for a free swimmer.
+    Raises `ParameterError` where `settle` is too long, and `ConfigError` for a free fish.
     """
     check_tethered(config.robot, "relative_thrust")
     ticks, first = count_ticks(seconds, settle, config.tick)
@@ -143,7 +143,7 @@ def judge(
         for index in range(ticks):
             if index == first:  # the first ticks are slower, as they fill caches
                 since = time.perf_counter()
-            angle = virtual.loop.applied
+            angle = virtual.loop.instruction_angle
             window = virtual.tick()
             if virtual.loop.active.fallback and took_over_at is None:
                 took_over_at = index * config.tick

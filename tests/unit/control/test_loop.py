@@ -185,7 +185,7 @@ def test_a_suspect_force_that_a_slow_sensor_repeats_reaches_no_estimator() -> No
     good = rig.run(10)[-1]
     robot.fx, robot.fy, robot.suspect = 1.0, 5.0, "F_y is clipped"
     rig.run(1)
-    robot.suspect, robot.samples = "", 0
+    robot.suspect, robot.samples = None, 0
     tick = rig.run(1)[-1]
     assert (tick.fx, tick.fy, tick.samples) == (good.fx, good.fy, 0)
     assert tick.sample_age_ms < 10.0
@@ -321,7 +321,7 @@ def test_no_field_of_a_tick_keeps_a_value_of_the_controller(mode: str, may_stay:
     rig.run(60)  # so that the zero of the force is known
     rig.start("square", frequency=4.9)
     rig.run(39, missed=1, lateness=5e-3)
-    rig.loop.thrust.calibrate(70.0, 0.5)  # since these forces do not determine it
+    rig.loop.perception.thrust.calibrate(70.0, 0.5)  # since these forces do not determine it
     running = rig.run(1, missed=1, lateness=5e-3)[-1]
     leave = {
         "idle": rig.loop.stop,
