@@ -10,7 +10,6 @@ import math
 import os
 import time
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
@@ -164,7 +163,7 @@ class Ticker:
 
     MARGIN_S = 2e-3
     """Time before the deadline at which other work stops, at most a quarter of the period [s]."""
-    EARLY_S = 1e-4
+    EARLY_S = 6e-5
     """Time before the deadline at which the last sleep ends, because a wake-up takes about as long
     [s]; the rest is a busy-wait."""
 

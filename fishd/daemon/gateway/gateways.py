@@ -7,10 +7,8 @@ program in the network disturbs the clients here.
 import asyncio
 import logging
 import os
-import select
 import socket
 import subprocess
-import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -100,14 +98,12 @@ class Gateway:
         self._unanswered = 0
         """Heartbeats since the latest sign of life."""
         self._reading = self._may_read = False
-        self._why = self._mistake = ""
-        """Reason of the latest restart, and mistake in the file of known keys."""
+        self._why = ""
+        """Reason of a restart that is not reported yet."""
         self._started = 0.0
         """Time of the latest start of a process [s]."""
         self._timer: asyncio.TimerHandle | None = None
         self._report: asyncio.TimerHandle | None = None
-        self._ending: float | None = None
-        """Time until which it may pass on the last messages before it ends [s, monotonic]."""
 
     def listen(self, kind: str, address: str, key: str, stack: ExitStack) -> ListeningSocket:
         """Add a socket until `stack` is closed, before `start`; raise `StartupError`.
@@ -180,32 +176,22 @@ class Gateway:
 
     def end(self) -> None:
         """Let the process pass on its messages and end; may be called twice."""
-        if self._ending is not None:
-            return
-        self._ending = time.monotonic() + END_TIMEOUT_S
         for timer in (self._timer, self._report):
             if timer:
                 timer.cancel()
         self.read(False)
-        self.send(link.END)
+        if self._link is not None:
+            with suppress(OSError):  # the process has ended
+                self._link.shutdown(socket.SHUT_WR)
 
     def close(self) -> None:
         """Wait until the process has ended, or kill it; may be called twice."""
         self.end()
-        assert self._ending is not None
-        while self._link is not None:
-            remaining = self._ending - time.monotonic()
-            if remaining <= 0.0 or not select.select([self._link], [], [], remaining)[0]:
-                break
-            try:
-                ended = not self._link.recv(2 * link.MAX_MESSAGE_BYTES)
-            except OSError:
-                ended = True
-            if ended:
-                break
-        self._drop_link()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(END_TIMEOUT_S)
         self._process.kill()
         self._process.wait()
+        self._drop_link()
 
     def _begin(self) -> None:
         """Send the listeners to a process that begins, again perhaps."""
@@ -235,7 +221,7 @@ class Gateway:
         elif message.startswith(link.TICKS):
             self.wants_ticks = bool(message[1])
         elif message.startswith(link.READY):
-            self._serves, self._mistake = True, message[1:].decode(errors="replace")
+            self._serves = True
             if self._why:
                 self._report_soon()
         elif message.startswith((link.EXCEEDED, link.CLOSED)):
@@ -278,7 +264,7 @@ class Gateway:
 
     def _report_restart(self) -> None:
         self._report, why, self._why = None, self._why, ""
-        self.on_restart(why if self._mistake in why else f"{why}; {self._mistake}")
+        self.on_restart(why)
 
     def _drop_link(self) -> None:
         if self._link is not None:

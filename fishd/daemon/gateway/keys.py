@@ -35,9 +35,6 @@ class KnownKeys:
         while self._stamp is None:
             self._update()
             time.sleep(SETTLE_TIME_S / 10)
-        self.mistake: str = self._change
-        """Mistake in the file at the start; empty without one."""
-        self._change = ""
 
     def find(self, key: str) -> keys.KnownKey | None:
         """Return the client of a public key; None if the key is not known."""

@@ -12,15 +12,15 @@ TELEMETRY, CONTROL = "telemetry", "control"
 """Kinds of sockets."""
 
 REQUEST, READY, TICKS = b"?", b"^", b"%"
-"""First bytes of messages from a gateway: a client's request; that it serves, perhaps in spite of a
-mistake in the file of known keys; whether ticks have subscribers."""
+"""First bytes of messages from a gateway: a client's request; that it serves; whether ticks have
+subscribers."""
 EXCEEDED, CLOSED = b"!", b"x"
 """First bytes of a limit for which the gateway starts again, and of a change of the keys for which
 it has closed the socket of telemetry."""
 PING, PONG = b"~", b"-"
 """A heartbeat, and the answer to it."""
-LISTEN, END = b"@", b"."
-"""First bytes of an address to listen at, which comes with its listener, and of fishd's end."""
+LISTEN = b"@"
+"""First byte of an address to listen at, which comes with its listener."""
 _PART, _LAST = b"+", b"="
 
 _HEAD_BYTES = 9

@@ -15,7 +15,6 @@ from fishd.daemon.gateway.limits import ResourceLimits
 from fishd.daemon.gateway.link import (
     CLOSED,
     CONTROL,
-    END,
     LISTEN,
     MAX_TELEMETRY_BYTES,
     PING,
@@ -44,8 +43,6 @@ MAX_TOPIC_BYTES = 512
 """Largest message from a subscriber, a topic or a handshake [bytes]."""
 HANDSHAKE_TIMEOUT_MS = 2000
 """Longest time for the handshake of a connection [ms]."""
-MAX_FORMER_LISTENERS = 16
-"""Largest number of further listeners of a socket."""
 _MAX_TOPICS_PER_TURN = 1000
 """Number of subscriptions that are read before other messages are."""
 _POLL_MS = 1000
@@ -74,7 +71,6 @@ class GatewayServer:
         self._link = link
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._servers: dict[str, zmq.Socket[bytes]] = {}
-        self._former_listeners: dict[str, list[str]] = {TELEMETRY: [], CONTROL: []}
         self._known: KnownKeys | None = None
         self._tick_topics: set[bytes] = set()
         """Subscriptions that match ticks: `tick`, or a prefix of it."""
@@ -97,7 +93,7 @@ class GatewayServer:
         control = self._servers[CONTROL]
         self._router = router = Router(self._link, control, self._known)
         limits = ResourceLimits(MAX_MEMORY_BYTES, MAX_CONNECTIONS)
-        self._tell(READY + (self._known.mistake.encode() if self._known else b""))
+        self._tell(READY)
         while not (why := limits.exceeded()):
             ready = dict(self._poller.poll(_POLL_MS))
             if self._link.fileno() in ready and not self._take_message():
@@ -119,7 +115,7 @@ class GatewayServer:
         space = socket.CMSG_SPACE(struct.calcsize("i"))
         size, ancillary, _, _ = self._link.recvmsg_into([self._buffer], space)
         message = bytes(self._buffer[:size])
-        if message in (b"", END):
+        if not message:
             return False
         if message == PING:
             self._tell(PONG)
@@ -140,20 +136,12 @@ class GatewayServer:
     def _listen(self, message: bytes, listener: int) -> None:
         """Let a socket listen at the address in a message, too; `listener` is its file descriptor.
 
-        Connections end with the listener through which they came, so former ones are kept, but no
-        more than `MAX_FORMER_LISTENERS`: then all connections end, and clients connect again.
+        Connections end with the listener through which they came, so former ones are kept.
         """
         kind, address, keys = read_listen(message)
-        server, former = self._servers.get(kind), self._former_listeners[kind]
-        if server is None:
-            server = self._open(kind, keys)
-        elif len(former) >= MAX_FORMER_LISTENERS:
-            for bound in set(former):  # `unbind` closes all listeners of an address
-                server.unbind(bound)
-            former.clear()
+        server = self._servers.get(kind) or self._open(kind, keys)
         server.set(zmq.USE_FD, listener)
         server.bind(address)
-        former.append(server.get_string(zmq.LAST_ENDPOINT))
 
     def _open(self, kind: str, keys: str) -> "zmq.Socket[bytes]":
         number, options = _OPTIONS[kind]
@@ -180,9 +168,8 @@ class GatewayServer:
         telemetry = self._servers.pop(TELEMETRY)
         self._poller.unregister(telemetry)
         telemetry.close(linger=0)
-        self._former_listeners[TELEMETRY].clear()
         self._tick_topics.clear()
-        self._link.send(f"{CLOSED.decode()}{why}".encode())
+        self._link.send(CLOSED + why.encode())
 
     def _take_subscriptions(self, telemetry: "zmq.Socket[bytes]") -> None:
         """Note which subscriptions match ticks."""

@@ -1,17 +1,12 @@
 """Messages between fishd and its gateway."""
 
-import os
-import socket
-from pathlib import Path
-
 import pytest
 import zmq
 from hypothesis import given
 from hypothesis import strategies as st
-from rigs.processes import wait_until
 
 from fishd.daemon.gateway import link
-from fishd.daemon.gateway.server import MAX_FORMER_LISTENERS, GatewayServer
+from fishd.daemon.gateway.server import GatewayServer
 
 
 @given(topic=st.sampled_from([b"tick", b"event", b"status"]), payload=st.binary())
@@ -47,34 +42,6 @@ def test_a_link_never_blocks_its_sender() -> None:
 
     with ours, theirs, pytest.raises(BlockingIOError):
         fill()
-
-
-def count_files() -> int:
-    return len(list(Path("/proc/self/fd").iterdir()))
-
-
-def test_a_socket_that_is_created_again_and_again_keeps_few_listeners(tmp_path: Path) -> None:
-    path = tmp_path / "control"
-    message = link.listen(link.CONTROL, f"ipc://{path}", "")
-    ours, theirs = link.pair()
-    with ours, theirs, zmq.Context() as context:
-        server = GatewayServer(theirs)
-        before = count_files()
-        for _ in range(5 * MAX_FORMER_LISTENERS):
-            path.unlink(missing_ok=True)
-            with socket.socket(socket.AF_UNIX) as listener:
-                listener.bind(str(path))
-                listener.listen()
-                server._listen(message, os.dup(listener.fileno()))
-        wait_until(lambda: count_files() <= before + 2 * MAX_FORMER_LISTENERS)
-        with context.socket(zmq.DEALER) as client:
-            client.set(zmq.LINGER, 0)
-            client.connect(f"ipc://{path}")
-            client.send(b"request")
-            router = server._servers[link.CONTROL]
-            assert router.poll(60_000)
-            assert router.recv_multipart()[-1] == b"request"
-        server._context.destroy(linger=0)
 
 
 @pytest.mark.parametrize(
