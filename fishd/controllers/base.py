@@ -132,12 +132,6 @@ class Controller(ABC, Generic[P]):
         """Apply new, already checked parameters while active; called between two updates."""
         self.parameters = parameters
 
-    def warm_up(self) -> None:
-        """Do the computation of `update` without an effect, to warm the caches for it.
-
-        Called up to once per tick, just before it; only for work that is slow with cold caches.
-        """
-
     def close(self) -> None:
         """Release all resources: called once, when the controller is no longer used."""
 
