@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from msgspec.structs import replace
 
 from fishd.config import Config
-from fishd.config.drivers import claims_of
+from fishd.config.drivers import claims_of, readings_of
 from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.fin_sensor import FinSensor
 from fishd.control.estimators.lateral_force import LateralForceEstimator
@@ -30,10 +30,10 @@ from fishd.core.signals import Publisher, Truth
 from fishd.hardware import ownership, release_recipe
 from fishd.hardware.base import CalibratedParts, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
-from fishd.hardware.driver import ServoDriver, read_counters
+from fishd.hardware.driver import SensorDriver, ServoDriver, read_counters
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.recipes import Recipes
-from fishd.hardware.registry import FORCE_SENSORS, POWER_METERS, SERVOS, driver_packages
+from fishd.hardware.registry import FORCE_SENSORS, SENSORS, SERVOS, driver_packages
 from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio
@@ -42,7 +42,7 @@ from fishd.virtual.plant.base import TrueWindow
 
 if TYPE_CHECKING:  # most runs need neither drivers nor emulation, so they are loaded on demand
     from fishd.hardware.panel import Panel
-    from fishd.hardware.power_meter.sampled_power import SampledPower
+    from fishd.hardware.sensors.sampled_readings import SampledReadings
     from fishd.virtual.pi.virtual_pi import VirtualPi
     from fishd.virtual.swimmer.robot import Swimmer
 
@@ -259,9 +259,14 @@ def assemble(
     folder = CalibrationFolder(state_folder(config))
     for line in folder.ignored():
         log.warning("%s", line)
-    meter = _open_power_meter(config, clock, stack, threaded=threaded)
-    between_samples = meter.catch_up if meter else _do_nothing
-    sensor = open_sensor(config, clock, threaded=threaded, between_samples=between_samples)
+    sensors = _open_sensors(config, clock, stack, threaded=threaded)
+
+    def catch_up() -> None:
+        """Let the other sensors sample between the samples of the force, in virtual time."""
+        for other in sensors:
+            other.catch_up()
+
+    sensor = open_sensor(config, clock, threaded=threaded, between_samples=catch_up)
     stack.callback(sensor.close)
     settings = config.servo
     with driver_packages(settings.driver):
@@ -292,7 +297,7 @@ def assemble(
     def limitations() -> tuple[str, ...]:
         lines = (
             *sensor.limitations,
-            *(meter.limitations if meter else ()),
+            *(line for other in sensors for line in other.limitations),
             *servo.driver.limitations,
         )
         if sensor.calibration.is_unset:
@@ -318,9 +323,9 @@ def assemble(
         counters=lambda: {
             **sensor.counters(),
             **read_counters(servo.driver),
-            **(meter.counters() if meter else {}),
+            **{name: count for other in sensors for name, count in other.counters().items()},
         },
-        power=meter.read if meter else None,
+        sensors=sensors,
         countdown=servo.driver.countdown,
         write_recipes=recipes.write_for if recipes else lambda control: None,
     )
@@ -330,20 +335,66 @@ def _do_nothing() -> None:
     pass
 
 
-def _open_power_meter(
+def _open_sensors(
     config: Config, clock: Clock, stack: ExitStack, *, threaded: bool
-) -> "SampledPower | None":
-    """Return the power meter if one is configured; it need not answer yet."""
-    settings = config.power_meter
-    if settings is None:
-        return None
-    from fishd.hardware.power_meter.sampled_power import SampledPower, sample_interval
+) -> "tuple[SampledReadings, ...]":
+    """Return the configured sensors; they need not answer yet."""
+    if not config.sensors:
+        return ()
+    from fishd.hardware.sensors.sampled_readings import SampledReadings, close_all, sample_period
 
-    with driver_packages(settings.driver):
-        driver = POWER_METERS.find(settings.driver)(settings, clock, sample_interval(config.tick))
-    meter = SampledPower(driver, clock, threaded=threaded, tick=config.tick)
-    stack.callback(meter.close)
-    return meter
+    sensors: list[SampledReadings] = []
+    stack.callback(close_all, sensors)
+    for name, settings in config.sensors.items():
+        with driver_packages(settings.kind):
+            kind = SENSORS.find(settings.kind)
+            period = sample_period(kind, settings, config.tick)
+            driver = kind(settings, clock, period, f"sensors.{name}")
+        sensors.append(
+            SampledReadings(
+                name,
+                driver,
+                readings_of(settings),
+                clock,
+                threaded=threaded,
+                tick=config.tick,
+            )
+        )
+    return tuple(sensors)
+
+
+def _with_stand_ins(config: Config, robot: Robot, clock: Clock) -> Robot:
+    """Return a simulated fish with its sensors: stand-ins for those that need hardware.
+
+    A reading that the fish has a model of has no stand-in.
+    """
+    if not config.sensors:
+        return robot
+    from fishd.hardware.sensors.sampled_readings import SampledReadings, sample_period
+    from fishd.hardware.sensors.simulated import StandIn
+
+    modelled = {name for sensor in robot.sensors for name in sensor.declared}
+    sensors = []
+    for name, settings in config.sensors.items():
+        kind, readings = SENSORS.find(settings.kind), readings_of(settings)
+        if modelled & readings.keys():
+            continue
+        place = sample_period(kind, settings, config.tick), f"sensors.{name}"
+        driver: SensorDriver[Any]
+        if kind.is_simulated:
+            driver = kind(settings, clock, *place)
+        else:
+            driver = StandIn(settings, clock, *place, kind.declare(settings))
+        sensors.append(
+            SampledReadings(name, driver, readings, clock, threaded=False, tick=config.tick)
+        )
+    lines = tuple(line for sensor in sensors for line in sensor.limitations)
+    before = robot.limitations
+    return dataclasses.replace(
+        robot,
+        sensors=(*robot.sensors, *sensors),
+        limitations=lambda: (*before(), *lines),
+    )
 
 
 def open_sensor(
@@ -439,6 +490,8 @@ def build_loop(
     Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.
     """
     guard = build_guard(config)
+    if not config.kind.has_hardware:
+        robot = _with_stand_ins(config, robot, clock)
     if robot.calibrated:
         guard.restrict(*robot.calibrated.servo.reach)
     loop = ControlLoop(

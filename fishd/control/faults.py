@@ -41,6 +41,10 @@ FAULTS = {
         "look for a clipped or broken wire of the force sensor, or calibrate it",
         in_a_row=3,
     ),
+    "sensor-lost": Fault(
+        "a sensor with `required: true` gives no reading, or only one older than its `stale_after`",
+        "mend what the message says, or set required: false",
+    ),
     "fish-lost": Fault(
         "the computation of a swimmer has diverged, or it has left the part of the tank that is "
         "computed well; or a plant of another package has failed",

@@ -18,8 +18,9 @@ from fishd.control.estimators.lateral_sign import LateralSign
 from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.guard import Guard
 from fishd.control.lease import Lease
+from fishd.control.readings import Readings
 from fishd.control.reporting import Reporter
-from fishd.control.servo import ServoOutput, ServoPower
+from fishd.control.servo import ServoOutput
 from fishd.control.statistics import Statistics
 from fishd.control.supervisor import Mode, Supervisor
 from fishd.controllers.base import Controller, Limits
@@ -51,8 +52,6 @@ class Turn(Struct, frozen=True, gc=False):
     observation: Observation
     marks: tuple[float, float, float]
     """Times at the start of the tick, after the read and after the estimate [s, monotonic]."""
-    power: float | None
-    """Mean electrical power of the servo since the previous tick [W]; None where it is unknown."""
 
 
 class ControlLoop:
@@ -85,7 +84,7 @@ class ControlLoop:
         self.active = ActiveController(limits, self.reporter)
         self.lease = Lease(clock.monotonic)
         self.servo = ServoOutput(robot, clock.monotonic)
-        self.power = ServoPower(robot, self.reporter, settings.tick)
+        self.readings = Readings(robot.sensors, self.reporter, settings.tick, clock.monotonic())
         self.seq = 0
         """Sequence number of the latest tick."""
         self.applied = 0.0
@@ -147,7 +146,8 @@ class ControlLoop:
         if self.lease.active:
             self.expire_lease()
         measurement = self._read(slot)
-        power = self.power.read(slot.deadline) if self.power.metered else None
+        if self.readings.sensors:
+            self._read_sensors(slot)
         read = self._now()
         suspect = bool(measurement.suspect)
         observation = self._estimate(
@@ -157,8 +157,10 @@ class ControlLoop:
             observation = self._follow_thrust(observation, suspect)
             if self.limits.tethered:
                 self._watch_sign(observation, measurement.fy, suspect)
+        if self.readings.latest:
+            observation = replace(observation, readings=self.readings.latest)
         self.observation = observation
-        return Turn(slot, measurement, observation, (started, read, self._now()), power)
+        return Turn(slot, measurement, observation, (started, read, self._now()))
 
     def act(self, turn: Turn) -> None:
         """Run the second half of a tick: let the controller choose, drive the servo, publish."""
@@ -333,6 +335,12 @@ class ControlLoop:
         if problem or self.supervisor.failures:
             self.supervisor.check("sensor-stale", problem)
         return measurement
+
+    def _read_sensors(self, slot: Slot) -> None:
+        self.readings.read(slot.deadline)
+        lost = self.readings.lost
+        if lost or self.supervisor.failures:
+            self.supervisor.check("sensor-lost", lost)
 
     def _last_trusted_measurement(self) -> Measurement:
         """Return the last trusted measurement, marked as holding no new samples."""
@@ -520,7 +528,7 @@ class ControlLoop:
             heading=course.heading if course else UNSET,
             thrust_factor=UNSET if factor is None else factor,
             thrust_factor_ci95=UNSET if factor_ci95 is None else factor_ci95,
-            power=UNSET if turn.power is None else turn.power,
+            readings=observation.readings or UNSET,
             leak=UNSET if self.found_leak is None else self.found_leak,
             fy_corrected=True if corrected else UNSET,
             suspect=text.line(measurement.suspect) if measurement.suspect else UNSET,

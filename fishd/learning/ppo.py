@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import Linear
 from torch.optim.adam import adam
 
+from fishd.controllers.policy.card import READING, is_even
 from fishd.controllers.policy.pilot import HOLD_TIME_S
 from fishd.core.camera_frames import Stack
 from fishd.core.errors import PolicyError
@@ -258,9 +259,10 @@ def make_policy(
 
 
 def even_inputs(settings: TrainingSettings) -> list[int]:
-    """Return the indices of the inputs that are the same for the mirrored fish: F_x."""
-    names = settings.seen.observation * settings.seen.history
-    return [index for index, name in enumerate(names) if name == "fx"]
+    """Return the indices of the inputs that are the same for the mirrored fish."""
+    seen = settings.seen
+    names = (*seen.observation, *(READING + name for name in seen.readings)) * seen.history
+    return [index for index, name in enumerate(names) if is_even(name)]
 
 
 def _policy_class(ppo: PpoSettings, extractor: FeatureExtractor | None) -> type[ActorCriticPolicy]:

@@ -4,15 +4,43 @@ It advances at each read, by the time since the previous read, under the latest 
 It does not use a clock, and therefore runs in real time and in virtual time.
 """
 
+import math
+from collections.abc import Mapping
+from typing import ClassVar
+
 from fishd.core.calibration import ForceCalibration
+from fishd.core.schema import Reading
 from fishd.core.signals import Measurement, Truth
 from fishd.hardware.base import Robot
 from fishd.hardware.driver import Pair
 from fishd.hardware.force_sensor.window import VoltageWatch
+from fishd.hardware.settings import POWER
 from fishd.virtual.imperfections import Imperfections, SimulationSettings
 from fishd.virtual.plant.base import PlantWindow, TrueWindow, Window
 from fishd.virtual.plant.parameters import TETHERED, PlantParameters
 from fishd.virtual.plant.registry import open_plant
+
+
+class ModelPower:
+    """The power meter of a simulated servo: the model of its motor."""
+
+    name = "power"
+    declared: ClassVar[Mapping[str, Reading]] = {"power": POWER}
+    required, stale_after = False, math.inf
+    doubts: ClassVar[Mapping[str, str]] = {}
+    trouble = ""
+
+    def __init__(self, fish: "SimulatedFish") -> None:
+        self._fish = fish
+
+    @property
+    def latest(self) -> dict[str, tuple[float, float]]:
+        """Power of the latest window; empty for a fish without a motor."""
+        power = self._fish.power()
+        return {"power": (self._fish.time, power)} if math.isfinite(power) else {}
+
+    def catch_up(self) -> None:
+        """Do nothing: the fish computes its power in each tick."""
 
 
 class SimulatedFish:
@@ -29,6 +57,7 @@ class SimulatedFish:
         self._sample_rate = settings.sample_rate
         self._tick = tick
         self._time: float | None = None
+        """Time of the latest read [s]; None before the first one."""
         self._start = 0.0
         self._duration, self._samples = 0.0, 1
         """Length of the latest window [s], and its number of samples."""
@@ -60,6 +89,11 @@ class SimulatedFish:
         newest, mean_time = now - 0.5 * duration / samples, now - 0.5 * duration
         return Measurement(newest, fx, fy, samples, mean_time=mean_time, span=duration)
 
+    @property
+    def time(self) -> float:
+        """Time of the latest read [s]; 0 before the first one."""
+        return self._time or 0.0
+
     def prepare(self) -> None:
         """Compute in advance what the next read needs, as far as that is possible."""
         if self._time is not None:
@@ -85,7 +119,7 @@ class SimulatedFish:
         # The loop has usually read the power already.
         return TrueWindow(window.duration, window.thrust, peak, self._power or self.power())
 
-    def power(self, now: float = 0.0) -> float:
+    def power(self) -> float:
         """Return the mean electrical power of the servo over the latest window [W]."""
         if self._power is None:
             self._power = self.window.power
@@ -117,5 +151,7 @@ class SimulatedFish:
             truth=self.truth,
             tared=self,
             prepare=self.prepare,
-            power=self.power if metered and self.fish.parameters.model == TETHERED else None,
+            sensors=(
+                (ModelPower(self),) if metered and self.fish.parameters.model == TETHERED else ()
+            ),
         )

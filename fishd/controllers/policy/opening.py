@@ -11,7 +11,7 @@ def read(text: str, limits: Limits) -> PolicyFile:
     path = library.find(text)
     policy = file.read(path)
     try:
-        policy.card.check_fit(limits.tick, limits.amplitude)
+        policy.card.check_fit(limits.tick, limits.amplitude, limits.readings)
         if limits.scaled and any(
             feature.name == "fin_velocity" for feature in policy.card.observation
         ):

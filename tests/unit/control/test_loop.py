@@ -10,6 +10,7 @@ from rigs.harness import Rig, Scripted, Wrapped, fragile_rig
 
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import ControllerFault, Refused, SensorError, ServoError
+from fishd.core.schema import Reading
 from fishd.core.signals import Extremes, Measurement, Observation, Tick, Truth
 from fishd.hardware.base import Robot
 
@@ -285,12 +286,22 @@ class Restless(Wrapped):
 
     clock = VirtualClock()
     reads = 0
+    name, required, stale_after, trouble = "flow", False, 1.0, ""
+    declared = {"flow": Reading("1", "Flow.")}  # noqa: RUF012
+    doubts: dict[str, str] = {}  # noqa: RUF012
+
+    @property
+    def latest(self) -> dict[str, tuple[float, float]]:
+        return {"flow": (self.clock.now, self.next_values(1)[0])}
+
+    def catch_up(self) -> None:
+        pass
 
     def robot(self) -> Robot:
         return replace(
             super().robot(),
             truth=lambda: Truth(*self.next_values(3)),
-            power=lambda now: self.next_values(1)[0],
+            sensors=(self,),
         )
 
     def next_values(self, count: int) -> list[float]:

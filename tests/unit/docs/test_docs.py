@@ -29,7 +29,7 @@ OPERATORS = [path for path in DOCS if path.stem in (
     "calibration", "configuration", "getting-started", "install", "protocol", "troubleshooting",
     "virtual-pi", "wiring",
 )]  # fmt: skip
-POWERED_ROBOT = ["robot=pi", "power_meter.driver=ina219"]
+POWERED_ROBOT = ["robot=pi", "sensors.power.kind=ina219"]
 ADDED_BY_EXAMPLES = {"beat", "estimator.fy_offset", "estimator.fy_offset=0.02"}
 """Verb and key that the examples of contributing.md add, which test_contributing.py applies."""
 
