@@ -261,12 +261,12 @@ def assemble(
         log.warning("%s", line)
     sensors = _open_sensors(config, clock, stack, threaded=threaded)
 
-    def catch_up() -> None:
+    def read_others() -> None:
         """Let the other sensors sample between the samples of the force, in virtual time."""
         for other in sensors:
-            other.catch_up()
+            other.read()
 
-    sensor = open_sensor(config, clock, threaded=threaded, between_samples=catch_up)
+    sensor = open_sensor(config, clock, threaded=threaded, between_samples=read_others)
     stack.callback(sensor.close)
     settings = config.servo
     with driver_packages(settings.driver):
@@ -498,13 +498,13 @@ def build_loop(
         robot=robot,
         estimator=build_estimator(config),
         thrust=build_live_thrust(config),
+        lateral_sign=LateralSign(config.estimator.reversed_fy),
         guard=guard,
         settings=config,
         limits=config.limits,
         clock=clock,
         publisher=publisher,
         notify=notify,
-        lateral_sign=LateralSign(config.estimator.reversed_fy),
     )
     start = config.start
     if created := start.create_controller(config.limits):

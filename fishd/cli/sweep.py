@@ -18,10 +18,10 @@ from fishd.cli.experiment_options import (
     fish_choice,
     folder_options,
 )
-from fishd.cli.free_swim import format_speed
 from fishd.cli.options import FiniteRange, for_option, json_option, plot_option
 from fishd.cli.output import echo, format_count, print_json, warn_of_fin
 from fishd.cli.progress import show_progress
+from fishd.cli.swimmer.simulation import format_speed
 from fishd.config import Config
 from fishd.controllers.base import Limits
 from fishd.core import text

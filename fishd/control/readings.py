@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from fishd.control.reporting import Reporter
+from fishd.control.supervisor import Supervisor
 from fishd.core.signals import ReadingState
 from fishd.hardware.base import Sensor
 
@@ -14,7 +15,14 @@ MEAN_SPAN_S = 2.0
 class Readings:
     """The reader of all sensors, called in each tick; the fish swims on without their readings."""
 
-    def __init__(self, sensors: Sequence[Sensor], reporter: Reporter, tick: float, now: float):
+    def __init__(
+        self,
+        sensors: Sequence[Sensor],
+        reporter: Reporter,
+        supervisor: Supervisor,
+        tick: float,
+        now: float,
+    ) -> None:
         """tick: period of the loop [s]; now: time of the start [s, monotonic]"""
         self.sensors = sensors
         self.declared = {
@@ -27,7 +35,9 @@ class Readings:
         """Lines on what is wrong with the readings, by sensor."""
         self._silent: set[str] = set()
         """Names of the sensors with an old reading."""
+        self._has_required = any(sensor.required for sensor in sensors)
         self._reporter = reporter
+        self._supervisor = supervisor
         self._start = now
         self._recent: deque[dict[str, float]] = deque(maxlen=max(1, round(MEAN_SPAN_S / tick)))
 
@@ -39,31 +49,30 @@ class Readings:
         readings: dict[str, float] = {}
         in_doubt = False
         for sensor in self.sensors:
-            sensor.catch_up()
-            for name, (time, value) in sensor.latest.items():
+            for name, (time, value) in sensor.read().items():
                 if now - time <= sensor.stale_after:
                     readings[name] = value
-            in_doubt = in_doubt or bool(sensor.doubts)
+            if sensor.doubts:
+                in_doubt = True
         self.latest = readings
         self._recent.append(readings)
         if in_doubt or self.troubles or len(readings) < len(self.declared):
             self._report(now)
+        if self._has_required:
+            lost = (s.name for s in self.sensors if s.required and s.name in self._silent)
+            problem = next((self.troubles[name] for name in lost), None)
+            self._supervisor.check("sensor-lost", problem)
         return readings
-
-    @property
-    def lost(self) -> str | None:
-        """Line on a required sensor with an old reading; None if there is none."""
-        lost = (s.name for s in self.sensors if s.required and s.name in self._silent)
-        return next((self.troubles[name] for name in lost), None) if self._silent else None
 
     def states(self, now: float) -> dict[str, ReadingState]:
         """Return every reading with its description, its mean and its age at a time."""
         states = {}
         for sensor in self.sensors:
+            samples = sensor.read()
             for name, reading in sensor.declared.items():
                 recent = [row[name] for row in self._recent if name in row]
                 is_old = name not in self.latest
-                time, _ = sensor.latest.get(name, (None, None))
+                time, _ = samples.get(name, (None, None))
                 states[name] = ReadingState(
                     unit=reading.unit,
                     description=reading.description,
@@ -98,6 +107,7 @@ class Readings:
 
     def _find_gap(self, sensor: Sensor, now: float) -> str | None:
         """Return which readings are old, and since when, in words; None if none is."""
-        times = {name: sensor.latest.get(name, (self._start, 0.0))[0] for name in sensor.declared}
+        samples = sensor.read()
+        times = {name: samples.get(name, (self._start, 0.0))[0] for name in sensor.declared}
         old = {name: now - t for name, t in times.items() if now - t > sensor.stale_after}
         return f"no {', '.join(old)} for {max(old.values()):.3g} s" if old else None

@@ -67,10 +67,6 @@ class Sensor(Protocol):
         """Age from which a reading is old [s]."""
 
     @property
-    def latest(self) -> Mapping[str, tuple[float, float]]:
-        """Time [s, monotonic] and value of each reading that is known; never changed in place."""
-
-    @property
     def doubts(self) -> Mapping[str, str]:
         """Reasons why readings are doubtful, by name; never changed in place."""
 
@@ -78,8 +74,11 @@ class Sensor(Protocol):
     def trouble(self) -> str:
         """Reason why the latest attempt to sample failed, one line; empty if it did not."""
 
-    def catch_up(self) -> None:
-        """Take a sample if one is due, without a thread; with a thread, do nothing."""
+    def read(self) -> Mapping[str, tuple[float, float]]:
+        """Return time [s, monotonic] and value of each reading that is known; never waits.
+
+        The mapping never changes. A sensor without a thread takes a sample first, if one is due.
+        """
 
 
 class Servo(Protocol):

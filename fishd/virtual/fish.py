@@ -33,14 +33,10 @@ class ModelPower:
     def __init__(self, fish: "SimulatedFish") -> None:
         self._fish = fish
 
-    @property
-    def latest(self) -> dict[str, tuple[float, float]]:
-        """Power of the latest window; empty for a fish without a motor."""
+    def read(self) -> dict[str, tuple[float, float]]:
+        """Return time and power of the latest window; nothing for a fish without a motor."""
         power = self._fish.power()
-        return {"power": (self._fish.time, power)} if math.isfinite(power) else {}
-
-    def catch_up(self) -> None:
-        """Do nothing: the fish computes its power in each tick."""
+        return {"power": (self._fish.time or 0.0, power)} if math.isfinite(power) else {}
 
 
 class SimulatedFish:
@@ -56,7 +52,7 @@ class SimulatedFish:
         self._imperfections = Imperfections(settings, tick)
         self._sample_rate = settings.sample_rate
         self._tick = tick
-        self._time: float | None = None
+        self.time: float | None = None
         """Time of the latest read [s]; None before the first one."""
         self._start = 0.0
         self._duration, self._samples = 0.0, 1
@@ -70,10 +66,10 @@ class SimulatedFish:
 
     def read(self, now: float) -> Measurement:
         """Advance to `now` [s] and return the forces of this window."""
-        if self._time is None:
-            self._start = self._time = now - self._tick
-        duration = round(now - self._time, 9)
-        self._time = now
+        if self.time is None:
+            self._start = self.time = now - self._tick
+        duration = round(now - self.time, 9)
+        self.time = now
         if duration != self._duration:
             self._duration, self._samples = duration, round(self._sample_rate * duration) or 1
         samples = self._samples
@@ -89,14 +85,9 @@ class SimulatedFish:
         newest, mean_time = now - 0.5 * duration / samples, now - 0.5 * duration
         return Measurement(newest, fx, fy, samples, mean_time=mean_time, span=duration)
 
-    @property
-    def time(self) -> float:
-        """Time of the latest read [s]; 0 before the first one."""
-        return self._time or 0.0
-
     def prepare(self) -> None:
         """Compute in advance what the next read needs, as far as that is possible."""
-        if self._time is not None:
+        if self.time is not None:
             self.fish.prepare(self._angle, self._duration, self._samples)
 
     def recalibrate(self, calibration: ForceCalibration) -> None:
@@ -105,7 +96,7 @@ class SimulatedFish:
 
     def watch(self) -> VoltageWatch:
         """Return a watch that adds up the forces of every window from now on."""
-        watch = VoltageWatch(self._time or 0.0, self.calibration)
+        watch = VoltageWatch(self.time or 0.0, self.calibration)
         self._watches.append(watch)
         return watch
 

@@ -100,7 +100,9 @@ class Lsm6dsoxChip(Chip):
             (self.OUTX_L_G, gyroscope >> 4, self.rotation, mdps * 1e-3),
         ):
             codes = [max(-32768, min(32767, round(value / step))) for value in values]
-            self.registers[register : register + 6] = struct.pack("<hhh", *codes) if on else bytes(6)
+            self.registers[register : register + 6] = (
+                struct.pack("<hhh", *codes) if on else bytes(6)
+            )
 
 
 class KellerChip(Chip):
@@ -130,7 +132,5 @@ def plug_thermometer(folder: Path, device: str, celsius: float, *, good: bool = 
     place.mkdir(exist_ok=True)
     data = "72 01 4b 46 7f ff 0e 10 57"
     check = "YES" if good else "NO"
-    (place / "w1_slave").write_text(
-        f"{data} : crc=57 {check}\n{data} t={round(celsius * 1e3)}\n"
-    )
+    (place / "w1_slave").write_text(f"{data} : crc=57 {check}\n{data} t={round(celsius * 1e3)}\n")
     return place

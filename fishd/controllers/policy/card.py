@@ -5,7 +5,7 @@ another tick, for another amplitude or on other pictures than those of its train
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import Annotated, Any, Literal, get_args
 
@@ -14,7 +14,6 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
-from fishd.core import text
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
 from fishd.core.files import MAX_SETTINGS_BYTES
@@ -26,6 +25,7 @@ from fishd.core.schema import (
     nested_too_deeply,
 )
 from fishd.core.signals import Observation
+from fishd.core.text import quoted
 
 CARD_KEY = "fishd.card"
 """Key of the card in the metadata of an ONNX file."""
@@ -76,40 +76,6 @@ class Feature(Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=Tru
         return self.name.removeprefix(READING) if self.name.startswith(READING) else ""
 
 
-class Layout:
-    """Conversion of an observation to the network's input: each feature divided by its scale.
-
-    A reading that is old keeps its latest value; before the first one, its input is 0.
-    """
-
-    def __init__(self, features: tuple[Feature, ...]) -> None:
-        self.features = features
-        self._inputs = [
-            (place, attrgetter(feature.name), 1.0 / feature.scale)
-            for place, feature in enumerate(features)
-            if not feature.reading
-        ]
-        self._readings = [
-            (place, feature.reading, feature.offset, 1.0 / feature.scale)
-            for place, feature in enumerate(features)
-            if feature.reading
-        ]
-
-    def vector(self, observation: Observation) -> NDArray[np.float32]:
-        """Return the input, shape (number of features,), dimensionless."""
-        row = np.zeros(len(self.features), np.float32)
-        self.write(observation, row)
-        return row
-
-    def write(self, observation: Observation, row: NDArray[np.float32]) -> None:
-        """Write the input to an existing array, which is faster."""
-        for place, value, factor in self._inputs:
-            row[place] = value(observation) * factor
-        for place, name, offset, factor in self._readings:
-            if name in observation.readings:
-                row[place] = (observation.readings[name] - offset) * factor
-
-
 def is_even(name: str) -> bool:
     """Return whether an input of this name is the same for the mirrored fish."""
     return name == "fx" or name.startswith(READING)
@@ -131,7 +97,8 @@ class History:
 
     Ticks before the beginning equal the first one. A tick with the time of the latest replaces it.
     A tick that is older, or newer by more than the window, restarts the history, such as after a
-    reset, a pause or a gap.
+    reset, a pause or a gap. A reading that is old keeps its latest value; before the first one, its
+    input is 0.
     """
 
     def __init__(
@@ -144,29 +111,41 @@ class History:
         window: window of ticks
         row: array for the input, shape (ticks × features,); by default a new one
         """
-        self._layout = Layout(features)
+        self._inputs = [
+            (place, attrgetter(feature.name), 1.0 / feature.scale)
+            for place, feature in enumerate(features)
+            if not feature.reading
+        ]
+        self._readings = [
+            (place, feature.reading, feature.offset, 1.0 / feature.scale)
+            for place, feature in enumerate(features)
+            if feature.reading
+        ]
         self._window = window
         self.row = np.zeros(window.ticks * len(features), np.float32) if row is None else row
-        """Input of the network, dimensionless."""
-        self._given = self.row.reshape(window.ticks, len(features))
+        """Input of the network, dimensionless: each feature divided by its scale."""
+        self._ticks = self.row.reshape(window.ticks, len(features))
+        for place, *_ in self._readings:
+            self._ticks[:, place] = 0.0
         self._time = -math.inf
-        self.push: Callable[[Observation], None] = self._only if window.ticks == 1 else self._next
-        """Method that adds the observation of a tick."""
 
     def forget(self) -> None:
         """Restart the history with the next observation."""
         self._time = -math.inf
 
-    def _only(self, observation: Observation) -> None:
-        self._layout.write(observation, self.row)
-
-    def _next(self, observation: Observation) -> None:
-        rows, elapsed = self._given, observation.time - self._time
+    def push(self, observation: Observation) -> None:
+        """Add the observation of a tick."""
+        rows, elapsed = self._ticks, observation.time - self._time
         if elapsed > 0.0:
             rows[1:] = rows[:-1]
-        self._layout.write(observation, rows[0])
+        newest = rows[0]
+        for place, value, factor in self._inputs:
+            newest[place] = value(observation) * factor
+        for place, name, offset, factor in self._readings:
+            if name in observation.readings:
+                newest[place] = (observation.readings[name] - offset) * factor
         if not 0.0 <= elapsed < self._window.span:
-            rows[1:] = rows[0]
+            rows[1:] = newest
         self._time = observation.time
 
 
@@ -243,7 +222,7 @@ class Card(Struct, frozen=True, kw_only=True):
         for feature in self.observation:
             if feature.reading and readings is not None and feature.reading not in readings:
                 raise PolicyError(
-                    f"it needs the reading {text.quoted(feature.reading)}, which this robot does "
+                    f"it needs the reading {quoted(feature.reading)}, which this robot does "
                     f"not have; it has {', '.join(readings) or 'none'}: add a sensor to sensors, "
                     "or rename one of its readings"
                 )
@@ -264,14 +243,14 @@ def encode(card: Card) -> str:
     return msgspec.json.encode(card).decode()
 
 
-def decode(content: str) -> Card:
-    """Return the card in a text; raise `PolicyError` with the problem."""
-    if len(content) > MAX_CARD_CHARACTERS:
+def decode(text: str) -> Card:
+    """Return the card in `text`; raise `PolicyError` with the problem."""
+    if len(text) > MAX_CARD_CHARACTERS:
         raise PolicyError(
-            f"its card has {len(content)} characters; at most {MAX_CARD_CHARACTERS} are permitted"
+            f"its card has {len(text)} characters; at most {MAX_CARD_CHARACTERS} are permitted"
         )
     try:
-        data = msgspec.json.decode(content)
+        data = msgspec.json.decode(text)
     except RecursionError:
         raise PolicyError(_TOO_DEEP) from None
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

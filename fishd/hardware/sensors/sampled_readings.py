@@ -1,6 +1,6 @@
 """Sensor of every driver: a thread samples it, and each tick takes the latest values.
 
-In virtual time `catch_up` samples when it is due, instead of a thread.
+In virtual time `read` samples when it is due, instead of a thread.
 """
 
 import math
@@ -57,13 +57,13 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
         self.stale_after = settings.stale_after or max(
             MIN_STALE_TICKS * tick, MIN_STALE_PERIODS * driver.period
         )
-        self.latest: dict[str, tuple[float, float]] = {}
+        self._latest: dict[str, tuple[float, float]] = {}
         self.doubts: dict[str, str] = {}
         self._samples: dict[str, list[tuple[float, float]]] = {}
         self._misfit = ""
         """Reason why the latest sample does not fit the declared readings; empty if it does."""
         self._period, self._tick = driver.period, tick
-        self._due = clock.monotonic()
+        self._due = clock.monotonic() + 0.5 * driver.period  # far from a tick of virtual time
         if threaded:
             self._start_thread(f"sensor-{name}")
 
@@ -72,10 +72,14 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
         """Reason why the latest attempt to sample failed, one line; empty if it did not."""
         return self._misfit or self._sampler.trouble
 
-    def catch_up(self) -> None:
-        """Take a sample if one is due; for virtual time."""
+    def read(self) -> dict[str, tuple[float, float]]:
+        """Return time [s, monotonic] and value of each reading that is known; never waits.
+
+        The mapping never changes. In virtual time, a sample is taken first, if one is due.
+        """
         if self._thread is None and self._pause() <= 0.0:
             self._step()
+        return self._latest
 
     def _pause(self) -> float:
         due = max(self._due, self._sampler.ready_at)
@@ -94,7 +98,7 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
 
     def _take(self, values: Mapping[str, float], now: float) -> None:
         """Keep the values of a sample, each as the mean over the latest tick."""
-        latest, doubts = dict(self.latest), dict(self.doubts)
+        latest, doubts = dict(self._latest), dict(self.doubts)
         for own_name, value in values.items():
             name = self._names.get(own_name, own_name)
             if name not in self.declared:
@@ -112,7 +116,7 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
             doubts.pop(name, None)
             if doubt := _describe_doubt(name, self.declared[name], number):
                 doubts[name] = doubt
-        self.latest, self.doubts = latest, doubts
+        self._latest, self.doubts = latest, doubts
 
 
 def _describe_doubt(name: str, reading: Reading, value: float) -> str | None:

@@ -5,6 +5,7 @@ import json
 import re
 import signal
 import stat
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -182,6 +183,29 @@ def test_a_token_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     paired.pair(paired.invite("watch"), "first")
     with pytest.raises(DeviceError, match="1 devices are paired"):
         paired.pair(paired.invite("watch"), "second")
+
+
+@pytest.mark.parametrize("seconds", [-86400.0, 86400.0])
+def test_a_step_of_the_clock_neither_ends_nor_revives_a_link(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seconds: float
+) -> None:
+    paired, real = Devices(tmp_path), time.time
+    valid, expired = paired.invite("watch"), paired.invite("watch", seconds=0.0)
+    monkeypatch.setattr(time, "time", lambda: real() + seconds)
+    with pytest.raises(DeviceError, match="was used already, or has expired"):
+        Devices(tmp_path).pair(expired, "late")
+    assert Devices(tmp_path).pair(valid, "in time")[0].scope == "watch"
+
+
+def test_a_link_from_before_the_machine_was_started_again_has_expired(tmp_path: Path) -> None:
+    paired = Devices(tmp_path)
+    token = paired.invite("watch")
+    file = tmp_path / "devices.json"
+    content = json.loads(file.read_text())
+    content["invitations"][0]["boot"] = "an earlier one"
+    file.write_text(json.dumps(content))
+    with pytest.raises(DeviceError, match="was used already, or has expired"):
+        paired.pair(token, "late")
 
 
 def test_a_state_folder_that_others_may_write_is_refused_as_they_could_pair_devices(

@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 from msgspec import UNSET, structs
 from rigs.harness import Rig, Scripted, Wrapped, fragile_rig
+from rigs.scripted_sensor import ScriptedSensor
 
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import ControllerFault, Refused, SensorError, ServoError
-from fishd.core.schema import Reading
 from fishd.core.signals import Extremes, Measurement, Observation, Tick, Truth
 from fishd.hardware.base import Robot
 
@@ -286,22 +286,18 @@ class Restless(Wrapped):
 
     clock = VirtualClock()
     reads = 0
-    name, required, stale_after, trouble = "flow", False, 1.0, ""
-    declared = {"flow": Reading("1", "Flow.")}  # noqa: RUF012
-    doubts: dict[str, str] = {}  # noqa: RUF012
-
-    @property
-    def latest(self) -> dict[str, tuple[float, float]]:
-        return {"flow": (self.clock.now, self.next_values(1)[0])}
-
-    def catch_up(self) -> None:
-        pass
 
     def robot(self) -> Robot:
         return replace(
             super().robot(),
             truth=lambda: Truth(*self.next_values(3)),
-            sensors=(self,),
+            sensors=(self.sensor,),
+        )
+
+    @property
+    def sensor(self) -> ScriptedSensor:
+        return ScriptedSensor(
+            latest=lambda: {"water_temperature": (self.clock.now, self.next_values(1)[0])}
         )
 
     def next_values(self, count: int) -> list[float]:
@@ -332,7 +328,7 @@ def test_no_field_of_a_tick_keeps_a_value_of_the_controller(mode: str, may_stay:
     rig.run(60)  # so that the zero of the force is known
     rig.start("square", frequency=4.9)
     rig.run(39, missed=1, lateness=5e-3)
-    rig.loop.thrust.calibrate(70.0, 0.5)  # since these forces do not determine it
+    rig.loop.perception.thrust.calibrate(70.0, 0.5)  # since these forces do not determine it
     running = rig.run(1, missed=1, lateness=5e-3)[-1]
     leave = {
         "idle": rig.loop.stop,
@@ -363,4 +359,4 @@ def test_only_the_active_controller_warms_up_and_the_angle_stays() -> None:
     rig.start(controller)
     rig.run()
     rig.loop.warm_up()
-    assert (ticks, rig.loop.applied, rig.loop.seq) == ([1], 0.1, 1)
+    assert (ticks, rig.loop.instruction_angle, rig.loop.seq) == ([1], 0.1, 1)

@@ -1,31 +1,14 @@
 """The readings of sensors in the ticks, in status and for controllers; and sensors that fail."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import pytest
 from msgspec import UNSET
 from rigs.harness import Rig, Scripted
+from rigs.scripted_sensor import ScriptedSensor
 
 from fishd.core.schema import Reading
 from fishd.hardware.base import Robot
-
-WATER = Reading("°C", "Temperature of the water.", 0.0, 50.0)
-
-
-@dataclass
-class ScriptedSensor:
-    """A sensor whose samples a test sets."""
-
-    name: str = "water"
-    declared: dict[str, Reading] = field(default_factory=lambda: {"water_temperature": WATER})
-    required: bool = False
-    stale_after: float = 0.525
-    latest: dict[str, tuple[float, float]] = field(default_factory=dict)
-    doubts: dict[str, str] = field(default_factory=dict)
-    trouble: str = ""
-
-    def catch_up(self) -> None:
-        pass
 
 
 class SensorRig(Rig):
@@ -41,8 +24,7 @@ class SensorRig(Rig):
 
     def give(self, value: float, sensor: int = 0) -> None:
         """Let a sensor have a sample of this moment."""
-        (name,) = self.sensors[sensor].declared
-        self.sensors[sensor].latest = {name: (self.now, value)}
+        self.sensors[sensor].give(self.now, value)
 
     def swim(self, *values: float) -> None:
         """Run a tick for each value of the first sensor."""
@@ -71,8 +53,8 @@ def test_every_tick_has_the_power_of_a_simulated_servo() -> None:
 def test_without_sensors_ticks_and_observations_have_no_readings() -> None:
     rig = Rig(wrap=lambda robot: replace(robot, sensors=()))
     assert rig.run(5)[-1].readings is UNSET
-    assert rig.loop.observation
-    assert rig.loop.observation.readings == {}
+    assert rig.loop.perception.observation
+    assert rig.loop.perception.observation.readings == {}
     assert rig.loop.readings.states(rig.now) == {}
 
 

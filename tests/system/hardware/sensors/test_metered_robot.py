@@ -64,11 +64,11 @@ def test_a_thread_reads_a_meter_in_real_time_and_a_read_does_not_wait_for_it() -
         stack.callback(meter.close)
         stack.callback(go.set)
         assert entered.wait(PATIENCE)
-        meter.catch_up()
-        assert meter.latest == {}
+        meter.read()
+        assert meter.read() == {}
         go.set()
-        wait_until(lambda: bool(meter.latest))
-        assert meter.latest["power"][1] == 2.5
+        wait_until(lambda: bool(meter.read()))
+        assert meter.read()["power"][1] == 2.5
 
 
 def test_a_meter_at_the_address_of_the_force_sensor_is_refused() -> None:

@@ -47,9 +47,9 @@ class MeterRig(Board):
         """Run a tick as in virtual time: let the meter sample until the tick, then read it."""
         self.index += 1
         while self.clock.monotonic() < self.index * TICK:
-            meter.catch_up()
+            meter.read()
             self.clock.sleep(1e-3)
-        time, value = meter.latest.get("power", (-1.0, 0.0))
+        time, value = meter.read().get("power", (-1.0, 0.0))
         return value if self.index * TICK - time <= meter.stale_after else None
 
 

@@ -21,7 +21,7 @@ from fishd.core.process.interruption import on_signal
 
 if TYPE_CHECKING:
     from fishd.config import Config
-    from fishd.lab.simulation.free_swim import SwimReport, SwimResult
+    from fishd.lab.swimmer.free_swim import SwimReport, SwimResult
     from fishd.virtual.swimmer.robot import Swimmer
 
 DEFAULT_CHECKPOINT_INTERVAL_S = 5.0
@@ -140,8 +140,8 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
     arguments: configuration, controller, parameters, seconds, settle time, publisher, begun
     Raises `FishdError` and OSError.
     """
-    from fishd.lab.simulation.free_swim import SwimFile
-    from fishd.lab.simulation.free_swim import swim as run
+    from fishd.lab.swimmer.free_swim import SwimFile
+    from fishd.lab.swimmer.free_swim import swim as run
     from fishd.virtual.swimmer import checkpoint, track
 
     target = options.target
