@@ -79,6 +79,8 @@ class Lsm6dsoxChip(Chip):
         self._pointer = 0
 
     def receive(self, data: bytes) -> None:
+        if not data:  # a probe of the address
+            return
         self._pointer = data[0]
         for offset, value in enumerate(data[1:]):
             self.registers[data[0] + offset] = value

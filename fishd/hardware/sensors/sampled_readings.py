@@ -63,7 +63,8 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
         self._misfit = ""
         """Reason why the latest sample does not fit the declared readings; empty if it does."""
         self._period, self._tick = driver.period, tick
-        self._due = clock.monotonic() + 0.5 * driver.period  # far from a tick of virtual time
+        # In virtual time, that is as far as possible from the ticks.
+        self._due = clock.monotonic() + 0.5 * min(driver.period, tick)
         if threaded:
             self._start_thread(f"sensor-{name}")
 
