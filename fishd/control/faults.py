@@ -46,7 +46,7 @@ FAULTS = {
         "mend what the message says, or set required: false",
     ),
     "fish-lost": Fault(
-        "the computation of a swimmer has diverged, or it has left the part of the tank that is "
+        "the computation of a free fish has diverged, or it has left the part of the tank that is "
         "computed well; or a plant of another package has failed",
         "change what the message says, and start fishd again",
     ),

@@ -71,8 +71,8 @@ class Sensor(Protocol):
         """Reasons why readings are doubtful, by name; never changed in place."""
 
     @property
-    def trouble(self) -> str:
-        """Reason why the latest attempt to sample failed, one line; empty if it did not."""
+    def trouble(self) -> str | None:
+        """Reason why the latest attempt to sample failed, one line; None if it did not."""
 
     def read(self) -> Mapping[str, tuple[float, float]]:
         """Return time [s, monotonic] and value of each reading that is known; never waits.

@@ -28,7 +28,7 @@ class ModelPower:
     declared: ClassVar[Mapping[str, Reading]] = {"power": POWER}
     required, stale_after = False, math.inf
     doubts: ClassVar[Mapping[str, str]] = {}
-    trouble = ""
+    trouble = None
 
     def __init__(self, fish: "SimulatedFish") -> None:
         self._fish = fish
@@ -80,7 +80,7 @@ class SimulatedFish:
         if self._watches:
             self._watches = [watch for watch in self._watches if not watch.closed]
             for watch in self._watches:
-                watch.add([Pair(now - duration, now, fx, fy)], "")
+                watch.add([Pair(now - duration, now, fx, fy)], None)
         fx, fy = self.calibration.forces(fx, fy)
         newest, mean_time = now - 0.5 * duration / samples, now - 0.5 * duration
         return Measurement(newest, fx, fy, samples, mean_time=mean_time, span=duration)

@@ -16,7 +16,7 @@ class ScriptedSensor:
     stale_after: float = 0.525
     latest: Callable[[], dict[str, tuple[float, float]]] = dict
     doubts: dict[str, str] = field(default_factory=dict)
-    trouble: str = ""
+    trouble: str | None = None
 
     def read(self) -> dict[str, tuple[float, float]]:
         return self.latest()

@@ -17,7 +17,16 @@ from fishd.core import schema
 from fishd.core.clock import SystemClock
 from fishd.core.console import format_reading
 from fishd.core.errors import ConfigError, MissingPackage, SensorError, ServoError, StartupError
-from fishd.hardware.checks import START_VIRTUAL_PI, Check, Result, fail, ok, skipped, warning
+from fishd.hardware.checks import (
+    START_VIRTUAL_PI,
+    Check,
+    Result,
+    fail,
+    ok,
+    on_this_machine,
+    skipped,
+    warning,
+)
 from fishd.hardware.driver import SensorDriver
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.registry import FORCE_SENSORS, SERVOS, driver_packages
@@ -40,7 +49,7 @@ def checks(context: Context) -> tuple[Check, ...]:
         Check("force", force),
         *(servo.find().checks(servo.settings) or (Check("servo", servo_opens),)),
         *(check for other in others for check in _sensor_checks(other)),
-        Check("gpio pins", pins, ("pi",)),
+        Check("gpio pins", pins, on_this_machine),
     )
 
 
@@ -191,7 +200,7 @@ def _judge_rate(per_tick: float, context: Context, details: str) -> Result:
     return ok(message)
 
 
-def _trial_windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str]]:
+def _trial_windows(sensor: SampledSensor, tick: float) -> Iterator[tuple[int, str | None]]:
     """Yield samples and suspicion of each window, without the first, when the sampler starts."""
     latest: SensorError | None = None
     start = time.monotonic()

@@ -60,8 +60,8 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
         self._latest: dict[str, tuple[float, float]] = {}
         self.doubts: dict[str, str] = {}
         self._samples: dict[str, list[tuple[float, float]]] = {}
-        self._misfit = ""
-        """Reason why the latest sample does not fit the declared readings; empty if it does."""
+        self._misfit: str | None = None
+        """Reason why the latest sample does not fit the declared readings; None if it does."""
         self._period, self._tick = driver.period, tick
         # In virtual time, that is as far as possible from the ticks.
         self._due = clock.monotonic() + 0.5 * min(driver.period, tick)
@@ -69,8 +69,8 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
             self._start_thread(f"sensor-{name}")
 
     @property
-    def trouble(self) -> str:
-        """Reason why the latest attempt to sample failed, one line; empty if it did not."""
+    def trouble(self) -> str | None:
+        """Reason why the latest attempt to sample failed, one line; None if it did not."""
         return self._misfit or self._sampler.trouble
 
     def read(self) -> dict[str, tuple[float, float]]:
@@ -92,7 +92,7 @@ class SampledReadings(SampledPart[Mapping[str, float]]):
         while self._sampler.samples:
             try:
                 self._take(self._sampler.samples.popleft(), now)
-                self._misfit = ""
+                self._misfit = None
             except Exception as error:  # a driver of another package returns anything
                 self._misfit = text.describe_error(error)
         self._due = max(self._due + self._period, now)
