@@ -152,11 +152,10 @@ def settings_of_drivers(section: str) -> dict[str, type[Struct]]:
 
 
 def driver_keys() -> list[str]:
-    """Return the keys of all drivers and plants that load, in dotted form."""
+    """Return the keys of all drivers and plants that load: `servo.gpio`, `sensors.NAME.kind`."""
     return [
-        f"{section}.{field.name}"
+        f"{section}{'.NAME' * (section == SENSOR_SECTIONS)}.{field.name}"
         for section in CHOICES
-        if section != SENSOR_SECTIONS
         for struct in settings_of_drivers(section).values()
         for field in fields_of(struct)
     ]

@@ -108,7 +108,7 @@ def test_a_short_loss_of_its_supply_costs_no_averaging_for_longer(
     for _ in range(round(lasts / TICK)):
         power = rig.tick(meter)
         messages.add(meter.trouble)
-    assert all("lost its settings: its supply was interrupted" in line for line in messages - {None})
+    assert all("its supply was interrupted" in line for line in messages - {None})
     assert rig.meter_chip.config == averages
     assert power == pytest.approx(1.5, rel=0.01)
     assert meter.counters()["power_reconnects"] == 1
