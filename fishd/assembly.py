@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -31,10 +31,11 @@ from fishd.core.signals import Publisher, Truth
 from fishd.hardware import ownership, release_recipe
 from fishd.hardware.base import CalibratedParts, Robot
 from fishd.hardware.calibration_files import CalibrationFolder
-from fishd.hardware.driver import SensorDriver, ServoDriver, read_counters
+from fishd.hardware.driver import ServoDriver, read_counters
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.recipes import Recipes
 from fishd.hardware.registry import FORCE_SENSORS, SENSORS, SERVOS, driver_packages
+from fishd.hardware.sampler import close_all
 from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio
@@ -245,7 +246,8 @@ def assemble(
     folder = CalibrationFolder(state_folder(config))
     for line in folder.ignored():
         log.warning("%s", line)
-    sensors = _open_sensors(config, clock, stack, threaded=threaded)
+    sensors = _open_sensors(config, clock, threaded=threaded)
+    stack.callback(close_all, sensors)
 
     def read_others() -> None:
         """Let the other sensors sample between the samples of the force, in virtual time."""
@@ -322,64 +324,45 @@ def _do_nothing() -> None:
 
 
 def _open_sensors(
-    config: Config, clock: Clock, stack: ExitStack, *, threaded: bool
+    config: Config, clock: Clock, *, threaded: bool, modelled: Iterable[str] = ()
 ) -> "tuple[SampledReadings, ...]":
-    """Return the configured sensors; they need not answer yet."""
+    """Return the configured sensors; they need not answer yet.
+
+    A simulated fish has stand-ins for those that need hardware.
+
+    modelled: readings that the fish has a model of; a sensor with one of them is left out
+    Raises `StartupError` when a package is missing.
+    """
     if not config.sensors:
         return ()
-    from fishd.hardware.sensors.sampled_readings import SampledReadings, close_all, sample_period
+    from fishd.hardware.sensors.sampled_readings import SampledReadings, sample_period
+    from fishd.hardware.sensors.simulated import StandIn
 
-    sensors: list[SampledReadings] = []
-    stack.callback(close_all, sensors)
+    sensors = []
     for name, settings in config.sensors.items():
+        kind, readings = SENSORS.find(settings.kind), readings_of(settings)
+        if readings.keys() & modelled:
+            continue
+        if not (config.kind.has_hardware or kind.is_simulated):
+            kind = StandIn.of(kind)
         with driver_packages(settings.kind):
-            kind = SENSORS.find(settings.kind)
             period = sample_period(kind, settings, config.tick)
             driver = kind(settings, clock, period, f"sensors.{name}")
         sensors.append(
-            SampledReadings(
-                name,
-                driver,
-                readings_of(settings),
-                clock,
-                threaded=threaded,
-                tick=config.tick,
-            )
+            SampledReadings(name, driver, readings, clock, threaded=threaded, tick=config.tick)
         )
     return tuple(sensors)
 
 
 def _with_stand_ins(config: Config, robot: Robot, clock: Clock) -> Robot:
-    """Return a simulated fish with its sensors: stand-ins for those that need hardware.
-
-    A reading that the fish has a model of has no stand-in.
-    """
-    if not config.sensors:
-        return robot
-    from fishd.hardware.sensors.sampled_readings import SampledReadings, sample_period
-    from fishd.hardware.sensors.simulated import StandIn
-
+    """Return a simulated fish with the configured sensors, which its ticks sample."""
     modelled = {name for sensor in robot.sensors for name in sensor.declared}
-    sensors = []
-    for name, settings in config.sensors.items():
-        kind, readings = SENSORS.find(settings.kind), readings_of(settings)
-        if modelled & readings.keys():
-            continue
-        place = sample_period(kind, settings, config.tick), f"sensors.{name}"
-        driver: SensorDriver[Any]
-        if kind.is_simulated:
-            driver = kind(settings, clock, *place)
-        else:
-            driver = StandIn(settings, clock, *place, kind.declare(settings))
-        sensors.append(
-            SampledReadings(name, driver, readings, clock, threaded=False, tick=config.tick)
-        )
+    sensors = _open_sensors(config, clock, threaded=False, modelled=modelled)
     lines = tuple(line for sensor in sensors for line in sensor.limitations)
-    before = robot.limitations
     return dataclasses.replace(
         robot,
         sensors=(*robot.sensors, *sensors),
-        limitations=lambda: (*before(), *lines),
+        limitations=lambda: (*robot.limitations(), *lines),
     )
 
 
@@ -476,7 +459,7 @@ def build_loop(
     Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.
     """
     guard = build_guard(config)
-    if not config.kind.has_hardware:
+    if config.sensors and not config.kind.has_hardware:
         robot = _with_stand_ins(config, robot, clock)
     if robot.calibrated:
         guard.restrict(*robot.calibrated.servo.reach)

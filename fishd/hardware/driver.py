@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from fishd.core.clock import Clock
 from fishd.core.foreign_code import call_foreign
-from fishd.core.schema import Problem, Reading, note, unit
-from fishd.hardware.checks import Check, Machine, Result
+from fishd.core.schema import Problem, Reading, format_reading, note, unit
+from fishd.hardware.checks import Check, Machine, Result, ok
 from fishd.hardware.settings import ForceSensorSettings, Gpio, SensorSettings, ServoSettings
 
 __all__ = [
@@ -227,6 +227,11 @@ class SensorDriver(SampledDriver[R]):
 
     def close(self) -> None:
         """Release the hardware, if `open` took any; see `SampledDriver.close`."""
+
+    def judge(self, values: Mapping[str, float]) -> Result:
+        """Return the result of the check of `fishctl doctor` for a sample, just after it."""
+        units = {name: reading.unit for name, reading in self.declare(self.settings).items()}
+        return ok(", ".join(f"{n} {format_reading(v, units[n])}" for n, v in values.items()))
 
 
 class LastResort(NamedTuple):

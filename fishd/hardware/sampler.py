@@ -2,9 +2,10 @@
 
 import math
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from typing import Any, Generic, TypeVar
 
@@ -118,10 +119,6 @@ class SampledPart(ABC, Generic[X]):
         """Reasons why the samples are not as good as they could be, a line each."""
         return self._driver.limitations
 
-    def begin_to_close(self) -> None:
-        """Ask its thread to end, without waiting for that."""
-        self._closing.set()
-
     def close(self, timeout: float = CLOSE_TIMEOUT_S) -> None:
         """Stop sampling and release the hardware; may be called twice, and never hangs.
 
@@ -154,3 +151,12 @@ class SampledPart(ABC, Generic[X]):
     @abstractmethod
     def _step(self) -> None:
         """Make one attempt to sample."""
+
+
+def close_all(parts: Iterable[SampledPart[Any]]) -> None:
+    """Close parts; wait no longer for many of them that hang than for one."""
+    parts, deadline = list(parts), time.monotonic() + CLOSE_TIMEOUT_S
+    for part in parts:
+        part.close(0.0)
+    for part in parts:
+        part.close(max(0.0, deadline - time.monotonic()))

@@ -7,13 +7,12 @@ import os
 import re
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from typing import Any
 
 from fishd.assembly import open_sensor
 from fishd.cli.doctor.base import ChosenDriver, Context
 from fishd.config.drivers import claims_of
-from fishd.core import schema
 from fishd.core.clock import SystemClock
 from fishd.core.console import format_reading
 from fishd.core.errors import ConfigError, MissingPackage, SensorError, ServoError, StartupError
@@ -48,16 +47,16 @@ def checks(context: Context) -> tuple[Check, ...]:
         *sensor.find().checks(sensor.settings),
         Check("force", force),
         *(servo.find().checks(servo.settings) or (Check("servo", servo_opens),)),
-        *(check for other in others for check in _sensor_checks(other)),
+        *(check for other in others for check in other.find().checks(other.settings)),
+        *map(_sensor_check, others),
         Check("gpio pins", pins, on_this_machine),
     )
 
 
-def _sensor_checks(sensor: ChosenDriver) -> tuple[Check, ...]:
-    """Return the checks of a sensor; a driver without its own is tried for its readings."""
+def _sensor_check(sensor: ChosenDriver) -> Check:
+    """Return the check that a sensor gives readings."""
     name = sensor.section.partition(".")[2]
-    own: tuple[Check, ...] = sensor.find().checks(sensor.settings)
-    return own or (Check(name, lambda context: _sensor_answers(context, name, sensor)),)
+    return Check(name, lambda context: _sensor_answers(context, name, sensor))
 
 
 def _sensor_answers(context: Context, name: str, sensor: ChosenDriver) -> Result:
@@ -71,22 +70,17 @@ def _sensor_answers(context: Context, name: str, sensor: ChosenDriver) -> Result
         return ok(", ".join(values))
     if occupied := context.occupied("reads it"):
         return occupied
-    with context.plugged_in(), driver_packages(sensor.name):
-        driver = sensor.find()(sensor.settings, SystemClock(), TRIAL_S, sensor.section)
-        try:
+    with driver_packages(sensor.name):
+        driver = sensor.find()(sensor.settings, SystemClock(), context.config.tick, sensor.section)
+    try:
+        with context.plugged_in(), closing(driver):
             driver.open()
-            sample = _first_sample(driver)
-        except Exception as error:  # the libraries of drivers raise all kinds of exceptions
-            return fail(driver.explain(error), "mend what this line says")
-        finally:
-            driver.close()
-    readings = driver.declare(sensor.settings)
-    return ok(
-        ", ".join(
-            f"{key} {schema.format_reading(value, readings[key].unit)}"
-            for key, value in sample.items()
-        )
-    )
+            result: Result = driver.judge(_first_sample(driver))
+            return result
+    except StartupError as error:
+        return fail(str(error), START_VIRTUAL_PI)
+    except Exception as error:  # the libraries of drivers raise all kinds of exceptions
+        return fail(driver.explain(error), "mend what this line says")
 
 
 def _first_sample(driver: SensorDriver[Any]) -> Mapping[str, float]:

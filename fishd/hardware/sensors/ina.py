@@ -6,7 +6,6 @@ those assume a certain shunt. The settings of the averages are lost when the chi
 so they are read back at intervals.
 """
 
-import contextlib
 import errno
 import math
 from abc import abstractmethod
@@ -15,10 +14,9 @@ from typing import Annotated, Any, ClassVar, TypeVar
 
 from msgspec import Meta
 
-from fishd.core.clock import Clock, SystemClock
-from fishd.core.errors import StartupError
+from fishd.core.clock import Clock
 from fishd.core.schema import Reading, note, unit
-from fishd.hardware.checks import START_VIRTUAL_PI, Check, Machine, Result, fail, ok, warning
+from fishd.hardware.checks import Result, ok, warning
 from fishd.hardware.sensors.i2c_sensor import I2cSensor, I2cSensorSettings
 from fishd.hardware.settings import POWER
 
@@ -125,33 +123,11 @@ class Ina(I2cSensor[N]):
             )
         return {"power": supply * current}
 
-    @classmethod
-    def checks(cls, settings: N) -> tuple[Check, ...]:
-        """Return the check that the meter answers, which shows what it measures now."""
-        return (Check("power meter", lambda machine: cls._check(machine, settings)),)
-
-    @classmethod
-    def _check(cls, machine: Machine, settings: N) -> Result:
-        from fishd.hardware.registry import driver_packages
-
-        if occupied := machine.occupied("reads it: see power in fishctl status"):
-            return occupied
-        with driver_packages(settings.kind):
-            meter = cls(settings, SystemClock(), 0.01, "its section")
-        try:
-            with machine.plugged_in(), contextlib.closing(meter):
-                meter.open()
-                meter.clock.sleep(3.0 * meter.period)
-                supply, shunt = meter.volts()
-        except StartupError as error:
-            return fail(str(error), START_VIRTUAL_PI)
-        except (OSError, ValueError) as error:
-            return fail(
-                meter.explain(error),
-                f"'i2cdetect -y {settings.bus}' (package i2c-tools) lists which addresses answer",
-            )
-        amps = shunt / settings.shunt
-        reading = f"{supply:.2f} V, {amps * 1e3:.0f} mA at {meter.place}"
+    def judge(self, values: Mapping[str, float]) -> Result:
+        """Do as `SensorDriver.judge`, with voltage and current."""
+        supply, shunt = self.volts()
+        amps = shunt / self.settings.shunt
+        reading = f"{supply:.2f} V, {amps * 1e3:.0f} mA at {self.place}"
         if supply < MIN_SUPPLY_V:
             return warning(
                 f"{reading}: no supply of a servo is behind the shunt",
@@ -159,7 +135,7 @@ class Ina(I2cSensor[N]):
             )
         if amps < -5e-3:
             return warning(f"{reading}: the current is negative", "swap VIN+ and VIN-")
-        return ok(f"{reading}; up to {meter.full_scale / settings.shunt:.3g} A")
+        return ok(f"{reading}; up to {self.full_scale / self.settings.shunt:.3g} A")
 
 
 class Ina219Settings(InaSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):

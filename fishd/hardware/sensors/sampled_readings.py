@@ -4,8 +4,7 @@ In virtual time `read` samples when it is due, instead of a thread.
 """
 
 import math
-import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from fishd.core import text
@@ -13,7 +12,7 @@ from fishd.core.clock import Clock
 from fishd.core.foreign_code import real_number
 from fishd.core.schema import Reading, format_quantity, format_reading
 from fishd.hardware.driver import SensorDriver, SensorSettings
-from fishd.hardware.sampler import CLOSE_TIMEOUT_S, SampledPart
+from fishd.hardware.sampler import SampledPart
 
 MIN_PERIOD_S = 5e-3
 """Shortest default of the time between two samples, which leaves a bus to the forces [s]."""
@@ -129,12 +128,3 @@ def _describe_doubt(name: str, reading: Reading, value: float) -> str | None:
     else:
         return None
     return f"{name} is {format_reading(value, reading.unit)}, {beyond}"
-
-
-def close_all(sensors: Iterable[SampledReadings]) -> None:
-    """Close sensors; wait no longer for many of them that hang than for one."""
-    sensors, deadline = list(sensors), time.monotonic() + CLOSE_TIMEOUT_S
-    for sensor in sensors:
-        sensor.begin_to_close()
-    for sensor in sensors:
-        sensor.close(max(0.0, deadline - time.monotonic()))

@@ -2,11 +2,10 @@
 
 import math
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 from msgspec import Meta
 
-from fishd.core.clock import Clock
 from fishd.core.schema import PRINTABLE, Reading, note, unit
 from fishd.hardware.driver import SensorDriver, SensorSettings
 
@@ -47,28 +46,25 @@ class Simulated(SensorDriver[SimulatedSettings]):
         return {settings.name: settings.value + wave}
 
 
-class StandIn(SensorDriver[SensorSettings]):
+class StandIn(SensorDriver[Any]):
     """Stand-in of a simulated fish for a sensor of the robot: constants within the limits."""
 
-    Settings = SensorSettings
-    is_simulated = True
+    stands_for: ClassVar[type[SensorDriver[Any]]]
 
-    def __init__(
-        self,
-        settings: SensorSettings,
-        clock: Clock,
-        period: float,
-        section: str,
-        readings: Mapping[str, Reading],
-    ) -> None:
-        """readings: those of the sensor"""
-        super().__init__(settings, clock, period, section)
-        self.limitations = (f"{section} is simulated, as the fish is: its readings are constant",)
-        self._values = {name: _middle(reading) for name, reading in readings.items()}
+    @classmethod
+    def of(cls, kind: type[SensorDriver[Any]]) -> type["StandIn"]:
+        """Return the stand-in for a kind of sensor."""
+        return type("StandIn", (cls,), {"stands_for": kind})
+
+    @property
+    def limitations(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Line that says that it is no true sensor."""
+        return (f"{self.section} is simulated, as the fish is: its readings are constant",)
 
     def sample(self) -> dict[str, float]:
         """Return the middle of the limits of each reading."""
-        return self._values
+        readings = self.stands_for.declare(self.settings)
+        return {name: _middle(reading) for name, reading in readings.items()}
 
 
 def _middle(reading: Reading) -> float:

@@ -16,11 +16,12 @@ from rigs.sensor_chips import BUS, Lsm6dsoxChip, SensorBoard, plug_thermometer
 from fishd.core.clock import SystemClock, VirtualClock
 from fishd.core.schema import Reading
 from fishd.hardware.driver import SensorDriver, SensorSettings
+from fishd.hardware.sampler import close_all
 from fishd.hardware.sensors import ds18b20
 from fishd.hardware.sensors.analog import AnalogInput, AnalogSettings
 from fishd.hardware.sensors.ds18b20 import Ds18b20, Ds18b20Settings
 from fishd.hardware.sensors.lsm6dsox import Lsm6dsox, Lsm6dsoxSettings
-from fishd.hardware.sensors.sampled_readings import SampledReadings, close_all
+from fishd.hardware.sensors.sampled_readings import SampledReadings
 from fishd.hardware.sensors.simulated import Simulated, SimulatedSettings
 
 TICK = 0.05
