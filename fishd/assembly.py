@@ -159,9 +159,12 @@ class FishInVirtualTime(NamedTuple):
     """The fish itself if it swims freely."""
 
 
-def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> FishInVirtualTime:
+def open_fish_in_virtual_time(
+    config: Config, stack: ExitStack, *, metered: bool = True
+) -> FishInVirtualTime:
     """Return a simulated fish, free, on its rod or behind a virtual Pi.
 
+    metered: whether the robot `simulated` has a power meter
     Raises `MissingPackage` if a package is missing.
     """
     if config.robot == "swimmer":
@@ -171,7 +174,7 @@ def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> FishInVirtual
         robot, pi = open_in_virtual_time(config, stack)
         return FishInVirtualTime(robot, pi.tank.take_window)
     fish = simulated_fish(config)
-    return FishInVirtualTime(fish.robot(), fish.take_window)
+    return FishInVirtualTime(fish.robot(metered=metered), fish.take_window)
 
 
 def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:

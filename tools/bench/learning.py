@@ -41,13 +41,13 @@ from fishd.config import Config, load
 from fishd.controllers import registry
 from fishd.lab.compare.contestants import Contestant, best_on_grid, parse
 from fishd.lab.compare.survey import FishResult, OtherFish, harsh, mild, survey
-from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.lab.simulation import simulate
 from fishd.learning import settings as training
 from fishd.learning.env.environment import SwimEnv, best_thrust
 from fishd.learning.env.evaluation import Evaluation, judge
 from fishd.learning.export import export
 from fishd.learning.extractors import make_extractor
+from fishd.learning.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder.checkpoints import load_policy
 from fishd.learning.run_folder.tables import best_so_far, read_evaluations

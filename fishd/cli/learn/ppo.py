@@ -227,8 +227,8 @@ def _prepare_job(
     Raises `ConfigError` and `CheckpointError`.
     """
     from fishd.lab.experiment import default_folder
-    from fishd.lab.links.fishd_link import config_of, plant_differences
     from fishd.learning import settings as training
+    from fishd.learning.links.fishd_link import config_of, plant_differences
     from fishd.learning.run_folder import checkpoints, runs
     from fishd.learning.train.jobs import Job
 

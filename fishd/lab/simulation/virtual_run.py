@@ -12,7 +12,7 @@ from fishd import __version__
 from fishd.assembly import build_loop, open_fish_in_virtual_time
 from fishd.config import Config, adopt, load
 from fishd.controllers import registry
-from fishd.core.clock import VirtualClock, virtual_slots
+from fishd.core.clock import Slot, VirtualClock, virtual_slots
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
 from fishd.core.signals import Event, Publisher, Tick
@@ -61,15 +61,19 @@ class KeepingPublisher:
 class VirtualRun:
     """fishd's loop on a simulated fish in virtual time, a tick at a time; a context manager."""
 
-    def __init__(self, config: Config, publisher: Publisher | None) -> None:
-        """publisher: receiver of every tick and event; None to create no messages
+    def __init__(
+        self, config: Config, publisher: Publisher | None, *, metered: bool = True
+    ) -> None:
+        """
+        publisher: receiver of every tick and event; None to create no messages
+        metered: whether the loop reads the power of the servo; False is faster
 
         Raises `MissingPackage`.
         """
         self.config = config
         clock = VirtualClock()
         with ExitStack() as stack:
-            fish = open_fish_in_virtual_time(config, stack)
+            fish = open_fish_in_virtual_time(config, stack, metered=metered)
             self.swimmer = fish.swimmer
             """The free swimmer; None for a tethered fish."""
             self._take_window = fish.take_window
@@ -109,9 +113,13 @@ class VirtualRun:
         limits = replace(self.config.limits, virtual=True)
         self.loop.set_controller(name, registry.create(name, parameters, limits))
 
+    def next_slot(self) -> Slot:
+        """Advance the clock by a tick, for a caller of both halves of a tick of the loop."""
+        return next(self._slots)
+
     def tick(self) -> TrueWindow:
         """Run one tick; return the true motion between its read and the one before."""
-        self.loop.tick(next(self._slots))
+        self.loop.tick(self.next_slot())
         return self._take_window()
 
 

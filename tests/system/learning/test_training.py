@@ -15,9 +15,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from fishd.controllers.policy.card import Layout
 from fishd.core.errors import ConfigError
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import features, thrust_scale
 from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import EnvironmentSettings, EvaluationSettings, PpoSettings
