@@ -32,7 +32,7 @@ def test_a_signal_lets_the_fish_rest(daemon: Daemon, number: int, runs: Path) ->
     assert (process.returncode, out) == (130, f"fish: the fish of fishd at {daemon.endpoint}\n")
     (folder,) = runs.glob("[!.]*")
     resume = f"fishctl compare --resume {folder}"
-    assert err == f"fishctl: interrupted; the fish rests; resume with: {resume}\n"
+    assert err == f"fishctl: interrupted, the fish rests; resume with: {resume}\n"
     assert daemon.status().mode == "idle"
 
 

@@ -20,12 +20,13 @@ from msgspec.structs import replace
 from common.foreign_fish import best_wave, foreign_fish
 from common.report import JOBS, Options, Report, percent, progress, run_cases, table
 from fishd.config import Config, Start, load
+from fishd.core.signals import Event, Tick
+from fishd.lab.compare.comparison import Standing
 from fishd.lab.compare.survey import harsh
-from fishd.lab.experiment import Header, count_attempts, open_experiment
+from fishd.lab.experiment import Header, open_experiment
 from fishd.lab.session import VirtualSession
-from fishd.learning.adapt.adaptation import Adaptation, add_true_thrusts
-from fishd.learning.adapt.state import AdaptFolder, Contender, State, Verdict
-from fishd.learning.adapt.verdict import SQUARE
+from fishd.learning.adapt.adaptation import adapt, add_true_thrusts
+from fishd.learning.adapt.results import SQUARE, Adapted, Verdict
 from fishd.virtual.plant.optimum import best_square_wave
 
 FIRST_SEED = 900
@@ -36,28 +37,32 @@ EQUAL = 0.9999
 """Ratio of thrusts from which two gaits count as equal."""
 
 
-class Adapted(Struct, frozen=True):
+class Result(Struct, frozen=True):
     """Result for one fish."""
 
     seed: int
     best: float
     """Thrust of the best square wave [N]."""
     verdict: Verdict
-    contenders: dict[str, Contender]
-    """Measured and true thrusts, by gait."""
+    gaits: dict[str, Standing]
+    """Measured thrusts, by gait."""
+    true_thrusts: dict[str, float]
+    """True thrusts, by gait [N]."""
     tank_time: float
     """Duration of the adaptation [s]."""
 
     def truth(self, gait: str) -> float:
         """Return the true thrust of a gait [N]."""
-        thrust = self.contenders[gait].true_thrust
-        assert thrust is not None
-        return thrust
+        return self.true_thrusts[gait]
+
+    def errors(self) -> list[float]:
+        """Return the error of the measured thrust of each gait [N]."""
+        return [gait.thrust - self.truth(name) for name, gait in self.gaits.items()]
 
     @property
     def largest(self) -> float:
         """Largest true thrust of the gaits [N]."""
-        return max(map(self.truth, self.contenders))
+        return max(self.true_thrusts.values())
 
     @property
     def includes_best(self) -> bool:
@@ -84,37 +89,39 @@ class _Display:
     def done(self, line: str, amount: float) -> None:
         """Ignore the end of a step."""
 
-    def at(self, amount: float, outcome: str = "") -> None:
-        """Count a tick or a step; raise `_Interruption` at the end."""
+    def at(self, amount: float, outcome: str | None = None) -> None:
+        """Count a step of the training; raise `_Interruption` at the end."""
         self._left -= 1
         if self._left <= 0:
             raise _Interruption
+
+    def tick(self, _: Tick) -> None:
+        """Count a tick."""
+        self.at(0.0)
+
+    def event(self, _: Event) -> None:
+        """Ignore an event."""
 
     def warn(self, line: str) -> None:
         """Ignore a warning."""
 
 
-def _adapt(config: Config, path: Path, steps: int, tank_time: float, ends: list[int]) -> State:
+def _adapt(config: Config, path: Path, steps: int, tank_time: float, ends: list[int]) -> Adapted:
     """Adapt to a fish, interrupted after each of these numbers of ticks, and resumed."""
     header = Header(kind="adapt", on="simulation")
     for attempt, end in enumerate([*ends, None]):
         try:
             with open_experiment(path, header, resume=attempt > 0) as experiment:
-                run = AdaptFolder(experiment)
-                session = VirtualSession(config)
-                session.resume(count_attempts(path) if attempt else 0)
-                with session:
-                    # What interrupted steps swam is swum again, beyond the tank time of one run.
-                    budget = tank_time + run.state.tank_time if attempt else tank_time
-                    Adaptation(session, run, budget, steps, 0, _Display(end)).run()
-                add_true_thrusts(run, config)
-                return run.state
+                display = _Display(end)
+                with VirtualSession(config) as session, session.heard_by(display):
+                    result = adapt(session, experiment, tank_time, steps, 0, display)
+                return add_true_thrusts(result, config)
         except _Interruption:
             continue
     raise AssertionError("the last attempt is not interrupted")
 
 
-def adapted(task: tuple[str, int, int, float, int]) -> Adapted:
+def adapted(task: tuple[str, int, int, float, int]) -> Result:
     """Adapt to one fish.
 
     task: kind, seed, steps of the training, tank time [s], number of interruptions
@@ -129,14 +136,13 @@ def adapted(task: tuple[str, int, int, float, int]) -> Adapted:
         config = replace(load(None, harsh(seed).overrides), start=Start())
         best = best_square_wave(config.plant, config.amplitude_limit).thrust
     with TemporaryDirectory() as folder:
-        state = _adapt(config, Path(folder) / "adapt", steps, tank_time, ends)
-    assert state.verdict
-    progress(f"fish {seed}", state.verdict.claim)
-    contenders = {contender.name: contender for contender in state.contenders}
-    return Adapted(seed, best, state.verdict, contenders, state.tank_time)
+        found = _adapt(config, Path(folder) / "adapt", steps, tank_time, ends)
+    progress(f"fish {seed}", found.verdict.claim)
+    gaits = {gait.contestant: gait for gait in found.gaits}
+    return Result(seed, best, found.verdict, gaits, found.true_thrusts, found.tank_time)
 
 
-def row(result: Adapted) -> list[str]:
+def row(result: Result) -> list[str]:
     """Return the row of the table for one fish."""
     verdict = result.verdict
     chosen = verdict.chosen_gait
@@ -156,26 +162,26 @@ def row(result: Adapted) -> list[str]:
     ]
 
 
-def summary(results: list[Adapted]) -> str:
+def summary(results: list[Result]) -> str:
     """Return medians, worst values and coverage."""
     chosen = [result.truth(result.verdict.chosen_gait) for result in results]
     shares = [thrust / result.best for thrust, result in zip(chosen, results, strict=True)]
     lost = [1.0 - thrust / result.largest for thrust, result in zip(chosen, results, strict=True)]
     decided = [result for result in results if result.verdict.is_decided]
-    policies = [r.truth("policy") / r.best for r in results if "policy" in r.contenders]
+    policies = [r.truth("policy") / r.best for r in results if "policy" in r.gaits]
     claims = [
         result
         for result in results
         if result.verdict.chosen_gait in result.verdict.relative_thrusts
     ]
     gaits = [(result, gait) for result in results for gait in result.verdict.relative_thrusts]
-    thrusts = [contender for result in results for contender in result.contenders.values()]
-    off = [abs(one.thrust - (one.true_thrust or 0.0)) for one in thrusts]
-    total = [one.thrust_ci95 if one.total_ci95 is None else one.total_ci95 for one in thrusts]
+    thrusts = [gait for result in results for gait in result.gaits.values()]
+    off = [abs(error) for result in results for error in result.errors()]
+    total = [gait.known_ci95 or 0.0 for gait in thrusts]
     rows = [
         ["chosen gait, % of the best square wave", *_middle_and_worst(shares, min)],
         ["policy, % of the best square wave", *_middle_and_worst(policies, min)],
-        ["policies that took part", _count(["policy" in r.contenders for r in results])],
+        ["policies that took part", _count(["policy" in r.gaits for r in results])],
         ["verdicts that name a winner", _count([r.verdict.is_decided for r in results])],
         ["winners that are truly the best", _count([r.includes_best for r in decided])],
         ["verdicts that include the best gait", _count([r.includes_best for r in results])],
@@ -190,7 +196,7 @@ def summary(results: list[Adapted]) -> str:
         ],
         [
             "statistical interval of a thrust contains the true value",
-            _count([a <= one.thrust_ci95 for a, one in zip(off, thrusts, strict=True)]),
+            _count([a <= (gait.thrust_ci95 or 0.0) for a, gait in zip(off, thrusts, strict=True)]),
         ],
         [
             "total interval of a thrust contains the true value",
@@ -240,8 +246,8 @@ def measure(options: Namespace) -> Report:
     name = "bench adapt" if options.kind == "harsh" else "bench adapt foreign"
     sections = {name: table(head, map(row, results)), f"{name} summary": summary(results)}
     errors = [
-        (gait.thrust - (gait.true_thrust or 0.0)) / (gait.total_ci95 or gait.thrust_ci95)
+        error / (gait.known_ci95 or math.inf)
         for result in results
-        for gait in result.contenders.values()
+        for gait, error in zip(result.gaits.values(), result.errors(), strict=True)
     ]
     return Report(sections, results, errors={f"adapt, {options.kind} fish": errors})

@@ -225,7 +225,7 @@ def _calibrate(live: LiveThrust, config: Config, wave: Wave) -> None:
     """Measure the wave on this rig, and set its factor as `fishctl measure` does."""
     with VirtualSession(config) as rig:
         measured = measure(rig, *wave, MEASURED_S)
-    live.calibrate(measured.thrust / measured.power, measured.thrust_ci95 / measured.power)
+    live.calibrate(measured.factor, measured.factor_ci95)
 
 
 def _shown(tick: Tick, is_held: bool) -> tuple[float, float] | None:

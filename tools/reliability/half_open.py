@@ -34,7 +34,7 @@ from common.report import Options, Report, progress, table
 from fishd.camera.client import CameraClient
 from fishd.client import Fish, FishError
 from fishd.core.errors import RecordingError
-from fishd.lab.experiment import ROWS
+from fishd.lab.swim_log import SWIMS
 from fishd.recording import open_run
 
 KINDS = ("forgotten", "for some seconds", "for ever")
@@ -293,7 +293,7 @@ def _lost_in_experiment(folder: Path) -> int:
     """Return how many ticks of the swims and rests in the table the recordings lack."""
     seqs = [tick.seq for path in folder.glob("*.mcap*") for tick in open_run(path).ticks]
     lost = 0
-    if (table := folder / ROWS).exists():
+    if (table := folder / SWIMS).exists():
         for row in csv.DictReader(table.read_text().splitlines()):
             stored = sum(int(row["first_tick"]) <= seq <= int(row["last_tick"]) for seq in seqs)
             lost += round(float(row["seconds"]) / TICK_S) - stored

@@ -1,9 +1,10 @@
 """The best gait according to the measurement, and its relative thrust."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from fishd.lab.compare.comparison import Standing
 from fishd.lab.ranking import (
     Candidate,
     complexity,
@@ -18,9 +19,8 @@ from fishd.lab.ranking import (
 )
 from fishd.lab.statistics import Z95
 from fishd.learning.adapt.prior import combine, deviations, is_rejected
-from fishd.learning.adapt.state import Contender, Model, Verdict
+from fishd.learning.adapt.results import SQUARE, Model, Verdict
 
-SQUARE = "square"
 NAMES = {
     "policy": "the policy",
     "swing": "swing",
@@ -28,7 +28,9 @@ NAMES = {
 }
 
 
-def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
+def judge(
+    gaits: Sequence[Standing], model: Model, expected: Mapping[str, Sequence[float]]
+) -> Verdict:
     """Return which gait is the best one, or between which gaits the measurement is undecided.
 
     A gait wins if it thrusts more than all others by more than the intervals of the differences
@@ -40,21 +42,22 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
 
     There is none where the thrust of the square wave does not differ clearly from zero.
 
-    contenders: measured gaits; one is named `square`
+    gaits: measured gaits; one is named `square`
+    expected: as `Adapted.expected_thrusts`
     """
-    square = next(contender for contender in contenders if contender.name == SQUARE)
-    others = [contender for contender in contenders if contender is not square]
+    square = next(gait for gait in gaits if gait.contestant == SQUARE)
+    others = [gait for gait in gaits if gait is not square]
     shares = {
-        contender.name: share
-        for contender in others
-        if (share := _relative_thrust(contender, square, len(others)))
+        gait.contestant: share
+        for gait in others
+        if (share := _relative_thrust(gait, square, len(others)))
     }
-    ranking = rank([_candidate(contender) for contender in contenders])
+    ranking = rank([_candidate(gait) for gait in gaits])
     names = [candidate.name for candidate in ranking.undecided]
     if ranking.is_decided:
         chosen, claim = names[0], _format_win(names[0], shares)
     else:
-        left = _not_excluded_by(contenders, names, model)
+        left = _not_excluded_by(gaits, names, model, expected)
         chosen = left[0]
         reason = _explain_choice(ranking.reason, chosen == names[0], len(left), model)
         claim = format_choice([NAMES[name] for name in names], NAMES[chosen], reason)
@@ -78,41 +81,46 @@ def judge(contenders: Sequence[Contender], model: Model) -> Verdict:
     )
 
 
-def _candidate(contender: Contender) -> Candidate:
+def _candidate(gait: Standing) -> Candidate:
     return Candidate(
-        contender.name, contender.thrust, contender.thrust_ci95, complexity(contender.controller)
+        gait.contestant, gait.thrust, gait.thrust_ci95 or 0.0, complexity(gait.controller)
     )
 
 
 def _relative_thrust(
-    contender: Contender, square: Contender, comparisons: int
+    gait: Standing, square: Standing, comparisons: int
 ) -> tuple[float, float, float] | None:
     """Return a relative thrust with its interval; None where that of the square is near zero."""
-    widths = [half_width(_candidate(gait), comparisons) for gait in (contender, square)]
-    return ratio(contender.thrust, widths[0], square.thrust, widths[1])
+    widths = [half_width(_candidate(each), comparisons) for each in (gait, square)]
+    return ratio(gait.thrust, widths[0], square.thrust, widths[1])
 
 
-def _not_excluded_by(contenders: Sequence[Contender], names: list[str], model: Model) -> list[str]:
+def _not_excluded_by(
+    gaits: Sequence[Standing],
+    names: list[str],
+    model: Model,
+    expected_thrusts: Mapping[str, Sequence[float]],
+) -> list[str]:
     """Return the undecided gaits that the identified fish does not exclude, in their order."""
     if model.standard_error is None or model.is_rejected:
         return names
-    expected = np.array([contender.expected_thrusts for contender in contenders]).T
+    expected = np.array([expected_thrusts.get(gait.contestant, ()) for gait in gaits]).T
     if not expected.size or expected[0].min() <= 0.0:
         return names
-    places = range(len(contenders))
-    measured = np.array([contender.thrust for contender in contenders])
-    ci95 = np.array([contender.thrust_ci95 for contender in contenders])
+    places = range(len(gaits))
+    measured = np.array([gait.thrust for gait in gaits])
+    ci95 = np.array([gait.thrust_ci95 for gait in gaits])
     spread = deviations(expected, model.standard_error)
     if is_rejected(expected[0], spread, places, measured, ci95):
         return names
     thrusts, covariance = combine(expected[0], spread, places, measured, ci95)
-    width = Z95 * widening(len(contenders) * (len(contenders) - 1) // 2)
+    width = Z95 * widening(len(gaits) * (len(gaits) - 1) // 2)
 
     def apart(i: int, j: int) -> float:
         variance = covariance[i, i] + covariance[j, j] - 2.0 * covariance[i, j]
         return width * float(np.sqrt(max(0.0, variance)))
 
-    left = {contenders[k].name for k in not_excluded(thrusts.tolist(), apart)}
+    left = {gaits[k].contestant for k in not_excluded(thrusts.tolist(), apart)}
     return [name for name in names if name in left] or names
 
 

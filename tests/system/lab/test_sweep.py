@@ -30,10 +30,6 @@ MEASURED = select_quantity("live", {}, "N").measured
 SQUARES = [Point("square", {"frequency": value}) for value in (1.25, 5.0 / 3.0, 2.0)]
 
 
-def do_nothing(*_: object) -> None:
-    pass
-
-
 def open_folder(
     path: Path,
     config: Config | None = None,
@@ -50,7 +46,7 @@ def open_folder(
 
 def measure(folder: SweepFolder, points: Sequence[Point], session: VirtualSession) -> None:
     with session:
-        measure_all(folder, points, session, 21.0, do_nothing)
+        list(measure_all(folder, points, session, 21.0))
 
 
 def test_a_simulated_fish_is_judged_by_its_true_thrust_whatever_its_sensor_says() -> None:
@@ -80,7 +76,7 @@ def test_a_rig_that_drifts_is_measured_point_by_point_and_recorded(tmp_path: Pat
     config = load(None, DRIFTS)
     folder = open_folder(tmp_path, config)
     with VirtualSession(config) as session:
-        measure_all(folder, SQUARES, session, 30.0, do_nothing)
+        list(measure_all(folder, SQUARES, session, 30.0))
     for point, truth in zip(SQUARES, (20.57e-3, 25.74e-3, 23.83e-3), strict=True):
         result = folder.results[folder.key(point)]
         assert result.thrust is not None

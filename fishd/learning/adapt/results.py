@@ -1,16 +1,17 @@
-"""The results of an adaptation, and the folder that keeps them from step to step."""
+"""The results of the steps of an adaptation."""
 
 from typing import Any
 
 from msgspec import Struct
 
-from fishd.lab.experiment import Experiment
+from fishd.lab.compare.comparison import Standing
 from fishd.virtual.imperfections import SimulationSettings
 from fishd.virtual.plant.parameters import PlantParameters
 
-STATE = "adapt.json"
 FISH, POLICY, TRAINING = "fish.yaml", "policy.onnx", "training"
-PICTURE, PAGE = "adapt.png", "adapt.html"
+"""Files and folder of the identified fish, the policy and its training."""
+SQUARE = "square"
+"""Name of the gait with the best square wave tried."""
 
 
 class Model(Struct, frozen=True, kw_only=True):
@@ -47,8 +48,8 @@ class Rung(Struct, frozen=True):
     """Whether the search was over."""
 
 
-class Tried(Struct, frozen=True):
-    """The measurement of one square wave of the search."""
+class Wave(Struct, frozen=True):
+    """A square wave that was tried."""
 
     frequency: float
     """[Hz]"""
@@ -56,10 +57,6 @@ class Tried(Struct, frozen=True):
     """[N]"""
     thrust_ci95: float
     """Half-width of the 95 % confidence interval of `thrust` [N]."""
-    swim_ticks: int
-    """Ticks of swimming since the beginning of the search."""
-    tank_time: float
-    """Time since the beginning of the search, rests included [s]."""
 
 
 class Trained(Struct, frozen=True, kw_only=True):
@@ -75,39 +72,6 @@ class Trained(Struct, frozen=True, kw_only=True):
     """Relative thrust on the worst of the tried fish of the cloud."""
     refusal: str = ""
     """Reason why a policy is missing; empty if there is one."""
-
-
-class Contender(Struct, frozen=True, kw_only=True):
-    """A gait, measured on the fish."""
-
-    name: str
-    """`policy`, `swing` or `square`"""
-    controller: str
-    parameters: dict[str, Any]
-    thrust: float
-    """[N]"""
-    thrust_ci95: float
-    """Half-width of the 95 % confidence interval of `thrust` [N]."""
-    calibration_ci95: float | None = None
-    """Half-width of the 95 % interval of `thrust` due to the calibration of the sensor [N].
-
-    It is the same fraction of all thrusts, so it does not affect a relative thrust. None if it is
-    unknown.
-    """
-    total_ci95: float | None = None
-    """Half-width of the 95 % interval from `thrust_ci95` and `calibration_ci95` together [N]."""
-    frequency: float
-    """[Hz]"""
-    seconds: float
-    """Length of the measurement, rests included [s]."""
-    remark: str = ""
-    expected_thrusts: list[float] = []
-    """Simulated thrusts on fish of the cloud, the identified fish first [N]; empty where the
-    cloud is not used."""
-    true_thrust: float | None = None
-    """True thrust, known only of a simulated fish [N]."""
-    true_relative_thrust: float | None = None
-    """`true_thrust` relative to the thrust of the best of all square waves."""
 
 
 class Verdict(Struct, frozen=True, kw_only=True):
@@ -130,39 +94,34 @@ class Verdict(Struct, frozen=True, kw_only=True):
     """The verdict in one or more sentences, without the last full stop."""
 
 
-class State(Struct, kw_only=True, forbid_unknown_fields=True):
-    """The results of the finished steps; a field that is None belongs to a step still to do."""
+class Adapted(Struct, frozen=True, kw_only=True):
+    """The result of an adaptation; the fields are those of the JSON output."""
 
-    tank_time: float = 0.0
-    """Time spent in the tank, rests and failed measurements included [s]."""
-    step_times: dict[str, float] = {}
-    """Time in the tank by step [s]."""
-    excitation: str | None = None
-    """Name of the recording that the fish is fitted to."""
-    fitted: Fitted | None = None
-    swing: Rung | None = None
-    trials: list[Tried] = []
-    """Square waves in the order in which they were tried."""
-    square: float | None = None
-    """Frequency of the best square wave [Hz]."""
-    is_fit_rejected: bool = False
+    tank_time: float
+    """Time in the tank, rests included [s]."""
+    fitted: Fitted
+    is_fit_rejected: bool
     """Whether the square waves tried disagree with the identified fish."""
-    trained: Trained | None = None
-    contenders: list[Contender] = []
-    exclusions: dict[str, str] = {}
+    swing: Rung
+    waves: list[Wave]
+    """Square waves in the order in which they were tried."""
+    trained: Trained
+    gaits: list[Standing]
+    """Measured gaits: `policy`, `swing` and `square`."""
+    left_out: dict[str, str]
     """Reason by name of each gait that could not be measured."""
-    verdict: Verdict | None = None
+    expected_thrusts: dict[str, list[float]]
+    """By gait, simulated thrusts on fish of the cloud, the identified fish first [N].
 
+    Empty where the cloud is not used.
+    """
+    true_thrusts: dict[str, float] = {}
+    """By gait, the true thrust of a simulated fish [N]."""
+    true_relative_thrusts: dict[str, float] = {}
+    """The same, relative to the thrust of the best of all square waves."""
+    verdict: Verdict
 
-class AdaptFolder:
-    """The folder of an adaptation, which stores the result of each finished step in `state`."""
-
-    def __init__(self, experiment: Experiment) -> None:
-        """Read the state; raises `ConfigError` where that fails."""
-        self.path = experiment.path
-        self.experiment = experiment
-        self.state = experiment.read_struct(STATE, State) or State()
-
-    def save(self) -> None:
-        """Write the state; raises `FishdError`."""
-        self.experiment.write_struct(STATE, self.state)
+    @property
+    def chosen(self) -> Standing:
+        """The chosen gait."""
+        return next(gait for gait in self.gaits if gait.contestant == self.verdict.chosen_gait)
