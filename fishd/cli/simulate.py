@@ -8,13 +8,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from fishd.cli.config import fish_options
-from fishd.cli.free_swim import (
-    DEFAULT_SETTLE_S,
-    SimulateGroup,
-    SwimmerOptions,
-    swim,
-    swimmer_options,
-)
 from fishd.cli.options import for_option, json_option
 from fishd.cli.output import (
     echo,
@@ -23,6 +16,13 @@ from fishd.cli.output import (
     format_criterion,
     print_json,
     warn_of_fin,
+)
+from fishd.cli.swimmer.simulation import (
+    DEFAULT_SETTLE_S,
+    SimulateGroup,
+    SwimmerOptions,
+    swim,
+    swimmer_options,
 )
 from fishd.config import Config, load
 from fishd.core.console import format_power

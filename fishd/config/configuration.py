@@ -133,9 +133,7 @@ class ControlSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         str | None,
         note(
             "ZeroMQ address of the ROUTER socket: ipc://PATH or tcp://127.0.0.1:PORT. null: a "
-            "socket named control in $RUNTIME_DIRECTORY, else in $XDG_RUNTIME_DIR/fishd, else in a "
-            "private folder under /tmp. From another machine, use an ssh tunnel, or the section "
-            "network."
+            "socket named control in the folder of the service or of the user."
         ),
     ] = None
     lease: Annotated[

@@ -4,7 +4,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import msgspec
 import zmq
@@ -12,16 +12,15 @@ import zmq
 from fishd.client import Fish
 from fishd.client.zmq_sockets import TELEMETRY_TIMEOUT_S, Subscription, connect_subscriber
 from fishd.core import text
-from fishd.core.camera_frames import Pixels
 from fishd.core.errors import FishError, NoDaemon, RecordingError, Refused
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Status
-from fishd.recording.images import FrameHead
 from fishd.recording.summary import TickHead
 from fishd.recording.writer import CHANNELS, RunWriter
 
 if TYPE_CHECKING:
     from fishd.core.keys import Access
+    from fishd.recording.camera_tap import CameraTap
 
 DRAIN_INTERVAL_S = 0.2
 """Interval at which messages are read from their queue, to wake up rarely [s]."""
@@ -60,30 +59,6 @@ TAKEOVER_MESSAGE = (
 )
 
 
-class NewFrames(NamedTuple):
-    """News and frames of a camera since the previous call."""
-
-    news: list[str]
-    """One line for the user per change of the camera's state."""
-    frames: list[tuple[FrameHead, Pixels]]
-
-
-class FrameSource(Protocol):
-    """A camera whose frames are recorded; its errors never end the recording."""
-
-    def set_time(self, t: float, monotonic: float) -> None:
-        """Set the clock offset from the times of a tick: unix, and on fishd's clock [s]."""
-
-    def take(self) -> NewFrames:
-        """Return the news and frames since the previous call."""
-
-    def count_missing(self) -> int | None:
-        """Return how many published frames have not arrived; None if the camera does not say."""
-
-    def close(self) -> None:
-        """Disconnect; may be called twice."""
-
-
 class Position(NamedTuple):
     """Position of a recorder in the ticks of a fishd."""
 
@@ -105,7 +80,7 @@ class Recorder:
         after: Position | None = None,
         progress: Callable[[RunWriter], None] = lambda writer: None,
         due: Callable[[RunWriter], bool] = lambda writer: False,
-        camera: FrameSource | None = None,
+        camera: "CameraTap | None" = None,
     ) -> None:
         """
         endpoint: control socket of fishd; None for that of this machine
@@ -297,7 +272,7 @@ class Recorder:
         self._doubt(line)
         self.reason = f"{self.reason}; {line}"
 
-    def _take_frames(self, camera: FrameSource) -> None:
+    def _take_frames(self, camera: "CameraTap") -> None:
         news, frames = camera.take()
         for line in news:
             self._tell(line)

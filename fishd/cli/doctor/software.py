@@ -10,7 +10,7 @@ from fishd.cli.doctor.base import Context, sudo_unless
 from fishd.core.errors import MissingPackage, StartupError, install_command
 from fishd.hardware import header
 from fishd.hardware.checks import Check, Result, fail, ok, warning
-from fishd.hardware.panel_pins import ChipPins, find_chip, find_pins
+from fishd.hardware.panel_pins import find_chip
 from fishd.hardware.registry import PACKAGES
 
 _MODULES = {package: module for module, package in PACKAGES.items()} | {
@@ -70,7 +70,7 @@ def packages(context: Context) -> Result:
 
 
 def gpio_package(context: Context) -> Result | None:
-    """Check the packages for pins of the header: gpiod for the panel, RPi.GPIO for drivers."""
+    """Check the packages with which drivers use pins of the header."""
     drivers = [
         settings.driver
         for _, plugins, settings in context.drivers
@@ -90,15 +90,10 @@ def gpio_package(context: Context) -> Result | None:
             f"{install_command('rpi-lgpio')}; or rpi-gpio, on a Pi 4 and older",
         )
     used = installed if drivers else []
-    if context.config.panel.has_pins:
-        try:
-            used = sorted({*used, *(["gpiod"] if find_pins() is ChipPins else installed)})
-        except MissingPackage as error:
-            return fail(str(error), install_command("pi"))
     if "RPi.GPIO" in used and "Raspberry Pi 5" in context.model:
         return fail(
             "RPi.GPIO does not work on a Pi 5",
-            f"{pip} uninstall RPi.GPIO; {install_command('rpi-lgpio' if drivers else 'pi')}",
+            f"{pip} uninstall RPi.GPIO; {install_command('rpi-lgpio')}",
         )
     return ok(", ".join(used)) if used else None
 
@@ -108,9 +103,9 @@ def gpio_chip(context: Context) -> Result | None:
     if not context.config.panel.has_pins:
         return None
     try:
-        return ok(find_chip()) if find_pins() is ChipPins else None
-    except MissingPackage:  # `gpio_package` reports it
-        return None
+        return ok(find_chip())
+    except MissingPackage as error:
+        return fail(str(error), install_command("pi"))
     except StartupError as error:
         problem, _, remedy = str(error).partition("; ")
         return fail(problem, remedy)

@@ -5,16 +5,15 @@ import shutil
 import signal
 import sys
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 from msgspec.structs import asdict
 
-from fishd.cli.camera.options import camera_option
 from fishd.cli.options import Utf8Text, endpoint_option, for_option, json_option
 from fishd.cli.output import echo, format_count, print_json
 from fishd.cli.recording.files import folder_option
@@ -27,9 +26,8 @@ from fishd.recording.folder import ensure_folder, open_new, recording_path, runs
 from fishd.recording.recorder import MIN_FREE_BYTES, Position, Recorder
 
 if TYPE_CHECKING:
-    from fishd.lab.camera_tap import CameraTap
+    from fishd.recording.camera_tap import CameraTap
 
-F = TypeVar("F", bound=Callable[..., Any])
 UNIT_BYTES = {"MB": 10**6, "GB": 10**9}
 INCOMPLETE = 3
 """Exit status of a recorder that lost ticks or frames, or may have."""
@@ -62,27 +60,6 @@ class BlackBoxSize(click.ParamType[int]):
         return round(size)
 
 
-def _recording_options(function: F) -> F:
-    """Add RUN, and the options of every verb that records."""
-    for decorate in (
-        json_option,
-        for_option("End by itself after this time [s]; by default Ctrl-C ends it."),
-        click.option("--note", type=Utf8Text(), default="", help="Purpose of the recording."),
-        click.option("--subject", type=Utf8Text(), default="", help="Name or number of the fish."),
-        click.option(
-            "--operator",
-            type=Utf8Text(),
-            default="",
-            help="Name of the operator; default: this user.",
-        ),
-        folder_option,
-        endpoint_option,
-        click.argument("run", required=False),
-    ):
-        function = decorate(function)
-    return function
-
-
 class _Record(click.Command):
     """Verb whose `--camera` may stand alone: the next word is an address if it looks like one."""
 
@@ -96,7 +73,16 @@ class _Record(click.Command):
 
 
 @click.command(cls=_Record)
-@_recording_options
+@click.argument("run", required=False)
+@endpoint_option
+@folder_option
+@click.option(
+    "--operator", type=Utf8Text(), default="", help="Name of the operator; default: this user."
+)
+@click.option("--subject", type=Utf8Text(), default="", help="Name or number of the fish.")
+@click.option("--note", type=Utf8Text(), default="", help="Purpose of the recording.")
+@for_option("End by itself after this time [s]; by default Ctrl-C ends it.")
+@json_option
 @click.option(
     "--camera",
     metavar="[ADDRESS]",
@@ -158,40 +144,13 @@ def record(
 
         _record_endlessly(open_recorder, has_room, _StopSignals(), seconds, as_json)
         return
-    if camera is None:
-        _record_one(run, endpoint, folder, begin, seconds, as_json)
-        return
-    from fishd.lab.camera_tap import CameraTap
+    with ExitStack() as stack:
+        tap = None
+        if camera is not None:
+            from fishd.recording.camera_tap import CameraTap
 
-    with CameraTap(camera or None, endpoint) as tap:
+            tap = stack.enter_context(CameraTap(camera or None, endpoint))
         _record_one(run, endpoint, folder, begin, seconds, as_json, tap)
-
-
-@click.command("record")
-@_recording_options
-@camera_option
-def record_camera(
-    run: str | None,
-    endpoint: str | None,
-    folder: Path | None,
-    operator: str,
-    subject: str,
-    note: str,
-    seconds: float | None,
-    as_json: bool,
-    address: str | None,
-) -> None:
-    """Record a running fish and the frames of the camera above it in one file.
-
-    RUN is a name in the folder of recordings or a path; by default the date and time. As `fishctl
-    record --camera`. If the camera is lost, the recording goes on; the loss is reported and
-    counted, and the exit status is 3.
-    """
-    from fishd.lab.camera_tap import CameraTap
-
-    begin = partial(RunWriter, operator=operator, subject=subject, note=note)
-    with CameraTap(address, endpoint) as camera:
-        _record_one(run, endpoint, folder, begin, seconds, as_json, camera)
 
 
 def _record_one(
@@ -201,7 +160,7 @@ def _record_one(
     begin: Callable[[Path], RunWriter],
     seconds: float | None,
     as_json: bool,
-    camera: "CameraTap | None" = None,
+    camera: "CameraTap | None",
 ) -> None:
     """Record until a signal, or until a time has passed.
 

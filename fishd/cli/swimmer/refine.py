@@ -15,9 +15,9 @@ from fishd.controllers import registry
 from fishd.core import text
 from fishd.core.errors import FishdError, ParameterError
 from fishd.lab.sweep.grid import Lengths, Point
-from fishd.lab.sweep.measuring import swim_freely
 from fishd.lab.swimmer import refinement
 from fishd.lab.swimmer.refinement import Estimate, GridSpeed, Refinement
+from fishd.lab.swimmer.speed import swim_freely
 
 
 def refine_options(function: F) -> F:

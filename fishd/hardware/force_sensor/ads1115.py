@@ -72,8 +72,7 @@ class Ads1115Settings(ForceSensorSettings, frozen=True, forbid_unknown_fields=Tr
         unit(
             "V",
             "Voltage of the input at or above which its amplifier counts as saturated; null for "
-            "none. With a full_scale of 4.096 or 6.144, an amplifier at 3.3 V saturates before "
-            "the ADC clips.",
+            "none.",
         ),
     ] = 3.2
     data_rate: Annotated[

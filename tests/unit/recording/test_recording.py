@@ -24,7 +24,7 @@ from fishd.core.signals import Tick
 from fishd.recording import Gap, RunWriter, open_run, read
 from fishd.recording import recorder as recorder_module
 from fishd.recording.folder import find_recording, list_recordings, read_overview, read_overviews
-from fishd.recording.recorder import TAKEOVER_MESSAGE, Description, NewFrames, Recorder
+from fishd.recording.recorder import TAKEOVER_MESSAGE, Description, Recorder
 from fishd.recording.recover import recover
 from fishd.recording.summary import Tally
 
@@ -330,8 +330,8 @@ def test_what_fishd_could_not_be_told_of_the_camera_it_is_told_later(
     class Camera:
         news: ClassVar = [["it is gone"], [], ["it is back", "and again"], ["and well"]]
 
-        def take(self) -> NewFrames:
-            return NewFrames(self.news.pop(0), [])
+        def take(self) -> tuple[list[str], list[None]]:
+            return self.news.pop(0), []
 
     monkeypatch.setattr(recorder_module, "Fish", Fishd)
     recorder = Recorder(None, partial(RunWriter, tmp_path / "run"), tell=lambda line: None)

@@ -11,8 +11,8 @@ from rigs.reversed_force import reversed_robot
 from fishd.controllers import registry
 from fishd.controllers.base import Limits
 from fishd.core.errors import ParameterError, RecordingError
-from fishd.lab.rerun import Rerun, rerun
 from fishd.recording import RunWriter, open_run
+from fishd.recording.rerun import Rerun, rerun
 
 
 def rerun_of(rig: Rig, path: Path) -> Rerun:
@@ -60,7 +60,7 @@ def test_a_reversed_force_that_was_corrected_is_corrected_again(tmp_path: Path, 
     rig.run_for(3)
     rig.start("swing")
     rig.run_for(5)
-    assert rig.loop.fy_corrected
+    assert rig.loop.perception.estimator.fy_corrected
     result = rerun_of(rig, tmp_path / "run")
     assert [(stretch.equal, stretch.ticks) for stretch in result.stretches] == [(100, 100)]
     assert result.estimates.equal == result.estimates.ticks == len(rig.recorder.ticks)
@@ -68,7 +68,7 @@ def test_a_reversed_force_that_was_corrected_is_corrected_again(tmp_path: Path, 
 
 def test_a_thrust_that_was_held_by_a_measured_factor_is_held_by_it_again(tmp_path: Path) -> None:
     rig = Rig("simulation.noise=0.002")
-    rig.loop.thrust.calibrate(68.0, 0.5)
+    rig.loop.perception.thrust.calibrate(68.0, 0.5)
     rig.start("thrust", target=0.01)
     rig.run_for(10)
     stretch = rerun_of(rig, tmp_path / "run").stretches[0]
@@ -161,7 +161,7 @@ def test_a_new_zero_of_the_force_sensor_is_one_for_the_rerun_too(tmp_path: Path)
     robot.fy = 1.0
     rig.run_for(3)
     robot.fy = None
-    rig.loop.forget_force(scale=False)
+    rig.loop.perception.forget_force(scale=False)
     rig.loop.reporter.event("calibration", "force sensor: a.yaml", file="a.yaml")
     rig.run_for(1)
     rig.start("swing")
@@ -183,6 +183,6 @@ def test_time_stands_still_for_a_controller_only_where_it_did(
         seen.append(limits.virtual)
         return registry.create(name, parameters, limits)
 
-    monkeypatch.setattr("fishd.lab.rerun.registry", SimpleNamespace(create=create))
+    monkeypatch.setattr("fishd.recording.rerun.registry", SimpleNamespace(create=create))
     rerun(open_run(path))
     assert seen == [virtual]
