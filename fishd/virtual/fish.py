@@ -55,7 +55,7 @@ class SimulatedFish:
         if self._watches:
             self._watches = [watch for watch in self._watches if not watch.closed]
             for watch in self._watches:
-                watch.add([Pair(now - duration, now, fx, fy)], "")
+                watch.add([Pair(now - duration, now, fx, fy)], None)
         fx, fy = self.calibration.forces(fx, fy)
         newest, mean_time = now - 0.5 * duration / samples, now - 0.5 * duration
         return Measurement(newest, fx, fy, samples, mean_time=mean_time, span=duration)
@@ -108,8 +108,8 @@ class SimulatedFish:
         state = self.fish.state
         return Truth(alpha=state.alpha, alpha_rate=state.alpha_rate, phi=state.phi)
 
-    def robot(self, *, metered: bool = True) -> Robot:
-        """Return the robot of the loop; metered: with a power meter, if the fish has a motor."""
+    def robot(self) -> Robot:
+        """Return the robot of the loop, with a power meter if the fish has a motor."""
         return Robot(
             name="simulated",
             sensor=self,
@@ -117,5 +117,5 @@ class SimulatedFish:
             truth=self.truth,
             tared=self,
             prepare=self.prepare,
-            power=self.power if metered and self.fish.parameters.model == TETHERED else None,
+            power=self.power if self.fish.parameters.model == TETHERED else None,
         )

@@ -1,5 +1,6 @@
 """The control loop of fishd on a simulated fish in virtual time; its ticks, also as a table."""
 
+import dataclasses
 import os
 from collections.abc import Mapping
 from contextlib import ExitStack
@@ -73,11 +74,10 @@ class VirtualRun:
         self.config = config
         clock = VirtualClock()
         with ExitStack() as stack:
-            fish = open_fish_in_virtual_time(config, stack, metered=metered)
-            self.swimmer = fish.swimmer
-            """The free swimmer; None for a tethered fish."""
-            self._take_window = fish.take_window
-            self.loop = build_loop(config, fish.robot, clock, publisher)
+            robot, self.fish = open_fish_in_virtual_time(config, stack)
+            """The fish itself, as `RobotKind.open` describes it."""
+            robot = robot if metered else dataclasses.replace(robot, power=None)
+            self.loop = build_loop(config, robot, clock, publisher)
             stack.callback(self.loop.close)
             self._stack = stack.pop_all()
         self._slots = virtual_slots(clock, config.tick)
@@ -120,7 +120,8 @@ class VirtualRun:
     def tick(self) -> TrueWindow:
         """Run one tick; return the true motion between its read and the one before."""
         self.loop.tick(self.next_slot())
-        return self._take_window()
+        window: TrueWindow = self.fish.take_window()
+        return window
 
 
 def check_length(what: str, seconds: float) -> None:
