@@ -42,7 +42,7 @@ DEFAULT_STEPS = 6400
         is_flag=True,
         help="Live: leave the fish at rest at the end. [default: swim the chosen gait]",
     ),
-    plot="fit, search, training and comparison",
+    plot="command, fin, force and thrust of each gait",
     keeps_simulations=True,
 )
 def adapt(budget: float, steps: int, seed: int, no_command: bool, run: Run) -> None:
@@ -59,14 +59,15 @@ def adapt(budget: float, steps: int, seed: int, no_command: bool, run: Run) -> N
     for package in ("onnxruntime", "tensorboard"):  # before the fish swims
         import_module(package)
     from fishd.lab.session import LiveSession
-    from fishd.learning.adapt import adaptation, figure
+    from fishd.learning.adapt import adaptation
 
     run.fish.refuse_other({}, {"--no-command": no_command})
     session = run.session()
     session.check_calibrated()
     run.open({"budget": budget, "steps": steps, "seed": seed})
     with run.swimming(budget, "s of tank time") as show:
-        adapted = adaptation.adapt(session, run.experiment, budget, steps, seed, show)
+        paths = run.pictures("gaits")
+        adapted = adaptation.adapt(session, run.experiment, budget, steps, seed, show, paths)
     run.check(f"{session.used:.0f} s of tank time are kept")
     if run.fish.on == "simulation":
         adapted = adaptation.add_true_thrusts(adapted, run.fish.load())
@@ -78,8 +79,6 @@ def adapt(budget: float, steps: int, seed: int, no_command: bool, run: Run) -> N
         lambda: _print_result(adapted),
         kept=msgspec.to_builtins(adapted) | measured | summary,
     )
-    paths = run.pictures("adapt")
-    figure.draw(paths, adapted, run.folder, session.amplitude)
     run.echo_pictures(paths)
     again = f"to swim it again: {format_command(chosen, run.fish)}"
     if isinstance(session, LiveSession) and not no_command:
@@ -108,8 +107,7 @@ def format_command(gait: "Standing", fish: ChosenFish) -> str:
 
 
 def _print_result(adapted: "Adapted") -> None:
-    claim = adapted.verdict.claim
-    echo(f"{claim[0].upper()}{claim[1:]}.")
+    echo(f"Verdict: {adapted.verdict}.")
     for name, thrust in adapted.true_thrusts.items():
         share = adapted.true_relative_thrusts[name]
         echo(f"{name}: truly {1e3 * thrust:.2f} mN, {share:.1%} of the best of all square waves")

@@ -164,7 +164,7 @@ def _swim(task: _Task, run: Run) -> _Outcome:
     run.open(task.settings(chosen))
     with run.swimming(len(accepted) * runs * task.seconds, "s swum") as bar:
         result = comparison.compare(config, accepted, task.seconds, settle, runs, bar.at, camera)
-    run.check("the fish are simulated again")
+    run.check("before the end of all runs")
     omitted = [(*pair, 0) for pair in left_out]
     return _Outcome(*result, omitted, config.amplitude_limit, is_random=is_random)
 

@@ -5,6 +5,7 @@ log, and swims those of a simulated fish again. Fit and training, which take min
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from msgspec.structs import replace
 
@@ -13,10 +14,13 @@ from fishd.core import text
 from fishd.core.errors import FishdError
 from fishd.lab.compare.comparison import Standing
 from fishd.lab.compare.contestants import Contestant
+from fishd.lab.compare.figures import draw as draw_gaits
 from fishd.lab.compare.live import LiveComparison
 from fishd.lab.error_budget import format_thrust
 from fishd.lab.experiment import Experiment, Progress
 from fishd.lab.identification import experiment as swim_excitation
+from fishd.lab.identification.figure import draw as draw_fit
+from fishd.lab.optimise.figure import draw as draw_search
 from fishd.lab.session import Session
 from fishd.lab.simulation import simulate
 from fishd.lab.swim_plan import MEAN_REST_S
@@ -31,6 +35,7 @@ from fishd.learning.adapt.results import (
     Trained,
 )
 from fishd.learning.adapt.verdict import judge
+from fishd.learning.run_folder.figure import draw as draw_training
 
 _BY_MEASUREMENT = "the fit is not used, the gaits are chosen by measurement alone"
 _SIMULATED_FISH = 8
@@ -44,6 +49,7 @@ def adapt(
     training_steps: int,
     seed: int,
     show: Progress,
+    pictures: Sequence[Path] = (),
 ) -> Adapted:
     """Adapt to one fish, from its first swim to the verdict.
 
@@ -51,6 +57,7 @@ def adapt(
     tank_time: time for all steps that need the fish, rests included [s]; at least 150, so that the
         excitation takes 30, the shortest time that a fit accepts
     training_steps: number of steps of the training
+    pictures: files of the picture of the comparison; the other steps have theirs in the folder
 
     Raises `Unidentifiable`, `FishdError` where the tank time is used up, `Disturbed`, `NoDaemon`
     and `ConfigError`; earlier measurements are kept.
@@ -82,6 +89,7 @@ def adapt(
         except (ArithmeticError, ValueError) as error:  # the numerics of a fit
             return steps.without_fit(f"the fit failed: {text.describe_error(error)}")
         folder.write(FISH, fish.to_yaml("fishctl adapt"))
+        draw_fit(fish, folder.path / "fit.png")
         return fitted
 
     fitted = folder.once("fit.json", Fitted, fit)
@@ -104,6 +112,7 @@ def adapt(
     budget = max(steps.BUDGET["search"] * tank_time, steps.min_search_time(session, search))
     waves = steps.search_square_waves(session, search, budget)
     frequency, is_used = steps.best_of(search, waves, fitted, session.amplitude)
+    draw_search([folder.path / "search.png"], search, search.propose(), {}, "thrust (mN)")
     is_rejected = is_fitted and not is_used
     basis = "in agreement with the fit" if is_used else "from these waves alone"
     basis = "they contradict the fit, which is not used" if is_rejected else basis
@@ -133,6 +142,7 @@ def adapt(
         on_worst = "" if worst is None else f", {worst:.1%} on the worst tried"
         cloud = f"{len(fitted.cloud)} fish within the errors of the fit"
         done(f"training on {cloud}: {trained.relative_thrust:.1%} in simulation{on_worst}")
+        draw_training(folder.path / "training.png", folder.path / trained.folder)
 
     say("measuring the gaits")
     policy = None if trained.refusal else str((folder.path / POLICY).absolute())
@@ -146,6 +156,8 @@ def adapt(
         show.warn(f"fishctl: {name}: left out: {reason}")
     for gait in gaits:
         done(f"{gait.contestant}: {format_thrust(gait, session.unit)} at {gait.frequency:.3f} Hz")
+    for path in pictures:
+        draw_gaits(path, gaits, live.traces(), session.amplitude, session.unit)
     for name, remark in live.remarks():
         show.warn(f"fishctl: {name}: {remark}")
 
@@ -159,6 +171,7 @@ def adapt(
                 f"{text.describe_error(error)}"
             )
     model = replace(fitted.model, is_rejected=is_rejected)
+    verdict = judge(gaits, model, expected)
     return Adapted(
         tank_time=session.used,
         fitted=replace(fitted, model=model),
@@ -169,7 +182,8 @@ def adapt(
         gaits=gaits,
         left_out=left_out,
         expected_thrusts=expected,
-        verdict=judge(gaits, model, expected),
+        verdict=verdict.sentence,
+        undecided=verdict.best,
     )
 
 

@@ -74,26 +74,6 @@ class Trained(Struct, frozen=True, kw_only=True):
     """Reason why a policy is missing; empty if there is one."""
 
 
-class Verdict(Struct, frozen=True, kw_only=True):
-    """The chosen gait and the reason; thrusts are relative to the best square wave found."""
-
-    chosen_gait: str
-    """Name of the winner, or of the gait chosen from `undecided_gaits`."""
-    is_decided: bool
-    """Whether the measurement alone shows that `chosen_gait` is the best gait."""
-    undecided_gaits: list[str]
-    """Names of the gaits that may be the best according to the measurement, simplest first."""
-    relative_thrust: float | None
-    """Relative thrust of the chosen gait; None if the square wave hardly thrusts."""
-    relative_thrust_ci95_low: float | None
-    """Lower end of the 95 % interval of `relative_thrust`, valid whichever gait is chosen."""
-    relative_thrust_ci95_high: float | None
-    relative_thrusts: dict[str, tuple[float, float, float]]
-    """Relative thrust, and its interval, of each gait except the square wave."""
-    claim: str
-    """The verdict in one or more sentences, without the last full stop."""
-
-
 class Adapted(Struct, frozen=True, kw_only=True):
     """The result of an adaptation; the fields are those of the JSON output."""
 
@@ -119,9 +99,12 @@ class Adapted(Struct, frozen=True, kw_only=True):
     """By gait, the true thrust of a simulated fish [N]."""
     true_relative_thrusts: dict[str, float] = {}
     """The same, relative to the thrust of the best of all square waves."""
-    verdict: Verdict
+    verdict: str
+    """The verdict in a sentence, without the full stop."""
+    undecided: tuple[str, ...]
+    """Names of the gaits that may be the best, the chosen one first."""
 
     @property
     def chosen(self) -> Standing:
         """The chosen gait."""
-        return next(gait for gait in self.gaits if gait.contestant == self.verdict.chosen_gait)
+        return next(gait for gait in self.gaits if gait.contestant == self.undecided[0])
