@@ -110,8 +110,11 @@ def compare(
     run.fish.refuse_other(
         {"--settle": settle, "--camera-config": camera_config}, {"--agent": agent}
     )
-    task = _Task(contestants, seconds, settle, runs, camera_config or camera)
-    outcome = _measure(task, run, agent) if run.fish.on == "live" else _swim(task, run)
+    settings = {"for": seconds, "settle": settle}
+    if run.fish.on == "live":
+        outcome = _measure(run, contestants, settings, runs or 1, camera, agent)
+    else:
+        outcome = _swim(run, contestants, settings, runs, camera_config)
     status = _report(outcome, runs or 1, run)
     if run.picture and outcome.standings:
         from fishd.lab.compare.figures import draw
@@ -119,36 +122,26 @@ def compare(
         draw(run.picture, outcome.standings, outcome.traces, outcome.amplitude, outcome.unit)
     run.check()
     if outcome.error:
-        run.ending.leave(str(outcome.error), 1)
+        run.ending.end_verb(str(outcome.error), 1)
     return status
 
 
-class _Task(NamedTuple):
-    texts: tuple[str, ...]
-    seconds: float
-    settle: float | None
-    runs: int | None
-    camera: str | None
-    """File of a simulated camera; address of the camera of a live fish."""
-
-    def settings(self, chosen: "list[Contestant]") -> dict[str, Any]:
-        """Return what the runs depend on; there may be more of them when it is resumed."""
-        return {
-            "contestants": list(map(list, chosen)),
-            "for": self.seconds,
-            "settle": self.settle,
-        }
-
-
-def _swim(task: _Task, run: Run) -> _Outcome:
+def _swim(
+    run: Run,
+    texts: tuple[str, ...],
+    settings: dict[str, Any],
+    runs: int | None,
+    camera_file: str | None,
+) -> _Outcome:
+    """Swim simulated fish, and return their standings."""
     from fishd.camera import settings as cameras
     from fishd.lab.compare import comparison
     from fishd.lab.compare.contestants import is_missing, parse_all, refusal
 
-    config, camera = run.fish.load(), cameras.load_simulated(task.camera)
+    config, camera = run.fish.load(), cameras.load_simulated(camera_file)
     check_tethered(config.robot, "compare")
-    chosen = parse_all(task.texts) or _default_contestants(config)
-    _check_camera(task.camera, chosen)
+    chosen = parse_all(texts) or _default_contestants(config)
+    _check_camera(camera_file, chosen)
     left_out = [
         (contestant, reason) for contestant in chosen if (reason := refusal(config, contestant))
     ]
@@ -157,33 +150,42 @@ def _swim(task: _Task, run: Run) -> _Outcome:
             raise reason  # a misspelt path is not a policy for another fish
     refused = [contestant for contestant, _ in left_out]
     accepted = [contestant for contestant in chosen if contestant not in refused]
-    settle = DEFAULT_SETTLE_S if task.settle is None else task.settle
+    seconds, settle = settings["for"], settings["settle"]
+    settle = DEFAULT_SETTLE_S if settle is None else settle
     is_random = config.simulation.is_random
     differ = any(comparison.depends_on_seed(contestant, is_random) for contestant in accepted)
-    runs = task.runs or (DEFAULT_RUNS if differ and len(accepted) > 1 else 1)
-    run.open(task.settings(chosen))
-    with run.swimming(len(accepted) * runs * task.seconds, "s swum") as bar:
-        result = comparison.compare(config, accepted, task.seconds, settle, runs, bar.at, camera)
+    runs = runs or (DEFAULT_RUNS if differ and len(accepted) > 1 else 1)
+    run.open(settings | {"contestants": list(map(list, chosen))})
+    with run.swimming(len(accepted) * runs * seconds, "s swum") as bar:
+        result = comparison.compare(config, accepted, seconds, settle, runs, bar.at, camera)
     run.check("before the end of all runs")
     omitted = [(*pair, 0) for pair in left_out]
     return _Outcome(*result, omitted, config.amplitude_limit, is_random=is_random)
 
 
-def _measure(task: _Task, run: Run, agent: str | None) -> _Outcome:
+def _measure(
+    run: Run,
+    texts: tuple[str, ...],
+    settings: dict[str, Any],
+    runs: int,
+    camera: str | None,
+    agent: str | None,
+) -> _Outcome:
+    """Measure a live fish, and return the standings until an error or a signal."""
     from fishd.lab.compare.contestants import absolute, parse_all
     from fishd.lab.compare.live import LiveComparison
 
-    error, runs = None, task.runs or 1
-    chosen = list(map(absolute, parse_all(task.texts)))
-    session = run.session(camera=task.camera, agent=agent)
+    error, seconds = None, settings["for"]
+    chosen = list(map(absolute, parse_all(texts)))
+    session = run.session(camera=camera, agent=agent)
     chosen = chosen or _default_contestants(session.read_config())
-    _check_camera(task.camera, chosen)
+    _check_camera(camera, chosen)
     live = LiveComparison(session, chosen)
-    live.check(task.seconds)  # before the experiment has a folder
-    run.open(task.settings(chosen))
+    live.check(seconds)  # before the experiment has a folder
+    run.open(settings | {"contestants": list(map(list, chosen))})
     try:
-        with run.swimming(len(chosen) * runs * task.seconds):
-            live.swim(task.seconds, runs)
+        with run.swimming(len(chosen) * runs * seconds):
+            live.swim(seconds, runs)
     except ParameterError:
         raise
     except FishdError as reason:  # the runs until then are shown

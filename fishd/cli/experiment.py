@@ -113,9 +113,9 @@ class Ending:
         done: what was finished, in words
         """
         if self.is_interrupted:
-            self.leave(f"interrupted, {done}; {self.hint}", INTERRUPTED)
+            self.end_verb(f"interrupted, {done}; {self.hint}", INTERRUPTED)
 
-    def leave(self, message: str, status: int) -> NoReturn:
+    def end_verb(self, message: str, status: int) -> NoReturn:
         """Print a message and end the verb before its experiment is complete."""
         echo(f"fishctl: {message}", err=True)
         raise click.exceptions.Exit(status)
@@ -175,8 +175,10 @@ class Run:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exception: Any) -> bool | None:
-        return self._stack.__exit__(*exception)
+    def __exit__(self, *exception: Any) -> None:
+        self._stack.__exit__(*exception)
+        if isinstance(exception[1], KeyboardInterrupt):  # after the fish was left at rest
+            self.ending.end_verb(f"interrupted; {self.ending.hint}", INTERRUPTED)
 
     def session(self, **piloted: Any) -> "Session":
         """Return the session with the fish: nothing moves before `swimming`.

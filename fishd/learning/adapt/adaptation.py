@@ -64,7 +64,7 @@ def adapt(
     """
     config = replace(session.read_config(), start=Start())
 
-    def say(doing: str) -> None:
+    def show_step(doing: str) -> None:
         show.at(session.used, doing)
 
     def done(line: str) -> None:
@@ -74,12 +74,12 @@ def adapt(
         for remark in remarks:
             show.warn(f"fishctl: careful: {remark}")
 
-    say("excitation")
+    show_step("excitation")
     seconds = steps.BUDGET["excitation"] * tank_time
     table = swim_excitation(session, seconds)
     done(f"excitation: {seconds:.0f} s")
 
-    say("fitting a model of the fish, which rests")
+    show_step("fitting a model of the fish, which rests")
 
     def fit() -> Fitted:
         try:
@@ -101,13 +101,13 @@ def adapt(
         careful(f"{_BY_MEASUREMENT}: {report['headline']}")
     careful(*report["remarks"])
 
-    say("swing --C auto")
+    show_step("swing --C auto")
     rung = steps.settle_swing(session, steps.BUDGET["swing"] * tank_time - MEAN_REST_S)
     lead = f", {rung.lead * 1e3:.0f} ms ahead" if rung.lead else ""
     unsure = "" if rung.is_finished else "; its search was not finished"
     done(f"swing --C auto: C = {rung.C:g}{lead}{unsure}")
 
-    say("searching square waves")
+    show_step("searching square waves")
     search = steps.square_waves(fitted, session, seed)
     budget = max(steps.BUDGET["search"] * tank_time, steps.min_search_time(session, search))
     waves = steps.search_square_waves(session, search, budget)
@@ -130,7 +130,7 @@ def adapt(
     def progress(count: int) -> None:
         repetition, step = divmod(count - 1, training_steps)
         number = f" (training {repetition + 1} of {steps.MAX_TRAININGS})" if repetition else ""
-        say(f"training, {step + 1} of {training_steps} steps{number}; the fish rests")
+        show_step(f"training, {step + 1} of {training_steps} steps{number}; the fish rests")
 
     trained = folder.once("training.json", Trained, train)
     if trained.refusal and is_fitted:
@@ -144,7 +144,7 @@ def adapt(
         done(f"training on {cloud}: {trained.relative_thrust:.1%} in simulation{on_worst}")
         draw_training(folder.path / "training.png", folder.path / trained.folder)
 
-    say("measuring the gaits")
+    show_step("measuring the gaits")
     policy = None if trained.refusal else str((folder.path / POLICY).absolute())
     live = LiveComparison(session, list_gaits(rung, frequency, policy))
     live.swim(steps.share_time(tank_time - session.used, live.contestants))

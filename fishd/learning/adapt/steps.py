@@ -83,6 +83,8 @@ MAX_DRAWS = 20
 """Largest number of draws for each fish of the cloud."""
 EPISODE = 128
 """Steps per episode; each episode swims one fish of the cloud."""
+MAX_OFFSET_N = 10.0
+"""Largest half-width of the range of the offset of F_y [N]."""
 MAX_NOISE = 0.3
 """Largest noise of a tick in the training, as a share of the best thrust; more would hide the
 reward."""
@@ -123,7 +125,7 @@ def fit(
     fitted = Fitted(
         plant=plant,
         rig=msgspec.convert(identification.simulation, SimulationSettings),
-        offset=max(offset.ci95_high - offset.value, 0.5 * drift),
+        offset=min(MAX_OFFSET_N, max(offset.ci95_high - offset.value, 0.5 * drift)),
         cloud=cloud,
         model=model,
         identification=identification.to_builtins(),
@@ -302,7 +304,7 @@ def training_settings(fitted: Fitted, steps: int, seed: int) -> TrainingSettings
         seed=seed,
         checkpoint_every=max(1, steps),
         environment=EnvironmentSettings(episode=EPISODE),
-        randomisation=Randomisation(fish=fitted.cloud, offset=min(10.0, fitted.offset)),
+        randomisation=Randomisation(fish=fitted.cloud, offset=fitted.offset),
         imitation=ImitationSettings(rounds=IMITATION_ROUNDS, fish=IMITATION_FISH),
         ppo=PpoSettings(decay_steps=max(1, steps)),
         evaluation=EvaluationSettings(every=EVALUATION_INTERVAL, others=OTHER_FISH, patience=None),

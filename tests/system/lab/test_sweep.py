@@ -140,16 +140,6 @@ def test_a_table_with_other_columns_is_refused_with_what_differs(
         open_folder(tmp_path)
 
 
-def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
-    folder = open_folder(tmp_path)
-    for point in SQUARES:
-        folder.add_result(point, Result(thrust=0.02, thrust_ci95=1e-4), b"a recording")
-    table = tmp_path / "rows.csv"
-    table.write_bytes(table.read_bytes()[:-30])
-    assert len(open_folder(tmp_path).results) == 2
-    assert table.read_text().count("\n") == 3
-
-
 def test_a_table_as_long_as_that_of_as_many_points_as_are_permitted_is_resumed(
     tmp_path: Path,
 ) -> None:

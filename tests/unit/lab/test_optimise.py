@@ -11,14 +11,12 @@ import pytest
 from rigs.processes import fishctl, one_line
 
 from fishd.config import load
-from fishd.lab.experiment import Header, find_answer, open_experiment
+from fishd.lab.experiment import find_answer
 from fishd.lab.optimise.choice import Choice
 from fishd.lab.optimise.search import Range, Search
 from fishd.lab.optimise.trials import (
     Aim,
-    Candidate,
     Trial,
-    TrialTable,
     measure_trials,
     restrict_to_whole_ticks,
     trial_durations,
@@ -210,20 +208,6 @@ def test_a_search_that_is_interrupted_again_and_again_loses_no_candidate(
     seconds = sum(len(read(path)) for path in folder.glob("optimise*.mcap")) * 0.05
     swims = sum(float(b[3]) - float(a[3]) for a, b in pairwise([[0.0] * 5, *rows])) * 0.05
     assert seconds > swims + 2.75 * len(rows)
-
-
-def test_a_row_that_a_kill_cut_off_is_measured_again(tmp_path: Path) -> None:
-    header = Header(kind="optimise", on="simulation")
-    table = tmp_path / "run" / "rows.csv"
-    with open_experiment(tmp_path / "run", header) as search:
-        trials = TrialTable(search, ["frequency"])
-        assert trials.candidates == []
-        trials.add(Trial({"frequency": 1.25}, 0.02, 0.001, 0.5, 0.01, 40, 12.5))
-    whole = table.read_text()
-    table.write_text(whole + "2.0,0.023,0.001,0.7,0.01,80,24.7")  # of 24.75
-    with open_experiment(tmp_path / "run", header, resume=True) as search:
-        assert TrialTable(search, ["frequency"]).candidates == [Candidate({"frequency": 1.25})]
-    assert table.read_text() == whole
 
 
 @pytest.mark.parametrize(
