@@ -128,15 +128,13 @@ class SimulatedFish:
         state = self.fish.state
         return Truth(alpha=state.alpha, alpha_rate=state.alpha_rate, phi=state.phi)
 
-    def robot(self, *, metered: bool = True) -> Robot:
-        """Return the robot of the loop; metered: with a power meter, if the fish has a motor."""
+    def robot(self) -> Robot:
+        """Return the robot of the loop, with a power meter if the fish has a motor."""
         return Robot(
             name="simulated",
             sensor=self,
             servo=self,
             truth=self.truth,
             tared=self,
-            sensors=(
-                (ModelPower(self),) if metered and self.fish.parameters.model == TETHERED else ()
-            ),
+            sensors=(ModelPower(self),) if self.fish.parameters.model == TETHERED else (),
         )

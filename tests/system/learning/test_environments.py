@@ -17,8 +17,8 @@ import fishd.learning  # noqa: F401 (registers the environments)
 from fishd.client import Fish
 from fishd.config import load
 from fishd.core.errors import ConfigError
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.settings import EnvironmentSettings
 
 STILL = ("simulation.noise=0.0",)
