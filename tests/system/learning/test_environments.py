@@ -83,7 +83,6 @@ def test_an_environment_is_made_from_the_files_of_fish_and_training(tmp_path: Pa
     observation, _ = env.reset(seed=1)
     assert observation.shape == (1,)
     swim = env.unwrapped
-    assert isinstance(swim, SwimEnv)
     assert swim.link.amplitude == 0.2
     ends = [env.step(np.ones(1, np.float32))[2:4] for _ in range(3)]
     assert ends == [(False, False), (False, False), (False, True)]
@@ -277,7 +276,6 @@ def test_power_with_a_price_is_subtracted_from_the_reward() -> None:
         env.reset(seed=1)
         rewards.append(env.step(np.array([1.0], np.float32))[1])
         power = link.step(0.42).power
-        assert power is not None
         assert power > 0.06
     assert rewards[1] < rewards[0] - 0.3 * 0.01 * 0.06 / env.best_thrust
 
