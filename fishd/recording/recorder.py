@@ -1,7 +1,6 @@
 """Recorder of a running fishd: a separate process that subscribes to telemetry."""
 
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
@@ -47,8 +46,6 @@ STATUS_FIELDS = (
     "realtime",
 )
 """Fields of the status of each fishd that are recorded."""
-MAX_UNSENT_LINES = 100
-"""Maximum number of lines that wait to be sent to fishd; older ones are dropped."""
 MAX_WAITING_MESSAGES = 20000
 """Maximum number of messages that wait for a delayed recorder: a quarter of an hour."""
 MAX_STALL_S = 1.0
@@ -100,8 +97,6 @@ class Recorder:
         self._described: Description | None = None
         self._after = after
         self._seq = 0
-        self._unsent: deque[str] = deque(maxlen=MAX_UNSENT_LINES)
-        """Lines that could not be sent to fishd yet, since it did not answer in time."""
         self._gone = False
         self._refused = 0
         """Number of messages that are not fishd's."""
@@ -276,20 +271,11 @@ class Recorder:
         news, frames = camera.take()
         for line in news:
             self._tell(line)
-            self._unsent.append(text.line(line))
-        if self._unsent and not self._gone:
-            self._send_lines()
+            with suppress(FishError), Fish(self._endpoint, timeout=0.5) as fish:
+                fish.mark(text.line(line))
         for head, pixels in frames:
             if lost := self.writer.frame(head, pixels):
                 self._lose(f"just before frame {head.seq}, frames were lost: {lost}")
-
-    def _send_lines(self) -> None:
-        """Send waiting lines to fishd as events; keep those that it does not answer for later."""
-        with suppress(FishError), Fish(self._endpoint, timeout=0.5) as fish:
-            while self._unsent:
-                with suppress(Refused):
-                    fish.mark(self._unsent[0])
-                self._unsent.popleft()
 
     def _close(self) -> None:
         if self._telemetry:

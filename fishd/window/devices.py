@@ -120,13 +120,8 @@ class Devices:
             self._write(replace(content, invitations=kept))
         return token
 
-    def pair(
-        self, token: str, name: str, is_wanted: Callable[[], bool] = lambda: True
-    ) -> tuple[Device, str]:
-        """Use up a token; return the new device, and the token for its cookie.
-
-        is_wanted: returns whether a browser still waits for this token, just before it is stored
-        """
+    def pair(self, token: str, name: str) -> tuple[Device, str]:
+        """Use up a token; return the new device, and the token for its cookie."""
         digest, secret = hash_token(token), secrets.token_urlsafe(32)
         with self._changing() as content:
             match = next((entry for entry in content.invitations if entry.token == digest), None)
@@ -148,8 +143,6 @@ class Devices:
                 paired=time.time(),
                 seen=time.time(),
             )
-            if not is_wanted():
-                raise DevicesBusy("the browser no longer waits to be paired")
             others = tuple(entry for entry in content.invitations if entry is not match)
             self._write(_Content((*content.devices, device), others))
         return device, secret

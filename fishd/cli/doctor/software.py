@@ -9,7 +9,7 @@ from importlib import metadata
 from fishd.cli.doctor.base import Context, sudo_unless
 from fishd.core.errors import MissingPackage, StartupError, install_command
 from fishd.hardware import header
-from fishd.hardware.checks import Check, Result, fail, ok, warning
+from fishd.hardware.checks import Check, Result, fail, ok, on_this_machine, warning
 from fishd.hardware.panel_pins import find_chip
 from fishd.hardware.registry import PACKAGES
 
@@ -22,8 +22,6 @@ _MODULES = {package: module for module, package in PACKAGES.items()} | {
 _REQUIREMENT = re.compile(
     r"(?P<name>[\w.-]+)\s*(?P<bounds>[^;]*)(;.*extra == [\"'](?P<extra>.+)[\"'])?"
 )
-_SWIMMER_PACKAGES = {("swimmer", "numba"), ("lab", "scipy")}
-"""Extra and package of each requirement of `robot: swimmer`."""
 _BOUND = re.compile(r"(>=|<|==)\s*([\d.]+)")
 
 
@@ -57,8 +55,8 @@ def packages(context: Context) -> Result:
         match = _REQUIREMENT.match(text)
         assert match
         name, extra = match["name"].lower(), match["extra"]
-        is_for_swimmer = not kind.is_tethered and (extra, name) in _SWIMMER_PACKAGES
-        if extra is None or (extra == "pi" and name in packages) or is_for_swimmer:
+        of_driver = extra == "pi" and name in packages
+        if extra is None or of_driver or (extra, name) in kind.packages:
             requirements.append((name, match["bounds"]))
     problems = [
         problem for name, bounds in requirements if (problem := _find_problem(name, bounds))
@@ -137,6 +135,6 @@ def _parse_version(version: str) -> list[int]:
 CHECKS = (
     Check("configuration", configuration),
     Check("packages", packages),
-    Check("gpio package", gpio_package, ("pi",)),
-    Check("gpio chip", gpio_chip, ("pi",)),
+    Check("gpio package", gpio_package, on_this_machine),
+    Check("gpio chip", gpio_chip, on_this_machine),
 )

@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import signal
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -20,6 +19,7 @@ from fishd.cli.recording.files import folder_option
 from fishd.client import Fish
 from fishd.core import text
 from fishd.core.errors import FishError, NoDaemon, RecordingError
+from fishd.core.process.interruption import caught_signals
 from fishd.recording import RunWriter
 from fishd.recording.black_box import BlackBox
 from fishd.recording.folder import ensure_folder, open_new, recording_path, runs_folder
@@ -142,7 +142,8 @@ def record(
         def open_recorder(after: Position | None) -> Recorder:
             return Recorder(endpoint, box.open, tell=_print_line, after=after, due=box.due)
 
-        _record_endlessly(open_recorder, has_room, _StopSignals(), seconds, as_json)
+        with caught_signals() as stopping:
+            _record_endlessly(open_recorder, has_room, stopping, seconds, as_json)
         return
     with ExitStack() as stack:
         tap = None
@@ -166,7 +167,6 @@ def _record_one(
 
     begin: opens the recording at a path; seconds: longest duration [s]
     """
-    stopping = _StopSignals()
     place = ensure_folder(folder or runs_folder())
     progress = _draw if sys.stdout.isatty() and not as_json else lambda writer: None
     open_writer = (
@@ -174,7 +174,7 @@ def _record_one(
     )
     recorder = Recorder(endpoint, open_writer, tell=_print_line, progress=progress, camera=camera)
     try:
-        with recorder:
+        with caught_signals() as stopping, recorder:
             echo(f"recording to {recorder.writer.path}; Ctrl-C ends it", err=as_json)
             if (mode := recorder.status.mode) != "running":
                 clearing = "fishctl clear-fault, then " if mode in ("fault", "estop") else ""
@@ -182,7 +182,7 @@ def _record_one(
                     f"the fish is at rest (mode {mode}); it swims with: {clearing}fishctl "
                     "set-controller"
                 )
-            recorder.run(stopping, seconds)
+            recorder.run(partial(stopping, 0.0), seconds)
     except RecordingError as error:
         if recorder.began:
             _mark_in_fishd(endpoint, f"recording {recorder.writer.path.name} ended: {error}")
@@ -198,7 +198,7 @@ def _record_one(
 def _record_endlessly(
     open_recorder: Callable[[Position | None], Recorder],
     has_room: Callable[[], bool],
-    stopping: "_StopSignals",
+    stopping: Callable[[float], bool],
     seconds: float | None,
     as_json: bool,
 ) -> None:
@@ -208,19 +208,19 @@ def _record_endlessly(
     """
     waiting, failure = False, None
     position: Position | None = None
-    while not stopping():
+    while not stopping(0.0):
         recorder = open_recorder(position)
         try:
             with recorder:
                 echo(f"recording to {recorder.writer.path}", err=as_json)
                 failure = None
-                recorder.run(stopping, seconds)
+                recorder.run(partial(stopping, 0.0), seconds)
                 return
         except NoDaemon as error:
             if not waiting:
                 _print_line(f"waiting: {error}")
             waiting = True
-            stopping.wait(1.0)
+            stopping(1.0)
         except RecordingError as error:
             position = recorder.position
             if position is None:
@@ -228,32 +228,11 @@ def _record_endlessly(
             if failure is None:
                 _print_line(f"{error}; the black box tries again every {DISK_RETRY_S:.0f} s")
             failure = error
-            stopping.wait(DISK_RETRY_S)
-            while not (has_room() or stopping()):
-                stopping.wait(DISK_RETRY_S)
+            stopping(DISK_RETRY_S)
+            while not (has_room() or stopping(0.0)):
+                stopping(DISK_RETRY_S)
     if failure:
         raise failure
-
-
-class _StopSignals:
-    """Stop request: true after Ctrl-C, SIGTERM, or when the terminal closes."""
-
-    def __init__(self) -> None:
-        self._is_set = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) is not signal.SIG_IGN:  # ignored below nohup
-                signal.signal(number, self._set)
-
-    def __call__(self) -> bool:
-        return self._is_set
-
-    def wait(self, seconds: float) -> None:
-        """Wait for a signal, up to some seconds."""
-        if not self._is_set:
-            signal.sigtimedwait((), seconds)
-
-    def _set(self, *_: object) -> None:
-        self._is_set = True
 
 
 def _print_line(line: str) -> None:

@@ -1,9 +1,7 @@
 """Devices of the network: pairing, scopes, and revocation that closes their pages."""
 
-import asyncio
 import json
 import re
-import signal
 import stat
 import time
 from collections.abc import AsyncIterator
@@ -24,23 +22,6 @@ from rigs.window_process import (
 
 from fishd.window import devices
 from fishd.window.devices import DeviceError, Devices
-
-SLOW_DISK = """
-import signal, threading
-from fishd.window import devices, paired_devices
-paired_devices.CHANGE_TIMEOUT_S = 0.1
-real, goes_on = devices.secrets.token_hex, threading.Event()
-def token_hex(size):
-    if threading.current_thread().name.startswith("devices"):
-        goes_on.wait()
-    return real(size)
-devices.secrets.token_hex = token_hex
-def go_on(*_):
-    paired_devices.CHANGE_TIMEOUT_S = 60.0
-    goes_on.set()
-signal.signal(signal.SIGUSR1, go_on)
-"""
-"""Code of a window whose disk lets a pairing wait until SIGUSR1."""
 
 
 def token_of(link: str) -> str:
@@ -218,27 +199,6 @@ def test_a_damaged_file_pairs_nothing_and_says_what_to_do(tmp_path: Path) -> Non
             change()
     (tmp_path / "devices.copy.json").replace(tmp_path / "devices.json")
     assert [device.name for device in paired.all()] == ["tablet"]
-
-
-async def test_a_pairing_that_came_too_late_pairs_nothing_and_keeps_the_link(
-    daemon: Daemon, tmp_path: Path
-) -> None:
-    with running_window(tmp_path, changes=SLOW_DISK, fish=daemon.endpoint) as window:
-        token = token_of(window.invite())
-        async with Browser(window.url, NETWORK_HOST) as browser:
-            body = {"token": token, "name": "tablet"}
-            assert await browser.refusal("/api/pair", body) == (503, "busy")
-            window.process.send_signal(signal.SIGUSR1)
-            while await _is_busy(browser, body):
-                await asyncio.sleep(0.05)
-        assert [device.name for device in Devices(window.state).all()] == ["tablet"]
-
-
-async def _is_busy(browser: Browser, body: dict[str, str]) -> bool:
-    """Try to pair a browser; return whether the disk was too slow for it."""
-    async with browser.session.post("/api/pair", json=body) as response:
-        assert response.status in (200, 503)
-        return response.status == 503
 
 
 def test_the_copy_of_the_file_revives_no_revoked_device(tmp_path: Path) -> None:
