@@ -89,8 +89,6 @@ class Robot:
     Called after each read of the sensor with the start of the tick [s, monotonic]; never blocks.
     Raises `SensorError` if the power is not known.
     """
-    prepare: Callable[[], None] = lambda: None
-    """Called between the ticks of a loop in real time, just before the next read."""
     countdown: float = math.inf
     """Time for which the servo continues without a write [s]; see `ServoDriver.countdown`."""
     write_recipes: Callable[[Path], None] = lambda control: None
