@@ -78,7 +78,7 @@ class VirtualRun:
             robot, self.fish = open_fish_in_virtual_time(config, stack)
             """The fish itself, as `RobotKind.open` describes it."""
             if not metered:
-                others = tuple(s for s in robot.sensors if "power" not in s.readings)
+                others = tuple(s for s in robot.sensors if "power" not in s.declared)
                 robot = dataclasses.replace(robot, sensors=others)
             self.loop = build_loop(config, robot, clock, publisher)
             stack.callback(self.loop.close)
