@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from fishd.core.beats import upward_reversals
 from fishd.core.errors import ParameterError
 from fishd.core.estimation import PIECE_S, REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
-from fishd.core.signals import Tick
+from fishd.core.signals import Tick, reading_of
 from fishd.lab.disturbances import RESPONSE_TIMES_S, Disturbance
 from fishd.lab.drift import MIN_FIT_BLOCKS, Array, Blocks, fit
 from fishd.lab.error_budget import Thrust, lateral_force, thrust_fields, visible_rotation
@@ -169,7 +169,7 @@ def to_samples(ticks: Iterable[Tick]) -> list[Sample]:
             tick.fin_velocity,
             tick.phi_c,
             tick.mode == "running",
-            math.nan if tick.power is UNSET else tick.power,
+            reading_of(tick.readings, "power"),
         )
         for tick in ticks
         if tick.suspect is UNSET

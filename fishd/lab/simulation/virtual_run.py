@@ -16,6 +16,7 @@ from fishd.controllers import registry
 from fishd.core.clock import Slot, VirtualClock, virtual_slots
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
+from fishd.core.schema import Reading
 from fishd.core.signals import Event, Publisher, Tick
 from fishd.virtual.plant.base import TrueWindow
 
@@ -76,7 +77,9 @@ class VirtualRun:
         with ExitStack() as stack:
             robot, self.fish = open_fish_in_virtual_time(config, stack)
             """The fish itself, as `RobotKind.open` describes it."""
-            robot = robot if metered else dataclasses.replace(robot, power=None)
+            if not metered:
+                others = tuple(s for s in robot.sensors if "power" not in s.declared)
+                robot = dataclasses.replace(robot, sensors=others)
             self.loop = build_loop(config, robot, clock, publisher)
             stack.callback(self.loop.close)
             self._stack = stack.pop_all()
@@ -104,6 +107,11 @@ class VirtualRun:
             "highest_angle": str(loop.guard.highest),
             "force_unit": loop.robot.force_unit,
         }
+
+    @property
+    def readings(self) -> dict[str, Reading]:
+        """Readings of the sensors by name, for a recording."""
+        return self.loop.readings.declared
 
     def set_controller(self, name: str, parameters: Mapping[str, Any]) -> None:
         """Make a controller the active one, from the next tick on.

@@ -101,7 +101,7 @@ class SimulatedLink:
         supervisor = run.loop.supervisor
         if supervisor.reason:
             raise LinkLost(f"the loop is in {supervisor.mode}: {supervisor.reason.message}")
-        return StepResult(self._turn.observation, power=self._turn.power)
+        return StepResult(self._turn.observation)
 
     def look(self) -> Stack | None:
         """Return the frames of the simulated camera; None without a camera."""
