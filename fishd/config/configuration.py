@@ -180,13 +180,6 @@ class RealtimeSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             le=99,
         ),
     ] = 50
-    warm_up: Annotated[
-        bool,
-        note(
-            "Run mock ticks just before each real tick, so that it has warm caches; has no effect "
-            "for ticks below 10 ms."
-        ),
-    ] = True
     lock_memory: Annotated[bool, note("Keep fishd's memory from being paged out.")] = True
 
 

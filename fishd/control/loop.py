@@ -167,14 +167,6 @@ class ControlLoop:
         if self._notify:
             self._notify(started)
 
-    def warm_up(self) -> None:
-        """Warm the active controller and the robot up for the imminent tick."""
-        self.robot.prepare()
-        try:
-            self.active.warm_up()
-        except Exception as error:
-            self._fail("controller-error", f"controller {self.active.name} failed", error)
-
     def set_controller(self, name: str, controller: Controller[Any]) -> None:
         """Make a controller the active one, from the next tick on.
 

@@ -93,7 +93,7 @@ class Controller(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[Struct]]
-    swims_like: ClassVar[Likeness | None] = None
+    same_wave_as: ClassVar[Likeness | None] = None
     """The other controller whose known thrust applies to the wave of this one, too."""
 
     uses_lateral_force: ClassVar[bool] = True
@@ -133,12 +133,6 @@ class Controller(ABC, Generic[P]):
     def retune(self, parameters: P) -> None:
         """Apply new, already checked parameters while active; called between two updates."""
         self.parameters = parameters
-
-    def warm_up(self) -> None:
-        """Do the computation of `update` without an effect, to warm the caches for it.
-
-        Called up to once per tick, just before it; only for work that is slow with cold caches.
-        """
 
     def close(self) -> None:
         """Release all resources: called once, when the controller is no longer used."""

@@ -327,8 +327,8 @@ EVENTS: tuple[tuple[EventKind, str, str, str], ...] = (
     (
         "gateway",
         "warning",
-        "the process behind a socket was restarted; messages were lost",
-        "`gateway`: `telemetry` or `control`",
+        "the process that has the sockets was restarted; messages were lost",
+        "`gateway`: `local`, or `network` for clients with a key",
     ),
     (
         "sockets",

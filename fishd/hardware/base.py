@@ -120,8 +120,6 @@ class Robot:
     """Numbers of recovered errors since start, such as failed I2C transfers."""
     sensors: "tuple[Sensor, ...]" = ()
     """Its other sensors, whose readings each tick takes after the read of the force sensor."""
-    prepare: Callable[[], None] = lambda: None
-    """Called between the ticks of a loop in real time, just before the next read."""
     countdown: float = math.inf
     """Time for which the servo continues without a write [s]; see `ServoDriver.countdown`."""
     write_recipes: Callable[[Path], None] = lambda control: None

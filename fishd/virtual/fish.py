@@ -85,11 +85,6 @@ class SimulatedFish:
         newest, mean_time = now - 0.5 * duration / samples, now - 0.5 * duration
         return Measurement(newest, fx, fy, samples, mean_time=mean_time, span=duration)
 
-    def prepare(self) -> None:
-        """Compute in advance what the next read needs, as far as that is possible."""
-        if self.time is not None:
-            self.fish.prepare(self._angle, self._duration, self._samples)
-
     def recalibrate(self, calibration: ForceCalibration) -> None:
         """Use another zero from the next read on, for the lifetime of this object."""
         self.calibration = calibration
@@ -141,7 +136,6 @@ class SimulatedFish:
             servo=self,
             truth=self.truth,
             tared=self,
-            prepare=self.prepare,
             sensors=(
                 (ModelPower(self),) if metered and self.fish.parameters.model == TETHERED else ()
             ),
