@@ -99,11 +99,11 @@ def test_readings_of_sensors_are_columns_curves_and_means_with_their_units(tmp_p
         "power": pytest.approx(table["readings.power"].mean()),
         "water_temperature": 21.0,
     }
-    (schema,) = (
+    (schema,) = {
         record.data
         for _, record in run.records()
         if isinstance(record, Schema) and record.name == "fishd.Tick"
-    )
+    }
     properties = json.loads(schema)["properties"]["readings"]["properties"]
     assert properties["water_temperature"]["description"] == "Simulated reading. [°C]"
 

@@ -79,8 +79,8 @@ def test_a_policy_for_readings_that_a_fish_lacks_is_refused_with_those_that_it_h
 ) -> None:
     path = write(tmp_path, to_onnx(linear(1.0), "tanh", card((WATER, 10.0, 20.0))))
     assert refusal(path, load(None, ["sensors.flow={kind: simulated, name: flow}"]).limits) == (
-        f"ppo: policy: {path}: it needs the reading water_temperature, which this robot does not have; "
-        "it has power, flow: add a sensor to sensors, or rename one of its readings"
+        f"ppo: policy: {path}: it needs the reading water_temperature, which this robot does not "
+        "have; it has power, flow: add a sensor to sensors, or rename one of its readings"
     )
     create_policy(path)  # a client does not know the readings of the fish
 
