@@ -32,7 +32,7 @@ class SimulatedFish:
         self._start = 0.0
         self._duration, self._samples = 0.0, 1
         """Length of the latest window [s], and its number of samples."""
-        self._angle: float | None = None
+        self._instruction_angle: float | None = None
         self._fin_speed = 0.0
         self.calibration = ForceCalibration()
         """Calibration between the forces of the rig and those of measurements; a tare sets it."""
@@ -48,7 +48,7 @@ class SimulatedFish:
         if duration != self._duration:
             self._duration, self._samples = duration, round(self._sample_rate * duration) or 1
         samples = self._samples
-        self.window = window = self.fish.advance(self._angle, duration, samples)
+        self.window = window = self.fish.advance(self._instruction_angle, duration, samples)
         self._power = None
         fx, fy = window.sampled_thrust, window.sampled_lateral_force
         fx, fy = self._imperfections.apply(fx, fy, now - self._start, duration, samples)
@@ -63,7 +63,7 @@ class SimulatedFish:
     def prepare(self) -> None:
         """Compute in advance what the next read needs, as far as that is possible."""
         if self._time is not None:
-            self.fish.prepare(self._angle, self._duration, self._samples)
+            self.fish.prepare(self._instruction_angle, self._duration, self._samples)
 
     def recalibrate(self, calibration: ForceCalibration) -> None:
         """Use another zero from the next read on, for the lifetime of this object."""
@@ -91,13 +91,13 @@ class SimulatedFish:
             self._power = self.window.power
         return self._power
 
-    def write(self, angle: float) -> None:
+    def write(self, instruction_angle: float) -> None:
         """Set the instruction angle [rad] from the latest read onwards."""
-        self._angle = angle
+        self._instruction_angle = instruction_angle
 
     def release(self) -> None:
         """Stop the pulses; the wheel keeps its angle."""
-        self._angle = None
+        self._instruction_angle = None
 
     def close(self) -> None:
         """Release the servo."""

@@ -166,7 +166,7 @@ class Card(Struct, frozen=True, kw_only=True):
 
     @property
     def sees(self) -> str:
-        """Inputs that depend on the fish: `forces`, `pictures` or both; commands do not count."""
+        """Inputs that depend on the fish, unlike past angles: `forces`, `pictures` or both."""
         forces = any(feature.name not in COMMAND_FEATURES for feature in self.observation)
         if self.pictures is None:
             return "forces"
@@ -181,7 +181,7 @@ class Card(Struct, frozen=True, kw_only=True):
             )
         if self.amplitude > amplitude:
             raise PolicyError(
-                f"it commands up to ±{self.amplitude:g} rad, beyond the robot's amplitude_limit, "
+                f"it sends up to ±{self.amplitude:g} rad, beyond the robot's amplitude_limit, "
                 f"{amplitude:g} rad; set amplitude_limit: {self.amplitude:g}, or train one for less"
             )
 
