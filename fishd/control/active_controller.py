@@ -91,10 +91,6 @@ class ActiveController:
         self.wave = _wave_kind(self.name, self.controller, self.parameters)
         self._reporter.controller("parameters", self.name, self.parameters, self.parameter_units)
 
-    def warm_up(self) -> None:
-        """Warm the controller up for the imminent update; raises what the controller raises."""
-        call_foreign(self.controller.warm_up)
-
 
 @lru_cache(maxsize=64)
 def _quantity_units(controller: type[Controller[Any]]) -> dict[str, str]:

@@ -24,6 +24,7 @@ FAULTS = {
     "sensor-range": Fault(
         "look for a clipped or broken wire of the force sensor, or calibrate it", in_a_row=3
     ),
+    "sensor-lost": Fault("mend what the message says, or set required: false"),
     # A simulation that has diverged, or a plant of another package: it cannot be mended meanwhile.
     "fish-lost": Fault("change what the message says, and start fishd again"),
     "fy-reversed": Fault("calibrate the force sensor or the servo, as the message says"),

@@ -11,7 +11,7 @@ from msgspec import UNSET, Struct
 from fishd.core.beats import upward_reversals
 from fishd.core.errors import ParameterError
 from fishd.core.estimation import PIECE_S, REST_SETTLE_TIME_S, SWIM_SETTLE_TIME_S
-from fishd.core.signals import Tick
+from fishd.core.signals import Tick, reading_of
 from fishd.lab import error_budget
 from fishd.lab.disturbances import RESPONSE_TIMES_S, Disturbance
 from fishd.lab.drift import MIN_FIT_BLOCKS, Array, Blocks, fit
@@ -165,7 +165,7 @@ def to_samples(ticks: Iterable[Tick]) -> list[Sample]:
             tick.fin_velocity,
             tick.phi_c,
             tick.mode == "running",
-            math.nan if tick.power is UNSET else tick.power,
+            reading_of(tick.readings, "power"),
         )
         for tick in ticks
         if tick.suspect is UNSET

@@ -284,7 +284,7 @@ class VirtualSession(Session):
 
     def describe(self, writer: "RunWriter") -> None:
         """Write the configuration and the robot to a recording."""
-        writer.describe(self._run.config, self._run.about())
+        writer.describe(self._run.config, self._run.about(), self._run.readings)
 
     def __exit__(self, *exception: Any) -> None:
         self._run.close()

@@ -177,7 +177,7 @@ def _print_recordings(recordings: list[Overview]) -> None:
             _format_start(glance.about.get("started", "")),
             _format_duration(summary.duration),
             _format_thrust(summary),
-            "–" if summary.power is None else format_power(summary.power),
+            format_power(summary.readings["power"]) if "power" in summary.readings else "–",
             str(summary.ticks),
             str(summary.lost_ticks),
             str(summary.marks),

@@ -124,7 +124,7 @@ class SimulatedLink:
         supervisor = fish.loop.supervisor
         if supervisor.reason:
             raise LinkLost(f"the loop is in {supervisor.mode}: {supervisor.reason.message}")
-        return StepResult(fish.turn.observation, power=fish.turn.power)
+        return StepResult(fish.turn.observation)
 
     def look(self) -> Stack | None:
         """Return the frames of the simulated camera; None without a camera."""

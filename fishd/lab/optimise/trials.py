@@ -307,7 +307,7 @@ class Aim(NamedTuple):
         if not (math.isfinite(trial.power) and trial.power > 0.0):
             raise ParameterError(
                 "this needs the power of the servo, and the fish has no power meter that can be "
-                "read: set power_meter in its configuration, see docs/how-to/bench.md"
+                "read: add one to sensors in its configuration, see docs/how-to/bench.md"
             )
         if isinstance(search, LeastPower):
             search.observe(trial.parameters, thrust, (trial.power, trial.power_ci95))

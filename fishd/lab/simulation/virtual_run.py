@@ -15,6 +15,7 @@ from fishd.controllers import registry
 from fishd.core.clock import VirtualClock, virtual_slots
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.errors import ParameterError
+from fishd.core.schema import Reading
 from fishd.core.signals import Event, Publisher, Tick
 from fishd.virtual.plant.base import TrueWindow
 
@@ -98,6 +99,11 @@ class VirtualRun:
             "highest_angle": str(loop.guard.highest),
             "force_unit": loop.robot.force_unit,
         }
+
+    @property
+    def readings(self) -> dict[str, Reading]:
+        """Readings of the sensors by name, for a recording."""
+        return self.loop.readings.declared
 
     def set_controller(self, name: str, parameters: Mapping[str, Any]) -> None:
         """Make a controller the active one, from the next tick on.

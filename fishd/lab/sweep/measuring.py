@@ -64,7 +64,7 @@ def simulate_point(task: Task) -> tuple[PointResult, bytes] | None:
             result: PointResult
 
             def describe_run(run: VirtualRun) -> None:
-                writer.describe(run.config, run.about())
+                writer.describe(run.config, run.about(), run.readings)
 
             arguments = (task.point, task.config, task.lengths, writer, describe_run)
             measure = swim if task.config.kind.is_tethered else swim_freely

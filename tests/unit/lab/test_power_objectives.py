@@ -40,7 +40,7 @@ def test_a_measurement_tells_power_and_thrust_per_watt_with_their_intervals() ->
 
 @pytest.mark.slow
 def test_without_a_power_meter_a_measurement_tells_the_thrust_alone() -> None:
-    config = load("config/virtual-pi.yaml", ["power_meter=null"])
+    config = load("config/virtual-pi.yaml", ["sensors.power_meter=null"])
     with VirtualSession(config) as rig:
         report = summarise(measure(rig, "square", {"frequency": 2.0}, 20.5), rig.tick)
     assert report.thrust > 0.0
