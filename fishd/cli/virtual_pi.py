@@ -168,7 +168,7 @@ def _format_line(state: PiState) -> str:
 
 
 def _format_pulses(state: PiState) -> str:
-    return "none" if state.angle is None else f"{state.pulse:.0f} µs, {state.angle:+.3f} rad"
+    return "none" if state.phi_c is None else f"{state.pulse:.0f} µs, {state.phi_c:+.3f} rad"
 
 
 def _format_faults(state: PiState) -> str:
