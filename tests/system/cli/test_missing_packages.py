@@ -123,9 +123,16 @@ def test_an_agent_names_the_extra_that_policies_need(tmp_path: Path, module: str
     )
 
 
-@pytest.mark.parametrize(("module", "verb"), [("aiohttp", ("page",)), ("mcap", ("record", "run"))])
-def test_a_camera_verb_names_its_extra(tmp_path: Path, module: str, verb: tuple[str, ...]) -> None:
-    done = call(FISHCTL, "camera", *verb, env=environment_without(tmp_path, module))
-    extra = "camera" if module == "aiohttp" else "record"
+@pytest.mark.parametrize(
+    ("module", "extra", "verb"),
+    [
+        ("aiohttp", "camera", ("camera", "page")),
+        ("mcap", "record", ("record", "run")),
+    ],
+)
+def test_a_camera_verb_names_its_extra(
+    tmp_path: Path, module: str, extra: str, verb: tuple[str, ...]
+) -> None:
+    done = call(FISHCTL, *verb, env=environment_without(tmp_path, module))
     assert (done.returncode, done.stdout) == (1, "")
     assert re.fullmatch(rf"fishctl: {module} is not installed; [^\n]*\[{extra}\]'\n", done.stderr)
