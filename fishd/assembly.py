@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from msgspec.structs import replace
 
 from fishd.config import Config
-from fishd.config.drivers import claims_of
+from fishd.config.drivers import claims_of, readings_of
 from fishd.control.estimators.base import Estimator
 from fishd.control.estimators.fin_sensor import FinSensor
 from fishd.control.estimators.lateral_force import LateralForceEstimator
@@ -21,11 +21,12 @@ from fishd.control.estimators.live_thrust import LiveThrust
 from fishd.control.estimators.observer import Observer
 from fishd.control.guard import Guard
 from fishd.control.loop import ControlLoop
-from fishd.core import files
+from fishd.core import files, text
 from fishd.core.addresses import virtual_pi_socket
 from fishd.core.calibration import ForceCalibration, ServoCalibration
 from fishd.core.clock import Clock, SystemClock, VirtualClock
-from fishd.core.errors import MissingPackage, SensorError
+from fishd.core.errors import FishdError, SensorError, StartupError
+from fishd.core.foreign_code import call_foreign
 from fishd.core.signals import Publisher, Truth
 from fishd.hardware import ownership, release_recipe
 from fishd.hardware.base import CalibratedParts, Robot
@@ -33,18 +34,17 @@ from fishd.hardware.calibration_files import CalibrationFolder
 from fishd.hardware.driver import ServoDriver, read_counters
 from fishd.hardware.force_sensor.sampled_sensor import SampledSensor
 from fishd.hardware.recipes import Recipes
-from fishd.hardware.registry import FORCE_SENSORS, POWER_METERS, SERVOS, driver_packages
+from fishd.hardware.registry import FORCE_SENSORS, SENSORS, SERVOS, driver_packages
+from fishd.hardware.sampler import close_all
 from fishd.hardware.servo import pulses
 from fishd.hardware.servo.calibrated_servo import CalibratedServo
 from fishd.hardware.servo.pigpio import Pigpio
 from fishd.virtual.fish import SimulatedFish
-from fishd.virtual.plant.base import TrueWindow
 
 if TYPE_CHECKING:  # most runs need neither drivers nor emulation, so they are loaded on demand
     from fishd.hardware.panel import Panel
-    from fishd.hardware.power_meter.sampled_power import SampledPower
+    from fishd.hardware.sensors.sampled_readings import SampledReadings
     from fishd.virtual.pi.virtual_pi import VirtualPi
-    from fishd.virtual.swimmer.robot import Swimmer
 
 log = logging.getLogger(__name__)
 
@@ -71,17 +71,13 @@ def open_robot(
     stack.push(recipes.remove_at_end)
     if not config.kind.has_hardware:
         recipes.write_without_servo()
-    if config.robot == "simulated":
         if file and not (release_recipe.read(str(file)) or {}).get("fresh"):
             release_recipe.remove(str(file))  # of an earlier content of the file
-        return dataclasses.replace(simulated_fish(config).robot(), write_recipes=recipes.write_for)
-    if config.robot == "swimmer":
-        swimmer = open_swimmer(config)
-        swimmer.compile()
-        return dataclasses.replace(swimmer.robot(), write_recipes=recipes.write_for)
+        robot: Robot = open_fish(config).robot()
+        return dataclasses.replace(robot, write_recipes=recipes.write_for)
     stack.enter_context(ownership.claim_parts(parts_of(config)))
     recipes.remove_former()
-    if config.robot == "virtual-pi":
+    if config.kind.is_virtual:
         plug_in_virtual_pi(config, stack)
     return assemble(config, clock, stack, threaded=True, recipes=recipes)
 
@@ -91,23 +87,27 @@ def simulated_fish(config: Config) -> SimulatedFish:
     return SimulatedFish(config.plant, config.simulation, config.tick)
 
 
-def open_swimmer(config: Config) -> "Swimmer":
-    """Return a fish that swims freely; raise `MissingPackage` if a package is missing."""
+def open_fish(config: Config) -> Any:
+    """Return the fish of a robot without drivers, as `RobotKind.open` describes it.
+
+    Raises `MissingPackage`, and `StartupError` where a robot of another package cannot start.
+    """
     try:
-        from fishd.virtual.swimmer.robot import Swimmer
-    except ModuleNotFoundError as error:
-        package = (error.name or "").partition(".")[0]
-        raise MissingPackage.of_extra("robot: swimmer", package, "swimmer") from None
-    return Swimmer(config.swimmer, config.plant, config.amplitude_limit, config.tick)
+        return call_foreign(config.kind.open, config) or simulated_fish(config)
+    except FishdError:
+        raise
+    except Exception as error:
+        message = f"robot '{config.robot}' cannot start: {text.describe_error(error)}"
+        raise StartupError(message) from error
 
 
 def parts_of(config: Config) -> tuple[ownership.Part, ...]:
     """Return the parts that no other fishd may drive; `fishctl release` ignores such claims."""
-    if config.robot == "pi":
-        return ownership.parts_of_pi(claims_of(config.driver_settings))
-    if config.robot == "virtual-pi":
+    if not config.kind.has_hardware:
+        return ()
+    if config.kind.is_virtual:
         return ownership.parts_of_virtual_pi(virtual_pi_socket(config.virtual_pi.socket))
-    return ()
+    return ownership.parts_of_pi(claims_of(config.driver_settings))
 
 
 class InVirtualTime(NamedTuple):
@@ -149,29 +149,16 @@ def open_in_virtual_time(config: Config, stack: ExitStack) -> InVirtualTime:
     return InVirtualTime(robot, pi)
 
 
-class FishInVirtualTime(NamedTuple):
-    """Fish in virtual time, of every robot that a configuration can name."""
-
-    robot: Robot
-    take_window: Callable[[], TrueWindow]
-    """Function that returns the true motion since its previous call."""
-    swimmer: "Swimmer | None" = None
-    """The fish itself if it swims freely."""
-
-
-def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> FishInVirtualTime:
-    """Return a simulated fish, free, on its rod or behind a virtual Pi.
+def open_fish_in_virtual_time(config: Config, stack: ExitStack) -> tuple[Robot, Any]:
+    """Return a robot in virtual time, and its fish, as `RobotKind.open` describes it.
 
     Raises `MissingPackage` if a package is missing.
     """
-    if config.robot == "swimmer":
-        swimmer = open_swimmer(config)
-        return FishInVirtualTime(swimmer.robot(), swimmer.take_window, swimmer)
-    if config.robot == "virtual-pi":
+    if config.kind.is_virtual:
         robot, pi = open_in_virtual_time(config, stack)
-        return FishInVirtualTime(robot, pi.tank.take_window)
-    fish = simulated_fish(config)
-    return FishInVirtualTime(fish.robot(), fish.take_window)
+        return robot, pi.tank
+    fish = open_fish(config)
+    return fish.robot(), fish
 
 
 def plug_in_virtual_pi(config: Config, stack: ExitStack) -> None:
@@ -259,9 +246,15 @@ def assemble(
     folder = CalibrationFolder(state_folder(config))
     for line in folder.ignored():
         log.warning("%s", line)
-    meter = _open_power_meter(config, clock, stack, threaded=threaded)
-    between_samples = meter.catch_up if meter else _do_nothing
-    sensor = open_sensor(config, clock, threaded=threaded, between_samples=between_samples)
+    sensors = _open_sensors(config, clock, threaded=threaded)
+    stack.callback(close_all, sensors)
+
+    def read_others() -> None:
+        """Let the other sensors sample between the samples of the force, in virtual time."""
+        for other in sensors:
+            other.read()
+
+    sensor = open_sensor(config, clock, threaded=threaded, between_samples=read_others)
     stack.callback(sensor.close)
     settings = config.servo
     with driver_packages(settings.driver):
@@ -286,13 +279,13 @@ def assemble(
 
     if permitted := pulses.format_reach(settings, config.amplitude_limit):
         log.info("servo.lowest and servo.highest permit %s, amplitude_limit", permitted)
-    if line := _calibration_warning(config, servo):
-        log.warning("%s", line)
+    if warning := _calibration_warning(config, servo):
+        log.warning("%s", warning)
 
     def limitations() -> tuple[str, ...]:
         lines = (
             *sensor.limitations,
-            *(meter.limitations if meter else ()),
+            *(line for other in sensors for line in other.limitations),
             *servo.driver.limitations,
         )
         if sensor.calibration.is_unset:
@@ -318,9 +311,9 @@ def assemble(
         counters=lambda: {
             **sensor.counters(),
             **read_counters(servo.driver),
-            **(meter.counters() if meter else {}),
+            **{name: count for other in sensors for name, count in other.counters().items()},
         },
-        power=meter.read if meter else None,
+        sensors=sensors,
         countdown=servo.driver.countdown,
         write_recipes=recipes.write_for if recipes else lambda control: None,
     )
@@ -330,20 +323,47 @@ def _do_nothing() -> None:
     pass
 
 
-def _open_power_meter(
-    config: Config, clock: Clock, stack: ExitStack, *, threaded: bool
-) -> "SampledPower | None":
-    """Return the power meter if one is configured; it need not answer yet."""
-    settings = config.power_meter
-    if settings is None:
-        return None
-    from fishd.hardware.power_meter.sampled_power import SampledPower, sample_interval
+def _open_sensors(
+    config: Config, clock: Clock, *, threaded: bool, modelled: Iterable[str] = ()
+) -> "tuple[SampledReadings, ...]":
+    """Return the configured sensors; they need not answer yet.
 
-    with driver_packages(settings.driver):
-        driver = POWER_METERS.find(settings.driver)(settings, clock, sample_interval(config.tick))
-    meter = SampledPower(driver, clock, threaded=threaded, tick=config.tick)
-    stack.callback(meter.close)
-    return meter
+    A simulated fish has stand-ins for those that need hardware.
+
+    modelled: readings that the fish has a model of; a sensor with one of them is left out
+    Raises `StartupError` when a package is missing.
+    """
+    if not config.sensors:
+        return ()
+    from fishd.hardware.sensors.sampled_readings import SampledReadings, sample_period
+    from fishd.hardware.sensors.simulated import StandIn
+
+    sensors = []
+    for name, settings in config.sensors.items():
+        kind, readings = SENSORS.find(settings.kind), readings_of(settings)
+        if readings.keys() & modelled:
+            continue
+        if not (config.kind.has_hardware or kind.is_simulated):
+            kind = StandIn.of(kind)
+        with driver_packages(settings.kind):
+            period = sample_period(kind, settings, config.tick)
+            driver = kind(settings, clock, period, f"sensors.{name}")
+        sensors.append(
+            SampledReadings(name, driver, readings, clock, threaded=threaded, tick=config.tick)
+        )
+    return tuple(sensors)
+
+
+def _with_stand_ins(config: Config, robot: Robot, clock: Clock) -> Robot:
+    """Return a simulated fish with the configured sensors, which its ticks sample."""
+    modelled = {name for sensor in robot.sensors for name in sensor.declared}
+    sensors = _open_sensors(config, clock, threaded=False, modelled=modelled)
+    lines = tuple(line for sensor in sensors for line in sensor.limitations)
+    return dataclasses.replace(
+        robot,
+        sensors=(*robot.sensors, *sensors),
+        limitations=lambda: (*robot.limitations(), *lines),
+    )
 
 
 def open_sensor(
@@ -373,11 +393,11 @@ def open_sensor(
     )
 
 
-def _calibration_warning(config: Config, servo: CalibratedServo) -> str:
-    """Return a line if the calibration of the servo does not permit ±Φ; empty if it does."""
+def _calibration_warning(config: Config, servo: CalibratedServo) -> str | None:
+    """Return a line if the calibration of the servo does not permit ±Φ; None if it does."""
     permitted = servo.format_reach(config.amplitude_limit)
     if not permitted or servo.calibration == config.servo.calibration:
-        return ""
+        return None
     return (
         f"the servo's calibration of {servo.calibration.date or 'no date'} permits {permitted}, "
         "amplitude_limit: fishctl calibrate servo"
@@ -439,6 +459,8 @@ def build_loop(
     Raises `UnknownController` and `ParameterError`, neither for a configuration from `load`.
     """
     guard = build_guard(config)
+    if config.sensors and not config.kind.has_hardware:
+        robot = _with_stand_ins(config, robot, clock)
     if robot.calibrated:
         guard.restrict(*robot.calibrated.servo.reach)
     loop = ControlLoop(

@@ -1,7 +1,7 @@
 """Free swimmer that is fast to compute, for tests of its surroundings."""
 
-from fishd.assembly import open_swimmer
 from fishd.config import Config, load
+from fishd.virtual.swimmer.kind import FreeSwimmer
 from fishd.virtual.swimmer.robot import Swimmer
 from rigs.documents import ROOT
 from rigs.processes import sets
@@ -25,4 +25,4 @@ def coarse(*overrides: str) -> Config:
 
 
 def swimmer(*overrides: str) -> Swimmer:
-    return open_swimmer(coarse(*overrides))
+    return FreeSwimmer.open(coarse(*overrides))

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from rigs.inputs_of_others import FILES, TICKS, as_text, swum_table, write_all
 from rigs.processes import fishctl, one_line
+from rigs.recording_verbs import VERBS, find_mistakes, run_verb
 
-from common.recording_verbs import VERBS, find_mistakes, run_verb
 from fishd.lab.experiment import HEADER, RESULT, ROWS
 from fishd.recording import open_run
 

@@ -65,7 +65,7 @@ class FishDescription(NamedTuple):
     lockstep: bool
 
 
-class Foresight:
+class MotionPrediction:
     """Prediction of the tail's motion from each tick to the next."""
 
     def __init__(self, description: FishDescription) -> None:
@@ -189,7 +189,7 @@ class _View:
     ) -> None:
         self._settings = settings
         self._camera = SimulatedCamera(settings, size)
-        self._foresight = Foresight(description)
+        self._prediction = MotionPrediction(description)
         self._description = description
         self._sink = sink
         self._due: deque[Shot] = deque()
@@ -202,8 +202,14 @@ class _View:
 
         status: status of the fishd that has ticked
         """
-        if not find_kind(status.robot).is_tethered or not isinstance(tick.alpha, float):
-            raise _no_sight(status.robot)
+        kind = find_kind(status.robot)
+        if kind.hides_from_camera or not isinstance(tick.alpha, float):
+            is_real = kind.has_hardware and not kind.is_virtual
+            raise Trouble(
+                "unusable",
+                kind.hides_from_camera or "this fishd does not publish the position of the tail",
+                "use source: v4l2" if is_real else "start fishd with robot: simulated",
+            )
         if math.isnan(tick.time):
             raise Trouble(
                 "unusable",
@@ -216,13 +222,13 @@ class _View:
         elif tick.seq > self._last_seq + 1:
             self._sink.lost(dropped=self._frames_in(tick.seq - self._last_seq - 1))
         self._last_seq = tick.seq
-        for before, after in self._foresight.follow(tick):
+        for before, after in self._prediction.follow(tick):
             for frame in self._camera.frames(before, after):
                 self._due.append(Shot(*frame, self._settings.exposure))
         if self._description.lockstep:
             while self._due:
                 self._sink.put(self._due.popleft())
-            self._sink.covered(self._foresight.end)
+            self._sink.covered(self._prediction.end)
 
     def publish(self) -> None:
         """Put the frames that are due."""
@@ -281,14 +287,3 @@ def _read_description(config: dict[str, Any]) -> FishDescription:
             f"the description of the fish by this fishd is not valid: {error}",
             "install the same version of fishd and fishd-camera",
         ) from None
-
-
-def _no_sight(robot: str) -> Trouble:
-    """Return the reason why a robot's fish cannot be drawn."""
-    reason = {
-        "virtual-pi": "a virtual Pi does not publish the position of the tail",
-        "swimmer": "a swimmer leaves the camera's view",
-    }.get(robot)
-    if reason:
-        return Trouble("unusable", reason, "start fishd with robot: simulated")
-    return Trouble("unusable", "this fishd drives a real fish", "use source: v4l2")

@@ -9,7 +9,7 @@ from importlib import metadata
 from fishd.cli.doctor.base import Context, sudo_unless
 from fishd.core.errors import MissingPackage, StartupError, install_command
 from fishd.hardware import header
-from fishd.hardware.checks import Check, Result, fail, ok, warning
+from fishd.hardware.checks import Check, Result, fail, ok, on_this_machine, warning
 from fishd.hardware.panel_pins import find_chip
 from fishd.hardware.registry import PACKAGES
 
@@ -22,8 +22,6 @@ _MODULES = {package: module for module, package in PACKAGES.items()} | {
 _REQUIREMENT = re.compile(
     r"(?P<name>[\w.-]+)\s*(?P<bounds>[^;]*)(;.*extra == [\"'](?P<extra>.+)[\"'])?"
 )
-_SWIMMER_PACKAGES = {("swimmer", "numba"), ("lab", "scipy")}
-"""Extra and package of each requirement of `robot: swimmer`."""
 _BOUND = re.compile(r"(>=|<|==)\s*([\d.]+)")
 
 
@@ -49,16 +47,16 @@ def packages(context: Context) -> Result:
     kind, requirements, drivers = context.config.kind, [], list[str]()
     texts, packages = list(metadata.requires("fishd") or []), set[str]()
     if kind.has_hardware:
-        for _, plugins, settings in context.drivers:
-            packages |= {name.lower() for name in plugins.find(settings.driver).packages}
-            texts += plugins.requirements(settings.driver)
-            drivers.append(settings.driver)
+        for driver in context.drivers:
+            packages |= {name.lower() for name in driver.find().packages}
+            texts += driver.plugins.requirements(driver.name)
+            drivers.append(driver.name)
     for text in texts:
         match = _REQUIREMENT.match(text)
         assert match
         name, extra = match["name"].lower(), match["extra"]
-        is_for_swimmer = not kind.is_tethered and (extra, name) in _SWIMMER_PACKAGES
-        if extra is None or (extra == "pi" and name in packages) or is_for_swimmer:
+        of_driver = extra == "pi" and name in packages
+        if extra is None or of_driver or (extra, name) in kind.packages:
             requirements.append((name, match["bounds"]))
     problems = [
         problem for name, bounds in requirements if (problem := _find_problem(name, bounds))
@@ -72,9 +70,7 @@ def packages(context: Context) -> Result:
 def gpio_package(context: Context) -> Result | None:
     """Check the packages with which drivers use pins of the header."""
     drivers = [
-        settings.driver
-        for _, plugins, settings in context.drivers
-        if header.PACKAGE in plugins.find(settings.driver).packages
+        driver.name for driver in context.drivers if header.PACKAGE in driver.find().packages
     ]
     installed = header.installed_packages()
     pip = f"{sys.executable} -m pip"
@@ -137,6 +133,6 @@ def _parse_version(version: str) -> list[int]:
 CHECKS = (
     Check("configuration", configuration),
     Check("packages", packages),
-    Check("gpio package", gpio_package, ("pi",)),
-    Check("gpio chip", gpio_chip, ("pi",)),
+    Check("gpio package", gpio_package, on_this_machine),
+    Check("gpio chip", gpio_chip, on_this_machine),
 )

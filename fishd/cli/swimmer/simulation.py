@@ -12,9 +12,9 @@ import click
 from fishd.cli.controller_arguments import ControllerGroup
 from fishd.cli.experiment_options import RUN_ONLY_OPTIONS, kept_arguments, restore_arguments
 from fishd.cli.options import F, FiniteRange
-from fishd.cli.output import echo, echo_rows, format_controller, print_json
+from fishd.cli.output import echo, echo_rows, format_controller, format_speed, print_json
 from fishd.cli.progress import show_progress
-from fishd.core import files, text
+from fishd.core import files
 from fishd.core.console import INTERRUPTED
 from fishd.core.errors import FishdError, ParameterError
 from fishd.core.process.interruption import on_signal
@@ -35,7 +35,7 @@ _RUN_ONLY_OPTIONS = RUN_ONLY_OPTIONS | dict.fromkeys(
 """Options that a resumed swim does not take over, and the number of words after each."""
 
 
-class SwimmerOptions(NamedTuple):
+class FreeSwimOptions(NamedTuple):
     """Values of the options that only a free swimmer has."""
 
     target: Path | None
@@ -80,7 +80,7 @@ def _check_writable(path: Path) -> None:
         raise ParameterError(f"{path}: {problem}") from None
 
 
-def swimmer_options(function: F) -> F:
+def free_swim_options(function: F) -> F:
     """Add `--to`, `--checkpoint-every`, `--resume` and `--film`."""
 
     def file_option(*names: str, about: str) -> Callable[[F], F]:
@@ -134,7 +134,7 @@ def _read_command(_: click.Context, path: Path) -> list[str]:
     return [*checkpoint.load(path).command, "--to", str(path)]
 
 
-def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> int:
+def swim(arguments: tuple[Any, ...], options: FreeSwimOptions, as_json: bool) -> int:
     """Swim, and print the report; return the exit status.
 
     arguments: configuration, controller, parameters, seconds, settle time, publisher, begun
@@ -200,7 +200,7 @@ def swim(arguments: tuple[Any, ...], options: SwimmerOptions, as_json: bool) -> 
 
 
 @contextmanager
-def _open_film(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[[Swimmer], None]]":
+def _open_film(config: "Config", options: FreeSwimOptions) -> "Iterator[Callable[[Swimmer], None]]":
     """Yield a function that paints the fish if there is a film; the film is written at the end."""
     if options.film is None:
         yield lambda fish: None
@@ -211,7 +211,7 @@ def _open_film(config: "Config", options: SwimmerOptions) -> "Iterator[Callable[
         yield lambda fish: film.add_frame(fish.fish)
 
 
-def _describe_checkpoint(outcome: "SwimResult", options: SwimmerOptions) -> str:
+def _describe_checkpoint(outcome: "SwimResult", options: FreeSwimOptions) -> str:
     """Return a clause about the file from which the swim can be resumed."""
     if outcome.checkpoint_time is not None:
         return (
@@ -251,14 +251,6 @@ def _report_rows(report: "SwimReport") -> list[tuple[str, str]]:
             f"{report.real_time_factor:.3g} × real time",
         ),
     ]
-
-
-def format_speed(speed: float, ci95: float | None, grid_error: float | None) -> str:
-    """Return a speed with its errors by averaging and by the grid."""
-    value = text.format_measured(speed, ci95, "m/s")
-    if grid_error is None:
-        return f"{value}, grid error not known (fishctl swimmer refine)"
-    return f"{value}, {text.format_half_width(grid_error)} by the grid"
 
 
 def _trend_rows(report: "SwimReport") -> list[tuple[str, str]]:

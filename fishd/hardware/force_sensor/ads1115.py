@@ -176,12 +176,7 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
     @classmethod
     def check(cls, settings: Ads1115Settings, tick: float) -> None:
         """Refuse an impossible range, one input for both forces, or too slow a rate."""
-        if settings.full_scale not in FULL_SCALES_V:
-            permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES_V)
-            raise Problem(
-                ("full_scale",),
-                f"{settings.full_scale:g} is not valid: one of {permitted} V is needed",
-            )
+        check_full_scale(settings.full_scale)
         low, high = settings.saturation_low, settings.saturation_high
         if low is not None and high is not None and low >= high:
             raise Problem(
@@ -212,16 +207,25 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
             Check("adc", lambda machine: _chip(machine, settings)),
         )
 
-    def _clipped(self, channel: int, code: int) -> str:
-        """Return why a code is clipped, by the ADC or by its amplifier; empty if it is not."""
+    def _clipped(self, channel: int, code: int) -> str | None:
+        """Return why a code is clipped, by the ADC or by its amplifier; None if it is not."""
         if self._lowest < code < self._highest:
-            return ""
+            return None
         name = self.names[channel]
         if code in (-ADC_STEPS, self._largest):
             return f"{name} is clipped at {math.copysign(self.settings.full_scale, code):+g} V"
         key = "saturation_high" if code >= self._highest else "saturation_low"
         volts = code * self._step
         return f"{name} is at {volts:+.4g} V: the amplifier is at its end (force_sensor.{key})"
+
+
+def check_full_scale(full_scale: float) -> None:
+    """Raise `Problem` unless this is a range of the chip, ± [V]."""
+    if full_scale not in FULL_SCALES_V:
+        permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES_V)
+        raise Problem(
+            ("full_scale",), f"{full_scale:g} is not valid: one of {permitted} V is needed"
+        )
 
 
 def _amplifier(settings: Ads1115Settings) -> Result:

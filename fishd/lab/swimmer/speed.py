@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from fishd.config import Config, Start
 from fishd.controllers import registry
 from fishd.core.beats import Reversals
+from fishd.core.errors import ConfigError
 from fishd.core.signals import Publisher
 from fishd.lab.simulation import VirtualRun
 from fishd.lab.statistics import student95
@@ -18,6 +20,9 @@ from fishd.lab.sweep.grid import Lengths, Point
 from fishd.lab.sweep.results import SpeedResult
 from fishd.lab.swimmer.refinement import find_grid_error
 from fishd.virtual.swimmer.track import Track
+
+if TYPE_CHECKING:
+    from fishd.virtual.swimmer.robot import Swimmer
 
 Array = NDArray[np.float64]
 MAX_SWIM_S = 24.0
@@ -31,6 +36,18 @@ The speed is steady if the means of its two halves differ by less than the first
 difference up to the second fraction is allowed if it lies within its 95 % confidence interval.
 """
 _STOP_CHECK_TICKS = 50
+
+
+def find_swimmer(run: VirtualRun) -> "Swimmer":
+    """Return the free swimmer of a run; raise `ConfigError` if its fish is of another kind."""
+    from fishd.virtual.swimmer.robot import Swimmer  # imports numba
+
+    if not isinstance(run.fish, Swimmer):
+        raise ConfigError(
+            f"robot: {run.config.robot} does not hang from a force sensor, so it has no thrust to "
+            "measure, and its speed is measured only with robot: swimmer"
+        )
+    return run.fish
 
 
 def swim_freely(
@@ -61,8 +78,7 @@ def swim_freely(
     track = Track()
     beat_starts: list[int] = []
     with VirtualRun(config, publisher) as run:
-        fish = run.swimmer
-        assert fish
+        fish = find_swimmer(run)
         on_start(run)
         track.begin(fish)
         run.loop.set_controller(point.controller, controller)

@@ -17,7 +17,6 @@ from rigs.window_process import (
     Browser,
     WindowProcess,
     open_page,
-    run,
     running_window,
 )
 
@@ -48,99 +47,79 @@ async def refuse_page(browser: Browser) -> int:
     return refusal.value.status
 
 
-def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url, NETWORK_HOST) as browser:
-            session = await browser.get("/api/session")
-            assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
-            for path in ("/api/fish", "/api/jobs", "/api/runs"):
-                assert await browser.refusal(path) == (401, "not-paired")
-            for path in ("estop", "drive", "release", "request"):
-                assert await browser.refusal(f"/api/fish/fish/{path}", {}) == (401, "not-paired")
-            assert await browser.refusal("/api/jobs", {}) == (401, "not-paired")
-            assert await refuse_page(browser) == 401
-
-    run(test())
+async def test_a_device_that_is_not_paired_gets_only_the_page(window: WindowProcess) -> None:
+    async with Browser(window.url, NETWORK_HOST) as browser:
+        session = await browser.get("/api/session")
+        assert (session["paired"], session["scope"], session["device"]) == (False, None, None)
+        for path in ("/api/fish", "/api/jobs", "/api/runs"):
+            assert await browser.refusal(path) == (401, "not-paired")
+        for path in ("estop", "drive", "release", "request"):
+            assert await browser.refusal(f"/api/fish/fish/{path}", {}) == (401, "not-paired")
+        assert await browser.refusal("/api/jobs", {}) == (401, "not-paired")
+        assert await refuse_page(browser) == 401
 
 
-def test_a_token_pairs_one_device_and_no_second_one(window: WindowProcess) -> None:
-    async def test() -> None:
-        token = token_of(window.invite("watch"))
-        async with (
-            Browser(window.url, NETWORK_HOST) as first,
-            Browser(window.url, NETWORK_HOST) as second,
-        ):
-            async with first.session.post(
-                "/api/pair", json={"token": token, "name": "A"}
-            ) as answer:
-                cookie = answer.headers["Set-Cookie"]
-                assert answer.status == 200
-            for part in ("HttpOnly", "SameSite=Strict", "Max-Age=31536000", "Path=/"):
-                assert part in cookie
-            assert (await first.get("/api/session"))["scope"] == "watch"
-            assert await second.refusal("/api/pair", {"token": token}) == (403, "device")
-            assert await second.refusal("/api/pair", {"token": "x" * 22}) == (403, "device")
-            await first.post("/api/unpair")
-            assert not (await first.get("/api/session"))["paired"]
-
-    run(test())
+async def test_a_token_pairs_one_device_and_no_second_one(window: WindowProcess) -> None:
+    token = token_of(window.invite("watch"))
+    async with (
+        Browser(window.url, NETWORK_HOST) as first,
+        Browser(window.url, NETWORK_HOST) as second,
+    ):
+        async with first.session.post("/api/pair", json={"token": token, "name": "A"}) as answer:
+            cookie = answer.headers["Set-Cookie"]
+            assert answer.status == 200
+        for part in ("HttpOnly", "SameSite=Strict", "Max-Age=31536000", "Path=/"):
+            assert part in cookie
+        assert (await first.get("/api/session"))["scope"] == "watch"
+        assert await second.refusal("/api/pair", {"token": token}) == (403, "device")
+        assert await second.refusal("/api/pair", {"token": "x" * 22}) == (403, "device")
+        await first.post("/api/unpair")
+        assert not (await first.get("/api/session"))["paired"]
 
 
-def test_a_device_that_may_watch_sees_the_fish_stops_it_and_nothing_more(
+async def test_a_device_that_may_watch_sees_the_fish_stops_it_and_nothing_more(
     window: WindowProcess,
 ) -> None:
-    async def test() -> None:
-        async with paired(window, "watch", "wall") as browser, open_page(browser) as page:
-            assert page.hello["session"]["scope"] == "watch"
-            await page.until("ticks")
-            for what in ("drive", "release", "request"):
-                assert await page.refusal(what) == (403, "only-watch")
-            assert await page.refusal("/api/jobs") == (403, "only-watch")
-            assert (await page.post("estop"))["way"] == "control"
-        async with Browser(window.url) as browser, open_page(browser) as page:
-            await page.drive()
-            await page.request("clear-fault")
-
-    run(test())
+    async with paired(window, "watch", "wall") as browser, open_page(browser) as page:
+        assert page.hello["session"]["scope"] == "watch"
+        await page.until("ticks")
+        for what in ("drive", "release", "request"):
+            assert await page.refusal(what) == (403, "only-watch")
+        assert await page.refusal("/api/jobs") == (403, "only-watch")
+        assert (await page.post("estop"))["way"] == "control"
+    async with Browser(window.url) as browser, open_page(browser) as page:
+        await page.drive()
+        await page.request("clear-fault")
 
 
-def test_a_paired_device_drives(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with paired(window, "drive", "tablet") as browser, open_page(browser) as page:
+async def test_a_paired_device_drives(window: WindowProcess) -> None:
+    async with paired(window, "drive", "tablet") as browser, open_page(browser) as page:
+        await page.swim()
+        status = await page.until("status", lambda status: status["lease"])
+        assert status["lease"]["name"] == "window: tablet"
+        await page.request("stop")
+
+
+async def test_a_revoked_device_loses_its_page_and_the_fish_stops(window: WindowProcess) -> None:
+    async with Browser(window.url) as here, open_page(here) as watcher:
+        async with paired(window, "drive", "stolen") as browser, open_page(browser) as page:
             await page.swim()
-            status = await page.until("status", lambda status: status["lease"])
-            assert status["lease"]["name"] == "window: tablet"
-            await page.request("stop")
-
-    run(test())
-
-
-def test_a_revoked_device_loses_its_page_and_the_fish_stops(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with Browser(window.url) as here, open_page(here) as watcher:
-            async with paired(window, "drive", "stolen") as browser, open_page(browser) as page:
-                await page.swim()
-                removed = window.ask("revoke", "stolen")
-                assert removed == "stolen is no longer paired; what it drives and its jobs end\n"
-                while (await page.sock.receive()).type is aiohttp.WSMsgType.TEXT:
-                    pass
-                assert page.sock.closed
-                assert await refuse_page(browser) == 401
-                assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
-            await watcher.until_at_rest()
-
-    run(test())
+            removed = window.ask("revoke", "stolen")
+            assert removed == "stolen is no longer paired; what it drives and its jobs end\n"
+            while (await page.sock.receive()).type is aiohttp.WSMsgType.TEXT:
+                pass
+            assert page.sock.closed
+            assert await refuse_page(browser) == 401
+            assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
+        await watcher.until_at_rest()
 
 
-def test_the_devices_are_listed_without_any_secret(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with paired(window, "watch", "listed"):
-            text = window.ask("devices")
-            assert re.search(r"(?m)^\w{8}  watch  seen \d{4}-\d\d-\d\d \d\d h  listed$", text)
-            listed: list[dict[str, Any]] = json.loads(window.ask("devices", "--json"))
-            assert listed[-1].keys() == {"id", "name", "scope", "paired", "seen"}
-
-    run(test())
+async def test_the_devices_are_listed_without_any_secret(window: WindowProcess) -> None:
+    async with paired(window, "watch", "listed"):
+        text = window.ask("devices")
+        assert re.search(r"(?m)^\w{8}  watch  seen \d{4}-\d\d-\d\d \d\d h  listed$", text)
+        listed: list[dict[str, Any]] = json.loads(window.ask("devices", "--json"))
+        assert listed[-1].keys() == {"id", "name", "scope", "paired", "seen"}
     file = window.state / "devices.json"
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     assert stat.S_IMODE(window.state.stat().st_mode) == 0o700
@@ -245,32 +224,23 @@ def test_the_file_is_written_after_its_copy(tmp_path: Path) -> None:
     assert paired.read_copy() == ()
 
 
-def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:
-    async def test() -> None:
-        async with paired(window, "watch", "viewer") as browser:
-            options = {"protocols": ["foxglove.sdk.v1"]}
-            async with browser.session.ws_connect("/foxglove", **options) as sock:
-                await sock.receive_str()
-                window.ask("revoke", "viewer")
-                while not sock.closed:
-                    await sock.receive()
-
-    run(test())
+async def test_a_revoked_device_loses_its_foxglove_too(window: WindowProcess) -> None:
+    async with paired(window, "watch", "viewer") as browser:
+        options = {"protocols": ["foxglove.sdk.v1"]}
+        async with browser.session.ws_connect("/foxglove", **options) as sock:
+            await sock.receive_str()
+            window.ask("revoke", "viewer")
+            while not sock.closed:
+                await sock.receive()
 
 
-def test_with_pair_all_a_browser_on_this_machine_needs_pairing(
+async def test_with_pair_all_a_browser_on_this_machine_needs_pairing(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     with running_window(tmp_path, settings="pair_all: true", fish=daemon.endpoint) as window:
-
-        async def test() -> None:
-            async with Browser(window.url) as browser:
-                assert await browser.refusal("/api/fish") == (401, "not-paired")
-                assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
-                session = await browser.post(
-                    "/api/pair", {"token": token_of(window.invite("drive"))}
-                )
-                assert (session["scope"], session["loopback"]) == ("drive", False)
-                assert await browser.get("/api/fish")
-
-        run(test())
+        async with Browser(window.url) as browser:
+            assert await browser.refusal("/api/fish") == (401, "not-paired")
+            assert await browser.refusal("/api/fish/fish/estop", {}) == (401, "not-paired")
+            session = await browser.post("/api/pair", {"token": token_of(window.invite("drive"))})
+            assert (session["scope"], session["loopback"]) == ("drive", False)
+            assert await browser.get("/api/fish")

@@ -30,16 +30,10 @@ def test_a_code_that_is_the_same_after_a_gap_was_not_frozen_for_all_that_time() 
         assert not measurements(ticks.run(0.2))[-1].suspect
 
 
+@pytest.mark.parametrize("bits", [16, 12])
 @pytest.mark.parametrize(("volts", "end"), [(3.0, "+2.048"), (-3.0, "-2.048")])
-def test_a_clipped_channel_is_named_with_its_limit(rig: ForceRig, volts: float, end: str) -> None:
-    rig.volts["A2-A3"] = volts
-    measured = Ticks(rig.sensor()).next()
-    assert measured.suspect == f"F_y (channel A2-A3) is clipped at {end} V"
-
-
-@pytest.mark.parametrize(("volts", "end"), [(3.0, "+2.048"), (-3.0, "-2.048")])
-def test_the_largest_code_of_an_ads1015_is_clipped_too(volts: float, end: str) -> None:
-    with ForceRig(bits=12) as rig:
+def test_a_clipped_channel_is_named_with_its_limit(volts: float, end: str, bits: int) -> None:
+    with ForceRig(bits=bits) as rig:
         rig.volts["A2-A3"] = volts
         measured = Ticks(rig.sensor()).next()
     assert measured.suspect == f"F_y (channel A2-A3) is clipped at {end} V"
@@ -58,8 +52,8 @@ def test_an_amplifier_with_one_output_ends_at_0(rig: ForceRig, low: float, suspe
     rig.volts = {"A0": 0.02, "A1": 1.65}
     sensor = rig.sensor(channel_x="A0", channel_y="A1", full_scale=4.096, saturation_low=low)
     suspect = Ticks(sensor).next().suspect
-    assert suspect.startswith("F_x (channel A0) is at +0.0") == suspected
-    assert bool(suspect) == suspected
+    assert (suspect is not None) == suspected
+    assert not suspect or suspect.startswith("F_x (channel A0) is at +0.0")
 
 
 def test_where_the_amplifier_has_another_supply_the_whole_range_is_believed(rig: ForceRig) -> None:
