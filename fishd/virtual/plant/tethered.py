@@ -184,14 +184,6 @@ class TetheredFish(Plant[PlantParameters]):
             [drive for w in windows for drive in w.drives],
         )
 
-    def prepare(self, instruction_angle: float | None, duration: float, samples: int) -> None:
-        """Compute the held windows of which the next one may be the first."""
-        if self._is_plain and instruction_angle is not None:
-            request = (instruction_angle, duration, samples)
-            counted = self._request, self._request_windows, self._mean_request_windows
-            if not self._is_known(request) and self._hold(*request) is None:
-                self._request, self._request_windows, self._mean_request_windows = counted
-
     def _is_known(self, request: tuple[float, float, int]) -> bool:
         """Return whether the next held window is that of a request from the present state."""
         held = self._held

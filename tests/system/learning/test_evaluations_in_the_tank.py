@@ -16,11 +16,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from fishd.client import Fish
 from fishd.config import load
 from fishd.core.signals import Observation
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import Evaluation
 from fishd.learning.env.swims import REST_TIME_S, Swims
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.ppo import make_learner
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.settings import EnvironmentSettings, PpoSettings, TrainingSettings

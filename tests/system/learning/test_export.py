@@ -28,9 +28,9 @@ from fishd.controllers.base import Limits
 from fishd.controllers.policy.file import read
 from fishd.controllers.policy.runtime import Network
 from fishd.core.errors import PolicyError
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.export import export, export_model
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.ppo import DeterministicPolicy
 from fishd.learning.run_folder import checkpoints
 from fishd.learning.run_folder.checkpoints import CheckpointError

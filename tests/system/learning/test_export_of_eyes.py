@@ -21,11 +21,11 @@ from fishd.controllers.policy.runtime import Network, Pilot
 from fishd.core.camera_frames import StackSettings
 from fishd.core.errors import PolicyError
 from fishd.lab.compare import compare
-from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning import export as exporting
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.export import export, export_model
 from fishd.learning.extractors import random_angles
+from fishd.learning.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.look import look
 from fishd.learning.ppo import DeterministicPolicy, activation_of, layers_of
 from fishd.learning.settings import (

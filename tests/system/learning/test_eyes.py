@@ -13,10 +13,10 @@ from fishd.camera.axis import NoMotion
 from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import Stack, StackSettings
-from fishd.lab.links.link import StepResult
-from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.extractors import FeatureExtractor, make_extractor, random_angles
+from fishd.learning.links.link import StepResult
+from fishd.learning.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.settings import EnvironmentSettings, TrainingSettings, VisionSettings
 
 CONFIG = Config()

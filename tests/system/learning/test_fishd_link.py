@@ -13,10 +13,10 @@ from fishd.client import Agent, Fish, FishError, NoDaemon
 from fishd.config import load
 from fishd.core.agent_messages import Observed
 from fishd.core.signals import Status
-from fishd.lab.links.fishd_link import FishdLink
-from fishd.lab.links.link import Link, LinkLost
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
+from fishd.learning.links.fishd_link import FishdLink
+from fishd.learning.links.link import Link, LinkLost
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.settings import EnvironmentSettings
 
 FISH = ["simulation.noise=1e-3", "simulation.offset_y=5e-3", "simulation.seed=7"]

@@ -17,10 +17,10 @@ from fishd.camera.axis import NoMotion
 from fishd.camera.simulated import DEFAULT, WEB, SimulatedCameraSettings
 from fishd.config import Config
 from fishd.core.camera_frames import StackSettings
-from fishd.lab.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.env import environment
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.extractors import FeatureExtractor, make_extractor
+from fishd.learning.links.simulated_link import Camera, SimulatedLink
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import (

@@ -10,12 +10,12 @@ from rigs.swimming import BRIEF, brief_job
 from fishd.config import load
 from fishd.controllers.policy.file import read
 from fishd.core.signals import Observation
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.lab.simulation import simulate
 from fishd.learning.env.environment import SwimEnv
 from fishd.learning.env.evaluation import evaluate_in_simulation, worst_on_others
 from fishd.learning.env.fish_variation import draw_fish
 from fishd.learning.export import export
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import (
     EnvironmentSettings,

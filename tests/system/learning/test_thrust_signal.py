@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from rigs.swimming import BRIEF, brief_job
 
 from fishd.config import load
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.ppo import Rollout
 from fishd.learning.settings import EnvironmentSettings, Randomisation
 from fishd.learning.thrust_signal import ThrustSignal

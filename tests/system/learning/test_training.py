@@ -15,9 +15,9 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from fishd.core.errors import ConfigError
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import features, thrust_scale
 from fishd.learning.env.evaluation import Evaluation
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.run_folder import checkpoints, runs
 from fishd.learning.run_folder.checkpoints import CheckpointError
 from fishd.learning.settings import EnvironmentSettings, EvaluationSettings, PpoSettings

@@ -10,7 +10,7 @@ from rigs.lockstep_rig import NEUTRAL, LockstepRig, lockstep_rig
 
 from fishd.config import load
 from fishd.control.estimators.lateral_force import LateralForceEstimator
-from fishd.control.faults import FAULTS, UNLISTED, Effect
+from fishd.control.faults import FAULTS, UNLISTED
 from fishd.control.guard import Guard
 from fishd.controllers.swing import Swing
 from fishd.core.signals import Reason, Tick
@@ -88,7 +88,7 @@ def test_the_servo_gets_what_the_row_of_a_latched_fault_says(code: str) -> None:
     rig.loop.supervisor.fail(code, "it broke")
     row = FAULTS.get(code, UNLISTED)
     assert rig.loop.supervisor.reason == Reason(code, "it broke", row.remedy)
-    released = row.effect is Effect.RELEASE
+    released = row.releases
     assert (robot.log[-1] is None) is released
     ticks = rig.run(12)
     assert {tick.mode for tick in ticks} == {"estop" if released else "fault"}

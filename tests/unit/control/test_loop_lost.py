@@ -159,7 +159,9 @@ def line(**changes: object) -> str:
     none = Percentiles(0.0, 0.0, 0.0, 0)
     fields = {**dict.fromkeys(Status.__struct_fields__, 0), "timing": Timing(none, none, {})}
     known = {"mode": "fault", "reason": None, "controller": "hold", "thrust": 0.0217}
-    return status_line(Status(**fields | known | {"force_unit": "N", "speed": None} | changes))
+    return status_line(
+        Status(**fields | known | {"force_unit": "N", "speed": None, "readings": {}} | changes)
+    )
 
 
 def test_the_status_line_shows_no_thrust_without_a_force_and_says_that_the_servo_is_lost() -> None:

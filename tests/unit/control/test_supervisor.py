@@ -7,14 +7,14 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from fishd.control.faults import FAULTS, Effect
+from fishd.control.faults import FAULTS
 from fishd.control.supervisor import Mode, Supervisor
 from fishd.core.errors import Refused
 from fishd.core.signals import Reason
 
 COUNTED = [code for code, row in FAULTS.items() if row.in_a_row == 3]
 counted = st.sampled_from(COUNTED)
-codes = st.sampled_from([code for code, row in FAULTS.items() if row.effect is Effect.FADE])
+codes = st.sampled_from([code for code, row in FAULTS.items() if not row.releases])
 
 
 class Transitions(RuleBasedStateMachine):

@@ -70,16 +70,6 @@ def test_a_policy_for_a_smaller_amplitude_stays_within_it(tmp_path: Path) -> Non
     assert max(tick.phi_c for tick in rig.run(10)) == 0.2
 
 
-def test_a_warm_up_changes_nothing(tmp_path: Path) -> None:
-    layers = random_layers(1, 8, 1)
-    path = write(tmp_path, to_onnx(layers, "tanh", card()))
-    warmed, plain = create_policy(path), create_policy(path)
-    warmed.warm_up()
-    for angle in (0.1, -0.3, 0.42):
-        assert warmed.update(observe(angle)) == plain.update(observe(angle))
-        warmed.warm_up()
-
-
 def root_of_what_is_left(largest: float, about: Card) -> bytes:
     """√(largest − x): not a number beyond."""
     left = helper.make_node("Sub", ["largest", "observation"], ["left"])
