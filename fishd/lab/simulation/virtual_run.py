@@ -77,7 +77,9 @@ class VirtualRun:
         with ExitStack() as stack:
             robot, self.fish = open_fish_in_virtual_time(config, stack)
             """The fish itself, as `RobotKind.open` describes it."""
-            robot = robot if metered else dataclasses.replace(robot, sensors=())
+            if not metered:
+                others = tuple(s for s in robot.sensors if "power" not in s.declared)
+                robot = dataclasses.replace(robot, sensors=others)
             self.loop = build_loop(config, robot, clock, publisher)
             stack.callback(self.loop.close)
             self._stack = stack.pop_all()

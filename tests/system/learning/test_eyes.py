@@ -26,9 +26,7 @@ TICKS = 256
 
 def extractor_of(kind: str, **settings: object) -> FeatureExtractor:
     camera = VisionSettings(feature_extractor=kind, **settings)
-    extractor = make_extractor(TrainingSettings(see="camera", camera=camera))
-    assert extractor
-    return extractor
+    return make_extractor(TrainingSettings(see="camera", camera=camera))
 
 
 def swim_with(
@@ -45,7 +43,6 @@ def swim_with(
     stacks, fins = [], []
     for angle in angles:
         env.advance(float(angle))
-        assert env.stack
         stacks.append(env.stack)
         fins.append(link._swimming().loop.robot.truth().alpha)
     return stacks, np.array(fins), angles
