@@ -27,6 +27,7 @@ from rigs.processes import (
     fishctl,
     one_line,
     running,
+    sets,
     wait_until,
 )
 
@@ -43,27 +44,23 @@ CAMERA = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def daemon_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    # The lease outlasts a program that is stopped for 3 s.
-    with running(tmp_path_factory.mktemp("fishd"), "--set", "control.lease=10") as daemon:
-        yield daemon
+DAEMON = sets("control.lease=10")  # it outlasts a program that is stopped for 3 s
 
 
 @pytest.fixture(scope="module")
 def camera(
-    daemon_of_all: Daemon, tmp_path_factory: pytest.TempPathFactory
+    shared_daemon: Daemon, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[CameraProcess]:
     folder = tmp_path_factory.mktemp("camera")
-    with running_camera(folder, f"simulated.fishd={daemon_of_all.endpoint}", *CAMERA) as camera:
+    with running_camera(folder, f"simulated.fishd={shared_daemon.endpoint}", *CAMERA) as camera:
         camera.until(lambda state: state.seq > 30)
         yield camera
 
 
 @pytest.fixture
-def daemon(daemon_of_all: Daemon, camera: CameraProcess) -> Daemon:
+def daemon(shared_daemon: Daemon, camera: CameraProcess) -> Daemon:
     """The fishd, at rest."""
-    return daemon_of_all.at_rest()
+    return shared_daemon.at_rest()
 
 
 @pytest.fixture
