@@ -4,13 +4,20 @@ import socket
 import time
 from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Callable, Iterable
 from contextlib import suppress
+from typing import TypeVar
 
 from fishd.core.errors import FishError, NoDaemon, NoKey
 from fishd.core.zmtp import Dealer
 
+T = TypeVar("T")
+
 MAX_REPLY_BYTES = 64 * 2**20
 """Maximum size of a reply [bytes]."""
+MAX_UNANSWERED_S = 1.0
+"""Time from a request to the end of its TCP connection if nothing is answered: a router may have
+forgotten it, and the next request connects again [s]."""
 
 
 class Requests(ABC):
@@ -30,6 +37,37 @@ class Requests(ABC):
         if is_ready:
             self.send(request)
         return is_ready
+
+    def exchange(
+        self,
+        request: bytes,
+        read: Callable[[bytes], T | None],
+        deadlines: Iterable[float],
+        may_repeat: bool,
+    ) -> T | None:
+        """Send a request, and return its result; None if there is none by the last deadline.
+
+        read: returns the result in a reply, None in one to an earlier request
+        deadlines: times to wait until, one after another [s, monotonic]
+        may_repeat: whether to send it again if the connection is lost
+
+        Raise `ConnectionResetError` if the connection was lost after the request was sent.
+        """
+        sent_on = None
+        for deadline in deadlines:
+            while sent_on is not None or self.send_by(deadline, request):
+                sent_on = sent_on or self.connections
+                if reply := self.receive_by(deadline, sent_on):
+                    result = read(reply)
+                    if result is not None:
+                        return result
+                elif self.is_connected(sent_on):
+                    break
+                elif may_repeat:
+                    sent_on = None
+                else:
+                    raise ConnectionResetError
+        return None
 
     def is_connected(self, connection: int) -> bool:
         """Return whether the connection of this number still exists."""
@@ -83,15 +121,65 @@ class Requests(ABC):
         return remaining > 0.0
 
 
+class Requester:
+    """Requests over a connection that is opened again where it may have died without an end."""
+
+    def __init__(self, open_socket: Callable[[], Requests], forgettable: bool) -> None:
+        """
+        open_socket: connects, or raises `FishError`
+        forgettable: whether there may be a router that forgets the connection
+        """
+        self._open_socket, self._forgettable = open_socket, forgettable
+        self._socket: Requests | None = None
+        self._asked = 0.0
+        """Time of the first request since the latest answer [s, monotonic]; 0 without one."""
+
+    def exchange(
+        self,
+        request: bytes,
+        read: Callable[[bytes], T | None],
+        deadlines: Iterable[float],
+        may_repeat: bool = True,
+    ) -> T | None:
+        """Do as `Requests.exchange`; disconnect if nothing was answered for a long time."""
+
+        def read_reply(reply: bytes) -> T | None:
+            self._asked = 0.0
+            return read(reply)
+
+        self._socket = self._socket or self._open_socket()
+        self._asked = self._asked or time.monotonic()
+        try:
+            result = self._socket.exchange(request, read_reply, deadlines, may_repeat)
+        except ConnectionResetError:
+            self._asked = 0.0
+            raise
+        is_silent = self._asked and time.monotonic() - self._asked >= MAX_UNANSWERED_S
+        if result is None and is_silent and self._forgettable:
+            self.disconnect()
+        return result
+
+    def interrupt(self) -> None:
+        """End the request of another thread, which then raises `FishError`."""
+        if self._socket:
+            self._socket.interrupt()
+
+    def disconnect(self) -> None:
+        """Close the connection; the next request opens another one."""
+        if self._socket:
+            self._socket.close()
+        self._socket, self._asked = None, 0.0
+
+
 class RequestSocket(Dealer[bytes | FishError], Requests):
     """Connection to the control socket of a daemon."""
 
     RETRY_S = 0.02
     HANDSHAKE_S = 30.0
 
-    def __init__(self, endpoint: str) -> None:
-        """Raises `NoDaemon` if the endpoint is not an address."""
-        self._endpoint = endpoint
+    def __init__(self, endpoint: str, program: str = "fishd") -> None:
+        """Raises `NoDaemon` if the endpoint is not an address; program: name of the server."""
+        self._endpoint, self._program = endpoint, program
         try:
             super().__init__(endpoint, MAX_REPLY_BYTES)
         except ValueError as error:
@@ -121,4 +209,6 @@ class RequestSocket(Dealer[bytes | FishError], Requests):
         return payload
 
     def _bad(self, what: str) -> FishError:
-        return FishError(f"the program at {self._endpoint} is not a fishd: it sent {what}")
+        return FishError(
+            f"the program at {self._endpoint} is not a {self._program}: it sent {what}"
+        )
