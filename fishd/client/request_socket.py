@@ -21,72 +21,33 @@ forgotten it, and the next request connects again [s]."""
 
 
 class Requests(ABC):
-    """Requests and replies over a connection to a daemon."""
+    """Connection of requests to a daemon."""
 
     connections: int
     """Number of connections established until the latest `state`."""
     _inbox: deque[bytes | FishError]
     _endpoint: str
-    _interrupted = False
+    is_interrupted = False
+    """Whether `interrupt` was called."""
     _ready = False
-
-    def send_by(self, deadline: float, request: bytes) -> bool:
-        """Send a request once the daemon accepts it; return False after the deadline [s]."""
-        while not (is_ready := self.state()[0]) and self._wait_until(deadline):
-            pass
-        if is_ready:
-            self.send(request)
-        return is_ready
-
-    def exchange(
-        self,
-        request: bytes,
-        read: Callable[[bytes], T | None],
-        deadlines: Iterable[float],
-        may_repeat: bool,
-    ) -> T | None:
-        """Send a request, and return its result; None if there is none by the last deadline.
-
-        read: returns the result in a reply, None in one to an earlier request
-        deadlines: times to wait until, one after another [s, monotonic]
-        may_repeat: whether to send it again if the connection is lost
-
-        Raise `ConnectionResetError` if the connection was lost after the request was sent.
-        """
-        sent_on = None
-        for deadline in deadlines:
-            while sent_on is not None or self.send_by(deadline, request):
-                sent_on = sent_on or self.connections
-                if reply := self.receive_by(deadline, sent_on):
-                    result = read(reply)
-                    if result is not None:
-                        return result
-                elif self.is_connected(sent_on):
-                    break
-                elif may_repeat:
-                    sent_on = None
-                else:
-                    raise ConnectionResetError
-        return None
 
     def is_connected(self, connection: int) -> bool:
         """Return whether the connection of this number still exists."""
         return self._ready and self.connections == connection
 
-    def receive_by(self, deadline: float, connection: int) -> bytes:
-        """Return a reply; empty if none has come by `deadline` [s, monotonic].
-
-        connection: number of the connection of the request; return empty once it is lost
-        Raise `FishError` for an invalid message.
-        """
-        while not self.state()[1]:
-            self._check_interrupted()
-            if not self.is_connected(connection) or not self._wait_until(deadline):
-                return b""
+    def take(self) -> bytes:
+        """Return a message, only if `state` reports one; raise `FishError` for an invalid one."""
         reply = self._inbox.popleft()
         if isinstance(reply, FishError):
             raise reply
         return reply
+
+    def wait_until(self, deadline: float) -> bool:
+        """Wait until `state` may have changed; return False after the deadline [s]."""
+        remaining = deadline - time.monotonic()
+        if remaining > 0.0:
+            self.wait(remaining)
+        return remaining > 0.0
 
     @abstractmethod
     def state(self) -> tuple[bool, bool]:
@@ -107,18 +68,6 @@ class Requests(ABC):
     @abstractmethod
     def close(self) -> None:
         """Disconnect; may be called twice."""
-
-    def _check_interrupted(self) -> None:
-        if self._interrupted:
-            raise FishError("the client was closed during a request")
-
-    def _wait_until(self, deadline: float) -> bool:
-        """Wait until `state` may have changed; return False after the deadline [s]."""
-        self._check_interrupted()
-        remaining = deadline - time.monotonic()
-        if remaining > 0.0:
-            self.wait(remaining)
-        return remaining > 0.0
 
 
 class Requester:
@@ -141,23 +90,41 @@ class Requester:
         deadlines: Iterable[float],
         may_repeat: bool = True,
     ) -> T | None:
-        """Do as `Requests.exchange`; disconnect if nothing was answered for a long time."""
+        """Send a request, and return its result; None if there is none by the last deadline.
 
-        def read_reply(reply: bytes) -> T | None:
-            self._asked = 0.0
-            return read(reply)
+        read: returns the result in a reply, None in one to an earlier request
+        deadlines: times to wait until, one after another [s, monotonic]
+        may_repeat: whether to send it again if the connection is lost
 
-        self._socket = self._socket or self._open_socket()
+        Raise `ConnectionResetError` if the connection was lost after the request was sent.
+        """
+        connection = self._socket = self._socket or self._open_socket()
         self._asked = self._asked or time.monotonic()
-        try:
-            result = self._socket.exchange(request, read_reply, deadlines, may_repeat)
-        except ConnectionResetError:
-            self._asked = 0.0
-            raise
-        is_silent = self._asked and time.monotonic() - self._asked >= MAX_UNANSWERED_S
-        if result is None and is_silent and self._forgettable:
+        sent_on = None
+        """Number of the connection over which the request was sent."""
+        for deadline in deadlines:
+            while True:
+                can_send, is_waiting = connection.state()
+                if connection.is_interrupted:
+                    raise FishError("the client was closed during a request")
+                if sent_on is None and can_send:
+                    sent_on = connection.connections
+                    connection.send(request)
+                elif sent_on is not None and is_waiting:
+                    self._asked = 0.0
+                    result = read(connection.take())
+                    if result is not None:
+                        return result
+                elif sent_on is not None and not connection.is_connected(sent_on):
+                    if not may_repeat:
+                        self._asked = 0.0
+                        raise ConnectionResetError
+                    sent_on = None
+                elif not connection.wait_until(deadline):
+                    break
+        if self._asked and time.monotonic() - self._asked >= MAX_UNANSWERED_S and self._forgettable:
             self.disconnect()
-        return result
+        return None
 
     def interrupt(self) -> None:
         """End the request of another thread, which then raises `FishError`."""
@@ -200,7 +167,7 @@ class RequestSocket(Dealer[bytes | FishError], Requests):
 
     def interrupt(self) -> None:
         """End the wait of another thread, whose request then raises `FishError`."""
-        self._interrupted = True
+        self.is_interrupted = True
         if connected := self._socket:
             with suppress(OSError):
                 connected.shutdown(socket.SHUT_RDWR)
