@@ -127,7 +127,7 @@ def _wave_kind(
     name: str, controller: Controller[Any], parameters: dict[str, Any]
 ) -> tuple[str, dict[str, Any]]:
     """Return a value that is equal for waves of one kind, whatever their size."""
-    likeness = type(controller).swims_like
+    likeness = type(controller).same_wave_as
     if not isinstance(likeness, Likeness):
         return name, parameters
     return likeness.name, {

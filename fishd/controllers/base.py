@@ -64,6 +64,8 @@ class Limits(Struct, frozen=True):
     """Settings for a policy that reverses too fast; `dwell` above is the effective one."""
     tethered: bool = True
     """Whether the fish hangs from its force sensor, so that F_x is its thrust."""
+    readings: tuple[str, ...] | None = None
+    """Names of the readings of the sensors, which `Observation.readings` has; None if unknown."""
     thrust_coefficient: float | None = None
     """K of the observer's model of the fish: ratio of thrust to the mean square of the fin velocity
     [N s²/rad²]; None if the fin velocity is not from a model."""
@@ -91,7 +93,7 @@ class Controller(ABC, Generic[P]):
     """
 
     Parameters: ClassVar[type[Struct]]
-    swims_like: ClassVar[Likeness | None] = None
+    same_wave_as: ClassVar[Likeness | None] = None
     """The other controller whose known thrust applies to the wave of this one, too."""
 
     uses_lateral_force: ClassVar[bool] = True

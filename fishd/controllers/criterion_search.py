@@ -88,7 +88,7 @@ rung and the other side the other: with few ticks per half beat, the optimum may
 
 
 class Judgement(NamedTuple):
-    """Measurement of some beats by the force."""
+    """Measurement of several beats by the force."""
 
     ripple: float
     """Ripple of F_x, rms [N]."""

@@ -154,7 +154,7 @@ class Operations:
             clock=self._clock.monotonic(),
             boot_id=self._boot,
             speed=self._speed(),
-            power=loop.power.mean,
+            readings=loop.readings.states(self._clock.monotonic()),
             fy_reversed=loop.perception.lateral_sign.reversed,
             leak=loop.perception.found_leak,
             lease=loop.lease.holder,
@@ -167,7 +167,8 @@ class Operations:
         loop = self._loop
         return (
             *loop.robot.limitations(),
-            *filter(None, [loop.power.trouble, loop.perception.lateral_sign.complaint]),
+            *loop.readings.troubles.values(),
+            *filter(None, [loop.perception.lateral_sign.complaint]),
         )
 
     def _speed(self) -> float | None:

@@ -3,7 +3,8 @@
 import copy
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -38,12 +39,15 @@ from fishd.recording.writer import (
     CALIBRATIONS_ATTACHMENT,
     CHANNELS,
     CONFIG_ATTACHMENT,
+    UNITS,
 )
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 T = TypeVar("T")
+
+_decode_units: Callable[[bytes], dict[str, str]] = decoder(dict[str, str])
 
 TOPICS = dict(enumerate((*CHANNELS, IMAGE_TOPIC), start=1))
 """Topics by the channel numbers of `RunWriter`, for a file whose channel records are damaged."""
@@ -147,6 +151,15 @@ class Run:
                 f"{self.path}: the configuration of fishd {version} cannot be read by this one: "
                 f"{error}"
             ) from None
+
+    @property
+    def reading_units(self) -> dict[str, str]:
+        """Unit of each reading of the sensors, by name, as far as they were recorded."""
+        units: dict[str, str] = {}
+        for daemon in self.daemons:
+            with suppress(msgspec.DecodeError):
+                units |= _decode_units(daemon.get(UNITS, "{}").encode())
+        return units
 
     def has_settings(self, number: int) -> bool:
         """Return whether the recording contains the configuration of this fishd."""

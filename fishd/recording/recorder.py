@@ -365,7 +365,7 @@ class Description(NamedTuple):
     def write(self, writer: RunWriter) -> None:
         """Write the description to a recording; raise `RecordingError`."""
         about = {name: str(getattr(self.status, name)) for name in STATUS_FIELDS}
-        writer.describe(self.config, about)
+        writer.describe(self.config, about, self.status.readings)
         if self.calibrations is not None:
             writer.calibrated(self.calibrations)
 

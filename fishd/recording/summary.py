@@ -53,8 +53,8 @@ class Summary(Struct):
     It is the mean of those of the ticks: all ticks share the error of one zero, which does not
     average out.
     """
-    power: float | None = None
-    """Mean electrical power of the servo while a controller swam; None if unknown [W]."""
+    readings: dict[str, float] = {}
+    """Means of the readings of the sensors while a controller swam, by name."""
     swim_ticks: dict[str, int] = {}
     """Number of ticks in mode running, by controller."""
     force_unit: str = "N"
@@ -81,7 +81,7 @@ class TickHead(Struct, frozen=True, gc=False):
     thrust: float
     frequency: float
     thrust_ci95: float | UnsetType = UNSET
-    power: float | UnsetType = UNSET
+    readings: dict[str, float] | UnsetType = UNSET
     time: float = 0.0
     busy_time_us: float = 0.0
 
@@ -117,7 +117,8 @@ class Tally:
         self._impulse = 0.0
         self._known_ticks = 0
         self._thrust = self._error = 0.0
-        self._energy, self._metered = 0.0, 0
+        self._readings: dict[str, tuple[float, int]] = {}
+        """Sum and number of the values of each reading."""
         self._last_frame: FrameHead | None = None
 
     def set_daemon(self, daemon: Mapping[str, str]) -> None:
@@ -156,9 +157,9 @@ class Tally:
                 self._known_ticks += 1
                 self._thrust += tick.thrust
                 self._error += tick.thrust_ci95
-            if tick.power is not UNSET:
-                self._energy += tick.power
-                self._metered += 1
+            for name, value in (tick.readings or {}).items():
+                total, count = self._readings.get(name, (0.0, 0))
+                self._readings[name] = total + value, count + 1
             counts.swim_ticks[tick.controller] = counts.swim_ticks.get(tick.controller, 0) + 1
         is_same_fishd = last is None or tick.seq > last.seq
         if not is_same_fishd:  # it counts from 1
@@ -257,7 +258,7 @@ class Tally:
             lost_ticks=sum(gap.lost for gap in self.gaps),
             thrust=thrust,
             thrust_ci95=error,
-            power=self._energy / self._metered if self._metered else None,
+            readings={name: total / count for name, (total, count) in self._readings.items()},
             swim_ticks=swim_ticks,
             clock_steps=tuple(self.clock_steps),
         )

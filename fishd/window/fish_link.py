@@ -385,12 +385,12 @@ def _builtins(result: Struct) -> dict[str, Any]:
 
 
 def _columns(payloads: Iterable[bytes]) -> dict[str, Any]:
-    """Return ticks as columns by field; those of the quantities are in a mapping."""
+    """Return ticks as columns by field; those of quantities and readings are in mappings."""
     ticks = [_decode_tick(payload) for payload in payloads]
     columns: dict[str, Any] = {}
     for name in Tick.__struct_fields__:
         column = [getattr(tick, name) for tick in ticks]
-        if name == "quantities":
+        if name in ("quantities", "readings"):
             columns[name] = _transpose([{} if row is UNSET else row for row in column])
         elif name not in _OPTIONAL or any(value is not UNSET for value in column):
             columns[name] = [None if value is UNSET else value for value in column]

@@ -172,7 +172,7 @@ class Wrapped:
             sensor=self,
             servo=self,
             truth=self._robot.truth,
-            power=self._robot.power,
+            sensors=self._robot.sensors,
         )
 
     def read(self, now: float) -> Measurement:

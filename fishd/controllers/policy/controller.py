@@ -56,14 +56,14 @@ class Ppo(Controller[PpoParameters]):
 
     def __init__(self, parameters: PpoParameters, limits: Limits) -> None:
         """Read, check and warm up the policy."""
-        from fishd.controllers.policy.card import History
+        from fishd.controllers.policy.card import History, is_even
 
         self.parameters = parameters  # without super(), which would read the policy twice
         self.limits = limits
         card, self._network = _open(parameters, limits)
         self._history = History(card.observation, card.window, self._network.row)
         names = [feature.name for feature in card.observation] * card.history
-        self._odd = [index for index, name in enumerate(names) if name != "fx"]
+        self._odd = [index for index, name in enumerate(names) if not is_even(name)]
         """Indices of the inputs that change sign for a mirrored fish."""
         self._amplitude = card.amplitude
         self._limit = DwellLimit(limits.dwell, limits, card.amplitude)

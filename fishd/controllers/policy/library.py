@@ -65,7 +65,7 @@ def open_policy(text: str, limits: "Limits") -> "PolicyFile":
     path = find(text)
     policy = file.read(path)
     try:
-        policy.card.check_fit(limits.tick, limits.amplitude)
+        policy.card.check_fit(limits.tick, limits.amplitude, limits.readings)
         if limits.scaled and any(
             feature.name == "fin_velocity" for feature in policy.card.observation
         ):

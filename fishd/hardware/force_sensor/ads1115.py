@@ -176,12 +176,7 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
     @classmethod
     def check(cls, settings: Ads1115Settings, tick: float) -> None:
         """Refuse an impossible range, one input for both forces, or too slow a rate."""
-        if settings.full_scale not in FULL_SCALES_V:
-            permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES_V)
-            raise Problem(
-                ("full_scale",),
-                f"{settings.full_scale:g} is not valid: one of {permitted} V is needed",
-            )
+        check_full_scale(settings.full_scale)
         low, high = settings.saturation_low, settings.saturation_high
         if low is not None and high is not None and low >= high:
             raise Problem(
@@ -222,6 +217,15 @@ class Ads1115(ForceSensorDriver[Ads1115Settings]):
         key = "saturation_high" if code >= self._highest else "saturation_low"
         volts = code * self._step
         return f"{name} is at {volts:+.4g} V: the amplifier is at its end (force_sensor.{key})"
+
+
+def check_full_scale(full_scale: float) -> None:
+    """Raise `Problem` unless this is a range of the chip, ± [V]."""
+    if full_scale not in FULL_SCALES_V:
+        permitted = ", ".join(f"{scale:g}" for scale in FULL_SCALES_V)
+        raise Problem(
+            ("full_scale",), f"{full_scale:g} is not valid: one of {permitted} V is needed"
+        )
 
 
 def _amplifier(settings: Ads1115Settings) -> Result:

@@ -17,7 +17,7 @@ from rigs.camera_process import COMMAND, CameraProcess, running_camera
 from rigs.processes import PATIENCE, Daemon, call, running, sets, wait_until
 
 from fishd.camera import requests
-from fishd.camera.client import CameraClient, CameraLost
+from fishd.camera.client import CameraLost
 from fishd.camera.requests import CameraRequests, resolve_frames_address
 from fishd.cli.doctor import service
 from fishd.cli.doctor.base import Context
@@ -133,11 +133,6 @@ def test_views_are_drawn_for_whoever_wants_them_and_seldom(camera: CameraProcess
         assert client.view is None
 
 
-def test_no_camera_is_said_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(CameraLost, match=r"no camera at ipc:\S+: no answer within 0.2 s; start"):
-        CameraClient(f"ipc://{tmp_path}/nobody", timeout=0.2)
-
-
 @pytest.mark.parametrize(
     ("frames", "endpoint", "seen"),
     [
@@ -156,7 +151,6 @@ def test_the_doctor_says_how_the_camera_is(
     camera.until(lambda state: state.rate > 0.0)  # a single frame has no rate
     monkeypatch.setenv("FISHD_CAMERA", camera.endpoint)
     check = service.camera(context)
-    assert check
     assert (check.level, check.message[:5]) == ("ok", "120.0")
     monkeypatch.setenv("FISHD_CAMERA", f"ipc://{tmp_path}/nobody")
     assert service.camera(context) is None

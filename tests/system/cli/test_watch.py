@@ -127,8 +127,6 @@ def test_json_lines_are_not_held_back_and_ctrl_c_is_a_clean_end(daemon: Daemon) 
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        assert process.stdout
-        assert process.stderr
         assert json.loads(process.stdout.readline())["mode"] == "running"
         process.send_signal(signal.SIGINT)
         process.stdout.read()

@@ -51,14 +51,6 @@ def test_the_default_slew_limit_leaves_a_square_wave_alone(amplitude: float, tic
     assert guard.apply(amplitude, -amplitude) == amplitude
 
 
-def test_a_fade_takes_the_fade_time_from_the_limit_to_neutral() -> None:
-    guard = Guard(amplitude=0.4, tick=0.05, slew_limit=None, fade_time=0.4)
-    angle, steps = 0.4, 0
-    while angle:
-        angle, steps = guard.fade(angle), steps + 1
-    assert steps == 8
-
-
 @given(angles, angles, st.lists(angles | finite))
 def test_a_restricted_guard_permits_neither_more_than_the_servo_reaches_nor_more_than_phi(
     left: float, right: float, commands: list[float]

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from msgspec import UNSET, structs
 from rigs.harness import Rig, Scripted, Wrapped, fragile_rig
+from rigs.scripted_sensor import ScriptedSensor
 
 from fishd.core.clock import VirtualClock
 from fishd.core.errors import ControllerFault, Refused, SensorError, ServoError
@@ -290,7 +291,13 @@ class Restless(Wrapped):
         return replace(
             super().robot(),
             truth=lambda: Truth(*self.next_values(3)),
-            power=lambda now: self.next_values(1)[0],
+            sensors=(self.sensor,),
+        )
+
+    @property
+    def sensor(self) -> ScriptedSensor:
+        return ScriptedSensor(
+            latest=lambda: {"water_temperature": (self.clock.now, self.next_values(1)[0])}
         )
 
     def next_values(self, count: int) -> list[float]:

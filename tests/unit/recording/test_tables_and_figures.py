@@ -77,7 +77,9 @@ def test_a_curve_has_breaks_and_events_and_units_are_said(path: Path, tmp_path: 
     assert [index for index, value in enumerate(drawn.fx) if value != value] == [20]
     expected = ["swing C=0.6 longest_half_period=1 s lead=0 s", "C=0.3"]
     assert [event.text for event in traces(open_run(path)).events] == expected
-    assert list(drawn.quantities) == ["top_speed", "reversal_speed", "since_reversal (s)"]
+    assert list(drawn.quantities) == [
+        *("power", "top_speed", "reversal_speed", "since_reversal (s)")
+    ]
 
 
 def test_spectrum_and_mean_beat_of_a_swim_show_its_frequency_and_no_gap(tmp_path: Path) -> None:

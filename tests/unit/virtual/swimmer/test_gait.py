@@ -56,10 +56,8 @@ def rising(by: float, seconds: float = 20.0) -> Array:
 def test_a_fish_that_still_speeds_up_is_said_to_and_the_interval_widens_too_little() -> None:
     result = gait(track(20.0, rising(0.01)), SETTINGS)
     assert result.speed_trend == pytest.approx(0.01 / 1.1, rel=0.02)
-    assert result.speed_ci95
     assert result.speed_ci95 < 0.12 - result.speed
     slower = gait(track(20.0, rising(-0.01)), SETTINGS)
-    assert slower.speed_trend
     assert slower.speed_trend < 0.0
 
 
@@ -84,6 +82,5 @@ def test_the_interval_covers_the_mean_although_beats_are_alike() -> None:
         for index in range(1, 3000):  # correlated over 0.5 s
             wander[index] = 0.98 * wander[index - 1] + noise[index]
         result = gait(track(30.0, 0.1 + 0.002 * wander), SETTINGS)
-        assert result.speed_ci95
         held += abs(result.speed - 0.1) <= result.speed_ci95
     assert 180 <= held <= 199
