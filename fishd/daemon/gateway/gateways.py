@@ -53,13 +53,13 @@ class ListeningSocket:
         self._gateway, self._listener = gateway, listener
 
     def open(self) -> None:
-        """Let the process of the gateway listen; raise OSError if it cannot be told."""
+        """Let the process of the gateway listen; raise OSError if that fails."""
         self._gateway.send_listener(self.kind, self.address, self._listener)
 
     def listen_at(self, address: str, listener: socket.socket) -> None:
         """Listen at another address, too; connections through the present one stay.
 
-        Raise OSError if the process could not be told; nothing has changed then.
+        Raise OSError if the process does not get it; nothing has changed then.
         """
         self._gateway.send_listener(self.kind, address, listener)
         former, self._listener = self._listener, listener.dup()
