@@ -43,16 +43,10 @@ REDRAW_INTERVAL_S = 0.2
 @json_option
 def status(address: str | None, as_json: bool) -> None:
     """Show the state of the camera and its beginning, the rate, the age of frames, and losses."""
-    import zmq
-
     from fishd.camera.requests import CameraRequests, find_camera
 
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    try:
-        requests = CameraRequests(address or find_camera(), context, ANSWER_TIMEOUT_S)
+    with CameraRequests(address or find_camera(), ANSWER_TIMEOUT_S) as requests:
         state = requests.status()
-    finally:
-        context.destroy(linger=0)
     if as_json:
         print_json(state)
     else:

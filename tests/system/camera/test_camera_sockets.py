@@ -108,15 +108,11 @@ def test_within_a_tick_there_is_no_time_to_find_out_why_no_answer_comes(
     camera: CameraProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(requests, "_PUBLISHER_CHECK_MS", int(PATIENCE * 1e3))
-    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    try:
-        asking = CameraRequests(camera.frames, context, timeout=0.3)
+    with CameraRequests(camera.frames, timeout=0.3) as asking:
         with pytest.raises(CameraLost, match=r"no answer within 0\.05 s"):
             asking.status(0.05)
         with pytest.raises(CameraLost, match=r".+ is the address of a camera's frames"):
             asking.status()
-    finally:
-        context.destroy(linger=0)
 
 
 def test_views_are_drawn_for_whoever_wants_them_and_seldom(camera: CameraProcess) -> None:
