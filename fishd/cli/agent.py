@@ -23,7 +23,7 @@ from fishd.core.signals import Observation
 if TYPE_CHECKING:
     from fishd.camera.live_sight import LiveSight
     from fishd.controllers.policy.runtime import Pilot
-    from fishd.lab.links.fishd_link import FishdLink
+    from fishd.learning.links.fishd_link import FishdLink
 
 CAMERA_LOST_AFTER_S = 2.0
 """Time without frames after which the camera counts as lost [s]."""
@@ -74,8 +74,8 @@ def agent(
         import_module(package)  # `Verbs` names the extra of a missing package
     from fishd.camera.live_sight import LiveSight
     from fishd.controllers.policy.runtime import Pilot
-    from fishd.lab.links.fishd_link import FishdLink
-    from fishd.lab.links.link import LinkLost
+    from fishd.learning.links.fishd_link import FishdLink
+    from fishd.learning.links.link import LinkLost
 
     stopping = threading.Event()
     with on_signal(stopping.set), Fish(endpoint) as fish, ExitStack() as stack:

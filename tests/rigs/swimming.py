@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from fishd.config import load
 from fishd.core.signals import Observation
-from fishd.lab.links.link import LinkLost, StepResult
-from fishd.lab.links.simulated_link import SimulatedLink
+from fishd.learning.links.link import LinkLost, StepResult
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.settings import EvaluationSettings, PpoSettings, TrainingSettings
 from fishd.learning.train.jobs import Job
 from rigs.processes import fishctl

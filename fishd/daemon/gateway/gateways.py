@@ -53,13 +53,13 @@ class ListeningSocket:
         self._gateway, self._listener = gateway, listener
 
     def open(self) -> None:
-        """Let the process of the gateway listen; raise OSError if it cannot be told."""
+        """Let the process of the gateway listen; raise OSError if that fails."""
         self._gateway.send_listener(self.kind, self.address, self._listener)
 
     def listen_at(self, address: str, listener: socket.socket) -> None:
         """Listen at another address, too; connections through the present one stay.
 
-        Raise OSError if the process could not be told; nothing has changed then.
+        Raise OSError if the process does not get it; nothing has changed then.
         """
         self._gateway.send_listener(self.kind, address, listener)
         former, self._listener = self._listener, listener.dup()
@@ -200,10 +200,12 @@ class Gateway:
         self._open_all(CONTROL, TELEMETRY)
 
     def _open_all(self, *kinds: str) -> None:
-        with suppress(OSError):  # a read will notice the end of the process
+        try:
             for listening in self._sockets:
                 if listening.kind in kinds:
                     listening.open()
+        except OSError:  # it has ended, or the link is full
+            self._process.kill()  # a read will notice that
 
     def _read_message(self) -> None:
         assert self._link
@@ -263,7 +265,8 @@ class Gateway:
             self._report = self._events.call_later(RECONNECT_TIME_S, self._report_restart)
 
     def _report_restart(self) -> None:
-        self._report, why, self._why = None, self._why, ""
+        why = self._why or "its process ended"  # just now, again
+        self._report, self._why = None, ""
         self.on_restart(why)
 
     def _drop_link(self) -> None:
@@ -318,9 +321,9 @@ class Gateways:
             stack.callback(gateway.end)  # so that all end at the same time
 
     @property
-    def want_ticks(self) -> bool:
-        """Whether a subscriber of any gateway wants ticks."""
-        return any(gateway.wants_ticks for gateway in self._gateways)
+    def of_ticks(self) -> list[Gateway]:
+        """Those with a subscriber of ticks."""
+        return [gateway for gateway in self._gateways if gateway.wants_ticks]
 
     def publish(self, message: bytes) -> None:
         """Send a message to all subscribers."""
@@ -378,8 +381,10 @@ class Telemetry:
 
     def tick(self, tick: Tick) -> None:
         """Publish a tick on topic `tick`, if there is a subscriber."""
-        if self._gateways.want_ticks:
-            self._gateways.publish(join_frames(b"tick", self._encode(tick)))
+        if gateways := self._gateways.of_ticks:
+            message = join_frames(b"tick", self._encode(tick))
+            for gateway in gateways:
+                gateway.send(message)
 
     def event(self, event: Event) -> None:
         """Publish an event on topic `event`."""

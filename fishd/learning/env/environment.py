@@ -29,9 +29,9 @@ from fishd.core.camera_frames import Stack
 from fishd.core.errors import ConfigError
 from fishd.core.schema import Reading
 from fishd.core.signals import Observation, Truth
-from fishd.lab.links.link import Link, LinkLost
 from fishd.learning.env.perception import Perception
 from fishd.learning.extractors import FeatureExtractor, random_angles
+from fishd.learning.links.link import Link, LinkLost
 from fishd.learning.settings import EnvironmentSettings
 from fishd.virtual.plant.optimum import best_square_wave
 

@@ -12,7 +12,7 @@ import struct
 import subprocess
 import termios
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -41,19 +41,13 @@ COLOUR = re.compile(r"\x1b\[(?:\d+;)*[34]\d(?:;\d+)*m")
 BRAILLE = re.compile("[\u2801-\u28ff]")
 
 
-@pytest.fixture(scope="module")
-def daemon_of_all(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    with running(tmp_path_factory.mktemp("daemon")) as daemon:
-        yield daemon
-
-
 @pytest.fixture
-def daemon(daemon_of_all: Daemon) -> Daemon:
+def daemon(shared_daemon: Daemon) -> Daemon:
     """The fishd, swimming, reset to its state after the start."""
-    with Fish(daemon_of_all.at_rest().endpoint, timeout=PATIENCE) as fish:
+    with Fish(shared_daemon.at_rest().endpoint, timeout=PATIENCE) as fish:
         fish.set_controller("swing")
         wait_until(lambda: fish.status().phi_c != 0.0)
-    return daemon_of_all
+    return shared_daemon
 
 
 class Terminal:
@@ -137,8 +131,6 @@ def test_json_lines_are_not_held_back_and_ctrl_c_is_a_clean_end(daemon: Daemon) 
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
-        assert process.stdout
-        assert process.stderr
         assert json.loads(process.stdout.readline())["mode"] == "running"
         process.send_signal(signal.SIGINT)
         process.stdout.read()

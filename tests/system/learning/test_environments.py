@@ -17,8 +17,8 @@ import fishd.learning  # noqa: F401 (registers the environments)
 from fishd.client import Fish
 from fishd.config import load
 from fishd.core.errors import ConfigError
-from fishd.lab.links.simulated_link import SimulatedLink
 from fishd.learning.env.environment import SwimEnv
+from fishd.learning.links.simulated_link import SimulatedLink
 from fishd.learning.settings import EnvironmentSettings
 
 STILL = ("simulation.noise=0.0",)
@@ -82,7 +82,6 @@ def test_an_environment_is_made_from_the_files_of_fish_and_training(tmp_path: Pa
     observation, _ = env.reset(seed=1)
     assert observation.shape == (1,)
     swim = env.unwrapped
-    assert isinstance(swim, SwimEnv)
     assert swim.link.amplitude == 0.2
     ends = [env.step(np.ones(1, np.float32))[2:4] for _ in range(3)]
     assert ends == [(False, False), (False, False), (False, True)]

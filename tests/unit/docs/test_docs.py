@@ -141,7 +141,6 @@ def options_of(command: click.Command, context: click.Context) -> Iterator[str]:
     if isinstance(command, click.Group):
         for name in command.list_commands(context):
             subcommand = command.get_command(context, name)
-            assert subcommand
             yield from options_of(subcommand, click.Context(subcommand, parent=context))
 
 

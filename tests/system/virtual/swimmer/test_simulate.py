@@ -14,10 +14,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rigs.coarse_swimmer import OPTIONS, coarse
+from rigs.coarse_swimmer import OPTIONS
 from rigs.processes import FISHCTL, PATIENCE, fishctl, one_line, sets
 
-from fishd.lab.swimmer.free_swim import swim
 from fishd.virtual.swimmer import checkpoint
 from fishd.virtual.swimmer.track import COLUMNS
 
@@ -287,8 +286,3 @@ def test_a_recording_has_where_the_fish_was(tmp_path: Path) -> None:
     assert done.returncode == 0
     header = (tmp_path / "swim.csv").read_text().partition("\n")[0].split(",")
     assert {"x", "y", "speed", "heading"} <= set(header)
-
-
-def test_the_same_swim_gives_the_same_track() -> None:
-    first, second = (swim(coarse(), "swing", {"C": 0.6}, 0.5, 0.1).track.rows() for _ in range(2))
-    assert np.array_equal(first, second)
