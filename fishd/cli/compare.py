@@ -114,7 +114,7 @@ def compare(
     if run.fish.on == "live":
         outcome = _measure(run, contestants, settings, runs or 1, camera, agent)
     else:
-        outcome = _swim(run, contestants, settings, runs, camera_config)
+        outcome = _swim(run, contestants, settings, runs, camera_config or camera)
     status = _report(outcome, runs or 1, run)
     if run.picture and outcome.standings:
         from fishd.lab.compare.figures import draw

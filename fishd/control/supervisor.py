@@ -95,7 +95,7 @@ class Supervisor:
         problem: what failed; None if the check passed
         """
         limit = FAULTS[code].in_a_row
-        if problem is None:
+        if not problem:
             self.failures.pop(code, None)
             return
         self.failures[code] = count = self.failures.get(code, 0) + 1

@@ -50,7 +50,7 @@ class Limits(Struct, frozen=True):
     """Limits of the loop for a controller."""
 
     amplitude: float
-    """Φ: commands beyond ±Φ are clamped by the guard [rad]."""
+    """Φ: angles beyond ±Φ are clamped by the guard [rad]."""
     tick: float
     """Period of the loop [s]."""
     scaled: bool = False
@@ -97,7 +97,7 @@ class Controller(ABC, Generic[P]):
     """The other controller whose known thrust applies to the wave of this one, too."""
 
     uses_lateral_force: ClassVar[bool] = True
-    """False if the commands depend neither on F_y nor on the fin velocity: then the controller may
+    """False if its angles depend neither on F_y nor on the fin velocity: then the controller may
     start although F_y is reversed and `estimator.reversed_fy` is refuse."""
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

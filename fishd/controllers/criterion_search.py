@@ -193,7 +193,7 @@ class CriterionSearch:
 
         fx, fy: mean forces since the previous tick [N]
         dt: time since then [s]
-        side: sign of the command since then
+        side: sign of the instruction angle since then
         """
         self._watched += dt
         if side != self._side:

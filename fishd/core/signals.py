@@ -123,7 +123,7 @@ class Tick(Struct, frozen=True, gc=False):
     t: Annotated[float, unit("s", "Time of the tick, unix.")]
     seq: Annotated[int, note("Number of the tick, from 1; a gap means lost messages.")]
     mode: Annotated[str, note(MODES)]
-    controller: Annotated[str, note("Name of the controller that chose the command.")]
+    controller: Annotated[str, note("Name of the controller that chose `phi_c`.")]
     fx: Annotated[float, unit("N", "Mean longitudinal force since the previous tick.")]
     fy: Annotated[float, unit("N", "Mean lateral force since the previous tick.")]
     fy_rate: Annotated[float, unit("N/s", "Rate of change of the lateral force.")]

@@ -84,7 +84,7 @@ class Sensor(Protocol):
 class Servo(Protocol):
     """The tail servo."""
 
-    def write(self, angle: float) -> None:
+    def write(self, instruction_angle: float) -> None:
         """Send an instruction angle [rad]; start the pulses if there are none.
 
         Raises `ServoError` when the servo cannot be reached.

@@ -25,12 +25,13 @@ from msgspec.structs import replace
 
 from fishd.config import Config, adopt
 from fishd.core import strict_yaml, text
+from fishd.core.camera_frames import FrameHead
 from fishd.core.dataframes import ticks_to_frame
 from fishd.core.decoding import decoder
 from fishd.core.errors import FishdError, RecordingError
 from fishd.core.protocol import Calibrations
 from fishd.core.signals import Event, Status, Tick
-from fishd.recording.images import IMAGE_TOPIC, FrameHead, RecordedFrame, decode_frame, decode_head
+from fishd.recording.images import IMAGE_TOPIC, RecordedFrame, decode_frame, decode_head
 from fishd.recording.mcap_file import Appended, Damaged, read_records
 from fishd.recording.part_file import PART_SUFFIX, SUFFIX
 from fishd.recording.provenance import FORMAT

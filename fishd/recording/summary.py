@@ -6,11 +6,11 @@ from typing import Any, NamedTuple, TypeAlias
 import msgspec
 from msgspec import UNSET, Struct, UnsetType
 
+from fishd.core.camera_frames import FrameHead
 from fishd.core.decoding import decoder
 from fishd.core.robots import find_kind
 from fishd.core.signals import Event, Status, Tick
 from fishd.recording.axis import Axis, ClockStep, ClockSteps
-from fishd.recording.images import FrameHead
 
 
 class Gap(NamedTuple):
@@ -109,7 +109,7 @@ class Tally:
         self._sent = 0
         """Number of the latest tick that the present fishd is known to have published; 0 if no."""
         self._counts = Summary(swim_ticks={})
-        """What was counted until now; `summary` adds what is computed."""
+        """Counts until now; `summary` adds what is computed."""
         self._first = self._position = 0.0
         self._clock_steps = ClockSteps()
         self._is_real_time = True

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fishd.config import Config, to_yaml
+from fishd.core.camera_frames import FrameHead
 from fishd.core.decoding import decoder
 from fishd.core.errors import RecordingError
 from fishd.core.protocol import Calibrations
@@ -26,7 +27,6 @@ from fishd.recording.axis import Axis
 from fishd.recording.images import (
     IMAGE_SCHEMA,
     IMAGE_TOPIC,
-    FrameHead,
     encode_frame,
     image_json_schema,
 )

@@ -57,7 +57,7 @@ class SimulatedFish:
         self._start = 0.0
         self._duration, self._samples = 0.0, 1
         """Length of the latest window [s], and its number of samples."""
-        self._angle: float | None = None
+        self._instruction_angle: float | None = None
         self._fin_speed = 0.0
         self.calibration = ForceCalibration()
         """Calibration between the forces of the rig and those of measurements; a tare sets it."""
@@ -73,7 +73,7 @@ class SimulatedFish:
         if duration != self._duration:
             self._duration, self._samples = duration, round(self._sample_rate * duration) or 1
         samples = self._samples
-        self.window = window = self.fish.advance(self._angle, duration, samples)
+        self.window = window = self.fish.advance(self._instruction_angle, duration, samples)
         self._power = None
         fx, fy = window.sampled_thrust, window.sampled_lateral_force
         fx, fy = self._imperfections.apply(fx, fy, now - self._start, duration, samples)
@@ -111,13 +111,13 @@ class SimulatedFish:
             self._power = self.window.power
         return self._power
 
-    def write(self, angle: float) -> None:
+    def write(self, instruction_angle: float) -> None:
         """Set the instruction angle [rad] from the latest read onwards."""
-        self._angle = angle
+        self._instruction_angle = instruction_angle
 
     def release(self) -> None:
         """Stop the pulses; the wheel keeps its angle."""
-        self._angle = None
+        self._instruction_angle = None
 
     def close(self) -> None:
         """Release the servo."""

@@ -115,14 +115,14 @@ def measure_drifts(seed: int) -> Errors:
 
 
 def show_thrusts(seed: int) -> Errors:
-    """Swim after one rest under each drift, and judge the thrust that is shown every second."""
+    """Swim after one rest under each drift, and judge the thrust that is shown every minute."""
     truth = simulate(Config(), "swing", {}).mean_thrust
     errors = []
     for drift in DRIFTS:
         with VirtualSession(drifting(drift, seed)) as session:
             session.rest(REST_S)
             ticks = session.swim("swing", {}, SHOWN_S)
-        shown = ticks[round(SKIPPED_S / session.tick) :: round(1 / session.tick)]
+        shown = ticks[round(SKIPPED_S / session.tick) :: round(60.0 / session.tick)]
         errors += [
             (f"shown thrust, {drift}", (tick.thrust - truth) / tick.thrust_ci95)
             for tick in shown

@@ -203,7 +203,7 @@ class Card(Struct, frozen=True, kw_only=True):
 
     @property
     def sees(self) -> str:
-        """`forces`, `pictures` or both; commands and readings do not count."""
+        """Inputs that show the fish: `forces`, `pictures` or both; not readings and past angles."""
         forces = any(
             feature.name in FEATURE_NAMES and feature.name not in COMMAND_FEATURES
             for feature in self.observation

@@ -99,9 +99,9 @@ class Ppo(Controller[PpoParameters]):
             action = 1.0
         elif math.isfinite(action):
             action = max(-1.0, min(1.0, action))
-        angle = self._limit.apply(self._amplitude * action, observation.dt)
+        instruction_angle = self._limit.apply(self._amplitude * action, observation.dt)
         self.held = self._limit.share
-        return angle
+        return instruction_angle
 
     def _choose(self, observation: Observation) -> float:
         """Return the output of the network."""

@@ -1,7 +1,7 @@
 """The NPZ file of a swim: its track, its midlines, and the state from which it resumes.
 
-Body, water, time and command continue exactly. The controller is not stored: it restarts from the
-current command.
+Body, water, time and instruction angle continue exactly. The controller is not stored: it restarts
+from that angle.
 """
 
 import io

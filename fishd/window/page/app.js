@@ -1,7 +1,7 @@
 // The page: its state, what the stream says about it, the header with the E-stop, and the values.
 import {
   call, duration, forceUnit, html, interval, number, parametersText, recall, remember, render, sentence, setClient,
-  timeOfDay, useState,
+  significant, timeOfDay, unitText, useState,
 } from "./common.js";
 import { Charts } from "./charts.js";
 import { defaultOf, Drive, driverName, request, selectionOf } from "./controls.js";

@@ -288,3 +288,16 @@ def test_power_that_is_not_known_can_have_no_price() -> None:
     env.reset(seed=1)
     with pytest.raises(ConfigError, match=r"power_price: this fish has no reading power"):
         env.step(np.array([1.0], np.float32))
+
+
+def test_readings_are_inputs_of_an_agent_and_those_that_a_fish_lacks_are_refused() -> None:
+    water = "sensors.water={kind: simulated, value: 15, amplitude: 0, low: 10, high: 30}"
+    config = load(None, [water])
+    settings = EnvironmentSettings(observation=("fy",), readings=("water_temperature",))
+    env = SwimEnv(SimulatedLink(config, metered=False), config, settings)
+    env.reset(seed=1)
+    seen, *_ = env.step(np.array([1.0], np.float32))
+    assert seen.shape == (2,)
+    assert seen[1] == pytest.approx(-0.5)
+    with pytest.raises(ConfigError, match="the fish has no reading water_temperature; it has powe"):
+        SwimEnv(SimulatedLink(load(None)), load(None), settings)

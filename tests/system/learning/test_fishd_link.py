@@ -24,11 +24,8 @@ DEFAULT_MISSES, MANY_MISSES = 5, 100
 """Numbers of ticks that an agent may miss: the default, and more than a busy machine loses."""
 
 
-@pytest.fixture(scope="module")
-def shared_daemon(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
-    """A fishd in real time: an agent on a busy machine may lose ticks, but not its control."""
-    with running(tmp_path_factory.mktemp("daemon"), *sets("tick=0.1")) as process:
-        yield process
+DAEMON = sets("tick=0.1")
+"""In real time: an agent on a busy machine may lose ticks, but not its control."""
 
 
 @pytest.fixture
@@ -127,7 +124,7 @@ def test_a_link_swims_a_fishd_in_real_time_and_rests_it(daemon: Daemon, fish: Fi
         sent: dict[float, float] = {}
         for n in range(20):
             angle = 0.02 * (n + 1)
-            after, lost, _ = link.step(angle)
+            after, lost = link.step(angle)
             if not lost:
                 sent[before.fx] = angle
                 passed = after.time - before.time  # a tick, or several on a busy machine
@@ -242,6 +239,17 @@ def test_a_fault_ends_control_with_its_reason_until_it_is_cleared(env: SwimEnv, 
     with losing("fishd is in mode fault"):
         env.pause(1.0)
     with losing("has not answered within"):
+        env.reset()
+    fish.clear_fault()
+    env.reset()
+    assert swims(env)
+
+
+def test_an_emergency_stop_ends_control_with_its_message(env: SwimEnv, fish: Fish) -> None:
+    fish.estop("water on the floor")
+    with losing("fishd is in mode estop: water on the floor"):
+        swim_on(env)
+    with losing("water on the floor"):
         env.reset()
     fish.clear_fault()
     env.reset()

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msgspec.structs import replace
-from rigs.swimming import BRIEF, brief_job
+from rigs.swimming import brief_job
 
 from fishd.config import load
 from fishd.controllers.policy.file import read
@@ -132,15 +132,6 @@ def test_a_policy_that_violates_the_shortest_dwell_has_no_worst_thrust_in_the_ra
     assert evaluate_in_simulation(CONFIG, six_ticks, chosen).relative_thrust > 0.9
     assert worst_on_others(CONFIG, six_ticks, settings) > 0.7
     assert worst_on_others(CONFIG, every_tick, settings) == 0.0
-
-
-def test_a_training_on_harsh_fish_records_its_worst(tmp_path: Path) -> None:
-    chosen = replace(BRIEF.evaluation, others=2, others_from="range")
-    environment = replace(REMEMBERING, own_fish=True, episode=32)
-    varied = {"randomisation": HARSH, "evaluation": chosen}
-    job = brief_job(tmp_path / "run", environment=environment, **varied)
-    latest = train(job).latest_evaluation
-    assert latest.lowest_relative_thrust <= latest.relative_thrust
 
 
 def test_with_own_fish_reversals_are_delayed_by_its_own_shortest_dwell() -> None:

@@ -55,6 +55,36 @@ def test_what_the_network_sees_is_each_feature_over_its_scale(tmp_path: Path) ->
         assert tick.phi_c == pytest.approx(0.42 * wanted, abs=1e-6)
 
 
+WATER = "readings.water_temperature"
+
+
+def test_a_policy_sees_the_readings_of_its_card_and_keeps_those_that_are_old(
+    tmp_path: Path,
+) -> None:
+    path = write(tmp_path, to_onnx(linear(1.0), "tanh", card((WATER, 10.0, 20.0))))
+    rig = Rig("sensors.w={kind: simulated, value: 22, amplitude: 0}", "slew_limit=null")
+    rig.start("ppo", policy=str(path))
+    ticks = rig.run(3)
+    assert ticks[0].readings.keys() == {"power"}  # it has no sample yet, and the fish is pushed
+    assert [tick.phi_c for tick in ticks[1:]] == pytest.approx([0.42 * 0.2] * 2)
+    (sensor,) = (sensor for sensor in rig.loop.readings.sensors if sensor.name == "w")
+    sensor.stale_after = -1.0
+    tick = rig.run(3)[-1]
+    assert tick.readings.keys() == {"power"}
+    assert tick.phi_c == pytest.approx(0.42 * 0.2)
+
+
+def test_a_policy_for_readings_that_a_fish_lacks_is_refused_with_those_that_it_has(
+    tmp_path: Path,
+) -> None:
+    path = write(tmp_path, to_onnx(linear(1.0), "tanh", card((WATER, 10.0, 20.0))))
+    assert refusal(path, load(None, ["sensors.flow={kind: simulated, name: flow}"]).limits) == (
+        f"ppo: policy: {path}: it needs the reading water_temperature, which this robot does not "
+        "have; it has power, flow: add a sensor to sensors, or rename one of its readings"
+    )
+    create_policy(path)  # a client does not know the readings of the fish
+
+
 @pytest.mark.parametrize("bias", [0.0, 1e-7])
 def test_an_offset_of_fx_does_not_keep_a_fish_at_rest(tmp_path: Path, bias: float) -> None:
     # The network has left-right symmetry: its output is zero, up to rounding, where fy is zero.
