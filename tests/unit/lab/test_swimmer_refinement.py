@@ -106,7 +106,7 @@ def test_a_speed_has_its_error_by_the_grid_after_a_refinement(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    monkeypatch.setattr(speed, "MAX_SWIM_S", 0.4)  # any speed has an error by the grid
+    monkeypatch.setattr(measuring, "MAX_SWIM_S", 0.4)  # any speed has an error by the grid
     fish = (*OPTIONS, *sets("swimmer.numerics.cell=0.001", "swimmer.numerics.step=0.0005"))
     gait = ("sine", "--frequency", "10")
     brief = ("simulate", *gait, *OPTIONS, "--for", "0.5", "--settle", "0.2")
