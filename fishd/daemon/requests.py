@@ -39,8 +39,8 @@ class Access(NamedTuple):
     telemetry: str = ""
     keyed_telemetry: str = ""
     """Address of telemetry for clients with a key; empty for none."""
-    limitation: str = ""
-    """Line about what is wrong with the sockets; empty if nothing is."""
+    limitation: str | None = None
+    """Line about what is wrong with the sockets; None if nothing is."""
     counters: Mapping[str, int] = {}
     """Numbers of recovered errors since start."""
 

@@ -175,10 +175,10 @@ def _format_with_budget(
     )
 
 
-def warn_of_unknown_calibration(measured: Thrust, unit: str) -> str:
-    """Return a remark on a calibration of unknown uncertainty; empty where it is known."""
+def warn_of_unknown_calibration(measured: Thrust, unit: str) -> str | None:
+    """Return a remark on a calibration of unknown uncertainty; None where it is known."""
     if measured.calibration_ci95 is not None:
-        return ""
+        return None
     if unit != "N":
         return (
             f"the force sensor is not calibrated: forces are in {text.quoted(unit)}, and no "

@@ -107,8 +107,8 @@ def gpio_chip(context: Context) -> Result | None:
         return fail(problem, remedy)
 
 
-def _find_problem(name: str, bounds: str) -> str:
-    """Return what is wrong with an installed package; empty if nothing is."""
+def _find_problem(name: str, bounds: str) -> str | None:
+    """Return what is wrong with an installed package; None if nothing is."""
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -123,7 +123,7 @@ def _find_problem(name: str, bounds: str) -> str:
         return f"{name} cannot be imported: {error}"
     except Exception as error:
         return f"{name} cannot be imported: {type(error).__name__}: {error}"
-    return ""
+    return None
 
 
 def _parse_version(version: str) -> list[int]:
