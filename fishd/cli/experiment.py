@@ -274,7 +274,7 @@ class Run:
                 writer = stack.enter_context(session.recorded(path, note))
                 if logged and self.fish.on == "live":
                     log = SwimLog(experiment, writer, session.tick)
-                    stack.enter_context(session.logged(log))
+                    stack.enter_context(session.logged(log.swim))
             show = stack.enter_context(show_progress(total, unit, err=self.as_json))
             if session:
                 stack.enter_context(session.heard_by(_Bar(session, show, since)))

@@ -19,7 +19,7 @@ class Fault(Struct, frozen=True):
 
 
 FAULTS = {
-    # One lost or doubtful window is no reason to stop: the last trusted one is used again.
+    # The fish swims on after one lost or doubtful window: the last trusted one is used again.
     "sensor-stale": Fault("check wires and power of the force sensor", in_a_row=3),
     "sensor-range": Fault(
         "look for a clipped or broken wire of the force sensor, or calibrate it", in_a_row=3

@@ -7,7 +7,7 @@ from fishd.core.foreign_code import call_foreign, real_number
 
 
 class Guard:
-    """A limiter of the instruction angle without a memory of its own, so nothing can wind up."""
+    """A limiter of the instruction angle without a memory, so nothing can wind up."""
 
     def __init__(
         self, amplitude: float, tick: float, slew_limit: float | None, fade_time: float

@@ -208,7 +208,6 @@ class Daemon:
                 self._loop.expire_lease()
         if now >= self._next_housekeeping:
             self._next_housekeeping = now + STATUS_PERIOD_S / 4
-            self._gateways.check()
             next(self._housekeeping)()
 
     def _collect_garbage(self) -> None:
@@ -216,6 +215,7 @@ class Daemon:
 
     def _check_sockets(self) -> None:
         self._sockets.check()
+        self._gateways.check()
         kernel_names.drop_readers()
 
     def _access(self) -> Access:

@@ -184,8 +184,7 @@ class Operations:
 
     async def _list_policies(self, _: protocol.NoArguments) -> list[PolicyInfo]:
         self._calls.check_busy()
-        limits = self._loop.limits
-        describe = partial(library.describe_all, limits.tick, limits.amplitude)
+        describe = partial(library.describe_all, self._loop.limits)
         return await self._calls.call("the policy files have not been read", describe)
 
     async def _get_config(self, _: protocol.NoArguments) -> Config:

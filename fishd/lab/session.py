@@ -30,11 +30,15 @@ from fishd.core.signals import Event, Publisher, Reason, Tick
 from fishd.lab.simulation import VirtualRun
 
 if TYPE_CHECKING:
-    from fishd.lab.swim_log import SwimLog
     from fishd.recording.provenance import Source
     from fishd.recording.writer import RunWriter
 
 log = logging.getLogger(__name__)
+
+Swim = Callable[[], list[Tick]]
+Logged = Callable[[str, Mapping[str, Any], float, Swim], list[Tick]]
+"""Function that returns the ticks of a swim of a controller with these parameters, for so many
+seconds: those that it has, or else those of `Swim`. A rest has no controller."""
 
 IDLE_LIMIT = 5.0
 """Time after which an experiment that reads no tick while the fish swims counts as hung [s]."""
@@ -103,7 +107,7 @@ class Session(ABC):
 
     def __init__(self) -> None:
         self._listeners: list[Publisher] = []
-        self._log: SwimLog | None = None
+        self._log: Logged | None = None
         self._finished = self._elapsed = self._planned = 0.0
 
     @property
@@ -164,7 +168,7 @@ class Session(ABC):
         controller: str,
         parameters: Mapping[str, Any],
         seconds: float,
-        swim: Callable[[], list[Tick]],
+        swim: Swim,
     ) -> list[Tick]:
         """Swim or rest, unless the log of a resumed experiment has these ticks.
 
@@ -173,7 +177,7 @@ class Session(ABC):
         self._elapsed, self._planned = 0.0, seconds
         try:
             log = self._log
-            ticks = log.swim(controller, parameters, seconds, swim) if log else swim()
+            ticks = log(controller, parameters, seconds, swim) if log else swim()
             self._elapsed = seconds
         finally:
             self._finished, self._elapsed = self.used, 0.0
@@ -189,8 +193,8 @@ class Session(ABC):
             self._listeners.remove(listener)
 
     @contextmanager
-    def logged(self, log: "SwimLog") -> Iterator[None]:
-        """Log swims and rests while this lasts, and take those from the log that it has."""
+    def logged(self, log: Logged) -> Iterator[None]:
+        """Pass swims and rests through `log`, as `SwimLog.swim`, while this lasts."""
         self._log = log
         try:
             yield

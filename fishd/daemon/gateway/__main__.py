@@ -27,6 +27,7 @@ def main(number: str) -> None:
     status = 1
     try:
         gc.disable()  # imports leave no garbage, and searching for it takes a tenth of the time
+        from fishd.core.process.safe_path import python_command
         from fishd.daemon.gateway.link import EXCEEDED
         from fishd.daemon.gateway.server import GatewayServer
 
@@ -38,7 +39,8 @@ def main(number: str) -> None:
             link.setblocking(True)
             link.send(EXCEEDED + why.encode())
             link.set_inheritable(True)
-            os.execv(sys.executable, sys.orig_argv)
+            command = python_command("-m", "fishd.daemon.gateway", number)
+            os.execv(command[0], command)
         status = 0
     except ConnectionError:  # fishd was killed
         pass

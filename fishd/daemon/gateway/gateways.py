@@ -27,10 +27,10 @@ from fishd.daemon.gateway.link import CONTROL, TELEMETRY, join_frames
 
 log = logging.getLogger(__name__)
 
-MAX_UNANSWERED = 6
+MAX_UNANSWERED = 3
 """Number of unanswered heartbeats from which on a gateway counts as hung: long enough for one that
 gets little time from a processor with a real-time task, once a second."""
-MAX_STARTING = 240
+MAX_STARTING = 120
 """Longest start of a gateway, in heartbeats: a busy Pi may take long to load Python."""
 MIN_PERIOD_S = 1.0
 """Shortest time between two starts of a process [s]."""
@@ -163,7 +163,7 @@ class Gateway:
         self._listen()
 
     def beat(self) -> None:
-        """Send a heartbeat, or replace a process that hangs; call it four times a second."""
+        """Send a heartbeat, or replace a process that hangs; call it twice a second."""
         if self._link is None or not self._reading:  # an answer may be waiting unread
             return
         if self._unanswered >= (MAX_UNANSWERED if self._serves else MAX_STARTING):
@@ -343,7 +343,7 @@ class Gateways:
             gateway.read(enabled)
 
     def check(self) -> None:
-        """Replace a process that hangs; call it four times a second."""
+        """Replace a process that hangs; call it twice a second."""
         for gateway in self._gateways:
             gateway.beat()
 

@@ -10,7 +10,7 @@ from typing import IO, Literal
 _PAGE_BYTES = resource.getpagesize()
 _NICE = 5
 """Difference of the nice value of a gateway to that of fishd."""
-_CHECK_PERIOD_S = 0.2
+_CHECK_PERIOD_S = 0.1
 """Time between two checks of the limits [s]."""
 _MAX_FILES = 4096
 """Largest number of file descriptors, if the system permits it.

@@ -31,7 +31,7 @@ from fishd.daemon.gateway.router import Router
 if TYPE_CHECKING:
     from fishd.daemon.gateway.keys import KnownKeys
 
-MAX_MEMORY_BYTES = 56 * 2**20
+MAX_MEMORY_BYTES = 32 * 2**20
 """Largest memory in addition to that at the start [bytes]."""
 MAX_CONNECTIONS = 800
 """Largest number of connections of clients, subscribers and other programs."""

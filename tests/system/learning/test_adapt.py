@@ -339,7 +339,7 @@ def test_a_resume_repeats_no_measurement(tmp_path: Path, monkeypatch: pytest.Mon
             LiveSession(cast(Fish, daemon)) as rig,
             open_folder(path) as experiment,
             rig.recorded(experiment.recording("adapt"), "") as writer,
-            rig.logged(SwimLog(experiment, writer, rig.tick)),
+            rig.logged(SwimLog(experiment, writer, rig.tick).swim),
         ):
             gaits = [path / "gaits.png"]
             return adaptation.adapt(rig, experiment, 160.0, 640, 0, StoringDisplay(), gaits)

@@ -21,7 +21,7 @@ def swim(path: Path, *frequencies: float) -> list[list[float]]:
         open_experiment(path, header, resume=path.exists()) as experiment,
         VirtualSession(Config()) as rig,
         rig.recorded(experiment.recording("measure"), "") as writer,
-        rig.logged(SwimLog(experiment, writer, rig.tick)),
+        rig.logged(SwimLog(experiment, writer, rig.tick).swim),
     ):
         return [forces(rig.swim("square", {"frequency": f}, 2.0)) for f in frequencies]
 
