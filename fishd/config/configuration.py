@@ -230,7 +230,7 @@ class Config(LoopSettings, frozen=True, forbid_unknown_fields=True, kw_only=True
     )
     sensors: Annotated[
         Mapping[str, SensorSettings],
-        note("Any number of other sensors, each a section whose name you choose."),
+        note("Any number of other sensors, each a named section."),
     ] = {}
     panel: Annotated[
         PanelSettings, note("E-stop button and status light, if the robot has them.")
